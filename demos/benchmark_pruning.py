@@ -232,7 +232,7 @@ PAIRS: dict[str, tuple[Make, Make]] = {
         lambda n: apart(n, conditions=[mpm.Contact(0, 1, friction=0.3)]),
     ),
     "inertia": (block, lambda n: block(n, inertia=True)),
-    "inertia of wet soil, two substeps in both": (draining, lambda n: draining(n, inertia=True)),
+    "inertia of wet soil, both scenes with two substeps": (draining, lambda n: draining(n, inertia=True)),
     "free tool that touches nothing": (
         lambda n: block(n, inertia=True),
         lambda n: block(n, inertia=True, conditions=[mpm.Tool(mpm.HalfSpace((0, 2), (0, -1)), mass=1.0)]),

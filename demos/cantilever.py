@@ -52,7 +52,7 @@ class Outcome:
 
 
 def run(cells: int = 8, steps: int = 40, last: int = 10) -> tuple[dict[str, float], Outcome]:
-    """Bend the beam, `cells` cells high, to alpha = last in increments of 10 / steps.
+    """Bend the beam, `cells` cells high, to alpha = `last` in increments of 10 / `steps`.
 
     Returns the errors that the module's docstring defines, and the axes.
     """
@@ -70,7 +70,7 @@ def run(cells: int = 8, steps: int = 40, last: int = 10) -> tuple[dict[str, floa
 
 
 def rod(alpha: float) -> np.ndarray:
-    """Return the axis of the rod (k, 2), m, at the arc lengths ARC."""
+    """Return the axis of the rod (k, 2), m, at the arc lengths `ARC`."""
     axial, transverse = YOUNG * HEIGHT, 5 / 6 * RUBBER.shear * HEIGHT
     return shear_flexible_rod(LENGTH, axial, transverse, STIFFNESS, -alpha * STIFFNESS / LENGTH**2, points=ARC)
 

@@ -8,8 +8,8 @@ L² / (E I).  The material is elastic, so the deflection must not depend on the 
 integration of the particle domains.  Runs on any number of processes; --profile prints the cost of a step.
 
 Errors divided by L: `v` of the tip deflection and `u` of the shortening, compared with the rod.  `w` is the
-displacement normal to the plane of bending.  `drift` is the largest distance of the tip from the tip in the run with
-most steps.
+displacement normal to the plane of bending.  `drift` is the largest distance of the tip from its position in the run
+with the most steps.
 
 The tip deflection is too large because the stress is constant in each domain.  With n domains over the height the error
 is about 1/n².  In 10 steps with 2, 4 and 8 cells (n = 4, 8, 16), `v` is 0.0129, 0.0034, 0.0010 in 3D, and 0.0127,

@@ -54,8 +54,8 @@ def well() -> mpm.ModifiedCamClay:
 class Drained:
     """A drained cavity in infinite soil.
 
-    soil, state: the soil and its initial state variables; known: radius -> published pressure divided by p_0; reach:
-    outer radius of the radial solution.  Radii are divided by the initial radius of the cavity.
+    soil, state: the soil and its initial state variables; known: published pressure divided by p_0, for each radius;
+    reach: outer radius of the radial solution.  Radii are divided by the initial radius of the cavity.
     """
 
     soil: mpm.Skeleton
@@ -114,7 +114,7 @@ def pressure(s: mpm.Simulation, radius: float) -> float:
 
 
 def drained(name: str, cells: int) -> dict[float, tuple[float, float]]:
-    """Return radius -> cavity pressures divided by p_0: computed, and of the radial solution."""
+    """Return, for each radius, the computed cavity pressure and that of the radial solution, divided by p_0."""
     case = DRAINED[name]
     widest = max(case.known)
     reference, radii, out, p = cavity(case.soil, case.reach, 150, state=case.state), [1.0], [0.0], {}
@@ -133,9 +133,9 @@ def drained(name: str, cells: int) -> dict[float, tuple[float, float]]:
 class Undrained:
     """Results of an undrained expansion and of the consolidation after it.
 
-    total: radius -> cavity pressure minus p_0, computed and exact; water: radius -> pore pressure at the wall, computed
-    and exact; profiles: (time after the expansion, s, radii of the points, m, pore pressures).  All pressures are
-    divided by p_0.  balance: error of the fluid balance.
+    total: for each radius, the computed and the exact cavity pressure minus p_0; water: for each radius, the computed
+    and the exact pore pressure at the wall; profiles: (time after the expansion, s, radii of the points, m, pore
+    pressures).  All pressures are divided by p_0.  balance: error of the fluid balance.
     """
 
     total: dict[float, tuple[float, float]]

@@ -32,7 +32,7 @@ STIFF, COHESION = 200.0, 1e-3  # Young's modulus and cohesion, divided by rho g 
 GRAIN, RISE = 0.01, (0.64 - 0.38) / 0.279  # m; (mu_2 - mu_s) / I_0 of Jop et al.
 FALLS, SHOWN = 3.5, np.array([0.5, 1.0, 1.5, 2.0])  # duration, and times of the profiles, in units of sqrt(H/g)
 CELLS = {0.5: 12, 1.0: 8, 4.0: 4, 8.0: 4}  # cells over the width, for each aspect ratio
-SCATTER, BALANCE = 0.15, 0.02  # allowed error of the run-out; of the energy balance / work of the weight
+SCATTER, BALANCE = 0.15, 0.02  # allowed errors: of the run-out; of the energy balance, relative to the weight's work
 STEPS = 50  # in the time sqrt(H/g)
 
 

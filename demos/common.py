@@ -22,7 +22,7 @@ import mpm_dolfinx as mpm
 
 GALLERY = Path(__file__).with_name("README.md")
 COLOURS = "#0072B2 #E69F00 #009E73 #D55E00 #CC79A7 #56B4E9 #882255 #7F7F7F #999933 #332288".split()
-"""Colours of lines, in order, also distinct for the colour-blind (Okabe and Ito 2008, Tol 2021)."""
+"""Colours of lines, in order, distinct even for the colour-blind (Okabe and Ito 2008, Tol 2021)."""
 
 
 class Parser(argparse.ArgumentParser):

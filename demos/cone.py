@@ -57,7 +57,7 @@ def published() -> float:
 
 @dataclass
 class Push:
-    """Results of each step: depth / R; N, force on the cone / (pi R^2 s_u).
+    """Results of each step: depth divided by R; N, force on the cone divided by pi R^2 s_u.
 
     frame: final corners (n, 4, 2), m, a field (n,), and the outline of the cone (k, 2), m; seeded: number of points at
     the start.
@@ -121,9 +121,10 @@ def push(cells: int, depth: float, clay: mpm.Skeleton) -> Push:
 
 @dataclass
 class Dissipation:
-    """Excess pressure / s_u at the edge between cone and shaft, and its remaining fraction at the times T* of `TIMES`.
+    """Excess pressure at the edge between cone and shaft, divided by s_u.
 
-    frame: corners (n, 4, 2), m, and excess pressures / s_u (n,) when the cone stops, and the outline of the cone, m.
+    rest: fraction of this pressure that remains at the times T* of `TIMES`.
+    frame, when the cone stops: corners (n, 4, 2), m, excess pressures divided by s_u (n,), and outline of the cone, m.
     """
 
     N: float = 0.0
@@ -147,7 +148,7 @@ def push_wet(cells: int, depth: float) -> Dissipation:
     edge = np.array([R, outline[-2, 1] - depth])
 
     def excess(s: mpm.Simulation) -> float:
-        """Return the mean pressure / s_u within a cell of the edge."""
+        """Return the mean pressure within a cell of the edge, divided by s_u."""
         near = np.linalg.norm(s.points.x - edge, axis=1) < h
         volume = s.points.volume0[near]
         return float(volume @ s.points.pressure[near] / volume.sum() / STRENGTH)
@@ -170,8 +171,8 @@ def main(argv: list[str] | None = None) -> dict:
     """Run the demo; return the results of --json."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=2, help="whole cells over the radius, which has half a cell more")
-    parser.add_argument("--depth", type=float, default=10.0, help="depth of the tip / R")
-    parser.add_argument("--wet-depth", type=float, default=5.0, help="depth of the tip / R in saturated clay; 0: none")
+    parser.add_argument("--depth", type=float, default=10.0, help="depth of the tip, divided by R")
+    parser.add_argument("--wet-depth", type=float, default=5.0, help="the same in saturated clay; 0: none")
     parser.add_argument("--mises", action="store_true", help="von Mises's law in place of Tresca's, in undrained clay")
     o = parser.parse_args(argv)
     if not 2 <= o.cells <= 16 or not 0 < o.depth <= 20:
@@ -224,7 +225,7 @@ def draw(o: Namespace, run: Push, wet: Dissipation | None) -> None:
 
 
 def show(ax, frame: tuple, depth: float, label: str, title: str, clim: tuple[float, float]) -> None:
-    """Draw the clay at a state of the cone, coloured by the field of the frame."""
+    """Draw the clay and the cone; `frame` contains corners of domains, their values, and the outline of the cone."""
     corners, values, outline = frame
     domains = common.domains(ax, corners, values, cmap="viridis" if clim[0] == 0 else "RdBu_r", clim=clim)
     inside = np.concatenate([outline, [[0, outline[-1, 1]]]])

@@ -144,7 +144,7 @@ def with_water(s: mpm.Simulation, bulk: float) -> mpm.Simulation:
 def linearise(s: mpm.Simulation, dt: float) -> System:
     """Return the first Newton system of a step of length dt, s.
 
-    The load is that after RAMP_STEP, for any dt.
+    The load is that after the time `RAMP_STEP`, for any dt.
     """
     start = step.set_up(s.scene, s.state, RAMP_STEP)
     momentum = balances(s.scene, start, start.acting[-1]).momentum
@@ -191,7 +191,7 @@ def scan(scene: str, h: float, bulks=BULK, k_dt=K_DT, schemes=tuple(SCHEMES)) ->
 
 
 def worst(counts: list[Count]) -> float:
-    """Return the largest number of iterations; infinite if a scheme diverges or takes more than MOST iterations."""
+    """Return the largest number of iterations; infinite if a scheme diverges or takes more than `MOST` iterations."""
     return max(np.inf if c.iterations is None else c.iterations for c in counts)
 
 

@@ -143,9 +143,9 @@ def cycle(
 
 
 def turn(h: float, nu: float = 0.3, steps: int = 90, fluid: mpm.Fluid | None = None) -> float:
-    """Return rms change / rms of the total stress in the middle of the stretched block, by a rotation of 360 degrees.
+    """Return the rms change of the total stress in the middle of the stretched block, divided by the rms stress.
 
-    With a fluid the block is undrained.
+    The change is due to a rotation by 360 degrees.  With a fluid the block is undrained.
     """
     cells = round(1.8 * BLOCK / h)
     grid = mpm.Grid([0] * 2, [cells * h] * 2, [cells] * 2)
@@ -265,20 +265,21 @@ def draw(o: Namespace, runs: dict[float, dict], points: dict, fem: tuple[np.ndar
     """Draw the residual stress against the cycles, and the last cycle with the finite elements."""
     fig, ((left, loop),) = common.figure(1, 2, (11, 4.2))
     for (h, run), color in zip(runs.items(), COLORS, strict=False):
-        left.plot(np.arange(len(run["left"])) + 1, run["left"], "o-", ms=3, color=color, label=f"domains, h = {h:g} m")
+        label = f"exact integration, h = {h:g} m"
+        left.plot(np.arange(len(run["left"])) + 1, run["left"], "o-", ms=3, color=color, label=label)
     label = f"standard MPM, h = {o.h[-1]:g} m"
     left.plot(np.arange(len(points["left"])) + 1, points["left"], "s--", ms=3, color="C3", label=label)
-    left.set(xlabel="cycles", ylabel="rms stress at zero load / at the peak load", xscale="log", yscale="log")
+    left.set(xlabel="cycles", ylabel="rms stress, unloaded / at peak load", xscale="log", yscale="log")
     left.set_title("Residual stress")
     last = runs[o.h[-1]]
-    both = ("domains", last, "-", COLORS[len(runs) - 1]), ("standard MPM", points, "s--", "C3")
+    both = ("exact integration", last, "-", COLORS[len(runs) - 1]), ("standard MPM", points, "s--", "C3")
     for name, run, style, color in both:
         end = len(run["left"]) * o.steps
         part = slice(max(0, end - o.steps), end + 1)
         loop.plot(-run["tips"][part], run["force"][part] / 1e3, style, ms=3, color=color, label=name)
     loop.plot(-fem[0], fem[1] / 1e3, "k:", lw=2.5, label="FEM, first cycle")
     loop.set(xlabel="deflection of the tip (m)", ylabel="load (kPa)")
-    loop.set_title(f"Load and deflection, cycle {o.cycles}, h = {o.h[-1]:g} m")
+    loop.set_title(f"Load against deflection, cycle {o.cycles}, h = {o.h[-1]:g} m")
     for ax, place in ((left, "best"), (loop, "upper left")):
         ax.legend(loc=place)
         ax.grid(alpha=0.3)

@@ -102,7 +102,7 @@ class SaintVenantKirchhoff(mpm.Skeleton):
 
 
 def layered(X: np.ndarray) -> np.ndarray:
-    """Return a modulus, Pa, at reference positions (n, 2); it doubles from each quarter of the height to that below."""
+    """Return a modulus, Pa, at reference positions (n, 2), which doubles from each quarter of the height downwards."""
     return 1e6 * 2.0 ** np.floor(4 * (1 - X[:, 1]))
 
 
@@ -287,7 +287,7 @@ def plasticity(cells: int) -> Example:
 
 @dataclass(frozen=True)
 class Hardening(mpm.Skeleton):
-    """The pressure is K y; Newton's method solves y + power y^3 = ln J at each point, and the tangent is exact."""
+    """The pressure is K y; Newton's method solves y + `power` y^3 = ln J at each point, and the tangent is exact."""
 
     power: mpm.Field = 100.0
 
@@ -391,7 +391,7 @@ def draw(o: Namespace, examples: list[Example]) -> None:
         ax.locator_params(nbins=4)
         ax.grid(alpha=0.3)
     axes[0, 0].legend()
-    fig.suptitle("User-defined physics: largest error of each example")
+    fig.suptitle("User-defined physics: largest relative error of each example")
     common.save(fig, o.out / "extending_with_ufl.png")
 
 

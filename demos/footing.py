@@ -135,9 +135,9 @@ class Frame:
 class Push:
     """Results of a push.
 
-    settlement, load: settlement / B and load / (area c) after each step.  frames: states at some times.  pushed: index
-    of the last step of the push; later steps are consolidation.  results: of all runs.  Heights are measured from the
-    initial surface of the soil.
+    settlement, load: settlement divided by B, and load divided by area and c, after each step.  frames: states at some
+    times.  pushed: index of the last step of the push; later steps are consolidation.  results: results of all runs.
+    Heights are measured from the initial surface of the soil.
     """
 
     settlement: list[float] = field(default_factory=lambda: [0.0])
@@ -247,9 +247,7 @@ def bearing(shape: str, roughness: str, cells: int) -> dict[str, float]:
     fine = [0.0] * flat + [-deep], [wide] * flat + [2 * h]
     grid = mpm.Grid(lines=mpm.graded(*size, [fine], h, SOLID["ratio"], LARGEST * h), axisymmetric=flat == 1)
     body = mpm.box(grid, size[0], [*size[1][:flat], 0])
-    soil = mpm.MohrCoulomb(
-        bulk=STIFF * SOIL.bulk, shear=STIFF * SOIL.shear, friction=0, dilation=0, cohesion=COHESION
-    )
+    soil = mpm.MohrCoulomb(bulk=STIFF * SOIL.bulk, shear=STIFF * SOIL.shear, friction=0, dilation=0, cohesion=COHESION)
     down, half = np.eye(flat + 1)[flat] * -LIMIT_DEPTH * WIDTH, WIDTH / 2
     block = mpm.Convex(np.array(list(product(*[(-half, half)] * flat, (0.0, WIDTH)))))
     glued = 9 * COHESION if roughness == "rough" else 0.0
@@ -280,7 +278,7 @@ def main(argv: list[str] | None = None) -> dict:
     parser.add_argument("--box", type=float, default=BOX[0], help="with --steps: width of half the soil divided by B")
     methods = ("sdirk2", "backward-euler")
     parser.add_argument("--method", choices=methods, default=methods[0], help="with --steps: time integration")
-    what = "with --steps: viscosity of the soil over the cohesion and the time of the push"
+    what = "with --steps: viscosity of the soil, divided by the cohesion and by the time of the push"
     parser.add_argument("--viscosity", type=float, default=0.0, help=what)
     parser.add_argument(
         "--graded", action="store_true", help="only the undrained limit load, in a large box of graded cells"
@@ -362,7 +360,7 @@ def draw_cells(ax, frame: Frame) -> None:
 
 
 def viscous(viscosity: float, seconds: float) -> mpm.DruckerPrager:
-    """Return the soil with a viscosity, Pa s: (`viscosity`) (cohesion) (duration `seconds` of the push).
+    """Return the soil with a viscosity, Pa s: the factor `viscosity` times the cohesion times the duration `seconds`.
 
     A shear strain of 1 in this duration then increases the shear stress by `viscosity` times the cohesion.
     """
@@ -443,7 +441,7 @@ def report(runs: dict[str, Push]) -> dict:
 
 
 def view(ax, pair: tuple[Frame, Frame], limits: tuple[float, float]):
-    """Draw the footing, and pore pressures / c of two frames, as left and right half of the soil.
+    """Draw the footing, and pore pressures, divided by c, of two frames as left and right half of the soil.
 
     White gaps at the edge of the footing are due to inverted domains that were replaced.
     """
@@ -489,7 +487,7 @@ def draw(out: Path, runs: dict[str, Push], stiff: dict[tuple[str, int], Push]) -
             surface.plot(sign * x, y, color=colour, lw=1.2, label=f"{name} push" if sign > 0 else None)
     block(surface, run.at_end)
     surface.set(xlim=(-4 * WIDTH, 4 * WIDTH), ylim=(None, 0.7), aspect="auto", ylabel="y / B (-)")
-    surface.set_title("The soil's surface at the end of the push")
+    surface.set_title("Surface at the end of the push")
     surface.legend(fontsize=8, loc="upper left", ncol=3)
     for (how, cells), each in stiff.items():
         fine = cells == max(c for _, c in stiff)
@@ -501,7 +499,7 @@ def draw(out: Path, runs: dict[str, Push], stiff: dict[tuple[str, int], Push]) -
         label = f"{how}, {cells} cells over the width: {each.load[-1] - 1:+.1%}"
         limit.plot(np.array(each.settlement) / each.settlement[-1], each.load, label=label, **style)
     limit.axhline(1, color="black", lw=0.8, ls=":")
-    limit.set(xlabel="settlement / that at the end (-)", ylabel="load / theory (-)", xlim=(0, 1), ylim=(0, 1.15))
+    limit.set(xlabel="settlement / final settlement (-)", ylabel="load / theory (-)", xlim=(0, 1), ylim=(0, 1.15))
     limit.set_title("Very stiff soil: load / theoretical limit load")
     limit.legend(fontsize=8, loc="lower right")
     limit.grid(alpha=0.3)
@@ -522,7 +520,7 @@ def draw_loads(ax, runs: dict[str, Push]) -> None:
         ax.axhline(value, color="black", lw=0.8, ls="--")
         place = {"xytext": (0, -3), "textcoords": "offset points", "ha": "right", "va": "top", "fontsize": 8}
         ax.annotate(f"{name} limit at the surface: {value:.2f}", (depth[-1], value), **place)
-    ax.set(xlabel="settlement / B (-)", ylabel="load / (B c) (-)", title="Load and settlement; V = velocity · B / c_v")
+    ax.set(xlabel="settlement / B (-)", ylabel="load / (B c) (-)", title="Load; V = velocity · B / c_v")
     ax.set(xlim=(0, 1.02 * depth[-1]), ylim=(0, None))
     ax.legend(fontsize=8, loc="lower right", ncol=2)
     ax.grid(alpha=0.3)

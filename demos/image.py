@@ -45,7 +45,7 @@ def picture(pixels: int, seed: int = 9) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class Tissue:
-    """Tissue with grey values indexed by (x, y); pixels with values below HOLES are holes."""
+    """Tissue with grey values indexed by (x, y); pixels with values below `HOLES` are holes."""
 
     grey: NDArray[np.float64]
 
@@ -88,10 +88,10 @@ class Tissue:
 
 @dataclass
 class Outcome:
-    """Histories: times, s, settlements divided by EDGE, and highest pore pressures, Pa.
+    """Histories: times, s, settlements divided by `EDGE`, and highest pore pressures, Pa.
 
     frames: time, s, corners, m, pressures, Pa, and grey values of the points.  drained: settlement of dry tissue
-    divided by EDGE.
+    divided by `EDGE`.
     """
 
     t: list[float] = field(default_factory=list)
@@ -104,7 +104,7 @@ class Outcome:
 
 
 def modulus(tissue: Tissue) -> tuple[float, float, float]:
-    """Return the modulus (stress / strain), Pa, by material points, by elements, and at uniform strain (Voigt)."""
+    """Return the modulus, stress over strain, Pa, by material points, by elements, and at uniform strain (Voigt)."""
     simulation, top = tissue.scene(SMALL, wet=False)
     points = simulation.run(RAMP, RAMP, probes=top, progress=False).displacement[-1][0, 1]
     n = len(tissue.grey)

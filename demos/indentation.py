@@ -55,7 +55,7 @@ class Contact:
 
 
 def contact(s: mpm.Simulation) -> Contact:
-    """Return the present contact, from a fit of p^2 linear in x^2."""
+    """Return the present `Contact`; half-width and largest pressure are from a linear fit of p^2 against x^2."""
     p, x = s.points.data["ball_pressure"], s.points.x[:, 0]
     on = p > 0
     order = np.argsort(x[on])

@@ -57,7 +57,7 @@ class Outcome:
 
 
 def run(cells: int = 40, steps: int = 30, method: str = "sdirk2") -> tuple[dict[str, float], Outcome]:
-    """Consolidate the quarter until T = 1, with `steps` equal steps up to each time of SAMPLES.
+    """Consolidate the quarter until T = 1, with `steps` equal steps up to each time in `SAMPLES`.
 
     Returns the errors that the module's docstring defines, and the histories.
     """

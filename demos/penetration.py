@@ -92,7 +92,7 @@ def clay(cells: int, y: float = 0.0, follow: mpm.Tool | None = None) -> tuple:
 
 @dataclass
 class Push:
-    """Results of each step: depth / D; N, resistance / (s_u D); excess pressure / s_u.
+    """Results of each step: depth divided by D; N, resistance divided by s_u D; excess pressure divided by s_u.
 
     steady: whether this step counts in the error of N.
 
@@ -205,9 +205,9 @@ def main(argv: list[str] | None = None) -> dict:
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=8, help="cells over the diameter")
     parser.add_argument("--rough", nargs="*", type=float, default=list(ROUGH), help="roughnesses alpha of the bar")
-    parser.add_argument("--depth", type=float, default=1.0, help="depth of each push / diameter")
+    parser.add_argument("--depth", type=float, default=1.0, help="depth of each push, divided by the diameter")
     parser.add_argument("--wet-cells", type=int, default=4, help="cells over the diameter in saturated clay")
-    parser.add_argument("--wet-depth", type=float, default=1.0, help="depth of each push in wet clay / diameter")
+    parser.add_argument("--wet-depth", type=float, default=1.0, help="the same in wet clay")
     parser.add_argument("--follow", action="store_true", help="push the last bar again, on grid lines that follow")
     o = parser.parse_args(argv)
     if not 4 <= o.cells <= 32 or not 0 < o.depth <= 4 or any(not 0 <= alpha <= 1 for alpha in o.rough):

@@ -29,7 +29,7 @@ REFERENCE_CELLS = (67, 20)
 TIMES = (0.02, 0.04, 0.06, 0.1, 0.2, 0.4, 0.6, 0.8, 1.0, 1.2)  # s
 TRUTH = (-0.0665718, -0.1444268, -0.2306306, -0.2652579, -0.3085867)
 TRUTH += (-0.3378547, -0.3453412, -0.3474797, -0.3481624, -0.3484207)
-"""u_y of the tip (m) at TIMES, from Taylor-Hood elements, REFERENCE_CELLS, steps of 0.005 s (printed by --reference).
+"""u_y of the tip (m) at `TIMES`, from `REFERENCE_CELLS` Taylor-Hood elements, steps of 0.005 s (see --reference).
 
 Steps of 0.0025 s change the last digit but one; 100 x 30 cells change the fifth digit.
 """
@@ -116,7 +116,7 @@ def scene(o: Namespace) -> tuple[mpm.Simulation, float]:
 
 
 def output_times(o: Namespace) -> dict:
-    """Return arguments of `run`: the length of equal steps, or `rtol` and the output times TIMES of adaptive steps."""
+    """Return arguments of `run`: the length of equal steps, or `rtol` and output times `TIMES` of adaptive steps."""
     if o.rtol is None:
         return {"dt": o.dt}
     return {"rtol": o.rtol, "t_eval": [t for t in TIMES if t <= o.t_end]}

@@ -189,7 +189,7 @@ def animate(path: Path, film: list[Shot], rained: int) -> None:
         title.set_text(f"rain for {one.t / 3600:.1f} h" if k < rained else slides)
         fig.canvas.draw()
         frames.append(Image.fromarray(np.asarray(fig.canvas.buffer_rgba())[:, :, :3]))
-    colours = frames[-1].quantize(48)
+    colours = frames[-1].quantize(24, method=Image.Quantize.MAXCOVERAGE)
     flat = [one.quantize(palette=colours, dither=Image.Dither.NONE) for one in frames]
     lasts = [1200 if k in (0, rained - 1) else 150 for k in shown[:-1]] + [2500]  # ms
     flat[0].save(path, save_all=True, append_images=flat[1:], duration=lasts, loop=0, optimize=True)

@@ -251,7 +251,7 @@ def draw(out: Path, rows: list[dict]) -> None:
 
 
 def draw_parts(left, right, rows: list[dict]) -> None:
-    """Draw the time of the longest parts and the memory, with lines proportional to the number of points."""
+    """Draw times of the eight most expensive parts of a step, and memory; dotted lines are linear in the points."""
     n, found = np.array([row["points"] for row in rows]), exponents(rows)
     for k, part in enumerate(sorted((*PARTS, "rest"), key=lambda part: -rows[-1][part])[:8]):
         label = f"{part}, {found.get(part, np.nan):.2f}"

@@ -52,7 +52,7 @@ CV = CONDUCTIVITY / mpm.Fluid().unit_weight * (2 + 4 / 3) * SHEAR  # m²/s
 
 
 def bank(cells: int, length: float, room: float, friction: float, cohesion: float, conductivity: float, **scene):
-    """Return the consolidated bank with a probe on its crest; cells: over its height; room: floor in front, m."""
+    """Return the consolidated bank with a probe on its crest; cells: cells over its height; room: free floor, m."""
     h = HEIGHT / cells
     grid = mpm.Grid([0, 0], [length + room, HEIGHT + h], [round((length + room) / h), cells + 1])
     body = mpm.box(grid, [0, 0], [length, HEIGHT])
@@ -78,9 +78,10 @@ def bank(cells: int, length: float, room: float, friction: float, cohesion: floa
 
 @dataclass
 class Failure:
-    """Stability numbers gamma' H / c (n,), and settlement of the crest in each step / its mean in the first five (n,).
+    """Stability numbers gamma' H / c (n,), and settlement rates (n,) of the crest.
 
-    critical: the stability number at which the bank fails.
+    A rate is the settlement in a step, divided by its mean in the first five steps.  critical: the stability number at
+    which the bank fails.
     """
 
     cells: int
@@ -353,7 +354,7 @@ def draw_failure(path: Path, failures: list[Failure]) -> None:
         (line,) = ax.semilogy(f.number, f.rate, ".-", label=f"{f.cells} cells over the height")
         ax.plot(f.critical, RUNAWAY, "o", mfc="none", ms=9, color=line.get_color(), label=f"fails at {f.critical:.2f}")
     ax.axvline(THEORY, color="black", lw=1, ls="--", label=f"limit analysis: {THEORY}")
-    ax.set(xlabel=r"$\gamma' H / c$ (-)", ylabel="settlement in a step / that at the start (-)")
+    ax.set(xlabel=r"$\gamma' H / c$ (-)", ylabel="settlement per step / first step (-)")
     ax.set_title("Undrained, without friction: the strength falls by 1 % in each step", fontsize=11)
     ax.grid(alpha=0.3)
     ax.legend()

@@ -42,13 +42,13 @@ from mpm_dolfinx.verification.exact import terzaghi_pressure
 HEIGHT, SOIL = terzaghi.HEIGHT, terzaghi.SOIL
 T_END = 0.1
 CASES = {"resting": (0.0, 0.0), "moving": (0.5, 0.0), "moving, soft water": (0.5, 1.0)}
-"""For each column: base displacement / height; storage coefficient of the water times the oedometric modulus M."""
-STRIP_STEPS = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)  # length of the step / time of consolidation of the layer
+"""For each column: base displacement over height; storage coefficient of the water times the oedometric modulus M."""
+STRIP_STEPS = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)  # length of the step over time of consolidation of the layer
 
 
 @dataclass
 class Run:
-    """A column at T_END: depths z of centroids / height, pressures / p0, and errors as in the module's docstring."""
+    """A column at `T_END`: depths z of centroids over height, pressures over p0, errors (module's docstring)."""
 
     z: NDArray[np.float64]
     p: NDArray[np.float64]
@@ -57,7 +57,7 @@ class Run:
 
 
 def column(cells: int, steps: int, way: float = 0.0, softness: float = 0.0, strain: float = 1e-5) -> Run:
-    """Consolidate a column until T_END in equal steps, while its base moves down by way * HEIGHT."""
+    """Consolidate a column until `T_END` in equal steps, while its base moves down by `way` times `HEIGHT`."""
     h, modulus = HEIGHT / cells, SOIL.oedometric
     load, p0 = strain * modulus, strain * modulus / (1 + softness)
     water = mpm.Fluid(bulk=SOIL.porosity * modulus / softness if softness else np.inf)
@@ -99,7 +99,10 @@ def error_of_cells(cells: int) -> float:
 
 
 def strip(cells: int, dt: float, law: type[mpm.Skeleton]) -> NDArray[np.float64]:
-    """Return p / load (nx, ny) after the first step under a strip load; dt: step / time of consolidation."""
+    """Return the pressures (nx, ny), divided by the load, after one step under a strip load.
+
+    dt: length of the step, divided by the time of consolidation.
+    """
     grid = mpm.Grid([0, 0], [2 * HEIGHT, HEIGHT], [2 * cells, cells])
     soil = law(bulk=SOIL.bulk, shear=SOIL.shear, porosity=SOIL.porosity, conductivity=SOIL.conductivity)
     load = 1e-5 * SOIL.oedometric

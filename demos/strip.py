@@ -53,7 +53,7 @@ ELEMENTS = np.array(
         [-0.129321, -0.090335, -0.006179],
     ]
 )
-"""Upward displacements (TIMES, PLACES) divided by HEIGHT; Taylor-Hood elements for q/E = 0.25, extrapolated."""
+"""Upward displacements at `TIMES` and `PLACES` over `HEIGHT`; Taylor-Hood elements for q/E = 0.25, extrapolated."""
 WALLS = {"left": "x", "right": "x", "bottom": "y"}
 
 
@@ -64,14 +64,14 @@ def conditions(load: float) -> dict:
 
 
 def times(a_decade: int) -> NDArray[np.float64]:
-    """Return the times T at which steps end: `a_decade` in each decade after RAMP, two thirds of this number before."""
+    """Return the times T at which steps end: `a_decade` in each decade after `RAMP`, two thirds as many before."""
     ramp = RAMP * np.linspace(0, 1, 1 + 2 * a_decade // 3)[1:]
     return np.append(ramp, RAMP * 10 ** (np.arange(1, 5 * a_decade // 2 + 1) / a_decade))
 
 
 @dataclass
 class Outcome:
-    """Histories: reduced times T, and upward displacements of PLACES divided by HEIGHT.
+    """Histories: reduced times T, and upward displacements of `PLACES` divided by `HEIGHT`.
 
     frames: T, corners, pressures divided by E, and porosities of the points.  why: reason if the run ended early.
     """
@@ -113,7 +113,7 @@ def seen(s: mpm.Simulation, T: float) -> tuple[float, NDArray, NDArray, NDArray]
 
 
 def elements(cells: int, load: float, a_decade: int) -> NDArray[np.float64]:
-    """Return the upward displacements (times, PLACES), divided by HEIGHT, of Taylor-Hood elements at TIMES."""
+    """Return the upward displacements at `TIMES` and `PLACES`, divided by `HEIGHT`, of Taylor-Hood elements."""
     fem, out = BiotFEM([0, 0], [HEIGHT] * 2, [cells] * 2, SOIL, **conditions(load)), []
     for T in times(a_decade):
         fem.step(T * UNIT - fem.t)

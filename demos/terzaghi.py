@@ -32,7 +32,10 @@ CV = SOIL.conductivity / WATER.unit_weight * SOIL.oedometric  # m²/s
 
 @dataclass
 class Outcome:
-    """Results at each output time: T_v, depth / height and p / p0 of the cells, and settlement / final settlement."""
+    """Results at each output time: T_v; depths and pressures of the cells; settlement.
+
+    Depths are divided by the height, pressures by p0, and settlements by the final settlement.
+    """
 
     result: mpm.Result
     time: list[float] = field(default_factory=list)

@@ -168,12 +168,12 @@ from matplotlib.patches import Polygon  # noqa: E402
 
 pieces = cut(mpm.Grid(lower=[0, 0], upper=[0.4, 1.2], cells=[4, 12]), domain)
 figure, ax = plt.subplots(figsize=(6, 4.2), layout="constrained")
-ax.add_patch(Polygon(domain[0][[0, 1, 3, 2]], facecolor="#cfe3f2", edgecolor="black"))
+ax.add_patch(Polygon(domain[0][[0, 1, 3, 2]], facecolor="#cce3f0", edgecolor="black"))
 for x, share in zip(pieces.x, pieces.fraction, strict=True):
-    ax.plot(*x, "o", color="C3", ms=4 + 16 * share**0.5)
+    ax.plot(*x, "o", color="#D55E00", ms=4 + 16 * share**0.5)
     ax.annotate(f"{share:.0%}", x, xytext=(9, 5), textcoords="offset points", fontsize=9)
-ax.plot(*domain[0].T, "s", color="black", ms=5, label="corners, which are tracked")
-ax.plot([], [], "o", color="C3", label="centroids of the pieces, with fractions of the volume")
+ax.plot(*domain[0].T, "s", color="black", ms=5, label="corners of the particle domain")
+ax.plot([], [], "o", color="#D55E00", label="centroids of its parts, with fractions of the volume")
 ax.set(xlim=(0, 0.3), ylim=(0.2, 0.5), aspect="equal", xlabel="x (m)", ylabel="y (m)")
 ax.set_xticks(np.arange(4) / 10)
 ax.set_yticks([0.2, 0.3, 0.4, 0.5])

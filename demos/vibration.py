@@ -60,7 +60,7 @@ def struck(h: float, way: str, steps: int = 80) -> tuple[np.ndarray, np.ndarray,
 
 
 def flown(cells: int, periods: int, steps: int) -> dict[str, np.ndarray]:
-    """Move the free bar; return times in periods, oscillation of its end, m, and energy of oscillation / initial."""
+    """Move the free bar; return times in periods, oscillation of its end, m, and energy divided by initial energy."""
     h, count = 1 / cells, 3 * cells + 8 + round(2.5 * cells)
     grid = mpm.Grid([0, 0], [count * h, h], [count, 1])
     low, speed = 2.3 * h, 2.5 / (2 * periods)  # over 2.5 lengths

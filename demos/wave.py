@@ -59,7 +59,7 @@ def column(
 
 
 def sudden(cells: int, base: str) -> dict[str, np.ndarray]:
-    """Return times / (L / c), stress on the base / q, and velocity of the top / (q / (rho c)).
+    """Return times divided by L / c, stress on the base divided by q, and velocity of the top divided by q / (rho c).
 
     The stress on a rigid base is computed from the reaction, that on an absorbing base from the velocity.
     """

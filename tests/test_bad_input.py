@@ -176,8 +176,8 @@ CASES = {
     "wall of no component": (lambda: scene(walls={"left": ""}), "walls: 'left'", "''"),
     "component by number": (lambda: scene(walls={"left": 0}), "walls: 'left'", "0"),
     "walls in a list": (lambda: scene(walls=["left"]), "walls", "['left']"),
-    "nothing holds the body": (lambda: scene(walls={"right": "xy"}).run(1, 1), "walls", "3 of 3 ways"),
-    "the body may turn": (lambda: scene(walls={"left": "x"}).run(1, 1), "walls", "1 of 3 ways"),
+    "nothing holds the body": (lambda: scene(walls={"right": "xy"}).run(1, 1), "walls", "3 of 3 modes"),
+    "the body may turn": (lambda: scene(walls={"left": "x"}).run(1, 1), "walls", "1 of 3 modes"),
     "drained without fluid": (lambda: scene(conditions=[mpm.Drained("left")]), "drained", "fluid"),
     "source without fluid": (lambda: scene(terms=[mpm.Source(lambda q: q)]), "sources", "fluid"),
     "source of what there is not": (
@@ -384,7 +384,7 @@ def test_steps_by_error_end_at_the_grid_as_soon_as_they_are_exact_enough():
 
 
 def test_a_column_that_slides_is_refused():
-    with pytest.raises(ValueError, match="free to move as a rigid body in 1 of 3 ways"):
+    with pytest.raises(ValueError, match="free to move as a rigid body in 1 of 3 modes"):
         column(fluid=False, walls={"left": "x", "right": "x"}, conditions=[top_load()]).run(1.0, 1.0)
 
 

@@ -28,6 +28,13 @@ def gradients(dim, scale=0.02, n=60):
     return np.concatenate([F, [np.eye(dim) * a for a in (0.98, 0.995, 1.005)]])
 
 
+def test_a_law_keeps_its_values_if_the_script_changes_its_arrays():
+    stress = np.full(3, -P0)
+    clay = replace(CLAY, initial_stress=stress)
+    stress *= 2
+    assert list(clay.initial_stress) == [-P0] * 3
+
+
 def test_isotropic_compression_follows_lambda_and_kappa():
     """ln J = -kappa ln(P / P_0), beyond P_c -lambda, and back along kappa."""
     r = element_test(CLAY, "isotropic", [0.04, 0.03], steps=20)

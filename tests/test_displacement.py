@@ -60,12 +60,12 @@ def test_given_displacements_hold_a_body_that_no_wall_holds():
     grid = mpm.Grid([0, 0], [1.0, 1.0], [10, 10])
     body = mpm.box(grid, [0.3, 0.3], [0.7, 0.7])
     one = mpm.Displacement("left", (0, 0), "y")
-    with pytest.raises(ValueError, match="free to move as a rigid body in 2 of 3 ways"):
+    with pytest.raises(ValueError, match="free to move as a rigid body in 2 of 3 modes"):
         mpm.Simulation(grid, [body], [SOFT], walls={}, conditions=[one]).run(1, 1)
     both = mpm.Displacement("left", (0, 0))
     assert mpm.Simulation(grid, [body], [SOFT], walls={}, conditions=[both]).run(1, 1).converged
 
 
 def test_components_are_checked():
-    with pytest.raises(ValueError, match="components must be some of 'xy'"):
+    with pytest.raises(ValueError, match="components must be letters of 'xy'"):
         column(fluid=False, conditions=[mpm.Displacement("top", (0, 0), "z")])

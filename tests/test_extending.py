@@ -384,7 +384,7 @@ CASES = {
         r"WrongUpdate.update: returns \{'damage': \(2, 2\)\}, must have",
     ),
     "unknown argument of a term": (
-        lambda: column(fluid=False, terms=[lambda points, w: w]), "argument 'w', must be some of points, u, v, t, dt"),
+        lambda: column(fluid=False, terms=[lambda points, w: w]), "argument 'w', must be one of points, u, v, t, dt"),
     "source without fluid": (lambda: column(fluid=False, terms=[mpm.Source(lambda q: q)]), "need a fluid"),
     "unknown argument of a conductivity": (
         lambda: column(material=replace(SOFT, conductivity_law=lambda stress: stress)), "argument 'stress', must be"),

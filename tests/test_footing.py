@@ -76,6 +76,34 @@ def test_a_strip_carries_the_same_whether_a_side_is_held_or_a_tool_presses_it(ce
     assert pressed == pytest.approx(held, rel=2e-3)
 
 
+def rough_square(cells, how):
+    """Return the limit load of a quarter of a rough square on very stiff soil without friction, over (2 + pi) s_u."""
+    h, end, edge = 1 / cells, 0.0012, 0.5
+    columns, rows = -(-3 * cells // 2), round(1.2 * cells)
+    grid = mpm.Grid([0, 0, -rows * h], [columns * h, columns * h, 2 * h], [columns, columns, rows + 2])
+    stiff = {name: footing.STIFF * getattr(footing.SOIL, name) for name in ("bulk", "shear")}
+    soil = mpm.DruckerPrager(**stiff, friction=0.0, dilation=0.0, cohesion=footing.COHESION)
+    if how == "displacement":
+        under = ((0, 0, -1), (edge, edge, 1))
+        pushed = mpm.Displacement("top", lambda t, X: (0, 0, -end * t), region=under)
+    else:
+        block = mpm.Convex([(x, y, z) for x in (-edge, edge) for y in (-edge, edge) for z in (0, 1)])
+        pushed = mpm.Tool(block, displacement=lambda t: (0, 0, -end * t), adhesion=9 * footing.COHESION)
+    walls = {"left": "x", "right": "x", "front": "y", "back": "y", "bottom": "xyz"}
+    body = mpm.box(grid, [0, 0, -rows * h], [columns * h, columns * h, 0])
+    s = mpm.Simulation(grid, [body], [soil], walls=walls, conditions=[pushed])
+    s.run(1.0, 1 / 10, progress=False)
+    force = (s.reactions if how == "displacement" else s.tool_forces).array[0, 2]
+    return -force / (edge**2 * footing.COHESION * soil.xi * (2 + np.pi))
+
+
+@pytest.mark.slow
+def test_a_square_carries_the_same_whether_a_side_is_held_or_a_tool_presses_it():
+    held, pressed = (rough_square(5, how) for how in ("displacement", "tool"))
+    print(f"5 cells: load over (2 + pi) s_u, held {held:.4f}, by a tool {pressed:.4f}")
+    assert pressed == pytest.approx(held, rel=2e-3)
+
+
 @pytest.mark.slow
 def test_the_drained_limit_load_of_stiff_soil_tends_to_prandtls():
     coarse, fine = (footing.limit_load("drained", cells).load for cells in (9, 17))

@@ -46,6 +46,28 @@ def test_a_dam_lets_through_what_dupuit_and_charny_say(cells, error):
     assert UPPER - 1.5 * h < left < UPPER + h and LOWER + h < right < 0.7 * UPPER
 
 
+@pytest.mark.parametrize("h, error", [(1.0, 0.03), pytest.param(0.5, 0.012, marks=pytest.mark.slow)])
+def test_a_well_takes_what_dupuit_and_charny_say(h, error):
+    """Q = pi k (H^2 - H_w^2) / ln(R / r), here r = 1 m and R = 11 m: cells as wide as the well's radius, or half."""
+    level, r, R = 6.0, 1.0, 11.0
+    grid = mpm.Grid([0, 0], [R + h, TOP + 2 * h], [round(R / h) + 1, round(TOP / h) + 2], axisymmetric=True)
+    soil = mpm.LinearElastic(bulk=1e9, shear=5e8, conductivity=K, conductivity_law=mpm.unsaturated(0.5 * 9810 * h))
+    s = mpm.Simulation(
+        grid,
+        [mpm.box(grid, [r, 0], [R, TOP])],
+        [soil],
+        fluid=mpm.Fluid(),
+        walls={"bottom": "xy"},
+        conditions=[mpm.water("left", level)[1], mpm.water("right", UPPER)[1]],
+        gravity=(0, -9.81),
+        pressure=mpm.hydrostatic(UPPER),
+    )
+    s.run(600, 20, progress=False)
+    over = s.outflows.array / (np.pi * K * (UPPER**2 - level**2) / np.log(R / r))
+    print(f"cells of {h} m: flow over Dupuit's {over}")
+    assert over == pytest.approx([1, -1], rel=error)
+
+
 def test_between_equal_levels_water_is_at_rest():
     s = dam(10, heads=(UPPER, UPPER), initial_stress=mpm.K0(0.3))
     s.run(20, 20, progress=False)

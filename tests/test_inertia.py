@@ -217,6 +217,29 @@ def test_the_base_bears_the_same_force_before_and_after_inertia_begins(load, flu
         assert np.abs(s.points.data["velocity"]).max() < fastest
 
 
+@pytest.mark.parametrize("held", [None, mpm.Displacement("bottom", lambda t: (0, 0.03 * min(t, 1)))])
+def test_a_block_off_the_grid_lines_stays_at_rest_when_inertia_begins_and_falls_when_it_is_let_go(held):
+    """Forces balance what the reset of the grid leaves, while the supports stay the same."""
+    low = 0.53 if held else 0.0
+    grid = mpm.Grid([0, 0], [1, 1.2], [10, 12])
+    block, walls = mpm.box(grid, [0.32, low], [0.72, low + 0.33]), {} if held else {"bottom": "xy"}
+    soil = mpm.Hencky(bulk=1e6, shear=6e5, grain_density=2000.0)
+    options = {"conditions": [held] if held else [], "gravity": (0, -9.81), "inertia": False}
+    s = mpm.Simulation(grid, [block], [soil], walls=walls, **options)
+    s.step(1.0)
+    settled = s.state
+    s.stage(inertia=True)
+    for _ in range(3):
+        s.step(2e-3)
+        assert np.abs(s.points.data["velocity"]).max() < 1e-6  # 2e-3 m/s without these forces
+    if held:
+        s.state = settled
+        s.stage(inertia=True, conditions=[])
+        s.step(2e-3)
+        mass = s.scene.materials.density(s.points) * s.points.volume0 * s.points.J
+        assert mass @ s.points.data["velocity"][:, 1] / mass.sum() == pytest.approx(-9.81 * 2e-3, rel=1e-9)
+
+
 def test_a_block_falls_as_stones_do():
     grid = mpm.Grid([0, 0], [1, 4], [5, 20])
     block = mpm.box(grid, [0.3, 3.1], [0.7, 3.5])

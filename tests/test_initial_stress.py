@@ -245,7 +245,7 @@ def test_forces_that_hold_a_rest_go_where_the_body_moves_or_is_dug_away():
         ({"initial_stress": 3.0}, "initial_stress: {0: 3.0}, must be a K0"),
         ({"initial_stress": {7: mpm.K0(0.5)}}, "initial_stress: {7: K0"),
         ({"initial_stress": lambda x: x}, "must be three normal stresses or a symmetric tensor"),
-        ({"gravity": (1.0, -9.81)}, r"K0 with gravity = \[1.0, -9.81\], must point down"),
+        ({"gravity": (1.0, -9.81)}, r"K0 with gravity = \[1.0, -9.81\], gravity must point down"),
         ({"pressure": lambda x: np.nan}, r"pressure\(x\) = nan, must be a finite number, or one for each"),
         ({"law": "mohr-coulomb", "initial_stress": mpm.K0(0.1)}, "must be inside the yield surface of MohrCoulomb"),
         ({"law": "mohr-coulomb", "initial_stress": mpm.K0(5.0)}, r"principal stresses .* degrees allows K0 from .* to"),

@@ -21,11 +21,12 @@ import numpy as np
 import pytest
 from scenes.balancing import ROUNDED, Ledger, balanced, held_by_conditions
 from scenes.comparing import differences, resolved
-from scenes.description import Block, Condition, RigidTool, Scene, draining, drawn, newer
+from scenes.description import Block, Condition, RigidTool, Scene, draining, drawn, flowing, newer
 from scenes.frames import Frame, composite
 from scenes.running import counted, run
 
 import mpm_dolfinx as mpm
+from mpm_dolfinx.stepping import renewal
 
 ASKED = 1e-8
 """Largest difference, over the largest value of each field in the scene."""
@@ -176,13 +177,30 @@ def test_scenes_with_inertia_ties_and_free_tools_show_the_same_in_any_frame(seed
     assert not count["differs"] and count["same"], count
 
 
+SOON = 0.6
+"""Length of domains, in cells, from which on they are renewed in random scenes, where they stretch little."""
+
+
+@pytest.mark.parametrize("seeds", [(5, 10), pytest.param(range(40), marks=pytest.mark.slow)], ids=["few", "many"])
+def test_scenes_whose_domains_are_renewed_show_the_same_in_any_frame(monkeypatch, seeds):
+    """With inertia and in axisymmetry.  INVARIANCE_SEEDS=1000:2000 says which many."""
+    monkeypatch.setattr(renewal, "LONGEST", SOON)
+    if len(seeds) > 2 and "INVARIANCE_SEEDS" in os.environ:
+        seeds = range(*map(int, os.environ["INVARIANCE_SEEDS"].split(":")))
+    count = reported(flowing(seed, laws=["DruckerPrager"]) for seed in seeds)
+    assert not count["differs"] and count["same"], count
+
+
 @pytest.mark.skipif("INVARIANCE_SEED" not in os.environ, reason="asks for a seed")
-def test_a_scene_is_reproduced():
-    """INVARIANCE_DRAW=newer (or draining) says by which function."""
+def test_a_scene_is_reproduced(monkeypatch):
+    """INVARIANCE_DRAW=newer (or draining, flowing) says by which function."""
     seed = int(os.environ["INVARIANCE_SEED"])
     scene = quick(seed) if seed < QUICK else drawn(seed)
     if draw := os.environ.get("INVARIANCE_DRAW"):
-        scene = {"newer": newer, "draining": draining}[draw](seed, laws=LAWS[seed % 3])
+        laws = ["DruckerPrager"] if draw == "flowing" else LAWS[seed % 3]
+        scene = {"newer": newer, "draining": draining, "flowing": flowing}[draw](seed, laws=laws)
+        if scene.renewal:
+            monkeypatch.setattr(renewal, "LONGEST", SOON)
     frame = composite(scene, 0)
     outcome = tried(scene, frame)
     print("\n" + repr(scene), "\n" + line(scene, frame, outcome))

@@ -159,7 +159,7 @@ def test_a_skin_of_the_users_own_on_a_side_resists_the_flow_through_it(conductan
 
 
 def test_a_block_without_its_springs_is_free_to_move(tmp_path):
-    refused_in_one_line(lambda: block().step(0.25), "walls", "1 of 3 ways", tmp_path, 400)
+    refused_in_one_line(lambda: block().step(0.25), "walls", "1 of 3 modes", tmp_path, 400)
 
 
 def test_results_are_found_by_names_and_not_by_positions():

@@ -129,7 +129,7 @@ def test_without_asking_there_is_no_stress_and_without_fluid_no_pressure(tmp_pat
 def test_a_run_goes_on_with_probes_of_the_same_kind_only(tmp_path):
     simulation, probes, result = probed(tmp_path, t_end=0.5)
     other = mpm.probes(simulation.bodies, probes.x0)
-    with pytest.raises(ValueError, match="probes: stress = False, must be as in the run to continue"):
+    with pytest.raises(ValueError, match="probes: stress = False, must be as in the run that is continued"):
         simulation.run(1.0, 0.25, probes=other, after=result, progress=False)
 
 

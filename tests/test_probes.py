@@ -23,7 +23,7 @@ def terzaghi(z, T):
     return (2 / M * np.sin(M * (1 - z[:, None])) * np.exp(-(M**2) * T)).sum(axis=1)
 
 
-@pytest.mark.parametrize("cells, allowed", [(10, 0.005), (20, 0.0012)])
+@pytest.mark.parametrize("cells, allowed", [(10, 0.005), (20, 0.0012), pytest.param(40, 3e-4, marks=pytest.mark.slow)])
 def test_a_column_consolidates_at_any_place_as_terzaghi_says(cells, allowed):
     h, times, modulus, k = 1 / cells, [0.06, 0.1, 0.2, 0.5, 1.0], 1e8, 1e-6
     grid = mpm.Grid([0, 0], [h, 1 + h], [1, cells + 1])
@@ -34,7 +34,8 @@ def test_a_column_consolidates_at_any_place_as_terzaghi_says(cells, allowed):
     s = mpm.Simulation(grid, [body], [soil], walls=walls, conditions=[*load, *water.pop("conditions", [])], **water)
     z, unit = np.linspace(0, 1, 37), WEIGHT / (k * modulus)
     probes = mpm.probes([body], np.column_stack([np.full(37, 0.2 * h), z]))
-    found = s.run(unit, rtol=1e-4, t_eval=unit * np.array(times), probes=probes, progress=False).probe_pressure[1:]
+    rtol = 0.05 * allowed  # errors in time are far smaller
+    found = s.run(unit, rtol=rtol, t_eval=unit * np.array(times), probes=probes, progress=False).probe_pressure[1:]
     errors = [np.abs(p / 1e3 - terzaghi(z, T)).max() for T, p in zip(times, found, strict=True)]
     print("errors over the load:", *(f"{e:.5f}" for e in errors))
     assert max(errors) < allowed

@@ -95,6 +95,8 @@ def test_contacts_stay_those_of_the_scene():
     s = mpm.Simulation(grid, bodies, [SOIL], walls=WALLS, conditions=[contact])
     s.stage(conditions=[mpm.Traction("top", (0, -1e3), region=((0, 0.9), (1, 2)))])
     assert contact in s.conditions
+    s.stage(conditions=[mpm.Contact(1, 0)])
+    assert s.conditions == (contact,)
     with pytest.raises(ValueError, match="must be the contacts of the scene"):
         s.stage(conditions=[mpm.Contact(1, 0, friction=0.3)])
 

@@ -74,7 +74,7 @@ def test_terms_that_the_reference_cannot_take_are_refused_in_a_line():
         reference(terms=[mpm.Source(lambda points, q: q * points.dx)])
     with pytest.raises(ValueError, match=r"terms = .*, must be a list of functions"):
         reference(terms=5)
-    with pytest.raises(ValueError, match=r"argument 'w', must be some of points, t, u, v, dt, velocity"):
+    with pytest.raises(ValueError, match=r"argument 'w', must be one of points, t, u, v, dt, velocity"):
         reference(terms=[lambda w: w])
     with pytest.raises(ValueError, match="depends on neither u nor v"):
         reference(terms=[lambda points, t: t * points.dx])

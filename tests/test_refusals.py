@@ -224,7 +224,7 @@ CASES = {
     "a body that nothing holds beside one that is held": (
         lambda: steps(scene(APART)),
         "walls: the part at [0.65 0.05]",
-        "3 of 3 ways",
+        "3 of 3 modes",
     ),
     # ---- running
     "end in words": (lambda: run("1", 0.1), "t_end", "'1'"),

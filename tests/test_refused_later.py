@@ -56,6 +56,11 @@ def test_fields_of_a_stage_are_checked_beside_each_other():
         scene(sand).stage(fields={"friction": 10.0})
     with pytest.raises(ValueError, match=r"stage: fields.*must be"):
         scene(sand).stage(fields=["friction"])
+    s = scene(sand)
+    with pytest.warns(mpm.ConditionWarning, match="is 'friction' meant"):
+        s.stage(fields={"fricton": np.full(len(s.points), 10.0)})
+    with pytest.raises(ValueError, match=r"must be one of .*friction.*, or new data"):
+        s.stage(fields={"cohesoin": 1e3})
 
 
 def stiffened(F, bulk, shear):

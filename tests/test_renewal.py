@@ -7,6 +7,7 @@ import mpi_renewal
 import numpy as np
 import penetration as demo
 import pytest
+import ufl
 from scenes.comparing import differences, resolved
 from scenes.description import Block, Condition, RigidTool, Scene
 from scenes.frames import Frame
@@ -208,6 +209,36 @@ def test_elastic_soil_is_left_alone(monkeypatch):
     _, at = new.find(some.id[~half])
     assert count > 0 and len(at) == (~half).sum()
     assert (new.corners[at] == some.corners[~half]).all() and (new.F[at] == some.F[~half]).all()
+
+
+def springs(points, u):
+    return 1e3 * ufl.inner(points.displacement, points.value(u)) * points.dx
+
+
+@pytest.mark.parametrize(
+    ("condition", "terms", "side"),
+    [
+        (mpm.Displacement("bottom", lambda t, X: 0 * X), [], "bottom"),
+        (mpm.Tied("left", "right"), [], "left"),
+        (None, [mpm.OnSide("left", springs)], "left"),
+    ],
+    ids=["held", "tied", "springs"],
+)
+def test_conditions_on_displacements_of_sides_act_on_these(monkeypatch, condition, terms, side):
+    """New domains have a mean displacement, so that held and tied sides slid and steps were given up."""
+    monkeypatch.setattr(renewal, "LONGEST", 0.6)
+    grid = mpm.Grid([0, 0], [1.5, 1.5], [12, 12])
+    box = mpm.box(grid, [0.28, 0.2 * (side == "bottom")], [1.2, 0.8])
+    ball = mpm.Tool(mpm.Ball((0.5, 1.1), 0.3), lambda t: (0.1 * t, -0.15 * t), adhesion=500.0)
+    acting = {"conditions": [ball, condition] if condition else [ball], "terms": terms}
+    acting["walls"] = {} if side == "bottom" else {"bottom": "xy"}
+    s = mpm.Simulation(grid, [box], [mpi_renewal.CLAY], numerics=mpm.Numerics(renewal=True), **acting)
+    result = s.run(0.5, 1 / 16, progress=False)
+    points, stage = s.points, s.state.stage
+    needed = [*(faces for _, faces, _ in stage.held), *(faces for one in stage.acting for faces in one.seeded)]
+    assert result.renewed > 10 and needed
+    for patch in map(s.scene.on_grid(points).cut.surface, needed):
+        assert patch.origin(points) + patch.base == pytest.approx(patch.X, abs=1e-12)
 
 
 @pytest.mark.parametrize("rings", [False, True])
@@ -437,6 +468,9 @@ def test_polygons_are_cut_and_divided():
     ring = Polygons.rings(np.array([[[0.0, 0.0], [2, 0], [2, 2], [0, 2]]]), np.array([[0, 1, 2, 3]]))
     half = ring.cut(np.array([[1.0, 1.0]]), np.array([2.0]))
     assert half.area == pytest.approx([2.0]) and half.simplified(1e-9).count.tolist() == [3]
+    on_a_side = np.array([[[0.5, 0.0], [1.0, 0.0], [1.0, 4e-4], [1.0, 0.5], [0.504, 0.5]]])
+    for edge, count in (([0, 1, 1, 2, 3], 4), ([0, 1, 2, 3, 4], 5)):
+        assert Polygons.rings(on_a_side, np.array([edge])).simplified(1e-9).count.tolist() == [count]
     other = np.array([[[1.0, -1.0], [3, 1], [1, 3], [-1, 1]]])
     within = ring.within(other)
     row, quads, _ = within.quadrilaterals()

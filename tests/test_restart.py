@@ -305,10 +305,10 @@ def test_what_makes_no_sense_is_refused_in_one_line():
         with pytest.raises(ValueError, match="checkpoint: "):
             mpm.Checkpoint("x", **options)
     result = simulation.run(0.02, 0.02)
-    with pytest.raises(ValueError, match=r"to continue has dt = 0\.02"):
+    with pytest.raises(ValueError, match=r"is continued has dt = 0\.02"):
         simulation.run(0.1, 0.01, after=result)
-    with pytest.raises(ValueError, match=r"probes: .* must be 0, as in the run to continue"):
+    with pytest.raises(ValueError, match=r"probes: .* must be 0, as in the run that is continued"):
         simulation.run(0.1, 0.02, probes=probe, after=result)
     simulation.step(0.03)
-    with pytest.raises(ValueError, match=r"to continue has dt = 0\.02, t = 0\.02"):
+    with pytest.raises(ValueError, match=r"is continued has dt = 0\.02, t = 0\.02"):
         simulation.run(0.1, 0.02, after=result)

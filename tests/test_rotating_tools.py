@@ -42,8 +42,8 @@ def test_a_tool_spins_as_it_flies():
     grid = mpm.Grid([0, 0], [1, 1], [4, 4])
     box = mpm.Convex([(0, 5), (0.4, 5), (0.4, 5.2), (0, 5.2)])
     tools = [
-        mpm.Tool(box, mass=3.0, velocity=(0.5, 1.0), spin=-2.0, rotation_rad=0.3),
-        mpm.Tool(box, mass=3.0, direction=(0, 1)),
+        mpm.Tool(box, mass=3, velocity=(0.5, 1.0), spin=-2.0, rotation_rad=0.3),
+        mpm.Tool(box, mass=3, direction=(0, 1)),
     ]
     options = {"walls": {"bottom": "y", "left": "x", "right": "x"}, "gravity": (0, -G), "inertia": True}
     s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [1, 0.3])], [ROCK], conditions=tools, **options)

@@ -113,13 +113,13 @@ def test_a_terminal_shows_each_trial(monkeypatch, caplog):
 @pytest.mark.parametrize(
     ("make", "options", "message"),
     [
-        (lambda: block([SOFT], load=1e4), {}, "no material has a strength, must have friction and cohesion"),
+        (lambda: block([SOFT], load=1e4), {}, "no material has a strength, one must have friction and cohesion"),
         (at_rest, {"rtol": 0}, r"rtol = 0, must be in \[1e-4, 0.5\]"),
         (at_rest, {"steps": 3}, "steps = 3, must be an integer >= 8"),
         (at_rest, {"dt": -1}, "dt = -1, must be > 0 and finite"),
         (at_rest, {"progress": 1}, "progress = 1, must be True or False"),
         (lambda: block([CLAY], load=0.0), {}, "have no stress, must be in equilibrium under loads"),
-        (lambda: block([CLAY], load=-10.0), {}, "come to rest with strength / 16, must slide at some factor"),
+        (lambda: block([CLAY], load=-10.0), {}, "come to rest with strength divided by 16, must slide at some factor"),
         (
             lambda: column(cells=2, material=replace(CLAY, conductivity=1e-5)),
             {},
@@ -142,19 +142,18 @@ def test_one_line_says_what_is_wrong(make, options, message):
     assert "\n" not in str(caught.value)
 
 
-def bank(cells, *, run=4.0, crest=4.0, wet=False, **strength):
-    """Return a bank 4 m high on 2 m of ground as built, not run; under water, or as heavy as it is there."""
+def bank(cells, *, run=4.0, crest=4.0, ground=2.0, wet=False, **strength):
+    """Return a bank 4 m high on ground, or on a rough base, as built, not run; under water, or as heavy as there."""
     h, middle = 4.0 / cells, crest + run / 2
-    below, columns = round(2 / h), round((crest + run + 4) / h)
+    below, columns = round(ground / h), round((crest + run + 4) / h)
     grid = mpm.Grid(lower=[0, -below * h], upper=[columns * h, 4 + h], cells=[columns, below + cells + 1])
 
     def shape(X):
         return np.stack([X[:, 0] / middle * (crest + run * (1 - X[:, 1] / 4)), X[:, 1]], axis=1)
 
-    bodies = [
-        mpm.box(grid, [0, -below * h], [columns * h, 0]),
-        mpm.mapped(grid, mpm.box(grid, [0, 0], [middle, 4]), shape),
-    ]
+    bodies = [mpm.mapped(grid, mpm.box(grid, [0, 0], [middle, 4]), shape)]
+    if below:
+        bodies.insert(0, mpm.box(grid, [0, -below * h], [columns * h, 0]))
     conditions = {"walls": {"left": "x", "right": "x", "bottom": "xy"}, "gravity": (0, -9.81)}
     grains = 2650.0
     if wet:
@@ -181,13 +180,30 @@ def test_waiting_long_in_water_is_as_quick_as_without():
 
 
 @pytest.mark.slow
-def test_factors_are_of_first_order_in_the_cells():
-    """A vertical cut in clay: gamma H / c = 3.776 by limit analysis."""
-    clay = {"friction": 0.0, "dilation": 0.0, "cohesion": 1650 * 0.6 * 9.81 * 4 / 3.776}
-    coarse, fine = (mpm.factor_of_safety(bank(cells, run=0.0, crest=6.0, **clay)).factor for cells in (8, 16))
-    print(f"cut: {coarse - 1:+.1%}, {fine - 1:+.1%}, extrapolated {2 * fine - coarse - 1:+.1%}")
+@pytest.mark.parametrize(
+    ("shape", "height", "error"),
+    [({"run": 0.0, "crest": 6.0}, 3.776, 0.02), ({"ground": 0.0}, 5.86, 0.03)],  # height: gamma H / c
+    ids=["vertical cut", "slope of 45 degrees on a firm base"],
+)
+def test_factors_are_of_first_order_in_the_cells(shape, height, error):
+    """Against limit analysis; the slope slides on a circle through its toe (Chen 1975)."""
+    clay = {"friction": 0.0, "dilation": 0.0, "cohesion": 1650 * 0.6 * 9.81 * 4 / height}
+    coarse, fine = (mpm.factor_of_safety(bank(cells, **shape, **clay)).factor for cells in (8, 16))
+    print(f"{shape}: {coarse - 1:+.1%}, {fine - 1:+.1%}, extrapolated {2 * fine - coarse - 1:+.1%}")
     assert 0 < fine - 1 < 0.7 * (coarse - 1) < 0.08
-    assert 2 * fine - coarse == pytest.approx(1, abs=0.02)
+    assert 2 * fine - coarse == pytest.approx(1, abs=error)
+
+
+@pytest.mark.slow
+def test_soft_soil_changes_its_shape_before_it_slides():
+    """A vertical cut in clay whose Young's modulus is 50, 500 and 5000 times gamma H, nu = 2/7."""
+    weight = 1650 * 0.6 * 9.81 * 4
+    clay = {"friction": 0.0, "dilation": 0.0, "cohesion": weight / 3.776, "run": 0.0, "crest": 6.0}
+    shears = [ratio * weight / (18 / 7) for ratio in (50, 500, 5000)]
+    soft, *firm = (mpm.factor_of_safety(bank(8, bulk=2 * G, shear=G, **clay)).factor for G in shears)
+    print(f"E / (gamma H) = 50, 500, 5000: factors {soft:.2f}, {firm[0]:.2f}, {firm[1]:.2f}")
+    assert firm[1] == pytest.approx(firm[0], rel=0.01)
+    assert 0.9 < soft / firm[0] < 0.97
 
 
 @pytest.mark.slow

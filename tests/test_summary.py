@@ -96,7 +96,7 @@ BENCHMARK = {
     "rain": set(),
     "pressure that follows the surface": {"tractions", "pressures"},
     "inertia": {"inertia"} | SECOND,
-    "inertia of wet soil, two substeps in both": {"inertia", "weight of the fluid"},
+    "inertia of wet soil, both scenes with two substeps": {"inertia", "weight of the fluid"},
     "free tool that touches nothing": {"tools"},
     "free disc that rotates and touches nothing": {"tools"},
     "quiet side": {"quiet sides"},

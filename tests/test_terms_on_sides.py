@@ -92,7 +92,7 @@ def test_terms_on_sides_and_in_bodies_act_together_and_later_stages_keep_them():
         (mpm.OnSide("nowhere", springs), "side 'nowhere': must be one of"),
         (mpm.OnSide("top", 3), "terms: 3, must be a function"),
         (mpm.OnSide("top", lambda points: points.dx), "must be"),
-        (mpm.OnSide("top", lambda points, q: 0), "argument 'q', must be some of points, u, v"),
+        (mpm.OnSide("top", lambda points, q: 0), "argument 'q', must be one of points, u, v"),
     ],
 )
 def test_what_is_no_term_on_a_side_is_refused(term, said):

@@ -36,6 +36,14 @@ def test_a_slope_of_finite_width_settles_and_shears_as_an_infinite_one(begins):
     assert stress[:, 0, 1] == pytest.approx(RHO * 2.0 * depth, abs=3e-3 * most)
 
 
+def test_soil_at_rest_keeps_its_horizontal_stress_between_tied_sides():
+    s = layer(8, 2, mpm.Displacement("bottom", (0, 0)), gravity=(0, -9.81), initial_stress=mpm.K0(0.5))
+    s.run(1.0, 0.5, progress=False)
+    stress = s.effective_stress()
+    assert stress[:, 0, 0] == pytest.approx(stress[:, 1, 1] / 2, abs=3e-3 * np.abs(stress).max())
+    assert np.abs(s.points.displacement).max() < 1e-9 * HEIGHT
+
+
 @pytest.mark.parametrize("width", [2, 5])
 def test_a_layer_of_finite_width_shakes_as_an_infinite_one(width):
     """Exact: shear and pressure waves stand between a base that moves both ways and the surface."""

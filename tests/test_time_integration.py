@@ -350,7 +350,7 @@ def test_steps_that_cannot_be_are_refused_in_a_line(name):
 
 def test_a_method_that_has_no_error_cannot_choose_its_steps():
     s = column(cells=2, numerics=mpm.Numerics(method="backward-euler"), conditions=[OPEN])
-    with pytest.raises(ValueError, match=r"rtol = 0\.001: method backward-euler has no error estimate, must be sdirk2"):
+    with pytest.raises(ValueError, match=r"method backward-euler has no error estimate, the method must be sdirk2"):
         s.run(4.0, rtol=1e-3, progress=False)
     with pytest.raises(ValueError, match=r"method 'rk4': must be one of sdirk2, backward-euler"):
         column(cells=2, numerics=mpm.Numerics(method="rk4"))

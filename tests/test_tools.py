@@ -308,6 +308,16 @@ def test_a_tool_that_is_none_is_refused_in_one_line(make, said):
     assert "\n" not in str(caught.value)
 
 
+def test_a_tool_keeps_its_values_if_the_script_changes_its_arrays():
+    centre, away, turns_about = np.array([1.0, 2.0]), np.array([0.0, 1.0]), np.array([3.0, 4.0])
+    disc = mpm.Tool(mpm.Ball(centre, 0.5), centre=turns_about)
+    floor = mpm.Tool(mpm.HalfSpace(centre, away))
+    for values in (centre, away, turns_about):
+        values[:] = 7.0
+    assert list(disc.shape.centre) == [1, 2] and list(disc.centre) == [3, 4]
+    assert floor.shape.distance(np.array([[0.0, 5.0]])) == 3
+
+
 def test_a_tool_that_outruns_the_body_cuts_the_step():
     s = simple(tool={"displacement": lambda t: (0, -0.58 * t)})
     with pytest.raises(mpm.NotConverged):

@@ -156,7 +156,7 @@ DROP = 1e-2  # pressure difference, Pa, too small to move the layers
 
 @family(0.02)
 def contrast_of_conductivity():
-    """Steady flow through two layers, ratio of k 1e-8 to 1e8: pressures / pressure difference, exact."""
+    """Steady flow through two layers, ratio of k 1e-8 to 1e8: pressures divided by their difference, exact."""
     for name, cut in CUTS.items():
         for ratio in decades(-8, 8, 1 if cut == 0.5 else 2):
             layers = (SOIL, cut), (soil(conductivity=SOIL.conductivity * ratio), 1.0)
@@ -166,7 +166,7 @@ def contrast_of_conductivity():
 
 
 def series(cut: float, ratio: float, s: mpm.Simulation, r: mpm.Result) -> float:
-    """Return the largest error of the pressures in the cells / pressure difference; cut: height of the interface, m."""
+    """Return the largest error of the pressures, divided by their difference; cut: height of the interface, m."""
     cells = s.cells()
     y = cells.x[:, 1]
     lost = np.where(y < cut, y, cut + (y - cut) / ratio) / (cut + (1 - cut) / ratio)
@@ -225,7 +225,7 @@ def half_drained() -> float:
 
 
 def draining_error(s: mpm.Simulation, r: mpm.Result) -> float:
-    """Return the error of the mean pressure / initial pressure of 1e5 Pa."""
+    """Return the error of the mean pressure, divided by the initial pressure of 1e5 Pa."""
     return off(held(s), half_drained(), 1e5)
 
 
@@ -263,7 +263,7 @@ def few_points():
 
 @family(1.0)
 def thin():
-    """Beam half a cell, one or two cells high: error of the tip / error of Q1 elements on as many cells.
+    """Beam half a cell, one or two cells high: error of the tip, divided by that of Q1 elements on as many cells.
 
     The beam that is half a cell high has at least two points over its height.  With one point the beam would creep, and
     the package would warn.

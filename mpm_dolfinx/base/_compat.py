@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Wrappers of every function of dolfinx that differs between the supported releases (0.5.2, 0.9 and 0.11).
+"""Wrappers of every function of dolfinx that differs between the supported releases (0.5.2 and 0.9 to 0.11).
 
 No other module of the package asks for the version.  Branches marked OLD serve release 0.5.  Remove a branch when no
 supported release needs it.

@@ -33,7 +33,7 @@ class Latest(Generic[T]):
 
         key: everything on which the value depends: numbers, objects, arrays that never change, or tuples of these;
         make: function that computes the value; comm: processes that compute the value together.  If one process needs a
-        new value, all compute it.
+        new value, all processes compute it.
         """
         other = self._entry is None or not (self._entry[0] is key or same(self._entry[0], key))
         if other if comm.size == 1 else over_all(comm, other) > 0:

@@ -25,8 +25,8 @@ class Report:
     change: NDArray[np.float64] | tuple = (0.0,)  # largest pressure change of each body in the step, Pa
     extremes: NDArray[np.float64] | None = None  # at start and end: smallest and largest pressures (2, 2, bodies), Pa
     sealed: float = 0.0  # largest pressure change, Pa, in the same step without flow
-    first: NDArray[np.float64] | tuple = (0.0,)  # `change` in the first substep, Pa; 0 for bodies that keep pieces
-    sudden: NDArray[np.float64] | tuple = (0.0,)  # `first`, Pa; 0 if pressures change more in the second, see `SUDDEN`
+    first: NDArray[np.float64] | tuple = (0.0,)  # `change` in the first substep, Pa; 0 for bodies whose pieces are kept
+    sudden: NDArray[np.float64] | tuple = (0.0,)  # `first`, Pa; 0 if the second substep changes p enough, see `SUDDEN`
     stress: float = 0.0  # root mean square of the nodal forces, divided by the area of a cell face, Pa
     moves: tuple[float, float] = (0.0, 0.0)  # estimated error and size of the motion, see `motion_error`
     fills: tuple[float, float] = (0.0, 0.0)  # in unsaturated soil: estimated error and largest change of water content

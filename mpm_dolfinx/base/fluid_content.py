@@ -71,7 +71,7 @@ def mass_potential_form(p, compliance):
 
 
 def density_between(p0, p1, compliance):
-    """Return (logarithmic mean of the densities at two pressures) / (density at zero pressure), as a UFL expression."""
+    """Return the logarithmic mean of the densities at two pressures, divided by that at zero pressure, as UFL."""
     return ufl.exp(compliance * (p0 + p1) / 2) * _sinhc(compliance * (p0 - p1) / 2)
 
 

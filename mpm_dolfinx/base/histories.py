@@ -80,7 +80,7 @@ class Rows(Sequence[Row]):
         if columns.keys() != set(COLUMNS):
             raise ValueError(f"columns {', '.join(columns)}, must be {', '.join(COLUMNS)}")
         if {len(values) for values in columns.values()} != {len(outcomes)}:
-            raise ValueError("columns and outcomes differ in length")
+            raise ValueError("columns and outcomes differ in length, must have equal lengths")
         out = cls()
         arrays = {name: np.array(columns[name], dtype=np.float64) for name in COLUMNS}
         out._columns, out._count = _Columns(arrays, list(outcomes)), len(outcomes)

@@ -44,12 +44,12 @@ def in_step(
 ) -> NDArray[np.float64]:
     """Return the displacement to prescribe at the end of the first substep, so that the velocity there is exact.
 
-    The method computes this velocity v from the increment of displacement, which equals share dt v.  With the exact
+    The method computes this velocity v from the increment of displacement, which equals `share` dt v.  With the exact
     displacement, v is first-order accurate, and accelerations do not converge.  This function takes v from the parabola
-    through three displacements, and returns start + share dt v.
+    through three displacements, and returns `start` + `share` dt v.
 
-    `share` is the end of the substep as a fraction of the step.  The displacements are `start` at the
-    start of the step, `now` at the end of the substep and `end` at the end of the step.
+    `share` is the end of the substep as a fraction of the step.  The prescribed displacements are
+    `start` at the start of the step, `now` at the end of the substep, and `end` at the end of the step.
     """
     return start + ((2 * share - 1) * (now - start) - share**2 * (end - start)) / (share - 1)
 

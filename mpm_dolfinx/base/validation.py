@@ -242,7 +242,7 @@ def check_names(what: str, function: Callable, among: Sequence[str]) -> tuple[st
 
 
 def called(function: Callable, values: dict) -> object:
-    """Return the value of a function at given t, X and x."""
+    """Return the value of a function for the arguments t, X and x in `values`."""
     parameters = _parameters(function)
     if parameters is None:
         return function(values["t"])
@@ -253,7 +253,7 @@ def called(function: Callable, values: dict) -> object:
 
 
 def at_places(what: str, allowed: str, function: Callable, name: str, places: NDArray[np.float64]) -> object:
-    """Return the value of a function of positions.  Its only parameter must be called "X" or "x", as given by `name`.
+    """Return the value of a function of positions.  Its only parameter must have the name `name`, "X" or "x".
 
     Raises
     ------

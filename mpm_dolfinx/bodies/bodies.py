@@ -89,7 +89,7 @@ class Body:
         return self.facing(*SIDES[self.dim][name]) if name in self.names else (np.empty(0, np.int64),) * 2
 
     def facing(self, axis: int, end: int, least: float = 0.0) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the domains (m,) with a surface face at the lower (0) or upper (1) end of an axis, and face indices.
+        """Return domains (m,) with a surface face at the lower (0) or upper (1) end of an axis, and face indices (m,).
 
         In unstructured bodies, these are the surface faces whose outward unit normal has its largest component along
         this direction, if this component exceeds `least`.
@@ -103,7 +103,7 @@ class Body:
         return np.concatenate([np.empty(0, np.int64), *rows])
 
     def across(self, axis: int) -> tuple[float, float]:
-        """Return means over the body: number of domains in a row along an axis, and their edge length along it, m."""
+        """Return two means over the body: number of domains in a row along an axis, and their edge length, m."""
         return len(self) / max(1, len(self._with_face(axis, 0))), float(self.spacing[axis])
 
     def outer(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -126,7 +126,7 @@ class Body:
         x = X.reshape(-1, X.shape[-1])
         images = numbers("body: the map", asked("body: the map", "a function of positions", self.map, x), None)
         if images.shape != x.shape:
-            raise ValueError(f"body: the map returns shape {images.shape}, must be {x.shape}, as the given positions")
+            raise ValueError(f"body: the map returns shape {images.shape}, must be {x.shape}, as the positions")
         return images.reshape(X.shape)
 
     def bend(self, chosen: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -297,4 +297,4 @@ def check_different(bodies: Sequence[Body]) -> None:
     for j, body in enumerate(bodies):
         for i in range(j):
             if bodies[i] is body:
-                raise ValueError(f"bodies {i} and {j}: are the same object, must be two; seed the second one too")
+                raise ValueError(f"bodies {i} and {j}: are the same object, must be two objects; seed the other too")

@@ -153,7 +153,7 @@ def _rows(grid: Grid, axis: int, low: float, high: float, per_cell: int) -> NDAr
 
 
 def _rounded(rows: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return numbers of rows, rounded to integers >= 1.  Rounding errors of coordinates do not decide about halves."""
+    """Return numbers of rows, rounded to integers >= 1, the same for coordinates with small rounding errors."""
     return np.maximum(1, np.rint(NEAR * np.rint(rows / NEAR))).astype(np.int64)
 
 

@@ -72,7 +72,7 @@ class Surface:
 
     @cached_property
     def area0(self) -> NDArray[np.float64]:
-        """Seeded areas (m,), m^(d-1), of the free parts."""
+        """Seeded areas (m,), m^(d-1), of the polygons."""
         x = self.places()
         if x.shape[2] == 2:
             return np.linalg.norm(x[:, 1] - x[:, 0], axis=1)
@@ -80,13 +80,13 @@ class Surface:
 
     @cached_property
     def skew(self) -> NDArray[np.bool_]:
-        """Whether the seeded faces (m,) are no parallelograms."""
+        """Whether each seeded face (m,) differs from a parallelogram."""
         x = np.take_along_axis(self.domain, FACES[self.xi.shape[2]][self.face][:, :, None], axis=1)
         off = np.linalg.norm(x[:, -1] - x[:, 1] - x[:, -2] + x[:, 0], axis=1) if x.shape[2] == 3 else np.zeros(len(x))
         return off > SAME * np.ptp(x, axis=1).max(axis=1)
 
     def places(self) -> NDArray[np.float64]:
-        """Return the seeded positions (m, 2^(d-1), d), m, of the corners of the free parts."""
+        """Return the seeded positions (m, 2^(d-1), d), in metres, of the corners of the polygons."""
         domain = np.repeat(self.domain, self.xi.shape[1], axis=0)
         return interpolate(domain, self.xi.reshape(-1, self.xi.shape[2])).reshape(self.xi.shape)
 
@@ -96,13 +96,13 @@ class Surface:
 
     @cached_property
     def corners(self) -> NDArray[np.float64]:
-        """Reference positions (m, 2^(d-1), d), m, of the corners of the free parts."""
+        """Reference positions (m, 2^(d-1), d), m, of the corners of the polygons."""
         at = np.repeat(np.arange(len(self)), self.xi.shape[1])
         return self.reference(at, self.xi.reshape(len(at), self.xi.shape[2])).reshape(self.xi.shape)
 
     @property
     def X(self) -> NDArray[np.float64]:
-        """Bounding boxes (m, 2, d), m, of the reference positions of the free parts."""
+        """Bounding boxes (m, 2, d), m, of the reference positions of the polygons."""
         return np.stack([self.corners.min(axis=1), self.corners.max(axis=1)], axis=1)
 
     def check_apart(self, others: Surface, conditions: tuple[Any, Any]) -> None:
@@ -117,7 +117,7 @@ class Surface:
         both = np.flatnonzero(common.all(axis=1))
         if len(both):
             x = (low[both[0]] + high[both[0]]) / 2
-            raise ValueError(f"{' and '.join(map(line, conditions))}: both act at {x}, must not; limit them by regions")
+            raise ValueError(f"{' and '.join(map(line, conditions))}: both act at {x}, must be limited by regions")
 
 
 Region = tuple[ArrayLike, ArrayLike]
@@ -149,7 +149,7 @@ def surface(
     region : ((d,), (d,)), m
         Box of reference positions.  Faces are limited to their parts inside this box.
     present
-        Which bodies are active; by default all.
+        Whether each body is active; by default all bodies are.
     """
     shown = [present is None or bool(present[i]) for i in range(len(bodies))]
     dim, known = bodies[0].dim, dict.fromkeys(name for body in bodies for name in body.names)
@@ -278,7 +278,7 @@ def _clipped(
 
 
 def _free(own: Faces, others: Sequence[Faces]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the free parts of faces: for each part its face (n,) and corners (n, 4, 2) in face coordinates [0, 1].
+    """Return the parts of faces that touch no other body: their faces (n,), and corners (n, 4, 2) in face coordinates.
 
     A part is a rectangle if all boxes that cover its face lie along the edges of the face.  Otherwise it is a triangle
     with a repeated last corner.
@@ -307,7 +307,7 @@ def interpolate(corners: NDArray[np.float64], xi: NDArray[np.float64]) -> NDArra
 def on_face(
     corners: NDArray[np.float64], face: NDArray[np.int64], x: NDArray[np.float64], xi: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return xi (n, 3) with tangential components from the projections of positions x (n, 3), m, onto faces (n,)."""
+    """Return local coordinates xi (n, 3), with tangential components of positions x (n, 3), m, projected onto faces."""
     quads = np.take_along_axis(corners, FACES[3][face][:, :, None], axis=1)
     normal = face_vectors(corners, face)
     t, _ = local(quads, x[:, None], normal)

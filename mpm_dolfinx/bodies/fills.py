@@ -22,7 +22,7 @@ from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
 from mpm_dolfinx.points.cutting import TANGLED, centroids, domain_volumes, volumes
 from mpm_dolfinx.points.material_points import MaterialPoints
 
-MISFIT = 0.01  # largest (distance of a fill's straight edges from a bent surface) / cell size without a warning
+MISFIT = 0.01  # largest distance of a fill's edges from a bent surface without a warning, divided by the cell size
 UPRIGHT = 0.95  # cosine of the largest angle between an axis and normals of mesh faces on the side opposite a contact
 INSIDE = 0.05  # fraction of a domain's shortest edge; deeper penetration into a fill is an error
 
@@ -177,7 +177,7 @@ def _springs(body: Body, node: NDArray[np.int64], count: int) -> csr_array:
 
 
 def _between(K: csr_array, fixed: NDArray[np.bool_], u: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the displacements (n,) along an axis: u at fixed nodes, elsewhere in equilibrium by spring stiffness K."""
+    """Return the displacements (n,) along an axis: u at fixed nodes, elsewhere from equilibrium with stiffness K."""
     out, free = u.copy(), np.flatnonzero(~fixed)
     if len(free):
         held = np.flatnonzero(fixed)
@@ -221,7 +221,7 @@ def _check_shape(grid: Grid, fill: int, corners: NDArray, u: NDArray) -> None:
 def _penetration(
     grid: Grid, bodies: Sequence[Body], other: int, corners: NDArray, points: MaterialPoints, misfit: float
 ) -> tuple[float, float, NDArray[np.float64]]:
-    """Return the depth, m, to which a body penetrates the fill, the gap / cell size, and the position (d,), m.
+    """Return a body's penetration depth into the fill, m, their gap divided by the cell size, and the position (d,), m.
 
     Depth, gap or both are zero.
     """

@@ -53,7 +53,7 @@ def version(file: Path) -> str:
 
 
 def read(file: Path) -> meshio.Mesh:
-    """Return the mesh of a file of format 4.1; keys: tags of physical groups in `cell_sets`, names in `field_data`."""
+    """Return the mesh of a file of format 4.1, with `cell_sets` by tag of the physical group, `field_data` by name."""
     data = file.read_bytes()
     _, kind, size = _section(data, "MeshFormat").split()[:3]
     binary = kind == b"1"

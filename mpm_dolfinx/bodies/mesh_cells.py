@@ -2,7 +2,7 @@
 """Cell types of meshes: their facets, and their division into particle domains.
 
 A triangle is divided into three quadrilaterals, a tetrahedron into four hexahedra with plane faces: one domain for each
-vertex.  Each corner of a domain is the mean of its vertex and of none, some or all other vertices.  A wedge is divided
+vertex.  Each corner of a domain is the mean of several vertices, or its own vertex.  A wedge is divided
 like its triangle; a pyramid consists of two tetrahedra.  Neighbouring cells divide their common facet in the same way.
 The exception is a quadrilateral facet of a hexahedron, which is not divided.
 """

@@ -26,8 +26,8 @@ from mpm_dolfinx.grid.grid import FACES, Grid, corner_bits, rounding, sum_by
 from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
 from mpm_dolfinx.points.cutting import centroids, simplex_volumes, vertices, volumes
 
-LONG = 1.5  # cells / per_cell: domains with longer edges are divided
-SMALL = 0.2  # of the desired domain size: smaller domains cause a warning
+LONG = 1.5  # domains with edges longer than this factor times the cell size / per_cell are divided
+SMALL = 0.2  # fraction of the desired domain size: smaller domains cause a warning
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +113,7 @@ class MeshBody(Body):
         return row[along], face[along]
 
     def across(self, axis: int) -> tuple[float, float]:
-        """Return, along an axis, (extent of the body) / (mean edge length of domains), and this mean, m."""
+        """Return the body's extent along an axis divided by the mean edge length of domains, and this length, m."""
         edge = float(self.spacing[:, axis].mean())
         return float(np.ptp(self.vertices[:, :, axis])) / edge, edge
 
@@ -258,7 +258,7 @@ def _check_overlaps(
         one, other = boxes[pairs[deep[depth.argmax()]]]
         meet = (np.maximum(one[0], other[0]) + np.minimum(one[1], other[1])) / 2
         what = f"{len(np.unique(pairs[deep]))} cells overlap, the first at {meet}"
-        raise ValueError(f"{name}: {what}, by {depth.max():.3g} m; must not")
+        raise ValueError(f"{name}: {what}, by {depth.max():.3g} m, must be apart or touch")
 
 
 def _box_overlaps(

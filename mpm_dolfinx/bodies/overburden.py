@@ -20,12 +20,12 @@ from mpm_dolfinx.grid.grid import ABOUT_MIDDLE, FACE_SIGNS, FACES, corner_bits
 def overburden(
     corners: NDArray[np.float64], unit_weight: NDArray[np.float64], x: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the overburden stress (m,), Pa, at positions, and the level of the ground surface above them (m,), m.
+    """Return the overburden stress (k,), Pa, at positions, and the level (k,), m, of the ground surface above them.
 
     Both are means over vertical lines on all sides close to a position, because a border of domains may lie above it.
 
     corners (n, 2^d, d), m: corners of the particle domains of all bodies; the last axis is vertical. unit_weight (n,),
-    N/m^3: unit weights of the domains; x (m, d), m: positions in the domains.
+    N/m^3: unit weights of the domains; x (k, d), m: positions in the domains.
     """
     least = np.ptp(corners[..., :-1], axis=1).min(initial=np.inf)
     aside = SAME * least * np.sqrt([2.0, 3.0])[: x.shape[1] - 1] * (1 - 2 * corner_bits(x.shape[1] - 1))
@@ -34,7 +34,7 @@ def overburden(
 
 
 def _along(corners: NDArray, unit_weight: NDArray, x: NDArray, places: NDArray) -> tuple[NDArray, NDArray]:
-    """Return overburden stresses, Pa, and surface levels, m, above x, on vertical lines at `places` (m, d-1)."""
+    """Return overburden stresses, Pa, and surface levels, m, above x, on vertical lines at `places` (k, d-1)."""
     low, high = corners[..., :-1].min(axis=1), corners[..., :-1].max(axis=1)
     half = (high - low).max(initial=0.0) / 2
     across, line = np.unique(places, axis=0, return_inverse=True)

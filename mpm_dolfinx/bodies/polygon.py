@@ -109,7 +109,7 @@ def _check_simple(outlines: Sequence[NDArray[np.float64]]) -> None:
     crossing = np.flatnonzero((~separate & ~adjacent) | folded)
     if len(crossing):
         one, other = ([a[k[crossing[0]]].tolist(), b[k[crossing[0]]].tolist()] for k in (i, j))
-        raise ValueError(f"polygon: the edges {one} and {other} touch or cross, must not")
+        raise ValueError(f"polygon: the edges {one} and {other} touch or cross, must be apart")
     for k, hole in enumerate(outlines[1:], start=1):
         within = [_inside(hole[0], outline) for m, outline in enumerate(outlines) if m != k]
         if not within[0] or any(within[1:]):

@@ -99,7 +99,7 @@ def weights(t: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def near(a: NDArray[np.float64], b: NDArray[np.float64], distance: float = 0.0) -> tuple[NDArray, NDArray]:
-    """Return indices (n,) in a (k, c, d), and in b (l, c, d), of polytopes whose boxes may lie within a distance."""
+    """Return index pairs (n,), (n,) of polytopes a (k, c, d), b (l, c, d) whose boxes may lie within a distance, m."""
     if not (len(a) and len(b)):
         return (np.empty(0, dtype=np.int64),) * 2
     low, high = np.maximum(a.min(axis=(0, 1)), b.min(axis=(0, 1))), np.minimum(a.max(axis=(0, 1)), b.max(axis=(0, 1)))
@@ -187,7 +187,7 @@ def covered(count: int, cover: Cover) -> NDArray[np.float64]:
 def uncovered_triangles(
     own: Faces, cover: Cover, faces: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return free parts of faces (m,) as triangles: face (n,) and corners (n, 3, 2), in [0, 1], of each triangle."""
+    """Return uncovered parts of faces (m,) as triangles: their faces (n,), and corners (n, 3, 2) in [0, 1]."""
     corners = own.corners[faces]
     normal = own.outward[faces] / np.linalg.norm(own.outward[faces], axis=1, keepdims=True)
     whole, _ = local(_parallelograms(corners), corners, normal)
@@ -253,7 +253,7 @@ def _areas(s: NDArray) -> NDArray[np.float64]:
 
 
 def split(s: NDArray, owner: NDArray, axis: int, plane) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-    """Divide triangles (3, e, n) at a plane normal to an axis; return parts below, owners, parts above, owners."""
+    """Divide triangles (3, e, n) at a plane normal to an axis; return parts and owners below it, and above it."""
     plane = np.broadcast_to(plane, len(owner))
     low, high = s[:, axis].min(axis=0) < plane, s[:, axis].max(axis=0) > plane
     both = np.flatnonzero(low & high)
@@ -382,7 +382,7 @@ def meeting(
     b: tuple[NDArray[np.float64], NDArray[np.float64]],
     in_cells: Callable[[NDArray[np.float64]], NDArray[np.float64]],
 ) -> tuple[float, float, NDArray[np.float64]]:
-    """Return the largest overlap of domains, m, their smallest (gap / cell size), and the position (d,), m.
+    """Return the largest overlap of domains, m, their smallest gap divided by the cell size, and the position (d,), m.
 
     `a` and `b` are domains and tolerances, see `solids`.  `in_cells` divides positions by the cell size.  Touching
     domains have overlap 0 and gap 0; the gap of distant domains is inf.
@@ -413,7 +413,7 @@ def check_apart(grid: Grid, bodies: Sequence[Body], present: Sequence[bool]) -> 
     for i, j in combinations(indices, 2):
         depth, gap, x = meeting(found[i], found[j], lambda x: grid.in_cells(x - grid.base))
         if depth:
-            raise ValueError(f"bodies {i} and {j}: overlap at {x} by {depth:.3g} m, must not")
+            raise ValueError(f"bodies {i} and {j}: overlap at {x} by {depth:.3g} m, must be apart or touch")
         together = grid.copies == 1 or np.ptp(grid.copy(first[[i, j]])) == 0  # contact groups share no node
         if together and 0 < gap < 1 and not any(_inside(x, found[k][0]) for k in indices if k not in (i, j)):
             warn_near(grid, f"bodies {i} and {j}", gap, x)

@@ -74,7 +74,7 @@ class Setting:
 
     sides: Sides  # finds the faces of conditions
     free: NDArray[np.bool_]  # whether no wall fixes a displacement component (nodes, d)
-    materials: SceneMaterials  # of the scene
+    materials: SceneMaterials  # materials of the scene
     forms: FormsOf  # compiled forms of the scene's conditions
     conditions: Mapping[str, Any]  # all conditions of the stage, by name
 
@@ -119,7 +119,7 @@ class Shares(NamedTuple):
 
 
 class At(NamedTuple):
-    """Displacement increment u of the step, a local array, m; numbering of the unknowns; connected parts."""
+    """Numbering of the unknowns, displacement increment u of the step (a local array, m), and connected parts."""
 
     unknowns: Unknowns
     u: NDArray[np.float64]
@@ -162,7 +162,7 @@ class Loads:
         """With inertia, return the data of this converged substep that the next substep needs."""
 
     def rubbing(self, at: At, v: NDArray[np.float64]) -> tuple[float, float]:
-        """Return two powers at u on this process, W: the dissipation by slip, and a correction of the external power.
+        """Return two powers at u on this process, W: the dissipation by slip, and the correction of the external power.
 
         The external power is first computed from the forces in `push` and the nodal velocities v, a local array, m/s.
         """
@@ -181,7 +181,7 @@ class Loads:
         """Add resisting forces at u, with the sign of the internal forces."""
 
     def takes_up(self, b: NDArray[np.float64]) -> None:
-        """Add forces at u that count as internal forces, also in the scale of residuals."""
+        """Add forces at u that count as internal forces; the scale of residuals includes them."""
 
     def penalty(self, A: PETSc.Mat, walls: bool) -> None:
         """Add the matrix of forces that are linear in u.  `walls`: whether to add rows of components fixed by walls."""
@@ -206,7 +206,7 @@ class Loads:
         """Return minus the derivative of the forces in `push`, without the part in `tangent`."""
 
     def settle(self, at: At, sticks: bool) -> bool:
-        """Update which points slip at u, and return whether any changed.  `sticks`: points may return to stick."""
+        """Update which points slip at u; return whether any point changed.  `sticks`: points may return to stick."""
         return False
 
     def augment(self, at: At) -> bool:
@@ -274,14 +274,14 @@ class Loads:
         """Return the corners (n, 2^d, d), m, moved out of forbidden regions.
 
         `free` (n, 2^d, d) tells which components no other condition prescribes.  By default only small penetrations
-        are corrected; with `everywhere`, penetrations of any depth.
+        are corrected; with `everywhere`, penetrations of any depth are corrected.
         """
         return corners
 
     def under_held(
         self, ids: NDArray[np.int64], tracked: NDArray[np.float64], volume: NDArray[np.float64], corners: NDArray
     ) -> NDArray[np.float64]:
-        """Return new corners (m, 2^d, d), m, of re-initialised domains: on prescribed sides, the tracked corners.
+        """Return new corners (m, 2^d, d), m, of re-initialised domains; on prescribed sides these are tracked corners.
 
         `ids` (m,) identify the points; `tracked` are the tracked corners, `corners` the corners initialised from F, and
         `volume` (m,), m^d, the volumes.  A domain with a face on a prescribed side becomes a prism of its volume.
@@ -302,7 +302,7 @@ class Acting:
     """
 
     conditions: ClassVar[tuple[type, ...]] = ()
-    """Condition classes of this kind."""
+    """Classes of conditions of this kind."""
     title: ClassVar[str] = "user-defined conditions"
     """Name in the summary of a scene."""
     symmetric: bool = True
@@ -315,6 +315,8 @@ class Acting:
     """Faces that tools may touch; None without tools."""
     held: Sequence[tuple[Any, Surface, Sequence[int]]] = ()
     """Prescribed displacements: (condition, faces, prescribed axes)."""
+    seeded: Sequence[Surface] = ()
+    """Further faces whose displacement from the seeded position is needed; renewal leaves their domains."""
 
     def placed(self, place: Place) -> Loads:
         """Return the loads of a substep."""

@@ -36,7 +36,7 @@ from mpm_dolfinx.materials.skeleton import Skeleton
 class Condition:
     """Base class of conditions.  Lists and arrays are copied, so that later changes to them have no effect.
 
-    `name` is the name of the results; by default kind and side of the condition, such as "displacement_top".
+    `name` is the name of the results.  The default consists of kind and side, such as "displacement_top".
     """
 
     name: str | None = field(default=None, kw_only=True, repr=False)
@@ -317,10 +317,10 @@ class Rain(Flux):
     """Side of the bodies with rain or evaporation, limited by the soil's capacity to take up or release water.
 
     Rain infiltrates until the pressure at the side reaches `ponding`; the excess runs off.  Water evaporates at the
-    given rate until the pressure at the side falls to `driest`.  Seepage can leave through the side too.  `outflows` of
-    the simulation are the flow through the side; `simulation.outcome("runoff")` is the run-off, m^3/s (m^2/s in plane
-    strain).  Three outcomes are volumes, m^3 (m^2), since the condition began.  `outcome("flowed")`: outflow through
-    all open sides; `outcome("ran_off")`: run-off and seepage on this side; `outcome("ponded")`: ponded water.
+    prescribed rate until the pressure at the side falls to `driest`.  Seepage can leave through the side too.
+    `outflows` of the simulation are the flow through the side; `simulation.outcome("runoff")` is the run-off, m^3/s
+    (m^2/s in plane strain).  Three outcomes are volumes, m^3 (m^2), since the condition began.  `outcome("flowed")` is
+    outflow through all open sides, `outcome("ran_off")` run-off and seepage here, `outcome("ponded")` ponded water.
 
     Parameters
     ----------
@@ -364,7 +364,7 @@ class Rain(Flux):
 class Tied(Condition):
     """Two opposite sides of a box with equal displacements, as if the ground repeated itself beyond the box.
 
-    Displacements at equal heights are equal, forces are equal and opposite, with and without inertia.  A wave that
+    Displacements at equal heights are equal, and forces are equal and opposite, with and without inertia.  A wave that
     leaves the box at one side enters at the other.  No water flows through these sides.
 
     Parameters
@@ -386,11 +386,11 @@ class Tied(Condition):
 
 
 RIGIDITY = 1e4
-"""Rigidity of a plate, in units of (oedometric modulus of the body) x (length of the side)."""
+"""Rigidity of a plate, divided by the oedometric modulus of the body and by the length of the side."""
 HOLD = 3e2
-"""Penalty stiffness for cell means of prescribed displacements, in units of (modulus from `holding`) / (cell size).
+"""Penalty stiffness for cell means of prescribed displacements, times cell size, divided by the `holding` modulus.
 
-The displacement error is (change of traction in the step, except by rotation) / (modulus) x (cell size) / HOLD.  The
+The displacement error is the change of traction in the step, except by rotation, divided by this stiffness.  The
 error does not accumulate, because each step measures the error from the prescribed position.  Where a body is much
 stiffer than the penalty, multipliers remove the error, see `HoldLoads.augment`.
 
@@ -431,9 +431,9 @@ class Displacement(Condition):
         Side of the bodies, as for `Traction`.
     value : (d,) or callable (t, X) -> (d,) or (m, d), m
         Displacement since the start, or since a stage set it to zero, at reference positions X (m, d).  For a mapped
-        body, the map converts X to seeded positions.  All d components are given, also if some are not prescribed.
+        body, the map converts X to seeded positions.  All d components are required, even those not prescribed.
     components
-        Prescribed components, such as "y"; by default all.
+        Prescribed components, such as "y"; by default all d components.
     region : ((d,), (d,)), m
         Box of reference positions; faces inside it are prescribed.  Let the box end within a cell.  The cell's node
         outside the box is prescribed if the box covers more than half of the cell, otherwise free.
@@ -454,7 +454,7 @@ class Displacement(Condition):
     def axes(self, dim: int) -> list[int]:
         """Return the axes of the prescribed components."""
         if not isinstance(self.components, str) or any(c not in "xyz"[:dim] for c in self.components):
-            raise ValueError(f"{line(self)}: components must be some of {'xyz'[:dim]!r}")
+            raise ValueError(f"{line(self)}: components must be letters of {'xyz'[:dim]!r}")
         return sorted("xyz".index(c) for c in set(self.components or "xyz"[:dim]))
 
     def at(self, t: float, X: NDArray[np.float64]) -> NDArray[np.float64]:

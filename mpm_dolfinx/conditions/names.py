@@ -24,7 +24,7 @@ class ByName(dict[str, T]):
         return np.stack(list(self.values())) if self else np.zeros(0)
 
     def __missing__(self, name: Any) -> T:
-        """Raise a KeyError for an unknown name, or for an index in place of a name."""
+        """Raise a KeyError for an unknown name, or for an index used as a name."""
         raise KeyError(f"{name!r}: must be the name of a condition: {', '.join(map(repr, self)) or 'there is none'}")
 
 
@@ -39,7 +39,7 @@ def named(conditions: Sequence[Any]) -> dict[str, Any]:
     given = [getattr(one, "name", None) for one in conditions]
     for name, one in zip(given, conditions, strict=True):
         if name is not None and not (isinstance(name, str) and re.fullmatch(r"[\w .-]+", name)):
-            raise ValueError(f"{line(one)}: name = {line(name)}, must be of letters, digits, spaces, and any of _ . -")
+            raise ValueError(f"{line(one)}: name = {line(name)}, must consist of letters, digits, blanks and _ . -")
         if name is not None and given.count(name) > 1:
             raise ValueError(f"{line(one)}: name = {line(name)} of another condition, must be unique")
     out: dict[str, Any] = {}

@@ -52,7 +52,7 @@ class Record:
             raise ValueError(f"Record: quantity = {line(quantity)}, must be one of {', '.join(QUANTITIES)}")
         flag("Record: at_rest", at_rest)
         if at_rest and quantity == "velocity":
-            raise ValueError("Record: at_rest = True with velocities, must be a record of accelerations")
+            raise ValueError("Record: at_rest = True with velocities, must be True for accelerations only")
         self.direction = numbers("Record: direction", direction, (2,), (3,), allowed="2 or 3 finite numbers")
         rows = numbers(
             "Record", _read(record) if isinstance(record, (str, os.PathLike)) else record, None, allowed=ALLOWED

@@ -21,7 +21,7 @@ from mpm_dolfinx.parallel.exchange import over_all
 class Sides:
     """Finder of the faces on which a condition acts.  Conditions on the same faces share one `Surface`.
 
-    grid, bodies: background grid and all bodies of the scene; present: which bodies are active in the stage.
+    grid, bodies: background grid and all bodies of the scene; present: whether each body is active in the stage.
     """
 
     def __init__(self, grid: Grid, bodies: Sequence[Body], present: Sequence[bool]):
@@ -40,7 +40,7 @@ class Sides:
         copies = np.unique(self.grid.copy(found.id))
         if len(copies) > 1:
             what = f"{line(condition)}: {len(copies)} groups of bodies have this side"
-            raise ValueError(f"{what}, must be one; limit each condition to one group by a region")
+            raise ValueError(f"{what}, must be one group; limit each condition to one group by a region")
         return found
 
     def _of(self, side: str, region: Region | None) -> Surface:
@@ -131,7 +131,7 @@ class Sides:
                 raise ValueError(f"{what}, must leave it free in this stage")
 
     def around(self, bodies: Sequence[int]) -> Surface:
-        """Return all surface faces of some active bodies, including faces in contact with other bodies."""
+        """Return all surface faces of the active `bodies`, including faces in contact with other bodies."""
         key = ("", np.array(bodies).tobytes())
         if key not in self._found:
             there = [bool(here) and i in bodies for i, here in enumerate(self.present)]

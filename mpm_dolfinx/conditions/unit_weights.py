@@ -26,7 +26,7 @@ Gravity = ArrayLike | Callable[[float], ArrayLike] | None
 
 
 def under(fluid: Fluid | None, gravity: Gravity) -> Fluid | None:
-    """Return the fluid.  If the scene's gravity, m/s^2, is constant, conductivities refer to this gravity."""
+    """Return the fluid, with conductivities that refer to the scene's gravity, m/s^2, if this gravity is constant."""
     if fluid is None or fluid.gravity is not None or gravity is None or callable(gravity):
         return fluid
     strength = float(np.linalg.norm(numbers("gravity", gravity, None, allowed="finite numbers")))
@@ -56,7 +56,7 @@ def with_weight(condition: T, fluid: Fluid | None) -> T:
 
 
 def warn_units(comm: MPI.Intracomm, fluid: Fluid, gravity: Gravity) -> None:
-    """Warn about a fluid that is no liquid in SI units, if no gravity is given from which its unit weight follows."""
+    """Warn if the fluid's constants, read in SI units, are not those of a liquid, and no gravity is specified."""
     if fluid.gravity is not None or gravity is not None:
         return
     if not DENSITIES[0] <= fluid.density <= DENSITIES[1] or fluid.bulk < SOFTEST:
@@ -92,7 +92,7 @@ def warn_levels(comm: MPI.Intracomm, fluid: Fluid | None, gravity: Gravity, leve
 
 
 def other_gravity(fluid: Fluid, gravity: Sequence[NDArray[np.float64]]) -> float | None:
-    """Return the last gravity, m/s^2, if conductivities are converted with another gravity, else None.
+    """Return the last value of `gravity`, m/s^2, if conductivities are converted with another gravity, else None.
 
     gravity, m/s^2: at the start of a step, and at times in the step.  A varying gravity counts only above 9.81 m/s^2.
     """

@@ -32,7 +32,7 @@ def fixed_nodes(grid: Grid, walls: Mapping[str, str]) -> NDArray[np.bool_]:
         raise ValueError(f"walls = {line(walls)}, must be a mapping of walls to components, such as {{'left': 'xy'}}")
     for wall, axes in walls.items():
         if not isinstance(axes, str) or not axes or any(a not in "xyz"[:d] for a in axes):
-            raise ValueError(f"walls: {wall!r} fixes {axes!r}, must fix some of {'xyz'[:d]!r}")
+            raise ValueError(f"walls: {wall!r} fixes {axes!r}, must fix components among {'xyz'[:d]!r}")
         for a in axes:
             out[grid.wall_nodes(wall), "xyz".index(a)] = True
     return out
@@ -66,10 +66,10 @@ def wall_forces(
 ) -> dict[str, NDArray[np.float64]]:
     """Return the force (d,), N, of each wall by name; all processes must call this function.
 
-    If several walls fix a component of a node, the wall normal to this component carries the force, or all of them
-    carry it evenly if none is normal.  The axis of revolution has no area, so its radial force is zero.
+    If several walls fix a component of a node, the wall normal to this component carries the force.  If none of
+    these walls is normal to it, all carry the force evenly.  The axis of revolution has no area and no radial force.
 
-    dofs (n,): local degrees of freedom, unrolled; repetitions are allowed.  Free components are ignored. forces (n,),
+    dofs (n,): local degrees of freedom, unrolled; repetitions are allowed.  Free components are ignored.  forces (n,),
     N: forces on these degrees of freedom.
     """
     d, sides = grid.dim, SIDES[grid.dim]

@@ -37,7 +37,7 @@ def water(
         Box of reference positions; water acts on the parts of faces inside it.
     unit_weight
         Unit weight of the water, N/m^3, > 0; by default that of the scene's fluid.  If it differs from fluid density
-        times gravity, a warning is given.
+        times gravity, a warning is issued.
 
     Raises
     ------

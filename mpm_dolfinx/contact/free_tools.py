@@ -7,9 +7,9 @@ is the motion without forces in the step.  g is the weight of the substep's rate
 is the load, and f are the contact forces on the points.  A q is the displacement of the contact positions on the tool.
 The columns of A are e_x, e_y, and e_z x r with the lever arm r.
 
-The unknowns q are condensed.  Let D be minus the derivative of f by the displacement of the points, and dw the
-increment of this displacement.  Forces rotate with the tool, so f changes by (D A + E) dq, where E has the columns 0,
-0, e_z x f.  The force on the tool changes by the product of dq with
+The unknowns q are condensed.  Let D be minus the derivative of f with respect to the displacement w of the
+points, and dw the increment of w.  Forces rotate with the tool, so f changes by (D A + E) dq, where E has the columns
+0, 0, e_z x f.  The force on the tool changes by the product of dq with
 
     A^T D A + [[0, e_z x F], [(e_z x F)^T, sum r . f]],     F = sum f.
 
@@ -59,7 +59,7 @@ class FreeTools(ContactProblem):
 
     placed: arguments of `ToolLoads`; mass (k, q): masses, kg, and moments of inertia, kg m^2, 0 for tools that are not
     free; guides (k, q, q): projections on the motions that each tool can perform, see `motion_count`; velocity (k, q):
-    velocities at the start of the step, m/s and rad/s; pushes (k, q): loads, N and N m.
+    velocities at the start of the step, m/s and rad/s; pushes (k, q): prescribed loads, N and N m.
     """
 
     couples = True
@@ -189,7 +189,7 @@ class FreeTools(ContactProblem):
 
     @property
     def _loaded(self) -> NDArray[np.int64]:
-        """Indices of the free tools, see `ContactProblem`."""
+        """Indices of the free tools, see `_loaded` of `ContactProblem`."""
         return np.flatnonzero(self._free_tools)
 
     def coupling(self, at: At) -> PETSc.Mat:

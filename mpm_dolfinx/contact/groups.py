@@ -73,7 +73,7 @@ class Contact:
             found.append(tuple(sorted({int(i) for i in value.ravel()})))
         if common := set(found[0]) & set(found[1]):
             what = f"Contact: body {min(common)} is in one = {line(self.one)} and in other = {line(self.other)}"
-            raise ValueError(f"{what}, must be in one of them, because a body does not touch itself")
+            raise ValueError(f"{what}, must be in one of the two, because a body does not touch itself")
         return found[0], found[1]
 
 
@@ -84,12 +84,12 @@ def groups_of(contacts: Sequence[Contact], count: int) -> list[tuple[int, ...]]:
     for one, other in combinations(groups, 2):
         if common := set(one) & set(other):
             what = f"contacts: body {min(common)} is in the groups {line(one)} and {line(other)}"
-            raise ValueError(f"{what}, must be in one; name all bodies of a group in each of its contacts")
+            raise ValueError(f"{what}, must be in one group; name all bodies of a group in each of its contacts")
         between = sum({*pair} == {one, other} for pair in pairs)
         if between != 1:
             raise ValueError(f"contacts: groups {line(one)} and {line(other)} have {between} contacts, must have one")
     if missing := set(range(count)) - {body for group in groups for body in group}:
-        raise ValueError(f"contacts: body {min(missing)} is in no group, must be in one")
+        raise ValueError(f"contacts: body {min(missing)} is in no group, must be in one group")
     return groups
 
 
@@ -119,12 +119,12 @@ def grouped(
     if not contacts:
         return grid
     if grid.axisymmetric:
-        raise ValueError("contacts: must be none in axisymmetry")
+        raise ValueError("contacts: not available in axisymmetry, must be absent")
     if quadrature == "point":
-        raise ValueError("quadrature 'point': must be domain with contacts")
+        raise ValueError("quadrature = 'point', must be 'domain' with contacts")
     for name, value in other.items():
         if value is not None and not (isinstance(value, Sequence) and not len(value)):
-            raise ValueError(f"{name}: must be none with contacts")
+            raise ValueError(f"{name}: not available with contacts, must be absent")
     group = np.zeros(len(bodies), dtype=np.int64)
     for number, members in enumerate(groups_of(contacts, len(bodies))):
         group[list(members)] = number

@@ -40,13 +40,13 @@ from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.parallel.exchange import first, over_all
 
 STIFF = 100.0
-"""Stiffness k in units of (`resistance`) / (cell size)."""
+"""Stiffness k, times the cell size, divided by the modulus from `resistance`."""
 GRIP = 6.0
-"""Stiffness k_t in units of (`resistance`) / (cell size).  With a larger k_t, spurious shear stresses would alternate
-between cells: their nodal forces cancel, so nothing would resist them.
+"""Stiffness k_t, times the cell size, divided by the modulus from `resistance`.  With a larger k_t, spurious shear
+stresses would alternate between cells: their nodal forces cancel, so nothing would resist them.
 """
-DEPTH = 5e-4  # allowed mean penetration / cell size
-SLIVER = 0.25  # of a cell's face: the penetration of smaller contact areas is reduced in proportion
+DEPTH = 5e-4  # allowed mean penetration, divided by the cell size
+SLIVER = 0.25  # fraction of a cell's face: penetrations of smaller contact areas are reduced in proportion
 ROUNDS = 20  # largest number of augmentations
 BEGIN = 1.0, np.inf, 0.0, 0.0  # initial values of `ContactState.updates`
 SLOW, STIFFER = 0.6, 10.0
@@ -62,8 +62,8 @@ class ContactState:
     slip: NDArray[np.float64]  # direction of slip, zero in stick (k, d)
     resticks: NDArray[np.bool_]  # whether the condition has returned from slip to stick (k,)
     parts: NDArray[np.bool_]  # whether the condition has opened after a return to stick (k,)
-    stuck: NDArray[np.float64]  # shear traction in stick at the last update (k, d), Pa
-    # (k, 4): factor on the stiffness k, penetration / cell size after the last augmentation, number of augmentations,
+    stuck: NDArray[np.float64]  # shear traction in stick at the last update of slip (k, d), Pa
+    # (k, 4): factor on the stiffness k, penetration in cell sizes after the last augmentation, number of augmentations,
     updates: NDArray[np.float64]  # number of updates of the pairs; the same for all conditions of a connected part
 
     @property
@@ -78,14 +78,14 @@ class Touch:
 
     force: NDArray[np.float64]  # force on the points (m, d), N
     push: NDArray[np.float64]  # pressure (m,), Pa
-    stiff: NDArray[np.float64]  # minus the derivative of the pressure by the gap (m,), Pa/m
+    stiff: NDArray[np.float64]  # minus the derivative of the pressure with respect to the gap (m,), Pa/m
     pressure: NDArray[np.float64]  # mean pressure (k,), Pa
     sticks: NDArray[np.bool_]  # whether the condition is in contact and sticks (k,)
     trial: NDArray[np.float64]  # shear traction in stick (k, d), Pa
     shear: NDArray[np.float64]  # shear traction (k, d), Pa
     most: NDArray[np.float64]  # shear strength (k,), Pa
-    grip: NDArray[np.float64]  # minus the derivative of the shear traction by slip (k, d, d), Pa/m
-    by_pressure: NDArray[np.float64]  # derivative of the shear traction by the pressure (k, d)
+    grip: NDArray[np.float64]  # minus the derivative of the shear traction with respect to slip (k, d, d), Pa/m
+    by_pressure: NDArray[np.float64]  # derivative of the shear traction with respect to the pressure (k, d)
 
 
 class ContactLaw:
@@ -101,7 +101,7 @@ class ContactLaw:
         self.pairs = pairs
         key, self.of = np.unique(pairs.number * self.grid.num_local + pairs.cell, return_inverse=True)
         self.key = key
-        """Key of each condition (k,): (index of the contact) * (number of local cells) + local cell."""
+        """Key of each condition (k,): the index of the contact times the number of local cells, plus the local cell."""
         self.cell = key % self.grid.num_local
         self.area = sum_by(self.of, pairs.area, len(key))
         strength = np.array([(contact.friction, contact.adhesion) for contact in contacts], dtype=float)
@@ -134,7 +134,7 @@ class ContactLaw:
         return state.updates[self.of, 0] * self._stiffness
 
     def touch(self, state: ContactState, at: Geometry) -> Touch:
-        """Return forces and derivatives for pairs with a geometry `at`."""
+        """Return the forces of pairs with the geometry `at`, and the derivatives of these forces."""
         stiffness = self.stiffness(state)
         push = np.maximum(0.0, state.pressure[self.of] - stiffness * at.gap)
         # gaps within rounding count as contact, because light bodies penetrate less than 1e-8 cells
@@ -172,7 +172,7 @@ class ContactLaw:
         return ~slips & on, trial, shear, most, grip, by_pressure
 
     def tangent(self, touch: Touch, at: Geometry) -> scipy.sparse.csr_matrix:
-        """Return D (m d, m d): minus the derivative of the forces by w, without the rotation of shear tractions."""
+        """Return minus the derivative D (m d, m d) of forces with respect to w, without rotation of shear tractions."""
         pairs = self.pairs
         d = self.grid.dim
         m = len(self.pairs.cell)
@@ -211,7 +211,7 @@ class ContactLaw:
         return area * out
 
     def choose(self, state: ContactState, touch: Touch, sticks: bool) -> tuple[ContactState, bool]:
-        """Update which conditions slip; return the state and whether any changed.  `sticks`: allow returns to stick."""
+        """Update which conditions slip; return the state, and whether any condition changed.  `sticks`: allow stick."""
         before = state.slips
         left = ~before & ~touch.sticks & state.stuck.any(axis=1)
         parts = state.parts | (left & state.resticks)
@@ -277,7 +277,7 @@ class ContactLaw:
     def tractions(self, touch: Touch, at: Geometry) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the pressures (m,) and shear tractions (m, d), Pa, of the pairs.
 
-        In stick, pairs keep deviations of shear tractions from the mean in a cell, as repeated averaging causes creep.
+        In stick, pairs keep their deviations from the mean shear traction of a cell: repeated averaging causes creep.
         """
         off = (at.shear - self.mean(at.shear)[self.of]) * touch.sticks[self.of, None]
         return touch.push, touch.shear[self.of] + off

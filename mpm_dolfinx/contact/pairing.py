@@ -32,21 +32,21 @@ from mpm_dolfinx.contact.pairs import FacePairs
 from mpm_dolfinx.contact.problem import ContactProblem, Touching
 from mpm_dolfinx.contact.tool_placing import BEGINS, FACING
 from mpm_dolfinx.domains.cut_domains import CutDomains
-from mpm_dolfinx.parallel.exchange import Exchange, first, over_all
+from mpm_dolfinx.parallel.exchange import first, over_all
 from mpm_dolfinx.points.cutting import FACES
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.points.parts import parts_of_domains
 
 REACH = 2.0
-"""Largest gap / cell size that may close in a step.  Steps with larger motion are rejected."""
+"""Largest gap, divided by the cell size, that may close in a step.  Steps with larger motion are rejected."""
 CLEAR = 0.5
-"""Gap / cell size above which faces cannot touch before the next update of the pairs."""
+"""Gap, divided by the cell size, above which faces cannot touch before the next update of the pairs."""
 DEEP = 0.25
-"""Penetration / cell size above which a position lies behind a thin body and is not paired."""
+"""Penetration, divided by the cell size, above which a position lies behind a thin body and is not paired."""
 CANDIDATES = {2: 8, 3: 24}
 """Number of nearest points on the other surface whose faces may contain the opposite position."""
 BESIDE = 0.6
-"""(Distance from points on the other surface) / cell size below which domain corners follow the Q1 field alone."""
+"""Distance from the other surface, divided by the cell size, below which domain corners follow the Q1 field alone."""
 PLACES = 1 << 32
 """Upper bound of the number of quadrature points of a process on a surface."""
 
@@ -73,7 +73,7 @@ class Pairs(NamedTuple):
 
 
 class Contacts(Touching):
-    """The contacts between groups in a stage; setting: data of the stage; contacts: by name."""
+    """The contacts between groups in a stage; setting: data of the stage; contacts: contacts by name."""
 
     conditions, title = (Contact,), "contacts"
 
@@ -152,7 +152,7 @@ class Contacts(Touching):
         if off := first(grid.comm, off):
             raise NotConverged(off)
         cell, other, at, values = (np.concatenate(column) for column in zip(*rows, strict=True))
-        exchange = Exchange(grid.comm, grid.owner(cell))
+        exchange = grid.to_owners(cell)
         cell, other, sent = (exchange.send(columns) for columns in (cell, other, values))
         number, sign, place = sent[:, :3].T.astype(np.int64)
         x, y, n, offset, shear = np.split(sent[:, 6:], 5, axis=1)
@@ -237,7 +237,7 @@ class Contacts(Touching):
     def _under(self, facets: Facets, chosen: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:
         """Return the cells (m,) just inside the chosen facets at positions x (m, d).
 
-        If a cell contains no quadrature point of the face, the cell of the facet is returned in its place.
+        If a cell contains no quadrature point of the face, the cell of the facet is returned instead.
         """
         grid, inside = self.grid, x - NEAR * self.grid.least * facets.outward[chosen]
         number = grid.number(grid.index_from_base(inside)) + facets.cell[chosen] // grid.cells * grid.cells
@@ -245,7 +245,7 @@ class Contacts(Touching):
         return np.where(np.isin(facets.face[chosen] * len(grid.owners) + number, keys), number, facets.cell[chosen])
 
     def near(self, cut: CutDomains, points: MaterialPoints, corners: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return which corners (n, 2^d, d) are near another group; points: at the start of the step."""
+        """Return which corners (n, 2^d, d) are near another group; points: points at the start of the step."""
         out, largest = np.zeros(corners.shape[:2], dtype=bool), BESIDE * self.grid.sizes_at(corners).max(axis=-1)
         largest = np.broadcast_to(largest, corners.shape[:2])
         for _, *pair, _ in self._faces:
@@ -283,7 +283,7 @@ class Contacts(Touching):
     def check_start(self, place: Place) -> None:
         """Raise an error if groups overlap at the start of the stage."""
         if message := self._too_deep(place.cut, place.points):
-            raise ValueError(f"{message}, at the start t = {place.start:g} s, must touch or be apart")
+            raise ValueError(f"{message}, at the start t = {place.start:g} s, must be apart or touch")
 
     def _too_deep(self, cut: CutDomains, points: MaterialPoints) -> str:
         """Return a message with depth and position of an overlap of groups, or "" if none overlap."""

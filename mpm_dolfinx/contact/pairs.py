@@ -23,14 +23,14 @@ from mpm_dolfinx.contact.shapes import DISTANCE, Distance
 from mpm_dolfinx.contact.tool import Pose, Tool
 from mpm_dolfinx.forms.unknowns import Unknowns
 from mpm_dolfinx.grid.grid import Grid
-from mpm_dolfinx.parallel.exchange import Exchange, everywhere
+from mpm_dolfinx.parallel.exchange import everywhere
 
 
 class Geometry(NamedTuple):
     """Geometry of m contact pairs at relative displacements w (m, d), m."""
 
     gap: NDArray[np.float64]  # gap (m,), m; negative in penetration
-    n: NDArray[np.float64]  # derivative of the gap by w (m, d): the outward unit normal of the other side
+    n: NDArray[np.float64]  # derivative of the gap with respect to w (m, d): outward unit normal of the other side
     curvature: NDArray[np.float64] | None  # second derivative of the gap (m, d, d), 1/m; None if zero
     slip: NDArray[np.float64]  # slip in the step (m, d), m
     arm: NDArray[np.float64]  # lever arm for moments (m, d), m
@@ -134,7 +134,7 @@ class FacePairs(Pairs):
     place: NDArray[np.int64]  # identifier of the point, the same in all updates of the pairs in a step (m,)
 
     def at(self, w: NDArray[np.float64], motion: NDArray[np.float64]) -> Geometry:
-        """See `Pairs`.  Moments refer to the positions at the start of the step."""
+        """See `Pairs`.  Lever arms are those at the start of the step."""
         gap = np.einsum("md,md->m", self.n, self.offset + w)
         return Geometry(gap, self.n, None, w, self.x + self.grid.base, self.shear)
 
@@ -165,7 +165,7 @@ def at_nodes(
     numbers = unknowns.map.indices.reshape(-1, d)
     column = numbers[grid.cell_nodes[cell]]
     if other is not None:
-        exchange = Exchange(grid.comm, grid.owner(other))
+        exchange = grid.to_owners(other)
         columns = exchange.back(numbers[grid.cell_nodes[grid.local(exchange.send(other))]])
         column = np.concatenate([column, columns], axis=1)
     column = column.swapaxes(1, 2)

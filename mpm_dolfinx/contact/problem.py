@@ -2,14 +2,14 @@
 """Contact problem of a substep, with tools or between groups of bodies.
 
 A pair consists of a quadrature point on a surface and the opposite position, on a tool or another group (`pairs`).
-With the relative displacements w = B u and the forces f(w) of the pairs, nodal forces are B^T f(w).  Forces on both
+The pairs have the relative displacements w = B u and the forces f(w); the nodal forces are B^T f(w).  Forces on both
 bodies are therefore equal and opposite within rounding.  If both sides deform, pairs, normals and gaps are first taken
 at the start of the step.  After convergence, pairs, normals and gaps are updated at the new positions, and the step is
 solved again.  This is repeated until an update changes the gaps by less than `DEPTH` cells.
 
 A load-controlled tool has one more unknown: its displacement a along the direction e of the load.  Let f(w - a e) be
-the forces on points, let D be minus their derivative by w, and let s = e . D e.  Newton's method solves e . f = load
-together with the equilibrium of the bodies, by
+the forces on points, let D be minus their derivative with respect to w, and let s = e . D e.  Newton's method solves
+e . f = load together with the equilibrium of the bodies, by
 
     da = (e . D dw + load - e . f) / s.
 
@@ -37,7 +37,7 @@ from mpm_dolfinx.contact.history import Origin, Rough, joined, pressure_name, sh
 from mpm_dolfinx.contact.law import BEGIN, DEPTH, ROUNDS, ContactLaw, ContactState, Touch
 from mpm_dolfinx.contact.pairs import Geometry, Pairs, at_nodes, petsc_matrix
 from mpm_dolfinx.forms.unknowns import Unknowns, collect_garbage
-from mpm_dolfinx.parallel.exchange import Exchange, over_all
+from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.material_points import MaterialPoints
 
 FOLLOWS = 8  # largest number of updates of the pairs in a step
@@ -45,9 +45,9 @@ FOLLOWS = 8  # largest number of updates of the pairs in a step
 
 @dataclass(frozen=True, eq=False)
 class Pushes:
-    """Loads of k load-controlled tools."""
+    """Prescribed loads on k load-controlled tools."""
 
-    names: Sequence[str]  # of the tools, for error messages
+    names: Sequence[str]  # names of the tools, for error messages
     start: NDArray[np.float64]  # displacement by the load before the step (k,), m
     direction: NDArray[np.float64]  # unit vector of the load (k, d)
     load: NDArray[np.float64]  # load (k,), N; nan for tools without a load
@@ -64,7 +64,7 @@ class LinearMotion:
     w: NDArray[np.float64]  # relative displacements of the pairs (m, d), m
     motion: NDArray[np.float64]  # displacements of the tools at w (k,), m
     shift: NDArray[np.float64]  # Newton increment of `motion` (k,), m
-    slope: NDArray[np.float64]  # derivative by the relative displacements of each pair (m, d)
+    slope: NDArray[np.float64]  # derivative with respect to the relative displacements of each pair (m, d)
 
 
 class Found(NamedTuple):
@@ -94,7 +94,7 @@ class SubstepMotion(NamedTuple):
 
 
 class Touching(Acting):
-    """Contact conditions of one kind in a stage; given: its tools, or its contacts between groups, by name."""
+    """Contact conditions of one kind in a stage.  `given` are its tools, or its contacts between groups, by name."""
 
     linear = False
 
@@ -120,16 +120,10 @@ class Touching(Acting):
 class ContactProblem(Loads):
     """Contact forces in a substep.  `now` is replaced during the solution.
 
-    Parameters
-    ----------
-    law, origin
-        Contact law at the start of the step, and the material points of its pairs.
-    pushes
-        Loads of tools.
-    again
-        Function from displacements (a local array, m) to law and origin of the pairs found there, see `FacePairs`.
-    cell_pairs
-        Function that returns all pairs of cells, as first * cells + second, that contact pairs may join in the step.
+    law, origin: contact law at the start of the step, and the material points of its pairs; pushes: prescribed loads on
+    the tools; again: function from displacements (a local array, m) to law and origin of the pairs found there, see
+    `FacePairs`; cell_pairs: function that returns all pairs of cells, as integers first * cells + second, that contact
+    pairs may join.
     """
 
     linear, smooth, touches = False, False, True
@@ -197,8 +191,7 @@ class ContactProblem(Loads):
         return self._operator((law, unknowns), make, self.grid.comm) if law is self.now.law else make()
 
     def _find_at(self, w: NDArray[np.float64], motion: NDArray[np.float64]) -> Found:
-        law = self.now.law
-        state = self.now.state
+        law, state = self.now.law, self.now.state
         of = self.pairs.number
         at = law.pairs.at(w, motion)
         touch = law.touch(state, at)
@@ -230,7 +223,7 @@ class ContactProblem(Loads):
         """Return a matrix with all entries that pairs between groups may have in the step."""
         grid, d = self.grid, self.grid.dim
         cell, other = np.divmod(self._cell_pairs(), len(grid.owners))
-        exchange = Exchange(grid.comm, grid.owner(cell))
+        exchange = grid.to_owners(cell)
         cell, other = exchange.send(cell), exchange.send(other)
         key, of = np.unique(cell, return_inverse=True)
         m = len(cell)
@@ -245,10 +238,9 @@ class ContactProblem(Loads):
     def coupling(self, at: At) -> PETSc.Mat:
         """Return minus the derivative of the forces at u."""
         collect_garbage(self.grid.comm)  # with friction in 3D, pairs in 12 cells fill 60 MB in each iteration
-        found = self.found(at)
+        where, touch, *_ = found = self.found(at)
         law = self.now.law
         unknowns = at.unknowns
-        where, touch, *_ = found
         B, _ = self._B(law, unknowns)
         K = petsc_matrix(law.tangent(touch, where), B.getLocalSize()[0], self.grid.comm, own=True).PtAP(B)
         if not self.pushed:
@@ -302,8 +294,7 @@ class ContactProblem(Loads):
 
     def _seek(self, found: Found) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """Return displacements (tools,), m, at which one point would bear the load, else inf, and which tools touch."""
-        law = self.now.law
-        state = self.now.state
+        law, state = self.now.law, self.now.state
         of = self.pairs.number
         along, k = (found.at.n * self.pushes.direction[of]).sum(axis=1), law.stiffness(state)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -351,8 +342,7 @@ class ContactProblem(Loads):
         If penetrations are small enough, move tools whose reaction differs from the load.
         """
         found = self.found(at)
-        law = self.now.law
-        state = self.now.state
+        law, state = self.now.law, self.now.state
         part = at.parts.cells[law.cell]
         new = law.augmented(state, found.touch, lambda of: at.parts.largest(self.grid.comm, part, of)[part])
         self.now = self.now._replace(state=new)
@@ -381,7 +371,7 @@ class ContactProblem(Loads):
         if self._again is None:
             return False
         new, late = self._continued(Current(*self._again(at.u), self.now.state), at)
-        if late.any():  # in these parts alone are pairs replaced
+        if late.any():  # pairs are replaced in these connected parts only
             both = self.now, new
             chosen = [late[at.parts.cells[of.law.cell]] == (of is new) for of in both]
             kept = [rows[of.law.of] for rows, of in zip(chosen, both, strict=True)]
@@ -397,8 +387,7 @@ class ContactProblem(Loads):
         Pairs that are open before and after the update are ignored, as are parts after `FOLLOWS` updates.
         """
         found = self.found(at)
-        law = self.now.law
-        state = self.now.state
+        law, state = self.now.law, self.now.state
         pairs = new.law.pairs
         gap = np.einsum("md,md->m", pairs.n, pairs.offset)
         pairs = replace(pairs, offset=pairs.offset - self._apart_by(new.law, at))
@@ -452,6 +441,8 @@ class ContactProblem(Loads):
         """See `Loads`: forces, N, and moments, N m, on the bodies (3,), in 3D (6,); displacements due to loads, m."""
         where, touch, motion, _ = self.found(at)
         names = self.now.law.names
+        if self.pairs.other_side() is not None:  # arms to present positions: moments of a body at rest sum to zero
+            where = where._replace(arm=where.arm + self.grid.at(self.pairs.cell, self.pairs.x, at.nodal))
         out = {"tool_forces": dict(zip(names, self.now.law.forces(touch, where), strict=True))}
         if self.pushes is not None:
             out["tool_travel"] = dict(zip(names, self.pushes.start + motion, strict=True))
@@ -486,7 +477,7 @@ class ContactProblem(Loads):
 
 
 def _merged(both: Sequence[Any], kept: Sequence[NDArray[np.bool_]], order: NDArray[np.int64]) -> Any:
-    """Return the rows of two pairs or states that `kept` flags, as one object, sorted by the indices `order`."""
+    """Merge two objects, both `Pairs` or both `ContactState`: keep the rows flagged in `kept`, in the order `order`."""
     names = (f.name for f in fields(both[1]) if f.name != "grid")
     columns = {name: [getattr(of, name)[rows] for of, rows in zip(both, kept, strict=True)] for name in names}
     return replace(both[1], **{name: np.concatenate(rows)[order] for name, rows in columns.items()})

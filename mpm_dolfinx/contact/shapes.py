@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Shapes of rigid tools: signed distances, m, positive outside, for the initial position of the tool."""
+"""Shapes of rigid tools: signed distances, m, positive outside the tool, for its initial position."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from scipy.spatial import ConvexHull, QhullError
 from mpm_dolfinx.base.tolerances import CENTRAL, NEAR, SAME, SECOND, TINY
 from mpm_dolfinx.base.validation import asked, line, numbers
 
-ROUNDED = SAME  # penetration / cell size below which a position lies on the surface
+ROUNDED = SAME  # penetration, divided by the cell size, below which a position lies on the surface
 DISTANCE = 0.1
 """Largest deviation of the slope of a user's distance function from 1."""
 

@@ -8,12 +8,14 @@ are measured from the seeded positions, so errors do not accumulate.  Forces on 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from copy import copy
 from itertools import combinations, product
 
 from petsc4py import PETSc
 
 import numpy as np
 import scipy.sparse
+from dolfinx import fem
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
@@ -44,7 +46,7 @@ class Tie:
         alike = (one.face == one.face[0]).all() and (other.face == one.face[0] ^ 1).all()
         small = NEAR * one.whole0.min() ** (1 / max(1, at.shape[1] - 1))
         if not alike or len(one) != len(other) or len(np.unique(self.partner)) < len(one) or (off > small).any():
-            raise ValueError(f"{line(tied)}: sides, must be opposite sides of a body from mpm.box, with equal faces")
+            raise ValueError(f"{line(tied)}: its sides must be opposite sides of a body from mpm.box, with equal faces")
         self.offset = opposite[self.partner] - at
 
 
@@ -68,16 +70,13 @@ class Ties(Acting):
         self._grid, self._materials = setting.grid, setting.materials
         of = setting.sides.of
         self._ties = [Tie(tied, of(tied), of(Tied(tied.other, tied.side))) for tied in ties.values()]
+        self.surfaces = [tie.one for tie in self._ties]
+        self.seeded = [faces for tie in self._ties for faces in (tie.one, tie.other)]
         sides = [(tied, (tie.one, tie.other)) for tied, tie in zip(ties.values(), self._ties, strict=True)]
         excluded = [(one, (of(one),)) for one in setting.of(Quiet, Drained, Inflow, Rain).values()]
         for (one, faces), (other, others) in [*combinations(sides, 2), *product(sides, excluded)]:
             for a, b in product(faces, others):
                 a.check_apart(b, (one, other))
-
-    @property
-    def surfaces(self) -> list[Surface]:
-        """Faces on the first side of each tie."""
-        return [tie.one for tie in self._ties]
 
     def placed(self, place: Place) -> Loads:
         """Return the penalty forces in a substep."""
@@ -130,6 +129,7 @@ class TieLoads(Loads):
         values = np.concatenate([grid.shape_values(cell, x), -shape_values_in(grid, other, y)], axis=1)
         self._stiffness, self._gap = np.repeat(stiffness, grid.dim), gap.ravel()
         self._difference = lambda unknowns: at_nodes(grid, unknowns, cell, values, other)
+        self._cells, self._rest = (cell, other), 0.0
         self._operator: Latest[PETSc.Mat] = Latest()
 
     def _B(self, unknowns: Unknowns) -> PETSc.Mat:
@@ -140,10 +140,22 @@ class TieLoads(Loads):
         """Add the penalty forces at u."""
         B = self._B(at.unknowns)
         w = B.createVecLeft()
-        B.mult(at.unknowns.gather_owned(at.u[at.unknowns.owned]), w)
+        B.mult(at.unknowns.gather_owned((at.u + self._rest)[at.unknowns.owned]), w)
         w.array_w[:] = self._stiffness * (w.array_r + self._gap)
         B = B if on is at.unknowns else self._difference(on)
         B.multTransposeAdd(w, residual, residual)
+
+    def moved(self, u: fem.Function) -> Loads:
+        """Return the ties with differences of displacements changed by a displacement u."""
+        out = copy(self)
+        out._rest = u.x.array.copy()
+        return out
+
+    @property
+    def held_cells(self) -> NDArray[np.int32]:
+        """Cells of both sides."""
+        cell, other = self._cells
+        return np.append(cell, self._grid.local(self._grid.to_owners(other).send(other)))
 
     def pattern(self, unknowns: Unknowns) -> PETSc.Mat:
         """Return a zero matrix with the pattern of `coupling`."""

@@ -76,7 +76,7 @@ class Tool:
     shape : HalfSpace, Ball, Convex, Cone, or callable y (m, d) -> (m,), m
         The tool in its initial position.  A function returns the signed distance, positive outside the tool.
     displacement : (d,) or callable t (s) -> (d,), m
-        Displacement from the initial position, also in later stages.  In axisymmetry: along the axis.
+        Displacement from the initial position, even in later stages.  In axisymmetry: along the axis.
     rotation_rad : float or callable t (s) -> float, rad
         Counterclockwise rotation about `centre`, before the displacement; only in 2D, not in axisymmetry.
     centre : (d,), m
@@ -102,8 +102,8 @@ class Tool:
         Initial velocity of a free tool.
     moment
         Moment of inertia of a free tool about `centre`, kg m^2 (kg m in plane strain), > 0; only in 2D.  The default is
-        that of a uniform disc or polygon.  Other shapes, and tools with `direction`, do not rotate without a given
-        value.  Results are `outcome("tool_rotation")`, rad, and `outcome("tool_spin")`, rad/s.
+        that of a uniform disc or polygon.  Other shapes, and tools with `direction`, rotate only if `moment` is
+        specified.  Results are `outcome("tool_rotation")`, rad, and `outcome("tool_spin")`, rad/s.
     spin
         Initial angular velocity of a free tool, rad/s, counterclockwise.
     name
@@ -147,11 +147,10 @@ class Tool:
             what = f"Tool: load = {line(self.load)} and direction = {line(self.direction)}"
             raise ValueError(f"{what}, must be given together")
         self._check_free()
-        for name in ("displacement", "rotation_rad", "load"):
-            value = getattr(self, name)
-            if callable(value):
+        for name, value in vars(self).items():
+            if name in ("displacement", "rotation_rad", "load") and callable(value):
                 check_names(f"{line(self)}: {name}", value, ("t",))
-            elif isinstance(value, (list, np.ndarray)):
+            elif isinstance(value, (list, np.ndarray, HalfSpace, Ball, Convex, Cone)):
                 object.__setattr__(self, name, deepcopy(value))  # protects against later changes
         if self.load is not None and not callable(self.load):
             self.pushes(0.0)
@@ -169,7 +168,7 @@ class Tool:
             numbers("Tool: moment", self.moment, test=lambda v: v > 0, allowed="> 0, or infinity")
         if callable(self.displacement) or callable(self.rotation_rad):
             raise ValueError(
-                f"{line(self)}: a free tool moves by itself, displacement and rotation_rad must be constant"
+                f"{line(self)}: forces move a free tool, so displacement and rotation_rad must be constant"
             )
 
     @property
@@ -281,7 +280,7 @@ class Tool:
         return numbers("Tool: centre", self.centre, (dim,), allowed=f"{dim} finite coordinates") - self._base
 
     def pose(self, t: float, dim: int, by_forces: NDArray[np.float64] | float = 0.0) -> Pose:
-        """Return the pose at t (s).  by_forces: displacement by loads, m; of a free tool (d,), with rotation, rad."""
+        """Return the pose at t (s).  by_forces: displacement by loads, m; of a free tool (d,), m, and rotation, rad."""
         shift = self._given("displacement", t, dim)
         if shift.ndim == 0 and shift:
             raise ValueError(f"{line(self)}: displacement at t = {t:g} s = {shift:g}, must be {dim} finite numbers")

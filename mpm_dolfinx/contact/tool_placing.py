@@ -28,14 +28,14 @@ from mpm_dolfinx.contact.law import ContactLaw
 from mpm_dolfinx.contact.pairs import ToolPairs
 from mpm_dolfinx.contact.problem import ContactProblem, Pushes, SubstepMotion, Touching
 from mpm_dolfinx.contact.tool import Pose, Tool, rotation
-from mpm_dolfinx.parallel.exchange import Exchange, everywhere, first, over_all
+from mpm_dolfinx.parallel.exchange import everywhere, first, over_all
 from mpm_dolfinx.points.material_points import MaterialPoints, middle
 
-BEGINS = 1e-2  # allowed penetration / cell size into a body at the start, and into prescribed sides
-NEAR = 0.1  # distance / cell size from a tool below which corners follow the Q1 field
-STRIDE = 0.02  # thickness / cell size of a tool below which it may pass through points in a step without notice
-LEFT = 1e-3  # penetration / cell size that remains at corrected corners; full projection would roughen the stress
-FACING = 0.5  # smallest cosine between the normal of a face and the direction to the tool, if the face faces the tool
+BEGINS = 1e-2  # allowed penetration into a body at the start, and into prescribed sides, divided by the cell size
+NEAR = 0.1  # distance from a tool, divided by the cell size, below which corners follow the Q1 field
+STRIDE = 0.02  # tools thinner than this fraction of a cell may pass through points in a step without notice
+LEFT = 1e-3  # penetration of corrected corners, divided by the cell size; zero would roughen the stress
+FACING = 0.5  # smallest cosine between the normal of a face that faces the tool and the direction to the tool
 
 
 def _box(x: NDArray[np.float64]) -> list[tuple[NDArray[np.float64], MPI.Op]]:
@@ -63,7 +63,7 @@ class LoadMotion(NamedTuple):
 
 
 class Tools(Touching):
-    """The tools of a stage, with their motion in a step; setting: data of the stage; tools: by name."""
+    """The tools of a stage, with their motion in a step; setting: data of the stage; tools: tools by name."""
 
     conditions, title = (Tool,), "tools"
 
@@ -75,7 +75,7 @@ class Tools(Touching):
         still = np.zeros(len(self.tools))
         self.by_loads, self._end = LoadMotion(0.0, 0.0, still, still), None
         if len({id(tool) for tool in self.tools}) < len(self.tools):
-            raise ValueError("tools: one is given twice, must be distinct")
+            raise ValueError("tools: one tool is listed twice, must be distinct")
         for tool in self.tools:
             tool.check(grid.dim)
             if grid.axisymmetric and tool.along(grid.dim)[0]:
@@ -101,7 +101,7 @@ class Tools(Touching):
     def masses(self) -> NDArray[np.float64]:
         """Masses, kg, and moments of inertia, kg m^2, of free tools (tools, q); 0 for other tools."""
         d = self.grid.dim
-        out = np.array([np.full(motion_count(d), tool.mass or 0.0) for tool in self.tools])
+        out = np.array([np.full(motion_count(d), float(tool.mass or 0)) for tool in self.tools])
         for row, tool in zip(out, self.tools, strict=True):
             if tool.rotates(d):
                 row[d:] = tool.inertia(d)
@@ -142,7 +142,7 @@ class Tools(Touching):
     def _posed(self, tool: Tool, start: float, t: float) -> Pose:
         """Return the pose of a tool at time t (s), the end of a substep.
 
-        With inertia, the first of two substeps needs the displacement with the exact velocity, see `in_step`.
+        With inertia, the first of two substeps needs the displacement that gives the exact velocity, see `in_step`.
         """
         pose = self._pose(tool, t)
         if self._end is None or not start < t < self._end or tool.free:
@@ -161,7 +161,7 @@ class Tools(Touching):
         pose = tool.pose(t, self.grid.dim, self.by_loads.at(t)[self.tools.index(tool)])
         if self.grid.axisymmetric and (pose.shift[0] or pose.R[0, 1]):
             what = f"moves by {pose.shift}{' and rotates' * bool(pose.R[0, 1])} at t = {t:g} s"
-            raise ValueError(f"{line(tool)}: {what}, must move by (0, z) and not turn in axisymmetry")
+            raise ValueError(f"{line(tool)}: {what}, must move by (0, z) and not rotate in axisymmetry")
         return pose
 
     def unknown(self, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:
@@ -193,7 +193,7 @@ class Tools(Touching):
         return out
 
     def placed(self, place: Place) -> Loads:
-        """Return the contact loads of tools in a substep; without inertia free tools keep their position."""
+        """Return the contact loads of tools in a substep; without inertia, free tools keep their position."""
         before = self._before(place)
         tools = self.going(LoadMotion(place.start, place.t, before, before), place.start + place.dt * place.inertia)
         if not (self.free and place.inertia):  # an initial stress is balanced without inertia
@@ -227,12 +227,12 @@ class Tools(Touching):
             scalars = [np.full(len(at), number), size[at], resistances[at], pressure]
             found.append((at, np.concatenate([np.stack(scalars, axis=1), *vectors], axis=1)))
         at, values = (np.concatenate(column) for column in zip(*found, strict=True))
-        exchange = Exchange(grid.comm, grid.owner(patches.cell[at]))
-        cell, place, sent = (exchange.send(rows) for rows in (patches.cell[at], patches.x[at], values))
+        exchange = grid.to_owners(patches.cell[at])
+        cell, places, sent = (exchange.send(rows) for rows in (patches.cell[at], patches.x[at], values))
         number, *own = sent[:, :4].T
         now, carried, shear = np.split(sent[:, 4:], 3, axis=1)
         acts = np.ones(len(number)), self.tools, poses
-        pairs = ToolPairs(grid, number.astype(np.int64), grid.local(cell), *own, shear, place, *acts, now, carried)
+        pairs = ToolPairs(grid, number.astype(np.int64), grid.local(cell), *own, shear, places, *acts, now, carried)
         origin = Origin(exchange, patches.at[at], values[:, 0].astype(np.int64), values[:, 1])
         along = np.array([tool.along(d) for tool in self.tools])
         pushes = Pushes([line(tool) for tool in self.tools], self.by_loads.before, along, np.array(loads))
@@ -246,7 +246,7 @@ class Tools(Touching):
         The last loaded node also carries half a cell outside the edge, so this margin has no contact.  A tool narrower
         than a cell keeps its whole contact.
 
-        x, unit (m, d): positions on the surface, m, and outward normals; faces (m,): which of these face the tool.
+        x, unit (m, d): positions on the surface, m, and outward normals; faces (m,): whether each faces the tool.
         """
         grid, (y, n) = self.grid, (x[faces], unit[faces])
         h = grid.sizes_at(y)
@@ -296,7 +296,7 @@ class Tools(Touching):
                 deep, where = self._deepest(tool, place.cut.surface(faces).now(points), t)
                 if deep > BEGINS:
                     what = f"{line(tool)} and {line(hold)}: both act at {where} at t = {t:g} s"
-                    raise ValueError(f"{what}, must not; limit the displacement by a region, or move the tool")
+                    raise ValueError(f"{what}, must be apart; limit the displacement by a region, or move the tool")
             corners = points.corners[self._gaps(tool, points.corners, t).min(axis=1) < -BEGINS * self.grid.least]
             deep, where = self._deepest(tool, points.x, t)
             held, at_middle = self._deepest(tool, middle(corners), t)
@@ -319,12 +319,12 @@ class Tools(Touching):
     def pushed_out(
         self, corners: NDArray[np.float64], t: float, free: NDArray[np.bool_], most: float
     ) -> NDArray[np.float64]:
-        """Return corners of domains after a correction that reduces small penetrations into tools to `LEFT`.
+        """Return the corners of domains; small penetrations into tools are reduced to the tolerated depth `LEFT`.
 
         Tools constrain means over cells, so corners of sliding domains would remain inside the tool.
 
         corners (n, 2^d, d): corners of the domains, m; t: time, s; free (n, 2^d, d): whether no other condition
-        prescribes a component; most: (largest penetration that is corrected) / cell size.
+        prescribes a component; most: largest corrected penetration, divided by the cell size.
         """
         out, h = corners.copy(), self.grid.least
         for tool in self.tools:
@@ -370,7 +370,7 @@ class Tools(Touching):
         return ""
 
     def _deepest(self, tool: Tool, x: NDArray[np.float64], t: float) -> tuple[float, str]:
-        """Return (largest penetration of positions x (m, d) into a tool) / cell size, and the position as text."""
+        """Return the largest penetration of positions x (m, d) into a tool, in cell sizes, and the position as text."""
         h, pose = self.grid.least, self._pose(tool, t)
         gap = everywhere(self.grid.comm, lambda: tool.solid(h).distance(pose.own(x)))
         deepest = over_all(self.grid.comm, float(gap.min(initial=np.inf)), MPI.MIN)
@@ -381,7 +381,7 @@ class Tools(Touching):
 
 
 class ToolLoads(ContactProblem):
-    """Contact loads of tools in a substep; tools: with their motion in the step; place: positions and times."""
+    """Contact loads of tools in a substep; tools: tools and their motion in the step; place: positions and times."""
 
     def __init__(self, tools: Tools, place: Place):
         super().__init__(*tools.contact(place))
@@ -434,4 +434,4 @@ class ToolLoads(ContactProblem):
 
 
 class FreeToolLoads(FreeTools, ToolLoads):
-    """Contact loads of tools, among them free tools."""
+    """Contact loads of tools, of which at least one is free."""

@@ -72,7 +72,7 @@ def warn_smeared(
     Parameters
     ----------
     least
-        Lost fraction from which a material is named, in [0, 1].
+        Smallest lost fraction, in [0, 1], of which the function warns.
 
     Returns
     -------
@@ -111,8 +111,8 @@ def _losses(cut: CutDomains, volume: NDArray[np.float64], modulus: NDArray[np.fl
     """Return for owned cells (n,): lost volume of the softest material, m^d, modulus ratio, and one of its pieces.
 
     With moduli M and volume fractions s in a cell, layers in series have the compliance sum s/M.  Equal strain in the
-    cell gives 1 / sum s M instead.  The loss is the difference of both, divided by the largest 1/M.  The loss is at
-    most (1 - sqrt(r))^2 of the cell for two moduli of ratio r < 1.
+    cell gives 1 / sum s M instead.  The loss is the difference of both compliances, divided by the
+    largest 1/M.  For two moduli of ratio r < 1, the loss is at most (1 - sqrt(r))^2 of the cell.
     """
     n, order = cut.grid.num_owned, np.argsort(-modulus, kind="stable")
     softest, hardest = (np.zeros(n, dtype=np.int64) for _ in range(2))
@@ -126,21 +126,21 @@ def _losses(cut: CutDomains, volume: NDArray[np.float64], modulus: NDArray[np.fl
     return np.where(loss > FINE * total, loss, 0.0), contrast, softest
 
 
-COARSE = 0.7  # of a cell: in larger domains, constant stress costs more stiffness than Q1 bending adds
+COARSE = 0.7  # fraction of a cell: in larger domains, constant stress costs more stiffness than Q1 bending adds
 FEW = 3  # points over the thickness at which bending is an eighth too large.  Source: exact, 1 / (n^2 - 1)
-SLENDER = 4  # length / thickness from which a body counts as a beam
-LOST_WET = 2.5  # (lost fraction of a wet beam's stiffness) x n^2: in sealed beams 1.8, 2.3, 3.2 with n = 4, 8, 16
+SLENDER = 4  # length divided by thickness from which on a body counts as a beam
+LOST_WET = 2.5  # lost fraction of a wet beam's stiffness, times n^2: 1.8, 2.3, 3.2 for n = 4, 8, 16 in sealed beams
 FEW_WET = int((100 * LOST_WET) ** 0.5)  # points with a loss of 1 %.  Source: exact, by LOST_WET
-SLENDER_WET = 2  # length / thickness from which a wet body counts as a beam
+SLENDER_WET = 2  # length divided by thickness from which on a wet body counts as a beam
 
 
 def warn_thin(grid: Grid, bodies: Sequence[Body], walls: Mapping[str, str], wet: bool) -> None:
     """Warn about each slender body that can bend and has too few points over its thickness.
 
     The increment of stress is constant in a cut domain, so n points over the thickness give 1 - 1/n^2 of the bending
-    stiffness in a single step, and more in several steps (`domain_slopes`).  A body with a single point carries no
-    moment, and creeps from step to step, because only the increment of a step resists.  Saturated bodies (wet) lose
-    more stiffness, as measured, and continue to creep.
+    stiffness in a single step, and more in several steps (`domain_slopes`).  A body with one point over its thickness
+    carries no moment, and creeps from step to step, because only the increment of a step resists.  Saturated bodies
+    (`wet`) lose more stiffness, as measurements show, and continue to creep.
     """
     few, slender = (FEW_WET, SLENDER_WET) if wet else (FEW, SLENDER)
     for i, body in enumerate(bodies):

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.tolerances import NEAR
-from mpm_dolfinx.parallel.exchange import Exchange
 from mpm_dolfinx.points.active import ActiveSet
 
 
@@ -52,7 +51,7 @@ def check_held(
     for cell, other, place, along in holds:
         both, sides = [part[cell]], 1
         if other is not None:
-            exchange, sides = Exchange(grid.comm, grid.owner(other)), 2
+            exchange, sides = grid.to_owners(other), 2
             both.append(exchange.back(part[grid.local(exchange.send(other))]))
         number = np.concatenate([number, *both])
         against = np.concatenate([against, *(both[::-1] if sides == 2 else [np.zeros(len(cell), dtype=np.int64)])])
@@ -80,7 +79,7 @@ def check_held(
                 f"the part at [{' '.join(f'{x:.9g}' for x in places[0][0] + grid.base)}]" if count > 1 else "the body"
             )
             raise ValueError(
-                f"walls: {where} is free to move as a rigid body in {missing[k - 1]} of {len(modes)} ways; "
+                f"walls: {where} is free to move as a rigid body in {missing[k - 1]} of {len(modes)} modes; "
                 "it must be constrained by walls that it touches, by prescribed displacements, or by contact with "
                 "a tool or a constrained group"
             )

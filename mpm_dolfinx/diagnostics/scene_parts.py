@@ -36,7 +36,7 @@ def check_options(
     """Raise an error for invalid terms, sources or quadrature, and for pressures and sources without fluid."""
     rotated = [i for i, body in enumerate(bodies) if not body.aligned]
     if quadrature == "point" and rotated:
-        raise ValueError(f"quadrature 'point': body {rotated[0]} is mapped or a mesh, must be a box along the grid")
+        raise ValueError(f"quadrature = 'point': body {rotated[0]} is mapped or a mesh, must be a box along the grid")
     functions("terms", _functions_of(terms))
     functions("sources", sources)
     if fluid is not None:
@@ -50,7 +50,7 @@ def check_options(
 def check_axisymmetry(grid: Grid, bodies: Sequence[Body], quadrature: str) -> None:
     """Raise an error for invalid axisymmetric scenes.  Warn about narrow holes around the axis."""
     if grid.axisymmetric and quadrature == "point":
-        raise ValueError("quadrature 'point': must be domain in axisymmetry")
+        raise ValueError("quadrature = 'point', must be 'domain' in axisymmetry")
     if not grid.has_axis:
         return
     x = np.concatenate([body.corners() for body in bodies])

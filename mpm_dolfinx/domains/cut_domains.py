@@ -23,7 +23,7 @@ from mpm_dolfinx.points.cutting import Pieces, cut, cut_faces
 from mpm_dolfinx.points.material_points import MaterialPoints, middle
 
 STILL = 3e-4
-"""Largest motion of corners / cell size for which a cut remains valid.  After larger motion the domains are cut again.
+"""Largest motion of corners, divided by the cell size, for which a cut remains valid.  Otherwise domains are cut again.
 
 Compared with a new cut in every step, pressures in a consolidating column of ten cells change by 7e-5 of the load.  The
 settlement changes by 3e-5 of its value.  Both changes are proportional to STILL.
@@ -123,7 +123,7 @@ class CutDomains(Keyed):
         self.pieces = cut(grid, points.corners, second, faces) if domains else whole_points(grid, points.x)
         if grid.copies > 1:
             self.pieces.cell += grid.copy(points.id)[self.pieces.point]
-        exchange = Exchange(grid.comm, grid.owner(self.pieces.cell))
+        exchange = grid.to_owners(self.pieces.cell)
         self.pieces_to_cells = exchange.send
         """Function that sends values of the pieces to the owners of their cells."""
         self.to_pieces = exchange.back
@@ -138,7 +138,7 @@ class CutDomains(Keyed):
         """In axisymmetry: moments (m, 4) of the pieces in the plane, see `Pieces`."""
 
     def moved(self, points: MaterialPoints, part: NDArray[np.int64], count: int) -> NDArray[np.float64]:
-        """Return for each connected part (count,) the largest motion of corners since the cut / cell size.
+        """Return for each connected part (count,) the largest motion of corners since the cut, in cell sizes.
 
         `part` (n,) is the index of the part to which each point belongs.
         """
@@ -245,7 +245,7 @@ class CutDomains(Keyed):
         x = self.points.corners.reshape(-1, d) if self.domains else self.points.x
         # rounding must not assign a corner on a grid line to a cell outside the domain
         cell = self._filled_cell(at, x + NEAR * (self.points.x[at] - x))
-        exchange = Exchange(grid.comm, grid.owner(cell))
+        exchange = grid.to_owners(cell)
         return exchange, grid.local(exchange.send(cell)), exchange.send(x)
 
     def total_displacement(self, points: MaterialPoints) -> NDArray[np.float64]:

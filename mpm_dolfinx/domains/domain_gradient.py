@@ -52,7 +52,7 @@ def _of_hexahedra(
 
 
 def _slopes(X: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the derivatives (8, 3, n), m^2, of the volumes of hexahedra by their corners X (8, 3, n), m."""
+    """Return the derivatives (8, 3, n), m^2, of hexahedron volumes with respect to the corners X (8, 3, n), m."""
     slope = np.zeros_like(X)
     for face, sign in zip(FACES[3], FACE_SIGNS, strict=True):
         p, q, r, s = X[face]
@@ -68,7 +68,7 @@ def _slopes(X: NDArray[np.float64]) -> NDArray[np.float64]:
 def volume_slopes(
     corners: NDArray[np.float64], axisymmetric: bool = False
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the volumes (n,) of domains, m^d, and their derivatives (n, 2^d, d) by the corners, m^(d-1).
+    """Return the volumes (n,) of domains, m^d, and derivatives (n, 2^d, d) with respect to corners, m^(d-1).
 
     In axisymmetry the domains are rings: volumes, m^3, are integrals of pi r^2 dz, and the derivatives are in m^2.
     """
@@ -92,10 +92,10 @@ def cell_ratios(
     """Return the volume ratios (m,) of the pieces of a cut at the start of a step.
 
     With mean dilatation, the ratio of a cell is the current volume of its domains, computed from the corners, divided
-    by the reference volume.  This ratio does not depend on the path of deformation.  Differences between the ratios of
-    domains in a cell do no work, so no force would oppose a drift of ratios updated by increments only.  Without
-    mean dilatation, pieces have the ratio of their point.  The same applies in cells with yielded soil, because corner
-    volumes are meaningless near plastic flow.
+    by the reference volume.  This ratio does not depend on the path of deformation.  Differences between the volume
+    ratios of domains in a cell do no work.  If ratios were updated by increments only, no force would oppose a drift.
+    Without mean dilatation, pieces have the ratio of their point.  The same applies in cells with yielded soil, because
+    corner volumes are meaningless near plastic flow.
 
     cut, points: cut particle domains, and points at the start of the step; share (n,): weight, in [0, 1], of the ratio
     from corners in the geometric mean of this ratio and the ratio of the point; 0 without mean dilatation.  flows (n,):

@@ -33,7 +33,7 @@ from mpm_dolfinx.points.material_points import body_of, cofactor, determinant
 
 
 class Neighbours:
-    """Neighbours of domains across shared faces, also on other processes.
+    """Neighbours of domains across shared faces, including neighbours on other processes.
 
     comm: communicator of the processes; bodies: all bodies of the scene; ids (n,): identifiers of the material points
     of this process; chosen (n,): whether to find the neighbours of each point.
@@ -62,7 +62,7 @@ class Neighbours:
         self._partner = partner.reshape(-1, 2 * dim).T.copy()  # index of the opposite face; -1 if there is none
 
     def at_neighbours(self, own: NDArray[np.float64], faces: Sequence[NDArray[np.float64]]) -> Callable[[int], tuple]:
-        """Return a function of a face index.  It returns the neighbours' data (c, k) and face centres, and which exist.
+        """Return a function of a face index.  It returns the neighbours' data (c, k), face centres, and a mask.
 
         `own` (c, k) are c data columns of the k points.  `faces` are, for each face index, the face centres (d, k), m.
         """
@@ -151,7 +151,7 @@ def linear_gradients(
 def _slopes(
     neighbours: Neighbours, cut: CutDomains, F: NDArray[np.float64], soils: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the derivatives (d, k, k, r) of F by xi, and the inverse edge matrices (d, d, r) of domains, 1/m."""
+    """Return the derivatives dF/dxi (d, k, k, r), and the inverse edge matrices (d, d, r) of domains, 1/m."""
     rows = neighbours.rows
     d, k = cut.grid.dim, F.shape[1]
     corners = cut.points.corners[rows].transpose(1, 2, 0).copy()

@@ -8,9 +8,9 @@ overfill.  After a step the corners of yielded domains therefore move by the d t
 
     sum_p V_p e_p^2 + SOFT^2 sum_p V_p mean |d / h|^2,  V_p e_p = V_p - V - dV/dx d,
 
-with the volumes V_p of a point and V of its domain, the mean over the corners of the domain, and the edges h of cells.
+V_p is the volume of a point and V that of its domain; the mean is over the domain's corners; h are edges of cells.
 Both sums are integrals over the soil, so a slice moves as in plane strain.  Shared corners move together.  Corners of
-elastic domains and held corners stay.  Kugelstadt et al. (2019) correct densities of cells in this way.
+elastic domains and held corners do not move.  Kugelstadt et al. (2019) correct densities of cells in this way.
 """
 
 from __future__ import annotations

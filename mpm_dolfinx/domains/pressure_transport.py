@@ -64,7 +64,7 @@ class PiecePressures:
         return self._each(exchange.send)._ordered()
 
     def potentials(self, bulk: float) -> PiecePressures:
-        """Return mass potentials in place of pressures, for a fluid of bulk modulus `bulk`, Pa, see `transport`."""
+        """Return mass potentials (see `fluid_content`) instead of pressures, for a fluid of bulk modulus `bulk`, Pa."""
         pi, bounds = mass_potential(self.pressure, bulk), mass_potential(self.bounds, bulk)
         slope = np.exp(self.pressure / bulk)[:, None] * self.slope
         return replace(self, pressure=pi, slope=slope, bounds=bounds)
@@ -160,7 +160,7 @@ class Reconstruction:
     def up_to_surface(
         self, pressures: CellPressures, x: NDArray[np.float64], slot: NDArray[np.int64]
     ) -> NDArray[np.float64]:
-        """Return pressures (m,), Pa, at positions in owned cells, with second-order accuracy also at the surface.
+        """Return pressures (m,), Pa, at positions in owned cells, with second-order accuracy even at the surface.
 
         In a cell at a no-flow side, the slope is the smaller of the slope in the next cell inside, and the linear
         extrapolation of the slopes inside.  Linear fields are exact, and steep slopes are not continued.  Pressures
@@ -216,7 +216,7 @@ def _bounds_of(jump: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[
 
 
 def transport(old: PiecePressures, points: MaterialPoints, new: Pieces) -> NDArray[np.float64]:
-    """Return the pressures (m,), Pa, of the new pieces, or the mass potentials if `old` contains mass potentials."""
+    """Return the pressures (m,), Pa, of the new pieces; mass potentials (`fluid_content`) if `old` contains these."""
     n = len(points)
     if not n:
         return np.empty(0)

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -27,18 +27,18 @@ from mpm_dolfinx.points.polygons import NONE, Polygons
 from mpm_dolfinx.points.surface_in_cells import BOX, EDGES, RING, Region, resampled
 
 GAP = 0.01
-"""Largest gap / cell size between faces of two domains that still count as one surface.  Halving this value changes the
-result of scene "flow" in tests/plateaus.py by 2.5e-05 (relative), doubling it by 0.0e+00, and finer cells by 9.0e-02.
-"""
+"""Largest gap between faces of two domains that count as one surface, divided by the cell size.  Halving this value
+changes the result of scene "flow" in tests/plateaus.py by 2.5e-05 (relative), doubling it by 0.0e+00, and
+finer cells by 9.0e-02."""
 CRUMB = NEAR
-"""Area of a part / area of its cell, below which the part is dropped; others receive its mass.  Source: as `NEAR`."""
+"""Area of a part, divided by the area of its cell, below which other parts receive its mass.  Source: as `NEAR`."""
 SMALL = (0.5 / EDGES) ** 2
-"""Area of a part / area of its cell.  A cell in which renewal leaves a smaller part of a domain is renewed too.
+"""Area of a part in cell areas.  A cell in which renewal leaves a smaller part of a domain is renewed too.
 
 Source: definition, a square with half the length of an edge of the surface, which has `EDGES` edges in a cell.
 """
 COVERED = 0.25
-"""Largest difference (area of pieces) - (filled area) in a cell / cell area.  Source: definition, one domain."""
+"""Largest difference between the pieces' area and the filled area, in cell areas.  Source: definition, one domain."""
 SIDE = np.array([2, 1, 3, 0])
 """Index of the face at each edge of the ring of a domain's corners."""
 START, END = np.array([2, 1, 0, 3]), np.array([0, 3, 1, 2])
@@ -374,28 +374,25 @@ class RefilledCells:
                 area[at, face] = np.linalg.norm(b[at] - a[at], axis=1) * around * dense[sides]
         return New(self._place(cells, local), self._group(cells), parent, area, ends)
 
-    @property
-    def remainders(self) -> New:
-        """New domains for the remaining parts of removed domains outside the renewed cells."""
-        return self._remainders[0]
-
-    @property
-    def outside(self) -> NDArray[np.int64]:
-        """Indices of the pieces of removed domains outside the renewed cells."""
-        return self._remainders[1]
-
     @cached_property
-    def _remainders(self) -> tuple[New, NDArray[np.int64]]:
-        """The results of `remainders` and `outside`.  New domains from the same piece form a group, see `New`."""
+    def remainders(self) -> tuple[New, NDArray[np.int64]]:
+        """Pieces of removed domains outside the renewed cells: new domains, a group for each piece; the pieces."""
         pieces, points = self.pieces, self.points
         left = np.flatnonzero(self.affected[pieces.point] & ~self.chosen[self.cell])
         left = left[self._areas[left] > CRUMB * self._volume(self.cell[left])]
         rings, of = _convex(points.corners[pieces.point[left]], self._volume(self.cell[left]))
+        faces = self.faces
+        index = np.full((len(points), 5), NONE)  # index of each face among the outer faces; the last one stays NONE
+        index[faces.point, faces.face] = np.arange(len(faces.face))
+        outer = index[pieces.point[left[of]][:, None], rings.edge] != NONE
+        rings = replace(rings, edge=np.where(outer, rings.edge, NONE))
         rings, of = rings.of(np.repeat(np.arange(len(of)), 4)), np.repeat(of, 4)
         halves = np.tile((BOX + corner_bits(2)[:, None]) / 2, (len(of) // 4, 1, 1))
         near = NEAR * self.grid.least  # tolerance: rounding would otherwise split a surface on a grid line
-        polygons = rings.within(self._place(self.cell[left][of], halves), near).simplified(near)
-        row, quads, edge = polygons.quadrilaterals()
+        halves = self._place(self.cell[left][of], halves)
+        polygons = rings.within(halves, near)
+        inside = np.clip(polygons.x, halves.min(axis=1)[:, None], halves.max(axis=1)[:, None])
+        row, quads, edge = replace(polygons, x=inside).simplified(near).quadrilaterals()
         piece = left[of[row]]
         large = np.flatnonzero(Polygons.rings(quads).area > CRUMB * self._volume(self.cell[piece]))
         large = large[np.lexsort((self.cell[piece[large]], pieces.point[piece[large]]))]  # crumbs change no numbers
@@ -404,14 +401,9 @@ class RefilledCells:
         corners = np.empty_like(quads)
         corners[:, RING] = quads
         parent, area, ends = _no_faces(len(quads))
-        faces = self.faces
-        index = np.full((len(points), 4), NONE)
-        index[faces.point, faces.face] = np.arange(len(faces.face))
         for k in range(4):
             at = np.flatnonzero(edge[:, k] != NONE)
-            row = index[pieces.point[piece[at]], edge[at, k]]
-            at, row = at[row != NONE], row[row != NONE]
-            face = SIDE[k]
+            row, face = index[pieces.point[piece[at]], edge[at, k]], SIDE[k]
             old = points.corners[faces.point[row]]
             low, high = (old[np.arange(len(row)), FACES[2][faces.face[row], e]] for e in (0, 1))
             chord = high - low
@@ -449,15 +441,16 @@ class RefilledCells:
         inverse = np.where(some, 1 / np.where(some, value, 1.0), 0.0)
         sizes = grid.sizes_of(np.arange(self.cells))[..., None]
         slope = (axes * inverse[:, None]) @ axes.swapaxes(1, 2) @ right / sizes
-        return slope[np.concatenate([np.flatnonzero(self.chosen), self.cell[self.outside]])[group]]
+        cells = np.concatenate([np.flatnonzero(self.chosen), self.cell[self.remainders[1]]])
+        return slope[cells[group]]
 
     @cached_property
     def into(self) -> tuple[NDArray, NDArray, NDArray]:
         """Pieces of removed domains, the group that receives each piece, and the piece's fraction of the domain."""
-        pieces = self.pieces
+        pieces, outside = self.pieces, self.remainders[1]
         into = np.flatnonzero(self.chosen[self.cell] & self.affected[pieces.point])
-        piece = np.concatenate([into, self.outside])
-        groups = np.concatenate([self._group(self.cell[into]), int(self.chosen.sum()) + np.arange(len(self.outside))])
+        piece = np.concatenate([into, outside])
+        groups = np.concatenate([self._group(self.cell[into]), int(self.chosen.sum()) + np.arange(len(outside))])
         share = pieces.fraction[piece]
         whole = sum_by(pieces.point[piece], share, len(self.points))
         return piece, groups, share / whole[pieces.point[piece]]  # includes the mass of dropped parts
@@ -470,11 +463,10 @@ class RefilledCells:
         of, at = ranges(first, stop - first)
         at = order[at]
         old = self.pieces.point[piece[of]]
-        common = np.zeros(len(of))
         rings, which = _convex(self.points.corners[old], self._volume(self.cell[piece[of]]))
         both = rings.within(corners[at][which][:, RING])
         around = self.grid.around(both.centroid) if self.grid.axisymmetric else 1.0
-        common += np.maximum(sum_by(which, both.area * around, len(of)), 0.0)
+        common = np.maximum(sum_by(which, both.area * around, len(of)), 0.0)
         whole = np.abs(domain_volumes(corners[at], self.grid.axisymmetric))
         common += EPSILON * whole  # a domain without overlap receives the mean of its cell
         total = sum_by(of, common, len(piece))
@@ -499,8 +491,9 @@ class RefilledCells:
         number = self._group(cell)
         whole = np.maximum(sum_by(number, length, count), TINY)
         means = np.stack([sum_by(number, length * column, count) / whole for column in flat.T], axis=1)
-        pieces = values[self.pieces.point[self.outside]].reshape(len(self.outside), flat.shape[1])
-        out = np.concatenate([means, pieces])[group] * (parent != NONE).any(axis=1)[:, None]
+        pieces = values[self.pieces.point[self.remainders[1]]]
+        out = np.concatenate([means, pieces.reshape(len(pieces), flat.shape[1])])[group]
+        out *= (parent != NONE).any(axis=1)[:, None]
         return out.reshape(len(corners), *values.shape[1:])
 
 

@@ -16,7 +16,7 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 PARENT = "renewed faces"
 AREA = "renewed areas"
 ENDS = "renewed ends"
-"""Names of data of a point's faces: key of the seeded face, or -1; seeded area, m^(d-1); ends in the reference, m."""
+"""Names of data of a point's faces: seeded face's key, or -1 (PARENT); seeded area, m^(d-1); reference ends, m."""
 
 
 def keys(point: NDArray[np.int64], face: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -46,7 +46,7 @@ class RenewedFaces:
     old: NDArray[np.bool_] | None = None  # in the result of `of`: which positions lie on seeded faces (n,)
 
     def of(self, number: NDArray[np.int64]) -> RenewedFaces:
-        """Return the renewed faces with indices `number` (n,); rows of negative indices, of seeded faces, are `old`."""
+        """Return the renewed faces with indices `number` (n,); rows of seeded faces (index < 0) are `old`."""
         old, at = number < 0, np.maximum(number, 0)
         if not len(self.row):
             return RenewedFaces(*(np.zeros((len(number), *v.shape[1:]), v.dtype) for v in self._columns), old)

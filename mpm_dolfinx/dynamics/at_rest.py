@@ -32,18 +32,10 @@ def balancing_tractions(
     Tractions are forces per reference area, computed from the stresses.  On a connected part, resultants and
     moments of tractions and of reactions may differ.  Rigid-body fields of tractions remove this difference.
 
-    Parameters
-    ----------
-    cut, points
-        Cut particle domains, and material points.
-    stresses, surfaces
-        Total stresses (faces, k, k), Pa, on the sides, and the sides; both by name of the side.
-    parts
-        Connected parts of the bodies.
-    forces : (nodes, d), N
-        Reactions of the sides at the owned nodes of this process, zero at other nodes.
-    held : (nodes, d)
-        Which displacement components remain fixed.
+    cut, points: cut particle domains, and material points; stresses, surfaces: total stresses (faces, k, k), Pa, on the
+    sides, and the sides, both by name of the side; parts: connected parts of the bodies; forces (nodes, d), N:
+    reactions of the sides at the owned nodes of this process, zero at other nodes; held (nodes, d): which displacement
+    components remain fixed.
     """
     grid, d = cut.grid, cut.grid.dim
     patches = cut.surfaces(list(surfaces.values()))

@@ -32,8 +32,8 @@ def traction_name(name: str) -> str:
 
 
 class QuietForms:
-    """Forms at points on quiet sides.  Fields are the tangential and the normal minus the tangential impedance,
-    kg/m^2/s, and the constant traction, Pa: the traction at rest plus the traction of incoming waves.
+    """Forms at points on quiet sides.  Fields are two impedances, kg/m^2/s: the tangential, and the normal minus the
+    tangential one.  A further field is the constant traction, Pa, at rest plus that of incoming waves.
     """
 
     def __init__(self, grid: Grid, u: fem.Function, velocity: Velocity):

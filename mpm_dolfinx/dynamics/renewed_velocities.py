@@ -32,8 +32,8 @@ class Momenta(NamedTuple):
     ) -> Momenta:
         """Return the momenta of `count` groups.
 
-        piece (m,): indices in `pieces`; group (m,), mass (m,), kg: of each piece; v (n, 2), m/s, L (n, 2, 2), 1/s:
-        velocities and velocity gradients of the domains.
+        piece, group (m,), mass (m,), kg: index in `pieces`, group and mass of each piece; v (n, 2), m/s, L (n, 2, 2),
+        1/s: velocities and velocity gradients of the domains.
         """
         of, x = pieces.point[piece], pieces.x[piece]
         second = pieces.second[piece]
@@ -55,7 +55,7 @@ def velocities(
 
     The correction is a rigid motion of each group of domains; it restores momentum and angular momentum of the group.
 
-    corners (n, 4, 2), x (n, 2), m, group (n,): of each new domain; masses, kg: masses of the old and new points.
+    corners (n, 4, 2), x (n, 2), m, group (n,): corners, place, group of new domains; masses, kg: of old and new points.
     """
     points = work.points
     n, count = len(x), int(group.max()) + 1
@@ -77,10 +77,10 @@ def velocities(
 
 
 def centred(work: RefilledCells, group: NDArray, x: NDArray, mass: NDArray, old: NDArray) -> NDArray[np.float64]:
-    """Return masses (n,) of new domains at x (n, 2), m, shifted within each cell so that the old centre of mass stays.
+    """Return masses (n,), kg, of new domains at x (n, 2), m, changed within each cell so that the centre of mass stays.
 
     group (n,): group of each new domain; old (points,): masses of the old domains.  A mass changes by at most half;
-    if this limit applies, the centre moves.  Outside the renewed cells a group is of one domain, and its masses stay.
+    if this limit applies, the centre moves.  Outside the renewed cells a group is one domain, and its mass stays.
     """
     cells, inside = int(work.chosen.sum()), group < work.chosen.sum()
     received = _received(work, old)

@@ -34,7 +34,7 @@ class Borders:
     cells : (m,)
         Cell of each piece.
     soils : (m, k)
-        Constants of the soil of each piece.
+        Numbers that identify the soil of each piece: equal rows have the same conductivity.
     law : (m,)
         Index of the retention curve of each piece.
     facets
@@ -133,7 +133,7 @@ class Borders:
         outer: NDArray[np.float64],
         drop: NDArray[np.float64],
     ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]]:
-        """Yield indices (k,) of faces at owned mixed cells, k_r and derivatives (k,), see `Relative.through_sides`."""
+        """Yield (k,) indices of faces at owned mixed cells, k_r, and derivatives, see `Relative.through_sides`."""
         rows = np.flatnonzero(self.mixed[cells] >= 0)
         if not len(rows):
             return
@@ -168,7 +168,7 @@ class BorderFaces:
     mobility: Mobility  # mobility of the filled owned cells
     laws: Any  # relative conductivities, see `Laws`
     pair: NDArray[np.int64]  # local cells on both sides (2, m)
-    area: NDArray[np.float64]  # (m,), m^(d-1)
+    area: NDArray[np.float64]  # areas (m,), m^(d-1)
     paths: list[Paths]  # flow paths from the cells on both sides to the faces, see `through`
     lengths: list[NDArray[np.float64]]  # lengths of the flow paths (m,), m
     offsets: list[NDArray[np.float64]]  # vectors along paths (m, d), m, for the pressure drops by weight
@@ -195,7 +195,7 @@ class BorderFlows:
 
     pair: NDArray[np.int64]  # local cells on both sides (2, m)
     flux: NDArray[np.float64]  # flux from the first to the second cell (m,), m^d/s
-    slopes: list[NDArray[np.float64]]  # derivatives by the pressures on both sides (m,), m^d/(Pa s)
+    slopes: list[NDArray[np.float64]]  # derivatives with respect to the pressures on both sides (m,), m^d/(Pa s)
 
     def add_fluxes(self, out: NDArray[np.float64]) -> None:
         """Add the fluxes to the outflows of the local cells (c,), m^d/s."""

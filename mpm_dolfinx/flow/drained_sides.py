@@ -3,7 +3,7 @@
 
 The outflow of a cell through a face is either prescribed, or computed as T r [p - p_out + rho_w g . (x_out - x)].  Here
 p is the pressure at the centroid x of the cell's material, and p_out the pressure outside at the face, x_out.  T is A
-kappa / d, with the area A of the face, the mobility kappa (conductivity / unit weight), and the distance d from x to
+kappa / d.  A is the area of the face, kappa the mobility (conductivity / unit weight), and d the distance from x to
 the face.  r is the density of the fluid divided by the density at zero pressure.  At a seepage face, fluid can only
 leave.  A primal-dual active-set method (Hintermueller, Ito and Kunisch 2002) opens faces with outflow and closes the
 others: at the start of the substep and after each solution (`SideFeeds.settle`).  Infiltration is the rain, but at most
@@ -35,7 +35,7 @@ from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.parallel.exchange import everywhere, over_all
 
 THICK = np.sqrt(2)
-"""(Area of the largest plane section of a cube) / (area of a face).  Source: exact bound (Ball 1986).
+"""Area of the largest plane section of a cube, divided by the area of a face.  Source: exact bound (Ball 1986).
 
 Let a convex body of volume V in a cell of edge length h lie on one side of a plane.  The distance from its centroid to
 the plane is at least V / ((d + 1) THICK h^(d-1)).  A face closer to the centroid of the cell's material, or behind it,
@@ -188,8 +188,8 @@ class UnsaturatedFaces(OpenFaces):
     ) -> tuple[NDArray[np.float64] | float, NDArray[np.float64] | float]:
         """Return the non-orthogonal correction, here no flow but only a fraction of the two-point flux, in [-1, 1].
 
-        Conductivities change by decades in a step, so the correction must be proportional to the flux.  Limits keep
-        the correction from emptying the soil.
+        Conductivities change by orders of magnitude in a step, so the correction must be proportional to the flux.
+        Limits keep the correction from emptying the soil.
         """
         difference = fluid.pi[self.at] - self.outer
         share = np.divide(correction, difference, out=np.zeros_like(correction), where=difference != 0).clip(-1, 1)
@@ -200,11 +200,11 @@ class UnsaturatedFaces(OpenFaces):
         return self.conductance * self._through(fluid)[0]
 
     def derivative(self, fluid: Fluid) -> NDArray[np.float64]:
-        """Return the derivative of the outflow by the pressure of the cell, >= 0, m^d/(Pa s)."""
+        """Return the derivative of the outflow with respect to the pressure of the cell, >= 0, m^d/(Pa s)."""
         return self.conductance * self._through(fluid)[1]
 
     def _through(self, fluid: Fluid) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return k_r of the faces (m,), and the derivative of k_r (p - outside + drop) by the cell pressure p (m,)."""
+        """Return k_r of the faces (m,), and d[k_r (p - outside + drop)]/dp (m,) with the cell pressure p."""
         return self.relative.through_sides(self.cells, self.normal, fluid.p[self.at], self.outside, self.drop)
 
 
@@ -244,7 +244,7 @@ class RainedFaces(OpenFaces):
         return self.pond.open_by(fluid)
 
     def derivative(self, fluid: Fluid) -> NDArray[np.float64]:
-        """Return the derivative of the outflow by the pressure of the cell, m^d/(Pa s)."""
+        """Return the derivative of the outflow with respect to the pressure of the cell, m^d/(Pa s)."""
         out = np.where(self.rain <= -self.dry.outflow(fluid), self.dry.derivative(fluid), 0.0)
         return np.where(self.rain < -self.pond.outflow(fluid), out, self.pond.derivative(fluid))
 
@@ -272,7 +272,7 @@ class SideFeeds(Feeds):
     def _pond(
         self, sides: OpenSides, ponds: tuple[float | None, ...], dt: float
     ) -> tuple[OpenSides, NDArray[np.float64]]:
-        """Return the sides with the pressure of ponds, and their supply in a time dt, s; and capacities of ponds, m^d.
+        """Return the sides with the pressure and the supply of ponds in a time dt, s, and the capacities of ponds, m^d.
 
         `ponds` are the largest depths of the ponds, m.
         """
@@ -326,7 +326,7 @@ class SideFeeds(Feeds):
         return Leaving(cells, turnover * np.abs(fluid.pi), gain)  # rain is no gain: steady rain changes no storage
 
     def slope(self, at: OpenFaces, fluid: Fluid) -> NDArray[np.float64]:
-        """Return the derivative of the outflow by the pressure of the cell."""
+        """Return the derivative of the outflow with respect to the pressure of the cell."""
         return sum_by(at.at, self._if_open(at, (1 + self._share) * at.derivative(fluid)), len(fluid.pi))
 
     def settle(self, at: OpenFaces, fluid: Fluid) -> int:

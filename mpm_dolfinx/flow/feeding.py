@@ -40,7 +40,7 @@ class Fluid(NamedTuple):
     """Fluid in the n active owned cells."""
 
     p: NDArray[np.float64]  # pressure (n,), Pa
-    pi: NDArray[np.float64]  # mass potential (n,), Pa
+    pi: NDArray[np.float64]  # mass potential (n,), Pa, see `fluid_content`
     density: NDArray[np.float64]  # density divided by the density at zero pressure (n,)
     force: NDArray[np.float64] | None = None  # inertia force on the fluid (n, d), N/m^3
 
@@ -61,7 +61,7 @@ class Feeds:
     """
 
     linear: bool = True
-    """Whether the outflow is always a linear function of the mass potentials."""
+    """Whether the outflow is always linear in the mass potentials pi (see `fluid_content`)."""
     settles: bool = False
     """Whether the condition has an active set, see `settle`."""
     sides: OpenSides | None = None
@@ -78,7 +78,7 @@ class Feeds:
         raise NotImplementedError
 
     def slope(self, at: Any, fluid: Fluid) -> NDArray[np.float64] | float:
-        """Return the derivative (n,) of the outflow by the pressure of the cell, m^d/(Pa s)."""
+        """Return the derivative (n,) of the outflow with respect to the pressure of the cell, m^d/(Pa s)."""
         return 0.0
 
     def settle(self, at: Any, fluid: Fluid) -> int:

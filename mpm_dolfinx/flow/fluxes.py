@@ -39,7 +39,7 @@ class Mobility:
     """Mobility of the n filled owned cells.  In unsaturated soil, `mean` and `share` refer to saturated pores."""
 
     mean: NDArray[np.float64]  # mean over the pieces (n,), m^2/(Pa s)
-    share: NDArray[np.float64] | None = None  # (mobility along each axis) / mean (n, d); None if all are 1
+    share: NDArray[np.float64] | None = None  # mobility along each axis divided by `mean` (n, d); None if all are 1
     # vector from the centroid to the pressure position of the cell (n, d), m; None without mixed cells
     shift: NDArray[np.float64] | None = None
     # fractions of the mean that come from soil without a retention curve, and from soil of each curve (n, k)
@@ -91,7 +91,7 @@ class Conduction:
         return across if hoop is None else across * hoop[at]
 
     def distance_ratio(self, at: NDArray[np.int64], normal: NDArray, offset: NDArray) -> NDArray[np.float64]:
-        """Return (distance of centroid) / (distance of pressure position), both from faces (m,) along normals (m, d).
+        """Return distances of centroids from faces (m,), divided by those of pressure positions, along normals (m, d).
 
         `offset` (m, d), m, are the vectors from the centroids to the faces.
         """
@@ -110,7 +110,7 @@ class OpenSides:
 
     number: NDArray[np.int64]  # index of the condition (m,)
     cells: NDArray[np.int32]  # cell behind the face (m,)
-    shape: NDArray[np.float64]  # area / (distance to the cell's centroid), 0 for a prescribed inflow (m,), m^(d-2)
+    shape: NDArray[np.float64]  # area divided by distance to the cell's centroid, 0 for prescribed inflow (m,), m^(d-2)
     pressure: NDArray[np.float64]  # pressure outside (m,), Pa
     given: NDArray[np.float64]  # prescribed inflow (m,), m^d/s
     seeps: NDArray[np.bool_]  # whether fluid can only leave (m,)
@@ -209,7 +209,7 @@ class CellContents(Keyed):
         self._slot = forms.active.slot
         self._slot[filled] = np.arange(len(filled))
         self.weight, self.area = pieces.weight, pieces.area
-        """Volumes (m,) of the pieces, m^d; and the same again, in axisymmetry areas of sections, m^2."""
+        """Volumes (m,) of the pieces, m^d; and sizes (m,): these volumes, or in axisymmetry areas of sections, m^2."""
         self._at, d = self._slot[pieces.cells], grid.dim
         rows = [self.weight, self.area, self.weight * pieces.fixed_stress], (self.area[:, None] * pieces.x).T
         sums = self.total(np.concatenate([*rows, pieces.faces.reshape(len(self.area), 2 * d).T]))

@@ -46,9 +46,9 @@ class Lines:
 
     line: NDArray[np.int64]  # index, among pieces of mixed cells, of the piece through whose centroid the line runs
     piece: NDArray[np.int64]  # index of the crossed piece
-    length: NDArray[np.float64]  # length in the crossed piece / cell size
+    length: NDArray[np.float64]  # length in the crossed piece, divided by the cell size
     before: NDArray[np.float64]  # fraction of the piece's resistance below the position of mean pressure
-    total: NDArray[np.float64]  # length of the whole line in the cell / cell size
+    total: NDArray[np.float64]  # length of the whole line in the cell, divided by the cell size
 
 
 class MixedCells:
@@ -69,7 +69,7 @@ class MixedCells:
     contents
         Material in the cells.
     soils
-        Constants (m, k) that are equal for pieces of equal conductivity.
+        Numbers (m, k) that identify the soils: pieces with equal rows have the same conductivity.
     """
 
     def __init__(self, rows, cells, low, high, x, volume, contents: CellContents, soils):
@@ -97,7 +97,7 @@ class MixedCells:
             self._lines.append(Lines(line, piece, length, before, total))
 
     def _crossed(self, rows: slice, first, count, low, high) -> list[tuple[NDArray, NDArray, NDArray]]:
-        """Return for each axis pairs of a line through a piece of `rows` and a piece that it crosses, and weights.
+        """Return for each axis three arrays (line, crossed piece, weight), for lines through the pieces `rows`.
 
         Weights are < 1 on borders.  `first`, `count` (m,): first piece, and number of pieces, in each piece's cell.
         """
@@ -131,7 +131,7 @@ class MixedCells:
     ) -> Mobility:
         """Return the mobility of filled cells.  kappa: mobilities of pieces; mean (n,): their cell means, m^2/(Pa s).
 
-        `share` (n, d) is (mobility along each axis) / mean in cells that are not mixed; it is changed in place.  `now`
+        `share` (n, d): mobility along each axis divided by `mean`; values of mixed cells are set in place.  `now`
         are the mobilities of all pieces at their pressures, in unsaturated soil.  If `now` is given, only inclined
         layers shift the position of the cell pressure away from the centroid.
         """
@@ -145,7 +145,7 @@ class MixedCells:
         return Mobility(mean, share, shift)
 
     def _along(self, kappa: NDArray[np.float64], mean: float = 1.0) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return, for mixed cells (n, d), mobilities along the axes, and shifts of the pressure position / cell size.
+        """Return, for mixed cells (n, d), mobilities along the axes, and shifts of the pressure position in cell sizes.
 
         `kappa` are mobilities of pieces.  If `mean` = 1, shifts lead to the position of mean pressure.  If `mean` = 0,
         only inclined layers cause shifts.
@@ -227,7 +227,7 @@ class MixedCells:
         return out._replace(parallel=parallel)
 
     def _sharper(self, kappa: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return for each cell (n,) the part due to inclined layers of the factor by which shifts are multiplied."""
+        """Return for each cell (n,) the contribution of inclined layers to the factor that multiplies shifts."""
         n = len(self._filled)
 
         def total(values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -246,7 +246,7 @@ class MixedCells:
 def graded(
     contents: CellContents, offset: NDArray[np.float64], kappa: NDArray[np.float64], mean: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return (mobility along each axis) / mean (n, d), for a mobility that varies gradually in a cell.
+    """Return the mobility along each axis (n, d), divided by `mean`, for a mobility that varies gradually in a cell.
 
     Pieces conduct in series along the mobility's gradient, and in parallel across it.  For other directions of the
     gradient, the arithmetic minus the harmonic mean is distributed over the axes, in proportion to the variance that a
@@ -273,13 +273,13 @@ def graded(
 def mixed_cells(cut: CutDomains, soils: NDArray[np.float64], contents: CellContents) -> MixedCells | None:
     """Return the owned cells with pieces of different conductivity; None if no process has such cells.
 
-    `soils` (m, k) are constants that are equal for pieces of equal conductivity.
+    `soils` (m, k) identify the soils: pieces with equal rows have the same conductivity.
     """
     grid = cut.grid
     cells = cut.cells
     volume = contents.area
     some = np.zeros((grid.num_local, soils.shape[1]))
-    some[cells] = soils  # constants of any piece of the cell
+    some[cells] = soils  # numbers of one piece of the cell
     mixed = sum_by(cells, (soils != some[cells]).any(axis=1), grid.num_local) > 0
     corners = cut.points.corners
     low, high = (cut.to_cells(rows) for rows in (corners.min(axis=1), corners.max(axis=1)))

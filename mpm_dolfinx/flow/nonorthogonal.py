@@ -29,11 +29,11 @@ from mpm_dolfinx.forms.point_forms import FacetSum
 from mpm_dolfinx.grid.grid import Grid, sum_by
 
 ALONG = 1e-4
-"""(Offset of two centroids along a face) / (cell size) up to which fluxes need no correction."""
+"""Offset of two centroids along a face, divided by the cell size, up to which fluxes need no correction."""
 NEAREST = 0.1
-"""Lower bound of distances in the weights of the least-squares fit / cell size.  Halving this value changes the result
-of scene "slope" in tests/plateaus.py by 3.0e-08 (relative), doubling it by 1.2e-06, and finer cells by 3.4e-03.
-"""
+"""Lower bound of distances in the weights of the least-squares fit, divided by the cell size.  Halving this value
+changes the result of scene "slope" in tests/plateaus.py by 3.0e-08 (relative), doubling it by 1.2e-06, and
+finer cells by 3.4e-03."""
 SIDES = 2.0
 """Total weight of the open sides of a cell in the least-squares fit, divided by the weight of one neighbour.  Halving
 this value changes the result of scene "slope" in tests/plateaus.py by 4.8e-06 (relative), doubling it by 2.8e-06, and
@@ -187,7 +187,7 @@ class NonorthogonalFlow(NamedTuple):
 
 
 def off_middle(sides: OpenSides, grid: Grid) -> NDArray[np.bool_]:
-    """Return for each face (m,) whether the faces of its condition in its cell are on average off the centroid."""
+    """Return for each face (m,) whether the faces of its condition in its cell have their mean off the centroid."""
     faces, at = np.unique(sides.number * grid.num_local + sides.cells, return_inverse=True)
     size, off = np.sqrt(np.add.reduce(sides.area**2, axis=1)), _along(sides) / grid.sizes(sides.cells)
     mean = sum_by(at, (size[:, None] * off).T, len(faces)) / sum_by(at, size, len(faces))

@@ -6,7 +6,7 @@
 with the weight w of a cell and axis, and the edge length h of the cell along the axis.  p_+- are the pressures of the
 neighbours, and d_+- the distances between centroids of the material.  A cell has a term along an axis if both faces
 across this axis are open.  For a pressure that alternates from cell to cell, the damping coefficient is 16 w; damping
-of pressure jumps with the weight w would give 4 w.  A uniform gradient is not damped, also at the sides of the body, so
+of pressure jumps with the weight w would give 4 w.  A uniform gradient is not damped, even at the sides of the body, so
 steep pressures are not smeared.  The sum of H p over the cells is zero, so damping conserves fluid.
 """
 

@@ -37,7 +37,7 @@ class Paths(NamedTuple):
     parallel: NDArray[np.float64]  # mobility of single-soil lines, times their fraction of all lines (l,), m^2/(Pa s)
     law: NDArray[np.int64]  # retention curve of each soil in series, -1 for unused entries (s,)
     length: NDArray[np.float64]  # fraction of the path in each soil (s,)
-    resistance: NDArray[np.float64]  # length / (mobility x fraction of lines) (s,), Pa s/m^2
+    resistance: NDArray[np.float64]  # length divided by mobility and by the fraction of lines (s,), Pa s/m^2
 
     def at(self, *index) -> Paths:
         """Return the paths for an index that applies to all arrays."""
@@ -65,8 +65,8 @@ class Paths(NamedTuple):
 class Through(NamedTuple):
     """Conductances of m faces between two pressures."""
 
-    conductance: NDArray[np.float64]  # (m,), m/(Pa s)
-    slopes: tuple[NDArray[np.float64], NDArray[np.float64]]  # derivatives of the flux by both pressures (m,), m/(Pa s)
+    conductance: NDArray[np.float64]  # conductances (m,), m/(Pa s)
+    slopes: tuple[NDArray[np.float64], NDArray[np.float64]]  # derivatives of the flux with respect to p on both sides
 
 
 def none(count: int, laws: int, slots: int) -> Paths:
@@ -77,7 +77,7 @@ def none(count: int, laws: int, slots: int) -> Paths:
 
 
 class _Links(NamedTuple):
-    """Segments of soil along the flow path through a face.  Each connects two nodes, positions with a pressure."""
+    """Segments of soil along the flow path through a face.  Each one connects two nodes (positions with a pressure)."""
 
     face: NDArray[np.int64]  # index of the face
     low: NDArray[np.int64]  # first node
@@ -91,8 +91,8 @@ class _Flows(NamedTuple):
     """Flows through the segments."""
 
     k: NDArray[np.float64]  # conductance, m/(Pa s)
-    own: NDArray[np.float64]  # derivative of the flux by the pressure of the first node, m/(Pa s)
-    other: NDArray[np.float64]  # minus the derivative of the flux by the pressure of the second node, m/(Pa s)
+    own: NDArray[np.float64]  # derivative of the flux with respect to the pressure of the first node, m/(Pa s)
+    other: NDArray[np.float64]  # minus the derivative of the flux with respect to the pressure of the second node
     flux: NDArray[np.float64]  # flux from the first to the second node, m/s
     rounding: NDArray[np.float64]  # rounding error of the flux, m/s
 
@@ -149,7 +149,7 @@ class _Chain:
         self._difference = self._hydrostatic[:, -1] - p[1]
 
     def solved(self) -> NDArray[np.float64]:
-        """Return (3, m): conductance between both ends, and derivatives of the flux by the pressures at both ends."""
+        """Return (3, m): conductance between both ends, and flux derivatives with respect to both end pressures."""
         links, difference = self._links, self._difference[:, None]
         inner = slice(1, -1)
         scale = np.full(self._hydrostatic.shape, np.inf)

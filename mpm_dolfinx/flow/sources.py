@@ -56,7 +56,7 @@ class Sources(Feeding):
         return self._sum(self._forms, pieces)
 
     def slope(self, pieces: PointData) -> NDArray[np.float64]:
-        """Return the derivative of `gain` by the pressure of the cell, m^d/(Pa s), as a local array."""
+        """Return the derivative of `gain` with respect to the pressure of the cell, m^d/(Pa s), as a local array."""
         return self._sum(self._slopes, pieces)
 
     def _sum(self, forms: Sequence[PointForm], pieces: PointData) -> NDArray[np.float64]:
@@ -89,5 +89,5 @@ class SourceFeeds(Feeds):
         return Leaving(-gain, gain=np.abs(gain))
 
     def slope(self, at: None, fluid: Fluid) -> NDArray[np.float64]:
-        """Return minus the derivative of the inflow by the cell's pressure."""
+        """Return minus the derivative of the inflow with respect to the cell's pressure."""
         return -self._sources.slope(self._pieces)[self._cells]

@@ -6,7 +6,7 @@
     int r [zeta(J_Delta, p) - zeta_n] dV_n  +  int sum_faces Q dt  =  0,      d zeta = alpha dJ + S J dp,
     Q = T r [p+ - p- + rho_w g . (x- - x+)],   T = A / (d+ / kappa+ + d- / kappa-),   kappa = k / (rho_w g).
 
-(div u in place of J_Delta would turn rotations into volume changes.)  r = exp(p / K_w) is the fluid density divided by
+(With div u instead of J_Delta, rotations would cause volume changes.)  r = exp(p / K_w) is the fluid density divided by
 the density rho_w at zero pressure.  In the storage term, r is taken at the pressure (p_n + p) / 2; on a face, r is the
 logarithmic mean over both cells.  Then r [p+ - p-] is the jump of the mass potential (`fluid_content`), and the mass
 that leaves a cell enters the neighbour.  The residual is this equation divided by the r of storage; the tangent
@@ -100,7 +100,7 @@ class StorageForms:
     weight : (d,), N/m^3
         Unit weight of the pore fluid rho_w g, as UFL; None without gravity.
     symmetric
-        Whether to use alpha as the derivative of the content by J_Delta, so that the Jacobian is symmetric.  The
+        Whether to use alpha as the derivative of the content with respect to J_Delta: the Jacobian is symmetric.  The
         neglected term is of the order of (p - p_n) / K_w, and Newton's method converges as fast as with it.
     feeding
         Sources and open sides of all stages.
@@ -169,9 +169,9 @@ class StorageForms:
         return b
 
     def derivatives(self, data: PointData) -> list[NDArray[np.float64]]:
-        """Return the derivatives of `change` by pressure (filled cells,), m^d/Pa, and by nodal displacements.
+        """Return derivatives of `change`: d/dp (filled cells,), m^d/Pa, and d/du with nodal displacements u.
 
-        The derivatives by displacements are one or two arrays (filled cells, n), m^(d-1).  The first, for the momentum
+        The derivatives d/du are one or two arrays (filled cells, n), m^(d-1).  The first, for the momentum
         balance, differentiates alpha dJ_Delta; the second, if it differs, differentiates the content.
         """
         sums, count = self._derivatives(data), self.grid.dim * 2**self.grid.dim
@@ -257,7 +257,7 @@ class StorageSystem:
         self._facets = facets
         self._uniform = self._over_uniform() if fluxes.relative is None else None
         self.set_alternation()
-        _add_diagonal(self.L, np.zeros(own.size))  # also of a cell without faces
+        _add_diagonal(self.L, np.zeros(own.size))  # even for a cell without faces
         pattern = self.L
         if forms.softens:
             grid, zeros = forms.grid, np.zeros((forms.grid.num_local, d, 2))
@@ -267,7 +267,7 @@ class StorageSystem:
 
     @property
     def gravity(self) -> FacetSum | None:
-        """Form of the fluxes by p and the fluid's weight between cells of the same soil; None without weight."""
+        """Form of the fluxes due to p and the fluid's weight between cells of one soil; None without weight."""
         return (self._uniform or self._over_uniform())[1]
 
     def _over_uniform(self) -> tuple[FacetSum | None, FacetSum | None]:
@@ -313,7 +313,7 @@ class StorageSystem:
             mobility = mobility * relative.at(contents.filled, p)[:, None]
             flow = replace(flow, relative=relative)
         self.assemble_fluxes()
-        total = _add_diagonal(self.T, np.zeros(self.unknowns.size))  # also of a cell without faces
+        total = _add_diagonal(self.T, np.zeros(self.unknowns.size))  # even for a cell without faces
         nonorthogonal = None
         if off is not None:
             facets, gradients, sides = off
@@ -485,7 +485,7 @@ class StorageProblem:
         return volumes / (self.forms.derivatives(self.data)[0] + self._contents.fixed_stress)
 
     def filling(self, error: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return errors of the water content due to pressure errors (n,), Pa, and changes of content in the step."""
+        """Return errors (n,) of the water content due to pressure errors (n,), Pa, and its changes (n,) in the step."""
         capacity, _ = self.forms.drained(self.data)
         change = self.forms.change(self.data)[self.system.unknowns.owned]
         share = self.fill / self._contents.volume
@@ -518,7 +518,7 @@ class StorageProblem:
     def restrained(
         self, dp: NDArray[np.float64], previous: NDArray[np.float64] | float
     ) -> tuple[NDArray[np.float64], NDArray[np.float64] | float]:
-        """Return limited pressure decreases, Pa, and changes of the suction's logarithm (n,).
+        """Return the limited pressure decreases (n,), Pa, and the resulting changes (n,) of the suction's logarithm.
 
         `dp` (n,), Pa, are the decreases by Newton's method.  `previous` (n,) is the change of the logarithm in the
         previous iteration.
@@ -626,8 +626,8 @@ class StorageProblem:
     ) -> None:
         """Assemble the derivatives C = d/dp and B = d/du of the residual at (u, p), for the problem's pieces or `data`.
 
-        `of_suction` are cells (c,) and derivatives of their nodal forces (c, n) by p, m^(d-1), if a law depends on
-        suction.
+        If a law depends on suction, `of_suction` are cells (c,), and derivatives (c, n), m^(d-1), of their nodal forces
+        with respect to p.
         """
         forms = self.forms
         system = self.system

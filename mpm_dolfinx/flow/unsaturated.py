@@ -42,16 +42,16 @@ class Between(NamedTuple):
     """Relative conductivity k_r between the two sides of a face."""
 
     k: Any  # value of k_r
-    slopes: tuple[Any, Any]  # derivatives by the pressures on both sides, 1/Pa
+    slopes: tuple[Any, Any]  # derivatives with respect to the pressures on both sides, 1/Pa
 
 
 def fitted(p: Sequence, tables: Sequence[Sequence], drop, scale, of: Functions) -> Between:
     """Return the relative conductivity k_r between the two sides of a face, with derivatives.
 
-    k is the mean of k_r over the pressures between both sides.  x is the jump of k_r divided by k; y is x drop / (jump
-    of the pressure).  With s(z) = sinh(z / 2) / (z / 2), the result is k s(x + y) / (s(x) s(y)).  The result is exact
-    for steady flow with an exponential k_r (Baker 1995), and never exceeds the value of the wetter side.  Without
-    gravity the result is k (Kirchhoff 1894).  For nearly equal pressures, k is the mean of the values on both sides.
+    k is the mean of k_r over the pressures between both sides.  x is the jump of k_r divided by k.  y is x times
+    `drop`, divided by the pressure jump.  With s(z) = sinh(z / 2) / (z / 2), the result is k s(x + y) / (s(x) s(y)).
+    It is exact for steady flow with an exponential k_r (Baker 1995), and never exceeds the value of the wetter side.
+    Without gravity it is k (Kirchhoff 1894).  For nearly equal pressures, k is the mean of the values on both sides.
 
     Parameters
     ----------
@@ -87,7 +87,7 @@ def fitted(p: Sequence, tables: Sequence[Sequence], drop, scale, of: Functions) 
 
 
 def _log_sinhc(z, of: Functions) -> tuple[Any, Any]:
-    """Return ln(sinh(z / 2) / (z / 2)) and the derivative by z."""
+    """Return ln(sinh(z / 2) / (z / 2)), and its derivative with respect to z."""
     small = of.less(abs(z), SECOND)
     half = of.where(small, 1.0, z / 2)
     size = abs(half)
@@ -153,7 +153,7 @@ class Relative:
         return out
 
     def conducts(self, side: str, means: Sequence):
-        """Return k_r of the cell on one side of a face, as UFL expression of k_r of each retention curve."""
+        """Return k_r of the cell on one side of a face, as UFL, from the k_r of each retention curve."""
         return self.shares(side)[0] + sum(self.shares(side)[1 + i] * k for i, k in enumerate(means))
 
     def set_pressures(self, p: NDArray[np.float64], force: NDArray[np.float64] | None = None) -> Any:
@@ -186,7 +186,7 @@ class Relative:
         outer: NDArray[np.float64],
         drop: NDArray[np.float64],
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return k_r between cells and sides, and the derivative of k_r (p - outer + drop) by p, both (m,).
+        """Return k_r between cells and sides, and d[k_r (p - outer + drop)]/dp, both (m,).
 
         Pressures (m,), Pa: p in owned cells, `outer` outside, and `drop`, the drop from the centroid to the face that
         the weight of the fluid causes.  `normal` (m, d): normals of the sides.

@@ -79,7 +79,7 @@ def insert_rows(A: PETSc.Mat, grid: Grid, cells: NDArray[np.int32], rows: NDArra
 
 
 def _entries(count: int, symmetric: bool) -> tuple[NDArray, NDArray, NDArray]:
-    """Return row and column of each stored entry of a matrix, and the index of each matrix entry among these."""
+    """Return row and column of each stored entry of a matrix, and the index of the stored entry of each entry."""
     rows, columns = np.triu_indices(count) if symmetric else np.divmod(np.arange(count**2), count)
     place = np.empty((count, count), dtype=np.int64)
     if symmetric:

@@ -35,7 +35,7 @@ from mpm_dolfinx.forms.axes import block
 from mpm_dolfinx.grid.grid import Grid, in_chunks
 
 BATCH, MANY = 2**10, 2**12
-"""Number of points in a batch of element matrices, which fits into the cache; and in one call of an expression.
+"""Numbers of points: in a batch of element matrices, which fits into the cache, and in one call of an expression.
 
 An expression always evaluates a whole list of cells, of either length.  The last few points use the shorter list.
 """
@@ -107,9 +107,9 @@ class FormPoints:
     def gradient(self, u: fem.Function) -> fem.Function:
         """Return grad u at the points as a coefficient, for a Q1 vector function u; numpy evaluates it.
 
-        UFL derivatives by u do not see this dependence.  All forms at the same u share the values.  UFL would otherwise
-        expand u as a Taylor polynomial about the cell's midpoint, with many terms in 3D.  With the coefficient instead,
-        a kernel of Hencky's law takes at most half of the time to run, and a fifth of the time to compile.
+        UFL derivatives with respect to u do not see this dependence.  All forms at the same u share the values.  UFL
+        would otherwise expand u as a Taylor polynomial about the cell's midpoint, with many terms in 3D.  With the
+        coefficient, a kernel of Hencky's law takes at most half of the time to run, and a fifth of the time to compile.
         """
         if "gradient" not in self.live:
             values = u.x.array
@@ -199,7 +199,7 @@ class Places(Keyed):
 
     @cached_property
     def dofs(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Unrolled local dofs (n,) of Q1 vectors in all cells with points; index of the dofs of each cell in these."""
+        """Unrolled local dofs (n,) of Q1 vectors in all cells with points; index of each cell's dofs among them."""
         d = self.grid.dim
         nodes, at = np.unique(self.grid.cell_nodes[self.filled], return_inverse=True)
         return tuple((rows.reshape(-1, 1) * d + np.arange(d)).astype(np.intp).ravel() for rows in (nodes, at))
@@ -275,7 +275,7 @@ class PointData(Keyed):
         return PointData(points, places, self.volume[rows], fields)
 
     def having(self, **fields: NDArray[np.float64]) -> PointData:
-        """Return the same points, with new values (n, ...) of some fields."""
+        """Return the same points, with new values (n, ...) of the named fields."""
         kept = {name: self.rows[name] for name in self.points.sizes}
         return PointData(self.points, self.places, self.volume, kept | fields)
 
@@ -442,7 +442,7 @@ class FacetForm:
 
 
 class FacetSum:
-    """A form over given facets.  `some` tells whether any process has such facets."""
+    """A form over the facets `facets`.  `some` tells whether any process has such facets."""
 
     def __init__(self, form: FacetForm, facets: NDArray[np.int32], some: bool):
         self._of = form

@@ -26,7 +26,7 @@ def check_follow(follow: Any, lines: Sequence[ArrayLike] | None) -> None:
     """Raise ValueError for an object that lines cannot follow, and for a grid without lines."""
     if hasattr(follow, "pose"):
         if lines is not None and all(map(equal, checked(lines))):
-            raise ValueError(f"grid: follow = {line(follow)}: all cells are equal, must be smaller around the tool")
+            raise ValueError(f"grid: follow = {line(follow)}: equal cells, must be smaller around the tool")
     elif callable(follow):
         check_names("grid: follow", follow, PLACES)
     else:

@@ -33,14 +33,14 @@ SIDES = {
     3: {"left": (0, 0), "right": (0, 1), "front": (1, 0), "back": (1, 1), "bottom": (2, 0), "top": (2, 1)},
 }
 """Axis and end of each side of a box: (axis, 0 for the lower or 1 for the upper end)."""
-REACH = 1e-4  # (distance / cell size) by which bodies may lie outside the grid: penalties hold them at walls inexactly
+REACH = 1e-4  # distance, in cell sizes, by which bodies may lie outside the grid: walls act by penalties, inexactly
 
 TURN = 2 * np.pi
 """Angle of a whole revolution, for axisymmetric volumes, forces and outflows.  Source: definition."""
 CHUNK = 2**14
 """Number of rows that are processed together, which limits the size of temporary arrays."""
 SNAP = 1e-10
-"""(Distance to a grid plane) / (cell size) below which a vertex is on the plane, unless rounding errors are larger."""
+"""Distance to a grid plane, in cell sizes, below which a vertex is on the plane, unless rounding errors are larger."""
 ORDER = "the order is Grid(lower, upper, cells)"
 MANY = "grid: h is undefined for unequal cells, must be replaced by sizes"
 
@@ -72,7 +72,7 @@ def side(name: str, dim: int) -> tuple[int, int]:
 
 
 def in_chunks(count: int) -> list[slice]:
-    """Return consecutive slices of at most CHUNK rows; an empty list for no rows."""
+    """Return consecutive slices of at most `CHUNK` rows; an empty list for no rows."""
     return [slice(start, min(start + CHUNK, count)) for start in range(0, count, CHUNK)]
 
 
@@ -105,7 +105,7 @@ def polynomial(
 
 
 def ranges(first: NDArray[np.int64], count: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the range (n,) and the value (n,) of each integer in m ranges from `first` on, of `count` integers."""
+    """Return each integer's range (n,) and value (n,), for m ranges that begin at `first` and have `count` integers."""
     of = np.arange(len(count)).repeat(count)
     return of, np.arange(len(of)) + np.repeat(first - (np.cumsum(count) - count), count)
 
@@ -190,7 +190,7 @@ class Cells:
         topology = mesh.topology
         topology.create_connectivity(d, d - 1)
         topology.create_connectivity(d - 1, d)
-        if d == 3 and grid.comm.size > 1:  # all processes must call this, also without facets
+        if d == 3 and grid.comm.size > 1:  # all processes must call this, even without facets
             topology.create_entity_permutations()
         self.cell_facets = topology.connectivity(d, d - 1).array.reshape(-1, 2 * d)
         adjacency = topology.connectivity(d - 1, d)
@@ -289,7 +289,7 @@ class Grid:
     least, most : m
         Shortest and longest edge of all cells.
     snap
-        (Distance to a grid plane) / (cell size) along each axis (d,), below which a vertex lies on the plane.
+        Distance to a grid plane along each axis (d,), in cell sizes, below which a vertex lies on the plane.
     base : (d,), m
         Origin of all internal positions: the lower corner, with a radius of 0 in axisymmetry.  This origin preserves
         digits of positions far from the true origin.
@@ -605,6 +605,10 @@ class Grid:
         """Return the owner rank of the cells with lexicographic indices `number`."""
         return self.owners[number]
 
+    def to_owners(self, number: NDArray[np.int64]) -> Exchange:
+        """Return the exchange that sends rows to the processes which own the lexicographic cells `number` (m,)."""
+        return Exchange(self.comm, self.owner(number))
+
     def local(self, number: NDArray[np.int64]) -> NDArray[np.int32]:
         """Return the local index of the cells with lexicographic indices `number`; -1 for cells of other processes."""
         return self.locals[number]
@@ -613,7 +617,7 @@ class Grid:
         """Send rows (cells, positions, values) to the owners of cells; return local cells, positions and values."""
         empty = (np.empty(0, dtype=np.int64), np.empty((0, self.dim)), np.empty((0, width)))
         parts = [np.concatenate(column) for column in zip(empty, *rows, strict=True)]
-        travel = Exchange(self.comm, self.owner(parts[0]))
+        travel = self.to_owners(parts[0])
         cell, x, values = map(travel.send, parts)
         return self.local(cell), x, values
 
@@ -640,7 +644,7 @@ class Grid:
         return out
 
     def outside(self, x: NDArray[np.float64], tolerance: float = SAME) -> NDArray[np.bool_]:
-        """Return which x, from the base, are outside the grid by more than `tolerance` cell sizes plus rounding."""
+        """Return which positions x, from the base, are outside the grid by more than `tolerance` cells and rounding."""
         least = self.h if self.even else np.array([w[[0, -1]].min() for w in self.widths])  # at the sides
         tolerance = tolerance + rounding(np.array([self.lower, self.upper])) / least
         inside, cells = np.ones(len(x), dtype=bool), None if self.even else self.in_cells(x)
@@ -719,8 +723,7 @@ class Grid:
 class GridOfGroups(Grid):
     """A grid with a separate copy of the box for each contact group, so that groups share no nodes.
 
-    The mesh consists of disconnected boxes at the same position.  The same process owns corresponding cells of all
-    copies.
+    The copies coincide in space.  The same process owns corresponding cells of all copies.
 
     grid: grid of the bodies; group (points,): index, from 0, of the group of each material point of the scene, in the
     order of ids.

@@ -18,8 +18,7 @@ EMPTY = 1e-2
 def owners(load: NDArray[np.float64], processes: int) -> NDArray[np.int32]:
     """Return the owner rank of each cell, as an array with the shape of the grid.
 
-    load (cells along each axis): load of each cell, such as its number of points, >= 0; processes: number of ranks, >=
-    1.
+    load (cells along each axis): load of a cell, such as its number of points, >= 0; processes: number of ranks, >= 1.
     """
     filled = load > 0
     weight = load + (EMPTY * load[filled].mean() if filled.any() else 1.0)

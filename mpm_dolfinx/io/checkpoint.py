@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Checkpoints: files from which an interrupted run is resumed, on any number of processes.
 
-A checkpoint is a numpy archive of the state between two steps (`State`).  A description in the archive identifies the
-scene.
+A checkpoint is a numpy archive of the state between two steps (`State`).  A description in it identifies the scene.
 """
 
 from __future__ import annotations

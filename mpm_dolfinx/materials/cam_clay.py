@@ -17,7 +17,7 @@ The plastic multiplier dgamma defines h by 6G dgamma / M^2 = exp(h) - 1.  With w
     (6G kappa / M^2) a = (exp(h) - 1) (2P - P_c).
 
 The local unknown is d = 2 (h - a).  The stress ratio at the end follows from d, Q / (M P) = sqrt(w) exp(-d/2).  On the
-yield surface a = (ln(P_t / P_c,n) + ln(1 + w exp(-d))) / (1 + rho).  The equation for d is smooth and monotone, also at
+yield surface a = (ln(P_t / P_c,n) + ln(1 + w exp(-d))) / (1 + rho).  The equation for d is smooth and monotone, even at
 isotropic stresses and at the critical state (a = 0).
 
 If M^2 P_c > 6G (lambda - kappa), soil on the dry side softens faster than it unloads.  Then the stress jumps, or the
@@ -84,7 +84,7 @@ class ModifiedCamClay(Skeleton):
         Normal effective stresses at F = I, tension positive, mean < 0.  The last one is out of plane in 2D, and
         circumferential in axisymmetry.  These stresses must be in equilibrium with the loads.
     OCR
-        Overconsolidation ratio, -, >= 1: initial P_c / P_c of the yield surface through the initial stress.
+        Overconsolidation ratio, -, >= 1: initial P_c, divided by P_c of the yield surface through the initial stress.
     shear
         Shear modulus G, Pa, > 0.
     bulk
@@ -186,7 +186,7 @@ class ModifiedCamClay(Skeleton):
 
     @staticmethod
     def update(trial, shear, M, lambda_, kappa, pressure, yield_pressure, plastic, consolidated, steeper):
-        """Return the state at the end of the step, name -> UFL."""
+        """Return the state at the end of the step: UFL by name."""
         to = _Return(trial, shear, M, lambda_, kappa, pressure, yield_pressure, consolidated, steeper)
         strain = trial["strain"]
         a = to.compaction
@@ -251,7 +251,7 @@ class BarcelonaBasic(ModifiedCamClay):
     lambda_
         Slope lambda(0) of saturated soil.
     OCR
-        Overconsolidation ratio, -, >= 1: initial P_c / P_c of the yield surface through the initial stress.
+        Overconsolidation ratio, -, >= 1: initial P_c, divided by P_c of the yield surface through the initial stress.
     initial_stress : (3,), Pa
         Bishop's effective stresses at F = I.
     r

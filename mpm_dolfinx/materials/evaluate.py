@@ -201,24 +201,24 @@ def by_scene(
 
 
 def mean_size(grid: Grid) -> float:
-    """Return the edge length, m, of a square or cube with the volume of a cell, in uneven grids of the largest cell."""
+    """Return the edge length, m, of a square or cube with the volume of a cell, on uneven grids of the largest cell."""
     h = grid.h if grid.even else [w.max() for w in grid.widths]
     return float(np.prod(h) ** (1 / grid.dim))
 
 
 MOST = 100.0
-"""Upper limit of the softness (elastic / tangent shear modulus), which is infinite in perfectly plastic flow.  Halving
+"""Upper limit of the softness, because softness is infinite in perfectly plastic flow.  Halving
 this value changes the result of scene "soil" in tests/plateaus.py by 4.0e-03 (relative), doubling it by 5.0e-03, and
 finer cells by 3.0e-02.
 """
 
 
 class SoftnessAtPoints:
-    """Softness of yielding points: elastic / tangent shear modulus, along the strain of the last step.
+    """Softness of yielding points: ratio of elastic to tangent shear modulus along the strain of the last step.
 
-    Volume strains that alternate from cell to cell grow with the strain.  Such a volume strain causes pressures of
-    volume strain / tau, with the damping coefficient tau, 1/Pa.  In plastic flow the strain grows at constant stress.
-    tau must then grow with the softness, else the alternating pressures reach the soil's strength.
+    Volume strains that alternate from cell to cell grow with the strain.  Such a volume strain causes a pressure:
+    the strain divided by the damping coefficient tau, 1/Pa.  In plastic flow the strain grows at constant stress.  tau
+    must then grow with the softness, else the alternating pressures reach the soil's strength.
 
     The strain of a step is e = dev sym dF F^-1.  With the Kirchhoff stress T(s) at F - (1 - s) dF, the tangent shear
     modulus is G_t = (dT/ds) : e / (2 e : e) at s = 1.  The softness of the previous step is used.  A value from the
@@ -250,7 +250,7 @@ class SoftnessAtPoints:
         self._along = PointExpression(ufl.as_vector([ufl.inner(e, e), ufl.inner(ufl.diff(tau, s), e)]), points)
 
     def __call__(self, at: PointData, dF: NDArray, shear: NDArray, dt: float, before: NDArray) -> NDArray[np.float64]:
-        """Return the softness (n,), in [1, MOST], of the points `at`, data with F, parameters and state.
+        """Return the softness (n,), in [1, `MOST`], of the points `at`, data with F, parameters and state.
 
         dF (n, d, d): change of F in a step of dt, s; shear (n,): elastic shear modulus, Pa; before (n,): old softness.
         """

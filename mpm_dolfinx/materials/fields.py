@@ -252,8 +252,8 @@ class SceneMaterials:
     def conducting(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return two numbers (n, 2) for each point: its conductivity, m/s, and the index of its conductivity law.
 
-        Points with equal pairs conduct alike; points with a law that depends on position all differ.  The fractional
-        part of the index denotes the retention curve.
+        Points with the same two numbers have the same conductivity.  If the law depends on position, each point has its
+        own index.  The fractional part of the index denotes the retention curve.
         """
         laws, known = [m.conductivity_law for m in self.materials], self.conductivity_laws
         law = np.array([known.index(law) if law in known else -1 for law in laws])[points.material]
@@ -322,7 +322,7 @@ class SceneMaterials:
         return out
 
     def changed(self, what: str, points: MaterialPoints, named: Collection[str]) -> MaterialPoints:
-        """Return the points after a change of the `named` fields: fields that depend on these are updated.
+        """Return the points after a change of the fields `named`; fields that depend on these are updated.
 
         Raises
         ------

@@ -25,7 +25,7 @@ from mpm_dolfinx.materials.trial import PLANE, SPACE
 from mpm_dolfinx.parallel.exchange import first, over_all
 from mpm_dolfinx.points.material_points import MaterialPoints, unstretched
 
-EXACT, CLOSE = 1e-13, SAME  # stress error / largest initial stress: to end Newton's method, and to accept a result
+EXACT, CLOSE = 1e-13, SAME  # stress error over largest initial stress: to end Newton's method, to accept a result
 MOST = 30  # largest number of Newton iterations
 LARGEST = 0.2  # limit to the change of a strain component in one iteration
 
@@ -194,7 +194,7 @@ class InitialStresses:
             return [points.pressure] * 3
         if gravity is None or np.any(gravity[:-1]) or not gravity[-1] <= 0:
             g = None if gravity is None else np.asarray(gravity).tolist()
-            raise ValueError(f"initial_stress: K0 with gravity = {g}, must point down along the last axis at the start")
+            raise ValueError(f"initial_stress: K0 with gravity = {g}, gravity must point down, along the last axis")
         surcharges = [stress.surcharge for stress in self.given.values() if isinstance(stress, K0)]
         if not np.any(gravity) and not any(callable(surcharge) or surcharge for surcharge in surcharges):
             raise ValueError("initial_stress: K0 has neither gravity at the start nor surcharge, must have one of them")
@@ -367,7 +367,7 @@ def _kappa(m) -> NDArray[np.float64]:
 
 
 def _friction(m) -> NDArray[np.float64]:
-    """Return the friction angle, degrees, nan for laws without one."""
+    """Return the friction angle, degrees; nan for laws without friction."""
     return getattr(m, "friction", np.full(np.shape(m.bulk), np.nan))
 
 

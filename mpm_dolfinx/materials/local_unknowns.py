@@ -6,11 +6,11 @@ to round-off.  The forms contain
 
     y = y* + Y (z(F) - z*),     Y = -(df/dy)^-1 df/dz  at the solution (y*, z*),
 
-which has the value and, with respect to F, the derivative of the solution.  UFL's derivative of a stress by F, also
-through y, is then the consistent tangent, without unrolled iterations.  y*, z* and Y are coefficients at the points.
-If the stress is not differentiated, y* alone is used.  If the law has an energy, the tangent is its second derivative.
-The expression for y then has a second-order term, whose coefficients also follow from f = 0.  A law in numpy returns
-y(z) and dy/dz.
+which has the value and, with respect to F, the derivative of the solution.  UFL's derivative of a stress with respect
+to F, including its dependence through y, is then the consistent tangent, without unrolled iterations.  y*, z* and Y are
+coefficients at the points.  If the stress is not differentiated, y* alone is used.  If the law has an energy, the
+tangent is its second derivative.  The expression for y then has a second-order term, whose coefficients also follow
+from f = 0.  A law in numpy returns y(z) and dy/dz.
 """
 
 from __future__ import annotations
@@ -71,8 +71,8 @@ class LocalUnknowns:
     values
         The unknowns by name, as UFL that depends on F, and `trial`.
     known
-        The unknowns and `trial`, for expressions that are not differentiated with respect to F: kernels then skip the
-        trial values.  For laws with an energy `known` equals `values`.
+        As `values`, but independent of F, for expressions that are not differentiated with respect to F: their kernels
+        need not compute trial values.  For laws with an energy `known` equals `values`.
     """
 
     def __init__(self, law: type[Skeleton], points: FormPoints, F, values: Mapping[str, object]):
@@ -82,7 +82,7 @@ class LocalUnknowns:
         given = {"trial": trial}
         trial = {name: value for name, value in trial.items() if isinstance(value, ufl.core.expr.Expr)}
         if not trial:
-            raise ValueError(f"{law.__name__}.trial: returns {line(given['trial'])}, must have some UFL of F")
+            raise ValueError(f"{law.__name__}.trial: returns {line(given['trial'])}, must contain UFL of F")
         z = _parts(trial.values())
         self._trial, self._dt = PointExpression(ufl.as_vector(z), points), values["dt"]
         self._solved: Latest[Solved] = Latest()
@@ -109,7 +109,7 @@ class LocalUnknowns:
     def update(self, data: PointData, derive: bool = True) -> None:
         """Solve for the local unknowns of the points at their present F; all processes must call it.
 
-        derive: also differentiate by the trial values.  Expressions in `values` need this; `known` does not.
+        derive: whether to differentiate with respect to the trial values too.  `values` needs this; `known` does not.
 
         Raises
         ------
@@ -270,7 +270,7 @@ class _Equations:
         Raises
         ------
         ValueError
-            The result is no dict of pairs with names and shapes of the unknowns, or a derivative is by no trial value.
+            The result is no dict of pairs with names and shapes of the unknowns, or names an unknown trial value.
         """
         instance(f"{self._title}: its result", found, dict)
         for of, pair in found.items():
@@ -285,20 +285,20 @@ class _Equations:
             values, slopes = found[of]
             for by in slopes:
                 if by not in self._trial:
-                    among = ", ".join(self._trial)
-                    raise ValueError(f"{self._title}: derivative of {of} by {line(by)}, must be by one of {among}")
+                    what = f"{self._title}: derivative of {of} with respect to {line(by)}"
+                    raise ValueError(f"{what}, must be with respect to one of {', '.join(self._trial)}")
             known = {by: slope if callable(slope) else self._slope(of, by, slope, n) for by, slope in slopes.items()}
             out[of] = _real(f"{self._title}: {of}", values, (n, *shape)), known
         return out
 
     def _slope(self, of: str, by: str, given, n: int) -> NDArray[np.float64]:
         """Return the derivative (n, ..., ...) of an unknown with respect to a trial value; given: array or function."""
-        what = f"{self._title}: derivative of {of} by {by}"
+        what = f"{self._title}: derivative of {of} with respect to {by}"
         value = asked(what, "a function without arguments that gives it", given) if callable(given) else given
         return _real(what, value, (n, *self._unknowns[of], *self._trial[by]))
 
     def _slopes_of(self, of: str, given: Mapping[str, object], n: int) -> NDArray[np.float64]:
-        """Return the derivatives (n, m, k) of one unknown; given: derivatives by name of the trial value."""
+        """Return the derivatives (n, m, k) of one unknown; given: the derivative for each name of a trial value."""
         m, parts = _size(self._unknowns[of]), []
         for by, shape in self._trial.items():
             slope = self._slope(of, by, given[by], n) if by in given else np.zeros((n, m, _size(shape)))

@@ -31,7 +31,7 @@ from mpm_dolfinx.materials.skeleton import Field, _check
 from mpm_dolfinx.materials.trial import PLANE, Coaxial, Isotropic, components, eigen, symmetric
 
 FACE, EDGES, ALL = slice(0, 1), slice(1, 3), slice(None)  # candidates for the final stress in the list of `end`
-NEVER = 1e6  # largest tensile strength / bulk modulus
+NEVER = 1e6  # largest tensile strength, divided by the bulk modulus
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,7 +98,7 @@ class MohrCoulomb(Frictional):
 
     @staticmethod
     def solution(trial, bulk, shear, sine, sine_flow, strength, cutoff):
-        """Return, with derivatives, the stress components at the end of the step, Pa, and 1 in plastic flow, else 0."""
+        """Return, with derivatives, the stress components at the end of the step, Pa, and 1 in plastic flow or 0."""
         x, axes = eigen(trial["b"])
         with np.errstate(invalid="ignore", divide="ignore"):  # in a diverging iterate, which is rejected later
             e = np.log(x) / 2
@@ -118,7 +118,7 @@ class MohrCoulomb(Frictional):
 
     @staticmethod
     def update(trial, bulk, shear, plastic, stress, flows):
-        """Return the state at the end of the step, name -> UFL."""
+        """Return the state at the end of the step: UFL by name."""
         (F, plane) = trial["F"]
         tau = symmetric(stress)
         I = ufl.Identity(3)
@@ -129,7 +129,7 @@ class MohrCoulomb(Frictional):
 
 
 def _returned(e: NDArray, bulk: NDArray, shear: NDArray, sine: NDArray, sine_flow: NDArray, *limits: NDArray) -> tuple:
-    """Return principal Kirchhoff stresses (n, 3), Pa, their derivatives by e (n, 3, 3), and flags (n,) of plastic flow.
+    """Return principal Kirchhoff stresses (n, 3), Pa, their derivatives d/de (n, 3, 3), and flags (n,) of plastic flow.
 
     e (n, 3): principal trial strains, the largest first; the other arguments are parameters (n,) of the law.
     """
@@ -191,7 +191,10 @@ class _Return:
         )
 
     def end(self, few: slice) -> tuple[NDArray, NDArray, NDArray]:
-        """Return final stresses (n, 3), Pa, derivatives by trial stresses, and violations (n,); few: candidates."""
+        """Return final stresses (n, 3), Pa, their derivatives with respect to t (n, 3, 3), and `_violation` (n,), Pa.
+
+        few: the slice of `_faces` on which stresses may end; `ALL` includes the vertices.
+        """
         with np.errstate(all="ignore"):  # vertices at infinity
             ends = [self._on(faces) for faces in self._faces[few]]
             if few is ALL:
@@ -212,7 +215,7 @@ class _Return:
         return np.max([self._surface.outside(t), t[:, 1] - t[:, 0], t[:, 2] - t[:, 1], *multipliers], axis=0)
 
     def _on(self, faces: Sequence) -> tuple[NDArray, NDArray, NDArray]:
-        """Return final stresses on a face, or on the edge of two faces, with their derivatives and their violations."""
+        """Return stresses on a face, or on the edge of two faces, their derivatives and their violation: see `end`."""
         normals, limits, flows = (np.stack(part, axis=1) for part in zip(*faces, strict=True))
         drops = np.einsum("nij,nfj->nif", self._elastic, flows)
         gram = normals @ drops
@@ -224,7 +227,7 @@ class _Return:
         return t, slopes, self._violation(t, multipliers.T)
 
     def _at(self, t: NDArray, conditions: Callable) -> tuple[NDArray, NDArray, NDArray]:
-        """Return stresses t at a vertex, zero derivatives and the violation; conditions: such as `_in_apex`."""
+        """Return stresses t at a vertex, zero derivatives and the violation; conditions: function, as `_in_apex`."""
         drop = self._trial - t
         mean = drop.mean(axis=1)
         plastic = drop / (2 * self._G)[:, None] + (mean / (3 * self._K) - mean / (2 * self._G))[:, None]

@@ -7,6 +7,7 @@ The material point method and the finite element reference use the same laws.  U
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, field, fields, replace
 from inspect import signature
 from math import inf
@@ -50,7 +51,7 @@ class Skeleton:
     Parameters
     ----------
     bulk
-        Drained bulk modulus K, Pa, > 0 (3D modulus, also in plane strain).
+        Drained bulk modulus K, Pa, > 0 (3D modulus, even in plane strain).
     shear
         Shear modulus G, Pa, > 0.
     porosity
@@ -81,15 +82,15 @@ class Skeleton:
     kirchhoff
         Kirchhoff stress tau = J sigma', Pa, (d, d) or (3, 3), of a law without an energy.  UFL gives the tangent.
 
-    The history variables are the law's `state`, name -> initial value.  `update` (F, ...) -> {name: UFL} computes them
+    The history variables are the law's `state`: initial values by name.  `update` (F, ...) -> {name: UFL} computes them
     at the points after every converged step.  If a new value is not finite, the time step is reduced.
 
-    A law whose stress has no closed formula has local `unknowns`, name -> initial value of their iteration.  Unknowns
+    A law whose stress has no closed formula has local `unknowns`: initial values of their iteration, by name.  Unknowns
     are arguments of `kirchhoff` and `update`.  Scale unknowns and residuals to values of about one:
 
     residual
-        Function of the law's fields, state, unknowns and `trial`.  It returns a dict: name of the unknown -> UFL of the
-        unknown's shape.  Newton's method solves residual = 0 at each point.
+        Function of the law's fields, state, unknowns and `trial`.  It returns a dict: UFL of the unknown's shape for
+        each unknown.  Newton's method solves residual = 0 at each point.
     solution
         Alternative to residual, in numpy: function of arrays (n, ...) of the law's fields, state and `trial`.  It
         returns a dict.  Each unknown has a pair: its values (n, ...), and a dict of its derivatives (n, ..., ...) by
@@ -176,6 +177,9 @@ class Skeleton:
         return [] if function is None else list(signature(function).parameters)
 
     def __post_init__(self):
+        for name, value in vars(self).items():
+            if isinstance(value, (list, np.ndarray)):
+                object.__setattr__(self, name, deepcopy(value))  # protects against later changes
         functions(
             f"{type(self).__name__}: conductivity_law", [self.conductivity_law] * (self.conductivity_law is not None)
         )
@@ -284,7 +288,7 @@ class Skeleton:
         """Return the damping tau, 1/Pa: 1/4 of the jump stabilisation of 2 x 2 cells, or 1/2 for laws with a state.
 
         The full value is 3 alpha^2 / (8 (lambda + 3G)).  A quarter gives better conditioning and smears less (Silvester
-        and Kechkar 1990; Camargo, White and Borja 2021).  The value for 2 x 2 x 2 cells is smaller, down to 0.44 times.
+        and Kechkar 1990; Camargo, White and Borja 2021).  The value for 2 x 2 x 2 cells is down to 0.44 times as large.
         In 3D the smaller value would not damp pressures that alternate along two axes only, like checkerboards in plane
         strain.  Only the increment of each step is damped, so an oscillation from the onset of yield remains.
         """
@@ -436,14 +440,15 @@ class unsaturated:
     The conductivity falls from k at p = `suction` to `least` k at p = -`suction`, by a smooth cubic (Bathe and
     Khoshgoftaar 1979).  The drainable porosity empties along the same cubic; other pores stay full.  The soil's weight
     is that with all pores full.  The law uses the pressure at the start of each substep.  Steady flow therefore needs
-    steps of about (cell size)^2 / (coefficient of consolidation), in which a free surface crosses less than a cell.
+    steps of about h^2 / c_v, with the cell size h and the coefficient of consolidation c_v.  In such a step a free
+    surface crosses less than a cell.
 
     Parameters
     ----------
     suction
         Half width of the transition, Pa, > 0.  Recommended: 0.5 to 1 times (unit weight of water) (cell height).
     least
-        Conductivity of drained soil / conductivity of saturated soil, in (0, 1).
+        Conductivity of drained soil, divided by that of saturated soil, in (0, 1).
     specific_yield
         Drainable porosity, in [0, 1), at most the porosity.  With 0, a free surface falls at once (for steady flow).
     """

@@ -87,7 +87,7 @@ class SofteningDruckerPrager(DruckerPrager):
     def update(
         F, bulk, shear, eta, xi, eta_flow, cohesion, residual, slip, viscosity, plastic, hardened, dt, cell_size
     ):
-        """Return the state at the end of the step, name -> UFL."""
+        """Return the state at the end of the step: UFL by name."""
         trial = Trial(F, plastic)
         strength = cohesion, residual, slip / cell_size, viscosity / (dt + TINY)
         to = _softened(trial, bulk, shear, eta, xi, eta_flow, hardened, *strength)

@@ -125,7 +125,7 @@ class Coaxial:
         return out
 
     def tangent(self, slopes: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return derivatives (n, 6, 4 or 6) of `values` by components of the given tensors; slopes (n, 3, 3): dy/dx.
+        """Return derivatives (n, 6, 4 or 6) of `values` with respect to the given components; slopes (n, 3, 3): dy/dx.
 
         In principal axes, off the diagonal, dy_ij = (y_i - y_j) / (x_i - x_j) dx_ij.  For x_i = x_j the limit is
         (dy_i/dx_i - dy_i/dx_j) dx_ij, because an isotropic function has y_i = y_j there.

@@ -63,7 +63,7 @@ def call(function: Callable, kind: str = "UFL", /, **available):
     names = list(signature(function).parameters)
     for name in names:
         if name not in available:
-            raise ValueError(f"{_name(function)}: argument {name!r}, must be some of {', '.join(available)}")
+            raise ValueError(f"{_name(function)}: argument {name!r}, must be one of {', '.join(available)}")
     given = {name: available[name] for name in names}
     return asked(_name(function), f"{kind} of {', '.join(names) or 'no argument'}", lambda: function(**given))
 
@@ -106,7 +106,7 @@ def _check_parts(what: str, out: ufl.core.expr.Expr) -> None:
 
 
 def named(what: str, given, shapes: Mapping[str, tuple[int, ...]], some: bool = False) -> dict:
-    """Return the dict that a user-defined function gave, as UFL with the given shapes; some: names may be missing.
+    """Return the dict from a user-defined function as UFL with the given shapes; some: whether names may be missing.
 
     Raises
     ------

@@ -23,9 +23,9 @@ def suction_sums(points: FormPoints, F, slopes: Sequence, locks: bool) -> CellSu
     """Return the sums over the pieces of one part in each cell that `OfSuction` needs; None if it needs none.
 
     points: integration points of the pieces; locks: whether their law uses the mean dilatation; F: deformation gradient
-    (d, d), a UFL variable; slopes: derivatives by the pressure, as UFL, of the first Piola-Kirchhoff stress (d, d) and,
-    with mean dilatation, of the mean stress pi conjugate to theta.  `slopes` are empty if the law is independent of
-    suction.
+    (d, d), a UFL variable; slopes: UFL derivatives of stresses with respect to the pressure, empty for laws without
+    suction.  The stresses are the first Piola-Kirchhoff stress (d, d) and, with mean dilatation, the mean stress pi
+    conjugate to theta.
     """
     share = 1 / ufl.det(points.F)
     tensors = [share * ufl.diff(ufl.det(F), F)] if locks else []
@@ -48,7 +48,7 @@ class OfSuction:
         self._free = {number: of for number, of in found.items() if number not in self._locked}
 
     def rows(self, data: QuadratureData) -> list[tuple[NDArray[np.int32], NDArray[np.float64]]]:
-        """Return pairs: cells (c,), and derivatives (c, n), m^(d-1), of their n nodal forces by their pressures."""
+        """Return pairs: cells (c,), and derivatives (c, n), m^(d-1), of their nodal forces with respect to pressure."""
         out = [(data.parts[number].places.filled, sums(data.parts[number])) for number, sums in self._free.items()]
         if self._locked:
             width = 2 * self._width + 1

@@ -6,8 +6,8 @@ is the strength of a face (see below). G is the shear modulus, h the cell size, 
 derivative.  Nearly empty cells then affect neither the conditioning nor the accuracy. The penalty resists each step's
 increment like a viscosity, so it must not act on load-bearing cells:
 
-* The strength s of a face falls from 1 to 0 as (filling of the emptier cell) / (filling of the fuller cell) rises from
-  0 to RATIO. A second factor is the square of (filling of the fuller cell) / (largest filling next to the emptier one).
+* The strength s of a face falls from 1 to 0 while the emptier cell's filling rises from 0 to `RATIO` times the fuller
+  cell's.  A second factor is a squared ratio: the fuller cell's filling to the largest filling next to the emptier one.
   Nearly empty cells thus follow full ones easily.  A penalty between equally filled cells would resist kinks of a body.
 * The scale is the shear modulus. With lambda + 2G, nearly empty cells of nearly incompressible bodies would copy the
   stretch of the full neighbour, against their own volume constraint.  In flowing soil the modulus `stiffness` is < 2G.

@@ -102,7 +102,7 @@ class GivenDisplacements(Acting):
     def check_start(self, place: Place) -> None:
         """Warn, once for each condition, if its side must jump at the start of a stage with inertia.
 
-        A gap is a jump if it strains the cell at the side by more than (stress there) / (modulus there).
+        A gap is a jump if it strains the cell at the side by more than stress over modulus there.
         """
         if not (place.inertia and place.dt):
             return
@@ -192,7 +192,7 @@ class GivenDisplacements(Acting):
                 raise ValueError(f"{what}, at {X[jump.argmax()]}; must be equal there, or the sides two cells apart")
 
     def _given(self, hold: Displacement, t: float, X: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the prescribed displacements (m, d), m, at reference positions X (m, d) of this process."""
+        """Return the prescribed displacements (n, d), m, at reference positions X (n, d) of this process."""
         return everywhere(self._grid.comm, lambda: hold.at(t, X))
 
     def unknown(self, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:
@@ -240,9 +240,9 @@ class GivenDisplacements(Acting):
     def under_held(
         self, ids: NDArray[np.int64], tracked: NDArray[np.float64], volume: NDArray[np.float64], corners: NDArray
     ) -> NDArray[np.float64]:
-        """Return corners (m, 2^d, d), m, of the particle domains `ids`, after domains at a held side become prisms.
+        """Return corners (n, 2^d, d), m, of the particle domains `ids`, after domains at a held side become prisms.
 
-        tracked, m: tracked corners; volume (m,): domain volumes, in axisymmetry areas of their sections.  A prism
+        tracked, m: tracked corners; volume (n,): domain volumes, in axisymmetry areas of their sections.  A prism
         has this volume, and the tracked corners on the held face.  If the face moved, the penalty would pull it back.
         """
         index = np.arange(2**self._grid.dim)
@@ -261,20 +261,10 @@ class GivenDisplacements(Acting):
 class HoldLoads(Loads):
     """Prescribed displacements in a substep.
 
-    Parameters
-    ----------
-    acting
-        The prescribed displacements of the stage.
-    forms, data
-        Forms, and their points: one for each prescribed component, with stiffness, direction and gap.
-    held
-        Geometry and stiffness of all penalties.
-    row : (m,)
-        Index in `held` of each prescribed component.
-    share : (m, 2^d)
-        Fraction of each component's force on each node, without the fraction that walls of the grid bear.
-    place
-        Time and cut domains of the substep.
+    acting: the prescribed displacements of the stage; forms, data: forms, and their points, one for each prescribed
+    component, with stiffness, direction and gap; held: geometry and stiffness of all penalties; row (m,): index in
+    `held` of each prescribed component; share (m, 2^d): fraction of each component's force on each node, without the
+    fraction that walls of the grid bear; place: time and cut domains of the substep.
     """
 
     stiff = True
@@ -326,7 +316,7 @@ class HoldLoads(Loads):
         return bool(more.any())
 
     def reached(self, at: At) -> NDArray[np.bool_]:
-        """Return whether each component (m,) lags at u by at most 1 / sqrt(HOLD) of its prescribed increment."""
+        """Return whether each component (m,) lags at u by at most 1 / sqrt(`HOLD`) of its prescribed increment."""
         return np.abs(self._asked - self._along(at.nodal)) * np.sqrt(HOLD) <= np.abs(self._asked)
 
     def pulls(self, b: NDArray[np.float64]) -> None:

@@ -25,12 +25,12 @@ from mpm_dolfinx.parallel.exchange import over_all
 ALIGNED = 1e-2
 """Largest slope of a side against a grid axis at which cells can follow all points of the side at constant volume."""
 WEAK = 8.0
-"""Pointwise penalty stiffness for deviations from the means, in units of (modulus + 10 stress) / (cell size).  Halving
+"""Pointwise penalty stiffness for deviations from the means, divided by (modulus + 10 stress) over cell size.  Halving
 this value changes the result of scene "soil" in tests/plateaus.py by 5.0e-06 (relative), doubling it by 7.9e-06, and
 finer cells by 3.0e-02.
 """
 EVERYWHERE = 1e2
-"""Normal penalty stiffness at each point of a side with a slope below `ALIGNED`, in units of resistance / cell size.
+"""Normal penalty stiffness at points of sides with slopes below `ALIGNED`, divided by resistance over cell size.
 Halving this value changes the result of scene "soil" in tests/plateaus.py by 2.2e-05 (relative), doubling it by
 1.7e-05, and finer cells by 3.0e-02.
 """
@@ -39,7 +39,7 @@ TENSE = 10
 Halving this value changes the result of scene "soil" in tests/plateaus.py by 2.8e-06 (relative), doubling it by
 4.7e-06, and finer cells by 3.0e-02.
 """
-CARRIED = 0.3  # largest plausible traction increment of a step / (resisting modulus + TENSE * stress of the body)
+CARRIED = 0.3  # largest plausible traction increment of a step over (resisting modulus + TENSE * stress of the body)
 
 
 class HeldPoints(NamedTuple):
@@ -51,7 +51,7 @@ class HeldPoints(NamedTuple):
     modulus: NDArray[np.float64]  # (n,) penalty modulus times area, N; down to `undrained`: at the last grid reset
     tension: NDArray[np.float64]  # (n,) norm of the stress times area, N
     resistance: NDArray[np.float64]  # (n,) resisting modulus times area, N
-    firm: NDArray[np.float64]  # (n,) confined modulus times area, N, of which the part of the fluid is limited
+    firm: NDArray[np.float64]  # (n,) confined modulus times area, N, with a limited contribution of the fluid
     undrained: NDArray[np.float64]  # (n,) undrained confined modulus times area, N
     x: NDArray[np.float64]  # (n, d) position, m
     gap: NDArray[np.float64]  # (n, d) prescribed minus present position, m
@@ -233,8 +233,8 @@ class HeldCells:
         penalties then push the side to and fro. Only the sum of the penalty forces at a node acts on the body and
         counts in the reaction. A force thus counts as too large only if the sums at its nodes exceed their limits too.
 
-        For each of k prescribed components: row: index of the penalty; axis; force, N; reached: whether the position is
-        reached.  told: indices of conditions that have been reported already, which are excluded.
+        For each of k prescribed components: row: index of the penalty; axis, force: its axis and force, N; reached:
+        whether it is at its position.  told: indices of conditions that have been reported already and are excluded.
         """
         grid = self.grid
         comm = grid.comm

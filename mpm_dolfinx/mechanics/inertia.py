@@ -5,11 +5,11 @@ A substep of a step of length dt balances rho a with a = (u - u^) / (g dt)^2. Th
 
     u^ = b dt v_1 + g dt (v_n + b dt a_1),      v = v_n + dt (b a_1 + g a).
 
-The weights g and b multiply the rates of the substep and of the previous substep (`time_integration`).  u and the
-motion u^ without forces are displacements since the start of the step, and v_n is the velocity at this start.  v_1 and
-a_1 are velocity and acceleration of the previous substep.  Only velocities are carried from step to step.  In each step
-SDIRK2 dissipates the fraction GAMMA^4 (omega dt)^4 = 0.0074 (omega dt)^4 of the energy of an oscillation of angular
-frequency omega.  This dissipation damps modes that the step cannot resolve.
+The weight g multiplies the rate of the substep, and b the rate of the previous substep (`time_integration`).  u^ is the
+displacement that would occur without forces.  Both u and u^ are measured from the start of the step, where the velocity
+is v_n.  v_1 and a_1 are velocity and acceleration of the previous substep.  Only velocities are carried from step to
+step.  In each step SDIRK2 dissipates the fraction GAMMA^4 (omega dt)^4 = 0.0074 (omega dt)^4 of the energy of an
+oscillation of angular frequency omega.  This dissipation damps modes that the step cannot resolve.
 
 The mass is integrated over the pieces of the particle domains, with masses m_k and second moments S_k about their
 centroids x_k,
@@ -170,8 +170,7 @@ def chord(G: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float
 class InertiaForms:
     """Compiled forms of mass and momentum, and the midpoint rule's coefficients in the forms of stresses and fluxes.
 
-    points: all integration points; of_laws: the integration points of each law; u: displacement increment of the step,
-    m.
+    points: all integration points; of_laws: the integration points of each law; u: displacement increment, m.
     """
 
     def __init__(self, points: FormPoints, of_laws: Sequence[FormPoints], u: fem.Function):
@@ -230,18 +229,9 @@ class InertiaForms:
     ) -> Mass:
         """Return the mass of the bodies on the grid.
 
-        Parameters
-        ----------
-        cut
-            The cut particle domains.
-        mass : (n,), kg
-            Masses of the points.
-        fill : (cells,)
-            Volume fraction of the local cells.
-        facets
-            Faces between two active cells, at least one not full.
-        unknowns, held
-            Unknown displacements, and displacements that grid boundary conditions fix.
+        cut: the cut particle domains; mass (n,), kg: masses of the points; fill (cells,): volume fraction of the local
+        cells; facets: faces between two active cells, at least one not full; unknowns, held: unknown displacements, and
+        displacements that grid boundary conditions fix.
         """
         grid = self.grid
         rows = cut.pieces_to_cells(cut.pieces.fraction * mass[cut.pieces.point])
@@ -405,7 +395,7 @@ class Flight(NamedTuple):
     acceleration: PETSc.Vec | None = None  # acceleration in the last substep, m/s^2
 
     def free(self, own: float, before: float) -> PETSc.Vec:
-        """Return the predictor of the next substep, m; own, before: weights, s, of its rate and the rate before it."""
+        """Return the predictor of the next substep, m; own, before: weights, s, of its rate and the previous rate."""
         flight = self.start * own
         if self.acceleration is not None:
             flight += self.velocity * before + self.acceleration * (own * before)

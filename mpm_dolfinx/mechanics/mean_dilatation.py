@@ -2,7 +2,7 @@
 """F-bar: one volume ratio per cell, against volumetric locking of nearly incompressible skeletons.
 
 Four volume constraints per cell suppress the bending modes of a Q1 quadrilateral, with errors of up to 50 % at nu =
-0.499. F-bar evaluates the law at a deformation gradient whose volume ratio of the step is the cell's mean theta,
+0.499. F-bar scales the law's deformation gradient so that its volume ratio in the step is theta, the mean of the cell,
 
     Fbar = (theta J_n / det F)^(1/3) F,     theta = sum w det(Delta) / sum w   over the locking pieces of the cell.
 
@@ -14,9 +14,9 @@ the derivative
 
     sum w [dPsi/dF : dF + pi d(det Delta)],   pi = (sum w dPsi/dtheta) / (sum w).
 
-At fixed theta and pi, the residual has the additional term with pi, and the residual's tangent is symmetric. The
-derivatives by theta and pi add a matrix of rank two in each cell (Simo, Taylor and Pister 1985; incremental F-bar in
-the material point method: Coombs et al. 2018). For a law without an energy, P(Fbar) : dFbar replaces dPsi. The points
+At fixed theta and pi, the residual has the additional term with pi, and its tangent is symmetric. The derivatives with
+respect to theta and pi add a matrix of rank two in each cell (Simo, Taylor and Pister 1985). Coombs et al. (2018) used
+incremental F-bar in the material point method. For a law without an energy, P(Fbar) : dFbar replaces dPsi. The points
 store Fbar.  The next step starts from a J_n computed from the particle domains in the cell (`cell_ratios`).
 """
 
@@ -184,7 +184,7 @@ class MeanDilatation:
     def total(
         self, data: QuadratureData, sums: Sequence[NDArray[np.float64]]
     ) -> tuple[NDArray[np.int32], NDArray[np.float64], NDArray[np.float64]]:
-        """Return the cells with F-bar, totals of `sums` over the parts in each, and volumes (cells, 1) with F-bar."""
+        """Return the cells with F-bar, totals (cells, k) of `sums` over all parts, volumes (cells, 1) with F-bar."""
         return self._cells(data).filled, self._cells(data).total(sums), self._volume_of(data)
 
     def update(self, data: QuadratureData, solve: Callable[[], None]) -> None:
@@ -196,7 +196,7 @@ class MeanDilatation:
     def _set_mean(self, f: fem.Function, sums: Sequence[CellSums | StressAtPoints], data: QuadratureData) -> None:
         """Set f in each cell to the volume mean of a quantity over the pieces with F-bar.
 
-        sums: one function for each part of the scene's points; it returns the sums of this part in the cells.
+        sums: for each part of the scene's points, a function that sums quantity times volume in each cell.
         """
         total = self._cells(data).total([of(part) for of, part in zip(sums, self._parts(data), strict=True)])
         f.x.array[self._cells(data).filled] = total[:, 0] / self._volume_of(data)[:, 0]
@@ -213,8 +213,8 @@ class MeanDilatation:
             axis=1,
         )
         d = c if self._symmetric else other[0]
-        # (d b^T + b c^T + e b b^T) V, with means over the volume V of derivatives: b, of det(Delta) by u; c, of
-        # dPsi/dtheta by u; d, of P by theta; e, of dPsi/dtheta by theta
+        # (d b^T + b c^T + e b b^T) V, with means over the volume V of derivatives: with respect to u, b of det(Delta)
+        # and c of dPsi/dtheta; with respect to theta, d of P and e of dPsi/dtheta
         columns, rows = (c + 0.5 * e * b) * volume, (d + 0.5 * e * b) * volume
         matrices = b[:, :, None] * columns[:, None, :] + rows[:, :, None] * b[:, None, :]
         insert(A, self._grid, self._cells(data).filled, matrices)

@@ -393,24 +393,10 @@ class MomentumSystem:
 class MomentumProblem:
     """Balance of momentum of one step.
 
-    Parameters
-    ----------
-    forms
-        Compiled forms.
-    system
-        Vectors and matrices, with assembled penalties.
-    data
-        Integration points.
-    loads
-        Loads on the bodies.
-    tolerance
-        Tolerance of the residual, relative to the forces.
-    goes_on : (unknowns,)
-        Displacements extrapolated from the last step, m, a local array; None if unknown.
-    held : (unknowns,)
-        Forces that balance the initial stress where loads do not, N, a local array, or None.
-    yielded
-        Whether any soil has yielded before this step.
+    forms: compiled forms; system: vectors and matrices, with assembled penalties; data: integration points; loads: on
+    the bodies; tolerance: of the residual, relative to the forces; goes_on (unknowns,): displacements extrapolated from
+    the last step, m, a local array, None if unknown; held (unknowns,): forces that balance the initial stress where
+    loads do not, N, a local array, or None; yielded: whether any soil has yielded before this step.
     """
 
     def __init__(
@@ -462,7 +448,7 @@ class MomentumProblem:
     def guesses(self) -> list[NDArray[np.float64]]:
         """Return initial guesses of the displacements (active dofs,), m, for Newton's method.
 
-        Each of the loads may propose a guess, such as a rigid rotation.  One more extrapolates the last step's motion.
+        Each of the loads may propose a guess, such as a rigid rotation.  Another guess extrapolates the last motion.
         """
         found = [one.guess(self.system.parts, self.forms.nodal) for one in self.loads]
         found = [values.ravel() for values in (*found, self._goes_on) if values is not None]
@@ -544,7 +530,7 @@ class MomentumProblem:
 
         For the first, the rounding error at each node is subtracted from the residual.  With `first` it is not
         subtracted, so that even a load below this error causes a solve.  For the second, the force scale of a part is
-        at least (rounding error) / (tolerance).  A residual as small as the rounding error then counts as converged.
+        at least the rounding error divided by the tolerance.  A residual within rounding then counts as converged.
         """
         system, parts = self.system, self.system.of_parts
         both = np.zeros((2, system.unknowns.size))

@@ -267,7 +267,7 @@ class QuadraturePoints:
         return cut.to_cells(self._scene.conducting(cut.points))
 
     def fixed_stress(self, cut: CutDomains, points: MaterialPoints, of_fluid: bool) -> NDArray[np.float64]:
-        """Return beta (m,), 1/Pa, at the integration points, for the fixed-stress operator C + factor beta V.
+        """Return beta (m,), 1/Pa, at the integration points, for the fixed-stress operator C + f beta V (f: `Scheme`).
 
         of_fluid: whether to return 1/K_w instead of beta; the iteration then converges for stiff skeletons only.
         """

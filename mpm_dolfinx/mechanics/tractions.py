@@ -3,9 +3,8 @@
 
 The virtual work of a traction t, force per reference area, is int t . v dA on the reference faces. The virtual work of
 a pressure is -int p n . v da on the present area. The tangent of this term is symmetric except for a contribution p/2
-(v x du) . dx of the surface's edges dx. This contribution vanishes where two surfaces of equal pressure meet. The
-contribution also vanishes on a wall that fixes the normal component of v and du, because v, du and the edge lie in the
-wall.
+(v x du) . dx of the surface's edges dx. This contribution vanishes where two surfaces of equal pressure meet. It also
+vanishes on a wall that fixes the normal component of v and du, because v, du and the edge lie in the wall.
 """
 
 from __future__ import annotations
@@ -113,7 +112,7 @@ class DeadLoads(Loads):
 def owners(grid: Grid, patches: Sequence[Patches]) -> tuple[Exchange, Places]:
     """Return the exchange of patch data with the processes that own the cells, and the positions there."""
     cell, x = (np.concatenate([getattr(p, name) for p in patches]) for name in ("cell", "x"))
-    travel = Exchange(grid.comm, grid.owner(cell))
+    travel = grid.to_owners(cell)
     return travel, Places(grid, grid.local(travel.send(cell)), travel.send(x))
 
 

@@ -28,6 +28,7 @@ class OwnTerm(NamedTuple):
     points: FormPoints  # integration points
     form: PointForm
     slope: PointForm | None  # derivative with respect to u, None if zero
+    seeded: bool  # whether the term depends on the displacement of a side
 
 
 class OwnTerms:
@@ -63,7 +64,8 @@ class OwnTerms:
             holds = u in form.coefficients()
             with compiling(f"terms: {line(term)}", "linear in v, or an energy of u"):
                 slope = PointForm(ufl.derivative(form, u, du), points) if holds else None
-                self.terms.append(OwnTerm(term, points, PointForm(form, points), slope))
+                seeded = on_side and points.displacement in form.coefficients()
+                self.terms.append(OwnTerm(term, points, PointForm(form, points), slope, seeded))
             self.symmetric &= potential or not holds
             self.holding |= holds
             self.rates |= forms.velocity.among(form)
@@ -83,11 +85,8 @@ class OwnTermsOfStage(Acting):
         self._terms = [
             (term, setting.sides.of(term.given) if isinstance(term.given, OnSide) else None) for term in terms
         ]
-
-    @property
-    def surfaces(self) -> list[Surface]:
-        """Faces with terms."""
-        return [faces for _, faces in self._terms if faces is not None]
+        self.surfaces = [faces for _, faces in self._terms if faces is not None]
+        self.seeded = [faces for term, faces in self._terms if term.seeded]
 
     def placed(self, place: Place) -> Loads:
         """Return the terms at the integration points of bodies and sides."""

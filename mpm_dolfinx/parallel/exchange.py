@@ -35,7 +35,7 @@ traffic = Traffic()
 
 @cache
 def _lasting(handle: int) -> PETSc.Vec:
-    """Return an object that keeps PETSc's duplicate of a communicator; a new one at the end needs all processes."""
+    """Return an object that keeps PETSc's duplicate of a communicator; making a duplicate needs all processes."""
     return PETSc.Vec().create(MPI.Comm.f2py(handle))
 
 

@@ -31,7 +31,7 @@ from mpm_dolfinx.grid.grid import ABOUT_MIDDLE, FACE_SIGNS, FACES, TURN, Grid, c
 SLIVER = NEAR**2
 """Smallest volume fraction of a piece. Pieces thinner than `Grid.snap` have an open face. Source: epsilon."""
 CHUNK = 2**15  # simplices cut in one call, so that they fit into the processor's cache
-TANGLED = 0.2  # least (volume between the corners) / (volume of the domain); else corners are re-initialised from F
+TANGLED = 0.2  # least volume between corners, divided by the domain's; below it corners are re-initialised from F
 
 
 @dataclass
@@ -40,7 +40,7 @@ class Pieces:
 
     point: NDArray[np.int64]  # (m,) index of the domain
     cell: NDArray[np.int64]  # (m,) lexicographic index of the cell
-    fraction: NDArray[np.float64]  # (m,) volume of the piece / volume of the domain
+    fraction: NDArray[np.float64]  # (m,) volume of the piece, divided by the volume of the domain
     x: NDArray[np.float64]  # (m, d) centroid, m
     # (m, d, 2) on request, else (m, 0, 2): area on the lower and upper face of the cell along each axis, m^(d-1)
     faces: NDArray[np.float64]
@@ -49,8 +49,8 @@ class Pieces:
     # (m, 4) in axisymmetry, else (m, 0): offset (2,) of the section's centroid from the cell's midpoint, m; mean over
     # the section of the product of both offsets from this midpoint, m^2; radius of the section's centroid, m
     hoop: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 0)))
-    # (m, d, d) on request, else (m, 0): (second moments about the centroid) / volume, m^2; in axisymmetry for pieces
-    # with symmetric sections
+    # (m, d, d) on request, else (m, 0): second moments about the centroid, divided by volume, m^2; in axisymmetry for
+    # pieces with symmetric sections
     second: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 0)))
 
 
@@ -316,7 +316,7 @@ def _sum(
     second: bool,
     faces: bool,
 ) -> Pieces:
-    """Sum the slices of the surfaces to one piece for each domain and cell."""
+    """Return the pieces, one for each domain and cell, from sums over the slices of the domains' surfaces."""
     d = grid.dim
     index = np.floor(s.sum(axis=0) / d)
     least = s.min(axis=0)
@@ -412,7 +412,7 @@ def _sum(
 
 
 def spreads(corners: NDArray[np.float64], rings: bool) -> NDArray[np.float64]:
-    """Return (second moments about the centroid) / volume (n, d, d), m^2, of domains, exact for parallelepipeds.
+    """Return second moments about the centroid divided by volume (n, d, d), m^2, of domains; exact for parallelepipeds.
 
     rings: whether the domains are sections of rings, in axisymmetry.
     """
@@ -422,10 +422,10 @@ def spreads(corners: NDArray[np.float64], rings: bool) -> NDArray[np.float64]:
 
 
 def of_rings(spread: NDArray[np.float64], radius: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (second moments about the centroid) / volume (n, 2, 2), m^2, of rings with symmetric sections.
+    """Return second moments about the centroid divided by volume (n, 2, 2), m^2, of rings with symmetric sections.
 
-    spread (n, 2, 2): second moments / area of the sections, m^2; radius (n,): radius of the sections' centroids, m.
-    The vector from a section's centroid to the ring's centroid is spread[:, 0] / radius.
+    spread (n, 2, 2): second moments of the sections, divided by their areas, m^2; radius (n,): radius of the sections'
+    centroids, m. The vector from a section's centroid to the ring's centroid is spread[:, 0] / radius.
     """
     off = spread[:, 0] / radius[:, None]
     return spread - off[:, :, None] * off[:, None]
@@ -496,7 +496,7 @@ def cut_faces(
     A face across a grid line must load the nodes on both sides in proportion to its parts. With one point per face, the
     error would move nodes of partly filled cells in every step without limit.
 
-    corners (m, 2^(d-1), d), m: corners of the faces; triangles repeat their last corner; local (m, 2^(d-1), e):
+    corners (faces, 2^(d-1), d), m: corners of the faces; triangles repeat their last corner; local (faces, 2^(d-1), e):
     coordinates of the corners, to be interpolated.
 
     Returns

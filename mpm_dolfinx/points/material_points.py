@@ -56,7 +56,7 @@ def with_ratio(F: NDArray[np.float64], J: NDArray[np.float64]) -> NDArray[np.flo
 
 
 def in_space(F: NDArray[np.float64], across: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return F (n, 3, 3) with the out-of-plane stretch (n,); the given plane part (n, 2, 2) has its determinant."""
+    """Return F (n, 3, 3) from its out-of-plane stretch (n,), and its plane part (n, 2, 2) scaled to the same det F."""
     out = np.zeros((len(F), 3, 3))
     out[:, :2, :2] = F / np.sqrt(across)[:, None, None]
     out[:, 2, 2] = across
@@ -110,7 +110,7 @@ class MaterialPoints:
         Corners at zero displacement: as seeded, or at the last time a stage set displacements to zero.
     reference : (n, 2^d, d), m
         Corners of the domain in the reference configuration of F: as seeded, or as re-initialised.
-    data : name -> (n, ...)
+    data : (n, ...) by name
         Further data of the points: parameters that vary with position, state of the law.
     """
 
@@ -125,7 +125,7 @@ class MaterialPoints:
     reference: NDArray[np.float64]
     data: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
     INTERNAL = (ACROSS, "owed", "due", "softness")
-    """Names of data that only the method needs."""
+    """Names of internal data, which users do not need."""
 
     def __post_init__(self):
         object.__setattr__(self, "data", MappingProxyType(dict(self.data)))
@@ -204,7 +204,7 @@ class MaterialPoints:
         return type(self)(**arrays, data={name: once(values) for name, values in self.data.items()})
 
     def where(self, rows: NDArray[np.bool_], other: MaterialPoints) -> MaterialPoints:
-        """Return these points where rows (n,) is true, and elsewhere `other`, another state of the same points."""
+        """Return these points where `rows` (n,) is true, and elsewhere `other`: the same points in another state."""
 
         def chosen(a: NDArray, b: NDArray) -> NDArray:
             return a if a is b else np.where(rows.reshape(-1, *[1] * (a.ndim - 1)), a, b)

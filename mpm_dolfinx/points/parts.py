@@ -28,7 +28,7 @@ class Parts:
     nodes: NDArray[np.int64]  # index, from 0, of each active local node's part, else -1
 
     def largest(self, comm: MPI.Comm, part: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the largest (count, ...) of the values (n, ...) in each part, else -inf; part (n,): part indices."""
+        """Return the largest of the values (n, ...) in each part (count, ...), or -inf; part (n,): their parts."""
         return largest_of_parts(comm, part, values, self.count)
 
 
@@ -68,7 +68,7 @@ class OfParts:
 
 
 def largest_of_parts(comm: MPI.Comm, part: NDArray, values: NDArray, count: int) -> NDArray[np.float64]:
-    """Return the largest (count, ...) of the values (n, ...) in each part on all processes; part (n,): part indices."""
+    """Return the largest value (count, ...) in each part, over all processes; part (n,): index of each value's part."""
     out = np.full((count, *values.shape[1:]), -np.inf)
     np.maximum.at(out, part, values)
     return over_all(comm, out, MPI.MAX)
@@ -89,7 +89,7 @@ def largest_of_bodies(
 def relative(
     norms: NDArray[np.float64], scales: NDArray[np.float64], round_off: NDArray[np.float64] | float = 0.0
 ) -> NDArray[np.float64]:
-    """Return norms / scales, but 0 where a norm is at most `round_off`, and inf instead of nan, for comparisons."""
+    """Return the norms divided by the scales: 0 where a norm is at most `round_off`, and inf instead of nan."""
     ratio = np.empty(norms.shape)
     ratio.fill(np.inf)
     np.divide(norms, scales, out=ratio, where=(scales > 0) & (norms < np.inf))
@@ -134,7 +134,7 @@ def joined_parts(
 ) -> tuple[NDArray[np.int64], int]:
     """Return parts and count, results of `parts_of_cells`, after the parts of some pairs of cells have been joined.
 
-    pairs (m, 2): lexicographic indices of active cells; each process may have some. All processes must call it.
+    pairs (m, 2): lexicographic indices of active cells; each process may have other pairs. All processes must call it.
     """
     cells, at = np.unique(np.concatenate(grid.comm.allgather(np.unique(pairs, axis=0))), return_inverse=True)
     of = np.where(grid.owner(cells) == grid.comm.rank, part[grid.local(cells)], 0)
@@ -145,7 +145,7 @@ def joined_parts(
 
 
 def _touching(index: NDArray[np.int64]) -> tuple[NDArray[np.int64], int]:
-    """Return the index (n,), from 0, of each cell's part, and their number; index (n, d + 1): grid indices and copy."""
+    """Return each cell's part (n,), from 0, and the number of parts; index (n, d + 1): grid indices and copy."""
     if not len(index):
         return np.empty(0, dtype=np.int64), 0
     low = index.min(axis=0)
@@ -158,7 +158,7 @@ def _touching(index: NDArray[np.int64]) -> tuple[NDArray[np.int64], int]:
 
 
 def _joined(rows: NDArray[np.int64], columns: NDArray[np.int64], shape: Sequence[int]) -> tuple[NDArray[np.int64], int]:
-    """Return the index, from 0, of each row's component, and their number; rows with a common column are connected."""
+    """Return the component of each row, an index from 0, and their number; rows with a common column are connected."""
     n = sum(shape)
     pairs = coo_array((np.ones(len(rows)), (rows, shape[0] + columns)), shape=(n, n)).tocsr()
     count, part = connected_components(pairs, directed=False)

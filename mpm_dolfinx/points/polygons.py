@@ -89,10 +89,19 @@ class Polygons:
         return out
 
     def simplified(self, near: float) -> Polygons:
-        """Return the polygons without vertices that are nearer than `near`, m, to the next vertex."""
-        k = self.edge.shape[1]
-        used = np.arange(k) < self.count[:, None]
-        return _packed(self.x, self.edge, used & (np.abs(self.after - self.x).max(axis=2) > near))
+        """Return the polygons without vertices nearer than `near`, m, to the next one, or to a line within one edge.
+
+        Rounding would otherwise divide a trapezoid with such a vertex: its diagonals divide the area equally evenly.
+        """
+        used = np.arange(self.edge.shape[1]) < self.count[:, None]
+        out = _packed(self.x, self.edge, used & (np.abs(self.after - self.x).max(axis=2) > near))
+        k, last = np.arange(out.edge.shape[1]), np.maximum(out.count - 1, 0)[:, None]
+        before = np.roll(out.x, 1, axis=1)  # vertices are padded by the last one
+        same = out.edge == np.where(k == 0, np.take_along_axis(out.edge, last, axis=1), np.roll(out.edge, 1, axis=1))
+        a, b = out.x - before, out.after - before
+        off = np.abs(a[:, :, 0] * b[:, :, 1] - a[:, :, 1] * b[:, :, 0])
+        straight = same & (off <= near * np.linalg.norm(b, axis=2))
+        return _packed(out.x, out.edge, (k <= last) & ~straight)
 
     def quadrilaterals(self) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64]]:
         """Divide convex polygons into quadrilaterals, by the diagonals that divide the area most evenly.

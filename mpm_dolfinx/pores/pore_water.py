@@ -27,7 +27,7 @@ MOST = 2200  # Source: exact bound, twice the halvings of a bracket of doubles (
 class PoreWater:
     """Water storage of m pieces of particle domains in n cells."""
 
-    # function of pressures (m,), Pa, that returns S, dS/dp (m,), 1/Pa, and maybe more
+    # function of pressures (m,), Pa, that returns S, dS/dp (m,), 1/Pa, and possibly other values
     saturation: Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], ...]]
     slot: NDArray[np.int64]  # (m,) index, from 0, of each piece's cell
     store: NDArray[np.float64]  # (m,) storage, m^d/Pa
@@ -36,7 +36,7 @@ class PoreWater:
     scale: NDArray[np.float64]  # (n,) suction at which the pores of a cell drain, Pa
 
     def emptied(self, p: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return (S - 1) rho of the pieces, and its derivative, 1/Pa, at pressures p (m,), Pa."""
+        """Return (S - 1) rho of the pieces, and its derivative with respect to p, 1/Pa, at pressures p (m,), Pa."""
         return emptied(p, self.bulk, *self.saturation(p)[:2])
 
     def of_cells(self, p: NDArray[np.float64]) -> NDArray[np.float64]:

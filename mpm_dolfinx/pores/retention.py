@@ -88,7 +88,7 @@ class VanGenuchten(Retention):
     Parameters
     ----------
     entry
-        Pressure that corresponds to van Genuchten's alpha, Pa, > 0: unit weight of water / alpha, with alpha in 1/m.
+        Characteristic suction, Pa, > 0: unit weight of water divided by van Genuchten's alpha, 1/m.
     residual
         Residual saturation S_r, in [0, 1).
     n
@@ -115,7 +115,7 @@ class VanGenuchten(Retention):
         return x ** (self.n - 1) * (1 + x**self.n) ** (1 / self.n - 1)
 
     def _least(self):
-        """Return air entry / `entry`, but > 0, because powers of zero have no derivatives."""
+        """Return `air_entry` divided by `entry`, kept above zero, because a power has no finite derivative at zero."""
         return ufl.max_value(self.air_entry / self.entry, TINY)
 
     def effective(self, s):
@@ -136,7 +136,7 @@ class Gardner(Retention):
     Parameters
     ----------
     entry
-        Suction at which S_e = k_r = 1/e, Pa, > 0: unit weight of water / Gardner's alpha, with alpha in 1/m.
+        Suction at which S_e = k_r = 1/e, Pa, > 0: unit weight of water divided by Gardner's alpha, 1/m.
     residual
         Residual saturation S_r, in [0, 1).
     """
@@ -202,7 +202,8 @@ def check_retention(what: str, law) -> None:
         if not good:
             shown = ", ".join(f"{value:.3g}" for value in values)
             where = ", ".join(f"{-s:.3g}" for s in suctions)
-            raise ValueError(f"{what}: {name} is {shown} at p = {where} Pa, must fall from 1 at 0 to no less than 0")
+            allowed = "must be 1 for p >= 0, must not increase with suction, and must not be negative"
+            raise ValueError(f"{what}: {name} is {shown} at p = {where} Pa, {allowed}")
 
 
 def sampled(law) -> list[float]:
@@ -405,7 +406,7 @@ class Conductance:
         self._edges = edges
 
     def __call__(self, p: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return three columns (n, 3) at pressures p (n,), Pa: integral, Pa; k_r; derivative of k_r, 1/Pa."""
+        """Return three columns (n, 3) at pressures p (n,), Pa: integral, Pa; k_r; derivative dk_r/dp, 1/Pa."""
         s = np.clip(-p, self._edges[0], self._edges[-1])
         z = (np.log(s) - self._low) / self._step
         i = np.minimum(z.astype(np.int64), ROWS - 2)
@@ -426,7 +427,7 @@ class Conductance:
 
 
 REACH = (1e-8, 1e8)
-"""Range of tabulated suctions / scale of the law.  Source: outside it the integral is exact to a fraction of 1e-8."""
+"""Range of tabulated suctions, divided by the law's scale.  Source: the integral is exact to 1e-8 outside the range."""
 ROWS = 4000
 """Number of tabulated suctions.  Halving this value changes the result of scene "dry" in tests/plateaus.py by 2.1e-08
 (relative), doubling it by 2.6e-09, and finer cells by 6.6e-03.
@@ -448,10 +449,10 @@ def pressure_at(y: NDArray[np.float64], scale: NDArray[np.float64]) -> NDArray[n
 
 
 FARTHEST = np.log(10)
-"""Largest change of the suction's logarithm in a Newton step; without a limit, fronts in dry soil do not converge.
+"""Largest change of the suction's natural logarithm in a Newton step; without it, fronts in dry soil do not converge.
 
-Celia's column of 25 and 100 cells takes 310 and 500 Newton steps in 28 time steps with a limit of 2.  With a limit of 4
-the column takes 330 and 920, and four time steps are reduced.
+If this change is at most 2, Celia's column takes 310 (25 cells) and 500 (100 cells) Newton steps in 28 time steps.  If
+it is at most 4, the column takes 330 and 920, and four time steps are reduced.
 
 Halving this value changes the result of scene "dry" in tests/plateaus.py by 7.6e-10 (relative), doubling it by 9.8e-10,
 and finer cells by 6.6e-03.

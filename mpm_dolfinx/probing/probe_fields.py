@@ -42,7 +42,7 @@ def probe_pressures(scene: Scene, state: State, probes: Probes) -> NDArray[np.fl
 
 
 class _Lattice:
-    """Blocks of (2 CELLS + 1)^d cells around the cells of m probes.
+    """Blocks of (2 `CELLS` + 1)^d cells around the cells of m probes.
 
     number (m, cells): lexicographic indices of the cells, -1 outside the grid; midpoint, size (m, cells, d), m.
     middle: index of the probe's cell in its block; stride (d,): increment of this index along each axis.
@@ -207,7 +207,7 @@ class _Around:
         return low, high
 
     def _outside_faces(self, head: NDArray[np.float64]) -> list[tuple[NDArray, ...]]:
-        """Return indices of probes, offsets, heads (two-point flux) and weights of faces to cells outside the fit."""
+        """Return data of faces to cells outside the fit: probe index, offset, head by two-point flux, weight."""
         out = []
         for (axis, end), pair in self._lattice.neighbours.items():
             own_cells, other_cells = pair
@@ -228,7 +228,7 @@ class _Around:
         return out
 
     def _drained(self, weight: NDArray[np.float64]) -> tuple[NDArray, ...]:
-        """Return indices of probes, offsets, heads, weights of drained sides, and whether each is in the probe's cell.
+        """Return data of drained sides: probe index, offset, head, weight, and whether the side is in the probe's cell.
 
         For each side of a cell, the fit uses the mean head over the side's faces: single heads cause false gradients.
         """

@@ -112,7 +112,7 @@ def probes(bodies: Sequence[Body], x0: ArrayLike, *, stress: bool = False) -> Pr
     for i, x in enumerate(x0):  # a loop suffices for few positions, once for a scene
         found = next(_domains_at(bodies, x, rounding(x0)), None)
         if found is None:
-            raise ValueError(f"probe at {x}: outside the bodies, must be in one or on its surface")
+            raise ValueError(f"probe at {x}: outside the bodies, must be in a body or on its surface")
         ids[i], xi[i] = found
     return Probes(x0, ids, xi, tuple(bodies), stress)
 

@@ -82,7 +82,7 @@ class Events:
 
         Trial steps of other lengths start from `step.start`. Brent's method chooses the lengths for functions that
         return numbers, bisection for booleans. The result is the first state found after the event, at most the
-        fraction `LOCATED` of the step later. Afterwards the simulation has the state `step.start`, also after an error.
+        fraction `LOCATED` of the step later. Afterwards the simulation has the state `step.start`, even after an error.
         """
         if not self._until:
             return None

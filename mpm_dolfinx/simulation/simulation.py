@@ -213,7 +213,7 @@ class Simulation:
         return self.outcome("tool_travel")
 
     def outcome(self, quantity: str) -> ByName[NDArray[np.float64]]:
-        """Return results of conditions, also of user-defined ones, at the end of the last step, by name.
+        """Return results of conditions, including user-defined conditions, at the end of the last step, by name.
 
         The result is empty for quantities that no condition of the stage has.
 

@@ -24,29 +24,30 @@ from mpm_dolfinx.stepping.scene import Scene
 from mpm_dolfinx.stepping.state import StepControl
 
 MIN_CUT, MIN_CUT_BY_ERROR = 2.0**-10, 2.0**-30
-"""Smallest reduced step / nominal step, for equal steps and for adaptive steps.
+"""Smallest reduced step, divided by the nominal step: first of equal steps, then of adaptive steps.
 
 Adaptive steps grow over decades. At the onset of sliding they must shrink to the time scale of sliding.
 """
 FINEST = NEAR**2
-"""Smallest adaptive step / time.  Without this limit, steps would become ever smaller at a singularity in time.
+"""Smallest adaptive step divided by the time.  Without it, steps would become ever smaller at a singularity in time.
 
 Source: epsilon, a smaller step changes less than four digits of the time.
 """
 SAFETY, SHRINKS, GROWS, KEEPS = 0.9, 0.2, 5.0, 1.2
-"""Next adaptive step / last one: SAFETY / (power of error / tolerance), in [SHRINKS, GROWS]; 1 if it is in [1, KEEPS).
+"""Factor of the next adaptive step: `SAFETY` times a power of tolerance over error, from `SHRINKS` to `GROWS`.
 
-Source: Hairer, Norsett and Wanner (1993), eq. 4.13; for KEEPS Hairer and Wanner (1996), IV.8.
+A factor from 1 to `KEEPS` counts as 1.  Source: Hairer, Norsett and Wanner (1993), eq. 4.13; for `KEEPS` Hairer and
+Wanner (1996), IV.8.
 """
 RINGS = 5e-3
-"""Sudden pressure change / largest change so far, above which two steps of half the length replace a step.
+"""Sudden pressure change, divided by the largest change so far, above which two half steps replace a step.
 
 The stability function is never below -0.21, so an undetected jump overshoots by at most a thousandth.
 """
 AGAIN = 2.0
-"""A pressure jumps if it changes by more than AGAIN times the rate in the first substep of the previous step."""
+"""A pressure jumps if it changes by more than `AGAIN` times the rate in the first substep of the previous step."""
 MOST = SAME / EPSILON
-"""Largest number of output intervals. Source: exact bound; with more, SAME times a step is below epsilon times t."""
+"""Largest number of output intervals. Source: exact; with more intervals, `SAME` times a step is below rounding."""
 RESOLVED = 10
 """Smallest ratio of `rtol` to the solver tolerance; below it, solver errors would hide the error of the step."""
 FIRST = 1e-3
@@ -153,12 +154,12 @@ class StepSize:
         return bool((excess > np.maximum(RINGS * np.asarray(control.change), NEAR * max(control.change))).any())
 
     def _factor(self, report: Report, control: StepControl, power: float) -> float:
-        """Return (length of a step with the tolerated error) / (length of the solved step)."""
+        """Return the factor from the length of the solved step to the length of a step with the tolerated error."""
         excess = self._excess(report, control)
         return min(GROWS, max(SHRINKS, SAFETY / excess**power if excess > 0 else GROWS))
 
     def _excess(self, report: Report, control: StepControl) -> float:
-        """Return the error of a step / its tolerance: the largest ratio for pressure, motion and water content.
+        """Return the largest ratio of error to tolerance in a step, among pressure, motion and water content.
 
         The tolerance of the pressure includes the undrained pressure change of the step, because freely draining
         pressures follow the motion. The time error of such pressures affects no motion. Their error due to the grid,
@@ -248,7 +249,7 @@ class Times:
 
 
 def diffusion_time(scene: Scene, points: MaterialPoints) -> float:
-    """Return the least (cell size)^2 / (coefficient of consolidation), s, of all points; 0 without conductivity."""
+    """Return the least time of diffusion through a cell, s: size squared, divided by c_v; 0 without conductivity."""
     if scene.fluid is None:
         return 0.0
     stored = scene.materials.table(points, lambda m: m.biot**2 / m.oedometric)
@@ -283,7 +284,7 @@ def step_rule(times: Times, rtol, first_step, max_step: float, scene: Scene, poi
     least = RESOLVED * scene.scheme.tolerance
     numbers("rtol", rtol, test=lambda v: (least <= v) & (v < 1), allowed=f"in [{least:g}, 1), >= {RESOLVED} tolerance")
     if scene.numerics.method == "backward-euler":
-        raise ValueError(f"rtol = {line(rtol)}: method backward-euler has no error estimate, must be sdirk2")
+        raise ValueError(f"rtol = {line(rtol)}: method backward-euler has no error estimate, the method must be sdirk2")
     timed = any("dt" in law.by_scene for law in scene.materials.laws)
     inertia = scene.momentum.inertia is not None
     if (scene.momentum.own.rates or timed) and not scene.flows and not inertia:

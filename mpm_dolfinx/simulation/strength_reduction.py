@@ -4,9 +4,9 @@
 A factor F divides cohesion, tensile strength and the tangents of the angles of friction and dilation (Griffiths and
 Lane 1999). Dilation is divided too, so that associated flow stays associated. Soil that is too weak has no equilibrium,
 but a failure of the solver is no proof that the soil is too weak. Each trial therefore adds a viscous stress and
-follows the motion in time. The criterion is the overload: viscous stress / shear stress in the moving soil. If a body
-comes to rest, the soil's strength bears the load, and the overload vanishes. In a slide the overload remains, equal to
-the missing strength, at any viscosity and cell size.
+follows the motion in time. The criterion is the overload: the ratio of viscous stress to shear stress in the moving
+soil. If a body comes to rest, the soil's strength bears the load, and the overload vanishes. In a slide the overload
+remains, equal to the missing strength, at any viscosity and cell size.
 
 Before the trials, soil with unlimited strength takes one step. Bodies in equilibrium keep their stresses in this step.
 Bodies that cannot stand, and were therefore not run, get elastic stresses in it.
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from mpm_dolfinx.simulation.simulation import Simulation
 
 WIDER, WIDEST = 2**0.5, 16.1
-"""Ratio of successive trial factors, until bodies rest at one factor and slide at another; limit of F and of 1 / F."""
+"""Ratio of successive trial factors, until bodies rest at one and slide at another; 1 / `WIDEST` <= F <= `WIDEST`."""
 LACKS = 0.25
 """Largest overload, divided by `rtol`, of a trial that comes to rest.
 
@@ -53,8 +53,7 @@ A trial that slides starts with an overload of 0.9 times the missing strength in
 By the end the overload has halved. With values of 1/8 and 1/2 the slope's factor changes by 1.1 and 0.5 %.
 """
 STRAINS = 4.0
-"""Strain in a trial of a marginal slide, divided by the smaller of two values: overload of the trial, elastic strain at
-yield.
+"""Strain in a trial of a marginal slide, divided by the smaller of the trial's overload and elastic strain at yield.
 
 Stresses of soil that begins to flow redistribute within strains of a few times that at yield.  In soft soil such large
 strains would change the shape of the body; a larger viscosity limits them.  If this number is halved or doubled, the
@@ -73,7 +72,7 @@ class Safety:
     bounds
         Largest factor of a trial that came to rest, and smallest factor of a trial that did not.
     overloads
-        Trial factor -> overload in each step (n,): work of the viscous stress / work of the shear stress.
+        Overload in each step (n,), by trial factor: work of the viscous stress, divided by that of the shear stress.
     newton
         Number of Newton steps of all trials.
     """
@@ -183,7 +182,7 @@ def _bracket(rests: Callable[[float], bool]) -> tuple[float, float]:
         known = trial
     found, allowed = ("come to rest", "slide") if begins else ("slide", "come to rest")
     allowed += " at some factor" if begins else " at some factor; loads must be constant in time"
-    raise ValueError(f"factor_of_safety: the bodies {found} with strength / {known:.3g}, must {allowed}")
+    raise ValueError(f"factor_of_safety: the bodies {found} with strength divided by {known:.3g}, must {allowed}")
 
 
 def _ends(overloads: Sequence[float], steps: int, least: float) -> bool:
@@ -225,7 +224,7 @@ class _Weakened:
                 what = f"factor_of_safety: strength of {type(m).__name__} cannot be divided"
                 raise ValueError(f"{what}, must be a law with friction and cohesion")
         if not any(isinstance(m, Frictional) for m in scene.materials.materials):
-            raise ValueError("factor_of_safety: no material has a strength, must have friction and cohesion")
+            raise ValueError("factor_of_safety: no material has a strength, one must have friction and cohesion")
         if scene.grid.copies > 1:
             raise ValueError("factor_of_safety: the scene has contacts, must have none")
         initial = begin_stage(scene, simulation.state, {}, [], [], False, {})  # has no data of the old grid
@@ -273,7 +272,7 @@ class _Weakened:
         return replace(trial.state, t=initial.t)
 
     def _trial(self, start: State, strength: Callable[[str, NDArray[np.float64]], NDArray[np.float64]]) -> _Trial:
-        """Return a trial from the state `start`; strength: function of name and values (n,) -> new values (n,)."""
+        """Return a trial from the state `start`; strength: function of a strength's name and values (n,)."""
         data = {name: strength(name, value) for name, value in self._strengths.items()}
         points = replace(start.points, data={**start.points.data, **data})
         return _Trial(self._scene, replace(start, points=points, velocity=None, result=None, control=None), self.newton)
@@ -286,7 +285,7 @@ class _Weakened:
             raise GaveUp(f"factor_of_safety: {what}: {error}", error.result, error.history) from error
 
     def _overload(self, before: MaterialPoints, now: MaterialPoints) -> float:
-        """Return (work of the viscous stress in a step) / (integral of the norms of deviatoric stress x strain).
+        """Return a step's viscous work, divided by the integral of the norm of deviatoric stress times that of strain.
 
         Points that moved to another process are excluded.
         """
@@ -349,7 +348,7 @@ def _constant(X: NDArray[np.float64], value: float) -> NDArray[np.float64]:
 
 
 def _strengths(scene: Scene, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
-    """Return a dict, name of a strength -> values (n,) of the points; zero in materials without it."""
+    """Return the values (n,) of each strength at the points, by name; zero in materials without it."""
     out = {}
     for i, m in enumerate(scene.materials.materials):
         rows = np.flatnonzero(points.material == i)

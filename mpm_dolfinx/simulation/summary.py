@@ -56,7 +56,7 @@ def _momentum(s: Scene, state: State) -> list[Part]:
             f"nu <= {LOCKING}, no plastic flow",
         ),
         _either("state of the law", evolves, evolves, "the stress depends on F only"),
-        _either("kept volumes", s.motion.keeps_volumes, "of yielded domains", "not asked, or no plastic flow"),
+        _either("kept volumes", s.motion.keeps_volumes, "of yielded domains", "not requested, or no plastic flow"),
         _either("initial stress", s.initial.given, f"of {len(s.initial.given)} bodies", "none given"),
         _either("inertia", state.stage.inertia, "of all bodies", "not asked" if m.inertia is None else "quasi-static"),
         _either("body force", s.gravity is not None, "gravity", "no gravity"),
@@ -113,7 +113,7 @@ def table(scene: Scene, state: State) -> str:
 
 
 def imbalance(scene: Scene, state: State) -> dict[str, float]:
-    """Return (largest number on a process) / (mean over processes) of points, of pieces and of active cells.
+    """Return the largest number on a process, divided by the mean, of points, of pieces and of active cells.
 
     The ratio 1 means perfect balance. Ratios of pieces and cells are also 1 before the first step. The time of a step
     is proportional to the number of pieces. All processes must call it.

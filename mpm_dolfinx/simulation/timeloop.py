@@ -260,13 +260,13 @@ def _histories(
     last = after.rows[-1].t
     # an interrupted run may have stopped within its next interval
     if control.interval != times.interval or not last <= now <= times.next(last):
-        what = f"dt = {times.interval!r} from t = {now!r}: the run to continue has dt = {control.interval!r}"
+        what = f"dt = {times.interval!r} from t = {now!r}: the run that is continued has dt = {control.interval!r}"
         raise ValueError(f"{what}, t = {last!r}; for other steps, or t_eval, start new histories, without after")
     count = 0 if probes is None else len(probes.id)
     if (recorded := len(start.displacement)) != count:
-        raise ValueError(f"probes: {count} probes, must be {recorded}, as in the run to continue")
+        raise ValueError(f"probes: {count} probes, must be {recorded}, as in the run that is continued")
     if count and probes.stressed != (len(start.probe_stress) > 0):
-        raise ValueError(f"probes: stress = {probes.stressed}, must be as in the run to continue")
+        raise ValueError(f"probes: stress = {probes.stressed}, must be as in the run that is continued")
     return after, control
 
 
@@ -322,7 +322,7 @@ def _accepted(
 def _advance(simulation: Simulated, rule: StepSize, target: float, verbose: bool) -> tuple[Step, State]:
     """Return a step towards the time `target`, s, and its end state; the step is reduced until it meets its tolerances.
 
-    verbose: warn of the first reduced step of a run.
+    verbose: whether to warn of the first reduced step of a run.
     """
     comm = simulation.scene.grid.comm
     preferred = whole = None

@@ -7,7 +7,7 @@ ordering, ms: blocks 110 and 60, scalar 430 and 150, MUMPS 260 and 155, UMFPACK 
 solve takes 4 ms (MUMPS 15, CHOLMOD 9). Copying the entries into blocks takes a tenth of the factorisation. On two
 processes MUMPS factorises in the same time, and solves in 25 ms. With few processes, one process therefore holds the
 factors of displacements, which many solves use. Another holds the factors of pressures, computed at the same time.
-Factorisation of both on all of four processes took 1.7 times as long, because these share the memory's bandwidth.
+Both factorisations on all of four processes took 1.7 times as long, because these share the memory's bandwidth.
 
 Large bodies need nested dissection. With 504000 unknowns in 2D, a repeated factorisation ordered by grid lines
 (`dissection`) takes 3.0 s, and the factors have 4.6e7 entries. With PETSc's nested dissection these values are 5.1 s

@@ -38,7 +38,7 @@ With 1e3 or 1e5 as the limit, scenes take the same steps: the growth is below 1e
 WORK = 0.5
 """Largest ratio of the work at the end of a step to the work at its start (Matthies and Strang 1979)."""
 FIRM = 0.1
-"""Fraction of elastic shear stiffness in the tangent of yielding soil / relative residual; the fraction is at most 1.
+"""Fraction, <= 1, of elastic shear stiffness in the tangent of yielding soil, divided by the relative residual.
 
 With 0.05, 0.1 and 0.2 a footing on 9 cells takes 291, 293 and 293 Newton steps, pushed ground 42, 41 and 43.
 """
@@ -64,7 +64,7 @@ class Search:
 
     step: float = 1.0  # next trial, as a fraction of the full step
     low: float = 0.0  # from `low` to `high` the work changes its sign
-    at_low: float = 1.0  # work at `low` / initial work
+    at_low: float = 1.0  # work at `low`, divided by the initial work
     high: float = np.inf
     at_high: float = np.nan  # work at `high` / initial work
     ends: bool = False  # whether the next step is the last trial
@@ -72,7 +72,7 @@ class Search:
     """Largest growth of the residual at the end of a step."""
 
     def after(self, work: float, growth: float) -> Search | None:
-        """Return the next trial, or None if the search ends; work: work after the last trial / initial work, or nan.
+        """Return the next trial, or None if the search ends; work: last trial's work over the initial work, or nan.
 
         growth: factor by which the residual grew. A full step that does not increase the residual ends the search if
         |work| <= 1. A secant gives the next trial, or bisection if one of the bounds stays a second time.

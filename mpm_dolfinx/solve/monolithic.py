@@ -104,7 +104,7 @@ class BlockOperator:
         self.join(u, p, y)
 
     def displaced(self) -> NDArray[np.float64]:
-        """Return (fluid volume displaced by the residual forces) / (norm of these forces), m^d/N, by part (parts,)."""
+        """Return the fluid volume that residual forces displace in each part (parts,), divided by their norm, m^d/N."""
         forces, (u, _, _, g) = self.momentum.residual, self.work
         self.inverses[0].apply(forces, u)
         self.storage.B.mult(u, g)
@@ -227,7 +227,7 @@ class BlockSolver:
 
 
 def _foresight(many: int) -> Callable[[PETSc.KSP, int, float], None]:
-    """Return a monitor that ends a solve if its rate in the last many / 4 iterations predicts more than `many`."""
+    """Return a monitor that ends a solve if its rate in the last `many` / 4 iterations predicts more than `many`."""
     quarter = max(1, many // 4)
 
     def monitor(ksp: PETSc.KSP, count: int, norm: float) -> None:

@@ -66,7 +66,7 @@ def multigrid_solver(
         Unknowns of this process: indices along the grid axes, and index of the component, all >= 0. Each component is
         interpolated by itself.
     held : (m, d + 1)
-        Fixed degrees of freedom in cells of bodies, as `places`; interpolated displacements vanish there.
+        Fixed degrees of freedom in cells of bodies, described like `places`; interpolated displacements vanish there.
     nodal
         Whether the unknowns belong to nodes.
     coarsest
@@ -179,12 +179,12 @@ def _hats(
 def _shared(
     comm: MPI.Intracomm, keys: NDArray[np.int64], count: int, stated: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Return for each candidate its index (n,) as a coarse unknown, else NONE, and whether this process owns it (n,).
+    """Return for each candidate its index (n,) as a coarse unknown, else `NONE`, and whether this process owns it (n,).
 
     The process of lowest rank with a candidate owns the unknown. Keys are distributed over processes to find owners.
 
     keys (n,): coarse candidates of this process, ascending, below `count`; stated (n,): status of each candidate on
-    this process, MAYBE, NOT or IS, of which the largest value of all processes counts.
+    this process: `MAYBE`, `NOT` or `IS`; the largest value of all processes counts.
     """
     ask = Exchange(comm, (keys * comm.size // count).astype(np.int32))
     distinct, who = np.unique(ask.send(keys), return_inverse=True)

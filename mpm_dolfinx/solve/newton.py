@@ -42,7 +42,7 @@ from mpm_dolfinx.solve.factors import negative_pivots
 from mpm_dolfinx.solve.line_search import FIRM, Halving, Search
 from mpm_dolfinx.solve.schur import Kept, LinearSolvers
 
-INNER = 1e-3  # momentum tolerance / storage error; it is small because unconverged rotations cause volume changes
+INNER = 1e-3  # momentum tolerance over storage error; it is small because unconverged rotations change volumes
 MOMENTUM_STEPS = 10
 REBALANCED = 6  # largest number of iterations if contacts change, divided by the number if they do not
 LOOSEST = 1e-2
@@ -64,7 +64,7 @@ that rise or oscillate; 0.01 to 0.04 e with an oscillating source; 0.01 to 0.05 
 first step of a load that grows from zero; 0.26 e after a jump.  The largest error of a run is 0.7 to 5 times e / 20.
 """
 SUDDEN = np.sqrt(2)
-"""Ratio of the changes in second and first substep below which pressures decay so fast that sdirk2 overshoots.
+"""If a pressure's change in the second substep, over that in the first, is below this value, sdirk2 overshoots.
 
 With z = -(decay rate) dt, the stability function (1 + (1 - 2 gamma) z) / (1 - gamma z)^2 changes its sign at z = -1 -
 sqrt(2). The changes there are -gamma z / (1 - gamma z) = sqrt(2) - 1 and 2 - sqrt(2). The ratio is (1 - gamma) / gamma
@@ -164,9 +164,9 @@ def note_pressures(
 ) -> None:
     """Store the pressure changes and the estimated pressure error of a step in the report.
 
-    The difference between the step and a first-order step is the fluid volume seconds (Q2 - Q1). The fixed-stress
+    The difference between the step and a first-order step is the fluid volume `seconds` (Q2 - Q1). The fixed-stress
     operator converts this volume into a pressure that stays bounded for stiff modes, as in Hosea and Shampine (1996).
-    Cells are weighted by their filling. The error of the step is assumed to be ERROR times this pressure.
+    Cells are weighted by their filling. The error of the step is assumed to be `ERROR` times this pressure.
 
     seconds: factor, s, of the rates of the first substep; dt: length of the step, s; of_bodies: `Motion.of_bodies`, a
     function of active owned cells (n,) and values (k, n) that returns the largest values (k, bodies) in each body.
@@ -248,13 +248,14 @@ class Newton:
                 self._solvers.tangent(key, lambda: self._linearise_as_reset(as_reset))
             elif fresh:
                 self._linearise(np.where(eases, 0.0, FIRM * np.minimum(1.0, errors.u)))
-            self.report.coupling += self._direction(errors, fresh and slow)
+            self.report.coupling += self._direction(errors, slow)
             if self._storage is not None:
                 log_change = self._solvers.restrain(self._storage, log_change)
             before, errors = errors, self._line_search(errors, elastic)
-            count, slow = count + 1, fresh
+            count += 1
             # a residual is infinite before any fluid has been exchanged
             lags = (errors.each > keep * np.minimum(1.0, before.each)) & (errors.each > tolerance)
+            slow = fresh and bool((lags & (errors.p > errors.u)).any())
             fresh, eases = bool(lags.any()), eases & (elastic | ~lags)
             seeps = self._storage is not None and self._storage.settle()
             if self._momentum.settle(errors.worst <= SETTLED) or seeps:
@@ -396,7 +397,8 @@ class Newton:
         start (parts,): forces at the start of the step, N. Forces at other iterates are not part of the scale: after a
         diverging iterate every residual would seem small.
 
-        Residuals within round-off are returned as 0; the history has their norms, with scales >= round-off / tolerance.
+        Residuals within round-off are returned as 0.  The history has their norms, with scales of at least the
+        round-off divided by the tolerance.
         """
         first = not self.report.history
         with _compat.Timer("residual"):
@@ -433,8 +435,8 @@ class Newton:
     def _direction(self, errors: Errors, slow: bool) -> int:
         """Solve the linearised problem; return the number of coupling iterations.
 
-        slow: whether the last step converged slowly with a new tangent.  The tangent then also contains the derivative
-        of fluxes with respect to displacements.
+        slow: whether the storage's residual is the larger one and a new tangent has reduced it little.  The tangent
+        then also contains the derivative of fluxes with respect to displacements.
         """
         # the next residual needs no more accuracy
         iterative, least = self._solvers.plan.iterative, self._solvers.plan.forcing
@@ -526,5 +528,5 @@ class Newton:
 
 
 def _ratio(part: float, whole: float) -> float:
-    """Return part / whole, nan where it is not finite."""
+    """Return the ratio of `part` to `whole`, nan where it is not finite."""
     return part / whole if whole and np.isfinite(part) else np.nan

@@ -5,8 +5,7 @@
     [ B   C   ] [dp] = - [R_p]
 
 K, B and C: see `newton`. Elimination of du gives S = C + B K^-1 B^T. Conjugate gradients (or FGMRES) solve with S,
-preconditioned with the fixed-stress operator. For large bodies GMRES solves for both unknowns together, see
-`monolithic`.
+preconditioned with the fixed-stress operator. For large bodies GMRES solves for both unknowns (`monolithic`).
 
 PETSc's PCFIELDSPLIT with the same two solvers (full Schur factorisation) takes as many iterations, to the same digits.
 A solve takes 0.8 to 1 times the time of a solve here. But PCFIELDSPLIT needs a copy of -B^T for each tangent, and
@@ -154,7 +153,7 @@ class LinearSolvers:
     def schur(self) -> tuple[PETSc.Mat, PETSc.KSP]:
         """The Schur complement and its preconditioned solver; ValueError for monolithic multigrid, which has none."""
         if self._schur is None:
-            raise ValueError("solvers: monolithic multigrid has no Schur complement, must be direct solvers")
+            raise ValueError("solvers: monolithic multigrid has no Schur complement; direct solvers must be used")
         return self._schur, self._solve_s
 
     def linearise(

@@ -3,7 +3,7 @@
 
 There are four methods for the linearised problem. Without fluid the momentum balance is solved alone. With fluid the
 displacements are eliminated (`schur`), or both balances are solved together (`monolithic`) or in turn (fixed-stress
-iterations). The solver for displacements is direct (PETSc, also with a block for each node, or MUMPS) or multigrid.
+iterations). The solver for displacements is direct (PETSc, with or without nodal blocks, or MUMPS) or multigrid.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class Thresholds:
         Number of unknown displacements in 3D from which multigrid is used. Five load steps of a square beam take, with
         a direct solver and multigrid, s: 0.5 and 0.5 (1200 unknowns), 2.5 and 1.4 (2600), 8.2 and 2.1 (4900).
     multigrid_2d
-        As `multigrid_3d`, in wet 2D scenes without yield. Linear solvers in a step of the beam take, s: 0.06 and 0.05
+        The same number in wet 2D scenes without yield. Linear solvers in a step of the beam take, s: 0.06 and 0.05
         (10400 unknowns), 0.19 and 0.14 (25500), 0.53 and 0.32 (51000), 2.3 and 1.0 (151000).
     mumps
         Number of unknown displacements of wet unsymmetric problems from which MUMPS is used, on all processes. Factors
@@ -64,7 +64,7 @@ KEEP = 0.05
 scene "soil" in tests/plateaus.py by 4.9e-11 (relative), doubling it by 1.0e-11, and finer cells by 3.0e-02.
 """
 KEEP_WET = 0.01
-"""As `KEEP`, in wet 2D scenes without yield.  Halving this value changes the result of scene "beam" in
+"""Value of `KEEP` in wet 2D scenes without yield.  Halving this value changes the result of scene "beam" in
 tests/plateaus.py by 1.8e-11 (relative), doubling it by 2.9e-10, and finer cells by 1.5e-02.
 """
 

@@ -98,23 +98,11 @@ class Motion:
     ) -> tuple[State, int]:
         """Return the state at time t, s, after a solved step, and the number of inverted domains.
 
-        Parameters
-        ----------
-        state
-            State at the start of the step.
-        on_grid, data
-            The bodies on the grid, and their integration points at the start of the step.
-        loads
-            Loads at the end of the step.
-        net_inflow : (n,), m^d
-            Net inflow of fluid into the filled owned cells in the step; None leaves the volume defect unchanged.
-        report
-            Report of the step, for the exception if a point leaves the grid.
-        stays
-            Whether points that hardly move may keep their pieces.
-        carried
-            Function that returns new velocities, `Mass.carried`; argument (n,): motion of the points / cell size, 0 if
-            they keep their pieces.
+        state: at the start of the step; on_grid, data: the bodies on the grid, and their integration points at that
+        time; loads: at the end of the step; net_inflow (n,), m^d: net inflow of fluid into the filled owned
+        cells in the step, None leaves the volume defect unchanged; report: of the step, for the exception if a point
+        leaves the grid; stays: whether points that hardly move may keep their pieces; carried: function that returns
+        new velocities, `Mass.carried`, of the motion (n,) of the points / cell size, 0 if they keep their pieces.
 
         Raises
         ------
@@ -188,9 +176,9 @@ class Motion:
         return Trend(np.array([dt, *before.lengths[:2]]), np.concatenate([rates, before.rates[:, :2]], axis=1))
 
     def ahead(self, on_grid: OnGrid, state: State, seconds: float, first: float, implicit: bool) -> list[NDArray]:
-        """Return displacements (active dofs,), m, and with fluid pressures (active cells,), Pa, after seconds (s).
+        """Return displacements (active dofs,), m, and with fluid pressures (active cells,), Pa, after `seconds` (s).
 
-        They follow the trend, see `Trend.over`. If first > 0, the length of a first substep (s), its change, times
+        They follow the trend, see `Trend.over`. If `first` > 0, the change in a first substep of this length (s), times
         seconds / first, is added. Domains move affinely. A cell takes the volume mean of its pieces, a node that of its
         cells. Ten load steps of a drained beam take 50 Newton steps from rest, 29 from this guess.
         """
@@ -223,7 +211,7 @@ class Motion:
         The result is None without gravity. nodal (nodes, d), m: displacement since the cut.
         """
         gravity, grid = stage.gravity_at(t), self._momentum.grid
-        if gravity is None:  # also if nothing conducts: a distant body that conducts must not change pressures
+        if gravity is None:  # even if nothing conducts: a distant body that conducts must not change pressures
             return None
         weight = self._materials.fluid.density * gravity
         return lambda cells, x: (x - grid.low + (0.0 if nodal is None else grid.at(cells, x, nodal))) @ weight
@@ -267,7 +255,7 @@ class Motion:
     def _deformed(self, cut: CutDomains, data: QuadratureData, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return F of the points after a step: (n, 3, 3), or (n, 2, 2) if this suffices for the laws.
 
-        F is the mean of (increment of F) F_n over the pieces of the point, scaled so that det F is the mean of theirs.
+        F is the mean of (increment of F) F_n over the pieces of the point, scaled so that det F is their mean det F.
         """
         pieces = data.pieces
         grid = cut.grid
@@ -349,7 +337,7 @@ class Motion:
     def _corrected(
         self, points: MaterialPoints, state: State, loads: Sequence[Loads], keeps: NDArray[np.bool_]
     ) -> MaterialPoints:
-        """Return the points after `with_volumes` has corrected corners of yielded domains, except where keeps (n,)."""
+        """Return the points after `with_volumes` has corrected corners of yielded domains, except `keeps` (n,)."""
         grid, stage = self._momentum.grid, state.stage
         yielded = self._materials.evolved(points) & ~keeps
         if not over_all(grid.comm, int(yielded.sum())):
@@ -377,9 +365,9 @@ class Motion:
     ) -> dict[str, NDArray[np.float64]]:
         """Return the volume defect of the points (n,) after a step, per reference volume, and the correction `due`.
 
-        The step adds (increase of the fluid content due to volume and cell pressures - net inflow) / alpha to the
-        defect, both as fluid mass / density at zero pressure. Soil with a free surface has no defect, because its
-        content excludes drained water. Where keeps (n,) is true, points have no correction.
+        The step adds to the defect the increase of the fluid content, due to volume and cell pressures, minus the net
+        inflow, divided by alpha.  Both are fluid masses divided by the density at zero pressure. Soil with a free
+        surface has no defect, because its content excludes drained water. Points in `keeps` (n,) have no correction.
         """
         before = state.points
         cut = on_grid.cut
@@ -455,7 +443,7 @@ class Motion:
     def _left(
         self, carried: PiecePressures, points: MaterialPoints, stage: Stage, t: float, on_grid: OnGrid, some: bool
     ) -> PiecePressures:
-        """Return the pieces with pressures, at time t, s, for the next grid; some: whether some pieces stay."""
+        """Return the pieces with pressures, at time t, s, for the next grid; some: whether any piece stays."""
         with _compat.Timer("remap"):
             pieces = on_grid.cut.pieces
             store = self._materials.storage(points) * points.volume0 * points.J
@@ -494,7 +482,7 @@ def untangled(
     grid: Grid,
     loads: Sequence[Loads],
 ) -> NDArray[np.float64]:
-    """Return corners (n, 2^d, d), m; corners of inverted domains (bad) are re-initialised from F."""
+    """Return corners (n, 2^d, d), m; corners of inverted domains, `bad` (n,), are re-initialised from F."""
     at = bad.nonzero()[0]
     X = points.reference[bad]
     d = grid.dim

@@ -43,7 +43,7 @@ from mpm_dolfinx.stepping.stage import Stage
 from mpm_dolfinx.stepping.state import State
 
 AtPlaces = Callable[[NDArray[np.integer], NDArray[np.float64]], NDArray[np.float64]]
-"""Function that returns values (m,) at positions (m, d), m, in local cells (m,)."""
+"""Function that returns values (n,) at positions (n, d), m, in local cells (n,)."""
 
 
 class OnGrid(Keyed):
@@ -179,8 +179,8 @@ class OnGrid(Keyed):
     def _carried(self, state: State, pi: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the piece pressures (m,), Pa, for which the pieces contain the pore water of the points.
 
-        The mass potentials pi (m,), Pa, preserve linear fields. A constant for each point, added to the pressures of
-        its pieces, then preserves the water.
+        The mass potentials pi (m,), Pa (`fluid_content`), preserve linear fields. A constant for each point, added to
+        the pressures of its pieces, then preserves the water.
         """
         materials = self._quadrature.materials
         points = self.cut.points
@@ -260,8 +260,7 @@ class OnGrid(Keyed):
         """Return pressures (m,), slopes (m, d) and bounds (m, 2) in the pieces, from the cells' pressures.
 
         The mean of the pieces' mass potentials in a cell is the cell's potential. The mean is weighted by `store` (m,),
-        m^d/Pa, the storage of the pieces; in cells without storage by volume. t: time, s, of the pressures on drained
-        sides.
+        m^d/Pa, the storage of the pieces; in cells without storage by volume. t: time, s, of pressures on open sides.
 
         With `water`, the sum of pore water in a cell is conserved. Then the reconstruction acts on differences from the
         hydrostatic pressures `at_rest`, if there is gravity.
@@ -297,7 +296,7 @@ class OnGrid(Keyed):
         return [self.cut.to_pieces(rows) for rows in values]
 
     def softness(self, state: State) -> NDArray[np.float64] | float:
-        """Return elastic / tangent shear modulus of the pieces (m,) at the start of the step."""
+        """Return the ratio of elastic to tangent shear modulus of the pieces (m,) at the start of the step."""
         data = state.points.data
         return self.cut.to_cells(data["softness"]) if "softness" in data else 1.0
 
@@ -585,18 +584,8 @@ class Assembled(Keyed):
 
         Fluxes at the start are reused where points keep their pieces, if only u could change the fluxes.
 
-        Parameters
-        ----------
-        state
-            State at the start of the step.
-        weight : (d,), N/m^3
-            Unit weight of the fluid, with gravity.
-        data
-            Integration points.
-        t
-            Time of the pressures and fluxes on open sides, s.
-        dt
-            Length of the step, s.
+        state: at the start of the step; weight (d,), N/m^3: unit weight of the fluid, with gravity; data: integration
+        points; t: time of the pressures and fluxes on open sides, s; dt: length of the step, s.
         """
         on_grid = self._on_grid
         contents = self._on_grid.contents

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Grid lines that move with a body or tool; each reset computes them from the state, also in a resumed run."""
+"""Grid lines that move with a body or tool; each reset computes them from the state, even in a resumed run."""
 
 from __future__ import annotations
 

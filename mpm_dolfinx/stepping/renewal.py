@@ -13,7 +13,8 @@ Remainders of old domains outside these cells become domains. Masses, volumes an
 each cell, also mass-weighted sums of other point data, such as the logarithm of the elastic left Cauchy-Green tensor.
 These data are means over the overlap of old and new domains, shifted to the new centroids by fitted slopes, within the
 range of the old values. With inertia, the centre of mass, the momentum and the angular momentum of each cell are exact
-too. Cells with elastic soil, several bodies, prescribed displacements, or several surface crossings are unchanged.
+too. Cells with elastic soil, several bodies, several surface crossings, or domains on a side whose displacement a
+condition needs are unchanged.
 """
 
 from __future__ import annotations
@@ -96,8 +97,12 @@ class Renewal:
         return known & (self._materials.evolved(points) | (points.id >= self._starts[-1]))
 
     def _free(self, state: State) -> NDArray[np.bool_]:
-        """Return a mask (n,) of `flowed` points that may be renewed: without probes, and not with kept pieces."""
-        free = self.flowed(state.points)
+        """Return a mask (n,) of `flowed` points without probes, kept pieces, or faces whose displacement is needed."""
+        free, stage = self.flowed(state.points), state.stage
+        needed = [*(faces for _, faces, _ in stage.held), *(faces for one in stage.acting for faces in one.seeded)]
+        if needed:
+            faces = self._faces(state.points)
+            free[faces.point[np.isin(faces.key, np.concatenate([keys(one.id, one.face) for one in needed]))]] = False
         if state.watched is not None:
             free &= ~np.isin(state.points.id, state.watched)
         return free if state.stay is None else free & ~state.stay.keeps
@@ -131,16 +136,15 @@ class Renewal:
 
     def _renewed(self, state: State, free: NDArray[np.bool_]) -> tuple[State, int]:
         stage, points = state.stage, state.points
-        held, touched = [faces for _, faces, _ in stage.held], tuple(stage.kept(0))
-        signs = self._signs((stage,), lambda: self._signatures(stage.faces, held), MPI.COMM_SELF)
+        signs = self._signs((stage,), lambda: self._signatures(stage.faces), MPI.COMM_SELF)
         needs, body = self.long(points), body_of(points.id, self._starts)
         moves = MOTION[0] in points.data
         work = RefilledCells(self._grid, points, body, free, needs, self._faces(points), signs, moves)
         if not work.chosen.any():
             return state, 0
-        new = [work.full(), work.partial(), work.remainders]
+        new = [work.full(), work.partial(), work.remainders[0]]
         group = np.concatenate([one.group for one in new])
-        made = self._filled(points, work, new, touched)
+        made = self._filled(points, work, new, tuple(stage.kept(0)))
         if moves:
             masses = tuple(self._materials.present_density(of) * of.volume0 * of.J for of in (points, made))
             v, L = velocities(work, made.corners, made.x, group, masses)
@@ -187,10 +191,8 @@ class Renewal:
         stored = sum_by(group, materials.storage(made) * made.volume0 * made.J, count)
         return pressure_of(np.divide(over(brings, store), stored, out=even, where=stored > 0), bulk)[group]
 
-    def _signatures(
-        self, surfaces: Sequence[Surface], held: Sequence[Surface]
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return keys of outer faces, and the index of each face's set of conditions; -1: not to be renewed."""
+    def _signatures(self, surfaces: Sequence[Surface]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return keys of outer faces, and the index of each face's set of conditions; -1 for faces that must stay."""
         key = self._outer.key
         kind = np.zeros((len(key), len(surfaces)), dtype=np.int8)
         barred = np.zeros(len(key), dtype=bool)
@@ -200,8 +202,6 @@ class Renewal:
             whole = np.ptp(faces.xi, axis=1).max(axis=1) >= 2
             kind[at[ok & whole], k] = 1
             barred[at[ok & ~whole]] = True
-        for faces in held:
-            barred |= np.isin(key, keys(faces.id, faces.face))
         number = np.unique(kind, axis=0, return_inverse=True)[1].ravel() if len(surfaces) else np.zeros(len(key), int)
         return key, np.where(barred, -1, number)
 
@@ -300,7 +300,7 @@ class Renewal:
 
 
 def _joined(points: MaterialPoints, made: MaterialPoints, kept: NDArray[np.bool_]) -> MaterialPoints:
-    """Return the points where kept (n,) is true, together with the new points `made`."""
+    """Return the points where `kept` (n,) is true, together with the new points `made`."""
     return with_faces(points).map(lambda rows: rows[kept]).joined(made)
 
 

@@ -56,7 +56,7 @@ class Result:
     memory
         Peak memory of all processes with libraries, MB.
     imbalance
-        (Largest number on a process) / (mean) of points, pieces, cells at the end of the run, see `summary.imbalance`.
+        Largest number on a process divided by the mean, of points, pieces and cells: `summary.imbalance` at the end.
     """
 
     rows: Rows = field(default_factory=Rows, repr=False)
@@ -145,7 +145,7 @@ class Result:
         """Energies and works (times,), J (J/m in plane strain), of a `run(energies=True)`, by name.
 
         `kinetic` and `elastic` are energies of the bodies and free tools; `elastic` is 0 for laws without an energy.
-        Works since the start of the run: `external`, of all loads; `viscous`, on quiet sides and of user-defined terms;
+        Works since the start of the run: `external`, work of all loads; `viscous`, of quiet sides and user's terms;
         `friction`, of slip at tools and between groups; `internal`, of the stresses. `dissipated` is `internal` minus
         `elastic`, in wet bodies with the work of flow and storage of water. With `Numerics(renewal=True)`, `renewal` is
         the kinetic and elastic energy that renewed domains have lost. `kinetic` + `elastic` + `dissipated` +

@@ -178,7 +178,7 @@ class Scene:
         if self.fluid is None or not self.materials.conducts or gravity[0] is None or "gravity" in self._warned:
             return
         if strength := other_gravity(self.fluid, gravity):
-            what = "gravity = %.6g m/s^2, but as gravity changes with time, conductivities become mobilities by the "
+            what = "gravity = %.6g m/s^2, but because gravity varies in time, conductivities become mobilities by the "
             what += "fluid's density x 9.81 m/s^2; their gravity must be given as Fluid(gravity=...)"
             warn(self.grid.comm, ConditionWarning, what, strength)
             self._warned.add("gravity")
@@ -217,7 +217,7 @@ class Scene:
         """Raise ValueError if grid lines follow a tool that is absent from the first stage: they would never move."""
         follow = self.grid.follow
         if hasattr(follow, "pose") and followed_tool(self.grid, first.given) is None:
-            raise ValueError(f"grid: follow = {line(follow)}, not in the first stage, must be in its conditions")
+            raise ValueError(f"grid: follow = {line(follow)}, not in the first stage, must be one of its conditions")
 
     def followed(self, state: State) -> State:
         """Return the state for its next step, and move the grid to the lines of that step."""
@@ -249,7 +249,7 @@ class Scene:
     def for_reset(self, state: State, renew: bool) -> tuple[State, int]:
         """Return a state for a reset of the grid, with points at their owners, and the number of renewed domains.
 
-        renew: whether renewal is allowed. A state in which all points keep their pieces is returned as it is.
+        renew: whether renewal is allowed. A state in which all points keep their pieces is unchanged.
         """
         if state.stays:
             return state, 0

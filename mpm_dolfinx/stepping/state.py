@@ -106,9 +106,10 @@ class Trend:
         _freeze(vars(self))
 
     def over(self, seconds: float, implicit: bool = False, first: float = 0.0) -> NDArray[np.float64]:
-        """Return changes (n, ...) in a time (s) by the polynomial through the last states; implicit: end rate x time.
+        """Return changes (n, ...) in a time (s) by the polynomial through the last states.
 
-        If first > 0, the implicit change in a first substep of this length (s), times seconds / first, is subtracted.
+        implicit: whether the rate at the end of the time replaces its mean.  If `first` > 0, the implicit change in
+        a first substep of this length (s), times seconds / first, is subtracted.
         """
         order, last = np.arange(1, len(self.lengths) + 1), self.lengths[0]
         ends, powers = -self.lengths.cumsum()[:, None] / last, (seconds / last) ** order * (order if implicit else 1)
@@ -144,8 +145,7 @@ class State:
         step of a stage. `reactions` (d,), N: of prescribed displacements. `wall_reactions` (d,), N: of the grid's
         walls. `outflows`, m^3/s (m^2/s in plane strain): through open sides, as volumes at zero pressure. `tool_forces`
         (d + 1,), in 3D (6,): forces, N, and moments, N m, of tools and contacts on the bodies. `tool_travel`, m:
-        displacement of a load-controlled tool in addition to a prescribed displacement. Other keys: user-defined
-        conditions.
+        displacement of a load-controlled tool, added to a prescribed one. Other keys: user-defined conditions.
     stage
         The present stage, with its conditions.
     begins
@@ -154,7 +154,7 @@ class State:
         Nodal velocities in the last step on this process, with ghosts: an initial guess for Newton's method with yield
         or contact. None before the first step, and without yield or contact.
     trend
-        Motion in the last steps, an initial guess in elastic bodies; None in other scenes, and after new bodies.
+        Motion in the last steps, an initial guess in elastic bodies; None in other scenes, and after bodies were added.
     held : (unknowns,), N
         Nodal forces on this process, with ghosts, that balance an initial stress where loads do not. None without such
         forces, after a new stage, and after a reset of the grid.
@@ -186,7 +186,7 @@ class State:
 
     def __post_init__(self):
         if isinstance(self.points, PlacedPoints):
-            raise ValueError("state: points have true positions, must be relative to the grid's base: points.from_base")
+            raise ValueError("state: true positions of points, must be relative to the grid's base: points.from_base")
         _freeze(vars(self))
 
     @property
@@ -196,7 +196,7 @@ class State:
 
     @property
     def as_cut(self) -> MaterialPoints:
-        """Points at the positions at which the next step cuts them; with kept pieces, at those of the last reset."""
+        """Points at the positions at which the next step cuts them; if they keep their pieces, at the last reset."""
         if self.stay is None:
             return self.points
         return self.stay.points if self.stay.keeps is None else self.stay.points.where(self.stay.keeps, self.points)

@@ -113,7 +113,7 @@ class BiotFEM:
         `Traction`, `Pressure`, `RigidPlate` and `Drained` on sides.  With "taylor-hood", `Drained` acts on facets that
         lie wholly in its region.  Other sides are free and sealed.
     pressure : Pa
-        Initial pore pressure, or a function of positions x (m, d), m.  The initial effective stress is zero: loads or
+        Initial pore pressure, or a function of positions x (n, d), m.  The initial effective stress is zero: loads or
         strains must balance the pressure.
     gravity : callable t -> (d,), m/s^2
         Acceleration of gravity as a function of time.
@@ -257,7 +257,7 @@ class BiotFEM:
         space = self._space.u.function_space
         for name, held in walls.items():
             if not isinstance(held, str) or not held or not set(held) <= set(axes):
-                raise ValueError(f"walls: {name!r}: components {held!r}, must be some of {axes!r}")
+                raise ValueError(f"walls: {name!r}: components {held!r}, must be among {axes!r}")
             bcs += [self._prescribe(space.sub(axes.index(a)), 0.0, name) for a in held]
         return bcs + [self._prescribe(self._space.W.sub(1), o.pressure / self.scale, o.side, o.region) for o in drained]
 
@@ -405,7 +405,7 @@ class BiotFEM:
 
     @property
     def _seen(self):
-        """Pressure / `scale` that determines k_r, as UFL: with its derivative in the tangent, or without."""
+        """Pressure that determines k_r, divided by `scale`, as UFL: with its derivative in the tangent, or without."""
         now, same = (ufl.split(f)[1] for f in (self._space.w, self._space.same))
         return self._whole * now + (1 - self._whole) * same
 
@@ -533,7 +533,7 @@ class BiotFEM:
         return self._snes.getConvergenceHistory()[0], self._snes.reason
 
     def _restrained(self, x: PETSc.Vec) -> tuple[list[float], int]:
-        """Solve by single Newton steps with limited pressure changes, see `retention.restrained`; return as `_free`.
+        """Solve by single Newton steps with limited pressure changes, see `retention.restrained`; result: see `_free`.
 
         The first tangent omits the derivative of k_r (Celia, Bouloutas and Zarba 1990), as do tangents after a limited
         step and after an increase of the residual.  With gravity and dry soil this derivative can reverse the step.
@@ -608,11 +608,11 @@ class BiotFEM:
         return replace(result, wall=time.perf_counter() - start, converged=True)
 
     def displacement(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the displacements (m, d), m, at reference positions x (m, d) in the body, on every process."""
+        """Return the displacements (n, d), m, at reference positions x (n, d) in the body, on every process."""
         return self._at(self._space.u, x, self.grid.dim)
 
     def pressure(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the pore pressures (m,), Pa, at reference positions x (m, d) in the body, on every process."""
+        """Return the pore pressures (n,), Pa, at reference positions x (n, d) in the body, on every process."""
         return self.scale * self._at(self._space.p, x, 1)[:, 0]
 
     def water(self) -> float:
@@ -623,7 +623,7 @@ class BiotFEM:
         return self.grid.comm.allreduce(fem.assemble_scalar(held))
 
     def _at(self, f: fem.Function, x: NDArray[np.float64], size: int) -> NDArray[np.float64]:
-        """Return the values (m, size) of a function at reference positions x (m, d) in the body, on every process."""
+        """Return the values (n, size) of a function at reference positions x (n, d) in the body, on every process."""
         grid = self.grid
         out = np.zeros((len(x), size))
         x = x - self.grid.base

@@ -25,7 +25,7 @@ CLOSE, MOST = 1e-10, 60  # largest relative residual, and largest number of Newt
 
 
 class _Rings:
-    """A law at n rings.  Stretches (n, 2) are radial and hoop; a state is name -> (n, ...); `start`: initial state."""
+    """A law at n rings.  Stretches (n, 2): radial and hoop; state: values (n, ...) by name; `start`: initial state."""
 
     def __init__(self, material: Skeleton, count: int, state: Mapping[str, ArrayLike] | None = None):
         law = type(material)
@@ -114,7 +114,7 @@ def cavity(
     material
         The soil.
     outer
-        Outer radius / radius of the cavity; at least 100 for infinite soil.
+        Outer radius, divided by the radius of the cavity; at least 100 for infinite soil.
     elements
         Number of elements; their sizes form a geometric progression.
     state
@@ -126,7 +126,7 @@ def cavity(
 
 
 def undrained(material: Skeleton, outer: float, radii: Sequence[float], rings: int = 2000) -> tuple[float, float]:
-    """Return (total radial stress at the outer radius) - (at the wall), and effective radial stress at the wall, Pa.
+    """Return the total radial stress at the outer radius minus that at the wall, and the effective one at the wall, Pa.
 
     The radius of each element follows from constant volume, r^2 - a^2 = R^2 - 1.  radii: successive radii a of the
     cavity, in small steps.

@@ -43,7 +43,7 @@ def _within(name: str, value: ArrayLike, upper: float) -> Array:
 
 
 def _by_time(short, long, T: ArrayLike) -> Array:
-    """Return short(T) where T < SWITCH, else long(T); each function is evaluated only in its own range of T."""
+    """Return short(T) where T < `SWITCH`, else long(T); each function is evaluated only in its own range of T."""
     T = np.asarray(T)
     return np.where(T < SWITCH, short(np.minimum(T, SWITCH)), long(np.maximum(T, SWITCH)))[()]
 
@@ -80,7 +80,7 @@ def terzaghi_pressure(z: ArrayLike, t: ArrayLike, height: float, cv: float, p0: 
 
 
 def terzaghi_consolidation(t: ArrayLike, height: float, cv: float) -> Array:
-    """Return the degree of consolidation: settlement since t = 0+ / final settlement since t = 0+.
+    """Return the degree of consolidation: settlement since t = 0+, divided by its final value.
 
     Parameters as for `terzaghi_pressure`: t (...), s, > 0; height, m, > 0; cv, m²/s, > 0.
     Returns (...), in (0, 1]. Source: Terzaghi (1923); Verruijt.
@@ -151,7 +151,7 @@ class Mandel:
 
     @cached_property
     def roots(self) -> Array:
-        """The first positive roots of tan(r) = r (1 - nu)/(nu_u - nu), (TERMS,)."""
+        """The first positive roots of tan(r) = r (1 - nu)/(nu_u - nu), an array (`TERMS`,)."""
         n = np.arange(TERMS) * np.pi
         r = n + np.pi / 2
         for _ in range(50):  # Newton's method is monotone for a convex function from its positive side
@@ -181,7 +181,7 @@ class Mandel:
         return lateral / self._oedometric, strain * y
 
     def _pressures(self, x: ArrayLike, t: ArrayLike) -> Array:
-        """Return the pressure, Pa, and (integral of the pressure from 0 to x) / a, Pa, as one array (2, ...)."""
+        """Return the pressure, Pa, and its integral from 0 to x, divided by a, Pa, as one array (2, ...)."""
         _positive(t=t)
         xi, T = np.broadcast_arrays(_within("x", x, self.a) / self.a, self.cv * np.asarray(t, dtype=float) / self.a**2)
         p0 = self.skempton * (1 + self.nu_undrained) * self.force / (3 * self.a)
@@ -205,7 +205,7 @@ def cryer_pressure(t: ArrayLike, radius: float, cv: float, nu: float, p0: float 
     Parameters
     ----------
     t : (...), s, > 0; time
-    radius, cv : m and m²/s, > 0; radius, and kappa (K + 4G/3), as fluid and grains are incompressible
+    radius, cv : m and m²/s, > 0; radius, and kappa (K + 4G/3), because fluid and grains are incompressible
     nu : in (-1, 0.5); drained Poisson ratio
     p0 : Pa; uniform pressure on the surface, equal to the pore pressure at t = 0+
 
@@ -238,8 +238,8 @@ def _cryer_long(mu: float, T: Array) -> Array:
 class SelfWeightColumn:
     """Column of Hencky's material without lateral strain, standing at Y = 0 under its own weight.
 
-    Without lateral stretch, the Cauchy and the first Piola-Kirchhoff stress along the column are both
-    tau / stretch, and balance the weight above. For nu = 0 the modulus K + 4G/3 is Young's modulus.
+    Without lateral stretch, the Cauchy and the first Piola-Kirchhoff stress along the column are equal: tau divided by
+    the stretch.  They balance the weight above. For nu = 0 the modulus K + 4G/3 is Young's modulus.
 
     Parameters
     ----------

@@ -171,6 +171,7 @@ class Scene:
             "source" if self.rate else "",
             "springs" if self.stiffness else "",
             "inertia" if self.inertia else "",
+            "renewal" if self.renewal else "",
             "lines follow" if self.follows else "",
             self.method if self.method != "sdirk2" else "",
             f"rtol {self.rtol:g}" if self.rtol else "",
@@ -357,6 +358,40 @@ def newer(seed: int, **given) -> Scene:
         mass = draw.between(0.3, 3.0) * 2000 * tool.size**2
         spins = {"moment": mass * (tool.size / draw.between(1.0, 3.0)) ** 2, "spin": draw.between(-1, 1) / scene.end}
         return scene.with_(tools=(replace(tool, shape="ball", mass=mass, **spins),))
+    return scene
+
+
+def flowing(seed: int, **given) -> Scene:
+    """Return the scene of a seed in 2D whose domains are renewed: weak soil under a tool or a footing; as `drawn`."""
+    draw = Draw([seed, 6])
+    given = {"dim": 2, "axisymmetric": draw.yes(0.5), "laws": [draw.one(*PLASTIC[:3])]} | given
+    scene = drawn(seed, **given)
+    while scene.contact is not None:
+        scene = drawn(draw.whole(0, 10**6), **given).with_(seed=seed)
+    weak = [(law, c | {"cohesion": c["cohesion"] * draw.order(-1, 0)}) for law, c in scene.materials]
+    top, ramp = scene.bodies[-1], scene.end * draw.one(0.5, 1.0)
+    kept = [c for c in scene.conditions if c.side != "top" or c.kind in ("drained", "seepage", "inflow")]
+    push, part = draw.between(0.2, 0.6) * scene.h[-1], _part(scene, draw.between(0.3, 0.6))
+    scene = scene.with_(materials=tuple(weak), steps=draw.whole(4, 6), renewal=True, conditions=tuple(kept), tools=())
+    if draw.yes(0.5):
+        tool = replace(_tool(draw, scene, push, ramp, 0.0), load=0.0)
+        scene = scene.with_(tools=(tool,))
+    else:
+        footing = Condition("displacement", "top", (0.0, -push), ramp, draw.one("y", "xy"), part)
+        scene = scene.with_(conditions=(footing, *scene.conditions))
+    beside = (part[1][0] if not scene.tools else (top.lower[0] + 2 * top.upper[0]) / 3, -FAR), (FAR, FAR)
+    load = draw.one("none", "traction", "pressure")
+    if load != "none":
+        value = {"traction": (0.0, -1.0), "pressure": (1.0,)}[load]
+        value = tuple(draw.order(2.5, 3.5) * v for v in value)
+        scene = scene.with_(conditions=(*scene.conditions, Condition(load, "top", value, ramp, region=beside)))
+    if scene.surcharge:
+        scene = scene.with_(initial=None, surcharge=0.0, level=None)
+    if scene.tools and scene.stage and scene.stage.kind in ("remove", "add"):
+        scene = scene.with_(stage=None)
+    if not scene.axisymmetric and draw.yes(0.4):
+        scene = _moving(draw, scene.with_(stage=None, rtol=None, initial=None, level=None, method="sdirk2"))
+        scene = scene.with_(steps=2 * scene.steps)
     return scene
 
 
