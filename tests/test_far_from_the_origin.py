@@ -11,7 +11,7 @@ from test_output import fields
 import mpm_dolfinx as mpm
 
 SOIL = mpm.Hencky(bulk=1e8, shear=6e7, grain_density=2600.0, conductivity=1e-5)
-FREE = "free to move as a rigid body in {} of 3 ways"
+FREE = "free to move as a rigid body in {} of 3 modes"
 SIZES = {"1 m, 500 m away": (500.0, 1.0), "100 m in national coordinates": (5.123456789e6, 100.0)}
 NAMES = {"argvalues": SIZES.values(), "ids": SIZES}
 

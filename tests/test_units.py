@@ -86,7 +86,7 @@ def test_a_gravity_of_time_that_comes_to_another_strength_is_named_once(grows, w
     ramp = lambda t: min(1.0, t / 15) if grows else 1.0  # noqa: E731
     for unit, water, said in ((Units(), None, 0), (units, None, 1), (units, units.fluid(gravity=9810.0), 0)):
         column(unit, water=water, gravity=lambda t, unit=unit: (0, -9.81 * unit.gravity * ramp(t)))
-        messages = [message for message in warned() if "as gravity changes with time" in message]
+        messages = [message for message in warned() if "gravity varies in time" in message]
         assert len(messages) == said
 
 
