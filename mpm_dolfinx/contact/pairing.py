@@ -32,7 +32,7 @@ from mpm_dolfinx.contact.pairs import FacePairs
 from mpm_dolfinx.contact.problem import ContactProblem, Touching
 from mpm_dolfinx.contact.tool_placing import BEGINS, FACING
 from mpm_dolfinx.domains.cut_domains import CutDomains
-from mpm_dolfinx.parallel.exchange import first, over_all
+from mpm_dolfinx.parallel.exchange import Exchange, first, over_all
 from mpm_dolfinx.points.cutting import FACES
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.points.parts import parts_of_domains
@@ -152,7 +152,7 @@ class Contacts(Touching):
         if off := first(grid.comm, off):
             raise NotConverged(off)
         cell, other, at, values = (np.concatenate(column) for column in zip(*rows, strict=True))
-        exchange = grid.to_owners(cell)
+        exchange = Exchange(grid.comm, grid.owner(cell))
         cell, other, sent = (exchange.send(columns) for columns in (cell, other, values))
         number, sign, place = sent[:, :3].T.astype(np.int64)
         x, y, n, offset, shear = np.split(sent[:, 6:], 5, axis=1)

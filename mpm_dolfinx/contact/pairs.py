@@ -23,7 +23,7 @@ from mpm_dolfinx.contact.shapes import DISTANCE, Distance
 from mpm_dolfinx.contact.tool import Pose, Tool
 from mpm_dolfinx.forms.unknowns import Unknowns
 from mpm_dolfinx.grid.grid import Grid
-from mpm_dolfinx.parallel.exchange import everywhere
+from mpm_dolfinx.parallel.exchange import Exchange, everywhere
 
 
 class Geometry(NamedTuple):
@@ -165,7 +165,7 @@ def at_nodes(
     numbers = unknowns.map.indices.reshape(-1, d)
     column = numbers[grid.cell_nodes[cell]]
     if other is not None:
-        exchange = grid.to_owners(other)
+        exchange = Exchange(grid.comm, grid.owner(other))
         columns = exchange.back(numbers[grid.cell_nodes[grid.local(exchange.send(other))]])
         column = np.concatenate([column, columns], axis=1)
     column = column.swapaxes(1, 2)

@@ -37,7 +37,7 @@ from mpm_dolfinx.contact.history import Origin, Rough, joined, pressure_name, sh
 from mpm_dolfinx.contact.law import BEGIN, DEPTH, ROUNDS, ContactLaw, ContactState, Touch
 from mpm_dolfinx.contact.pairs import Geometry, Pairs, at_nodes, petsc_matrix
 from mpm_dolfinx.forms.unknowns import Unknowns, collect_garbage
-from mpm_dolfinx.parallel.exchange import over_all
+from mpm_dolfinx.parallel.exchange import Exchange, over_all
 from mpm_dolfinx.points.material_points import MaterialPoints
 
 FOLLOWS = 8  # largest number of updates of the pairs in a step
@@ -223,7 +223,7 @@ class ContactProblem(Loads):
         """Return a matrix with all entries that pairs between groups may have in the step."""
         grid, d = self.grid, self.grid.dim
         cell, other = np.divmod(self._cell_pairs(), len(grid.owners))
-        exchange = grid.to_owners(cell)
+        exchange = Exchange(grid.comm, grid.owner(cell))
         cell, other = exchange.send(cell), exchange.send(other)
         key, of = np.unique(cell, return_inverse=True)
         m = len(cell)

@@ -28,7 +28,7 @@ from mpm_dolfinx.contact.law import ContactLaw
 from mpm_dolfinx.contact.pairs import ToolPairs
 from mpm_dolfinx.contact.problem import ContactProblem, Pushes, SubstepMotion, Touching
 from mpm_dolfinx.contact.tool import Pose, Tool, rotation
-from mpm_dolfinx.parallel.exchange import everywhere, first, over_all
+from mpm_dolfinx.parallel.exchange import Exchange, everywhere, first, over_all
 from mpm_dolfinx.points.material_points import MaterialPoints, middle
 
 BEGINS = 1e-2  # allowed penetration into a body at the start, and into prescribed sides, divided by the cell size
@@ -227,7 +227,7 @@ class Tools(Touching):
             scalars = [np.full(len(at), number), size[at], resistances[at], pressure]
             found.append((at, np.concatenate([np.stack(scalars, axis=1), *vectors], axis=1)))
         at, values = (np.concatenate(column) for column in zip(*found, strict=True))
-        exchange = grid.to_owners(patches.cell[at])
+        exchange = Exchange(grid.comm, grid.owner(patches.cell[at]))
         cell, places, sent = (exchange.send(rows) for rows in (patches.cell[at], patches.x[at], values))
         number, *own = sent[:, :4].T
         now, carried, shear = np.split(sent[:, 4:], 3, axis=1)

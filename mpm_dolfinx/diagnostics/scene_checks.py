@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.tolerances import NEAR
+from mpm_dolfinx.parallel.exchange import Exchange
 from mpm_dolfinx.points.active import ActiveSet
 
 
@@ -51,7 +52,7 @@ def check_held(
     for cell, other, place, along in holds:
         both, sides = [part[cell]], 1
         if other is not None:
-            exchange, sides = grid.to_owners(other), 2
+            exchange, sides = Exchange(grid.comm, grid.owner(other)), 2
             both.append(exchange.back(part[grid.local(exchange.send(other))]))
         number = np.concatenate([number, *both])
         against = np.concatenate([against, *(both[::-1] if sides == 2 else [np.zeros(len(cell), dtype=np.int64)])])

@@ -123,7 +123,7 @@ class CutDomains(Keyed):
         self.pieces = cut(grid, points.corners, second, faces) if domains else whole_points(grid, points.x)
         if grid.copies > 1:
             self.pieces.cell += grid.copy(points.id)[self.pieces.point]
-        exchange = grid.to_owners(self.pieces.cell)
+        exchange = Exchange(grid.comm, grid.owner(self.pieces.cell))
         self.pieces_to_cells = exchange.send
         """Function that sends values of the pieces to the owners of their cells."""
         self.to_pieces = exchange.back
@@ -245,7 +245,7 @@ class CutDomains(Keyed):
         x = self.points.corners.reshape(-1, d) if self.domains else self.points.x
         # rounding must not assign a corner on a grid line to a cell outside the domain
         cell = self._filled_cell(at, x + NEAR * (self.points.x[at] - x))
-        exchange = grid.to_owners(cell)
+        exchange = Exchange(grid.comm, grid.owner(cell))
         return exchange, grid.local(exchange.send(cell)), exchange.send(x)
 
     def total_displacement(self, points: MaterialPoints) -> NDArray[np.float64]:

@@ -605,10 +605,6 @@ class Grid:
         """Return the owner rank of the cells with lexicographic indices `number`."""
         return self.owners[number]
 
-    def to_owners(self, number: NDArray[np.int64]) -> Exchange:
-        """Return the exchange that sends rows to the processes which own the lexicographic cells `number` (m,)."""
-        return Exchange(self.comm, self.owner(number))
-
     def local(self, number: NDArray[np.int64]) -> NDArray[np.int32]:
         """Return the local index of the cells with lexicographic indices `number`; -1 for cells of other processes."""
         return self.locals[number]
@@ -617,7 +613,7 @@ class Grid:
         """Send rows (cells, positions, values) to the owners of cells; return local cells, positions and values."""
         empty = (np.empty(0, dtype=np.int64), np.empty((0, self.dim)), np.empty((0, width)))
         parts = [np.concatenate(column) for column in zip(empty, *rows, strict=True)]
-        travel = self.to_owners(parts[0])
+        travel = Exchange(self.comm, self.owner(parts[0]))
         cell, x, values = map(travel.send, parts)
         return self.local(cell), x, values
 

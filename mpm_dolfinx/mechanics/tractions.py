@@ -112,7 +112,7 @@ class DeadLoads(Loads):
 def owners(grid: Grid, patches: Sequence[Patches]) -> tuple[Exchange, Places]:
     """Return the exchange of patch data with the processes that own the cells, and the positions there."""
     cell, x = (np.concatenate([getattr(p, name) for p in patches]) for name in ("cell", "x"))
-    travel = grid.to_owners(cell)
+    travel = Exchange(grid.comm, grid.owner(cell))
     return travel, Places(grid, grid.local(travel.send(cell)), travel.send(x))
 
 
