@@ -150,6 +150,11 @@ def shape_values_in(grid: Grid, cells: NDArray[np.int64], x: NDArray[np.float64]
     return np.prod(0.5 + off[:, None] * grid.signs, axis=2)
 
 
+def on_owners(grid: Grid, cells: NDArray[np.int64]) -> NDArray[np.int32]:
+    """Return the local indices of lexicographic cells of any process, on the processes that own them."""
+    return grid.local(Exchange(grid.comm, grid.owner(cells)).send(cells))
+
+
 def at_nodes(
     grid: Grid,
     unknowns: Unknowns,

@@ -25,10 +25,9 @@ from mpm_dolfinx.base.validation import line
 from mpm_dolfinx.bodies.faces import Surface, interpolate
 from mpm_dolfinx.conditions.acting import Acting, At, Loads, Place, Setting
 from mpm_dolfinx.conditions.conditions import HOLD, Drained, Inflow, Quiet, Rain, Tied, holding
-from mpm_dolfinx.contact.pairs import at_nodes, petsc_matrix, shape_values_in
+from mpm_dolfinx.contact.pairs import at_nodes, on_owners, petsc_matrix, shape_values_in
 from mpm_dolfinx.forms.unknowns import Unknowns
 from mpm_dolfinx.grid.grid import Grid
-from mpm_dolfinx.parallel.exchange import Exchange
 
 
 class Tie:
@@ -156,7 +155,7 @@ class TieLoads(Loads):
     def held_cells(self) -> NDArray[np.int32]:
         """Cells of both sides."""
         cell, other = self._cells
-        return np.append(cell, self._grid.local(Exchange(self._grid.comm, self._grid.owner(other)).send(other)))
+        return np.append(cell, on_owners(self._grid, other))
 
     def pattern(self, unknowns: Unknowns) -> PETSc.Mat:
         """Return a zero matrix with the pattern of `coupling`."""

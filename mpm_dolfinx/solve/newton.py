@@ -253,7 +253,7 @@ class Newton:
                 log_change = self._solvers.restrain(self._storage, log_change)
             before, errors = errors, self._line_search(errors, elastic)
             # the first residual is infinite without exchanged fluid; with yield it shows prescribed displacements alone
-            count, known = count + 1, np.where(before.each > 1, elastic, before.each)
+            count, known = count + 1, np.minimum(1.0, before.each) * (elastic | (before.each <= 1))
             lags = (errors.each > keep * known) & (errors.each > tolerance)
             slow = fresh and bool((lags & (errors.p > errors.u)).any())
             fresh, eases = bool(lags.any()), eases & (elastic | ~lags)
@@ -470,7 +470,8 @@ class Newton:
         """Move u and p against the direction; the line search sets the step length of each part; return the errors."""
         self.report.newton += 1
         of = self._momentum.system.of_parts
-        moved, steps = np.zeros(of.count), np.ones(of.count)
+        moved = np.zeros(of.count)
+        steps = moved + 1.0
         first = np.empty(0) if elastic else self._work()  # without yield it is not used
         if not elastic and (first < 0).any():
             self._solvers.turn_round(first < 0)
