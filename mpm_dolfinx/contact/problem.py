@@ -120,10 +120,16 @@ class Touching(Acting):
 class ContactProblem(Loads):
     """Contact forces in a substep.  `now` is replaced during the solution.
 
-    law, origin: contact law at the start of the step, and the material points of its pairs; pushes: prescribed loads on
-    the tools; again: function from displacements (a local array, m) to law and origin of the pairs found there, see
-    `FacePairs`; cell_pairs: function that returns all pairs of cells, as integers first * cells + second, that contact
-    pairs may join.
+    Parameters
+    ----------
+    law, origin
+        Contact law at the start of the step, and the material points of its pairs.
+    pushes
+        Prescribed loads on the tools.
+    again
+        Function from displacements (a local array, m) to law and origin of the pairs found there, see `FacePairs`.
+    cell_pairs
+        Function that returns all pairs of cells, as integers first * cells + second, that contact pairs may join.
     """
 
     linear, smooth, touches = False, False, True

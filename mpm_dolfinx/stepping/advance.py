@@ -98,11 +98,23 @@ class Motion:
     ) -> tuple[State, int]:
         """Return the state at time t, s, after a solved step, and the number of inverted domains.
 
-        state: at the start of the step; on_grid, data: the bodies on the grid, and their integration points at that
-        time; loads: at the end of the step; net_inflow (n,), m^d: net inflow of fluid into the filled owned
-        cells in the step, None leaves the volume defect unchanged; report: of the step, for the exception if a point
-        leaves the grid; stays: whether points that hardly move may keep their pieces; carried: function that returns
-        new velocities, `Mass.carried`, of the motion (n,) of the points / cell size, 0 if they keep their pieces.
+        Parameters
+        ----------
+        state
+            State at the start of the step.
+        on_grid, data
+            The bodies on the grid, and their integration points at the start of the step.
+        loads
+            Loads at the end of the step.
+        net_inflow : (n,), m^d
+            Net inflow of fluid into the filled owned cells in the step; None leaves the volume defect unchanged.
+        report
+            Report of the step, for the exception if a point leaves the grid.
+        stays
+            Whether points that hardly move may keep their pieces.
+        carried
+            Function that returns new velocities, `Mass.carried`; argument (n,): motion of the points in cell sizes, 0
+            if they keep their pieces.
 
         Raises
         ------
