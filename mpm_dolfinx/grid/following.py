@@ -58,8 +58,9 @@ def lines_at(
 
 
 def carried(lines: Sequence[NDArray[np.float64]], shift: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """Return lines (n,), m, along each axis, after a displacement `shift` (d,), m, of the smallest cells.
+    """Return lines (n,), m, along each axis, whose smallest cells have moved by `shift` (d,), m, less a part of a cell.
 
+    The smallest cells move by whole cells, towards their lines before.  Therefore tools cross them as if they stayed.
     Edge lengths between the smallest cells and a side are multiplied by powers 1, 2 ... of a common factor, counted
     from the smallest cells.  Cells therefore still grow with the distance from the smallest ones, but faster or slower.
 
@@ -73,6 +74,7 @@ def carried(lines: Sequence[NDArray[np.float64]], shift: NDArray[np.float64]) ->
         width = np.diff(x)
         small = np.flatnonzero(width <= width.min() * (1 + SAME))
         first, last = small[0], small[-1] + 1
+        step = np.trunc(step / width.min() + np.copysign(SAME, step)) * width.min()
         if step == 0 or last - first == len(width):
             out.append(x)
             continue
