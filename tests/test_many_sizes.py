@@ -76,6 +76,14 @@ def test_graded_lines_meet_the_boxes_and_grow_by_the_ratio(largest):
             assert width[inside] == pytest.approx(0.1) and inside.sum() == round((box[1][a] - box[0][a]) / 0.1)
 
 
+@pytest.mark.parametrize("gap", [1e-3, 0.05, 0.1])
+def test_no_cell_is_narrow_where_boxes_are_near_each_other_or_a_side(gap):
+    """Lines that follow a tool would follow such a cell: it would be the smallest."""
+    near = mpm.graded([0, 0], [1, 1], [[[0, 0], [0.4, 1]], [[0.4 + gap, 0], [1, 1 - gap]]], 0.1)
+    for x in near:
+        assert np.diff(x) == pytest.approx(0.1)
+
+
 def test_points_and_nodes_are_found_and_shape_functions_are_exact_for_linear_fields():
     for dim, axisymmetric in KINDS:
         grid = uneven(dim, axisymmetric)

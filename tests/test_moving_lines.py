@@ -91,7 +91,7 @@ def test_smallest_cells_move_with_the_tool_by_whole_cells_and_the_others_grow_fr
         assert up - given[1][:-1][fine][0] == pytest.approx(0.125 * int(way / 0.125 + 1e-6)) == given[1][:-1][fine][0] - down
 
 
-@pytest.mark.parametrize("load", [None, lambda t: 4e4 * t])
+@pytest.mark.parametrize("load", [None, lambda t: 1e5 * t])
 def test_a_run_goes_on_from_a_checkpoint_with_the_same_bits(load, tmp_path):
     """Of a tool that moves as told, and of one under a load, whose way is in the checkpoint."""
     file, ends = tmp_path / "kept", []
@@ -103,7 +103,7 @@ def test_a_run_goes_on_from_a_checkpoint_with_the_same_bits(load, tmp_path):
             result = mpm.resume(s, file)
         s.run(0.1, 0.025, progress=False, after=result)
         ends.append((s.points.corners, s.points.pressure, *s.grid.lines))
-        assert (s.grid.lines[1] != s.grid.seeded[1]).any()
+        assert any((x != y).any() for x, y in zip(s.grid.lines, s.grid.seeded, strict=True))
     assert all((one == other).all() for one, other in zip(*ends, strict=True))
 
 
