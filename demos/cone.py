@@ -77,7 +77,13 @@ class Push:
 
 
 def scene(
-    cells: int, depth: float, clay: mpm.Skeleton, speed: float, end: float, fluid: mpm.Fluid | None, follow: bool = False
+    cells: int,
+    depth: float,
+    clay: mpm.Skeleton,
+    speed: float,
+    end: float,
+    fluid: mpm.Fluid | None,
+    follow: bool = False,
 ):
     """Return a simulation of the cone on the surface of the clay, and half of its outline (k, 2), m.
 
@@ -231,8 +237,13 @@ def following(o: Namespace, clay: mpm.Skeleton, fixed: Push) -> dict[str, float]
     mean, beside = (np.interp(WAY * o.depth, each.depth, each.N).mean() for each in (run, fixed))
     out = {"load": float(mean / beside - 1), "last": run.N[-1] / fixed.N[-1] - 1, "cuts": run.result.cuts}
     out |= {"cells": run.cells[0] / run.cells[1], "fixed": run.cells[0] / fixed.cells[0]}
-    found = f"lines that follow: mean N from {halfway:g} radii on {mean:.2f}, fixed lines {beside:.2f} ({out['load']:+.1%})"
-    print(f"{found}; final N {out['last']:+.1%}; {run.cells[0]} cells, fixed {fixed.cells[0]}, equal {run.cells[1]}; ", end="")
+    found = (
+        f"lines that follow: mean N from {halfway:g} radii on {mean:.2f}, fixed lines {beside:.2f} ({out['load']:+.1%})"
+    )
+    print(
+        f"{found}; final N {out['last']:+.1%}; {run.cells[0]} cells, fixed {fixed.cells[0]}, equal {run.cells[1]}; ",
+        end="",
+    )
     print(f"{run.result.cuts} of {run.result.steps} steps cut", flush=True)
     return out
 

@@ -88,7 +88,11 @@ def test_smallest_cells_move_with_the_tool_by_whole_cells_and_the_others_grow_fr
         assert all((x == y).all() for x, y in zip(carried(given, np.array([0.0, stays])), given, strict=True))
     for way in (0.3, 3 * (0.1 + 1e-17) * 1.25):  # the same cell, whatever rounding
         up, down = (carried(given, np.array([0.0, sign * way]))[1][:-1][fine][0] for sign in (1, -1))
-        assert up - given[1][:-1][fine][0] == pytest.approx(0.125 * int(way / 0.125 + 1e-6)) == given[1][:-1][fine][0] - down
+        assert (
+            up - given[1][:-1][fine][0]
+            == pytest.approx(0.125 * int(way / 0.125 + 1e-6))
+            == given[1][:-1][fine][0] - down
+        )
 
 
 @pytest.mark.parametrize("load", [None, lambda t: 1e5 * t])

@@ -58,11 +58,11 @@ def lines_at(
 
 
 def carried(lines: Sequence[NDArray[np.float64]], shift: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """Return lines (n,), m, along each axis, whose smallest cells have moved by `shift` (d,), m, less a part of a cell.
+    """Return lines (n,), m, along each axis, after a displacement `shift` (d,), m, of the smallest cells.
 
-    The smallest cells move by whole cells, towards their lines before.  Therefore tools cross them as if they stayed.
-    Edge lengths between the smallest cells and a side are multiplied by powers 1, 2 ... of a common factor, counted
-    from the smallest cells.  Cells therefore still grow with the distance from the smallest ones, but faster or slower.
+    These move by whole cells, rounded towards zero. A tool therefore crosses them as it crosses fixed cells. Edge
+    lengths between the smallest cells and a side are multiplied by powers 1, 2 ... of a common factor, counted from the
+    smallest cells. Cells therefore still grow with the distance from the smallest ones, but faster or slower.
 
     Raises
     ------
