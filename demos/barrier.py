@@ -63,8 +63,9 @@ def bank(cells: int, barrier: bool) -> mpm.Simulation:
 class Frame:
     """The bank at a time, s.
 
-    corners (n, 4, 2), m; moved (n,), m: displacements of the points; force on the barrier (3,): normal and shear force,
-    N/m, and moment about the foot, N; bounds: bounds of the normal force, N/m; depth of the clay at the barrier, m.
+    corners (n, 4, 2), m; moved (n,), m: magnitudes of the displacements of the points; force on the barrier (3,):
+    normal and shear force, N/m, and moment about the foot, N; bounds: bounds of the normal force, N/m; depth of the
+    clay at the barrier, m.
     """
 
     t: float

@@ -62,7 +62,10 @@ def scene(cells: int, alpha: float) -> tuple[mpm.Simulation, mpm.surface.Probes]
 
 
 def run(cells: int, steps: int, alpha: float, taken: int | None = None) -> tuple[np.ndarray, mpm.Result, dict]:
-    """Return the tip displacement (3,), m, the result and the costs of a run; taken: number of steps to take."""
+    """Return the tip displacement (3,), m, the result and the costs of a run.
+
+    steps: number of steps to the full load; taken: number of these steps that are computed, None for all.
+    """
     simulation, tip = scene(cells, alpha)
     result = simulation.run((taken or steps) / steps, 1 / steps, probes=tip)
     comm, (on_grid, matrices) = simulation.grid.comm, simulation.scene.last

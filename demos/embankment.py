@@ -83,7 +83,10 @@ class Bund:
 
 
 def run(h: float = 0.5, steps: int = 6) -> Bund:
-    """Build the embankment on cells of size h, m, in `steps` steps a lift, and about 6 times as many after the last."""
+    """Build the embankment on cells of size h, m.
+
+    steps: number of steps for each lift; the consolidation takes about 6 times as many steps.
+    """
     grid = mpm.Grid([0, 0], [WIDTH, CLAY + LIFTS + 1], np.rint(np.array([WIDTH, CLAY + LIFTS + 1]) / h).astype(int))
     bodies = [mpm.box(grid, [0, 0], [WIDTH, CLAY]), *[lift(grid, k) for k in range(LIFTS)]]
     simulation = mpm.Simulation(

@@ -287,7 +287,7 @@ def plasticity(cells: int) -> Example:
 
 @dataclass(frozen=True)
 class Hardening(mpm.Skeleton):
-    """The pressure is K y; Newton's method solves y + `power` y^3 = ln J at each point, and the tangent is exact."""
+    """The pressure is K y; Newton's method solves y + a y^3 = ln J (a: `power`), with exact tangent."""
 
     power: mpm.Field = 100.0
 
