@@ -42,7 +42,10 @@ def run(name: str, options: str) -> tuple[mpm.Result, float]:
 
 
 def errors(result: mpm.Result) -> list[float]:
-    """Return relative errors of the tip deflection: at 0.02 s, 0.06 s, and largest from 0.1 s; nan if not reached."""
+    """Return relative errors of the tip deflection: at 0.02 s, at 0.06 s, and the largest from 0.1 s on.
+
+    An error is nan if the run ends before this time.
+    """
     found = {round(t, 9): u[0, 1] for t, u in zip(result.t, result.displacement, strict=True)}
     off = {t: abs(found.get(t, np.nan) / u - 1) for t, u in zip(beam.TIMES, beam.TRUTH, strict=True)}
     late = [error for t, error in off.items() if t >= 0.1 and error == error]

@@ -59,7 +59,7 @@ def block(
 ) -> mpm.Simulation:
     """Return the block, `cells` cells wide.
 
-    box: width of the grid, m; its height is larger by two cells.
+    box: width of the grid, m; the grid is two cells higher than wide.
     """
     h = 1 / cells
     count = [round(box * cells), round(box * cells) + 2]

@@ -245,7 +245,7 @@ PATH = "logarithmic compression (-)", "axial pressure (kPa)"
 
 
 def path(s: mpm.Simulation, steps: int) -> tuple[np.ndarray, np.ndarray]:
-    """Run to t = 1 s; return the logarithmic compression and the axial pressure (Kirchhoff's, Pa) of the steps."""
+    """Run to t = 1 s; return logarithmic compression and axial Kirchhoff pressure, Pa, after each step."""
     out = []
     s.run(1, 1 / steps, observe=lambda s: out.append((s.points.J, s.points.J * s.effective_stress()[:, 1, 1])))
     J, stress = np.array(out).mean(axis=2).T
