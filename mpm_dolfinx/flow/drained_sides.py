@@ -342,7 +342,7 @@ class SideFeeds(Feeds):
         return {name: np.array(sums[i]) for i, name in enumerate(self._names)}
 
     def run_off(self, at: OpenFaces, fluid: Fluid) -> dict[str, NDArray[np.float64]]:
-        """Return the rain that does not infiltrate, m^d/s, by name of the condition."""
+        """Return the run-off by name of the condition, m^d/s: rain that neither infiltrates nor fills the pond."""
         if not any(self._rains):
             return {}
         excess = np.maximum(self._fallen, 0.0) + np.minimum(self._through(at, fluid), 0.0)  # nan without rain

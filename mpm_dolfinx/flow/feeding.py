@@ -90,7 +90,7 @@ class Feeds:
         return {}
 
     def run_off(self, at: Any, fluid: Fluid) -> dict[str, NDArray[np.float64]]:
-        """Return the rain that does not infiltrate, m^d/s, by condition; all processes must call this."""
+        """Return the run-off, m^d/s, by name of the condition; all processes must call this."""
         return {}
 
     def passing(self, at: Any, fluid: Fluid) -> Mapping[str, NDArray[np.float64]]:

@@ -452,7 +452,7 @@ class StorageProblem:
         return {name: values for one, at in both for name, values in one.outflows(at, fluid).items()}
 
     def run_off(self) -> dict[str, NDArray[np.float64]]:
-        """Return the rain that does not infiltrate, m^d/s, by name of the condition."""
+        """Return the run-off, m^d/s, by name of the condition."""
         fluid, both = self._fluid, zip(self._feeds, self._flow(False).at, strict=True)
         return {name: values for one, at in both for name, values in one.run_off(at, fluid).items()}
 
