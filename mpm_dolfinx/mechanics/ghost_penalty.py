@@ -142,7 +142,7 @@ class GhostPenalty:
 
 
 class GhostLoads(Loads):
-    """Ghost penalty on all inner faces of partly filled cells, and on those faces whose cells lie at walls of the grid."""
+    """Ghost penalty on all inner faces of partly filled cells, and on the faces among them at walls of the grid."""
 
     def __init__(self, everywhere: FacetSum, at_walls: FacetSum):
         self._everywhere, self._at_walls = everywhere, at_walls
