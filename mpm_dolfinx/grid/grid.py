@@ -369,7 +369,7 @@ class Grid:
     def move(self, lines: Sequence[NDArray[np.float64]]) -> None:
         """Move the lines of a grid with `follow` to new coordinates (n,), m, along each axis, relative to the base.
 
-        Afterwards all coordinates of nodes, cells and mesh are exactly those of a new grid with these lines.
+        Afterwards all coordinates of nodes, cells and mesh are exactly as in a new grid with these lines.
         """
         if any((new != old).any() for new, old in zip(lines, self.lines, strict=True)):
             self._spacing = self._spaced(tuple(lines))
@@ -679,7 +679,7 @@ class Grid:
         return np.where(bits, self.signs / (self.h if self.even else 1.0), 0.5).prod(axis=2)
 
     def over_edges(self, coefficients: NDArray[np.float64], cells: NDArray[np.int32]) -> NDArray[np.float64]:
-        """Convert coefficients (d, 2^d, cells) of `monomials` for offsets in m; those of equal cells are unchanged."""
+        """Convert coefficients (d, 2^d, cells) of `monomials` for offsets in m; for equal cells they are unchanged."""
         if self.even:
             return coefficients
         bits = corner_bits(self.dim)[:, None]

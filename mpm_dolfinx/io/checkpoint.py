@@ -280,7 +280,7 @@ def _nested(arrays: dict[str, NDArray]) -> dict[str, Any]:
 def _points(arrays: dict[str, NDArray], like: MaterialPoints, ids: NDArray[np.int64], total: int) -> MaterialPoints:
     """Return the material points with the given ids from the stored arrays.
 
-    Raise ValueError if names or shapes differ from those of `like`, or ids from `ids`.  Renewed points replace some
+    Raise ValueError if names or shapes do not match `like`, or ids do not match `ids`.  Renewed points replace some
     seeded points; their ids are at least `total`, the number of seeded points.
     """
     data = _part(arrays, "data/")

@@ -88,10 +88,10 @@ def factor_of_safety(
 ) -> Safety:
     """Return the factor of safety by strength reduction: the largest divisor of the strength without failure.
 
-    The simulation is unchanged. A scene that cannot stand need not be run: before the trials, soil that cannot yield
-    takes one step of length dt.
-    Suction, as part of the effective stress, adds to the strength. Tool friction is not divided. If a thin weak surface
-    layer slides alone, the factor depends on `rtol` and the layer's share of the load. All processes must call this.
+    The simulation is unchanged. A scene that cannot stand need not be run: trials start after a step of length `dt` in
+    which the soil cannot yield. Suction, as part of the effective stress, adds to the strength. Friction of tools is
+    not divided. If a thin weak surface layer slides alone, the factor depends on `rtol` and the layer's share of the
+    load. All processes must call this.
 
     Parameters
     ----------

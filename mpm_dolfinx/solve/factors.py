@@ -88,7 +88,7 @@ def renew(A: PETSc.Mat) -> None:
 def solved(ksp: PETSc.KSP, name: str) -> int:
     """Return the number of iterations of a solver's last solve; raise NotConverged if it failed.
 
-    Results after the largest number of iterations, or with an indefinite tangent, are accepted: the line search follows.
+    Results after the largest number of iterations, or with an indefinite tangent, are judged by the line search.
     """
     count, reason = ksp.getIterationNumber(), ksp.getConvergedReason()
     if reason < 0 and reason not in TOLERABLE:

@@ -19,8 +19,8 @@ At nu = 0.499 the cycle is inaccurate, and GMRES takes more than 100 iterations 
 many iterations (see `plan`), or is predicted to, factors of K replace the cycle.  They are kept until a solve with them
 takes too many iterations.  With factors of an earlier tangent a solve takes about 10 iterations, with new factors 4 to
 6.  A step takes 6.2 s with kept factors, 8.5 s with new factors for each tangent.  Four steps of yielding soil with
-12^3 cells take 33 s and 41 s.  MUMPS factorises 3190 unknowns in 0.2 s, 8610 in 1.4 s (PETSc in 3.4 s).  Solves then take up to 19 iterations
-(22 at nu = 0.49 with contrasts of 1e3).
+12^3 cells take 33 s and 41 s.  MUMPS factorises 3190 unknowns in 0.2 s, 8610 in 1.4 s (PETSc in 3.4 s).  Solves then
+take up to 19 iterations (22 at nu = 0.49 with contrasts of 1e3).
 
 In 2D yielding soil would take 20 to 500 iterations (a footing on 41 cells, with any smoother). Shear bands are one cell
 wide, and coarse grids cannot represent them. With a viscosity of 0.05 GMRES takes 28 iterations, and 0.9 times as long
@@ -48,7 +48,7 @@ from mpm_dolfinx.solve.solver_choice import SolverPlan
 LEAST = 1e-4
 """Smallest scale of the fluid residual, divided by the volume that the residual forces displace in a drained body.
 
-Sealed bodies exchange nearly no fluid. With scales of both residuals in the ratio 5e5, rounding left 2e-5 of a residual.
+Sealed bodies exchange nearly no fluid. If both residuals' scales had a ratio of 5e5, rounding left 2e-5 of a residual.
 """
 
 IDLE = object()

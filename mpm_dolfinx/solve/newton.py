@@ -59,10 +59,9 @@ ERROR = 1 / 20
 
 For a mode with decay rate l, the stability function of sdirk2 gives an error of 0.081 dt |l| e in a step, at most 0.28
 e.  A pressure that follows a varying load has an error of at most 0.14 e.  With little decay in a step such errors add
-up, to 0.081 e.  Errors, measured against steps an eighth as long, are 0.05 to 0.08 e if loads rise or oscillate, or the
-prescribed pressure of a drained side oscillates; 0.01 to 0.04 e with an oscillating source; 0.01 to 0.05 e late in a
-consolidation; 0.17 e in the first step of a load that grows from zero; 0.26 e after a jump.  In a run the largest error
-is 0.7 to 5 times e / 20.
+up, to 0.081 e.  Measured against steps an eighth as long, errors are 0.05 to 0.08 e if loads rise or oscillate, or the
+pressure prescribed on a drained side oscillates; 0.01 to 0.04 e with an oscillating source; 0.01 to 0.05 e late in a
+consolidation; 0.17 e in the first step of a load that grows from zero; 0.26 e after a jump; in a run 0.035 to 0.25 e.
 """
 SUDDEN = np.sqrt(2)
 """If a pressure changes in the second substep by less than this multiple of its change in the first, sdirk2 overshoots.
@@ -215,7 +214,7 @@ class Newton:
             self._vectors.append((storage.forms.p.x, active.cells))
 
     def newton(self, as_reset: AsReset, key: Hashable, serves: bool, ahead: Callable | None) -> Errors:
-        """Solve both balances by Newton's method; a tangent is kept while it converges, for linear laws over many steps.
+        """Solve both balances by Newton's method; a tangent is kept while it converges, in linear laws many steps.
 
         serves: whether the tangent of the previous substep may be reused; ahead: see `solve_substep`.
         """

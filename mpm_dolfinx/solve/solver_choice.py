@@ -37,8 +37,8 @@ class Thresholds:
         Largest number of unknown displacements in 3D for which a direct solver may replace multigrid. MUMPS takes 8 s
         and 0.2 GB for this number, with unsymmetric K 15 s and 0.4 GB.
     many
-        Largest number of iterations of a solve before a direct solver replaces multigrid, or the next tangent renews the
-        fixed-stress operator's factors.  Limits of 12, 25, 50, 500 give equally many Newton steps (footing, 9 cells).
+        After more iterations of a solve, a direct solver replaces multigrid, or the next tangent renews the factors of
+        the fixed-stress operator.  Limits of 12, 25, 50 and 500 give equally many Newton steps (footing, 9 cells).
     coarsest
         Largest number of unknowns of multigrid's coarsest grid, which has a direct solver.
     """
