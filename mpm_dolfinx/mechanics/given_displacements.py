@@ -144,7 +144,7 @@ class GivenDisplacements(Acting):
         return HoldLoads(self, forms, data, held, row, own, place)
 
     def _held_points(self, place: Place, ends: Sequence[float]) -> HeldPoints:
-        """Return the integration points on sides, each on the process with its constraint, see `inner_cells`.
+        """Return the integration points on sides, each on the process of its constraint, see `inner_cells`.
 
         ends: start and end of the step, s; empty if the displacement is zero.
         """
