@@ -228,7 +228,7 @@ def of_cells(name: str) -> cached_property:
 
 
 def of_places(name: str) -> property:
-    """Return a property of a grid: current positions of nodes or of midpoints of cells, stored in `Cells.at`."""
+    """Return a property of a grid: current positions of nodes or of midpoints of cells, kept in `at` of its `Cells`."""
     return property(lambda grid: getattr((grid._cells or grid._of_process).at, name))
 
 
