@@ -400,6 +400,17 @@ def test_bodies_in_contact_press_each_other_evenly_between_lines_at_random():
     assert np.abs(s.effective_stress()[:, 1, 1] / exact - 1).max() < 2e-3
 
 
+@pytest.mark.parametrize(("start", "way", "cut"), [(0.2, 0.04, False), (0.2, 0.12, True), (2.0, 0.12, False)])
+def test_bodies_slide_in_a_step_by_a_cell_of_the_size_where_they_are(start, way, cut):
+    """In cells of 0.05 m up to x = 1.2 m, of 0.2 m beyond; y is divided equally."""
+    grid = mpm.Grid(lines=[np.append(np.linspace(-0.4, 1.2, 33), np.linspace(1.4, 3.4, 11)), np.linspace(0, 1.2, 13)])
+    ends = ((start - 0.2, 0), (start + 1, 0.4)), ((start, 0.4), (start + 0.4, 0.8))
+    hold = mpm.Displacement("top", lambda t: (way * t, -0.004 * t), region=([-0.4, 0.7], [3.4, 1.2]))
+    more = {"walls": {"bottom": "xy"}, "conditions": [hold, mpm.Contact(0, 1)]}
+    s = mpm.Simulation(grid, [mpm.box(grid, *each) for each in ends], [SOFT], **more)
+    assert bool(s.run(1.0, 1.0, progress=False).cuts) is cut
+
+
 @pytest.mark.slow
 def test_a_footing_in_a_large_box_of_graded_cells_carries_what_it_does_in_a_small_one_of_equal_cells():
     loads = [footing.limit_load("undrained", 5, footing.FAR[how], how == "graded").load[-1] for how in footing.FAR]
