@@ -131,9 +131,9 @@ def _along(
 
 
 def _growing(gap: float, size: float, ratio: float, largest: float) -> NDArray[np.float64]:
-    """Return edge lengths (n,), m, that fill a gap, m, and grow from `size` by a common factor, if possible <= `ratio`.
+    """Return edge lengths (n,), m, that fill a gap, m, and grow from `size` by a common factor.
 
-    Two counts of edges are tried; the count whose growth factor is nearer to 1 is used.
+    The factor is at most `ratio` if possible.  Of two numbers of edges, the one with a factor nearer to 1 is used.
     """
     if gap <= 0:
         return np.empty(0)

@@ -7,8 +7,8 @@ derivative.  Nearly empty cells then affect neither the conditioning nor the acc
 increment like a viscosity, so it must not act on load-bearing cells:
 
 * The strength s of a face falls from 1 to 0 while the emptier cell's filling rises from 0 to `RATIO` times the fuller
-  cell's.  A second factor is a squared ratio: the fuller cell's filling to the largest filling next to the emptier one.
-  Nearly empty cells thus follow full ones easily.  A penalty between equally filled cells would resist kinks of a body.
+  cell's.  The fuller cell's filling, divided by the largest filling of the emptier cell's neighbours, gives a second
+  factor, its square.  A penalty between equally filled cells would resist kinks of a body.
 * The scale is the shear modulus. With lambda + 2G, nearly empty cells of nearly incompressible bodies would copy the
   stretch of the full neighbour, against their own volume constraint.  In flowing soil the modulus `stiffness` is < 2G.
 
@@ -42,7 +42,7 @@ RATIO = 0.3
 result of scene "soil" in tests/plateaus.py by 1.3e-03 (relative), doubling it by 5.9e-04, and finer cells by 3.0e-02.
 """
 SPARSE, FULL = 0.2, 0.9
-"""With integration at points: strength of the penalty, and volume fraction below which all faces of a cell have it."""
+"""Penalty with integration at points: its strength, and the volume fraction of the fullest cells with this penalty."""
 
 
 def stiffness(material: Skeleton) -> NDArray[np.float64]:
@@ -142,7 +142,7 @@ class GhostPenalty:
 
 
 class GhostLoads(Loads):
-    """Ghost penalty on all inner faces of partly filled cells, and its part on cells at walls of the grid."""
+    """Ghost penalty on all inner faces of partly filled cells, and on the faces among them at walls of the grid."""
 
     def __init__(self, everywhere: FacetSum, at_walls: FacetSum):
         self._everywhere, self._at_walls = everywhere, at_walls

@@ -26,7 +26,7 @@ from mpm_dolfinx.stepping.state import StepControl
 MIN_CUT, MIN_CUT_BY_ERROR = 2.0**-10, 2.0**-30
 """Smallest reduced step, divided by the nominal step: first of equal steps, then of adaptive steps.
 
-Adaptive steps grow over decades. At the onset of sliding they must shrink to the time scale of sliding.
+Adaptive steps may grow by several powers of ten. At the onset of sliding they must shrink to its time scale.
 """
 FINEST = NEAR**2
 """Smallest adaptive step divided by the time.  Without it, steps would become ever smaller at a singularity in time.
@@ -34,13 +34,13 @@ FINEST = NEAR**2
 Source: epsilon, a smaller step changes less than four digits of the time.
 """
 SAFETY, SHRINKS, GROWS, KEEPS = 0.9, 0.2, 5.0, 1.2
-"""Factor of the next adaptive step: `SAFETY` times a power of tolerance over error, from `SHRINKS` to `GROWS`.
+"""Factor of the next adaptive step: `SAFETY` times a power of tolerance / error, from `SHRINKS` to `GROWS`.
 
 A factor from 1 to `KEEPS` counts as 1.  Source: Hairer, Norsett and Wanner (1993), eq. 4.13; for `KEEPS` Hairer and
 Wanner (1996), IV.8.
 """
 RINGS = 5e-3
-"""Sudden pressure change, divided by the largest change so far, above which two half steps replace a step.
+"""If a sudden pressure change exceeds this fraction of the largest change so far, two half steps replace the step.
 
 The stability function is never below -0.21, so an undetected jump overshoots by at most a thousandth.
 """
@@ -148,7 +148,7 @@ class StepSize:
 
         A step leaves at most a fifth of a jump. A change that is equally sudden in successive steps is therefore no
         jump. For example, an edge pushed into a body causes such changes, because the grid is reset in every step.
-        Nor are changes of a body that are only rounding, compared with those of other bodies.
+        Nor are changes of a body that are rounding errors compared with the changes of other bodies.
         """
         excess = report.sudden - AGAIN * size * np.asarray(control.first)
         return bool((excess > np.maximum(RINGS * np.asarray(control.change), NEAR * max(control.change))).any())

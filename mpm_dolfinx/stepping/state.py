@@ -196,7 +196,7 @@ class State:
 
     @property
     def as_cut(self) -> MaterialPoints:
-        """Points at the positions at which the next step cuts them; if they keep their pieces, at the last reset."""
+        """Points as they are cut: at the positions of the last reset if they keep their pieces, else at the present."""
         if self.stay is None:
             return self.points
         return self.stay.points if self.stay.keeps is None else self.stay.points.where(self.stay.keeps, self.points)
