@@ -133,7 +133,7 @@ class Borders:
         outer: NDArray[np.float64],
         drop: NDArray[np.float64],
     ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]]:
-        """Yield indices of faces at owned mixed cells, and (k,) their results of `Relative.through_sides`."""
+        """Yield indices (k,) of faces at owned mixed cells, and results of `Relative.through_sides` for these."""
         rows = np.flatnonzero(self.mixed[cells] >= 0)
         if not len(rows):
             return
