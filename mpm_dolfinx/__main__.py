@@ -51,7 +51,7 @@ def number(name: str, text: str) -> float | list[float]:
     try:
         values = [float(part) for part in text.split(",")]
     except ValueError:
-        raise ValueError(f"{name} = {text!r}, must be a number, or several with commas, in SI units") from None
+        raise ValueError(f"{name} = {text!r}, must be a number, or numbers separated by commas, in SI units") from None
     return values if len(values) > 1 else values[0]
 
 

@@ -40,7 +40,7 @@ TURN = 2 * np.pi
 CHUNK = 2**14
 """Number of rows of an array that are processed together.  It limits the size of temporary arrays."""
 SNAP = 1e-10
-"""Distance to a grid plane, in cell sizes, below which a vertex is on the plane, unless rounding errors are larger."""
+"""Vertices nearer to a grid plane than this, in cell sizes, count as on it; `Grid.snap` allows for rounding errors."""
 ORDER = "the order is Grid(lower, upper, cells)"
 MANY = "grid: h is undefined for unequal cells, must be replaced by sizes"
 
@@ -228,7 +228,7 @@ def of_cells(name: str) -> cached_property:
 
 
 def of_places(name: str) -> property:
-    """Return a property of a grid: current positions of nodes or of midpoints of cells, stored in `Cells.at`."""
+    """Return a property of a grid: current positions of nodes or of midpoints of cells, kept in `at` of its `Cells`."""
     return property(lambda grid: getattr((grid._cells or grid._of_process).at, name))
 
 
@@ -289,7 +289,7 @@ class Grid:
     least, most : m
         Shortest and longest edge of all cells.
     snap
-        Distance to a grid plane along each axis (d,), in cell sizes, below which a vertex lies on the plane.
+        Distances (d,) along the axes, in cell sizes: vertices nearer to a grid plane count as on the plane.
     base : (d,), m
         Origin of all internal positions: the lower corner, with a radius of 0 in axisymmetry.  This origin preserves
         digits of positions far from the true origin.
@@ -654,8 +654,8 @@ class Grid:
     ) -> NDArray[np.float64]:
         """Return the gradients (n, 2^d, d), 1/m, of the Q1 shape functions of local cells at points x.
 
-        `mixed` (n, 3), m^2, in 3D, are mean products of offsets in subdomains about these points.  With them, gradients
-        are means over the subdomains.
+        `mixed` (n, 3), m^2, in 3D: means of the products of two offsets from a point, over a subdomain about the point.
+        With `mixed`, gradients are means over the subdomains.
         """
         hats, h = self._hats(cells, x), self.sizes(cells).T[..., None] if not self.even else self.h
         dN = np.empty((*hats[0].shape, self.dim))

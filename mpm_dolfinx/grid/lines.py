@@ -51,7 +51,7 @@ def graded(
     ratio: float = 1.1,
     largest: float = np.inf,
 ) -> list[NDArray[np.float64]]:
-    """Return grid lines with small cells in fine boxes.  Cells outside the boxes grow with the distance.
+    """Return grid lines with small cells in fine boxes.  Cells outside the boxes grow with the distance from them.
 
     Lines cross the whole grid, so cells in the rows and columns of a fine box are as narrow as the cells in the box.
 

@@ -20,8 +20,8 @@ The local unknown is d = 2 (h - a).  The stress ratio at the end follows from d,
 yield surface a = (ln(P_t / P_c,n) + ln(1 + w exp(-d))) / (1 + rho).  The equation for d is smooth and monotone, even at
 isotropic stresses and at the critical state (a = 0).
 
-If M^2 P_c > 6G (lambda - kappa), soil on the dry side of critical softens faster than it unloads elastically.  Then
-the stress jumps, or the equation has no solution and the time step is reduced.
+If M^2 P_c > 6G (lambda - kappa), soil on the dry side of the critical state softens faster than it unloads elastically.
+Then the stress jumps, or the equation has no solution and the time step is reduced.
 """
 
 from __future__ import annotations

@@ -275,7 +275,7 @@ class ConductivityAtPieces:
     laws
         Distinct conductivity laws of the materials.
     pieces
-        Integration points of the pieces; with any law they have the fields F, position, conductivity and porosity0.
+        Integration points of the pieces; if there is a law, with the fields F, position, conductivity and porosity0.
     displacement
         Increment of the displacement since the start of the step.
     pressure

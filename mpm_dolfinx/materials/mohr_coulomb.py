@@ -10,8 +10,8 @@ flow is along (1 + sin psi) e_i - (1 - sin psi) e_j, and at the cut-off T along 
 psi, c and T are constants of `MohrCoulomb`.  The return mapping keeps the order of the principal values.  The return
 therefore ends on one of ten faces, edges and vertices, see `_Return` (de Souza Neto, Peric and Owen 2008, 8.2, without
 the cut-off).  On each of them the final stress is linear in the trial stress.  A final stress is valid if it is
-admissible, the order is kept, and all plastic multipliers are >= 0.  Of ten final stresses, the one that violates these
-conditions least is used, by a rounding error.  Derivatives, in numpy, are exact even for equal principal values.
+admissible, the order is kept, and all plastic multipliers are >= 0.  Of the ten final stresses, the one with the least
+violation is used; this violation is a rounding error.  Derivatives, in numpy, are exact even for equal eigenvalues.
 """
 
 from __future__ import annotations

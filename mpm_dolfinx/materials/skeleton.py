@@ -288,7 +288,7 @@ class Skeleton:
         """Return the damping coefficient tau, 1/Pa: 1/4, or 1/2 for laws with a state, of the value for 2 x 2 cells.
 
         The full value is 3 alpha^2 / (8 (lambda + 3G)).  A quarter gives better conditioning and smears less (Silvester
-        and Kechkar 1990; Camargo, White and Borja 2021).  The value for 2 x 2 x 2 cells is down to 56 % smaller.
+        and Kechkar 1990; Camargo, White and Borja 2021).  The value for 2 x 2 x 2 cells is up to 56 % smaller.
         In 3D the smaller value would not damp pressures that alternate along two axes only, like checkerboards in plane
         strain.  Only increments of the pressure are damped, so an oscillation from the onset of yield remains.
         """
@@ -446,7 +446,7 @@ class unsaturated:
     Parameters
     ----------
     suction
-        Half width of the transition, Pa, > 0.  Recommended: 0.5 to 1 times (unit weight of water) (cell height).
+        Half width of the transition, Pa, > 0.  Recommended: 0.5 to 1 times unit weight of water times cell height.
     least
         Conductivity of drained soil, divided by that of saturated soil, in (0, 1).
     specific_yield

@@ -58,7 +58,7 @@ def call(function: Callable, kind: str = "UFL", /, **available):
     Raises
     ------
     ValueError
-        The function has an unknown argument, or raises.
+        The function has an unknown argument, or raises an error.
     """
     names = list(signature(function).parameters)
     for name in names:

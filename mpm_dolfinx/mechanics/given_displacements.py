@@ -144,7 +144,7 @@ class GivenDisplacements(Acting):
         return HoldLoads(self, forms, data, held, row, own, place)
 
     def _held_points(self, place: Place, ends: Sequence[float]) -> HeldPoints:
-        """Return the integration points on sides, each on the process with its constraint, see `inner_cells`.
+        """Return the integration points on sides, each on the process of its constraint, see `inner_cells`.
 
         ends: start and end of the step, s; empty if the displacement is zero.
         """
@@ -226,7 +226,7 @@ class GivenDisplacements(Acting):
             start, end = (self._given(hold, t, p.X) for t in (place.start, place.t))
             gaps = (p.origin(of) + given - p.now(of) for of, given in ((before, start), (points, end)))
             old, new, increment = (np.linalg.norm(v[:, axes], axis=1) for v in (*gaps, end - start))
-            if place.begins:  # a value that does not begin at the present position, by more than penalties give way
+            if place.begins:  # a prescribed value that begins farther from the present position than penalties yield
                 jump = np.linalg.norm((p.origin(before) + end - p.now(before))[:, axes], axis=1)
                 sudden = HOLD * jump > self._grid.least
                 old, increment = np.where(sudden, 0.0, old), np.where(sudden, jump, increment)

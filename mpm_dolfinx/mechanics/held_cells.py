@@ -176,7 +176,7 @@ class HeldCells:
         Where a side ends at a wall, its penalties omit nodes that the wall fixes. Otherwise the free nodes of the cell
         would compensate for the fixed ones, with an oscillation along the side. The prescribed displacement is also
         extrapolated to the wall. If this value exceeds half of the cell's mean, at the start or the end of the step,
-        the displacement must vary over the cell. It is then omitted if other penalties hold a free node of the cell.
+        the displacement must vary over the cell. A penalty is then omitted if others hold a free node of the cell.
 
         given (conditions,): whether each prescribes component `axis`; free (nodes,): whether no wall fixes the node.
 

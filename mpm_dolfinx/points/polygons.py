@@ -89,7 +89,7 @@ class Polygons:
         return out
 
     def simplified(self, near: float) -> Polygons:
-        """Return the polygons without vertices nearer than `near`, m, to the next one, or to a straight edge.
+        """Return the polygons without vertices within `near`, m, of the next one, or inside a straight edge.
 
         A trapezoid with such a vertex has two diagonals that divide it equally well; rounding would select one.
         """

@@ -230,7 +230,7 @@ class _Around:
     def _drained(self, weight: NDArray[np.float64]) -> tuple[NDArray, ...]:
         """Return data of drained sides: probe index, offset, head, weight, and whether the side is in the probe's cell.
 
-        For each side of a cell, the fit uses the mean head over the side's faces; single heads cause false gradients.
+        For each side of a cell, the fit uses the mean head over its faces; heads of single faces give false gradients.
         """
         sides, d = self._sides, self._grid.dim
         probe, place = np.nonzero(self._counts & (self._local >= 0))

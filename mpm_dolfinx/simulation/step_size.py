@@ -45,7 +45,7 @@ RINGS = 5e-3
 The stability function is never below -0.21, so an undetected jump overshoots by at most a thousandth.
 """
 AGAIN = 2.0
-"""A pressure jumps if it changes by more than `AGAIN` times the rate in the first substep of the previous step."""
+"""A pressure jumps if its rate is more than `AGAIN` times the rate in the first substep of the previous step."""
 MOST = SAME / EPSILON
 """Largest number of output intervals. Source: exact; with more intervals, `SAME` times a step is below rounding."""
 RESOLVED = 10
@@ -92,7 +92,7 @@ class StepSize:
         return size if self.by_error else self.longest
 
     def fitted(self, left: float, small: float) -> float:
-        """Return the length of the next step, s: `small`, adjusted to the output time that follows after `left`, s."""
+        """Return the length of the next step, s: `small`, adjusted to the next output time, `left` seconds away."""
         if self.by_error:  # avoids a tiny step before an output
             small = min(small, self.longest)  # `small` may be longer if an earlier run had other steps
             return left if left <= min(1.05 * small, (1 + SAME) * self.longest) else min(small, left / 2)
@@ -244,7 +244,7 @@ class Times:
         return [start + k * dt for k in range(done + 1, count)] + [self.end] * (count > done)
 
     def next(self, t: float) -> float:
-        """Return the latest time, s, that a run may reach after an output at time t, s, before the next one."""
+        """Return the latest time, s, that a run may reach between the output at time t, s, and the next."""
         return max([*self.after(t)[:1], t]) + SAME * self.interval
 
 

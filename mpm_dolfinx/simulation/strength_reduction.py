@@ -50,10 +50,10 @@ LACKS = 0.25
 """Largest overload, divided by `rtol`, of a trial that comes to rest.
 
 A trial that slides starts with an overload of 0.9 times the missing strength in a uniform block, 0.6 times in a slope.
-By the end the overload has halved. With values of 1/8 and 1/2 the slope's factor changes by 1.1 and 0.5 %.
+By its end the overload has halved. With values of 1/8 and 1/2 the slope's factor changes by 1.1 and 0.5 %.
 """
 STRAINS = 4.0
-"""Strain in a trial of a marginal slide, divided by the smaller of the trial's overload and elastic strain at yield.
+"""Strain in a trial of a marginal slide, divided by the trial's overload, or the elastic strain at yield if smaller.
 
 Stresses of soil that begins to flow redistribute within strains of a few times that at yield.  In soft soil such large
 strains would change the shape of the body; a larger viscosity limits them.  If this number is halved or doubled, the

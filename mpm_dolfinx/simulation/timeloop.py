@@ -102,7 +102,7 @@ def run(
         number changes sign within a step, or a returned boolean becomes True. A condition that holds at the start is no
         event. Example of a number: `lambda s: -s.points.displacement[:, 1].min() - 0.1`. Trial steps locate the event:
         the run ends at the first state found after it, at most a thousandth of the step later. This state is an output;
-        `Result.event` has the function's index and the time. Values must be equal on all processes. An event completes
+        `Result.event` has the function's index and the time. All processes must return equal values. An event completes
         the histories, as t_end does; a later run without `until` continues them.
     probes
         Material particles with recorded results.

@@ -80,7 +80,7 @@ def _preonly(A: PETSc.Mat, name: str) -> PETSc.KSP:
 def renew(A: PETSc.Mat) -> None:
     """Rebuild the sparsity pattern of a matrix in PETSc after sums with other matrices.
 
-    PETSc has grouped rows with equal patterns before the sums. LU factors with these old groups are wrong.
+    Before the sums, PETSc has grouped rows with equal patterns. LU factors with these old groups would be wrong.
     """
     A.setPreallocationCSR([part.copy() for part in A.getValuesCSR()])
 

@@ -48,7 +48,7 @@ from mpm_dolfinx.solve.solver_choice import SolverPlan
 LEAST = 1e-4
 """Smallest scale of the fluid residual, divided by the volume that the residual forces displace in a drained body.
 
-Sealed bodies exchange nearly no fluid. If both residuals' scales had a ratio of 5e5, rounding left 2e-5 of a residual.
+Sealed bodies exchange nearly no fluid. With a ratio of 5e5 between both scales, rounding left 2e-5 of a residual.
 """
 
 IDLE = object()

@@ -60,8 +60,8 @@ ERROR = 1 / 20
 For a mode with decay rate l, the stability function of sdirk2 gives an error of 0.081 dt |l| e in a step, at most 0.28
 e.  A pressure that follows a varying load has an error of at most 0.14 e.  With little decay in a step such errors add
 up, to 0.081 e.  Measured against steps an eighth as long, errors are 0.05 to 0.08 e if loads rise or oscillate, or the
-pressure prescribed on a drained side oscillates; 0.01 to 0.04 e with an oscillating source; 0.01 to 0.05 e late in a
-consolidation; 0.17 e in the first step of a load that grows from zero; 0.26 e after a jump; in a run 0.035 to 0.25 e.
+pressure prescribed on a drained side oscillates.  They are 0.01 to 0.04 e with an oscillating source, 0.01 to 0.05 e
+late in a consolidation, 0.17 e in a first step from zero load, 0.26 e after a jump, and in a run at most 5 e / 20.
 """
 SUDDEN = np.sqrt(2)
 """If a pressure changes in the second substep by less than this multiple of its change in the first, sdirk2 overshoots.

@@ -36,7 +36,7 @@ def with_lines(grid: Grid, state: State, left: Callable[[State], State]) -> Stat
     Parameters
     ----------
     left
-        Function that adds the pressures of all pieces to a state in which they were kept; called before the grid moves.
+        Function that adds pressures of pieces to a state with kept pieces, for a reset; called before the grid moves.
     """
     before = grid.seeded if state.lines is None else [state.lines[letter] for letter in sorted(state.lines)]
     grid.move(before)

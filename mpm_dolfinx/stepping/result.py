@@ -144,7 +144,7 @@ class Result:
     def energies(self) -> ByName[NDArray[np.float64]]:
         """Energies and works (times,), J (J/m in plane strain), of a `run(energies=True)`, by name.
 
-        `kinetic` and `elastic` are energies of the bodies and free tools; `elastic` is 0 for laws without an energy.
+        `kinetic`, `elastic` are energies of bodies and free tools; `elastic` is 0 for laws of unknown elastic energy.
         Works since the start of the run: `external`, work of all loads; `viscous`, of quiet sides and user's terms;
         `friction`, of slip at tools and between groups; `internal`, of the stresses. `dissipated` is `internal` minus
         `elastic`; in wet bodies it includes the work of flow and storage of water. With `Numerics(renewal=True)`,

@@ -480,7 +480,7 @@ class BiotFEM:
         return _compat.petsc_vec(out)
 
     def step(self, dt: float) -> tuple[int, float]:
-        """Advance by dt, s, > 0; return Newton iterations and relative residual.  `NotConverged`: no change."""
+        """Advance by dt, s, > 0; return Newton iterations and relative residual.  `NotConverged` changes no state."""
         numbers("dt", dt, test=lambda v: (0 < v) & (v < np.inf), allowed="> 0 and finite")
         newton, worst = 0, 0.0
         for substep in self._substeps:
@@ -591,7 +591,7 @@ class BiotFEM:
         """
         steps = round((t_end - self.t) / dt) if dt > 0 else 0
         if steps < 1 or abs(steps * dt - (t_end - self.t)) > NEAR * dt:
-            raise ValueError(f"dt = {dt!r}, t_end = {t_end!r}: dt must divide the {t_end - self.t:g} s left")
+            raise ValueError(f"dt = {dt!r}, t_end = {t_end!r}: dt must divide the remaining {t_end - self.t:g} s")
         x = positions(probes, self.grid.dim)
         out = np.flatnonzero(self.grid.outside(x - self.grid.base))
         if len(out):
