@@ -195,7 +195,7 @@ class BorderFlows:
 
     pair: NDArray[np.int64]  # local cells on both sides (2, m)
     flux: NDArray[np.float64]  # flux from the first to the second cell (m,), m^d/s
-    slopes: list[NDArray[np.float64]]  # derivative by the first pressure, minus that by the second (m,), m^d/(Pa s)
+    slopes: list[NDArray[np.float64]]  # d flux / dp[0] and -d flux / dp[1] (m,), m^d/(Pa s)
 
     def add_fluxes(self, out: NDArray[np.float64]) -> None:
         """Add the fluxes to the outflows of the local cells (c,), m^d/s."""
