@@ -10,9 +10,9 @@ Above this water, both slopes are seepage faces.
 Checks:
 
 * `flow`: ratio of the outflow of a rectangular dam to the exact outflow.  The dam is 9.6 m wide, with 10 m and 2 m of
-  water at its sides.  Above these levels the suction at the sides is hydrostatic.  With the water levels H1 and H2 and
-  the width L, the exact flow is Dupuit's and Charny's k (H1^2 - H2^2) / (2 L), if Kirchhoff's potential (the integral
-  of k_r over the head) replaces the head;
+  water at its sides.  Above these levels the suction at the sides is hydrostatic.  Without suction the exact flow is
+  Dupuit's and Charny's k (H1^2 - H2^2) / (2 L), with the water levels H1 and H2 and the width L.  With suction,
+  Kirchhoff's potential (the integral of k_r over the head) replaces the head;
 * `steady`: ratio of the inflow of the dam to its outflow, before the reservoir falls;
 * `drained`: ratio of the outflow of a column to that of finite elements on cells of a quarter of the size.  The free
   surface in the column falls from 8 m towards 2 m.

@@ -156,7 +156,7 @@ def of_strain(conductivity, J):
 
 
 def flow(cells: int, law: Callable, exact_law: Callable, title: str) -> Example:
-    """Let water flow upwards through a column of two layers, of which the load compresses the lower one more."""
+    """Let water flow upwards through a column of two layers; the load compresses the lower layer more."""
 
     def modulus(X):
         return np.where(X[:, 1] < 0.5, 1e6, 4e6)

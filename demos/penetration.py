@@ -97,8 +97,8 @@ class Push:
     steady: whether this step counts in the error of N.
 
     frame: final corners (n, 4, 2), m, a field (n,), and the shape of the bar (k, 4, 2), m.  The field is the
-    displacement of the points since the clay was seeded, divided by that of the bar; in wet clay the excess pressure
-    divided by s_u.  lines: final grid lines along both axes, m.
+    displacement of the points since the clay was seeded, divided by that of the bar.  In wet clay the field is the
+    excess pressure, divided by s_u.  lines: final grid lines along both axes, m.
     """
 
     depth: list[float] = field(default_factory=list)

@@ -101,7 +101,7 @@ def time_step_of_a_beam():
 
 @family(0.01)
 def fluid_bulk():
-    """Sealed column and beam, K_w = 1e4 Pa to infinity: exact pressure and settlement; tip against finite elements."""
+    """Sealed, K_w = 1e4 Pa to infinity; column: exact pressure and settlement; beam: tip against finite elements."""
     load = 1e-5 * M
     for bulk in [*decades(4, 12), inf]:
         p = load / (1 + SOIL.storage(bulk, SOIL.porosity) * M)
@@ -247,7 +247,7 @@ def points_per_cell():
 
 @family(0.01)
 def filling():
-    """Beam and column, filling of the outermost cells 1e-10 to 0.5: tip against finite elements; exact settlement."""
+    """Outermost cells filled to 1e-10 to 0.5; beam: tip against finite elements; column: exact settlement."""
     for f in (*decades(-10, -1), 0.5):
         yield f"beam, {f:.0e} of a cell", Beam(soil(conductivity=1e-5), WATER, offset=1 - f)
         top = 1 + 0.05 * f

@@ -10,7 +10,7 @@ J, with a = S(n = 1), and
 
 The bracket is the mass of a fluid of density rho that fills the volume J + b / a.  The change of zeta in a step is
 computed as alpha times the change of this mass, divided by rho at the mean pressure of the step.  This formula is
-second-order accurate for any path.  In a step of any size without flow of fluid, the formula gives exactly zero.
+second-order accurate for any path.  If no fluid flows, the formula gives exactly zero, in a step of any size.
 
 Fluxes between cells conserve mass.  A fluid of density rho_w exp(p / K_w) has the mass flux -rho_w kappa grad pi, with
 kappa = conductivity / unit weight.  The mass potential is pi = K_w (exp(p / K_w) - 1) (Kirchhoff's transformation).

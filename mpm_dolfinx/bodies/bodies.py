@@ -132,7 +132,7 @@ class Body:
     def bend(self, chosen: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return for each chosen domain the largest distance (m,), m, between its straight edges and mapped box edges.
 
-        Distances are between midpoints.  Edges of two domains on the same curve may differ by this distance.
+        Distances are between midpoints of edges.  Edges of two domains on the same curve may differ by this distance.
         """
         out = np.zeros(len(chosen))
         if self.map is None:

@@ -234,7 +234,7 @@ def _check_overlaps(
     """Raise an error for overlapping cells.
 
     Each facet inside the mesh has a cell on both sides.  The number of cells that cover a position therefore changes
-    only across the surface.  If cells overlap, a cell at the surface overlaps another cell; only these are checked.
+    only across the surface.  If cells overlap, a cell at the surface overlaps another; only cells there are checked.
 
     x (nodes, d): positions, m; cells: nodes of the cells by cell type; outer (m,): cells with a facet on the surface;
     neighbours (n, 2): pairs of cells that share a facet.

@@ -138,7 +138,7 @@ class Quiet(Condition):
     side
         Side of the bodies, as for `Traction`.
     incoming : (d,) or callable t (s) -> (d,), m/s
-        Particle velocity of an incoming wave along the inward normal.  A free surface would move twice as fast.
+        Particle velocity of a wave that enters along the inward normal.  A free surface would move twice as fast.
     region : ((d,), (d,)), m
         As for `Traction`.
 
@@ -197,7 +197,7 @@ class Source:
     Parameters
     ----------
     term
-        Function of a test function q of the pressure, see `user_functions`.  A positive term adds fluid, 1/s.
+        Function of a test function q of the pressure, see `user_functions`.  A positive term, 1/s, adds fluid.
     """
 
     term: Callable
@@ -317,10 +317,10 @@ class Rain(Flux):
     """Side of the bodies with rain or evaporation, limited by the soil's capacity to take up or release water.
 
     Rain infiltrates until the pressure at the side reaches `ponding`; the excess runs off.  Water evaporates at the
-    prescribed rate until the pressure at the side falls to `driest`.  Seepage can leave through the side too.
+    prescribed rate until the pressure at the side falls to `driest`.  Water can also seep out of the side.
     `outflows` of the simulation are the flow through the side; `simulation.outcome("runoff")` is the run-off, m^3/s
     (m^2/s in plane strain).  Three outcomes are volumes, m^3 (m^2), since the condition began.  `outcome("flowed")` is
-    outflow through all open sides, `outcome("ran_off")` run-off and seepage here, `outcome("ponded")` ponded water.
+    outflow of each open side, `outcome("ran_off")` run-off and seepage here, `outcome("ponded")` ponded water.
 
     Parameters
     ----------

@@ -3,9 +3,9 @@
 
 A pair consists of a quadrature point on a surface and the opposite position, on a tool or another group (`pairs`).
 The pairs have the relative displacements w = B u and the forces f(w); the nodal forces are B^T f(w).  Forces on both
-bodies are therefore equal and opposite within rounding.  If both sides deform, pairs, normals and gaps are first taken
-at the start of the step.  After convergence, pairs, normals and gaps are updated at the new positions, and the step is
-solved again.  This is repeated until an update changes the gaps by less than `DEPTH` cells.
+bodies are therefore equal and opposite within rounding.  If both sides deform, the pairs and their geometry are first
+taken at the start of the step.  After convergence, both are updated at the new positions, and the step is solved
+again.  This is repeated until an update changes the gaps by less than `DEPTH` cells.
 
 A load-controlled tool has one more unknown: its displacement a along the direction e of the load.  Let f(w - a e) be
 the forces on points, let D be minus their derivative with respect to w, and let s = e . D e.  Newton's method solves

@@ -149,7 +149,7 @@ class Ball:
 class Convex:
     """The convex hull of corners: a polygon, in 3D a polyhedron.
 
-    The signed distance is the largest distance from the planes of the surface.  This is exact inside.  Outside, near
+    The signed distance is the largest distance from the planes of the surface.  It is exact inside.  Outside, near
     edges and corners, it is too small, but no contact occurs there.
 
     Parameters

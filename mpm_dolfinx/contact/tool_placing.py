@@ -289,7 +289,7 @@ class Tools(Touching):
                 raise ValueError(f"{what}, must be outside of all bodies, or touch them")
 
     def check_end(self, place: Place, points: MaterialPoints, before: MaterialPoints) -> None:
-        """Raise an error if a tool contains points, touches prescribed sides, or passed through a body in a step."""
+        """Raise an error if a tool contains points, touches prescribed sides, or has crossed a body in a step."""
         t = place.t
         for tool in self.tools:
             for hold, faces in self._held:

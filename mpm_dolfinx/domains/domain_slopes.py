@@ -96,7 +96,7 @@ class LinearGradients:
     def at_pieces(
         self, cut: CutDomains, F: NDArray[np.float64], elastic: NDArray[np.bool_], soils: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return `linear_gradients`, which vary only at `elastic` points (n,); all processes must call this."""
+        """Return `linear_gradients`, which vary only in domains of `elastic` points (n,); all processes call it."""
         key = cut.points.id, elastic
         return linear_gradients(
             self._neighbours(key, partial(Neighbours, self._comm, self._bodies, *key), self._comm), cut, F, soils

@@ -133,7 +133,7 @@ class Borders:
         outer: NDArray[np.float64],
         drop: NDArray[np.float64],
     ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]]:
-        """Yield indices of faces at owned mixed cells, and (k,) their results of `Relative.through_sides`."""
+        """Yield indices (k,) of faces at owned mixed cells, and results of `Relative.through_sides` for these."""
         rows = np.flatnonzero(self.mixed[cells] >= 0)
         if not len(rows):
             return
@@ -195,7 +195,7 @@ class BorderFlows:
 
     pair: NDArray[np.int64]  # local cells on both sides (2, m)
     flux: NDArray[np.float64]  # flux from the first to the second cell (m,), m^d/s
-    slopes: list[NDArray[np.float64]]  # derivative by the first pressure, minus that by the second (m,), m^d/(Pa s)
+    slopes: list[NDArray[np.float64]]  # d flux / dp[0] and -d flux / dp[1] (m,), m^d/(Pa s)
 
     def add_fluxes(self, out: NDArray[np.float64]) -> None:
         """Add the fluxes to the outflows of the local cells (c,), m^d/s."""

@@ -66,7 +66,7 @@ class Through(NamedTuple):
     """Conductances of m faces between two pressures."""
 
     conductance: NDArray[np.float64]  # conductances (m,), m/(Pa s)
-    slopes: tuple[NDArray[np.float64], NDArray[np.float64]]  # derivative of the flux by p[0], minus that by p[1]
+    slopes: tuple[NDArray[np.float64], NDArray[np.float64]]  # d flux / dp[0] and -d flux / dp[1]
 
 
 def none(count: int, laws: int, slots: int) -> Paths:

@@ -477,11 +477,11 @@ class StorageProblem:
 
     @property
     def fill(self) -> NDArray[np.float64]:
-        """Volume fraction of material in each cell, by which the cell's pressure is weighted."""
+        """Volume fraction of material in each cell, by which errors and changes of its pressure are weighted."""
         return self._contents.fill
 
     def sealed(self, volumes: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the undrained pressure rise of cells at fixed stress, Pa, for volumes that the cells lost, m^d."""
+        """Return the pressure rise (n,), Pa, if cells at fixed stress kept the fluid volumes, m^d, that they lost."""
         return volumes / (self.forms.derivatives(self.data)[0] + self._contents.fixed_stress)
 
     def filling(self, error: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -662,7 +662,7 @@ class StorageProblem:
         share
             Weight of the filter L, in [0, 1]; 0 gives the fixed-stress operator.  With the stiffness K, B K^-1 B^T
             equals beta V for a smooth pressure, and zero for a checkerboard.  It equals beta V / 2 (at nu = 0) for a
-            pressure that alternates along one axis.  beta V - L equals the same values, with L = sum over faces of
+            pressure that alternates along one axis.  beta V - L gives the same values, with L = sum over faces of
             min(beta V+, beta V-) / (4 d) [p][q].
         """
         system = self.system

@@ -107,7 +107,7 @@ class FormPoints:
     def gradient(self, u: fem.Function) -> fem.Function:
         """Return grad u at the points as a coefficient, for a Q1 vector function u; numpy evaluates it.
 
-        UFL derivatives with respect to u do not see this dependence.  All forms at the same u share the values.  UFL
+        UFL derivatives with respect to u omit this dependence.  All forms at the same u share the values.  UFL
         would otherwise expand u as a Taylor polynomial about the cell's midpoint, with many terms in 3D.  With the
         coefficient, a kernel of Hencky's law takes at most half of the time to run, and a fifth of the time to compile.
         """
@@ -431,7 +431,7 @@ class FacetForm:
         return "compiled" in vars(self)
 
     def on(self, facets: NDArray[np.int32]) -> FacetSum:
-        """Return the form over these facets of this process; all processes must call this, because it may compile."""
+        """Return the form over these facets of this process; all processes must call this; it may compile the form."""
         make = partial(FacetSum, self, facets)
         return self._last(facets, lambda: make(self._comm.allreduce(len(facets)) > 0), self._comm)
 
