@@ -25,7 +25,7 @@ from mpm_dolfinx.base.tolerances import NEAR, SAME
 from mpm_dolfinx.base.validation import flag, instance, line, numbers
 from mpm_dolfinx.grid.following import check_follow
 from mpm_dolfinx.grid.lines import MOST, checked, equal, rounding
-from mpm_dolfinx.grid.partition import destinations, owners
+from mpm_dolfinx.grid.partition import boxes, destinations, owners
 from mpm_dolfinx.parallel.exchange import Exchange
 
 SIDES = {
@@ -158,6 +158,8 @@ class Cells:
         Current positions of nodes and cells.
     cell_number
         Lexicographic index of each local cell.
+    boxes : (ranks, 2, d)
+        First cell index along each axis, and last index plus one, of the cells of each process.
     locals, owners
         Local index, or -1, and owner rank of all cells of the grid, copy by copy.
     cell_facets : (cells, 2d)
@@ -166,8 +168,8 @@ class Cells:
         Cells at each facet, -1 outside the boundary.
     """
 
-    def __init__(self, grid: Grid, mesh: Any, owners: NDArray[np.int32]):
-        self.mesh = mesh
+    def __init__(self, grid: Grid, mesh: Any, boxes: NDArray[np.int64], owners: NDArray[np.int32]):
+        self.mesh, self.boxes = mesh, boxes
         self.owners = owners
         d = grid.dim
         nodes = _compat.function_space(mesh, "Lagrange", 1)
@@ -476,7 +478,7 @@ class Grid:
         return np.minimum(np.maximum(self.lines[axis].searchsorted(x, side="right") - 1, 0), self.shape[axis] - 1)
 
     mesh = of_cells("mesh")
-    owners = of_cells("owners")
+    owners, boxes = map(of_cells, ("owners", "boxes"))
     num_owned = of_cells("num_owned")
     num_local = of_cells("num_local")
     cell_nodes = of_cells("cell_nodes")
@@ -498,7 +500,7 @@ class Grid:
     def share(self, load: NDArray[np.float64]) -> None:
         """Create the mesh, unless it exists, with cells distributed among processes by their loads (cells,)."""
         if self._cells is None:
-            self._cells = self._made(owners(load.reshape(self.shape), self.comm.size))
+            self._cells = self._made(boxes(load.reshape(self.shape), self.comm.size))
 
     def shared(self, load: NDArray[np.float64], keep: bool) -> Grid:
         """Return a grid with cells distributed by their loads: this grid, or an equal grid with another mesh.
@@ -506,24 +508,33 @@ class Grid:
         load (cells,): load of each cell, such as its number of points, >= 0; keep: whether to keep an existing mesh for
         any distribution, because other objects were created on this mesh.
         """
-        owner = owners(load.reshape(self.shape), self.comm.size)
+        new = boxes(load.reshape(self.shape), self.comm.size)
         if self._cells is None:
-            self._cells = self._made(owner)
-        elif not keep and (self.owners[: self.cells] != owner.ravel()).any():  # distributed for an earlier scene
-            other = Grid(**self.given, comm=self.comm, axisymmetric=self.axisymmetric)
-            other._cells = other._made(owner)
-            return other
+            self._cells = self._made(new)
+        elif not keep and (self.boxes != new).any():  # distributed for an earlier scene
+            return self.spread(new)
         return self
 
-    def _made(self, owner: NDArray[np.int32]) -> Cells:
-        """Create the mesh, and return its cells.  `owner` is the rank of each cell, with the shape of the grid."""
+    def spread(self, boxes: NDArray[np.int64]) -> Grid:
+        """Return an equal grid, with the present lines, whose mesh is distributed by these boxes (ranks, 2, d)."""
+        other = self._again()
+        other.seeded, other._spacing = self.seeded, self._spacing
+        other._cells = other._made(boxes)
+        return other
+
+    def _again(self) -> Grid:
+        return Grid(**self.given, comm=self.comm, axisymmetric=self.axisymmetric)
+
+    def _made(self, boxes: NDArray[np.int64]) -> Cells:
+        """Create the mesh, and return its cells.  `boxes` (ranks, 2, d) are the cells of the processes, see `Cells`."""
+        owner = owners(boxes, tuple(self.shape))
         own = (owner.ravel() == self.comm.rank).nonzero()[0]
         nodes = np.concatenate([self.corners(own) + copy * self.nodes for copy in range(self.copies)])
         ranks, first = destinations(owner, own)
         each = np.tile(np.diff(first), self.copies)
         where = np.tile(ranks, self.copies), np.concatenate([[0], np.cumsum(each)]).astype(np.int32)
         mesh = _compat.box_mesh(self.comm, nodes, self._nodes(), *where)
-        return Cells(self, mesh, np.tile(owner.ravel(), self.copies))
+        return Cells(self, mesh, boxes, np.tile(owner.ravel(), self.copies))
 
     def corners(self, cells: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return the lexicographic indices (n, 2^d) of the nodes of cells."""
@@ -623,6 +634,11 @@ class Grid:
         if self.copies > 1:
             copy[self.cell_nodes] = (self.cell_number // self.cells)[:, None]
         return np.column_stack([self.nodes_along(self.node_x[nodes]), copy[nodes]])
+
+    def node_numbers(self) -> NDArray[np.int64]:
+        """Return the lexicographic indices (nodes,), copy by copy, of the local nodes."""
+        *index, copy = self.node_places(np.arange(len(self.node_x))).T
+        return np.ravel_multi_index(tuple(index), tuple(self.shape + 1)) + copy * self.nodes
 
     def cell_places(self, cells: NDArray[np.integer]) -> NDArray[np.int64]:
         """Return for local cells (n,) the indices along the axes and, in column d, the index of the copy."""
@@ -736,6 +752,9 @@ class GridOfGroups(Grid):
     def copies(self) -> int:
         """Number of groups."""
         return self._copies
+
+    def _again(self) -> Grid:
+        return GridOfGroups(self, self._group)
 
     def copy(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return, for material points with these ids (n,), the index of the first cell of their copy of the box."""

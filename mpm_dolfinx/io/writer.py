@@ -31,7 +31,7 @@ from mpm_dolfinx.base.validation import flag, instance, line_of, on_disk, path, 
 from mpm_dolfinx.contact.tool import Tool, motion_by_forces
 from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.io.units import text
-from mpm_dolfinx.parallel.exchange import at_root, to_root
+from mpm_dolfinx.parallel.exchange import at_root, together
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.simulation.simulation import Simulation
 from mpm_dolfinx.stepping.result import Result
@@ -47,7 +47,7 @@ class Writer:
 
     The folder receives
 
-    * `points.pvd`: the particle domains as solid cells.  Fields are displacement, pore pressure, F, J, all data of the
+    * `points.pvd`: the particle domains as solid cells, in one file for each process that has points.  Fields are displacement, pore pressure, F, J, all data of the
       points, and the results of `Simulation.point_fields`: stresses, p', q, porosity;
     * `history.csv`: one row for each output time, with counts and errors of `Result`, smallest and largest pressure,
       quantities at probes, forces of prescribed displacements and tools, and outflows.  Forces and outflows are nan
@@ -152,18 +152,19 @@ class Writer:
             series.write_index()
 
     def _write_points(self, simulation: Simulation) -> None:
-        comm, file = simulation.grid.comm, self._points.next.with_suffix(".vtu")
-        points, wet = simulation.points, simulation.scene.fluid is not None
+        comm, points, wet = simulation.grid.comm, simulation.points, simulation.scene.fluid is not None
         points = replace(points, data={**points.data, **fields_of_points(simulation)})
-        points = points.migrated(to_root(comm, len(points)))
+        files = self._points.pieces([len(points)] if comm.size == 1 else comm.allgather(len(points)))
 
         def write() -> None:
+            if (file := files.get(comm.rank)) is None:
+                return
             with replacing(file) as part:
                 mesh = solid(points, points.displacement, wet)
                 mesh.write(part, file_format="vtu")
 
-        at_root(comm, write)
-        self._points.entries.append((simulation.t, [file]))
+        together(comm, write)
+        self._points.entries.append((simulation.t, list(files.values())))
         if self._tools is not None:
             file = self._tools.next.with_suffix(".vtu")
             at_root(comm, lambda: _write_tools(simulation, file))
@@ -359,6 +360,12 @@ class Series:
     @property
     def next(self) -> Path:
         return self.folder / f"{len(self.entries):06d}"
+
+    def pieces(self, counts: Sequence[int]) -> dict[int, Path]:
+        """Return the paths of the next files by rank, for the ranks with points; counts: number of points of each."""
+        some, stem = np.flatnonzero(counts).tolist(), self.next
+        of = dict.fromkeys(some, "") if len(counts) == 1 else {rank: f"_p{rank}" for rank in some}
+        return {rank: stem.with_name(f"{stem.name}{end}.vtu") for rank, end in of.items()}
 
     def _read(self) -> list[tuple[float, list[Path]]]:
         self.folder.mkdir(parents=True, exist_ok=True)

@@ -69,7 +69,7 @@ def first_state(scene: Scene, conditions: Mapping[str, Any], later: Sequence[int
     """Return the state of a scene in its first stage, with initial stresses that are not balanced yet."""
     present = [body not in later for body in range(len(scene.bodies))]
     check_apart(scene.grid, scene.bodies, present)
-    first = _stage(scene, conditions, present, later)
+    first = stage_of(scene, conditions, present, later)
     if scene.initial.given and (quiet := first.of(Quiet)):
         raise ValueError(
             f"{next(iter(quiet))}: cannot balance an initial stress, must begin a stage later: first prescribe the side"
@@ -119,7 +119,7 @@ def begin_stage(
     present = [(is_present and body not in remove) or body in add for body, is_present in enumerate(before.present)]
     later = [body for body in before.later if body not in add]
     conditions = _with_contacts(before, named.get("conditions", tuple(before.given.values())))
-    after = _stage(scene, {**before.conditions, **named, "conditions": conditions}, present, later)
+    after = stage_of(scene, {**before.conditions, **named, "conditions": conditions}, present, later)
     _check_weight(after, before, state.t)
     if "gravity" in named or waters(after.given) != waters(before.given):
         warn_levels(scene.grid.comm, scene.fluid, after.conditions["gravity"], waters(after.named))
@@ -276,7 +276,8 @@ def _with_contacts(before: Stage, conditions: Sequence[Condition]) -> list[Condi
     return [*(one for one in conditions if one not in given), *standing]
 
 
-def _stage(scene: Scene, conditions: Mapping[str, Any], present: Sequence[bool], later: Sequence[int]) -> Stage:
+def stage_of(scene: Scene, conditions: Mapping[str, Any], present: Sequence[bool], later: Sequence[int]) -> Stage:
+    """Return a stage of a scene; conditions, present, later: see `stage`."""
     feeding = scene.storage.feeding if scene.storage else ()
     return stage(scene.bodies, scene.materials, scene.momentum, feeding, conditions, present, later)
 

@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, replace
 from functools import cached_property, partial
 from typing import Any, NamedTuple
+from weakref import WeakSet
 
 import numpy as np
 from dolfinx import fem
@@ -33,6 +34,7 @@ from mpm_dolfinx.materials.user_functions import compiling
 from mpm_dolfinx.mechanics.inertia import moving
 from mpm_dolfinx.mechanics.momentum import MomentumForms, MomentumProblem, MomentumSystem
 from mpm_dolfinx.mechanics.quadrature_data import QuadratureData, QuadraturePoints
+from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.parallel.messages import ConditionWarning, warn
 from mpm_dolfinx.points.cutting import volumes
 from mpm_dolfinx.points.material_points import MaterialPoints
@@ -89,6 +91,11 @@ class Scene:
         velocity: ArrayLike | Callable | None = None,
     ):
         self.grid = grid
+        given = {"numerics": numerics, "weighs": weighs, "pressure": pressure, "extensions": extensions}
+        given |= {"initial": initial, "velocity": velocity}
+        self._on = partial(Scene, bodies=bodies, materials=materials, fluid=fluid, **given)
+        self.former: WeakSet[SceneMaterials] = WeakSet()
+        """Materials of this scene on grids with other distributions among processes."""
         self.bodies = tuple(bodies)
         self.fluid = fluid
         self.numerics, scheme = numerics, numerics.scheme
@@ -135,6 +142,11 @@ class Scene:
     def flows(self) -> bool:
         """Whether fluid flows, or sources add it."""
         return self.storage is not None and (self.materials.conducts or bool(self.storage.feeding))
+
+    @property
+    def extended(self) -> bool:
+        """Whether the scene has user-defined terms or sources, which may be defined on the mesh."""
+        return any(map(len, self.extensions))
 
     @property
     def substeps(self) -> tuple[Substep, ...]:
@@ -191,6 +203,20 @@ class Scene:
         if self.materials.retentions is not None:
             gravity = stage.gravity_at(t) if self.materials.conducts else None
             self.materials.retentions.weight.value = 0.0 if gravity is None else self.fluid.density * gravity
+
+    def spread(self, boxes: NDArray[np.int64]) -> Scene | None:
+        """Return an equal scene on a grid distributed by boxes (ranks, 2, d), see `Cells`.
+
+        The result is None if a function of position, such as a random field, does not return the same values again.
+        """
+        out = self._on(self.grid.spread(boxes))
+        if over_all(self.grid.comm, int(out.materials.checksums != self.materials.checksums)):
+            return None
+        out.former = self.former | {self.materials}
+        out.scheme, out._warned = self.scheme, self._warned
+        left = [getattr(look, "func", look) for look in self._looks]
+        out._looks = tuple(look for look in out._looks if getattr(look, "func", look) in left)
+        return out
 
     def check(self, state: State) -> None:
         """Raise ValueError for an object that is no state of this scene: its stage refers to other materials."""
