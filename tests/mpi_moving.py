@@ -11,18 +11,18 @@ import numpy as np
 from helpers import gathered
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.stepping import distribution
+from mpm_dolfinx.grid import grid as grids
 
-T_END, DT = 0.3, 0.1
+T_END, DT = 0.375, 0.125
 TIGHT = mpm.Numerics(tolerance=1e-11, method="backward-euler")
 
 
 def carried():
     """Return a wet block with friction under a disc; its bottom and the disc are carried along."""
     grid = mpm.Grid([0, 0], [2, 1], [10, 5])
-    law = mpm.DruckerPrager(2e5, 1e5, friction=25, dilation=5, cohesion=5e3, porosity=0.4, conductivity=1e-4)
-    hold = mpm.Displacement("bottom", lambda t: (1.5 * t, 0.0))
-    disc = mpm.Tool(mpm.Ball((0.6, 0.72), 0.11), displacement=lambda t: (1.5 * t, -0.05 * t), friction=0.2, name="disc")
+    law = mpm.DruckerPrager(2e5, 1e5, friction=25, dilation=5, cohesion=3e3, porosity=0.4, conductivity=1e-4)
+    hold = mpm.Displacement("bottom", lambda t: (1.2 * t, 0.0))
+    disc = mpm.Tool(mpm.Ball((0.6, 0.712), 0.11), displacement=lambda t: (1.2 * t, -0.1 * t), name="disc")
     body = mpm.box(grid, [0.1, 0.1], [1.1, 0.6])
     acting = {"conditions": [hold, disc, mpm.Drained("top")], "fluid": mpm.Fluid()}
     return mpm.Simulation(grid, [body], [law], walls={}, **acting, numerics=TIGHT)
@@ -74,7 +74,7 @@ if __name__ == "__main__":
     again = make()
     run(again, T_END, after=mpm.resume(again, file))
     resumed = state(again)
-    distribution.UNEVEN = np.inf
+    grids.UNEVEN = np.inf
     still = make()
     fixed = run(still, T_END)
     left = state(still)

@@ -25,8 +25,8 @@ from mpm_dolfinx.base.tolerances import NEAR, SAME
 from mpm_dolfinx.base.validation import flag, instance, line, numbers
 from mpm_dolfinx.grid.following import check_follow
 from mpm_dolfinx.grid.lines import MOST, checked, equal, rounding
-from mpm_dolfinx.grid.partition import boxes, destinations, owners
-from mpm_dolfinx.parallel.exchange import Exchange
+from mpm_dolfinx.grid.partition import UNEVEN, better, boxes, destinations, owners
+from mpm_dolfinx.parallel.exchange import Exchange, over_all
 
 SIDES = {
     2: {"left": (0, 0), "right": (0, 1), "bottom": (1, 0), "top": (1, 1)},
@@ -515,6 +515,22 @@ class Grid:
             return self.spread(new)
         return self
 
+    def better(self, x: NDArray[np.float64]) -> NDArray[np.int64] | None:
+        """Return boxes (ranks, 2, d) that distribute points at x (n, d), m, more evenly; None if the present ones do.
+
+        Points on all processes count.  The present boxes remain up to an imbalance of `UNEVEN`.
+        """
+        number = self.number(self.index_from_base(x))
+        counts = over_all(self.comm, np.bincount(self.owner(number), minlength=self.comm.size))
+        if counts.max() <= UNEVEN * counts.mean():
+            return None
+        load = np.bincount(number, minlength=self.cells).astype(float)
+        return better(over_all(self.comm, load).reshape(self.shape), self.boxes)
+
+    def check_boxes(self, boxes: NDArray[np.int64]) -> None:
+        """Raise ValueError for boxes (ranks, 2, d) that do not fill the grid exactly once."""
+        owners(boxes, tuple(self.shape))
+
     def spread(self, boxes: NDArray[np.int64]) -> Grid:
         """Return an equal grid, with the present lines, whose mesh is distributed by these boxes (ranks, 2, d)."""
         other = self._again()
@@ -639,6 +655,27 @@ class Grid:
         """Return the lexicographic indices (nodes,), copy by copy, of the local nodes."""
         *index, copy = self.node_places(np.arange(len(self.node_x))).T
         return np.ravel_multi_index(tuple(index), tuple(self.shape + 1)) + copy * self.nodes
+
+    def at_nodes(self, node: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the values (nodes, k) at local nodes, from values (m, k) at ascending `node_numbers` (m,); 0 elsewhere."""
+        return self._found(node, values, self.node_numbers())
+
+    def from_other(self, other: Grid, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return nodal values (unknowns,) from those on an equal grid with other owners; node i passes by rank i % P."""
+        rows = nodal.reshape(-1, self.dim)
+        some = rows.any(axis=1)
+        known, wanted = other.node_numbers()[some], self.node_numbers()
+        there, back = (Exchange(self.comm, (node % self.comm.size).astype(np.int32)) for node in (known, wanted))
+        node, first = np.unique(there.send(known), return_index=True)
+        return back.back(self._found(node, there.send(rows[some])[first], back.send(wanted))).ravel()
+
+    @staticmethod
+    def _found(
+        node: NDArray[np.int64], values: NDArray[np.float64], wanted: NDArray[np.int64]
+    ) -> NDArray[np.float64]:
+        at = np.searchsorted(node, wanted)
+        found = np.append(node, -1)[at] == wanted
+        return np.concatenate([values, np.zeros((1, values.shape[1]))])[np.where(found, at, len(node))]
 
     def cell_places(self, cells: NDArray[np.integer]) -> NDArray[np.int64]:
         """Return for local cells (n,) the indices along the axes and, in column d, the index of the copy."""

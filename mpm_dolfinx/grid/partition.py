@@ -11,6 +11,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+UNEVEN = 1.2
+"""Largest number of points of a process, divided by the mean, above which cells are distributed anew.  The answers do
+not depend on this number.  Source: definition, the documented limit of the imbalance.
+"""
 EMPTY = 1e-2
 """Weight of an empty cell divided by the mean weight of a filled cell, for memory and time that empty cells need."""
 
@@ -43,9 +47,20 @@ def owners(of: NDArray[np.int64], shape: tuple[int, ...]) -> NDArray[np.int32]:
     return out
 
 
-def unevenness(counts: NDArray[np.float64]) -> float:
-    """Return the largest count of a rank, divided by the mean; 1 without any counts."""
-    return float(counts.max() / counts.mean()) if counts.any() else 1.0
+def better(load: NDArray[np.float64], of: NDArray[np.int64]) -> NDArray[np.int64] | None:
+    """Return the boxes (ranks, 2, d) of a new bisection if it is more even than the boxes `of`, else None.
+
+    A bisection that leaves more than `UNEVEN` must be better by this factor.  Otherwise each reset of the grid might
+    distribute few cells anew.
+    """
+    before, new = imbalance(load, of), boxes(load, len(of))
+    return new if before > UNEVEN and imbalance(load, new) < max(UNEVEN, before / UNEVEN) else None
+
+
+def imbalance(load: NDArray[np.float64], of: NDArray[np.int64]) -> float:
+    """Return the largest load of the boxes `of` (ranks, 2, d), divided by the mean; 1 without loads."""
+    each = np.array([load[tuple(map(slice, *box))].sum() for box in of])
+    return float(each.max() / each.mean()) if each.any() else 1.0
 
 
 def _bisect(weight: NDArray[np.float64], filled: NDArray[np.bool_], low: NDArray[np.int64], out: NDArray[np.int64]):

@@ -23,15 +23,14 @@ from mpm_dolfinx.conditions.acting import MOTIONS, Outcome
 from mpm_dolfinx.domains.pressure_transport import PiecePressures
 from mpm_dolfinx.domains.renewed_faces import PARENT, with_faces
 from mpm_dolfinx.grid.grid import Grid
-from mpm_dolfinx.grid.partition import owners
 from mpm_dolfinx.io.writer import WRITABLE, replacing
 from mpm_dolfinx.parallel.exchange import at_root
 from mpm_dolfinx.parallel.messages import log
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.simulation.simulation import Simulation
-from mpm_dolfinx.stepping.distribution import NODAL, at_nodes, spread
+from mpm_dolfinx.stepping.distribution import spread
 from mpm_dolfinx.stepping.result import Result
-from mpm_dolfinx.stepping.state import State, Stay, StepControl, Trend
+from mpm_dolfinx.stepping.state import NODAL, State, Stay, StepControl, Trend
 
 FORMAT, VERSION = "mpm_dolfinx checkpoint", 15  # Source: the format of the files
 FOREIGN = "not a checkpoint of mpm_dolfinx, must be one"
@@ -305,7 +304,7 @@ def _partition(file: Path, given: list, grid: Grid) -> NDArray[np.int64]:
     """Return the boxes (ranks, 2, d) of the processes that have written a file; raise ValueError for others."""
     try:
         boxes = np.array(given, dtype=np.int64).reshape(-1, 2, grid.dim)
-        owners(boxes, tuple(grid.shape))
+        grid.check_boxes(boxes)
     except (TypeError, ValueError, OverflowError) as error:
         raise ValueError(f"{file}: is cut short or damaged ({line(error)}), must be a whole checkpoint") from error
     return boxes
@@ -327,7 +326,7 @@ def _nodal_here(grid: Grid, given: dict[str, NDArray] | None) -> NDArray[np.floa
     """Return the nodal values on this process, from the stored nodes with non-zero values; None if `given` is None."""
     if given is None:
         return None
-    return at_nodes(given["node"], given["values"], grid.node_numbers()).ravel()
+    return grid.at_nodes(given["node"], given["values"]).ravel()
 
 
 def _check_lines(arrays: dict[str, NDArray], grid: Grid) -> None:

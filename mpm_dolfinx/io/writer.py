@@ -152,18 +152,17 @@ class Writer:
             series.write_index()
 
     def _write_points(self, simulation: Simulation) -> None:
-        comm, points, wet = simulation.grid.comm, simulation.points, simulation.scene.fluid is not None
+        comm, wet = simulation.grid.comm, simulation.scene.fluid is not None
+        points = simulation.points
         points = replace(points, data={**points.data, **fields_of_points(simulation)})
-        files = self._points.pieces([len(points)] if comm.size == 1 else comm.allgather(len(points)))
+        files = self._points.pieces(comm.allgather(len(points)))
 
         def write() -> None:
-            if (file := files.get(comm.rank)) is None:
-                return
-            with replacing(file) as part:
+            with replacing(files[comm.rank]) as part:
                 mesh = solid(points, points.displacement, wet)
                 mesh.write(part, file_format="vtu")
 
-        together(comm, write)
+        together(comm, write if comm.rank in files else bool)
         self._points.entries.append((simulation.t, list(files.values())))
         if self._tools is not None:
             file = self._tools.next.with_suffix(".vtu")
@@ -363,9 +362,9 @@ class Series:
 
     def pieces(self, counts: Sequence[int]) -> dict[int, Path]:
         """Return the paths of the next files by rank, for the ranks with points; counts: number of points of each."""
-        some, stem = np.flatnonzero(counts).tolist(), self.next
-        of = dict.fromkeys(some, "") if len(counts) == 1 else {rank: f"_p{rank}" for rank in some}
-        return {rank: stem.with_name(f"{stem.name}{end}.vtu") for rank, end in of.items()}
+        names = {rank: f"{self.next.name}_p{rank}.vtu" for rank, count in enumerate(counts) if count}
+        names = names if len(counts) > 1 else {0: f"{self.next.name}.vtu"}
+        return {rank: self.folder / name for rank, name in names.items()}
 
     def _read(self) -> list[tuple[float, list[Path]]]:
         self.folder.mkdir(parents=True, exist_ok=True)

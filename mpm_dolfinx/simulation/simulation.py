@@ -31,7 +31,7 @@ from mpm_dolfinx.simulation import summary
 from mpm_dolfinx.simulation.tangent import tangent
 from mpm_dolfinx.simulation.timeloop import run
 from mpm_dolfinx.solve.numerics import DEFAULT, Numerics
-from mpm_dolfinx.stepping.distribution import distribute, on
+from mpm_dolfinx.stepping.distribution import distribute
 from mpm_dolfinx.stepping.initial_state import balanced, begin_stage, first_state
 from mpm_dolfinx.stepping.result import Result
 from mpm_dolfinx.stepping.scene import Scene
@@ -166,7 +166,7 @@ class Simulation:
     @state.setter
     def state(self, state: State) -> None:
         if isinstance(state, State) and state.stage.materials in self.scene.former:
-            state = on(self.scene, state)  # stored before the cells were distributed anew
+            state = self.scene.adopted(state)  # stored before the cells were distributed anew
         self._state = state
 
     @property

@@ -10,6 +10,8 @@ from functools import cached_property, partial
 from typing import Any, NamedTuple
 from weakref import WeakSet
 
+from mpi4py import MPI
+
 import numpy as np
 from dolfinx import fem
 from numpy.typing import ArrayLike, NDArray
@@ -34,7 +36,6 @@ from mpm_dolfinx.materials.user_functions import compiling
 from mpm_dolfinx.mechanics.inertia import moving
 from mpm_dolfinx.mechanics.momentum import MomentumForms, MomentumProblem, MomentumSystem
 from mpm_dolfinx.mechanics.quadrature_data import QuadratureData, QuadraturePoints
-from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.parallel.messages import ConditionWarning, warn
 from mpm_dolfinx.points.cutting import volumes
 from mpm_dolfinx.points.material_points import MaterialPoints
@@ -43,8 +44,8 @@ from mpm_dolfinx.stepping.advance import Motion
 from mpm_dolfinx.stepping.grid_reset import Assembled, OnGrid, System, assembled
 from mpm_dolfinx.stepping.moving_lines import followed_tool, with_lines
 from mpm_dolfinx.stepping.renewal import Renewal
-from mpm_dolfinx.stepping.stage import Stage
-from mpm_dolfinx.stepping.state import State
+from mpm_dolfinx.stepping.stage import Stage, stage
+from mpm_dolfinx.stepping.state import NODAL, State
 
 
 class When(NamedTuple):
@@ -207,16 +208,33 @@ class Scene:
     def spread(self, boxes: NDArray[np.int64]) -> Scene | None:
         """Return an equal scene on a grid distributed by boxes (ranks, 2, d), see `Cells`.
 
-        The result is None if a function of position, such as a random field, does not return the same values again.
+        The result is None if a function of position, such as a random field, does not return the same values again, or
+        if terms may be defined on the present mesh.
         """
-        out = self._on(self.grid.spread(boxes))
-        if over_all(self.grid.comm, int(out.materials.checksums != self.materials.checksums)):
+        out = None if self.extended else self._on(self.grid.spread(boxes))
+        if out is None or not self.grid.comm.allreduce(
+            out.materials.checksums == self.materials.checksums, op=MPI.LAND
+        ):
             return None
         out.former = self.former | {self.materials}
         out.scheme, out._warned = self.scheme, self._warned
         left = [getattr(look, "func", look) for look in self._looks]
         out._looks = tuple(look for look in out._looks if getattr(look, "func", look) in left)
         return out
+
+    def adopted(self, state: State) -> State:
+        """Return the state of an equal scene with another distribution, as a state of this scene."""
+        before = state.stage
+        given = {**before.conditions, "conditions": tuple(before.given.values())}
+        nodal = {name: rows for name in NODAL if (rows := getattr(state, name)) is not None}
+        nodal = {name: self.grid.from_other(before.materials.grid, rows) for name, rows in nodal.items()}
+        after = self.stage(given, before.present, before.later)
+        return replace(state, stage=after, **nodal).at_owners(self.grid)
+
+    def stage(self, conditions: Mapping[str, Any], present: Sequence[bool], later: Sequence[int]) -> Stage:
+        """Return a stage of the scene; conditions, present, later: see `stepping.stage.stage`."""
+        fed = self.storage.feeding if self.storage else ()
+        return stage(self.bodies, self.materials, self.momentum, fed, conditions, present, later)
 
     def check(self, state: State) -> None:
         """Raise ValueError for an object that is no state of this scene: its stage refers to other materials."""
