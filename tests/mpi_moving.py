@@ -22,7 +22,7 @@ def carried():
     grid = mpm.Grid([0, 0], [2, 1], [10, 5])
     law = mpm.DruckerPrager(2e5, 1e5, friction=25, dilation=5, cohesion=3e3, porosity=0.4, conductivity=1e-4)
     hold = mpm.Displacement("bottom", lambda t: (1.2 * t, 0.0))
-    disc = mpm.Tool(mpm.Ball((0.6, 0.712), 0.11), displacement=lambda t: (1.2 * t, -0.1 * t), name="disc")
+    disc = mpm.Tool(mpm.Ball((0.6, 0.902), 0.3), displacement=lambda t: (1.2 * t, -0.1 * t), name="disc")
     body = mpm.box(grid, [0.1, 0.1], [1.1, 0.6])
     acting = {"conditions": [hold, disc, mpm.Drained("top")], "fluid": mpm.Fluid()}
     return mpm.Simulation(grid, [body], [law], walls={}, **acting, numerics=TIGHT)
@@ -33,7 +33,8 @@ def dug():
     grid = mpm.Grid([0, 0], [2, 1], [10, 5])
     bodies = [mpm.box(grid, [x, 0], [x + 0.8, 0.2]) for x in (0.2, 1.0)] + [mpm.box(grid, [0.3, 0.2], [0.7, 0.6])]
     push = mpm.Traction("left", lambda t: (2e3 * t, 0), region=((0.25, 0.25), (0.35, 0.6)))
-    acting = {"conditions": [mpm.Contact([0, 1], [2], friction=0.3), push], "gravity": lambda t: (0, -9.81 * min(t / 0.1, 1)), "inertia": True}
+    acting = {"conditions": [mpm.Contact([0, 1], [2], friction=0.3), push], "inertia": True}
+    acting["gravity"] = lambda t: (0, -9.81 * min(t / 0.1, 1))
     laws, walls = [mpm.Hencky(2e6, 1e6)], {"bottom": "xy"}
     simulation = mpm.Simulation(grid, bodies, laws, walls=walls, **acting, numerics=TIGHT)
     run(simulation, DT)

@@ -104,7 +104,7 @@ def test_imbalance_memory_and_traffic_are_those_of_the_processes(tmp_path):
 
 
 @pytest.mark.parametrize("scene", ["carried", "dug"])
-@pytest.mark.parametrize("processes", [2, pytest.param(3, marks=pytest.mark.slow), pytest.param(4, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("processes", [2, *(pytest.param(n, marks=pytest.mark.slow) for n in (3, 4))])
 def test_bodies_that_leave_their_processes_are_distributed_anew_with_the_same_answer(scene, processes, tmp_path):
     """It kept the cells as seeded.  Resumed runs end with the same bits, and on one process with the same answer."""
     files = [tmp_path / f"{scene}-{n}.npz" for n in (processes, 1)]

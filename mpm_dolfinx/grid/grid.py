@@ -117,6 +117,15 @@ def among(numbers: NDArray[np.integer], chosen: NDArray[np.integer]) -> NDArray[
     return chosen[np.minimum(chosen.searchsorted(numbers), len(chosen) - 1)] == numbers
 
 
+def values_at(
+    chosen: NDArray[np.int64], numbers: NDArray[np.int64], values: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the values (n, k) of the numbers `chosen` (n,), from values (m, k) of ascending numbers (m,); else 0."""
+    at = numbers.searchsorted(chosen)
+    found = np.append(numbers, -1)[at] == chosen
+    return np.concatenate([values, np.zeros((1, values.shape[1]))])[np.where(found, at, len(numbers))]
+
+
 def across_faces(grid: Grid, n: Any) -> tuple[Any, Any, Any]:
     """Return the edge lengths, m, of the "+" and "-" cells along the normal n of a face, and their mean, as UFL."""
     h = grid.edge_in_forms()
@@ -301,8 +310,9 @@ class Grid:
         Dimension of deformation gradients: d, or in axisymmetry 3, with the circumferential stretch as third component.
     mesh
         The dolfinx mesh, with coordinates relative to `base`, created at its first use.  On several processes, a second
-        scene with another distribution of points has a separate mesh and grid, `Simulation.grid`.  Scenes with terms or
-        sources always keep this mesh, because terms may be defined on it.
+        scene with another distribution of points has a separate mesh and grid, `Simulation.grid`.  The same holds for a
+        scene that distributes its cells anew.  Scenes with terms or sources always keep this mesh, because terms may be
+        defined on it.
     """
 
     def __init__(
@@ -512,7 +522,7 @@ class Grid:
         if self._cells is None:
             self._cells = self._made(new)
         elif not keep and (self.boxes != new).any():  # distributed for an earlier scene
-            return self.spread(new)
+            return self.distributed(new)
         return self
 
     def better(self, x: NDArray[np.float64]) -> NDArray[np.int64] | None:
@@ -531,7 +541,7 @@ class Grid:
         """Raise ValueError for boxes (ranks, 2, d) that do not fill the grid exactly once."""
         owners(boxes, tuple(self.shape))
 
-    def spread(self, boxes: NDArray[np.int64]) -> Grid:
+    def distributed(self, boxes: NDArray[np.int64]) -> Grid:
         """Return an equal grid, with the present lines, whose mesh is distributed by these boxes (ranks, 2, d)."""
         other = self._again()
         other.seeded, other._spacing = self.seeded, self._spacing
@@ -656,26 +666,14 @@ class Grid:
         *index, copy = self.node_places(np.arange(len(self.node_x))).T
         return np.ravel_multi_index(tuple(index), tuple(self.shape + 1)) + copy * self.nodes
 
-    def at_nodes(self, node: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the values (nodes, k) at local nodes, from values (m, k) at ascending `node_numbers` (m,); 0 elsewhere."""
-        return self._found(node, values, self.node_numbers())
-
     def from_other(self, other: Grid, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return nodal values (unknowns,) from those on an equal grid with other owners; node i passes by rank i % P."""
         rows = nodal.reshape(-1, self.dim)
         some = rows.any(axis=1)
-        known, wanted = other.node_numbers()[some], self.node_numbers()
-        there, back = (Exchange(self.comm, (node % self.comm.size).astype(np.int32)) for node in (known, wanted))
-        node, first = np.unique(there.send(known), return_index=True)
-        return back.back(self._found(node, there.send(rows[some])[first], back.send(wanted))).ravel()
-
-    @staticmethod
-    def _found(
-        node: NDArray[np.int64], values: NDArray[np.float64], wanted: NDArray[np.int64]
-    ) -> NDArray[np.float64]:
-        at = np.searchsorted(node, wanted)
-        found = np.append(node, -1)[at] == wanted
-        return np.concatenate([values, np.zeros((1, values.shape[1]))])[np.where(found, at, len(node))]
+        old, new = other.node_numbers()[some], self.node_numbers()
+        store, fetch = (Exchange(self.comm, (node % self.comm.size).astype(np.int32)) for node in (old, new))
+        node, first = np.unique(store.send(old), return_index=True)
+        return fetch.back(values_at(fetch.send(new), node, store.send(rows[some])[first])).ravel()
 
     def cell_places(self, cells: NDArray[np.integer]) -> NDArray[np.int64]:
         """Return for local cells (n,) the indices along the axes and, in column d, the index of the copy."""

@@ -22,13 +22,13 @@ from mpm_dolfinx.base.validation import instance, line, numbers, on_disk, path, 
 from mpm_dolfinx.conditions.acting import MOTIONS, Outcome
 from mpm_dolfinx.domains.pressure_transport import PiecePressures
 from mpm_dolfinx.domains.renewed_faces import PARENT, with_faces
-from mpm_dolfinx.grid.grid import Grid
+from mpm_dolfinx.grid.grid import Grid, values_at
 from mpm_dolfinx.io.writer import WRITABLE, replacing
 from mpm_dolfinx.parallel.exchange import at_root
 from mpm_dolfinx.parallel.messages import log
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.simulation.simulation import Simulation
-from mpm_dolfinx.stepping.distribution import spread
+from mpm_dolfinx.stepping.distribution import distribute_by
 from mpm_dolfinx.stepping.result import Result
 from mpm_dolfinx.stepping.state import NODAL, State, Stay, StepControl, Trend
 
@@ -93,7 +93,8 @@ def save(simulation: Simulation, file: Path) -> None:
     for name in NODAL:
         nodal |= _nodal_of_all(simulation.grid, name, getattr(state, name))
     note = {"version": VERSION, "t": state.t, "resets": state.resets, "begins": state.begins}
-    note |= {"partition": simulation.grid.boxes.tolist(), "scene": describe(simulation), "result": _scalars(state.result), "control": vars(state.control)}
+    note |= {"scene": describe(simulation), "result": _scalars(state.result), "control": vars(state.control)}
+    note["partition"] = simulation.grid.boxes.tolist()
 
     def write() -> int:
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -141,8 +142,8 @@ def resume(simulation: Simulation, file: str | os.PathLike) -> Result:
     found: list[State] = []  # rank 0 reads all points and pieces, and sends them to their owners
     bare, boxes = at_root(comm, read)
     state = found[0] if found else bare
-    if len(boxes) == comm.size > 1 and (boxes != simulation.grid.boxes).any():  # the same processes: the same bits
-        spread(simulation, boxes)
+    if len(boxes) == comm.size > 1 and (boxes != simulation.grid.boxes).any():  # on as many processes: the same bits
+        distribute_by(simulation, boxes)
     nodal = {name: _nodal_here(simulation.grid, getattr(state, name)) for name in NODAL}
     if state.lines is not None:
         simulation.grid.move([state.lines[letter] for letter in sorted(state.lines)])
@@ -326,7 +327,7 @@ def _nodal_here(grid: Grid, given: dict[str, NDArray] | None) -> NDArray[np.floa
     """Return the nodal values on this process, from the stored nodes with non-zero values; None if `given` is None."""
     if given is None:
         return None
-    return grid.at_nodes(given["node"], given["values"]).ravel()
+    return values_at(grid.node_numbers(), given["node"], given["values"]).ravel()
 
 
 def _check_lines(arrays: dict[str, NDArray], grid: Grid) -> None:

@@ -75,7 +75,8 @@ def joined(pieces: Sequence[meshio.Mesh]) -> meshio.Mesh:
         return pieces[0]
     order = np.argsort(np.concatenate([piece.cell_data["id"][0] for piece in pieces]))
     corners = np.concatenate([piece.points[piece.cells[0].data] for piece in pieces])[order]
-    data = {name: [np.concatenate([piece.cell_data[name][0] for piece in pieces])[order]] for name in pieces[0].cell_data}
+    names = pieces[0].cell_data
+    data = {name: [np.concatenate([piece.cell_data[name][0] for piece in pieces])[order]] for name in names}
     cells = np.arange(corners[..., 0].size).reshape(corners.shape[:2])
     return meshio.Mesh(corners.reshape(-1, 3), [(pieces[0].cells[0].type, cells)], cell_data=data)
 

@@ -47,8 +47,9 @@ class Writer:
 
     The folder receives
 
-    * `points.pvd`: the particle domains as solid cells, in one file for each process that has points.  Fields are displacement, pore pressure, F, J, all data of the
-      points, and the results of `Simulation.point_fields`: stresses, p', q, porosity;
+    * `points.pvd`: the particle domains as solid cells, in a file for each process with points.  Fields are
+      displacement, pore pressure, F, J, all data of the points, and the results of `Simulation.point_fields`: stresses,
+      p', q, porosity;
     * `history.csv`: one row for each output time, with counts and errors of `Result`, smallest and largest pressure,
       quantities at probes, forces of prescribed displacements and tools, and outflows.  Forces and outflows are nan
       before the first step of a stage;

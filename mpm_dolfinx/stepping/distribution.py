@@ -33,13 +33,13 @@ def distribute(simulation: Distributed) -> None:
     if state.lines is not None:
         grid.move([state.lines[letter] for letter in sorted(state.lines)])
     boxes = grid.better(state.as_cut.x)
-    if boxes is not None and spread(simulation, boxes):
+    if boxes is not None and distribute_by(simulation, boxes):
         log(grid.comm, "t = %g s: cells distributed anew among %d processes", state.t, grid.comm.size)
 
 
-def spread(simulation: Distributed, boxes: NDArray[np.int64]) -> bool:
+def distribute_by(simulation: Distributed, boxes: NDArray[np.int64]) -> bool:
     """Distribute the cells by boxes (ranks, 2, d), see `Cells`; return whether the scene allows it."""
-    new = simulation.scene.spread(boxes)
+    new = simulation.scene.distributed(boxes)
     if new is not None:
         simulation.scene, simulation.state = new, new.adopted(simulation.state)
     return new is not None

@@ -205,16 +205,16 @@ class Scene:
             gravity = stage.gravity_at(t) if self.materials.conducts else None
             self.materials.retentions.weight.value = 0.0 if gravity is None else self.fluid.density * gravity
 
-    def spread(self, boxes: NDArray[np.int64]) -> Scene | None:
+    def distributed(self, boxes: NDArray[np.int64]) -> Scene | None:
         """Return an equal scene on a grid distributed by boxes (ranks, 2, d), see `Cells`.
 
         The result is None if a function of position, such as a random field, does not return the same values again, or
         if terms may be defined on the present mesh.
         """
-        out = None if self.extended else self._on(self.grid.spread(boxes))
-        if out is None or not self.grid.comm.allreduce(
-            out.materials.checksums == self.materials.checksums, op=MPI.LAND
-        ):
+        if self.extended:
+            return None
+        out = self._on(self.grid.distributed(boxes))
+        if not self.grid.comm.allreduce(out.materials.checksums == self.materials.checksums, op=MPI.LAND):
             return None
         out.former = self.former | {self.materials}
         out.scheme, out._warned = self.scheme, self._warned
