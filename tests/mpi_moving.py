@@ -21,8 +21,8 @@ def carried():
     """Return a wet block with friction under a disc; its bottom and the disc are carried along."""
     grid = mpm.Grid([0, 0], [2, 1], [10, 5])
     law = mpm.DruckerPrager(2e5, 1e5, friction=25, dilation=5, cohesion=3e3, porosity=0.4, conductivity=1e-4)
-    hold = mpm.Displacement("bottom", lambda t: (1.2 * t, 0.0))
-    disc = mpm.Tool(mpm.Ball((0.6, 0.902), 0.3), displacement=lambda t: (1.2 * t, -0.1 * t), name="disc")
+    hold = mpm.Displacement("bottom", lambda t: (1.3 * t, 0.0))
+    disc = mpm.Tool(mpm.Ball((0.6, 0.902), 0.3), displacement=lambda t: (1.3 * t, -0.1 * t), name="disc")
     body = mpm.box(grid, [0.1, 0.1], [1.1, 0.6])
     acting = {"conditions": [hold, disc, mpm.Drained("top")], "fluid": mpm.Fluid()}
     return mpm.Simulation(grid, [body], [law], walls={}, **acting, numerics=TIGHT)
