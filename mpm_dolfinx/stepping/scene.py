@@ -98,10 +98,8 @@ class Scene:
         self.former: WeakSet[SceneMaterials] = WeakSet()
         """Materials of this scene on grids with other distributions among processes."""
         self.bodies = tuple(bodies)
-        self.fluid = fluid
         self.numerics, scheme = numerics, numerics.scheme
-        terms, sources = self.extensions = extensions
-        """User-defined terms and sources."""
+        terms, sources = extensions
         pressure = weighed(pressure, fluid)
         self.initial = InitialStresses(self.bodies, initial, pressure)
         seeded = material_points(grid, bodies, pressure)
@@ -143,6 +141,16 @@ class Scene:
     def flows(self) -> bool:
         """Whether fluid flows, or sources add it."""
         return self.storage is not None and (self.materials.conducts or bool(self.storage.feeding))
+
+    @property
+    def fluid(self) -> Fluid | None:
+        """Pore fluid."""
+        return self.materials.fluid
+
+    @property
+    def extensions(self) -> tuple[Sequence[Callable], Sequence[Callable]]:
+        """User-defined terms and sources."""
+        return self._on.keywords["extensions"]
 
     @property
     def extended(self) -> bool:
