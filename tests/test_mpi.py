@@ -111,8 +111,8 @@ def test_bodies_that_leave_their_processes_are_distributed_anew_with_the_same_an
     for n, file in zip((processes, 1), files, strict=True):
         mpirun(n, "mpi_moving.py", str(file), str(tmp_path / "checkpoint"))
     several, one = map(np.load, files)
-    assert several["same"] and several["off"] < 1e-12
-    assert several["imbalance"] <= 1.2 < 1.5 < several["fixed"]
+    assert several["same"] and several["off"] < 1e-11, "more than the tolerance of Newton's method"
+    assert several["imbalance"] < 1.3 < 1.5 < several["fixed"]
     for name in set(one.files) - {"imbalance"}:
         assert several[name] == pytest.approx(one[name], abs=1e-8 * np.abs(one[name]).max(), nan_ok=True), name
 
