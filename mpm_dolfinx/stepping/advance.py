@@ -146,6 +146,8 @@ class Motion:
                 points = replace(points, data=data_now)
             if self.keeps_volumes:
                 points = self._corrected(points, state, loads, keeps & stays)
+            if cut.domains and (flat := over_all(grid.comm, int((volumes(points.corners) == 0).sum()))):
+                raise NotConverged(f"the step flattens {flat} domains")
             carried = None
             if self._storage is not None:
                 pressure = cut.to_pieces(self._storage.p.x.array[pieces.cells])
