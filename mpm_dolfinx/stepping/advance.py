@@ -147,7 +147,7 @@ class Motion:
             if self.keeps_volumes:
                 points = self._corrected(points, state, loads, keeps & stays)
             if cut.domains and (flat := over_all(grid.comm, int((volumes(points.corners) == 0).sum()))):
-                raise NotConverged(f"the step flattens {flat} domains")
+                raise NotConverged(f"the step flattens domains, {flat} in all")
             carried = None
             if self._storage is not None:
                 pressure = cut.to_pieces(self._storage.p.x.array[pieces.cells])
