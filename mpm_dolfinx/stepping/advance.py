@@ -310,10 +310,8 @@ class Motion:
         If Q1 cells would lock, F is scaled so that det F equals that of `deformed`. In yielded soil F is `deformed`:
         the deformation there is permanent, and domains in kinks would give wrong values.
         """
-        cut = on_grid.cut
-        stage = state.stage
-        folded = 0
-        grid = cut.grid
+        cut, stage = on_grid.cut, state.stage
+        grid, folded = cut.grid, 0
         own = self._own(stage, state.points)
         near = np.zeros(moved.shape[:2], dtype=bool)
         for one in loads:
