@@ -10,9 +10,9 @@ Above this water, both slopes are seepage faces.
 Checks:
 
 * `flow`: ratio of the outflow of a rectangular dam to the exact outflow.  The dam is 9.6 m wide, with 10 m and 2 m of
-  water at its sides.  Above these levels the suction at the sides is hydrostatic.  With the water levels H1 and H2 and
-  the width L, the exact flow is Dupuit's and Charny's k (H1^2 - H2^2) / (2 L), if Kirchhoff's potential (the integral
-  of k_r over the head) replaces the head;
+  water at its sides.  Above these levels the suction at the sides is hydrostatic.  Without suction the exact flow is
+  Dupuit's and Charny's k (H1^2 - H2^2) / (2 L), with the water levels H1 and H2 and the width L.  With suction,
+  Kirchhoff's potential (the integral of k_r over the head) replaces the head;
 * `steady`: ratio of the inflow of the dam to its outflow, before the reservoir falls;
 * `drained`: ratio of the outflow of a column to that of finite elements on cells of a quarter of the size.  The free
   surface in the column falls from 8 m towards 2 m.
@@ -42,7 +42,7 @@ LOAM = mpm.LinearElastic(
     retention=mpm.VanGenuchten(WEIGHT / 2, residual=0.15, n=2.0),
 )
 DAY = 86400.0  # s
-SETTLES = (0.1, 1.0, 10.0, 100.0)  # days: periods of equal steps until the flow is steady
+SETTLES = (0.1, 1.0, 10.0, 100.0)  # days: lengths of the steps until the flow is steady
 FALLS, SEEN = 5.0, (5.0, 15.0, 40.0)  # days: duration of the fall; times since its start, for the picture
 
 
@@ -73,7 +73,7 @@ class Dam:
 
 
 def run(h: float = 0.5, steps: int = 10) -> Dam:
-    """Run the dam on cells of size h, m, with `steps` equal steps in each period of `SETTLES`, and in the drawdown."""
+    """Run the dam on cells of size h, m, in `steps` steps of each length in `SETTLES`, then in drawdown."""
     grid = mpm.Grid([0, 0], [BASE + 2, HEIGHT + 1], np.rint(np.array([BASE + 2, HEIGHT + 1]) / h).astype(int))
 
     def trapezoid(X: np.ndarray) -> np.ndarray:

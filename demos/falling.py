@@ -104,7 +104,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, result: mpm.Result, t, way, above, shapes, rigid) -> None:
-    """Draw the bodies at some times, their distances with those of rigid bodies, and the energies."""
+    """Draw the bodies at some times, their distances compared with rigid bodies, and the energies."""
     fig, ((scene_, ways, energy),) = common.figure(1, 3, (15, 4.2))
     for k, corners in enumerate(shapes):
         shade = 0.25 + 0.75 * k / max(1, len(shapes) - 1)

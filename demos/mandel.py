@@ -42,7 +42,7 @@ EXACT = Mandel(WIDTH, HEIGHT, SOIL.bulk, SHEAR, SOIL.conductivity / WATER.unit_w
 class Outcome:
     """Results of a run, with an entry for each step: T; x, m, and p, Pa, of the cells (columns, rows); settlements, m.
 
-    Settlements are those of the top, at eleven positions from the middle to the side.
+    The settlements refer to eleven positions on the top, from the middle to the side.
     """
 
     time: list[float] = field(default_factory=list)

@@ -9,9 +9,9 @@ in UFL.  Inertia is neglected.  On one process.
 1. Critical strength.  Without friction and drainage, the strength c is reduced by 1 % in each step.  A vertical side of
    height H is stable while gamma' H / c < 3.78 (limit analysis: between 3.76 and 3.79, Pastor, Thai and Francescato
    2000; critical slip circle: 3.83, Fellenius 1927).  The bank has failed when its crest settles 20 times as much in a
-   step as in the first steps; with 10 or 40 times, the result changes by 1 %.  With 10 cells over the height the bank
-   fails at gamma' H / c = 3.93, which is 3.9 % too large; with 20 cells at 3.85, 1.9 % too large.  This error is of
-   first order in the cell size, and the extrapolated value is 3.78.
+   step as in the first steps.  With a factor of 10 or 40 instead of 20, the result changes by 1 %.  With 10 cells over
+   the height the bank fails at gamma' H / c = 3.93, which is 3.9 % too large; with 20 cells at 3.85, 1.9 % too large.
+   This error is of first order in the cell size, and the extrapolated value is 3.78.
 2. Run-out.  The consolidated bank, with friction, loses its cohesion within T = 10 minutes, far faster than it drains.
    The bank slumps, and its crest is carried along by the flowing soil.  In front of the initial toe, the water carries
    more than half of the weight.  At rest the bank is twice as long as before; then the excess pressure drains.  The

@@ -10,11 +10,11 @@ law, which has no stiffness of the grains, fails.  The package reports this, and
 time.
 
 The references for q/E = 0.25 are results of Taylor-Hood elements, extrapolated in time, and in h from 20, 40 and 80
-cells. The extrapolated settlements differ from those of 40 cells by 0.6 % at T = 0.01 and by 0.2 % at T = 0.1.  Errors:
-`settlement` is the largest error of the displacement of the strip's middle from T = 0.1 on, and `at_once` its error at
-T = 0.01.  `edge` is the error at the strip's edge, where the load jumps, and `beside` is the error at the far corner.
-All errors are relative to the displacement of the middle.  --reference also runs Taylor-Hood elements on the same
-cells. On one process.
+cells. The extrapolated settlements differ from the settlements on 40 cells by 0.6 % at T = 0.01, and by 0.2 % at T =
+0.1.  Errors: `settlement` is the largest error of the displacement of the strip's middle from T = 0.1 on, and `at_once`
+its error at T = 0.01.  `edge` is the error at the strip's edge, where the load jumps, and `beside` is the error at the
+far corner.  All errors are relative to the displacement of the middle.  --reference also runs Taylor-Hood elements on
+the same cells. On one process.
 """
 
 from __future__ import annotations
@@ -64,7 +64,10 @@ def conditions(load: float) -> dict:
 
 
 def times(a_decade: int) -> NDArray[np.float64]:
-    """Return the times T at which steps end: `a_decade` in each decade after `RAMP`, two thirds as many before."""
+    """Return the times T at which steps end.
+
+    a_decade: number of steps in which T grows tenfold after `RAMP`; two thirds of this number end at `RAMP` or before.
+    """
     ramp = RAMP * np.linspace(0, 1, 1 + 2 * a_decade // 3)[1:]
     return np.append(ramp, RAMP * 10 ** (np.arange(1, 5 * a_decade // 2 + 1) / a_decade))
 

@@ -144,7 +144,7 @@ def test_a_thick_cylinder_is_widened_as_the_exact_one_at_second_order():
     load, probes, errors = lambda t: 4e5 * t, [[0.5, 0.05], [1.0, 0.05]], []
     exact = widened(0.5, 1.0, 4e5)
     walls = {"bottom": "y", "top": "y"}
-    for cells in (4, 16):
+    for cells in (4, 8, 16, 32):
         h = 0.5 / cells
         grid = plane((1.5, 2 * h), (3 * cells, 2))
         body = mpm.box(grid, [0.5, 0], [1, 2 * h])
@@ -152,7 +152,8 @@ def test_a_thick_cylinder_is_widened_as_the_exact_one_at_second_order():
         places = [[x, h] for x, _ in probes]
         found = s.run(1, 0.25, probes=mpm.probes([body], places)).displacement[-1][:, 0]
         errors.append(np.abs(found / exact - 1).max())
-    assert errors[1] < 3e-4 and rates(errors)[0] / 2 > 1.8
+        print(f"{cells} cells: error of the inner and the outer displacement", found / exact - 1)
+    assert errors[2] < 3e-4 and rates(errors[::2])[0] / 2 > 1.8
     loads = [mpm.Pressure("left", load)]
     fem = BiotFEM([0.5, 0], [1, 0.1], [8, 1], ELASTIC, walls=walls, conditions=loads, axisymmetric=True)
     assert fem.run(1, 0.5, probes=probes).displacement[-1][:, 0] == pytest.approx(exact, rel=1e-6)
