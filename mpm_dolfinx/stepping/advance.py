@@ -146,8 +146,6 @@ class Motion:
                 points = replace(points, data=data_now)
             if self.keeps_volumes:
                 points = self._corrected(points, state, loads, keeps & stays)
-            if cut.domains and (flat := over_all(grid.comm, int((volumes(points.corners) == 0).sum()))):
-                raise NotConverged(f"the step flattens domains, {flat} in all")
             carried = None
             if self._storage is not None:
                 pressure = cut.to_pieces(self._storage.p.x.array[pieces.cells])
@@ -364,6 +362,8 @@ class Motion:
         corners[yielded] = stopped(grid, stage.conditions["walls"], corners[yielded], points.corners[yielded])
         for one in loads:
             corners = one.outside(corners, own)
+        if flat := over_all(grid.comm, int((volumes(corners) == 0).sum())):  # these cannot be cut into pieces
+            raise NotConverged(f"the step flattens domains, {flat} in all")
         return replace(points, corners=corners, x=centroids(corners))
 
     def _volume_defect(
