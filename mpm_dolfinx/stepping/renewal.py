@@ -134,11 +134,11 @@ class Renewal:
         return replace(made, points=with_faces(made.points), stay=stay), count
 
     def _renewed(self, state: State) -> tuple[State, int]:
-        stage, points, free = state.stage, state.points, self._free(state)
+        stage, points = state.stage, state.points
         signs = self._signs((stage,), lambda: self._signatures(stage.faces), MPI.COMM_SELF)
         needs, body = self.long(points), body_of(points.id, self._starts)
         moves = MOTION[0] in points.data
-        work = RefilledCells(self._grid, points, body, free, needs, self._faces(points), signs, moves)
+        work = RefilledCells(self._grid, points, body, self._free(state), needs, self._faces(points), signs, moves)
         if not work.chosen.any():
             return state, 0
         new = [work.full(), work.partial(), work.remainders[0]]
