@@ -297,4 +297,4 @@ def check_different(bodies: Sequence[Body]) -> None:
     for j, body in enumerate(bodies):
         for i in range(j):
             if bodies[i] is body:
-                raise ValueError(f"bodies {i} and {j}: are the same object, must be two objects; seed the other too")
+                raise ValueError(f"bodies {i} and {j}: are the same object, must be two objects; seed each separately")

@@ -68,7 +68,7 @@ def from_mesh(
     names
         Tag that each name stands for.  A tag without a name is named by its digits, such as "3".
     per_cell
-        Desired points per grid cell and direction, >= 1.  Domains with an edge above 1.5 cells / per_cell are divided.
+        Desired points per grid cell and direction, >= 1.  Domains with an edge > (1.5 / per_cell) cells are divided.
     material
         Index of the material in the scene's list, >= 0.
 

@@ -26,7 +26,7 @@ from mpm_dolfinx.grid.grid import FACES, Grid, corner_bits, rounding, sum_by
 from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
 from mpm_dolfinx.points.cutting import centroids, simplex_volumes, vertices, volumes
 
-LONG = 1.5  # domains with edges longer than this factor times the cell size / per_cell are divided
+LONG = 1.5  # domains with edges longer than this factor times (cell size / per_cell) are divided
 SMALL = 0.2  # fraction of the desired domain size: smaller domains cause a warning
 
 

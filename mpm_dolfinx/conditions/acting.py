@@ -316,7 +316,7 @@ class Acting:
     held: Sequence[tuple[Any, Surface, Sequence[int]]] = ()
     """Prescribed displacements: (condition, faces, prescribed axes)."""
     seeded: Sequence[Surface] = ()
-    """Further faces whose displacement from the seeded position is needed; renewal leaves their domains."""
+    """Further faces whose displacement from the seeded position is needed; renewal must not replace their domains."""
 
     def placed(self, place: Place) -> Loads:
         """Return the loads of a substep."""
@@ -330,5 +330,5 @@ class Acting:
         return {}
 
     def unknown(self, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return the results of the conditions before the first step, filled with this value."""
+        """Return the results of the conditions before the first step, all equal to `value`."""
         return {}

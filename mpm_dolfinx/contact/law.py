@@ -228,7 +228,7 @@ class ContactLaw:
         return replace(state, slip=slip, resticks=resticks, parts=parts, stuck=stuck), changed
 
     def augmented(self, state: ContactState, touch: Touch, largest: Callable[[NDArray], NDArray]) -> ContactState:
-        """Return the state with lambda set to the pressures in parts with large penetrations, or raise NotConverged.
+        """Return the state; in parts with large penetrations, lambda is set to the pressures.  May raise NotConverged.
 
         `largest` returns the largest value in the part of each condition (k,).
         """
@@ -277,7 +277,7 @@ class ContactLaw:
     def tractions(self, touch: Touch, at: Geometry) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the pressures (m,) and shear tractions (m, d), Pa, of the pairs.
 
-        In stick, pairs keep their deviations from the mean shear traction of a cell: repeated averaging causes creep.
+        In stick, pairs keep their deviations from the mean shear traction of a cell: repeated averages would creep.
         """
         off = (at.shear - self.mean(at.shear)[self.of]) * touch.sticks[self.of, None]
         return touch.push, touch.shear[self.of] + off

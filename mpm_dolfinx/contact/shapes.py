@@ -285,8 +285,8 @@ class Cone:
 class Distance:
     """A shape given by a user's signed distance function, with derivatives by finite differences.
 
-    The function is evaluated at true positions, not relative to the base of the grid.  Increments are powers of two, so
-    that distinct positions do not round to the same value.
+    The function is evaluated at true positions, not relative to the base of the grid.  Increments are powers of two,
+    because these are added to positions almost without rounding.
     """
 
     function: Callable[[NDArray[np.float64]], ArrayLike]  # signed distance, m

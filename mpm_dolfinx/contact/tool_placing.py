@@ -165,7 +165,7 @@ class Tools(Touching):
         return pose
 
     def unknown(self, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return forces and moments filled with this value, zero displacements due to loads, and initial velocities."""
+        """Return forces and moments equal to `value`, zero displacements due to loads, and initial velocities."""
         out, d = super().unknown(value), self.grid.dim
         tools = dict(zip(self.names, self.tools, strict=True))
         out["tool_travel"] = {name: np.zeros(d if tool.free else ()) for name, tool in tools.items()}

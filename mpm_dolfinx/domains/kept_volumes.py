@@ -4,7 +4,7 @@
 The volume ratio of a point is a mean over its cell.  The corners of its domain, however, follow a field that varies in
 the cell, and edges stay straight.  In elastic soil F and the volume ratios of cells follow from the corners.  In
 yielded soil F is updated by increments, so the volumes of domains and of points would drift apart, and cells would
-overfill.  After a step the corners of yielded domains therefore move by the d that minimises
+overfill.  After a step the corners of yielded domains therefore move by the vectors d that minimise
 
     sum_p V_p e_p^2 + SOFT^2 sum_p V_p mean |d / h|^2,  V_p e_p = V_p - V - dV/dx d,
 

@@ -5,7 +5,7 @@ A displacement wave of the corners with a wavelength of two domains does not mov
 resists it.  Corners that cross grid lines excite such waves, and the waves would grow from one load cycle to the next.
 The filter damps them when the grid is reset.  For each axis a in turn,
 
-    d <- d - D_a^T s / 64 D_a d.
+    d <- d - D_a^T (s / 64) D_a d.
 
 The result is the mean over all orders of the axes.  d is the displacement of the corners from their reference
 positions.  D_a is the third difference along axis a, of four corners in a row.  If the domains in a row have different

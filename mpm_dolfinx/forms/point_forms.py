@@ -4,7 +4,7 @@
 A multilinear function on a box is a polynomial of degree d.  Its Taylor series about the midpoint of the cell ends
 after d terms.  With the offset xi = x_p - x_mid of a point p from the midpoint,
 
-    v(x_p) = v + grad v . xi + 1/2 xi . grad grad v . xi + ...,   with the right side at the midpoint.
+    v(x_p) = v + grad v . xi + 1/2 xi . grad grad v . xi + ...,   right side evaluated at the midpoint.
 
 The right side is plain UFL, integrated by the one-point rule.  The offset xi and all other data of a point are DG0
 coefficients.  Each entry in the list of cells of the integral has separate values of these coefficients.
@@ -35,9 +35,9 @@ from mpm_dolfinx.forms.axes import block
 from mpm_dolfinx.grid.grid import Grid, in_chunks
 
 BATCH, MANY = 2**10, 2**12
-"""Numbers of points: in a batch of element matrices, which fits into the cache, and in one call of an expression.
+"""Numbers of points in a batch of element matrices, which fits into the cache, and in one call of an expression.
 
-An expression always evaluates a whole list of cells, of either length.  The last few points use the shorter list.
+An expression always evaluates a whole list of `MANY` or `BATCH` cells.  The last few points use the shorter list.
 """
 
 
@@ -167,7 +167,7 @@ class Places(Keyed):
     x : (n, d), m
         Positions of the points.
     mixed : (n, d), m^2
-        In 3D: mean products of the offsets in a piece about its centroid, see `Pieces`; None for points (zero).
+        In 3D: mean products of the offsets in a piece about its centroid, see `Pieces`; None: zero, for points.
     hoop : (n, 4)
         In axisymmetry: moments of the pieces in the plane, see `Pieces`; None for points.
     """
@@ -316,7 +316,7 @@ class PointData(Keyed):
 
 
 Packed = tuple[NDArray[np.float64], list[tuple[slice, NDArray[np.float64], NDArray[np.intp]]]]
-"""Rows of coefficients; and for each grid function among these the columns, the values, and the dofs of each row."""
+"""Coefficients, one row per point; and for each grid function among them its columns, its values, the rows' dofs."""
 
 
 class Rows:

@@ -4,7 +4,7 @@
 In grids of equal cells, points are located by arithmetic, in other grids by a search along each axis.  Methods such as
 `sizes` and `volumes` return cell sizes.  For equal cells they return a single row (`h`) or a single number.
 
-The mesh is created at its first use.  By then a simulation has distributed the cells by the number of points in them.
+The mesh is created at its first use.  Before, a simulation distributes the cells by their numbers of points.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ REACH = 1e-4  # distance, in cell sizes, by which bodies may lie outside the gri
 TURN = 2 * np.pi
 """Angle of a whole revolution, for axisymmetric volumes, forces and outflows.  Source: definition."""
 CHUNK = 2**14
-"""Number of rows that are processed together, which limits the size of temporary arrays."""
+"""Number of rows of an array that are processed together.  It limits the size of temporary arrays."""
 SNAP = 1e-10
-"""Distance to a grid plane, in cell sizes, below which a vertex is on the plane, unless rounding errors are larger."""
+"""Vertices nearer to a grid plane than this, in cell sizes, count as on it; `Grid.snap` allows for rounding errors."""
 ORDER = "the order is Grid(lower, upper, cells)"
 MANY = "grid: h is undefined for unequal cells, must be replaced by sizes"
 
@@ -59,7 +59,7 @@ def _faces(dim: int) -> NDArray[np.int64]:
 FACES = {d: _faces(d) for d in (2, 3)}
 """Indices (2d, 2^(d-1)) of the corners of the faces of a box: of a cell, or of a particle domain."""
 FACE_SIGNS = (-1, 1, 1, -1, -1, 1)
-"""Orientation (6,) of the faces with corners in the order of `FACES`: 1 outward, -1 inward; the first four in 2D."""
+"""Orientation (6,) of faces with corners in the order of `FACES`: 1 outward, -1 inward.  In 2D, the first four hold."""
 ABOUT_MIDDLE = ((0, 1, 4), (1, 3, 4), (3, 2, 4), (2, 0, 4))
 """Triangles of a face in 3D: two corners and the middle, without a preferred diagonal."""
 
@@ -77,7 +77,7 @@ def in_chunks(count: int) -> list[slice]:
 
 
 def sum_by(index: NDArray, values: NDArray[np.float64], size: int) -> NDArray[np.float64]:
-    """Return the sums (..., size) of values (..., n) of equal index (n,), as floats (`np.bincount` may return ints)."""
+    """Return the sums (..., size) of values (..., n) with equal index (n,), as floats also if there are no values."""
     shape = values.shape[:-1]
     if shape:
         index = (index + size * np.arange(prod(shape))[:, None]).ravel()
@@ -91,7 +91,7 @@ def polynomial(
     """Return the values (d, m) of a multilinear vector field at offsets y (d, m), m, from the midpoints of cells.
 
     `coefficients` (d, k, cells) are factors of the monomials, in the order of `Grid.monomials`.  `slot` (m,) is the
-    index of the cell of each value.  without: an axis along which the field is constant.
+    index of the cell of each value.  The field is constant along the axis `without`.
     """
     rows = [row for row in range(2 ** len(y)) if without is None or not row >> without & 1]
     total = np.zeros(y.shape)
@@ -105,13 +105,13 @@ def polynomial(
 
 
 def ranges(first: NDArray[np.int64], count: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return each integer's range (n,) and value (n,), for m ranges that begin at `first` and have `count` integers."""
+    """Return the integers in m ranges with these first integers and counts: indices (n,) of ranges, and values (n,)."""
     of = np.arange(len(count)).repeat(count)
     return of, np.arange(len(of)) + np.repeat(first - (np.cumsum(count) - count), count)
 
 
 def among(numbers: NDArray[np.integer], chosen: NDArray[np.integer]) -> NDArray[np.bool_]:
-    """Return which numbers (...) occur in sorted `chosen` (m,), without the large tables of numpy's `isin`."""
+    """Return which numbers (...) occur in the sorted array `chosen` (m,), with less memory than numpy's `isin`."""
     if not len(chosen):
         return np.zeros(numbers.shape, dtype=bool)
     return chosen[np.minimum(chosen.searchsorted(numbers), len(chosen) - 1)] == numbers
@@ -159,7 +159,7 @@ class Cells:
     cell_number
         Lexicographic index of each local cell.
     locals, owners
-        Local index, or -1, and owner rank of all cells of the grid, copy by copy.
+        Local index, -1 if not on this process, and owner rank of all cells of the grid, one copy after the other.
     cell_facets : (cells, 2d)
         Facets of each cell.
     facet_cells : (facets, 2)
@@ -228,7 +228,7 @@ def of_cells(name: str) -> cached_property:
 
 
 def of_places(name: str) -> property:
-    """Return a property of a grid that is a current position in its `Cells`."""
+    """Return a property of a grid: current positions of nodes or of midpoints of cells, kept in `at` of its `Cells`."""
     return property(lambda grid: getattr((grid._cells or grid._of_process).at, name))
 
 
@@ -289,7 +289,7 @@ class Grid:
     least, most : m
         Shortest and longest edge of all cells.
     snap
-        Distance to a grid plane along each axis (d,), in cell sizes, below which a vertex lies on the plane.
+        Distances (d,) along the axes, in cell sizes: vertices nearer to a grid plane count as on the plane.
     base : (d,), m
         Origin of all internal positions: the lower corner, with a radius of 0 in axisymmetry.  This origin preserves
         digits of positions far from the true origin.
@@ -369,7 +369,7 @@ class Grid:
     def move(self, lines: Sequence[NDArray[np.float64]]) -> None:
         """Move the lines of a grid with `follow` to new coordinates (n,), m, along each axis, relative to the base.
 
-        Afterwards nodes, cells and the mesh have the same digits as in a new grid with these lines.
+        Afterwards all coordinates of nodes, cells and mesh are exactly as in a new grid with these lines.
         """
         if any((new != old).any() for new, old in zip(lines, self.lines, strict=True)):
             self._spacing = self._spaced(tuple(lines))
@@ -654,8 +654,8 @@ class Grid:
     ) -> NDArray[np.float64]:
         """Return the gradients (n, 2^d, d), 1/m, of the Q1 shape functions of local cells at points x.
 
-        `mixed` (n, 3), m^2, in 3D, are mean products of offsets in subdomains about these points.  With them, gradients
-        are means over the subdomains.
+        `mixed` (n, 3), m^2, in 3D: means of the products of two offsets from a point, over a subdomain about the point.
+        With `mixed`, gradients are means over the subdomains.
         """
         hats, h = self._hats(cells, x), self.sizes(cells).T[..., None] if not self.even else self.h
         dN = np.empty((*hats[0].shape, self.dim))
@@ -679,7 +679,7 @@ class Grid:
         return np.where(bits, self.signs / (self.h if self.even else 1.0), 0.5).prod(axis=2)
 
     def over_edges(self, coefficients: NDArray[np.float64], cells: NDArray[np.int32]) -> NDArray[np.float64]:
-        """Convert coefficients (d, 2^d, cells) of `monomials` to offsets in m; for equal cells they are unchanged."""
+        """Convert coefficients (d, 2^d, cells) of `monomials` for offsets in m; for equal cells they are unchanged."""
         if self.even:
             return coefficients
         bits = corner_bits(self.dim)[:, None]
