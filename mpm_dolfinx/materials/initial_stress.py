@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import compress
 
 from mpi4py import MPI
 
@@ -16,7 +15,7 @@ from mpm_dolfinx.base.errors import NotConverged
 from mpm_dolfinx.base.tolerances import NEAR, ROUND_OFF, SAME
 from mpm_dolfinx.base.validation import at_places, line, numbers
 from mpm_dolfinx.bodies.bodies import Body
-from mpm_dolfinx.bodies.overburden import overburden
+from mpm_dolfinx.bodies.overburden import in_columns, overburden
 from mpm_dolfinx.materials.cam_clay import ModifiedCamClay
 from mpm_dolfinx.materials.fields import SceneMaterials
 from mpm_dolfinx.materials.prestressed import AT_REST
@@ -198,15 +197,11 @@ class InitialStresses:
         surcharges = [stress.surcharge for stress in self.given.values() if isinstance(stress, K0)]
         if not np.any(gravity) and not any(callable(surcharge) or surcharge for surcharge in surcharges):
             raise ValueError("initial_stress: K0 has neither gravity at the start nor surcharge, must have one of them")
-        # the densities of all points on all processes
-        seeded, total = materials.seeded, np.zeros(self._start[-1])
-        total[seeded.id] = materials.present_density(seeded)
-        total = over_all(materials.grid.comm, total)
-        used = np.repeat(present, [len(body) for body in self._bodies])
-        corners = np.concatenate([body.corners() for body in compress(self._bodies, present)])
-        base = materials.grid.base
-        weight, surface = overburden(corners - base, -gravity[-1] * total[used], points.x)
-        return [weight, surface + base[-1], materials.pore_stress(points)]
+        grid, seeded = materials.grid, materials.seeded.of_bodies(present, self._start)
+        weights = -gravity[-1] * materials.present_density(seeded)
+        corners, weights = in_columns(grid.comm, seeded.id, seeded.corners, weights, points.corners)
+        weight, surface = overburden(corners, weights, points.x)
+        return [weight, surface + grid.base[-1], materials.pore_stress(points)]
 
 
 def stressed(

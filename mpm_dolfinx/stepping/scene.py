@@ -282,6 +282,10 @@ class Scene:
 
         return self._assembled((on_grid.key, stage, *(one.key for one in now)), make, self.grid.comm)
 
+    def seeded(self, chosen: Sequence[bool]) -> MaterialPoints:
+        """Return the points of the chosen bodies on this process, as seeded."""
+        return self.materials.seeded.of_bodies(chosen, np.cumsum([0, *map(len, self.bodies)]))
+
     def ids(self, chosen: Sequence[bool]) -> NDArray[np.int64]:
         """Return the ids of all points of the chosen bodies."""
         return np.flatnonzero(np.repeat(chosen, [len(body) for body in self.bodies]))
