@@ -9,36 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from mpi4py import MPI
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from mpm_dolfinx.base.tolerances import SAME
 from mpm_dolfinx.grid.grid import ABOUT_MIDDLE, FACE_SIGNS, FACES, corner_bits
-from mpm_dolfinx.parallel.exchange import Exchange
-
-
-def in_columns(
-    comm: MPI.Intracomm,
-    ids: NDArray[np.int64],
-    corners: NDArray[np.float64],
-    unit_weight: NDArray[np.float64],
-    above: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return corners and unit weights of all domains above and below domains of this process, in the order of ids.
-
-    ids (n,), corners (n, 2^d, d), m, unit_weight (n,), N/m^3: domains of this process, present in the scene; above
-    (k, 2^d, d), m: corners of the domains whose columns this process needs.
-    """
-    ends = [above[..., :-1].min(axis=(0, 1), initial=np.inf), above[..., :-1].max(axis=(0, 1), initial=-np.inf)]
-    low, high = corners[..., :-1].min(axis=1), corners[..., :-1].max(axis=1)
-    rows = [((low <= most) & (high >= least)).all(axis=1).nonzero()[0] for least, most in comm.allgather(ends)]
-    sent = np.concatenate(rows)
-    exchange = Exchange(comm, np.arange(comm.size, dtype=np.int32).repeat(list(map(len, rows))))
-    order = exchange.send(ids[sent]).argsort()
-    return exchange.send(corners[sent])[order], exchange.send(unit_weight[sent])[order]
 
 
 def overburden(

@@ -228,7 +228,7 @@ class ContactProblem(Loads):
     def _pattern_of_pairs(self, unknowns: Unknowns) -> PETSc.Mat:
         """Return a matrix with all entries that pairs between groups may have in the step."""
         grid, d = self.grid, self.grid.dim
-        cell, other = np.divmod(self._cell_pairs(), len(grid.owners))
+        cell, other = np.divmod(self._cell_pairs(), grid.all_cells)
         exchange = Exchange(grid.comm, grid.owner(cell))
         cell, other = exchange.send(cell), exchange.send(other)
         key, of = np.unique(cell, return_inverse=True)

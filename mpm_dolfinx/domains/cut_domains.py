@@ -263,7 +263,7 @@ class CutDomains(Keyed):
 
     def _filled_cell(self, at: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:
         """Return the cell (m,) of each x; if the domain has no piece in this cell, the cell of its largest piece."""
-        pieces, cells = self.pieces, len(self.grid.owners)
+        pieces, cells = self.pieces, self.grid.all_cells
         cell = self.grid.number(self.grid.index_from_base(x)) + self.grid.copy(self.points.id[at])
         key, keys = at * cells + cell, pieces.point * cells + pieces.cell
         if not len(key):

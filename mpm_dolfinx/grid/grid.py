@@ -25,7 +25,7 @@ from mpm_dolfinx.base.tolerances import NEAR, SAME
 from mpm_dolfinx.base.validation import flag, instance, line, numbers
 from mpm_dolfinx.grid.following import check_follow
 from mpm_dolfinx.grid.lines import MOST, checked, equal, rounding
-from mpm_dolfinx.grid.partition import destinations, owners
+from mpm_dolfinx.grid.partition import Partition, destinations
 from mpm_dolfinx.parallel.exchange import Exchange
 
 SIDES = {
@@ -79,6 +79,8 @@ def in_chunks(count: int) -> list[slice]:
 def sum_by(index: NDArray, values: NDArray[np.float64], size: int) -> NDArray[np.float64]:
     """Return the sums (..., size) of values (..., n) of equal index (n,), as floats (`np.bincount` may return ints)."""
     shape = values.shape[:-1]
+    if shape and len(index) > CHUNK:  # the index of all rows together would take as much memory as the values
+        return np.array([sum_by(index, row, size) for row in values])
     if shape:
         index = (index + size * np.arange(prod(shape))[:, None]).ravel()
     sums = np.bincount(index, weights=values.ravel(), minlength=size * prod(shape))
@@ -158,17 +160,17 @@ class Cells:
         Current positions of nodes and cells.
     cell_number
         Lexicographic index of each local cell.
-    locals, owners
-        Local index, or -1, and owner rank of all cells of the grid, copy by copy.
+    partition
+        Boxes of cells of all processes.
     cell_facets : (cells, 2d)
         Facets of each cell.
     facet_cells : (facets, 2)
         Cells at each facet, -1 outside the boundary.
     """
 
-    def __init__(self, grid: Grid, mesh: Any, owners: NDArray[np.int32]):
+    def __init__(self, grid: Grid, mesh: Any, partition: Partition):
         self.mesh = mesh
-        self.owners = owners
+        self.partition = partition
         d = grid.dim
         nodes = _compat.function_space(mesh, "Lagrange", 1)
         self.num_owned, self.num_local = _compat.num_cells(mesh)
@@ -181,12 +183,18 @@ class Cells:
         self.signs = np.concatenate(grid.comm.allgather(np.sign(corners[:1] - midpoints[:1, None])))[0]
         self.cell_number = grid.number(grid.index_from_base(midpoints))
         if grid.copies > 1:
-            brought = np.concatenate(grid.comm.allgather((owners == grid.comm.rank).nonzero()[0]))
-            self.cell_number = brought[np.asarray(mesh.topology.original_cell_index)]
+            brought, cells = np.asarray(mesh.topology.original_cell_index), partition.count.prod(axis=1)
+            start = np.cumsum([0, *(grid.copies * cells)])
+            rank = start.searchsorted(brought, side="right") - 1
+            copy, k = np.divmod(brought - start[rank], cells[rank])
+            self.cell_number = partition.numbered(rank, k) + copy * grid.cells
         self.at = CellPlaces(node_x, midpoints, None if grid.even else grid.sizes_of(self.cell_number))
         self._index = [grid.nodes_along(x[:, :d]) for x in (node_x, mesh.geometry.x)] if grid.follow is not None else []
-        self.locals = np.full(len(owners), -1, dtype=np.int32)
-        self.locals[self.cell_number] = np.arange(self.num_local)
+        index = np.array(np.unravel_index(self.cell_number % grid.cells, tuple(grid.shape)))
+        self._low = index.min(axis=1, initial=np.iinfo(np.int64).max)
+        self._beyond = index.max(axis=1, initial=-1) + 1
+        self._locals = np.full((grid.copies, *np.maximum(self._beyond - self._low, 0)), -1, dtype=np.int32)
+        self._locals[(self.cell_number // grid.cells, *(index - self._low[:, None]))] = np.arange(self.num_local)
         topology = mesh.topology
         topology.create_connectivity(d, d - 1)
         topology.create_connectivity(d - 1, d)
@@ -203,6 +211,17 @@ class Cells:
         """Function spaces by value shape, each created once.  All functions of a shape share memory."""
         self.memory = cache(lambda shape, space=self.cellwise: fem.Function(space(shape)))
         self.move(grid)
+
+    def local(self, grid: Grid, number: NDArray[np.int64]) -> NDArray[np.int32]:
+        """Return the local index of the cells with lexicographic indices `number`; -1 for cells of other processes."""
+        if self._locals.size == grid.copies * grid.cells:
+            return self._locals.ravel()[number]
+        copy, number = np.divmod(number, grid.cells)
+        index = np.array(np.unravel_index(number, tuple(grid.shape)))
+        out, ends = np.full(number.shape, -1, dtype=np.int32), (len(index), *[1] * number.ndim)
+        near = ((index >= self._low.reshape(ends)) & (index < self._beyond.reshape(ends))).all(axis=0)
+        out[near] = self._locals[(copy[near], *(index[:, near] - self._low[:, None]))]
+        return out
 
     @cached_property
     def edges(self) -> fem.Function:
@@ -476,14 +495,13 @@ class Grid:
         return np.minimum(np.maximum(self.lines[axis].searchsorted(x, side="right") - 1, 0), self.shape[axis] - 1)
 
     mesh = of_cells("mesh")
-    owners = of_cells("owners")
+    partition = of_cells("partition")
     num_owned = of_cells("num_owned")
     num_local = of_cells("num_local")
     cell_nodes = of_cells("cell_nodes")
     node_x, midpoints = map(of_places, ("node_x", "midpoints"))
     signs = of_cells("signs")
     cell_number = of_cells("cell_number")
-    locals = of_cells("locals")
     cell_facets = of_cells("cell_facets")
     facet_cells = of_cells("facet_cells")
     facets_owned = of_cells("facets_owned")
@@ -498,7 +516,7 @@ class Grid:
     def share(self, load: NDArray[np.float64]) -> None:
         """Create the mesh, unless it exists, with cells distributed among processes by their loads (cells,)."""
         if self._cells is None:
-            self._cells = self._made(owners(load.reshape(self.shape), self.comm.size))
+            self._cells = self._made(Partition(load.reshape(self.shape), self.comm.size))
 
     def shared(self, load: NDArray[np.float64], keep: bool) -> Grid:
         """Return a grid with cells distributed by their loads: this grid, or an equal grid with another mesh.
@@ -506,24 +524,24 @@ class Grid:
         load (cells,): load of each cell, such as its number of points, >= 0; keep: whether to keep an existing mesh for
         any distribution, because other objects were created on this mesh.
         """
-        owner = owners(load.reshape(self.shape), self.comm.size)
+        partition = Partition(load.reshape(self.shape), self.comm.size)
         if self._cells is None:
-            self._cells = self._made(owner)
-        elif not keep and (self.owners[: self.cells] != owner.ravel()).any():  # distributed for an earlier scene
+            self._cells = self._made(partition)
+        elif not keep and self.partition != partition:  # distributed for an earlier scene
             other = Grid(**self.given, comm=self.comm, axisymmetric=self.axisymmetric)
-            other._cells = other._made(owner)
+            other._cells = other._made(partition)
             return other
         return self
 
-    def _made(self, owner: NDArray[np.int32]) -> Cells:
-        """Create the mesh, and return its cells.  `owner` is the rank of each cell, with the shape of the grid."""
-        own = (owner.ravel() == self.comm.rank).nonzero()[0]
+    def _made(self, partition: Partition) -> Cells:
+        """Create the mesh with the given distribution of cells, and return its cells."""
+        own = partition.cells(self.comm.rank)
         nodes = np.concatenate([self.corners(own) + copy * self.nodes for copy in range(self.copies)])
-        ranks, first = destinations(owner, own)
+        ranks, first = destinations(partition, own)
         each = np.tile(np.diff(first), self.copies)
         where = np.tile(ranks, self.copies), np.concatenate([[0], np.cumsum(each)]).astype(np.int32)
         mesh = _compat.box_mesh(self.comm, nodes, self._nodes(), *where)
-        return Cells(self, mesh, np.tile(owner.ravel(), self.copies))
+        return Cells(self, mesh, partition)
 
     def corners(self, cells: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return the lexicographic indices (n, 2^d) of the nodes of cells."""
@@ -547,6 +565,11 @@ class Grid:
     def cells(self) -> int:
         """Number of cells of one copy."""
         return prod(self.shape.tolist())
+
+    @property
+    def all_cells(self) -> int:
+        """Number of cells of all copies."""
+        return self.copies * self.cells
 
     @property
     def nodes(self) -> int:
@@ -603,11 +626,11 @@ class Grid:
 
     def owner(self, number: NDArray[np.int64]) -> NDArray[np.int32]:
         """Return the owner rank of the cells with lexicographic indices `number`."""
-        return self.owners[number]
+        return self.partition.owner(np.array(np.unravel_index(number % self.cells, tuple(self.shape))))
 
     def local(self, number: NDArray[np.int64]) -> NDArray[np.int32]:
         """Return the local index of the cells with lexicographic indices `number`; -1 for cells of other processes."""
-        return self.locals[number]
+        return self._of_process.local(self, number)
 
     def gathered(self, rows: Sequence[tuple], width: int) -> tuple[NDArray, NDArray, NDArray]:
         """Send rows (cells, positions, values) to the owners of cells; return local cells, positions and values."""
@@ -636,7 +659,7 @@ class Grid:
         for axis in range(self.dim):
             stride = prod(self.shape[axis + 1 :].tolist())
             for end, inside in enumerate((index[:, axis] > 0, index[:, axis] < self.shape[axis] - 1)):
-                out[inside, axis, end] = self.locals[self.cell_number[cells[inside]] + (2 * end - 1) * stride]
+                out[inside, axis, end] = self.local(self.cell_number[cells[inside]] + (2 * end - 1) * stride)
         return out
 
     def outside(self, x: NDArray[np.float64], tolerance: float = SAME) -> NDArray[np.bool_]:
@@ -721,13 +744,13 @@ class GridOfGroups(Grid):
 
     The copies coincide in space.  The same process owns corresponding cells of all copies.
 
-    grid: grid of the bodies; group (points,): index, from 0, of the group of each material point of the scene, in the
-    order of ids.
+    grid: grid of the bodies; group (bodies,): index, from 0, of the group of each body; starts (bodies,): id of the
+    first material point of each body.
     """
 
-    def __init__(self, grid: Grid, group: NDArray[np.int64]):
+    def __init__(self, grid: Grid, group: NDArray[np.int64], starts: NDArray[np.int64]):
         super().__init__(**grid.given, comm=grid.comm)
-        self._group, self._copies = group.astype(np.int16), int(group.max()) + 1
+        self._group, self._starts, self._copies = group, starts, int(group.max()) + 1
         if self.dim * self.copies * self.nodes > MOST:
             what = f"grid: has {self.nodes:.3g} nodes for each of {self.copies} groups"
             raise ValueError(f"{what}, must be below {MOST // (self.dim * self.copies)}")
@@ -739,4 +762,4 @@ class GridOfGroups(Grid):
 
     def copy(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return, for material points with these ids (n,), the index of the first cell of their copy of the box."""
-        return self._group[ids] * np.int64(self.cells)
+        return self._group[self._starts.searchsorted(ids, side="right") - 1] * np.int64(self.cells)

@@ -15,41 +15,76 @@ EMPTY = 1e-2
 """Weight of an empty cell divided by the mean weight of a filled cell, for memory and time that empty cells need."""
 
 
-def owners(load: NDArray[np.float64], processes: int) -> NDArray[np.int32]:
-    """Return the owner rank of each cell, as an array with the shape of the grid.
+class Partition:
+    """Boxes of cells, one for each process.
 
     load (cells along each axis): load of a cell, such as its number of points, >= 0; processes: number of ranks, >= 1.
     """
-    filled = load > 0
-    weight = load + (EMPTY * load[filled].mean() if filled.any() else 1.0)
-    out = np.zeros(load.shape, dtype=np.int32)
-    _bisect(weight, filled, out, 0, processes)
-    return out
 
+    def __init__(self, load: NDArray[np.float64], processes: int):
+        self.shape = load.shape
+        self.low, self.count = np.zeros((2, processes, load.ndim), dtype=np.int64)
+        """First index (processes, d) of each process's box, and numbers of cells (processes, d) along its edges."""
+        self._cuts: list[tuple[int, int, int, int]] = []  # axis, first cell beyond, first rank below and beyond
+        filled = load > 0
+        weight = load + (EMPTY * load[filled].mean() if filled.any() else 1.0)
+        self._bisect(weight, filled, np.zeros(load.ndim, dtype=np.int64), 0, processes)
 
-def _bisect(weight: NDArray[np.float64], filled: NDArray[np.bool_], out: NDArray[np.int32], first: int, count: int):
-    """Distribute a box of cells among `count` ranks from `first` on.  Arrays are views of the arrays of the whole grid.
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Partition) and bool((self.low == other.low).all() & (self.count == other.count).all())
 
-    If there are enough cells, each rank gets at least one; this has priority over equal loads.
-    """
-    out[...] = first
-    if count == 1 or weight.size == 1:
-        return
-    axis = int(np.argmax([_extent(filled, a) if filled.any() else n for a, n in enumerate(weight.shape)]))
-    layers = weight.sum(axis=tuple(a for a in range(weight.ndim) if a != axis))
-    if len(layers) == 1:  # all filled cells lie in one layer
-        axis = int(np.argmax(weight.shape))
+    __hash__ = None
+
+    def _bisect(
+        self, weight: NDArray[np.float64], filled: NDArray[np.bool_], low: NDArray[np.int64], first: int, count: int
+    ) -> None:
+        """Distribute a box of cells from index `low` (d,) on among `count` ranks from `first` on.
+
+        Arrays are views of the arrays of the whole grid.  If there are enough cells, each rank gets at least one; this
+        has priority over equal loads.
+        """
+        if count == 1 or weight.size == 1:
+            self.low[first], self.count[first] = low, weight.shape
+            return
+        axis = int(np.argmax([_extent(filled, a) if filled.any() else n for a, n in enumerate(weight.shape)]))
         layers = weight.sum(axis=tuple(a for a in range(weight.ndim) if a != axis))
-    cells = np.arange(1, len(layers)) * (weight.size // len(layers))  # below each plane
-    ranks = np.clip(count // 2, count - (weight.size - cells), cells)  # below each plane: half, unless ranks stay idle
-    even = (ranks == count // 2) | (ranks != count // 2).all()
-    off = np.abs(np.cumsum(layers)[:-1] - layers.sum() * ranks / count)
-    plane = int(np.argmin(np.where(even, off, np.inf)))
-    half, plane = int(ranks[plane]), plane + 1
-    parts = [np.moveaxis(array, axis, 0) for array in (weight, filled, out)]
-    lower, upper = ([np.moveaxis(p[side], 0, axis) for p in parts] for side in (slice(plane), slice(plane, None)))
-    _bisect(*lower, first, half)
-    _bisect(*upper, first + half, count - half)
+        if len(layers) == 1:  # all filled cells lie in one layer
+            axis = int(np.argmax(weight.shape))
+            layers = weight.sum(axis=tuple(a for a in range(weight.ndim) if a != axis))
+        cells = np.arange(1, len(layers)) * (weight.size // len(layers))  # below each plane
+        # ranks below each plane: half, unless ranks stay idle
+        ranks = np.clip(count // 2, count - (weight.size - cells), cells)
+        even = (ranks == count // 2) | (ranks != count // 2).all()
+        off = np.abs(np.cumsum(layers)[:-1] - layers.sum() * ranks / count)
+        plane = int(np.argmin(np.where(even, off, np.inf)))
+        half, plane = int(ranks[plane]), plane + 1
+        parts = [np.moveaxis(array, axis, 0) for array in (weight, filled)]
+        lower, upper = ([np.moveaxis(p[side], 0, axis) for p in parts] for side in (slice(plane), slice(plane, None)))
+        beyond = low.copy()
+        beyond[axis] += plane
+        self._cuts.append((axis, int(beyond[axis]), first, first + half))
+        self._bisect(*lower, low, first, half)
+        self._bisect(*upper, beyond, first + half, count - half)
+
+    def owner(self, index: NDArray[np.int64]) -> NDArray[np.int32]:
+        """Return the owner ranks (...) of cells with indices (d, ...) along the axes."""
+        out = np.zeros(index.shape[1:], dtype=np.int32)
+        for axis, plane, first, middle in self._cuts:  # from the whole box to its parts
+            out[(out == first) & (index[axis] >= plane)] = middle
+        return out
+
+    def cells(self, rank: int) -> NDArray[np.int64]:
+        """Return the lexicographic indices (n,) of the cells of a process, ascending."""
+        return self.numbered(np.full(self.count[rank].prod(), rank), np.arange(self.count[rank].prod()))
+
+    def numbered(self, rank: NDArray[np.int64], k: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the lexicographic index (n,) of the k-th cell (n,), from 0, of each process `rank` (n,)."""
+        out, stride = np.zeros_like(k), 1
+        for axis in reversed(range(len(self.shape))):
+            k, place = np.divmod(k, self.count[rank, axis])
+            out += (self.low[rank, axis] + place) * stride
+            stride *= self.shape[axis]
+        return out
 
 
 def _extent(filled: NDArray[np.bool_], axis: int) -> int:
@@ -58,20 +93,20 @@ def _extent(filled: NDArray[np.bool_], axis: int) -> int:
     return int(layers[-1] - layers[0] + 1)
 
 
-def destinations(owner: NDArray[np.int32], cells: NDArray[np.int64]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+def destinations(
+    partition: Partition, cells: NDArray[np.int64]
+) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     """Return the ranks that hold each cell, the owner first, in one list; and the start of each cell in this list.
 
-    Processes that own a neighbour across a face hold the cell as a ghost.
-
-    owner: owner rank of each cell, with the shape of the grid; cells (n,): lexicographic indices of the cells.
+    Processes that own a neighbour across a face hold the cell as a ghost.  cells (n,): lexicographic indices.
     """
-    index, shape = np.array(np.unravel_index(cells, owner.shape)), np.array(owner.shape)[:, None]
-    ranks = [owner.ravel()[cells]]
-    for axis in range(owner.ndim):
+    index, shape = np.array(np.unravel_index(cells, partition.shape)), np.array(partition.shape)[:, None]
+    ranks = [partition.owner(index)]
+    for axis in range(len(shape)):
         for step in (-1, 1):
             neighbour = index.copy()
             neighbour[axis] += step
-            ranks.append(owner[tuple(np.clip(neighbour, 0, shape - 1))])
+            ranks.append(partition.owner(np.clip(neighbour, 0, shape - 1)))
     ranks = np.stack(ranks, axis=1)
     new = np.ones(ranks.shape, dtype=bool)
     for k in range(1, ranks.shape[1]):

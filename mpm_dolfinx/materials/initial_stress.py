@@ -15,13 +15,13 @@ from mpm_dolfinx.base.errors import NotConverged
 from mpm_dolfinx.base.tolerances import NEAR, ROUND_OFF, SAME
 from mpm_dolfinx.base.validation import at_places, line, numbers
 from mpm_dolfinx.bodies.bodies import Body
-from mpm_dolfinx.bodies.overburden import in_columns, overburden
+from mpm_dolfinx.bodies.overburden import overburden
 from mpm_dolfinx.materials.cam_clay import ModifiedCamClay
 from mpm_dolfinx.materials.fields import SceneMaterials
 from mpm_dolfinx.materials.prestressed import AT_REST
 from mpm_dolfinx.materials.skeleton import STANDARD_GRAVITY, Field
 from mpm_dolfinx.materials.trial import PLANE, SPACE
-from mpm_dolfinx.parallel.exchange import first, over_all
+from mpm_dolfinx.parallel.exchange import Exchange, first, over_all
 from mpm_dolfinx.points.material_points import MaterialPoints, unstretched
 
 EXACT, CLOSE = 1e-13, SAME  # stress error over largest initial stress: to end Newton's method, to accept a result
@@ -199,9 +199,30 @@ class InitialStresses:
             raise ValueError("initial_stress: K0 has neither gravity at the start nor surcharge, must have one of them")
         grid, seeded = materials.grid, materials.seeded.of_bodies(present, self._start)
         weights = -gravity[-1] * materials.present_density(seeded)
-        corners, weights = in_columns(grid.comm, seeded.id, seeded.corners, weights, points.corners)
+        corners, weights = _in_columns(grid.comm, seeded.id, seeded.corners, weights, points.corners)
         weight, surface = overburden(corners, weights, points.x)
         return [weight, surface + grid.base[-1], materials.pore_stress(points)]
+
+
+def _in_columns(
+    comm: MPI.Intracomm,
+    ids: NDArray[np.int64],
+    corners: NDArray[np.float64],
+    unit_weight: NDArray[np.float64],
+    above: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return corners and unit weights of all domains above and below domains of this process, in the order of ids.
+
+    ids (n,), corners (n, 2^d, d), m, unit_weight (n,), N/m^3: domains of this process, present in the scene; above
+    (k, 2^d, d), m: corners of the domains whose columns this process needs.
+    """
+    ends = [above[..., :-1].min(axis=(0, 1), initial=np.inf), above[..., :-1].max(axis=(0, 1), initial=-np.inf)]
+    low, high = corners[..., :-1].min(axis=1), corners[..., :-1].max(axis=1)
+    rows = [((low <= most) & (high >= least)).all(axis=1).nonzero()[0] for least, most in comm.allgather(ends)]
+    sent = np.concatenate(rows)
+    exchange = Exchange(comm, np.arange(comm.size, dtype=np.int32).repeat(list(map(len, rows))))
+    order = exchange.send(ids[sent]).argsort()
+    return exchange.send(corners[sent])[order], exchange.send(unit_weight[sent])[order]
 
 
 def stressed(
