@@ -750,7 +750,8 @@ class GridOfGroups(Grid):
 
     def __init__(self, grid: Grid, group: NDArray[np.int64], starts: NDArray[np.int64]):
         super().__init__(**grid.given, comm=grid.comm)
-        self._group, self._starts, self._copies = group, starts, int(group.max()) + 1
+        self._group, self._starts = group, starts
+        self._copies = int(group.max()) + 1
         if self.dim * self.copies * self.nodes > MOST:
             what = f"grid: has {self.nodes:.3g} nodes for each of {self.copies} groups"
             raise ValueError(f"{what}, must be below {MOST // (self.dim * self.copies)}")

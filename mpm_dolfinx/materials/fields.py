@@ -100,7 +100,7 @@ class SceneMaterials:
         if prestressed:
             whole = dict(zip(self._used, known, strict=True))
             materials = [stressed(m, whole.get(i, True)) for i, m in enumerate(materials)]
-            evaluated = [here for here, _ in at_points()]
+            evaluated = [m for m, _ in at_points()]
         self.materials, self._evaluated = materials, evaluated
         used = [materials[i] for i in self._used]
         self._fields = [_by_place(m) for m in materials]
@@ -600,8 +600,8 @@ def _evaluated(
     """
     names = _by_place(m)
     out = everywhere(grid.comm, lambda: m.at(X) if len(X) or not names else m)
-    here = [(int(ids[0]), {name: getattr(out, name)[:1] for name in names})] if len(X) else []
-    found = over_all(grid.comm, here) if names else []
+    row = [(int(ids[0]), {name: getattr(out, name)[:1] for name in names})] if len(X) else []
+    found = over_all(grid.comm, row) if names else []
     values = min(found, key=itemgetter(0))[1] if found else {}
     out = out if len(X) else replace(out, **values)
     return out, _expanded(out, values, 1)
