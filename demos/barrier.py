@@ -2,9 +2,9 @@
 """A bank of clay loses strength and slides against a rigid barrier: run-out, and force on the barrier.
 
 Half of a bank of undrained clay, H = 10 m high and 10 m long, stands with a vertical side on a rough floor.  Within ten
-minutes the strength c of the clay falls from 0.3 to 0.07 gamma H (gamma: unit weight); the bank is stable down to 0.26
-gamma H.  Inertia is neglected.  A viscous stress, a term in UFL, limits the velocity, and vanishes without motion.  A
-wall with an adhesion of c / 2 stops the clay.
+minutes the strength c of the clay falls from 0.3 to 0.07 gamma H (gamma: unit weight); the bank is stable while c >
+0.26 gamma H.  Inertia is neglected.  A viscous stress, a term in UFL, limits the velocity, and vanishes without
+motion.  A wall with an adhesion of c / 2 stops the clay.
 
 After the slide the shear stress on any plane is at most c.  Consider a wedge of weight W between the wall and a plane
 through the foot of the wall, of inclination theta and length l.  The equilibrium of this wedge bounds the force F
@@ -63,8 +63,9 @@ def bank(cells: int, barrier: bool) -> mpm.Simulation:
 class Frame:
     """The bank at a time, s.
 
-    corners (n, 4, 2), m; moved (n,), m: displacements of the points; force on the barrier (3,): normal and shear force,
-    N/m, and moment about the foot, N; bounds: bounds of the normal force, N/m; depth of the clay at the barrier, m.
+    corners (n, 4, 2), m; moved (n,), m: magnitudes of the displacements of the points; force on the barrier (3,):
+    normal and shear force, N/m, and moment about the foot, N; bounds: bounds of the normal force, N/m; depth of the
+    clay at the barrier, m.
     """
 
     t: float

@@ -59,7 +59,7 @@ def block(
 ) -> mpm.Simulation:
     """Return the block, `cells` cells wide.
 
-    box: width of the grid, m; its height is larger by two cells.
+    box: width of the grid, m; the grid is two cells higher than wide.
     """
     h = 1 / cells
     count = [round(box * cells), round(box * cells) + 2]
@@ -100,7 +100,7 @@ def restless(cells: int, **options) -> mpm.Simulation:
 
 
 def of_many_sizes(cells: int, moves: bool) -> mpm.Simulation:
-    """Return the block with the grid reset in each step, in cells of two sizes; moves: whether its lines oscillate."""
+    """Return the block with the grid reset in each step, in cells of two sizes; moves: whether grid lines oscillate."""
 
     def lines(t: float) -> list[np.ndarray]:
         even = [np.linspace(0, end, n + 1) for end, n in ((1, cells), (1 + 2 / cells, cells + 2))]
@@ -148,9 +148,9 @@ class Watched(mpm.Hencky):
 
 
 def conducting(cells: int, law: type[mpm.Skeleton]) -> mpm.Simulation:
-    """Return the draining block with a flow of 8 tau h² in a substep, with tau of Hencky's law.
+    """Return the draining block with kappa dt = 8 tau h² in a substep: mobility kappa, damping tau of Hencky's law.
 
-    Pressure jumps are evaluated if the flow is below 4 tau h² of the law, and damped if it is below tau h².
+    Pressure jumps are evaluated if kappa dt < 4 tau h², and damped if kappa dt < tau h², with tau of the law `law`.
     """
     kappa = 8 * soil().pressure_damping() / cells**2 / (GAMMA * DT)
     return block(cells, soil(law, conductivity=kappa * WATER["fluid"].unit_weight), **WATER)
@@ -251,7 +251,7 @@ PAIRS: dict[str, tuple[Make, Make]] = {
     ),
     "ghost penalty on all faces": (block, weighted),
     "damping of pressure jumps": (lambda n: conducting(n, mpm.Hencky), lambda n: conducting(n, Watched)),
-    "damping as in yielded instead of elastic soil": (lambda n: sealed_soil(n, yields=False), sealed_soil),
+    "pressure damping as in yielding instead of elastic soil": (lambda n: sealed_soil(n, yields=False), sealed_soil),
     "mean dilatation": (
         lambda n: block(n, soil(nu=LOCKING - 1e-3)),
         lambda n: block(n, soil(nu=LOCKING + 1e-3)),
@@ -273,8 +273,8 @@ PAIRS: dict[str, tuple[Make, Make]] = {
     "Modified Cam Clay instead of Drucker-Prager": (partial(plastic, law=mpm.DruckerPrager), clayey),
     "suction in the law": (partial(drying, law=mpm.ModifiedCamClay), partial(drying, law=mpm.BarcelonaBasic, **LOOSE)),
     "finite strain": (lambda n: block(n, soil(mpm.LinearElastic)), block),
-    "factors of a linear law in each step": (linear, refactorised),
-    "files of each step": (block, block),
+    "factorisation in each step, linear law": (linear, refactorised),
+    "files written in each step": (block, block),
     "grid reset in each step": (block, restless),
     "grid lines that move": (partial(of_many_sizes, moves=False), partial(of_many_sizes, moves=True)),
     "body from a mesh": (block, lambda n: block(n, from_mesh=True)),
@@ -282,7 +282,7 @@ PAIRS: dict[str, tuple[Make, Make]] = {
         lambda n: restless(n, material=soil(conductivity=1e-4), **WATER),
         lambda n: restless(n, material=soil(conductivity=1e-4), axisymmetric=True, **WATER),
     ),
-    "pores that drain": (
+    "free surface with specific yield": (
         lambda n: restless(n, material=soil(conductivity=1e-4, conductivity_law=mpm.unsaturated(1e3)), **WATER),
         lambda n: restless(
             n, material=soil(conductivity=1e-4, conductivity_law=mpm.unsaturated(1e3, 1e-4, 0.1)), **WATER
@@ -296,7 +296,7 @@ PAIRS: dict[str, tuple[Make, Make]] = {
     "16 times the background grid": (lambda n: restless(n, box=1 + 2 / n), lambda n: restless(n, box=4.0)),
     "256 times the background grid": (lambda n: restless(n, box=1 + 2 / n), lambda n: restless(n, box=16.0)),
 }
-QUICK = ("files of each step",)
+QUICK = ("files written in each step",)
 MAKES = [make for pair in PAIRS.values() for make in pair]
 
 
@@ -318,7 +318,11 @@ def first_step(make: Make, cells: int) -> dict[str, float]:
 
 @cache
 def compiled(make: Make, cells: int) -> tuple[float, float]:
-    """Return the compilation time, s, and the peak memory, MB, of a process that reuses the compiled forms."""
+    """Return the compilation time, s, and the peak memory, MB, of a scene and its first step.
+
+    The compilation time is the difference between two processes: one with an empty cache of compiled forms, and one
+    with a full cache.  The memory is that of the process with the full cache.
+    """
     command = [sys.executable, __file__, "--cells", str(cells), "--one", str(MAKES.index(make))]
     with TemporaryDirectory() as folder:
         environment = {**os.environ, "XDG_CACHE_HOME": folder}
@@ -332,7 +336,7 @@ def measure(name: str, cells: int, repeat: int) -> dict:
     pair = [make(cells) for make in PAIRS[name]]
     least, tops = [np.inf, np.inf], [0.0, 0.0]
     with TemporaryDirectory() as folder:
-        files = [None, folder if name == "files of each step" else None]
+        files = [None, folder if name == "files written in each step" else None]
         for turn in range(repeat + 1):  # the first is not counted
             for k in (0, 1):
                 seconds, result = take(pair[k], files[k] and f"{files[k]}/{turn}")

@@ -48,7 +48,10 @@ CASES: dict[str, tuple[Callable[[int], mpm.Simulation], tuple[int, ...], tuple[i
 
 
 def took(make: Callable[[int], mpm.Simulation], n: int, name: str, least: int) -> tuple[float, int, plan.SolverPlan]:
-    """Return the time of the steps (s), the number of unknowns and the chosen solvers; `least`: threshold `name`."""
+    """Return the time of the steps (s), the number of unknowns and the chosen solvers.
+
+    least: value of the threshold `name`.
+    """
     usual, plan.THRESHOLDS = plan.THRESHOLDS, replace(plan.THRESHOLDS, **{name: least})
     try:
         s = make(n)

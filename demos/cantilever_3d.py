@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A square cantilever in 3D with a load inclined to the grid: tip deflection, number of load steps, cost of a step.
+"""A cantilever of square section with a load inclined to the grid: tip, number of load steps, cost of a step.
 
 A dry beam of 1 m x 0.1 m x 0.1 m, clamped at x = 0, carries a dead load P on its free end, along (0, 3, -4) / 5.  A
 square section has the same stiffness about all axes.  The beam must therefore bend in the direction of the load, like
@@ -43,7 +43,7 @@ def rod(alpha: float) -> tuple[float, float]:
 
 
 def scene(cells: int, alpha: float) -> tuple[mpm.Simulation, mpm.surface.Probes]:
-    """Return the beam, `cells` cells high, and the middle of its end; at time 1 the load is alpha."""
+    """Return the beam, `cells` cells high, and the middle of its end; at time 1 the load parameter is alpha."""
     h = SIDE / cells
     reach = np.abs(ALONG) * rod(alpha)[1] * 1.05
     span = np.array([LENGTH * 1.05, SIDE, SIDE]) + reach + 3 * h
@@ -62,7 +62,10 @@ def scene(cells: int, alpha: float) -> tuple[mpm.Simulation, mpm.surface.Probes]
 
 
 def run(cells: int, steps: int, alpha: float, taken: int | None = None) -> tuple[np.ndarray, mpm.Result, dict]:
-    """Return the tip displacement (3,), m, the result and the costs of a run; taken: number of steps to take."""
+    """Return the tip displacement (3,), m, the result and the costs of a run.
+
+    steps: number of steps to the full load; taken: number of these steps that are computed, None for all.
+    """
     simulation, tip = scene(cells, alpha)
     result = simulation.run((taken or steps) / steps, 1 / steps, probes=tip)
     comm, (on_grid, matrices) = simulation.grid.comm, simulation.scene.last

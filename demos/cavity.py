@@ -14,8 +14,9 @@ steps, without a grid, also has an error: pore pressures in normally consolidate
    degrees, without and with associated dilation (Yu and Houlsby 1991).  These solutions are for infinite soil.  The
    outer boundary of the ring therefore follows a radial solution (`mpm_dolfinx.verification.cavity`).
 
-Pressures are divided by p_0.  Errors are relative: undrained at the radii `MARKS`, drained at the radii with published
-pressures.
+Pressures are divided by p_0.  Errors are relative errors of the cavity pressure, and in undrained clay also of the pore
+pressure at the wall.  They refer to the radii `MARKS` in undrained clay, and to the radii with published pressures in
+drained soil.
 """
 
 from __future__ import annotations

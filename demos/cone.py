@@ -19,7 +19,8 @@ a cell.
 Saturated ("wet") clay is pushed so fast that it is undrained.  Then the cone stops, and the excess pressure at the edge
 between cone and shaft dissipates.  The remaining fraction is compared with the curve of Teh and Houlsby (1991,
 Geotechnique 41), a function of T* = c_v t / (R^2 sqrt(G / s_u)).  That curve is for a deep cone.  Near the surface
-pressures dissipate faster: half at T* = 0.03 and 0.08 with the tip three and five radii deep.
+pressures dissipate faster: half of the pressure has dissipated at T* = 0.03 with the tip three radii deep, and at T* =
+0.08 with the tip five radii deep.
 """
 
 from __future__ import annotations
@@ -73,7 +74,8 @@ class Push:
 def scene(cells: int, depth: float, clay: mpm.Skeleton, speed: float, end: float, fluid: mpm.Fluid | None):
     """Return a simulation of the cone on the surface of the clay, and half of its outline (k, 2), m.
 
-    cells: number of whole cells over the radius R, which has half a cell more; depth, m; speed, m/s, until `end`, s.
+    cells: number of cells over the radius R, minus one half; depth: greatest depth of the cone, m; speed: velocity of
+    the cone, m/s, until the time `end`, s.
     """
     h = R / (cells + 0.5)
     low, fine = -(np.ceil(depth / h) + 2 * cells + 0.5) * h, np.ceil(FINE / h) * h
@@ -148,7 +150,7 @@ def push_wet(cells: int, depth: float) -> Dissipation:
     edge = np.array([R, outline[-2, 1] - depth])
 
     def excess(s: mpm.Simulation) -> float:
-        """Return the mean pressure within a cell of the edge, divided by s_u."""
+        """Return the mean pressure of the points at a distance of less than a cell from the edge, divided by s_u."""
         near = np.linalg.norm(s.points.x - edge, axis=1) < h
         volume = s.points.volume0[near]
         return float(volume @ s.points.pressure[near] / volume.sum() / STRENGTH)

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Iterations of the coupling between displacement and pore pressure, from drained to undrained.
 
-The linear systems of Newton's first step are solved to 1e-8 (true residual).  Scenes are a cantilever (the poroelastic
-beam, undeformed and bent) and a footing on a column.  Only the product of conductivity and step length matters.  This
-product ranges from 1e-23 m (1e-14 m/s, 1e-9 s) to 1e11 m (1e2 m/s, 1e9 s).  The bulk modulus of the water ranges from
-1e4 Pa to infinity.
+The linear systems of Newton's first step are solved to a relative true residual of 1e-8.  Scenes are a cantilever (the
+poroelastic beam, undeformed and bent) and a footing on a column.  Only the product of conductivity and step length
+matters.  This product ranges from 1e-23 m (1e-14 m/s, 1e-9 s) to 1e11 m (1e2 m/s, 1e9 s).  The bulk modulus of the
+water ranges from 1e4 Pa to infinity.
 
 Three schemes are compared.  The package uses conjugate gradients on the Schur complement S = C + B K^-1 B^T, with the
 matrices C of storage and flow, K of stiffness, and B of coupling.  The preconditioner is the filtered fixed-stress
@@ -144,7 +144,7 @@ def with_water(s: mpm.Simulation, bulk: float) -> mpm.Simulation:
 def linearise(s: mpm.Simulation, dt: float) -> System:
     """Return the first Newton system of a step of length dt, s.
 
-    The load is that after the time `RAMP_STEP`, for any dt.
+    For any dt, the load increment is that of a step of `RAMP_STEP`.
     """
     start = step.set_up(s.scene, s.state, RAMP_STEP)
     momentum = balances(s.scene, start, start.acting[-1]).momentum

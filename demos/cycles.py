@@ -76,7 +76,7 @@ def cycle(
     cycles, steps
         Number of cycles; number of steps in a cycle, even.
     quadrature
-        Quadrature at the material points, see `mpm.Numerics`.
+        Quadrature rule, see `mpm.Numerics`.
     material
         Material of the body; by default the material of the beam.
     seed

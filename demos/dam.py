@@ -42,7 +42,7 @@ LOAM = mpm.LinearElastic(
     retention=mpm.VanGenuchten(WEIGHT / 2, residual=0.15, n=2.0),
 )
 DAY = 86400.0  # s
-SETTLES = (0.1, 1.0, 10.0, 100.0)  # days: periods of equal steps until the flow is steady
+SETTLES = (0.1, 1.0, 10.0, 100.0)  # days: lengths of the steps until the flow is steady
 FALLS, SEEN = 5.0, (5.0, 15.0, 40.0)  # days: duration of the fall; times since its start, for the picture
 
 
@@ -73,7 +73,7 @@ class Dam:
 
 
 def run(h: float = 0.5, steps: int = 10) -> Dam:
-    """Run the dam on cells of size h, m, with `steps` equal steps in each period of `SETTLES`, and in the drawdown."""
+    """Run the dam on cells of size h, m, in `steps` steps of each length in `SETTLES`, then in drawdown."""
     grid = mpm.Grid([0, 0], [BASE + 2, HEIGHT + 1], np.rint(np.array([BASE + 2, HEIGHT + 1]) / h).astype(int))
 
     def trapezoid(X: np.ndarray) -> np.ndarray:

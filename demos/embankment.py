@@ -5,8 +5,8 @@ The scene is half of the section; x = 0 is a plane of symmetry.  On 6 m of clay,
 built every 90 days.  After four lifts the clay consolidates for ten years.  Each lift is a polygon with named edges
 (`mpm.polygon`, by gmsh).  A lift is placed on the settled ground and filled up to its design level, so it is thicker
 than 1 m.  Pressures are in excess of the sea above, and weights are buoyant.  The weight of the lifts is a term in UFL;
-the clay is in equilibrium with its own weight from the start.  Each lift ends the drainage of the surface below, and is
-itself drained at its slope and crest.  On one process.
+the clay is in equilibrium with its own weight from the start.  The surface below a lift is no longer drained; the lift
+is drained at its slope and crest.  On one process.
 
 Check: at the end the lowest points of the clay carry the weight of all lifts.  `carried` is the integral of the
 effective stress at these points, divided by this weight; it is 1 in equilibrium.
@@ -83,7 +83,10 @@ class Bund:
 
 
 def run(h: float = 0.5, steps: int = 6) -> Bund:
-    """Build the embankment on cells of size h, m, in `steps` steps a lift, and about 6 times as many after the last."""
+    """Build the embankment on cells of size h, m.
+
+    steps: number of steps for each lift; the consolidation takes about 6 times as many steps.
+    """
     grid = mpm.Grid([0, 0], [WIDTH, CLAY + LIFTS + 1], np.rint(np.array([WIDTH, CLAY + LIFTS + 1]) / h).astype(int))
     bodies = [mpm.box(grid, [0, 0], [WIDTH, CLAY]), *[lift(grid, k) for k in range(LIFTS)]]
     simulation = mpm.Simulation(

@@ -276,7 +276,7 @@ def table(comparison: list[dict]) -> list[list[str]]:
 
 
 def draw(out: Path, case: str, rows: list[Row]) -> None:
-    """Draw error against time; solid lines join runs of different cell size, dashed lines runs of different step."""
+    """Draw error against time; solid lines join runs of different cell size, dashed lines of different steps."""
     fig, ((ax,),) = common.figure(1, 1, (9.5, 5))
     usual = Counter(r.steps for r in rows).most_common(1)[0][0]
     for method in dict.fromkeys(r.method for r in rows):

@@ -245,7 +245,7 @@ PATH = "logarithmic compression (-)", "axial pressure (kPa)"
 
 
 def path(s: mpm.Simulation, steps: int) -> tuple[np.ndarray, np.ndarray]:
-    """Run to t = 1 s; return the logarithmic compression and the axial pressure (Kirchhoff's, Pa) of the steps."""
+    """Run to t = 1 s; return logarithmic compression and axial Kirchhoff pressure, Pa, after each step."""
     out = []
     s.run(1, 1 / steps, observe=lambda s: out.append((s.points.J, s.points.J * s.effective_stress()[:, 1, 1])))
     J, stress = np.array(out).mean(axis=2).T
@@ -287,7 +287,7 @@ def plasticity(cells: int) -> Example:
 
 @dataclass(frozen=True)
 class Hardening(mpm.Skeleton):
-    """The pressure is K y; Newton's method solves y + `power` y^3 = ln J at each point, and the tangent is exact."""
+    """The pressure is K y; Newton's method solves y + a y^3 = ln J (a: `power`), with exact tangent."""
 
     power: mpm.Field = 100.0
 

@@ -5,8 +5,8 @@ Every scene is tiny and has one extreme property.  Scenes with the same extreme 
 one of these outcomes:
 
 * converged: the error is below the bound of the family.  The reference is an exact solution, a solution with finite
-  elements, or the same scene with a moderate setting.  Both residuals and the error of the fluid balance are below
-  1e-8;
+  elements, or the same scene with a moderate setting.  The residuals of momentum and fluid, and the error of the fluid
+  balance, are below 1e-8;
 * recovered: converged, but some steps were cut;
 * refused: the run ends with an error that gives the reason, as it must in a scene without equilibrium;
 * warned: the error is above the bound, and the package has issued a warning;

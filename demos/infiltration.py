@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Water infiltrates unsaturated soil: comparison with exact and converged solutions.
 
-The first scene is rain on exponential soil (`Gardner`) above a water table.  At t = 0 the rain increases from one to
-nine tenths of the conductivity.  Heads are compared with the series of Srivastava and Yeh (1991).  The second scene is
-a wetting front in dry soil (`VanGenuchten`), the second case of Celia, Bouloutas and Zarba (1990).  The front is
+The first scene is rain on exponential soil (`Gardner`) above a water table.  At t = 0 the rain increases from a tenth
+to nine tenths of the conductivity.  Heads are compared with the series of Srivastava and Yeh (1991).  The second scene
+is a wetting front in dry soil (`VanGenuchten`), the second case of Celia, Bouloutas and Zarba (1990).  The front is
 compared with a converged solution of Richards' equation, and with finite elements (Q1/DG0) on the same cells in the
 same steps.
 

@@ -15,8 +15,8 @@ over the diameter.
 Clay ahead of the bar flows around it and stretches exponentially, by about e^4 over a diameter.  After each quarter of
 a diameter, new points are therefore seeded around the bar, with the present stresses (remeshing and interpolation: Hu
 and Randolph 1998, Int. J. Numer. Anal. Meth. Geomech. 22).  Stress is the only memory of this clay.  After each new
-seeding, N is lower for one or two steps.  Errors refer to the mean of N over the last part of each quarter.  `spread`
-is the range of N in these parts, divided by the mean.
+seeding, N is lower for one or two steps.  Errors refer to the mean of N over the end of each quarter, and `spread` is
+the range of N there, divided by this mean.
 
 Saturated ("wet") clay is also computed: a smooth bar is pushed through it by one diameter, at three rates V = v D /
 c_v.  The water on top has the same pressure, so the clay starts without effective stress.  Wet clay is seeded only
@@ -113,7 +113,7 @@ class Push:
 
 
 def push(alpha: float, cells: int, depth: float, follow: bool = False) -> Push:
-    """Load the clay, then push a bar of roughness alpha to `depth` diameters; the clay is seeded again in each part.
+    """Load the clay, then push a bar of roughness alpha to `depth` diameters; seed the clay again after each `LEG`.
 
     follow: whether grid lines follow the bar.
     """
@@ -153,7 +153,10 @@ def leg(out: Push, stress: Callable | None, alpha: float, cells: int, y: float, 
 
 
 def kept(simulation: mpm.Simulation) -> Callable:
-    """Return a function of positions x (n, 2), m: interpolated effective stress (n, 3, 3), Pa, at most the strength."""
+    """Return a function of positions x (n, 2), m, that returns the effective stress (n, 3, 3), Pa.
+
+    The stress is interpolated between the points, and reduced to the strength where it exceeds the strength.
+    """
     x, stress = simulation.points.x, simulation.point_fields().effective_stress
     flat = [stress[:, a, b] for a, b in ((0, 0), (1, 1), (2, 2), (0, 1))]
     between, nearest = (by(x, np.stack(flat, axis=1)) for by in (LinearNDInterpolator, NearestNDInterpolator))

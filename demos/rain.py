@@ -218,7 +218,7 @@ def found(s: mpm.Simulation) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def error(depth: np.ndarray, suction_stress: np.ndarray, share: float) -> float:
-    """Return the largest relative error of the factors of safety at `DEPTHS`; no suction at the water table."""
+    """Return the largest relative error of the factors of safety at `DEPTHS`; suction is zero at the water table."""
     at = np.interp(DEPTHS, np.append(depth, TABLE), np.append(suction_stress, 0.0))
     return float(np.abs(safety(DEPTHS, at) / exact(DEPTHS, share) - 1).max())
 

@@ -2,10 +2,10 @@
 """A soft column settles to less than half its height under its own weight.
 
 A dry column, 50 m high, has E = 10 kPa, nu = 0 and a density of 80 kg/m³.  The column stands between smooth walls.
-Gravity, increased to 10 m/s² in equal steps, compresses the column to 24.06 m, and its foot to 0.3 of the initial
-length, so points cross many cells.  The first Piola-Kirchhoff stress at the reference height Y carries the weight
-above, P = -rho0 g (l0 - Y).  In a column of constant width this stress equals Cauchy's stress.  With Hencky's law, the
-stretch follows from Lambert's W function.  Source: the column of AMPLE (Coombs & Augarde 2020,
+Gravity, increased to 10 m/s² in equal steps, compresses the column to 24.06 m.  The soil at its foot is compressed to
+0.3 of its initial height, so points cross many cells.  The first Piola-Kirchhoff stress at the reference height Y
+carries the weight above, P = -rho0 g (l0 - Y).  In a column of constant width this stress equals Cauchy's stress.  With
+Hencky's law, the stretch follows from Lambert's W function.  Source: the column of AMPLE (Coombs & Augarde 2020,
 doi:10.1016/j.advengsoft.2019.102748), here with a hundredth of its stiffness.  On one process.
 
 Errors: `stress` is the mean of |sigma - exact(Y)| / (rho0 g l0) over the points, weighted by volume; `height` is the

@@ -15,8 +15,8 @@ computed:
   remapped from grid to grid.
 
 Motion adds an error, because all points of a cell have the same strain increment in a step.  This error is largest at
-the drained top, in cells that contain little of the column.  The error of the remap itself is of second order and
-smaller.
+the drained top, in cells that contain little of the column.  The error of the remap itself is smaller than the spatial
+error, and of second order in the cell size.
 
 The overshoot, the largest p / p0 - 1 in all steps, is zero for the column at rest, with steps of any length.  In one
 dimension, the scheme therefore has no smallest time step.  In more dimensions, small steps cause checkerboard modes of
@@ -87,7 +87,7 @@ def column(cells: int, steps: int, way: float = 0.0, softness: float = 0.0, stra
 
 
 def error_of_cells(cells: int) -> float:
-    """Return the error with exact time integration, for two-point fluxes and the damping of small steps."""
+    """Return the spatial error of two-point fluxes with the damping of small steps, by exact time integration."""
     laplacian = 2 * np.eye(cells) - np.eye(cells, k=1) - np.eye(cells, k=-1)
     laplacian[0, 0] = laplacian[-1, -1] = 1
     outflow = laplacian.copy()

@@ -5,10 +5,11 @@
    theory is accurate.  The reference of the first bending frequency is 3.24419 Hz, by spectral elements that are graded
    towards the corners of the clamp.  The first axial frequency is exactly c / (4 L) = 17.67767 Hz.  The computed
    frequencies are fitted to the motion of the tip over three periods.
-2. A free bar of length L, P = E (F - 1), vibrates with strains of A = 5 % and moves over fifty cells in 25 periods.  In
-   the exact solution the ends oscillate about the uniform motion by (A L / pi) sin(pi c t / L), without loss of energy.
-   In each step SDIRK2 itself loses the fraction gamma^4 y^4 / (1 + gamma^2 y^2)^2 of the energy, with y = omega dt.
-   The remaining loss is due to grid resets.
+2. A free bar of length L has the law P = E (F - 1), with the first Piola-Kirchhoff stress P.  It vibrates with strains
+   of A = 5 % and moves over fifty cells in 25 periods.  In the exact solution the ends oscillate about the uniform
+   motion by (A L / pi) sin(pi c t / L), without loss of energy.  In each step dt, SDIRK2 itself loses the fraction
+   gamma^4 y^4 / (1 + gamma^2 y^2)^2 of the energy.  Here y = omega dt, with the angular frequency omega.  The remaining
+   loss is due to grid resets.
 """
 
 from __future__ import annotations

@@ -9,9 +9,10 @@
    fast.  The complex amplitudes of settlement and pore pressures in the steady oscillation are compared.  In the slow
    case, water drains only from a layer of 0.3 m below the top.
 3. The same column, with incompressible water and grains and k = 0.01 m/s, takes a sudden load (after de Boer, Ehlers
-   and Liu 1993).  Until a wave returns from the base, its settlement is q / (M a^(1/2)) int exp(-b s / 2 a) I0(b s / 2
-   a) ds with a = n_s (rho_s - rho_w) / M, b = g rho_w / (k M), the oedometric modulus M, and the volume fraction n_s of
-   the grains.
+   and Liu 1993).  Until a wave returns from the base, the settlement of the top at the time t is q / (M a^(1/2))
+   int_0^t exp(-r s) I_0(r s) ds.  Here r = b / (2 a), I_0 is the modified Bessel function, a = n_s (rho_s - rho_w) / M
+   and b = g rho_w / (k M).  M is the oedometric modulus, n_s the volume fraction of the grains, rho_s and rho_w are the
+   densities of grains and water.
 
 The equations are the u-p form: water accelerates with the grains.  In the saturated columns each cell is 1.05 times as
 high as the cell above, so that cells resolve the layer that drains.

@@ -9,8 +9,8 @@ A `Simulation` contains a `Grid`, bodies (`box`, `shape`, `mapped`, `from_mesh`,
 which `one_file` joins; `resume` continues a run from a `Checkpoint`.  `stage` changes the scene between two runs.
 `factor_of_safety` reduces the strength until failure.  For terms in UFL see `mpm_dolfinx.materials.user_functions`.
 
-Units are SI, or any consistent ones (`Fluid`).  Stress is positive in tension, pore pressure in compression.  In plane
-strain, forces act on a slice of 1 m.  In axisymmetry (`Grid`), forces act on the full circumference.
+Units are SI, or other consistent units, see `Fluid`.  Stress is positive in tension, pore pressure in compression.  In
+plane strain, forces refer to a thickness of 1 m.  In axisymmetry (`Grid`), forces refer to the full circumference.
 """
 
 from mpm_dolfinx.base import _environment  # noqa: F401 - first: it reports missing dependencies

@@ -51,7 +51,7 @@ def number(name: str, text: str) -> float | list[float]:
     try:
         values = [float(part) for part in text.split(",")]
     except ValueError:
-        raise ValueError(f"{name} = {text!r}, must be a number, or several with commas, in SI units") from None
+        raise ValueError(f"{name} = {text!r}, must be a number, or numbers separated by commas, in SI units") from None
     return values if len(values) > 1 else values[0]
 
 
@@ -68,7 +68,7 @@ def law_of(name: str) -> type[mpm_dolfinx.Skeleton]:
     if _is_law(found):
         return found
     known = [n for n in mpm_dolfinx.__all__ if _is_law(getattr(mpm_dolfinx, n)) and n != "Skeleton"]
-    raise ValueError(f"law = {name!r}, must be one of {', '.join(known)}, or file.py:name of your own")
+    raise ValueError(f"law = {name!r}, must be one of {', '.join(known)}, or file.py:name for your own law")
 
 
 def _is_law(value: object) -> bool:
@@ -76,7 +76,7 @@ def _is_law(value: object) -> bool:
 
 
 def constants_of(law: type[mpm_dolfinx.Skeleton], texts: Sequence[str]) -> dict[str, float | list[float]]:
-    """Return the constants of a law from texts name=value.  Each name must be a constant of the law, and occur once."""
+    """Return the constants of a law from texts `name=value`.  Each name must be a constant, and occur only once."""
     out, known = {}, [f.name for f in fields(law) if f.init]
     for text in texts:
         name, equals, value = text.partition("=")

@@ -123,7 +123,7 @@ def test_a_terminal_shows_each_trial(monkeypatch, caplog):
         (
             lambda: column(cells=2, material=replace(CLAY, conductivity=1e-5)),
             {},
-            "dt = None: must be given where fluid flows",
+            "dt = None, must be given in s if fluid flows",
         ),
         (
             lambda: column(

@@ -80,8 +80,8 @@ def time_step():
 def terzaghi(h: float, s: mpm.Simulation, r: mpm.Result) -> float:
     """Return the larger of two errors: mean of |p - exact| / load over the points, and error of the settlement.
 
-    The error of the settlement is divided by the final settlement.  h: cell size, m.  The load is 1e-5 M.  The exact
-    pressures are sums of modes, averaged over each cell.
+    The error of the settlement is divided by the final settlement.  h: cell size, m.  The load is 1e-5 times the
+    oedometric modulus M.  The exact pressures are sums of modes, averaged over each cell.
     """
     m = (np.arange(20000) + 0.5) * np.pi
     left = np.exp(-(m**2) * s.t * SOIL.conductivity / INCOMPRESSIBLE.unit_weight * M)
@@ -156,7 +156,7 @@ DROP = 1e-2  # pressure difference, Pa, too small to move the layers
 
 @family(0.02)
 def contrast_of_conductivity():
-    """Steady flow through two layers, ratio of k 1e-8 to 1e8: pressures divided by their difference, exact."""
+    """Steady flow through two layers, ratio of k 1e-8 to 1e8: exact pressures, relative to the pressure drop."""
     for name, cut in CUTS.items():
         for ratio in decades(-8, 8, 1 if cut == 0.5 else 2):
             layers = (SOIL, cut), (soil(conductivity=SOIL.conductivity * ratio), 1.0)
@@ -166,7 +166,7 @@ def contrast_of_conductivity():
 
 
 def series(cut: float, ratio: float, s: mpm.Simulation, r: mpm.Result) -> float:
-    """Return the largest error of the pressures, divided by their difference; cut: height of the interface, m."""
+    """Return the largest error of the pressures, divided by the pressure drop; cut: height of the interface, m."""
     cells = s.cells()
     y = cells.x[:, 1]
     lost = np.where(y < cut, y, cut + (y - cut) / ratio) / (cut + (1 - cut) / ratio)
@@ -300,7 +300,7 @@ def weight():
 
 @family(0.01)
 def suction():
-    """Column with pore pressure p = -10 to 0.5 M: exact settlement; refused if pores close or without equilibrium."""
+    """Column, p = -10 to 0.5 times the modulus: exact settlement; refused if pores close or without equilibrium."""
     for ratio in (*(-x for x in decades(-6, 1)), 0.01, 0.1, 0.3, 0.4, 0.5):
         a = stretch(-ratio) if ratio < exp(-1) else nan
 
@@ -327,7 +327,7 @@ def buckling():
 
 @family(0.01)
 def overload():
-    """Column compressed by up to 100 M or in tension, in one step: exact settlement; refused without equilibrium."""
+    """Column under loads of -1 to 100 times the modulus: exact settlement; refused without equilibrium."""
     for law in (mpm.Hencky, mpm.NeoHookean, mpm.LinearElastic):
         for ratio in (0.1, 1, 10, 100, -0.1, -0.3, -0.4, -1):
             error = pressed(soil(law=law), ratio * M)

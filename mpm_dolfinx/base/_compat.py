@@ -148,7 +148,7 @@ class CompiledForm:
     """A UFL form over cells or interior facets, compiled once and integrated over any list of entities.
 
     A cell may occur several times in the list; the kernel is then called once for each entry.  Ghost cells are not
-    allowed, because dolfinx 0.5 silently skips them.  Release 0.5 needs mesh tags, later ones a list of entities.
+    allowed, because dolfinx 0.5 silently skips them.  Release 0.5 needs mesh tags, later releases need entities.
 
     Parameters
     ----------

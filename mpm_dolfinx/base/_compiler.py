@@ -43,7 +43,7 @@ logger = logging.getLogger("mpm_dolfinx")
 _settings = jit.get_options if hasattr(jit, "get_options") else jit.get_parameters  # OLD
 _ffcx_settings = ffcx.get_options if hasattr(ffcx, "get_options") else ffcx.get_parameters  # OLD
 _replacements: dict[Path, Path] = {}
-"""Temporary folders of this run.  Each key is the cache folder that is not writable, and is replaced."""
+"""Temporary folders of this run.  Each replaces a cache folder that is not writable, which is its key."""
 _warnings: dict[Path, str] = {}
 """Warnings still to be issued, by temporary folder.  The first compilation in a folder issues the warning."""
 

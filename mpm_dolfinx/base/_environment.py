@@ -21,7 +21,7 @@ def _check() -> None:
         where = f", nor in PETSC_DIR = {os.environ['PETSC_DIR']}" if os.environ.get("PETSC_DIR") else ""
         get = dict.fromkeys("dolfinx" if name in BROUGHT else name for name in missing)
         raise ImportError(
-            f"{', '.join(missing)}: not found by {sys.executable}{where}; mpm_dolfinx needs: on Debian, with "
+            f"{', '.join(missing)}: not found by {sys.executable}{where}; must be installed: on Debian, with "
             f"/usr/bin/python3, `apt install {' '.join(f'python3-{name}' for name in get)}`, "
             f"elsewhere `conda install -c conda-forge {' '.join(map(PACKAGES.get, get))}`",
             name=missing[0],

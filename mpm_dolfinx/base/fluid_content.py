@@ -3,14 +3,14 @@
 
 Per reference volume, the content zeta changes by d zeta = alpha dJ + S J dp.  alpha is Biot's coefficient, J the volume
 ratio, and p the pore pressure.  S = n / K_w + (alpha - n) / K_s is the storage coefficient, with the bulk moduli K_w of
-water and K_s of grains.  The porosity is n = 1 - (1 - n0) / J, at first n0.  Therefore S J = a J + b is linear in J,
-with a = S(n = 1), and
+water and K_s of grains.  The porosity is n = 1 - (1 - n0) / J, with n0 at J = 1.  Therefore S J = a J + b is linear in
+J, with a = S(n = 1), and
 
     d zeta = (alpha / rho) d[(J + b / a) rho],    rho = exp(a p / alpha).
 
 The bracket is the mass of a fluid of density rho that fills the volume J + b / a.  The change of zeta in a step is
 computed as alpha times the change of this mass, divided by rho at the mean pressure of the step.  This formula is
-second-order accurate for any path.  In a step of any size without flow of fluid, the formula gives exactly zero.
+second-order accurate for any path.  If no fluid flows, the formula gives exactly zero, in a step of any size.
 
 Fluxes between cells conserve mass.  A fluid of density rho_w exp(p / K_w) has the mass flux -rho_w kappa grad pi, with
 kappa = conductivity / unit weight.  The mass potential is pi = K_w (exp(p / K_w) - 1) (Kirchhoff's transformation).
@@ -71,7 +71,7 @@ def mass_potential_form(p, compliance):
 
 
 def density_between(p0, p1, compliance):
-    """Return the logarithmic mean of the densities at two pressures, divided by that at zero pressure, as UFL."""
+    """Return the logarithmic mean of the densities at two pressures, divided by the density at p = 0, as UFL."""
     return ufl.exp(compliance * (p0 + p1) / 2) * _sinhc(compliance * (p0 - p1) / 2)
 
 

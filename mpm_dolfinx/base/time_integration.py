@@ -10,7 +10,7 @@ zeta' + Q(u, p) = 0 with the net outflow Q.  With the subscript n at the start o
 
 With gamma = 1 - 1 / sqrt(2) this is Alexander's method (1977), second order and L-stable.  The method does not use the
 rate at the start of the step, which is noisy after a transfer between grids.  (u2, p2) are the values at the end of the
-step.  After a jump of the loads, one long step overshoots by a fifth, but two steps of half the length do not, see
+step.  After a jump of the loads, one long step overshoots by a fifth of the change, but two half steps do not, see
 `step_size`.  The error of a step is estimated from the rates of the two substeps: see `solve.newton.note_pressures`.
 """
 

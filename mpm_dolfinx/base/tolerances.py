@@ -18,7 +18,7 @@ CENTRAL = EPSILON ** (1 / 3)
 SECOND = EPSILON**0.25
 """Increment of second differences, relative to the variable.  Source: Dennis and Schnabel (1983), 5.6."""
 NEAR = 8 * float(np.finfo(np.float32).eps)
-"""Relative distance, 1e-6, below which positions coincide.  Mesh files have seven digits; maps add rounding errors.
+"""Relative distance, 1e-6, below which positions coincide.  Mesh files have seven digits; mapping adds errors.
 
 Source: epsilon of single precision (IEEE 754), for a few operations.
 """

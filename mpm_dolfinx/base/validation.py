@@ -13,7 +13,7 @@ x : (m, d), m
     Positions of the same places at the start of the step, for example to prescribe a water level.
 
 A single parameter with another name receives the time.  With several parameters, other names raise an error.
-Parameters keep their default values, unless all parameters have one.  Material constants are functions of X.  Initial
+Parameters with a default receive no argument, unless all have one.  Material constants are functions of X.  Initial
 pressures and stresses are functions of x, the seeded positions.
 
 A function of position returns a number or an array (m,).  Where vectors are allowed, it may also return a vector (d,)
@@ -304,7 +304,7 @@ def given(
         allowed = f"{allowed} for a time"
         return numbers(what, asked(what, allowed, called, value, {"t": t}), *one, allowed=allowed)
     m = len(next(iter(places.values())))
-    if not m:  # a function may fail for no places
+    if not m:  # a function may fail without places
         return np.zeros(0) if number else np.zeros((0, dim))
     again = max(dim, 1) // m + 1  # repetitions that make m exceed the number of components
     repeated = {name: np.tile(x, (again, 1)) for name, x in places.items()}

@@ -157,7 +157,7 @@ def _placed(file: Path) -> list[_Placed]:
             shift, turn = ([float(v) for v in row.split(",") if v.strip()] for row in (*rows, "", "")[:2])
             if len(shift) > 3 or len(turn) not in (0, 7):
                 what = f"*INSTANCE {options['NAME']}: {len(shift)} and {len(turn)} numbers"
-                raise ValueError(f"{what}, must be up to 3 of a translation, and 7 of a rotation or none")
+                raise ValueError(f"{what}, must be at most 3 numbers of a translation, and 7 or none of a rotation")
             instances.append(_Placed(scope, options["NAME"], np.array((*shift, 0.0, 0.0, 0.0)[:3]), tuple(turn)))
         elif keyword in ("END PART", "END INSTANCE"):
             scope = whole

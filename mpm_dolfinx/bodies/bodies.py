@@ -132,7 +132,7 @@ class Body:
     def bend(self, chosen: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return for each chosen domain the largest distance (m,), m, between its straight edges and mapped box edges.
 
-        Distances are between midpoints.  Edges of two domains on the same curve may differ by this distance.
+        Distances are between midpoints of edges.  Edges of two domains on the same curve may differ by this distance.
         """
         out = np.zeros(len(chosen))
         if self.map is None:
@@ -297,4 +297,4 @@ def check_different(bodies: Sequence[Body]) -> None:
     for j, body in enumerate(bodies):
         for i in range(j):
             if bodies[i] is body:
-                raise ValueError(f"bodies {i} and {j}: are the same object, must be two objects; seed the other too")
+                raise ValueError(f"bodies {i} and {j}: are the same object, must be two objects; seed each separately")

@@ -153,7 +153,7 @@ def _rows(grid: Grid, axis: int, low: float, high: float, per_cell: int) -> NDAr
 
 
 def _rounded(rows: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return numbers of rows, rounded to integers >= 1, the same for coordinates with small rounding errors."""
+    """Return numbers of rows as integers >= 1, which do not depend on small rounding errors of coordinates."""
     return np.maximum(1, np.rint(NEAR * np.rint(rows / NEAR))).astype(np.int64)
 
 

@@ -194,7 +194,7 @@ def _in_region(
     x = _face_corners(body, row, face)
     low, high = x.min(axis=1), x.max(axis=1)
     size = high - low
-    slack = SAME * size.max(axis=1, keepdims=True) + rounding(x)  # so that no sliver in the region prescribes a face
+    slack = SAME * size.max(axis=1, keepdims=True) + rounding(x)  # faces with only a sliver in the region are left out
     within = (low >= region[0] - slack) & (high <= region[1] + slack)
     common = np.minimum(high, region[1]) - np.maximum(low, region[0])
     on = np.where(size <= slack, within, common > slack).all(axis=1)
@@ -280,7 +280,7 @@ def _clipped(
 def _free(own: Faces, others: Sequence[Faces]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Return the parts of faces that touch no other body: their faces (n,), and corners (n, 4, 2) in face coordinates.
 
-    A part is a rectangle if all boxes that cover its face lie along the edges of the face.  Otherwise it is a triangle
+    A part is a rectangle if all faces that cover its face have edges parallel to its edges.  Otherwise it is a triangle
     with a repeated last corner.
     """
     on = [covers(own, other) for other in others]
@@ -307,7 +307,7 @@ def interpolate(corners: NDArray[np.float64], xi: NDArray[np.float64]) -> NDArra
 def on_face(
     corners: NDArray[np.float64], face: NDArray[np.int64], x: NDArray[np.float64], xi: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return local coordinates xi (n, 3), with tangential components of positions x (n, 3), m, projected onto faces."""
+    """Return xi (n, 3) with new tangential components: those of positions x (n, 3), m, projected onto faces."""
     quads = np.take_along_axis(corners, FACES[3][face][:, :, None], axis=1)
     normal = face_vectors(corners, face)
     t, _ = local(quads, x[:, None], normal)

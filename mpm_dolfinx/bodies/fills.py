@@ -223,7 +223,7 @@ def _penetration(
 ) -> tuple[float, float, NDArray[np.float64]]:
     """Return a body's penetration depth into the fill, m, their gap divided by the cell size, and the position (d,), m.
 
-    Depth, gap or both are zero.
+    At least one of depth and gap is zero.
     """
     start = _start(bodies, other)
     rows = np.flatnonzero((points.id >= start) & (points.id < start + len(bodies[other])))

@@ -59,16 +59,16 @@ def from_mesh(
     mesh
         A file that meshio reads, an Abaqus input file, a meshio mesh or a dolfinx mesh: triangles and quadrilaterals in
         2D; tetrahedra, hexahedra, wedges and pyramids in 3D.  Second-order cells are reduced to their corners, with a
-        warning that gives the distance of edge nodes from straight edges.  2D cells must lie in a plane of equal z.
+        warning that gives the distance of edge nodes from edge midpoints.  2D cells must lie in a plane of equal z.
     part
         Group of cells, by default all cells: a physical group, an Abaqus part, instance or set, or a tag in data such
         as "MaterialIDs".
     cell_tags, facet_tags
         Tags of a dolfinx mesh.  For a file, `cell_tags` is the name of the cell data with the tags of parts and sides.
     names
-        Tag that each name stands for.  A tag without a name is named by its digits, such as "3".
+        Tags by name, such as {"top": 3}.  A tag without a name is named by its digits, such as "3".
     per_cell
-        Desired points per grid cell and direction, >= 1.  Domains with an edge above 1.5 cells / per_cell are divided.
+        Desired points per grid cell and direction, >= 1.  Domains with an edge above 1.5 / per_cell cells are divided.
     material
         Index of the material in the scene's list, >= 0.
 

@@ -26,7 +26,7 @@ from mpm_dolfinx.grid.grid import FACES, Grid, corner_bits, rounding, sum_by
 from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
 from mpm_dolfinx.points.cutting import centroids, simplex_volumes, vertices, volumes
 
-LONG = 1.5  # domains with edges longer than this factor times the cell size / per_cell are divided
+LONG = 1.5  # domains with edges longer than this factor times (cell size / per_cell) are divided
 SMALL = 0.2  # fraction of the desired domain size: smaller domains cause a warning
 
 
@@ -234,7 +234,7 @@ def _check_overlaps(
     """Raise an error for overlapping cells.
 
     Each facet inside the mesh has a cell on both sides.  The number of cells that cover a position therefore changes
-    only across the surface.  If cells overlap, a cell at the surface overlaps another cell; only these are checked.
+    only across the surface.  If cells overlap, a cell at the surface overlaps another; only cells there are checked.
 
     x (nodes, d): positions, m; cells: nodes of the cells by cell type; outer (m,): cells with a facet on the surface;
     neighbours (n, 2): pairs of cells that share a facet.

@@ -194,7 +194,7 @@ class Loads:
         """Add the derivative of `resists` minus `loads` at u, without final assembly."""
 
     def push(self, at: At, residual: PETSc.Vec, on: Unknowns) -> None:
-        """Subtract forces at u from the residual of unknowns or fixed components.  The residual's scale omits them."""
+        """Subtract forces at u from the residual of unknowns or fixed components.  The scale omits these forces."""
 
     def inertia(self, at: At) -> PETSc.Vec | None:
         """Return the inertia forces at u, N, or None.  These forces enter the residual and its scale."""
@@ -206,7 +206,7 @@ class Loads:
         """Return minus the derivative of the forces in `push`, without the part in `tangent`."""
 
     def settle(self, at: At, sticks: bool) -> bool:
-        """Update which points slip at u; return whether any point changed.  `sticks`: points may return to stick."""
+        """Update which points slip at u; return whether any point changed.  `sticks`: whether points may stick."""
         return False
 
     def augment(self, at: At) -> bool:
@@ -316,7 +316,7 @@ class Acting:
     held: Sequence[tuple[Any, Surface, Sequence[int]]] = ()
     """Prescribed displacements: (condition, faces, prescribed axes)."""
     seeded: Sequence[Surface] = ()
-    """Further faces whose displacement from the seeded position is needed; renewal leaves their domains."""
+    """Further faces whose displacement from the seeded position is needed; renewal must not replace their domains."""
 
     def placed(self, place: Place) -> Loads:
         """Return the loads of a substep."""
@@ -330,5 +330,5 @@ class Acting:
         return {}
 
     def unknown(self, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return the results of the conditions before the first step, filled with this value."""
+        """Return the results of the conditions before the first step, all equal to `value`."""
         return {}

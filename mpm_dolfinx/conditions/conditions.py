@@ -138,14 +138,14 @@ class Quiet(Condition):
     side
         Side of the bodies, as for `Traction`.
     incoming : (d,) or callable t (s) -> (d,), m/s
-        Particle velocity of an incoming wave along the inward normal.  A free surface would move twice as fast.
+        Particle velocity of a wave that enters along the inward normal.  A free surface would move twice as fast.
     region : ((d,), (d,)), m
         As for `Traction`.
 
     Raises
     ------
     ValueError
-        Raised by the scene: bodies without inertia; bodies with inertia before the side became quiet; no point on the
+        Raised by the scene: bodies without inertia; bodies that had inertia before it became quiet; no point on the
         side; another `Quiet`, or a `Displacement` of all components, on the same part of a face; a wall of the grid
         that fixes the side; a weight that changes as the stage begins, because the traction at rest does not change.
     """
@@ -197,7 +197,7 @@ class Source:
     Parameters
     ----------
     term
-        Function of a test function q of the pressure, see `user_functions`.  A positive term adds fluid, 1/s.
+        Function of a test function q of the pressure, see `user_functions`.  A positive term, 1/s, adds fluid.
     """
 
     term: Callable
@@ -317,10 +317,10 @@ class Rain(Flux):
     """Side of the bodies with rain or evaporation, limited by the soil's capacity to take up or release water.
 
     Rain infiltrates until the pressure at the side reaches `ponding`; the excess runs off.  Water evaporates at the
-    prescribed rate until the pressure at the side falls to `driest`.  Seepage can leave through the side too.
+    prescribed rate until the pressure at the side falls to `driest`.  Water can also seep out of the side.
     `outflows` of the simulation are the flow through the side; `simulation.outcome("runoff")` is the run-off, m^3/s
     (m^2/s in plane strain).  Three outcomes are volumes, m^3 (m^2), since the condition began.  `outcome("flowed")` is
-    outflow through all open sides, `outcome("ran_off")` run-off and seepage here, `outcome("ponded")` ponded water.
+    outflow of each open side, `outcome("ran_off")` run-off and seepage here, `outcome("ponded")` ponded water.
 
     Parameters
     ----------
@@ -390,7 +390,7 @@ RIGIDITY = 1e4
 HOLD = 3e2
 """Penalty stiffness for cell means of prescribed displacements, times cell size, divided by the `holding` modulus.
 
-The displacement error is the change of traction in the step, except by rotation, divided by this stiffness.  The
+The displacement error is the change of traction in the step (without its rotation), divided by this stiffness.  The
 error does not accumulate, because each step measures the error from the prescribed position.  Where a body is much
 stiffer than the penalty, multipliers remove the error, see `HoldLoads.augment`.
 
@@ -414,7 +414,7 @@ def holding(material: Skeleton) -> NDArray[np.float64]:
 
     A Q1 field with constant volumetric strain in each cell cannot follow a curved side.  The penalty converts the
     difference into pressure, so it must not be stiff compared with the shear stiffness.  In an undrained cavity, a
-    penalty of 3e2 (lambda + 2G) gives up to 1.9 times the exact pressure; a penalty of 30 (4G) gives 1.01 times.
+    penalty of 3e2 (lambda + 2G) gives up to 1.9 times the exact pressure, and one of 30 (4G) 1.01 times this pressure.
     """
     return (YIELDING if material.state else 1.0) * resistance(material)
 
@@ -435,8 +435,8 @@ class Displacement(Condition):
     components
         Prescribed components, such as "y"; by default all d components.
     region : ((d,), (d,)), m
-        Box of reference positions; faces inside it are prescribed.  Let the box end within a cell.  The cell's node
-        outside the box is prescribed if the box covers more than half of the cell, otherwise free.
+        Box of reference positions; faces inside it are prescribed.  Where the box ends within a cell, the cell also has
+        a node outside the box.  This node is prescribed if the box covers more than half of the cell, otherwise free.
 
     Raises
     ------

@@ -94,7 +94,7 @@ def warn_levels(comm: MPI.Intracomm, fluid: Fluid | None, gravity: Gravity, leve
 def other_gravity(fluid: Fluid, gravity: Sequence[NDArray[np.float64]]) -> float | None:
     """Return the last value of `gravity`, m/s^2, if conductivities are converted with another gravity, else None.
 
-    gravity, m/s^2: at the start of a step, and at times in the step.  A varying gravity counts only above 9.81 m/s^2.
+    gravity: vectors, m/s^2, at the start of a step and at times in it.  A varying gravity counts only above 9.81 m/s^2.
     """
     first, last = gravity[0], float(np.linalg.norm(gravity[-1]))
     rests = all(np.array_equal(first, g) for g in gravity) and last > 0

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: MIT
 """Free tools: rigid tools with a mass, which weight, loads and contact forces move.
 
-Let q be the motion of a tool in a step: displacement and, in 2D, rotation.  The equation of motion has the form of that
-of nodes (`mechanics/inertia.py`), m (q - q^) / (g dt)^2 = l - sum A^T f.  Here m are mass and moment of inertia, and q^
-is the motion without forces in the step.  g is the weight of the substep's rate, and dt is the length of the step.  l
-is the load, and f are the contact forces on the points.  A q is the displacement of the contact positions on the tool.
-The columns of A are e_x, e_y, and e_z x r with the lever arm r.
+Let q be the motion of a tool in a step: displacement and, in 2D, rotation.  The equation of motion has the same form as
+for nodes (`mechanics/inertia.py`), m (q - q^) / (g dt)^2 = l - sum A^T f.  Here m are mass and moment of inertia, and
+q^ is the motion without forces in the step.  g is the time weight of the substep's rate, and dt is the length of the
+step.  l are load and weight, and f the contact forces on the points.  A q is the displacement of the contact positions
+on the tool.  The columns of A are e_x, e_y, and e_z x r with the lever arm r.
 
 The unknowns q are condensed.  Let D be minus the derivative of f with respect to the displacement w of the
 points, and dw the increment of w.  Forces rotate with the tool, so f changes by (D A + E) dq, where E has the columns
@@ -133,7 +133,7 @@ class FreeTools(ContactProblem):
     def _sizes(self, found: Found, force: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return bounds (m, q) of the generalised forces on the tools, from the sizes (m, d) of contact forces, N.
 
-        A moment is compared with lever arm times force, since the moment of a smooth disc consists of rounding errors.
+        A moment is compared with lever arm times force, because the moment of a smooth disc is a rounding error.
         """
         moment = np.linalg.norm(found.at.arm, axis=1) * np.linalg.norm(force, axis=1)
         return np.hstack([force, moment[:, None][:, : self.grid.dim == 2]])

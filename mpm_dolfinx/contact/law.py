@@ -15,8 +15,8 @@ over the pairs in a cell: the slip s in the step, and the shear traction t_n aft
 with the projection P on the tangent plane and Coulomb's coefficient mu.  Sticking contact is elastic with stiffness
 k_t.
 
-The set of slipping cells is updated after Newton steps (active-set method).  An update in each residual would make
-cells alternate between stick and slip, because slip has no stiffness.  All cells start in stick, whatever their
+The set of slipping cells is updated after Newton steps (active-set method).  With an update in each residual, cells
+would alternate between stick and slip, because slip has no stiffness.  All cells start in stick, whatever their
 traction.  Only near equilibrium does a cell with reversed slip return to stick; it may slip again.  A sticking cell
 that opens is set to slip; if it had returned from slip to stick before, it never sticks again.  Otherwise shear alone
 could open and close the contact under a round tool at first contact, where the mean normal is inclined.
@@ -228,7 +228,7 @@ class ContactLaw:
         return replace(state, slip=slip, resticks=resticks, parts=parts, stuck=stuck), changed
 
     def augmented(self, state: ContactState, touch: Touch, largest: Callable[[NDArray], NDArray]) -> ContactState:
-        """Return the state with lambda set to the pressures in parts with large penetrations, or raise NotConverged.
+        """Return the state; in parts with large penetrations, lambda is set to the pressures.  May raise NotConverged.
 
         `largest` returns the largest value in the part of each condition (k,).
         """
@@ -277,7 +277,7 @@ class ContactLaw:
     def tractions(self, touch: Touch, at: Geometry) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the pressures (m,) and shear tractions (m, d), Pa, of the pairs.
 
-        In stick, pairs keep their deviations from the mean shear traction of a cell: repeated averaging causes creep.
+        In stick, pairs keep their deviations from the mean shear traction of a cell: repeated averages cause creep.
         """
         off = (at.shear - self.mean(at.shear)[self.of]) * touch.sticks[self.of, None]
         return touch.push, touch.shear[self.of] + off

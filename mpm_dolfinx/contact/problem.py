@@ -3,9 +3,9 @@
 
 A pair consists of a quadrature point on a surface and the opposite position, on a tool or another group (`pairs`).
 The pairs have the relative displacements w = B u and the forces f(w); the nodal forces are B^T f(w).  Forces on both
-bodies are therefore equal and opposite within rounding.  If both sides deform, pairs, normals and gaps are first taken
-at the start of the step.  After convergence, pairs, normals and gaps are updated at the new positions, and the step is
-solved again.  This is repeated until an update changes the gaps by less than `DEPTH` cells.
+bodies are therefore equal and opposite within rounding.  If both sides deform, the pairs and their geometry are first
+taken at the start of the step.  After convergence, both are updated at the new positions, and the step is solved
+again.  This is repeated until an update changes the gaps by less than `DEPTH` cells.
 
 A load-controlled tool has one more unknown: its displacement a along the direction e of the load.  Let f(w - a e) be
 the forces on points, let D be minus their derivative with respect to w, and let s = e . D e.  Newton's method solves
@@ -13,7 +13,7 @@ e . f = load together with the equilibrium of the bodies, by
 
     da = (e . D dw + load - e . f) / s.
 
-Forces are therefore f + D e (load - e . f) / s; minus their derivative is D - (D e) (e . D) / s.
+Forces are therefore f + (D e) (load - e . f) / s; minus their derivative is D - (D e) (e . D) / s.
 """
 
 from __future__ import annotations
@@ -112,7 +112,7 @@ class Touching(Acting):
         return out
 
     def unknown(self, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return forces and moments on the bodies, all filled with this value."""
+        """Return forces and moments on the bodies, all equal to `value`."""
         rows = np.full((len(self.names), 3 if self.grid.dim == 2 else 6), value)
         return {"tool_forces": dict(zip(self.names, rows, strict=True))}
 
@@ -299,14 +299,14 @@ class ContactProblem(Loads):
         return reaction, slope, law.by_contact(off[:, None])[:, 0]
 
     def _seek(self, found: Found) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Return displacements (tools,), m, at which one point would bear the load, else inf, and which tools touch."""
+        """Return the least displacements (tools,), m, at which a single point bears the load, and which tools touch."""
         law, state = self.now.law, self.now.state
         of = self.pairs.number
         along, k = (found.at.n * self.pushes.direction[of]).sum(axis=1), law.stiffness(state)
         with np.errstate(divide="ignore", invalid="ignore"):
             far = found.at.gap - state.pressure[law.of] / k + self.pushes.load[of] / (k * self.pairs.area * along)
             far = np.where(along > 0, far / along, np.inf)
-        nearest = np.full(len(self.pushes.load), np.inf)
+        nearest = np.full(len(self.pushes.load), np.inf)  # inf: no point can bear the load
         np.minimum.at(nearest, of, far)
         touches = law.by_contact((found.touch.push > 0)[:, None].astype(float))[:, 0] > 0
         return over_all(self.grid.comm, nearest, MPI.MIN), touches
@@ -426,7 +426,7 @@ class ContactProblem(Loads):
     def rubbing(self, at: At, v: NDArray[np.float64]) -> tuple[float, float]:
         """See `Loads`.  Only tools do external work.  Elastic slip counts as dissipation, negative on unloading.
 
-        Contact pressures are taken to dissipate nothing: velocities of substeps jump where a gap closes in a step.
+        Dissipation by contact pressures is not computed, because velocities of substeps jump where a gap closes.
         """
         law = self.now.law
         found = self.found(at)

@@ -149,7 +149,7 @@ class Ball:
 class Convex:
     """The convex hull of corners: a polygon, in 3D a polyhedron.
 
-    The signed distance is the largest distance from the planes of the surface.  This is exact inside.  Outside, near
+    The signed distance is the largest distance from the planes of the surface.  It is exact inside.  Outside, near
     edges and corners, it is too small, but no contact occurs there.
 
     Parameters
@@ -285,8 +285,8 @@ class Cone:
 class Distance:
     """A shape given by a user's signed distance function, with derivatives by finite differences.
 
-    The function is evaluated at true positions, not relative to the base of the grid.  Increments are powers of two, so
-    that distinct positions do not round to the same value.
+    The function is evaluated at true positions, not relative to the base of the grid.  Increments are powers of two,
+    because these are added to positions almost without rounding.
     """
 
     function: Callable[[NDArray[np.float64]], ArrayLike]  # signed distance, m

@@ -31,7 +31,7 @@ from mpm_dolfinx.grid.grid import Grid
 
 
 class Tie:
-    """Two opposite tied sides, and the faces at equal heights.
+    """Two opposite tied sides, and their pairs of faces at equal heights.
 
     For each face of one side, `partner` (m,) is the index of the opposite face, and `offset` (m, d), m, is the vector
     to this face.  `axis` is the axis normal to the sides.

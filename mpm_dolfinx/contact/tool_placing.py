@@ -165,7 +165,7 @@ class Tools(Touching):
         return pose
 
     def unknown(self, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return forces and moments filled with this value, zero displacements due to loads, and initial velocities."""
+        """Return forces and moments equal to `value`, zero displacements due to loads, and initial velocities."""
         out, d = super().unknown(value), self.grid.dim
         tools = dict(zip(self.names, self.tools, strict=True))
         out["tool_travel"] = {name: np.zeros(d if tool.free else ()) for name, tool in tools.items()}
@@ -289,7 +289,7 @@ class Tools(Touching):
                 raise ValueError(f"{what}, must be outside of all bodies, or touch them")
 
     def check_end(self, place: Place, points: MaterialPoints, before: MaterialPoints) -> None:
-        """Raise an error if a tool contains points, touches prescribed sides, or passed through a body in a step."""
+        """Raise an error if a tool contains points, touches prescribed sides, or has crossed a body in a step."""
         t = place.t
         for tool in self.tools:
             for hold, faces in self._held:

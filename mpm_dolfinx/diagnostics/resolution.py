@@ -27,7 +27,7 @@ FULL = 1.2
 
 
 def warn_overfilled(cut: CutDomains, bodies: Sequence[Body]) -> Callable[..., Any] | None:
-    """Warn about the fullest cell and its bodies if domains overlap; return the next check, or None after a warning."""
+    """Warn about the fullest cell and its bodies if domains overlap; return the next check, None after a warning."""
     grid, points = cut.grid, cut.points
     volume = cut.to_cells(points.volume0 * points.J) * cut.pieces_to_cells(cut.pieces.fraction)
     fill = sum_by(cut.cells, cut.plane(volume)[0], grid.num_owned)[cut.cells] / grid.volumes(cut.cells)
@@ -59,7 +59,7 @@ def bodies_in(cut: CutDomains, bodies: Sequence[Body], cell: int) -> tuple[list[
 LOSS = 0.03
 """A warning is issued if a soft material loses more than this fraction of its deformation in mixed cells."""
 AGAIN = 2.0
-"""Factor by which the lost fraction grows between two warnings, as interfaces move to the middle of cells."""
+"""Factor by which the lost fraction must grow until the next warning; moving interfaces change this fraction."""
 FINE = 0.1
 """Smallest lost fraction of a cell's deformation that counts; stiffness contrasts below 2.1 lose less."""
 
@@ -108,7 +108,7 @@ def warn_smeared(
 
 
 def _losses(cut: CutDomains, volume: NDArray[np.float64], modulus: NDArray[np.float64]) -> tuple[NDArray, ...]:
-    """Return for owned cells (n,): lost volume of the softest material, m^d, modulus ratio, and one of its pieces.
+    """Return for owned cells (n,): loss times volume, m^d, modulus ratio, and index of a piece of softest material.
 
     With moduli M and volume fractions s in a cell, layers in series have the compliance sum s/M.  Equal strain in the
     cell gives 1 / sum s M instead.  The loss is the difference of both compliances, divided by the
@@ -130,7 +130,7 @@ COARSE = 0.7  # fraction of a cell: in larger domains, constant stress costs mor
 FEW = 3  # points over the thickness at which bending is an eighth too large.  Source: exact, 1 / (n^2 - 1)
 SLENDER = 4  # length divided by thickness from which on a body counts as a beam
 LOST_WET = 2.5  # lost fraction of a wet beam's stiffness, times n^2: 1.8, 2.3, 3.2 for n = 4, 8, 16 in sealed beams
-FEW_WET = int((100 * LOST_WET) ** 0.5)  # points with a loss of 1 %.  Source: exact, by LOST_WET
+FEW_WET = int((100 * LOST_WET) ** 0.5)  # points over the thickness at which the loss is 1 %.  Source: exact
 SLENDER_WET = 2  # length divided by thickness from which on a wet body counts as a beam
 
 

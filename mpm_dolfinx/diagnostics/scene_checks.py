@@ -26,7 +26,7 @@ def check_held(
     Parameters
     ----------
     active
-        Cells of this process that contain a cut subdomain.
+        Cells of this process that contain pieces of domains.
     free : (nodes, d)
         Whether no wall fixes a displacement component.
     holds

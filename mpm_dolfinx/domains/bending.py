@@ -9,10 +9,10 @@ and the sawtooth remains as stress.  The corner displacement therefore contains 
 
 with the shape functions N_i, the nodal displacements u_i, and the position t_a along axis a in the cell, from 0 to 1.
 This field is exact for quadratic displacements, equal to Q1 at the nodes, and continuous.  D_a belongs to the cell edge
-along axis a that ends at node i.  D_a is the second difference at one end of this edge: the smaller one in absolute
-value, or zero if their signs differ.  If only one end has a second difference, D_a is this one.  If cell sizes vary,
-D_a is the squared edge length times the second derivative of a parabola.  Physical kinks, for example at the boundary
-of two materials, are kept.
+along axis a that ends at node i.  D_a is the smaller, in absolute value, of the second differences at both ends
+of this edge, or zero if their signs differ.  If only one end has a second difference, D_a is this one.  If cell sizes
+vary, D_a is the squared edge length times the second derivative of a parabola through three nodes.  Physical kinks,
+for example at the boundary of two materials, are kept.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ def followed(
     """Return two fields (2, n, d), m: the Q1 displacement of the corners, and its quadratic correction.
 
     cells (n,): owned cells that contain the corners; x (n, d), m: positions of the corners; u (nodes, d), m: nodal
-    displacements; filled (cells,): whether local cells contain material.  Nodes beyond empty cells are not used,
-    because they may be of another body.
+    displacements; filled (cells,): whether local cells contain material.  Far nodes of empty neighbour cells
+    are not used, because they may belong to another body.
     """
     used = np.bincount(cells, minlength=1).nonzero()[0]
     slot = np.zeros(used.max(initial=0) + 1, dtype=np.intp)

@@ -62,7 +62,7 @@ class Neighbours:
         self._partner = partner.reshape(-1, 2 * dim).T.copy()  # index of the opposite face; -1 if there is none
 
     def at_neighbours(self, own: NDArray[np.float64], faces: Sequence[NDArray[np.float64]]) -> Callable[[int], tuple]:
-        """Return a function of a face index.  It returns the neighbours' data (c, k), face centres, and a mask.
+        """Return a function of a face index.  It returns neighbours' data (c, k), their face centres, and which exist.
 
         `own` (c, k) are c data columns of the k points.  `faces` are, for each face index, the face centres (d, k), m.
         """
@@ -96,7 +96,7 @@ class LinearGradients:
     def at_pieces(
         self, cut: CutDomains, F: NDArray[np.float64], elastic: NDArray[np.bool_], soils: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return `linear_gradients`, which vary only at `elastic` points (n,); all processes must call this."""
+        """Return `linear_gradients`, which vary only in domains of `elastic` points (n,); all processes call it."""
         key = cut.points.id, elastic
         return linear_gradients(
             self._neighbours(key, partial(Neighbours, self._comm, self._bodies, *key), self._comm), cut, F, soils

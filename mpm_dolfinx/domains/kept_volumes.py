@@ -4,12 +4,12 @@
 The volume ratio of a point is a mean over its cell.  The corners of its domain, however, follow a field that varies in
 the cell, and edges stay straight.  In elastic soil F and the volume ratios of cells follow from the corners.  In
 yielded soil F is updated by increments, so the volumes of domains and of points would drift apart, and cells would
-overfill.  After a step the corners of yielded domains therefore move by the d that minimises
+overfill.  After a step the corners of yielded domains therefore move by the vectors d that minimise
 
     sum_p V_p e_p^2 + SOFT^2 sum_p V_p mean |d / h|^2,  V_p e_p = V_p - V - dV/dx d,
 
 V_p is the volume of a point and V that of its domain; the mean is over the domain's corners; h are edges of cells.
-Both sums are integrals over the soil, so a slice moves as in plane strain.  Shared corners move together.  Corners of
+Both sums are integrals over the soil: a 3D slice moves as in plane strain.  Shared corners move together.  Corners of
 elastic domains and held corners do not move.  Kugelstadt et al. (2019) correct densities of cells in this way.
 """
 

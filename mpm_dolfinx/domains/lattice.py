@@ -5,13 +5,13 @@ A displacement wave of the corners with a wavelength of two domains does not mov
 resists it.  Corners that cross grid lines excite such waves, and the waves would grow from one load cycle to the next.
 The filter damps them when the grid is reset.  For each axis a in turn,
 
-    d <- d - D_a^T s / 64 D_a d.
+    d <- d - D_a^T (s / 64) D_a d.
 
 The result is the mean over all orders of the axes.  d is the displacement of the corners from their reference
 positions.  D_a is the third difference along axis a, of four corners in a row.  If the domains in a row have different
 widths, D_a is the divided difference, scaled to the same sum of absolute weights.  s is min(1, `FAST` c), if the
 corners have crossed c cells since the last grid reset.  Bodies that hardly move are not filtered.  Quadratic fields
-remain unchanged, even at the surface.  A wave of two domains along the axis is reduced by the fraction s, a wave of
+remain unchanged, even at the surface.  A wave with a length of two domains is reduced by the fraction s, a wave of
 eight domains by 0.003 s.  Domains that have separated from their neighbours are not filtered.  Yielded soil is not
 filtered either: its deformation is irreversible, and its kinks are physical.  The filter does not move corners held by
 a wall, a prescribed displacement, a plate or another body.

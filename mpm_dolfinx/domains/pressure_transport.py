@@ -11,7 +11,7 @@ again.  In a cell that contained the domain before, the smaller of the old and n
 fraction that is new in a cell receives the mean pressure of the fractions that left other cells.  The centroids of the
 pieces are remapped in the same way.  The error of the remapped centroid, times the mean slope of the domain, corrects
 the pressure.  The fractions of a domain add up to one, and the corrections add up to zero, so the remap is
-conservative.  Without motion it changes nothing.
+conservative.  Without motion, the remap changes nothing.
 
 Point pressures for output are reconstructed up to no-flow sides, see `up_to_surface`.  They are not transported.
 """
@@ -162,7 +162,7 @@ class Reconstruction:
     ) -> NDArray[np.float64]:
         """Return pressures (m,), Pa, at positions in owned cells, with second-order accuracy even at the surface.
 
-        In a cell at a no-flow side, the slope is the smaller of the slope in the next cell inside, and the linear
+        In a cell at a no-flow side, the slope is the smaller of two: the slope in the next cell inside, and the linear
         extrapolation of the slopes inside.  Linear fields are exact, and steep slopes are not continued.  Pressures
         stay between the extremes of cell, neighbours, drained sides, and the reconstructed value at the surface.
 

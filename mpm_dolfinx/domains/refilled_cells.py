@@ -31,14 +31,13 @@ GAP = 0.01
 changes the result of scene "flow" in tests/plateaus.py by 2.5e-05 (relative), doubling it by 0.0e+00, and
 finer cells by 9.0e-02."""
 CRUMB = NEAR
-"""Area of a part, divided by the area of its cell, below which other parts receive its mass.  Source: as `NEAR`."""
+"""Area of a part of a domain, divided by its cell's area, below which other parts receive its mass.  Source: `NEAR`."""
 SMALL = (0.5 / EDGES) ** 2
-"""Area of a part in cell areas.  A cell in which renewal leaves a smaller part of a domain is renewed too.
-
-Source: definition, a square with half the length of an edge of the surface, which has `EDGES` edges in a cell.
-"""
+"""Area in cell areas.  A cell in which renewal would leave a smaller part of a domain is renewed too.  Source:
+definition, a square with half the length of an edge of the surface, which has `EDGES` edges in a cell."""
 COVERED = 0.25
-"""Largest difference between the pieces' area and the filled area, in cell areas.  Source: definition, one domain."""
+"""Largest difference between the area of the pieces in a renewed cell and its filled area, in cell areas.  Source:
+definition, the area of a new domain in a full cell, which is divided into four."""
 SIDE = np.array([2, 1, 3, 0])
 """Index of the face at each edge of the ring of a domain's corners."""
 START, END = np.array([2, 1, 0, 3]), np.array([0, 3, 1, 2])
@@ -376,7 +375,7 @@ class RefilledCells:
 
     @cached_property
     def remainders(self) -> tuple[New, NDArray[np.int64]]:
-        """Pieces of removed domains outside the renewed cells: new domains, a group for each piece; the pieces."""
+        """New domains from pieces of removed domains outside the renewed cells, in a group per piece; the pieces."""
         pieces, points = self.pieces, self.points
         left = np.flatnonzero(self.affected[pieces.point] & ~self.chosen[self.cell])
         left = left[self._areas[left] > CRUMB * self._volume(self.cell[left])]
@@ -437,7 +436,7 @@ class RefilledCells:
         normal = means((y[:, :, None] * y[:, None]).reshape(-1, 4)).reshape(-1, 2, 2)
         right = means((y[:, :, None] * q[:, None]).reshape(len(y), -1)).reshape(-1, 2, q.shape[1])
         value, axes = np.linalg.eigh(normal)
-        some = value > SAME  # value: (cell size)^2; a single row of pieces determines no slope across the row
+        some = value > SAME  # `value` in squared cell sizes; a single row of pieces determines no slope across it
         inverse = np.where(some, 1 / np.where(some, value, 1.0), 0.0)
         sizes = grid.sizes_of(np.arange(self.cells))[..., None]
         slope = (axes * inverse[:, None]) @ axes.swapaxes(1, 2) @ right / sizes

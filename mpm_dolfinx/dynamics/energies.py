@@ -65,7 +65,7 @@ def after(
 def after_renewal(
     materials: SceneMaterials, energy: Mapping, old: MaterialPoints, new: MaterialPoints, renewed: int
 ) -> Mapping[str, NDArray[np.float64]]:
-    """Return the energies, J, after renewal of domains; `renewal` is all kinetic and elastic energy lost by renewal."""
+    """Return the energies, J, after renewal of domains; `renewal` is the total energy lost by renewals."""
     if not renewed:
         return energy
     now = stored(materials, new)

@@ -33,7 +33,7 @@ def traction_name(name: str) -> str:
 
 class QuietForms:
     """Forms at points on quiet sides.  Fields are two impedances, kg/m^2/s: the tangential, and the normal minus the
-    tangential one.  A further field is the constant traction, Pa, at rest plus that of incoming waves.
+    tangential one.  The field `force` is the constant traction at rest plus that of incoming waves, Pa.
     """
 
     def __init__(self, grid: Grid, u: fem.Function, velocity: Velocity):

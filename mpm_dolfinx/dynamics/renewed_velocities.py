@@ -51,11 +51,11 @@ class Momenta(NamedTuple):
 def velocities(
     work: RefilledCells, corners: NDArray, x: NDArray, group: NDArray, masses: tuple[NDArray, NDArray]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return velocities and their gradients in new domains: means of the old affine fields over the overlap, corrected.
+    """Return velocities and their gradients in new domains: corrected means of the old affine fields over the overlap.
 
     The correction is a rigid motion of each group of domains; it restores momentum and angular momentum of the group.
 
-    corners (n, 4, 2), x (n, 2), m, group (n,): corners, place, group of new domains; masses, kg: of old and new points.
+    corners (n, 4, 2), x (n, 2), m, group (n,): corners, place, group of new domains; masses: of old, of new points, kg.
     """
     points = work.points
     n, count = len(x), int(group.max()) + 1

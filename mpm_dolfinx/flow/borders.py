@@ -72,7 +72,7 @@ class Borders:
         self._axis = np.abs(offset).argmax(axis=1)
         downward = np.take_along_axis(offset, self._axis[:, None], axis=1) < 0
         self._pair = np.where(downward, grid.facet_cells[self.facets][:, ::-1], grid.facet_cells[self.facets]).T
-        of_others = contents.filled if grid.comm.size > 1 else contents.filled[:0]  # other processes may request them
+        of_others = contents.filled if grid.comm.size > 1 else contents.filled[:0]  # others may need their paths
         self._cells = np.unique(np.append(self._pair, of_others))
         self._slot = np.searchsorted(self._cells, self._pair)
 
@@ -133,7 +133,7 @@ class Borders:
         outer: NDArray[np.float64],
         drop: NDArray[np.float64],
     ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]]:
-        """Yield (k,) indices of faces at owned mixed cells, k_r, and derivatives, see `Relative.through_sides`."""
+        """Yield indices (k,) of faces at owned mixed cells, and results of `Relative.through_sides` for these."""
         rows = np.flatnonzero(self.mixed[cells] >= 0)
         if not len(rows):
             return
@@ -171,7 +171,7 @@ class BorderFaces:
     area: NDArray[np.float64]  # areas (m,), m^(d-1)
     paths: list[Paths]  # flow paths from the cells on both sides to the faces, see `through`
     lengths: list[NDArray[np.float64]]  # lengths of the flow paths (m,), m
-    offsets: list[NDArray[np.float64]]  # vectors along paths (m, d), m, for the pressure drops by weight
+    offsets: list[NDArray[np.float64]]  # vectors along paths (m, d), m, for pressure drops due to weight
     weight: NDArray[np.float64]  # unit weight of the fluid (d,), N/m^3
     bulk: float  # bulk modulus of the fluid, Pa
 
@@ -195,7 +195,7 @@ class BorderFlows:
 
     pair: NDArray[np.int64]  # local cells on both sides (2, m)
     flux: NDArray[np.float64]  # flux from the first to the second cell (m,), m^d/s
-    slopes: list[NDArray[np.float64]]  # derivatives with respect to the pressures on both sides (m,), m^d/(Pa s)
+    slopes: list[NDArray[np.float64]]  # derivative by the first pressure, minus that by the second (m,), m^d/(Pa s)
 
     def add_fluxes(self, out: NDArray[np.float64]) -> None:
         """Add the fluxes to the outflows of the local cells (c,), m^d/s."""

@@ -80,11 +80,11 @@ class DrainedSides(Feeding):
         return [faces for _, faces in self._outlets]
 
     def unknown(self, value: float) -> dict[str, NDArray[np.float64]]:
-        """Return outflows before the first step, filled with this value."""
+        """Return the outflows before the first step, all equal to `value`."""
         return {name: np.array(value) for name in self._names}
 
     def dry(self, value: float) -> dict[str, NDArray[np.float64]]:
-        """Return run-offs before the first step, filled with this value."""
+        """Return the run-offs before the first step, all equal to `value`."""
         return {name: np.array(value) for name, rain in zip(self._names, self._rains, strict=True) if rain}
 
     def empty(self) -> dict[str, dict[str, NDArray[np.float64]]]:
@@ -189,7 +189,7 @@ class UnsaturatedFaces(OpenFaces):
         """Return the non-orthogonal correction, here no flow but only a fraction of the two-point flux, in [-1, 1].
 
         Conductivities change by orders of magnitude in a step, so the correction must be proportional to the flux.
-        Limits keep the correction from emptying the soil.
+        The limits -1 and 1 keep the correction from emptying the soil.
         """
         difference = fluid.pi[self.at] - self.outer
         share = np.divide(correction, difference, out=np.zeros_like(correction), where=difference != 0).clip(-1, 1)
@@ -213,7 +213,7 @@ class RainedFaces(OpenFaces):
     """Faces on open sides; at least one of the faces has rain.
 
     With rain, the outflow is minus the rain, within two limits: the outflow at the pond's pressure, and the outflow at
-    the driest pressure.  This outflow includes seepage, so `seeps` is False at faces with rain.
+    the driest pressure.  The first limit includes seepage, so `seeps` is False at faces with rain.
     """
 
     rain: NDArray[np.float64]  # rain (m,), m^d/s; nan for faces without rain
@@ -253,7 +253,7 @@ class SideFeeds(Feeds):
     """Flow through open sides in a substep.
 
     sides: faces of the open sides; wet: data of the substep; names: names of the conditions; ponds: largest pond
-    depths, m, or None without rain.  Both have the order of `OpenSides.number`.
+    depths, m, or None without rain.  `OpenSides.number` are indices in both lists.
     """
 
     def __init__(self, sides: OpenSides, wet: Wet, names: tuple[str, ...], ponds: tuple[float | None, ...]):
@@ -272,7 +272,7 @@ class SideFeeds(Feeds):
     def _pond(
         self, sides: OpenSides, ponds: tuple[float | None, ...], dt: float
     ) -> tuple[OpenSides, NDArray[np.float64]]:
-        """Return the sides with the pressure and the supply of ponds in a time dt, s, and the capacities of ponds, m^d.
+        """Return the sides with pressures of ponds and their supply in a time dt, s; and the capacities of ponds, m^d.
 
         `ponds` are the largest depths of the ponds, m.
         """
@@ -342,12 +342,12 @@ class SideFeeds(Feeds):
         return {name: np.array(sums[i]) for i, name in enumerate(self._names)}
 
     def run_off(self, at: OpenFaces, fluid: Fluid) -> dict[str, NDArray[np.float64]]:
-        """Return the rain that does not infiltrate, m^d/s, by name of the condition."""
+        """Return the run-off by name of the condition, m^d/s: rain that neither infiltrates nor fills the pond."""
         if not any(self._rains):
             return {}
         excess = np.maximum(self._fallen, 0.0) + np.minimum(self._through(at, fluid), 0.0)  # nan without rain
         runs = over_all(self._comm, sum_by(self.sides.number, excess, len(self._names)))
-        runs = np.where(self._ponded < self._most, 0.0, np.maximum(runs, 0.0))  # the pond also supplies the soil
+        runs = np.where(self._ponded < self._most, 0.0, np.maximum(runs, 0.0))  # < 0 if a pond supplies the soil
         return {name: np.array(runs[i]) for i, name in enumerate(self._names) if self._rains[i]}
 
     def passing(self, at: OpenFaces, fluid: Fluid) -> dict[str, NDArray[np.float64]]:

@@ -68,7 +68,7 @@ class Feeds:
     """Faces with an outside pressure or a prescribed flux."""
 
     def conducting(self, flow: Conduction) -> Any:
-        """Return data that depend on conductivities and motion of the cells.  They are kept until either changes."""
+        """Return data that depend on conductivities and motion of the cells; stored until one of these changes."""
 
     def begin(self, at: Any, fluid: Fluid, difference: NDArray[np.float64]) -> None:
         """Start a substep.  `difference` (m,), Pa, corrects cell pressures at `sides`, see `nonorthogonal`."""
@@ -90,7 +90,7 @@ class Feeds:
         return {}
 
     def run_off(self, at: Any, fluid: Fluid) -> dict[str, NDArray[np.float64]]:
-        """Return the rain that does not infiltrate, m^d/s, by condition; all processes must call this."""
+        """Return the run-off, m^d/s, by name of the condition; all processes must call this."""
         return {}
 
     def passing(self, at: Any, fluid: Fluid) -> Mapping[str, NDArray[np.float64]]:
@@ -135,11 +135,11 @@ class Feeding:
         return np.empty(0, dtype=np.int64)
 
     def unknown(self, value: float) -> dict[str, NDArray[np.float64]]:
-        """Return the result of `Feeds.outflows` before the first step, filled with this value."""
+        """Return the result of `Feeds.outflows` before the first step: all are equal to `value`."""
         return {}
 
     def dry(self, value: float) -> dict[str, NDArray[np.float64]]:
-        """Return the result of `Feeds.run_off` before the first step, filled with this value."""
+        """Return the result of `Feeds.run_off` before the first step: all are equal to `value`."""
         return {}
 
     def empty(self) -> dict[str, dict[str, NDArray[np.float64]]]:

@@ -31,7 +31,7 @@ from mpm_dolfinx.grid.grid import Grid, across_faces, sum_by
 from mpm_dolfinx.points.active import Active
 from mpm_dolfinx.points.material_points import cofactor, determinant
 
-ALONG = 0.1  # a side determines the slope along an axis if its unit normal has a larger component along this axis
+ALONG = 0.1  # a side determines the slope along an axis if this component of its unit normal is larger than `ALONG`
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Mobility:
 
     mean: NDArray[np.float64]  # mean over the pieces (n,), m^2/(Pa s)
     share: NDArray[np.float64] | None = None  # mobility along each axis divided by `mean` (n, d); None if all are 1
-    # vector from the centroid to the pressure position of the cell (n, d), m; None without mixed cells
+    # vector from the centroid to the pressure position of the cell (see `layers`) (n, d), m; None without mixed cells
     shift: NDArray[np.float64] | None = None
     # fractions of the mean that come from soil without a retention curve, and from soil of each curve (n, k)
     shares: NDArray[np.float64] | None = None
@@ -91,9 +91,9 @@ class Conduction:
         return across if hoop is None else across * hoop[at]
 
     def distance_ratio(self, at: NDArray[np.int64], normal: NDArray, offset: NDArray) -> NDArray[np.float64]:
-        """Return distances of centroids from faces (m,), divided by those of pressure positions, along normals (m, d).
+        """Return distances of faces from centroids (m,), divided by distances from pressure positions (see `layers`).
 
-        `offset` (m, d), m, are the vectors from the centroids to the faces.
+        `normal` (m, d) are normals of the faces; `offset` (m, d), m, are vectors from the centroids to the faces.
         """
         distance = (offset * normal).sum(axis=1)
         shifted = distance - (self.mobility.shift[at] * normal).sum(axis=1)
@@ -176,7 +176,7 @@ class OpenSides:
             return sum_by(slots, values.ravel(), ends * len(p)).reshape(out.shape[:3])
 
         whole = total(share)
-        # the pressure is constant along the side, so its gradient is normal to it
+        # the pressure is constant along the side, so the pressure gradient is normal to the side
         for k, values in enumerate((jump[:, None], (jump / distance)[:, None] * normal)):
             np.divide(total(share * values[:, :, None]), whole, out=out[..., k], where=whole > 0)
         return out
@@ -372,7 +372,7 @@ class FluxForms:
         self.damp = FacetForm(damped * ufl.jump(dp) * ufl.jump(q) * dS, grid.comm)
         smaller = ufl.min_value(self.fixed_stress("+"), self.fixed_stress("-"))
         if grid.even:
-            volume = fem.Constant(mesh, grid.cell_volume)  # as a number, each value would be compiled again
+            volume = fem.Constant(mesh, grid.cell_volume)  # for numbers, each value would be compiled again
         else:
             h = grid.edge_in_forms()("+")
             volume = prod(h[a] for a in range(d))  # divided by h0, this is the area of the face on both sides
@@ -390,8 +390,8 @@ class FluxForms:
             )
         self.gravity = None
         if (weight is not None or relative is not None) and flows:
-            # still water must not flow: its pressure increases with depth by the weight at zero pressure.  Pressure
-            # and weight are in one form, so that rounding errors are small and conserve mass
+            # still water must not flow: its pressure increases with depth by the unit weight at zero pressure.
+            # Pressure and weight are in one form, so that rounding errors are small and conserve mass
             density = density_between(pressure("+"), pressure("-"), fem.Constant(mesh, 1 / bulk))
             difference = ufl.jump(pressure) + drop
             flux = T * density * difference * ufl.jump(q) * dS
@@ -420,9 +420,9 @@ class FluxForms:
         active: NDArray[np.int64],
         density: NDArray[np.float64],
     ) -> NDArray[np.float64]:
-        """Return the outflow of the local cells, m^d/s, through `facets`, caused by gradients in `cells`.
+        """Return the outflow of the local cells, m^d/s, through `facets`, caused by slopes in `cells`.
 
-        `slope` (n, d), Pa/m, are the gradients.  `active` (c,) are the active local cells; `density` (c,) is the
+        `slope` (n, d), Pa/m: see `Gradients`.  `active` (c,) are the active local cells; `density` (c,) is the
         density of their fluid, divided by the density at zero pressure.
         """
         self.density.x.array[active] = density

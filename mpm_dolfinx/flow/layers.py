@@ -6,7 +6,7 @@ harmonic mean along each line (Cardwell and Parsons 1945).  This mobility is exa
 the grid, for flow along and across them.  Inclined layers must be at least a cell thick.  Only then a seam of low
 conductivity blocks all lines of some cell, and a drain contains complete lines.
 
-The pressure of a cell refers to the position at which steady flow along a line has the mean pressure of the line.  Let
+The pressure of a cell refers to its pressure position: here steady flow along a line has the line's mean pressure.  Let
 R be the resistance of the line, and let s increase from 0 to 1 along the line.  The resistance from this position to
 the lower end is int (1 - s) dR, to the upper end int s dR.  The sum of these resistances is exact for lines through
 several cells.  For layers inclined by more than `INCLINED` the position moves to the more conductive end.  Otherwise a
@@ -32,9 +32,9 @@ from mpm_dolfinx.grid.grid import ranges, sum_by
 from mpm_dolfinx.parallel.exchange import over_all
 
 INCLINED = 0.01
-"""Inclination of layers above which the pressure position of a cell moves to the most conductive part.  Halving this
-value changes the result of scene "slope" in tests/plateaus.py by 4.1e-04 (relative), doubling it by 5.0e-05, and finer
-cells by 3.4e-03.
+"""If layers are steeper than this slope against the grid, the pressure position of a cell moves to the more conductive
+end.  Halving this value changes the result of scene "slope" in tests/plateaus.py by 4.1e-04 (relative), doubling it by
+5.0e-05, and finer cells by 3.4e-03.
 """
 PAIRS = 2**16
 """Number of pairs of pieces that are processed together."""
@@ -99,11 +99,11 @@ class MixedCells:
     def _crossed(self, rows: slice, first, count, low, high) -> list[tuple[NDArray, NDArray, NDArray]]:
         """Return for each axis three arrays (line, crossed piece, weight), for lines through the pieces `rows`.
 
-        Weights are < 1 on borders.  `first`, `count` (m,): first piece, and number of pieces, in each piece's cell.
+        Weights are < 1 on borders of pieces.  `first`, `count` (m,): first piece and number of pieces in the cell.
         """
         line, piece = ranges(first[rows], count[rows])
         line += rows.start
-        # means of two shifted lines, because borders of pieces lie on a line only within rounding
+        # means of two shifted lines, because a line lies on the border of a piece only within rounding
         places = [self._x[line] + shift for shift in (-NEAR / 2, NEAR / 2)]
         inside = np.mean([(low[piece] <= x) & (x <= high[piece]) for x in places], axis=0)
         out = []
@@ -248,8 +248,8 @@ def graded(
 ) -> NDArray[np.float64]:
     """Return the mobility along each axis (n, d), divided by `mean`, for a mobility that varies gradually in a cell.
 
-    Pieces conduct in series along the mobility's gradient, and in parallel across it.  For other directions of the
-    gradient, the arithmetic minus the harmonic mean is distributed over the axes, in proportion to the variance that a
+    Pieces conduct in series along the mobility's gradient, and in parallel across it.  If the gradient is not along
+    an axis, the arithmetic minus the harmonic mean is distributed over the axes, in proportion to the variance that a
     linear variation along each axis explains.
 
     offset, kappa: positions (m, d) of the pieces relative to the midpoints of cells, m, and mobilities (m,), m^2/(Pa

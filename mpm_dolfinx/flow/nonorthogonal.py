@@ -11,8 +11,8 @@ in each cell, the corrected flux is (other symbols: see `storage`)
 At an open side, p - p_out is replaced by p - p_out + G . t.  Here t is the vector along the side, from the foot of the
 perpendicular through the centroid to the centre of the face.  The gradients are a least-squares fit to the pressures of
 neighbours and drained sides, and to zero flow across no-flow sides.  The area vector of a no-flow side is the one that
-closes the surface of the material in the cell.  Linear pressures are exact.  The gradients are limited: corrected
-pressures at faces stay between the pressures of the neighbours.
+closes the surface of the material in the cell.  The fit is exact for linear pressures.  Gradients are limited: the
+corrected pressures at faces stay between the pressures of the neighbours.
 """
 
 from __future__ import annotations
@@ -52,9 +52,9 @@ def nonorthogonal_facets(contents: CellContents, facets: NDArray[np.int32]) -> N
 
 
 class Gradients:
-    """Pressure gradients minus unit weight in cells that need the correction: centroids offset along a face or side.
+    """Pressure gradients minus unit weight, in cells with a centroid that is offset along a face or an open side.
 
-    The object is valid for one cut.  contents: material in the cells; sides: open sides of the bodies.
+    The object is valid for one cut of the domains.  contents: material in the cells; sides: open sides of the bodies.
     """
 
     def __init__(self, contents: CellContents, sides: OpenSides):
@@ -106,7 +106,7 @@ class Gradients:
 
     @cached_property
     def _units(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Gradients, 1/m, for a unit difference to one neighbour (n, 2 d, d), and to one side (m, d)."""
+        """Gradients, 1/m, for a unit pressure difference to one neighbour (n, 2 d, d), and to one side (m, d)."""
         known, d = self._known, self._separation.shape[2]
         at, sealed = self._at[known], self._sealed(self._contents, self._sides)[self.rows]
         size = np.linalg.norm(self._sides.area, axis=1)[self._faces[known]]
@@ -187,7 +187,7 @@ class NonorthogonalFlow(NamedTuple):
 
 
 def off_middle(sides: OpenSides, grid: Grid) -> NDArray[np.bool_]:
-    """Return for each face (m,) whether the faces of its condition in its cell have their mean off the centroid."""
+    """Return for each face (m,) whether its condition's faces in the cell are, on average, offset along the face."""
     faces, at = np.unique(sides.number * grid.num_local + sides.cells, return_inverse=True)
     size, off = np.sqrt(np.add.reduce(sides.area**2, axis=1)), _along(sides) / grid.sizes(sides.cells)
     mean = sum_by(at, (size[:, None] * off).T, len(faces)) / sum_by(at, size, len(faces))

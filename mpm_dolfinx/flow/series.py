@@ -4,7 +4,7 @@
 The soils between the pressure positions of two cells lie in series.  The pressures at the interfaces of soils are local
 unknowns of each face.  Newton's method finds these pressures from the continuity of the flux, and condensation
 eliminates them.  Each soil conducts like a pair of cells that contain only this soil (`fitted`).  Steady flow through
-layers of exponential soil is therefore exact at any offset from the grid.
+layers with exponential k_r is therefore exact for any position of the layers.
 
 Lines through a cell (see `layers`) conduct in parallel if they cross a single soil up to the face.  All lines that
 cross several soils are replaced by one line.  This line crosses the same soils in the same sequence, each over
@@ -66,7 +66,7 @@ class Through(NamedTuple):
     """Conductances of m faces between two pressures."""
 
     conductance: NDArray[np.float64]  # conductances (m,), m/(Pa s)
-    slopes: tuple[NDArray[np.float64], NDArray[np.float64]]  # derivatives of the flux with respect to p on both sides
+    slopes: tuple[NDArray[np.float64], NDArray[np.float64]]  # derivative of the flux by p[0], minus that by p[1]
 
 
 def none(count: int, laws: int, slots: int) -> Paths:
@@ -149,7 +149,7 @@ class _Chain:
         self._difference = self._hydrostatic[:, -1] - p[1]
 
     def solved(self) -> NDArray[np.float64]:
-        """Return (3, m): conductance between both ends, and flux derivatives with respect to both end pressures."""
+        """Return (3, m): the conductance between both ends, and the two slopes of `Through`."""
         links, difference = self._links, self._difference[:, None]
         inner = slice(1, -1)
         scale = np.full(self._hydrostatic.shape, np.inf)
@@ -233,7 +233,7 @@ class _Chain:
 
 
 def _series(first: NDArray[np.float64] | None, second: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return conductance and flux derivatives (3, m) of two segments in series; of one if `first` is None."""
+    """Return conductance and slopes (3, m) of two segments in series; those of `second` if `first` is None."""
     if first is None:
         return second
     (k, own, other), (after, owns, others) = first, second

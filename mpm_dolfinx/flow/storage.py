@@ -9,12 +9,12 @@
 (With div u instead of J_Delta, rotations would cause volume changes.)  r = exp(p / K_w) is the fluid density divided by
 the density rho_w at zero pressure.  In the storage term, r is taken at the pressure (p_n + p) / 2; on a face, r is the
 logarithmic mean over both cells.  Then r [p+ - p-] is the jump of the mass potential (`fluid_content`), and the mass
-that leaves a cell enters the neighbour.  The residual is this equation divided by the r of storage; the tangent
+that leaves a cell enters the neighbour.  The residual is the left side divided by the r of storage; the tangent
 neglects that r of a face differs from the r of storage.  A is the exact area of the body on the face, k the
 conductivity.  x+- are the centroids of the material in both cells, and d+- their distances from the face.  `layers`
 defines kappa and d of mixed cells.  Distances from centroids give an error of 0.2 % for any filling; half of the cell
 size as distance would give up to 12 %. `nonorthogonal` corrects faces between centroids that are offset along the face.
-The sum over all cells is the bodies' balance.  `fluid_content` defines the change of the content, and
+The sum over all cells is the fluid balance of the bodies.  `fluid_content` defines the change of the content, and
 `time_integration` the integral over a substep.
 
 The volumes of domains drift from their fluid content, for three reasons: corners do not follow u alone, points move to
@@ -23,12 +23,12 @@ next steps correct fractions of this defect (`defect`), at a constant rate over 
 
 If no fluid flows within a step, Q1 displacements with DG0 pressures violate the inf-sup condition: pressures that
 alternate from cell to cell have no effect.  Therefore jumps of the pressure increment of the step are stabilised by the
-term max(0, tau d - dt kappa / d) A [p - p_n].  Here tau is the strength, 1/Pa, d = d+ + d-, and dt, s, is the weight of
-the rate at p in the step.  This raises the coefficient dt kappa A / d of a face to tau d A if the coefficient is
-smaller.  The stabilisation is conservative, and vanishes in steady states.  For elastic soil, tau is a quarter of
-Silvester and Kechkar's patch value (Camargo, White and Borja 2021).  Soil in plastic flow needs a tau up to a hundred
-times larger.  The increase of tau acts on second differences only (`second_differences`), because damping of jumps
-would smear steep pressures.
+term max(0, tau d - dt kappa / d) A [p - p_n].  Here tau is the strength of the stabilisation, 1/Pa, and
+d = d+ + d-.  dt, s, is here the step times the coefficient of Q(u, p) in `time_integration`: 1 or gamma.  The term
+raises the coefficient dt kappa A / d of a face to tau d A if it is smaller.  It is conservative, and zero in steady
+states.  For elastic soil, tau is a quarter of Silvester and Kechkar's patch value (Camargo, White and Borja 2021).
+Soil in plastic flow needs a tau up to a hundred times larger.  The increase of tau acts on second differences only
+(`second_differences`), because damping of jumps would smear steep pressures.
 """
 
 from __future__ import annotations
@@ -100,8 +100,8 @@ class StorageForms:
     weight : (d,), N/m^3
         Unit weight of the pore fluid rho_w g, as UFL; None without gravity.
     symmetric
-        Whether to use alpha as the derivative of the content with respect to J_Delta: the Jacobian is symmetric.  The
-        neglected term is of the order of (p - p_n) / K_w, and Newton's method converges as fast as with it.
+        Whether to use alpha as the derivative of the content with respect to J_Delta.  The Jacobian is then symmetric.
+        The neglected term is of the order of (p - p_n) / K_w; Newton's method converges as fast as with this term.
     feeding
         Sources and open sides of all stages.
     inertial : (d,), N/m^3
@@ -172,13 +172,13 @@ class StorageForms:
         """Return derivatives of `change`: d/dp (filled cells,), m^d/Pa, and d/du with nodal displacements u.
 
         The derivatives d/du are one or two arrays (filled cells, n), m^(d-1).  The first, for the momentum
-        balance, differentiates alpha dJ_Delta; the second, if it differs, differentiates the content.
+        balance, differentiates alpha dJ_Delta; the second, if not `symmetric`, differentiates the content.
         """
         sums, count = self._derivatives(data), self.grid.dim * 2**self.grid.dim
         return [sums[:, 0], *[sums[:, start : start + count] for start in range(1, sums.shape[1], count)]]
 
     def drained(self, data: PointData) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return for filled cells (n,) the storage due to saturation, m^d/Pa, and integrals of S d(chi p)/dp, m^d."""
+        """Return for filled cells (n,) the storage due to saturation s, m^d/Pa, and int s d(chi p)/dp dV, m^d."""
         capacity, coupled = self._capacity(data).T
         return capacity, coupled
 
@@ -248,7 +248,7 @@ class StorageSystem:
         fluxes = forms.fluxes
         self.unknowns = own = Unknowns(forms.p, cells.astype(np.int64), forms.grid.midpoints)
         self.of_parts = OfParts(forms.grid.comm, parts.cells[own.owned], parts.count)
-        """Connected part of each unknown."""
+        """Connected part of the bodies to which each unknown belongs."""
         self.T, self.D, self.L = (matrix(own, own, 2 * d + 1) for _ in range(3))
         self.B = matrix(own, momentum, 2**d * d)
         self.B_momentum = self.B if forms.symmetric else matrix(own, momentum, 2**d * d)
@@ -257,7 +257,7 @@ class StorageSystem:
         self._facets = facets
         self._uniform = self._over_uniform() if fluxes.relative is None else None
         self.set_alternation()
-        _add_diagonal(self.L, np.zeros(own.size))  # even for a cell without faces
+        _add_diagonal(self.L, np.zeros(own.size))  # has entries even for a cell without faces
         pattern = self.L
         if forms.softens:
             grid, zeros = forms.grid, np.zeros((forms.grid.num_local, d, 2))
@@ -313,7 +313,7 @@ class StorageSystem:
             mobility = mobility * relative.at(contents.filled, p)[:, None]
             flow = replace(flow, relative=relative)
         self.assemble_fluxes()
-        total = _add_diagonal(self.T, np.zeros(self.unknowns.size))  # even for a cell without faces
+        total = _add_diagonal(self.T, np.zeros(self.unknowns.size))  # entries even for cells without faces
         nonorthogonal = None
         if off is not None:
             facets, gradients, sides = off
@@ -363,11 +363,11 @@ class StorageProblem:
     flow
         Function that assembles the outflow at (u, p); its argument tells whether a substep starts.
     dt
-        Weight of the rate at (u, p), s.
+        Time weight of the rate at (u, p), s.
     before
         Outflow volumes from the rate of the previous substep.
     softness : (m,)
-        Softness of the pieces, see `SoftnessAtPoints`, if a law may yield.
+        Softness of the pieces, see `SoftnessAtPoints`; one if no law can yield.
     defect : (n,), m^d
         Part of the volume defect in the active owned cells that is corrected by the end of the substep.
     inertial
@@ -452,7 +452,7 @@ class StorageProblem:
         return {name: values for one, at in both for name, values in one.outflows(at, fluid).items()}
 
     def run_off(self) -> dict[str, NDArray[np.float64]]:
-        """Return the rain that does not infiltrate, m^d/s, by name of the condition."""
+        """Return the run-off, m^d/s, by name of the condition."""
         fluid, both = self._fluid, zip(self._feeds, self._flow(False).at, strict=True)
         return {name: values for one, at in both for name, values in one.run_off(at, fluid).items()}
 
@@ -477,11 +477,11 @@ class StorageProblem:
 
     @property
     def fill(self) -> NDArray[np.float64]:
-        """Volume fraction of material in each cell, by which the cell's pressure is weighted."""
+        """Volume fraction of material in each cell, by which errors and changes of its pressure are weighted."""
         return self._contents.fill
 
     def sealed(self, volumes: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the undrained pressure rise of cells at fixed stress, Pa, for volumes that the cells lost, m^d."""
+        """Return the pressure rise (n,), Pa, if cells at fixed stress kept the fluid volumes, m^d, that they lost."""
         return volumes / (self.forms.derivatives(self.data)[0] + self._contents.fixed_stress)
 
     def filling(self, error: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -545,7 +545,7 @@ class StorageProblem:
         """Return a function from changes of displacements (a vector), m, to changes of outflow volumes (n,), m^d.
 
         The function uses a matrix-free finite difference (Knoll and Keyes 2004) of the conductivity laws and of the
-        geometry of the fluxes.  `set_fluxes` resets the fluxes to u.  `dofs` are the active degrees of freedom of u.
+        geometry of the fluxes.  Then `set_fluxes` resets the fluxes to u.  `dofs` are the active dofs of u.
         """
         h = self.forms.grid.least
         base, density = self._rates(self._flow(False)).cells, self._density
@@ -662,7 +662,7 @@ class StorageProblem:
         share
             Weight of the filter L, in [0, 1]; 0 gives the fixed-stress operator.  With the stiffness K, B K^-1 B^T
             equals beta V for a smooth pressure, and zero for a checkerboard.  It equals beta V / 2 (at nu = 0) for a
-            pressure that alternates along one axis.  beta V - L equals the same values, with L = sum over faces of
+            pressure that alternates along one axis.  beta V - L gives the same values, with L = sum over faces of
             min(beta V+, beta V-) / (4 d) [p][q].
         """
         system = self.system

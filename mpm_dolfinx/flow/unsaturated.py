@@ -3,7 +3,7 @@
 
 The relative conductivity k_r of a face is the mean of k_r over all pressures between the values on both sides
 (`retention.Conductance`).  With the value of the wetter side, a wetting front would move too fast.  With gravity the
-mean is modified (`fitted`), so that steady flow through exponential soil is exact.  See `series` for mixed cells.
+mean is modified (`fitted`), so that steady flow with exponential k_r is exact.  See `series` for mixed cells.
 """
 
 from __future__ import annotations

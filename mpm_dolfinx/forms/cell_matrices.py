@@ -79,7 +79,7 @@ def insert_rows(A: PETSc.Mat, grid: Grid, cells: NDArray[np.int32], rows: NDArra
 
 
 def _entries(count: int, symmetric: bool) -> tuple[NDArray, NDArray, NDArray]:
-    """Return row and column of each stored entry of a matrix, and the index of the stored entry of each entry."""
+    """Return row and column of each stored entry of a matrix; and for each entry the index of its stored value."""
     rows, columns = np.triu_indices(count) if symmetric else np.divmod(np.arange(count**2), count)
     place = np.empty((count, count), dtype=np.int64)
     if symmetric:
@@ -104,9 +104,9 @@ class ElementForces:
 
 
 class Beside(NamedTuple):
-    """Further integrals over each cell, computed together with an element matrix A, because kernels share terms."""
+    """Further integrals over each cell, computed together with an element matrix, because kernels share terms."""
 
-    # UFL tensors T[i, k] (d, d), contracted like A: with grad v, or with grad v F, for each nodal displacement
+    # UFL tensors T[i, k] (d, d), contracted like the tangent A: with grad v, or grad v F, for each dof of v
     along: Sequence[ufl.core.expr.Expr] = ()
     scalars: Sequence[ufl.core.expr.Expr] = ()  # UFL scalars
 

@@ -4,7 +4,7 @@
 A multilinear function on a box is a polynomial of degree d.  Its Taylor series about the midpoint of the cell ends
 after d terms.  With the offset xi = x_p - x_mid of a point p from the midpoint,
 
-    v(x_p) = v + grad v . xi + 1/2 xi . grad grad v . xi + ...,   with the right side at the midpoint.
+    v(x_p) = v + grad v . xi + 1/2 xi . grad grad v . xi + ...,   right side evaluated at the midpoint.
 
 The right side is plain UFL, integrated by the one-point rule.  The offset xi and all other data of a point are DG0
 coefficients.  Each entry in the list of cells of the integral has separate values of these coefficients.
@@ -35,9 +35,9 @@ from mpm_dolfinx.forms.axes import block
 from mpm_dolfinx.grid.grid import Grid, in_chunks
 
 BATCH, MANY = 2**10, 2**12
-"""Numbers of points: in a batch of element matrices, which fits into the cache, and in one call of an expression.
+"""Numbers of points in a batch of element matrices, which fits into the cache, and in one call of an expression.
 
-An expression always evaluates a whole list of cells, of either length.  The last few points use the shorter list.
+An expression always evaluates a whole list of `MANY` or `BATCH` cells.  The last few points use the shorter list.
 """
 
 
@@ -107,7 +107,7 @@ class FormPoints:
     def gradient(self, u: fem.Function) -> fem.Function:
         """Return grad u at the points as a coefficient, for a Q1 vector function u; numpy evaluates it.
 
-        UFL derivatives with respect to u do not see this dependence.  All forms at the same u share the values.  UFL
+        UFL derivatives with respect to u omit this dependence.  All forms at the same u share the values.  UFL
         would otherwise expand u as a Taylor polynomial about the cell's midpoint, with many terms in 3D.  With the
         coefficient, a kernel of Hencky's law takes at most half of the time to run, and a fifth of the time to compile.
         """
@@ -167,7 +167,7 @@ class Places(Keyed):
     x : (n, d), m
         Positions of the points.
     mixed : (n, d), m^2
-        In 3D: mean products of the offsets in a piece about its centroid, see `Pieces`; None for points (zero).
+        In 3D: mean products of the offsets in a piece about its centroid, see `Pieces`; None: zero, for points.
     hoop : (n, 4)
         In axisymmetry: moments of the pieces in the plane, see `Pieces`; None for points.
     """
@@ -320,7 +320,7 @@ class PointData(Keyed):
 
 
 Packed = tuple[NDArray[np.float64], list[tuple[slice, NDArray[np.float64], NDArray[np.intp]]]]
-"""Rows of coefficients; and for each grid function among these the columns, the values, and the dofs of each row."""
+"""Coefficients, one row per point; and for each grid function among them its columns, its values, the rows' dofs."""
 
 
 class Rows:
@@ -435,7 +435,7 @@ class FacetForm:
         return "compiled" in vars(self)
 
     def on(self, facets: NDArray[np.int32]) -> FacetSum:
-        """Return the form over these facets of this process; all processes must call this, because it may compile."""
+        """Return the form over these facets of this process; all processes must call this; it may compile the form."""
         make = partial(FacetSum, self, facets)
         return self._last(facets, lambda: make(self._comm.allreduce(len(facets)) > 0), self._comm)
 

@@ -21,7 +21,7 @@ from mpm_dolfinx.base import _compat
 class Unknowns:
     """Numbering of a subset of the degrees of freedom of a function's space.
 
-    function: any function of the space; its ghosts are used.  dofs: unrolled local degrees of freedom that are
+    function: any function of the space, with ghosts.  dofs: unrolled local degrees of freedom that are
     unknowns, ghosts included; x (entities, d), m: positions of the nodes or cells of this process.  If x is None,
     the space computes all positions at each request.
     """

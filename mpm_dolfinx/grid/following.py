@@ -26,7 +26,7 @@ def check_follow(follow: Any, lines: Sequence[ArrayLike] | None) -> None:
     """Raise ValueError for an object that lines cannot follow, and for a grid without lines."""
     if hasattr(follow, "pose"):
         if lines is not None and all(map(equal, checked(lines))):
-            raise ValueError(f"grid: follow = {line(follow)}: equal cells, must be smaller around the tool")
+            raise ValueError(f"grid: follow = {line(follow)}: all cells are equal, must be smaller around the tool")
     elif callable(follow):
         check_names("grid: follow", follow, PLACES)
     else:
@@ -60,8 +60,8 @@ def lines_at(
 def carried(lines: Sequence[NDArray[np.float64]], shift: NDArray[np.float64]) -> list[NDArray[np.float64]]:
     """Return lines (n,), m, along each axis, after a displacement `shift` (d,), m, of the smallest cells.
 
-    Edge lengths between the smallest cells and a side are multiplied by powers 1, 2 ... of a common factor, counted
-    from the smallest cells.  Cells therefore still grow with the distance from the smallest ones, but faster or slower.
+    Between the smallest cells and a side, the edge of the k-th cell is multiplied by the k-th power of a common factor;
+    k = 1 next to the smallest cells.  Cells therefore still grow with this distance, but faster or slower.
 
     Raises
     ------

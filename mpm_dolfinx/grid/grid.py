@@ -4,7 +4,7 @@
 In grids of equal cells, points are located by arithmetic, in other grids by a search along each axis.  Methods such as
 `sizes` and `volumes` return cell sizes.  For equal cells they return a single row (`h`) or a single number.
 
-The mesh is created at its first use.  By then a simulation has distributed the cells by the number of points in them.
+The mesh is created at its first use.  Before, a simulation distributes the cells by their numbers of points.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ REACH = 1e-4  # distance, in cell sizes, by which bodies may lie outside the gri
 TURN = 2 * np.pi
 """Angle of a whole revolution, for axisymmetric volumes, forces and outflows.  Source: definition."""
 CHUNK = 2**14
-"""Number of rows that are processed together, which limits the size of temporary arrays."""
+"""Number of rows of an array that are processed together.  It limits the size of temporary arrays."""
 SNAP = 1e-10
-"""Distance to a grid plane, in cell sizes, below which a vertex is on the plane, unless rounding errors are larger."""
+"""Vertices nearer to a grid plane than this, in cell sizes, count as on it; `Grid.snap` allows for rounding errors."""
 ORDER = "the order is Grid(lower, upper, cells)"
 MANY = "grid: h is undefined for unequal cells, must be replaced by sizes"
 
@@ -59,7 +59,7 @@ def _faces(dim: int) -> NDArray[np.int64]:
 FACES = {d: _faces(d) for d in (2, 3)}
 """Indices (2d, 2^(d-1)) of the corners of the faces of a box: of a cell, or of a particle domain."""
 FACE_SIGNS = (-1, 1, 1, -1, -1, 1)
-"""Orientation (6,) of the faces with corners in the order of `FACES`: 1 outward, -1 inward; the first four in 2D."""
+"""Orientation (6,) of faces with corners in the order of `FACES`: 1 outward, -1 inward.  In 2D, the first four hold."""
 ABOUT_MIDDLE = ((0, 1, 4), (1, 3, 4), (3, 2, 4), (2, 0, 4))
 """Triangles of a face in 3D: two corners and the middle, without a preferred diagonal."""
 
@@ -77,7 +77,7 @@ def in_chunks(count: int) -> list[slice]:
 
 
 def sum_by(index: NDArray, values: NDArray[np.float64], size: int) -> NDArray[np.float64]:
-    """Return the sums (..., size) of values (..., n) of equal index (n,), as floats (`np.bincount` may return ints)."""
+    """Return the sums (..., size) of values (..., n) with equal index (n,), as floats also if there are no values."""
     shape = values.shape[:-1]
     if shape and len(index) > CHUNK:  # the index of all rows together would take as much memory as the values
         return np.array([sum_by(index, row, size) for row in values])
@@ -93,7 +93,7 @@ def polynomial(
     """Return the values (d, m) of a multilinear vector field at offsets y (d, m), m, from the midpoints of cells.
 
     `coefficients` (d, k, cells) are factors of the monomials, in the order of `Grid.monomials`.  `slot` (m,) is the
-    index of the cell of each value.  without: an axis along which the field is constant.
+    index of the cell of each value.  The field is constant along the axis `without`.
     """
     rows = [row for row in range(2 ** len(y)) if without is None or not row >> without & 1]
     total = np.zeros(y.shape)
@@ -107,13 +107,13 @@ def polynomial(
 
 
 def ranges(first: NDArray[np.int64], count: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return each integer's range (n,) and value (n,), for m ranges that begin at `first` and have `count` integers."""
+    """Return the integers in m ranges with these first integers and counts: indices (n,) of ranges, and values (n,)."""
     of = np.arange(len(count)).repeat(count)
     return of, np.arange(len(of)) + np.repeat(first - (np.cumsum(count) - count), count)
 
 
 def among(numbers: NDArray[np.integer], chosen: NDArray[np.integer]) -> NDArray[np.bool_]:
-    """Return which numbers (...) occur in sorted `chosen` (m,), without the large tables of numpy's `isin`."""
+    """Return which numbers (...) occur in the sorted array `chosen` (m,), with less memory than numpy's `isin`."""
     if not len(chosen):
         return np.zeros(numbers.shape, dtype=bool)
     return chosen[np.minimum(chosen.searchsorted(numbers), len(chosen) - 1)] == numbers
@@ -191,10 +191,10 @@ class Cells:
         self.at = CellPlaces(node_x, midpoints, None if grid.even else grid.sizes_of(self.cell_number))
         self._index = [grid.nodes_along(x[:, :d]) for x in (node_x, mesh.geometry.x)] if grid.follow is not None else []
         index = np.array(np.unravel_index(self.cell_number % grid.cells, tuple(grid.shape)))
-        self._low = index.min(axis=1, initial=np.iinfo(np.int64).max)
-        self._beyond = index.max(axis=1, initial=-1) + 1
-        self._locals = np.full((grid.copies, *np.maximum(self._beyond - self._low, 0)), -1, dtype=np.int32)
-        self._locals[(self.cell_number // grid.cells, *(index - self._low[:, None]))] = np.arange(self.num_local)
+        low = index.min(axis=1, keepdims=True) if self.num_local else np.zeros((d, 1), dtype=np.int64)
+        locals = np.full((grid.copies, *(index - low + 1).max(axis=1, initial=0)), -1, dtype=np.int32)
+        locals[(self.cell_number // grid.cells, *(index - low))] = np.arange(self.num_local)
+        self._window = low, locals
         topology = mesh.topology
         topology.create_connectivity(d, d - 1)
         topology.create_connectivity(d - 1, d)
@@ -214,14 +214,15 @@ class Cells:
 
     def local(self, grid: Grid, number: NDArray[np.int64]) -> NDArray[np.int32]:
         """Return the local index of the cells with lexicographic indices `number`; -1 for cells of other processes."""
-        if self._locals.size == grid.copies * grid.cells:
-            return self._locals.ravel()[number]
-        copy, number = np.divmod(number, grid.cells)
-        index = np.array(np.unravel_index(number, tuple(grid.shape)))
-        out, ends = np.full(number.shape, -1, dtype=np.int32), (len(index), *[1] * number.ndim)
-        near = ((index >= self._low.reshape(ends)) & (index < self._beyond.reshape(ends))).all(axis=0)
-        out[near] = self._locals[(copy[near], *(index[:, near] - self._low[:, None]))]
-        return out
+        low, locals = self._window  # local indices, or -1, of all cells of each copy from index `low` (d, 1) on
+        if locals.size == grid.all_cells:
+            return locals.ravel()[number]
+        copy, cell = np.divmod(np.ravel(number), grid.cells)
+        index = np.array(np.unravel_index(cell, tuple(grid.shape))) - low
+        out = np.full(len(cell), -1, dtype=np.int32)
+        inside = ((index >= 0) & (index < np.array(locals.shape[1:])[:, None])).all(axis=0)
+        out[inside] = locals[(copy[inside], *index[:, inside])]
+        return out.reshape(np.shape(number))
 
     @cached_property
     def edges(self) -> fem.Function:
@@ -247,7 +248,7 @@ def of_cells(name: str) -> cached_property:
 
 
 def of_places(name: str) -> property:
-    """Return a property of a grid that is a current position in its `Cells`."""
+    """Return a property of a grid: current positions of nodes or of midpoints of cells, kept in `at` of its `Cells`."""
     return property(lambda grid: getattr((grid._cells or grid._of_process).at, name))
 
 
@@ -308,7 +309,7 @@ class Grid:
     least, most : m
         Shortest and longest edge of all cells.
     snap
-        Distance to a grid plane along each axis (d,), in cell sizes, below which a vertex lies on the plane.
+        Distances (d,) along the axes, in cell sizes: vertices nearer to a grid plane count as on the plane.
     base : (d,), m
         Origin of all internal positions: the lower corner, with a radius of 0 in axisymmetry.  This origin preserves
         digits of positions far from the true origin.
@@ -388,7 +389,7 @@ class Grid:
     def move(self, lines: Sequence[NDArray[np.float64]]) -> None:
         """Move the lines of a grid with `follow` to new coordinates (n,), m, along each axis, relative to the base.
 
-        Afterwards nodes, cells and the mesh have the same digits as in a new grid with these lines.
+        Afterwards all coordinates of nodes, cells and mesh are exactly as in a new grid with these lines.
         """
         if any((new != old).any() for new, old in zip(lines, self.lines, strict=True)):
             self._spacing = self._spaced(tuple(lines))
@@ -677,8 +678,8 @@ class Grid:
     ) -> NDArray[np.float64]:
         """Return the gradients (n, 2^d, d), 1/m, of the Q1 shape functions of local cells at points x.
 
-        `mixed` (n, 3), m^2, in 3D, are mean products of offsets in subdomains about these points.  With them, gradients
-        are means over the subdomains.
+        `mixed` (n, 3), m^2, in 3D: means of the products of two offsets from a point, over a subdomain about the point.
+        With `mixed`, gradients are means over the subdomains.
         """
         hats, h = self._hats(cells, x), self.sizes(cells).T[..., None] if not self.even else self.h
         dN = np.empty((*hats[0].shape, self.dim))
@@ -702,7 +703,7 @@ class Grid:
         return np.where(bits, self.signs / (self.h if self.even else 1.0), 0.5).prod(axis=2)
 
     def over_edges(self, coefficients: NDArray[np.float64], cells: NDArray[np.int32]) -> NDArray[np.float64]:
-        """Convert coefficients (d, 2^d, cells) of `monomials` to offsets in m; for equal cells they are unchanged."""
+        """Convert coefficients (d, 2^d, cells) of `monomials` for offsets in m; for equal cells they are unchanged."""
         if self.even:
             return coefficients
         bits = corner_bits(self.dim)[:, None]

@@ -51,7 +51,7 @@ def graded(
     ratio: float = 1.1,
     largest: float = np.inf,
 ) -> list[NDArray[np.float64]]:
-    """Return grid lines with small cells in fine boxes.  Cells outside the boxes grow with the distance.
+    """Return grid lines with small cells in fine boxes.  Cells outside the boxes grow with the distance from them.
 
     Lines cross the whole grid, so cells in the rows and columns of a fine box are as narrow as the cells in the box.
 
@@ -131,9 +131,9 @@ def _along(
 
 
 def _growing(gap: float, size: float, ratio: float, largest: float) -> NDArray[np.float64]:
-    """Return edge lengths (n,), m, that fill a gap, m, and grow from `size` by a common factor, if possible <= `ratio`.
+    """Return edge lengths (n,), m, that fill a gap, m, and grow from `size` by a common factor.
 
-    Two counts of edges are tried; the count whose growth factor is nearer to 1 is used.
+    The factor is at most `ratio` if possible.  Of two numbers of edges, the one with a factor nearer to 1 is used.
     """
     if gap <= 0:
         return np.empty(0)

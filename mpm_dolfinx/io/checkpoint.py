@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Checkpoints: files from which an interrupted run is resumed, on any number of processes.
 
-A checkpoint is a numpy archive of the state between two steps (`State`).  A description in it identifies the scene.
+A checkpoint is a numpy archive of the state between two steps (`State`), with a description that identifies the scene.
 """
 
 from __future__ import annotations
@@ -280,8 +280,8 @@ def _nested(arrays: dict[str, NDArray]) -> dict[str, Any]:
 def _points(arrays: dict[str, NDArray], like: MaterialPoints, ids: NDArray[np.int64], total: int) -> MaterialPoints:
     """Return the material points with the given ids from the stored arrays.
 
-    Raise ValueError if names, shapes or ids do not match `like`.  Renewed points replace some seeded points;
-    their ids are at least `total`, the number of seeded points.
+    Raise ValueError if names or shapes do not match `like`, or ids do not match `ids`.  Renewed points replace some
+    seeded points; their ids are at least `total`, the number of seeded points.
     """
     data = _part(arrays, "data/")
     if PARENT in data:
@@ -355,7 +355,7 @@ def _check_trend(trend: Trend, points: MaterialPoints, wet: bool) -> None:
     right = k in (1, 2, 3) and trend.lengths.shape == (k,) and trend.rates.shape == (n, k, d * (1 + d) + wet)
     numbers_only = all(v.dtype == np.float64 and np.isfinite(v).all() for v in vars(trend).values())
     if not (right and numbers_only and (trend.lengths > 0).all()):
-        raise ValueError("trend: does not fit the points, is not finite, or has a step without length")
+        raise ValueError("trend: does not fit the points, is not finite, or has a step of length zero")
 
 
 def _check_pieces(arrays: dict[str, NDArray], ids: NDArray[np.int64], dim: int) -> None:

@@ -24,9 +24,9 @@ def one_file(folder: str | os.PathLike) -> Path:
 
     ParaView, VTK and meshio's `xdmf.TimeSeriesReader` read these files.  dolfinx reads the particle domains of one
     output time as a mesh, the third for example with `XDMFFile.read_mesh(name="2", xpath="/Xdmf/Domain/Grid")`.  Each
-    output time has separate domains, so bodies may be excavated and placed in between.  `<Information>` in points.xdmf
-    describes the fields and their units.  The files of the `Writer` are kept.  A call during a run writes the output
-    times so far; call the function again at the end.
+    output time has separate domains, so bodies may be added or removed between two times.  `<Information>` in
+    points.xdmf describes the fields and their units.  The files of the `Writer` remain.  A call during a run writes the
+    output times so far; call the function again at the end.
 
     Parameters
     ----------

@@ -27,8 +27,8 @@ def plot(simulation: Simulation, field: str = "pressure", ax=None, *, bar: bool 
         A scene in plane strain or axisymmetry.
     field
         "pressure", "displacement" (its magnitude), "displacement_x", "stress_xx", "effective_stress_xy",
-        "mean_effective_stress", "deviatoric_stress", "porosity", "J", of unsaturated soil "saturation" and "suction",
-        and any other scalar in `points.pvd` and `points.data`.
+        "mean_effective_stress", "deviatoric_stress", "porosity", "J", in unsaturated soil "saturation" and "suction",
+        or any other scalar in `points.pvd` and `points.data`.
     ax
         Axes for the picture; by default new axes.
     bar

@@ -330,7 +330,7 @@ def replacing(file: Path) -> Iterator[Path]:
 
 @contextmanager
 def _ours(file: Path) -> Iterator[None]:
-    """Context manager for reading a file: errors become a ValueError that no `Writer` wrote the file."""
+    """Context manager for reading a file: errors become a ValueError with the text that no `Writer` wrote the file."""
     try:
         yield
     except (ElementTree.ParseError, KeyError, TypeError, ValueError) as error:

@@ -10,8 +10,8 @@ elastic volume strain e_v and deviatoric strain e (tension positive), P = -tr(ta
 and flow is associated.  M is the slope of the critical state line, and P_c the size of the yield surface.  P_0 is the
 pressure at F = I, and e_v^p the plastic volume strain.  P and P_c follow the bilogarithmic law: ln v (v: specific
 volume) is linear in ln P, with the slope lambda in first loading, kappa in unloading.  The stress at the end of a step
-follows implicitly from the trial stresses P_t and Q_t, and from P_c,n at the start.  The plastic compaction is kappa a.
-The plastic multiplier dgamma defines h by 6G dgamma / M^2 = exp(h) - 1.  With w = (Q_t / (M P_t))^2,
+follows implicitly from the trial stresses P_t and Q_t, and from P_c,n at the start.  Let kappa a be the plastic
+compaction, and let h follow from the plastic multiplier: 6G dgamma / M^2 = exp(h) - 1.  With w = (Q_t / (M P_t))^2,
 
     P = P_t exp(-a),   Q = Q_t exp(-h),   P_c = P_c,n exp(rho a),   rho = kappa / (lambda - kappa),
     (6G kappa / M^2) a = (exp(h) - 1) (2P - P_c).
@@ -20,8 +20,8 @@ The local unknown is d = 2 (h - a).  The stress ratio at the end follows from d,
 yield surface a = (ln(P_t / P_c,n) + ln(1 + w exp(-d))) / (1 + rho).  The equation for d is smooth and monotone, even at
 isotropic stresses and at the critical state (a = 0).
 
-If M^2 P_c > 6G (lambda - kappa), soil on the dry side softens faster than it unloads.  Then the stress jumps, or the
-equation has no solution and the time step is reduced.
+If M^2 P_c > 6G (lambda - kappa), soil on the dry side of the critical state softens faster than it unloads elastically.
+Then the stress jumps, or the equation has no solution and the time step is reduced.
 """
 
 from __future__ import annotations

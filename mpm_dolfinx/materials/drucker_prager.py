@@ -130,12 +130,12 @@ def metric(trial: Trial, to: dict, bulk, plastic):
 
 
 def returned(trial: Trial, bulk, shear, eta, xi, eta_flow, cohesion, hardening, hardened, drag=0.0) -> dict:
-    """Return the stress and the hardening after the return to the yield surface; drag: viscosity over time step, Pa.
+    """Return the stress and the hardening after the return to the yield surface; drag: viscosity / time step, Pa.
 
     Returns
     -------
-    p: mean stress, Pa, > 0 in tension; ratio: deviatoric stress over its trial value; yields: whether the trial stress
-    is outside the yield surface; apex: 1 for return to the apex, else 0; hardened: increment of the hardening variable.
+    p: mean stress, Pa, > 0 in tension; ratio: factor from the trial to the final deviatoric stress; yields: whether the
+    trial stress is outside the yield surface; apex: 1 for return to the apex, else 0; hardened: increment of hardening.
     """
     p = bulk * trial.volumetric
     q = shear * ufl.sqrt(2 * ufl.inner(trial.deviatoric, trial.deviatoric) + LEAST)  # sqrt(J_2)

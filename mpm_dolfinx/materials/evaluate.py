@@ -146,7 +146,7 @@ class LawAtPoints:
             return PointExpression(ufl.as_vector(parts), self.points), {name: shapes[name] for name in new}
 
     def new_state(self, data: PointData, dt: float) -> list[tuple[str, NDArray[np.float64]]]:
-        """Return name and values (n, ...) of each updated state variable; data: with F after a step of dt, s."""
+        """Return name and values (n, ...) of each updated state variable; data have F after a step of dt, s."""
         if self.law.update is None:
             return []
         expression, shapes = self._update
@@ -201,7 +201,7 @@ def by_scene(
 
 
 def mean_size(grid: Grid) -> float:
-    """Return the edge length, m, of a square or cube with the volume of a cell, on uneven grids of the largest cell."""
+    """Return the edge length, m, of a square or cube with the volume of a cell; if cells differ, of the largest one."""
     h = grid.h if grid.even else [w.max() for w in grid.widths]
     return float(np.prod(h) ** (1 / grid.dim))
 
@@ -216,16 +216,16 @@ finer cells by 3.0e-02.
 class SoftnessAtPoints:
     """Softness of yielding points: ratio of elastic to tangent shear modulus along the strain of the last step.
 
-    Volume strains that alternate from cell to cell grow with the strain.  Such a volume strain causes a pressure:
-    the strain divided by the damping coefficient tau, 1/Pa.  In plastic flow the strain grows at constant stress.  tau
-    must then grow with the softness, else the alternating pressures reach the soil's strength.
+    Volume strains that alternate from cell to cell grow with the strain.  They cause alternating pressures, equal to
+    the volume strain divided by the damping coefficient tau, 1/Pa.  In plastic flow the strain grows at constant
+    stress.  tau must then grow with the softness, else the alternating pressures reach the soil's strength.
 
     The strain of a step is e = dev sym dF F^-1.  With the Kirchhoff stress T(s) at F - (1 - s) dF, the tangent shear
     modulus is G_t = (dT/ds) : e / (2 e : e) at s = 1.  The softness of the previous step is used.  A value from the
     current iterate would prevent convergence of Newton's method, or make the result depend on the iterates.
 
-    At rest the strain is rounding, and its direction is random.  G_t is therefore a weighted mean: the modulus of the
-    step has the weight e : e, the modulus before the step the weight `NEAR`^4.  A step at rest thus changes nothing.
+    At rest the strain is a rounding error, of random direction.  G_t is therefore a weighted mean: the modulus of the
+    step has the weight e : e, the old modulus the weight `NEAR`^4.  A step at rest thus does not change the softness.
 
     grid, law, shapes, stretches: see `LawAtPoints`.
     """
@@ -250,7 +250,7 @@ class SoftnessAtPoints:
         self._along = PointExpression(ufl.as_vector([ufl.inner(e, e), ufl.inner(ufl.diff(tau, s), e)]), points)
 
     def __call__(self, at: PointData, dF: NDArray, shear: NDArray, dt: float, before: NDArray) -> NDArray[np.float64]:
-        """Return the softness (n,), in [1, `MOST`], of the points `at`, data with F, parameters and state.
+        """Return the softness (n,), in [1, `MOST`], of points whose data `at` contain F, parameters and state.
 
         dF (n, d, d): change of F in a step of dt, s; shear (n,): elastic shear modulus, Pa; before (n,): old softness.
         """
@@ -275,7 +275,7 @@ class ConductivityAtPieces:
     laws
         Distinct conductivity laws of the materials.
     pieces
-        Integration points of the pieces; with any law they have the fields F, position, conductivity and porosity0.
+        Integration points of the pieces; if there is a law, with the fields F, position, conductivity and porosity0.
     displacement
         Increment of the displacement since the start of the step.
     pressure

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Materials of a scene at its material points.  Parameters may depend on position, and laws may differ."""
+"""Materials of a scene at its material points.  Parameters may depend on position, and materials may differ in law."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ RESERVED = frozenset(
 """Reserved names of quadrature point data, not available for parameters and state."""
 WHAT_IS_NAMED = "parameters, state and unknowns"
 EVOLVED = 1e-3
-"""Change of a state variable from its initial value above which the soil at a point has yielded.  Halving this value
+"""Soil has yielded if a state variable differs from its initial value by more than this number.  Halving this value
 changes the result of scene "soil" in tests/plateaus.py by 6.6e-05 (relative), doubling it by 1.4e-04, and finer cells
 by 3.0e-02.
 """
@@ -192,7 +192,7 @@ class SceneMaterials:
             raise ValueError(f"{law.__name__}: has {has}, must have one of the two if it has unknowns, else none")
         own, others = (*constants_of(m), *law.state), {*constants_of(m), *law.state, *BY_SCENE, "F", "trial"}
         if clashes := [name for name in own if name in BY_SCENE] + [name for name in law.unknowns if name in others]:
-            raise ValueError(f"{law.__name__}: the name {clashes[0]!r} is taken; {WHAT_IS_NAMED} must have another")
+            raise ValueError(f"{law.__name__}: the name {clashes[0]!r} is taken; {WHAT_IS_NAMED} must have others")
         for name, value in law.unknowns.items():
             _known(f"{law.__name__}: unknown {name!r}", value)
         if self.fluid is None and m.retention is not None:
@@ -215,7 +215,7 @@ class SceneMaterials:
 
     def _set_shape(self, law, name: str, shape: tuple[int, ...]) -> None:
         if name in RESERVED or hasattr(FormPoints(self.grid), name):
-            raise ValueError(f"{law.__name__}: the name {name!r} is taken; {WHAT_IS_NAMED} must have another")
+            raise ValueError(f"{law.__name__}: the name {name!r} is taken; {WHAT_IS_NAMED} must have others")
         other = self.shapes.setdefault(name, shape)
         if other != shape:
             raise ValueError(f"{law.__name__}: {name} has shape {shape}, in another law {other}; must be equal")
@@ -279,7 +279,7 @@ class SceneMaterials:
     def saturation(
         self, points: MaterialPoints, p: NDArray[np.float64], of: NDArray[np.int64] | slice = slice(None)
     ) -> tuple[NDArray[np.float64], ...]:
-        """Return S, dS/dp (1/Pa), chi and k_r at pressures p (m,), Pa; of (m,): indices of points, by default all."""
+        """Return saturation, dS/dp (1/Pa), Bishop's chi and relative permeability at p (m,), Pa, of the points `of`."""
         return self.saturations(self.retention_rows(points)[of], p)
 
     @cached_property
@@ -294,7 +294,7 @@ class SceneMaterials:
         return SaturationAt(self.grid, self.retentions)
 
     def saturations(self, rows: NDArray[np.float64], p: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
-        """Return S, dS/dp (1/Pa), chi and k_r at pressures p (m,), Pa; rows (m, width): field `retention` there."""
+        """Return the results of `saturation` at pressures p (m,), Pa; rows (m, width): the field `retention`."""
         return self._saturation(rows, p)
 
     def retention_scale(self, points: MaterialPoints) -> NDArray[np.float64]:
@@ -303,7 +303,7 @@ class SceneMaterials:
         return np.array(scales)[points.material]
 
     def pore_stress(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the pressure alpha chi p (n,), Pa, that is subtracted from the effective stress at the points."""
+        """Return alpha chi p (n,), Pa, at the points: the total stress is the effective stress minus this pressure."""
         pressure = self.table(points, lambda m: m.biot) * points.pressure
         return pressure if self.retentions is None else pressure * self.saturation(points, points.pressure)[2]
 
@@ -352,7 +352,7 @@ class SceneMaterials:
         return replace(points, data=data)
 
     def _at(self, points: MaterialPoints, i: int, rows: NDArray[np.int64]) -> Skeleton:
-        """Return a material with its constants as arrays over points `rows`; a uniform material is returned as is."""
+        """Return a material with its constants as arrays over points `rows`; a uniform material is not changed."""
         if not self._fields[i]:
             return self.materials[i]
         values = {name: points.data[name][rows] for name in self._fields[i]}

@@ -24,7 +24,7 @@ from mpm_dolfinx.materials.trial import PLANE, SPACE
 from mpm_dolfinx.parallel.exchange import Exchange, first, over_all
 from mpm_dolfinx.points.material_points import MaterialPoints, unstretched
 
-EXACT, CLOSE = 1e-13, SAME  # stress error over largest initial stress: to end Newton's method, to accept a result
+EXACT, CLOSE = 1e-13, SAME  # errors relative to the largest initial stress, to end Newton's method, to accept a result
 MOST = 30  # largest number of Newton iterations
 LARGEST = 0.2  # limit to the change of a strain component in one iteration
 
@@ -33,10 +33,10 @@ LARGEST = 0.2  # limit to the change of a strain component in one iteration
 class K0:
     """Initial effective stress of soil under its own weight, with the coefficient K0 of earth pressure at rest.
 
-    The vertical stress is the overburden of soil and fluid plus the surcharge, minus biot times the pore pressure
-    (times chi in unsaturated soil).  The horizontal stresses (radial and circumferential in axisymmetry) are K0 times
-    the vertical stress.  These stresses are exact for level ground with level layers.  Otherwise an equilibrium step
-    follows.  A warning is given if this step changes the stresses by more than 5 %, as on slopes.
+    The vertical effective stress is the overburden of soil and fluid plus the surcharge, minus the Biot coefficient
+    times the pore pressure (times chi in unsaturated soil).  The horizontal effective stresses, in axisymmetry radial
+    and circumferential, are K0 times the vertical one.  The stresses are exact for level ground with level layers.
+    Otherwise an equilibrium step follows.  A warning is given if it changes stresses by more than 5 %, as on slopes.
 
     Parameters
     ----------
@@ -69,9 +69,9 @@ InitialStress = K0 | Callable[[NDArray[np.float64]], ArrayLike]
 
 
 def hydrostatic(level: float, unit_weight: float | None = None) -> Callable[[NDArray], NDArray]:
-    """Return the hydrostatic pressure below a phreatic level as a function of positions x (n, d), for `pressure`.
+    """Return the hydrostatic pressure below a phreatic level as a function of positions x (n, d).
 
-    Above the level the pressure is negative (suction).
+    Use it as `pressure` of a `Simulation`.  Above the level the pressure is negative (suction).
 
     Parameters
     ----------
@@ -230,7 +230,7 @@ def stressed(
 ) -> MaterialPoints:
     """Return the points with target stresses (n, 3, 3), Pa, at the chosen points (n,); all processes must call it.
 
-    In Modified Cam Clay the initial stress is a parameter.  In other laws elastic strains cause it: `_ElasticStrains`.
+    In Modified Cam Clay the initial stress is a parameter.  In other laws elastic strains cause it, `_ElasticStrains`.
 
     Raises
     ------
@@ -351,7 +351,7 @@ class _ElasticStrains:
 
 
 def strained(materials: SceneMaterials, points: MaterialPoints, moved: MaterialPoints) -> MaterialPoints:
-    """Return points at their old positions, with the elastic strains of `moved`, the same points after deformation."""
+    """Return points with the elastic strains of `moved`, the same points after deformation; positions do not change."""
     law = materials.law_of(points)
     own = {name: points.data[name] for name in MaterialPoints.INTERNAL if name in points.data}
     data = {**moved.data, **own}

@@ -71,8 +71,8 @@ class LocalUnknowns:
     values
         The unknowns by name, as UFL that depends on F, and `trial`.
     known
-        As `values`, but independent of F, for expressions that are not differentiated with respect to F: their kernels
-        need not compute trial values.  For laws with an energy `known` equals `values`.
+        Like `values`, but independent of F, for expressions that are not differentiated with respect to F.  Their
+        kernels need not compute trial values.  For laws with an energy, `known` equals `values`.
     """
 
     def __init__(self, law: type[Skeleton], points: FormPoints, F, values: Mapping[str, object]):
@@ -270,7 +270,7 @@ class _Equations:
         Raises
         ------
         ValueError
-            The result is no dict of pairs with names and shapes of the unknowns, or names an unknown trial value.
+            The result is no dict of pairs with names and shapes of the unknowns, or lists a trial value not in `trial`.
         """
         instance(f"{self._title}: its result", found, dict)
         for of, pair in found.items():

@@ -10,8 +10,8 @@ flow is along (1 + sin psi) e_i - (1 - sin psi) e_j, and at the cut-off T along 
 psi, c and T are constants of `MohrCoulomb`.  The return mapping keeps the order of the principal values.  The return
 therefore ends on one of ten faces, edges and vertices, see `_Return` (de Souza Neto, Peric and Owen 2008, 8.2, without
 the cut-off).  On each of them the final stress is linear in the trial stress.  A final stress is valid if it is
-admissible, the order is kept, and all plastic multipliers are >= 0.  The final stress with the least violation is used;
-its violation is round-off.  Derivatives, in numpy, are exact also for equal principal values.
+admissible, the order is kept, and all plastic multipliers are >= 0.  Of the ten final stresses, the one with the least
+violation is used; this violation is a rounding error.  Derivatives, in numpy, are exact even for equal eigenvalues.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class MohrCoulomb(Frictional):
         Friction angle phi, degrees, in [0, 90); 0 is Tresca's law, with the undrained strength `cohesion`.
     dilation
         Dilation angle psi, degrees, in [0, friction].  If it equals `friction`, flow is associated, with a symmetric
-        tangent.  Soil in tension at the apex dilates at any angle.
+        tangent.  Soil in tension at the apex dilates for any psi.
     cohesion
         Cohesion c, Pa, >= 0.  If it is zero, points without mean pressure have no stiffness.
     tension
@@ -98,7 +98,7 @@ class MohrCoulomb(Frictional):
 
     @staticmethod
     def solution(trial, bulk, shear, sine, sine_flow, strength, cutoff):
-        """Return, with derivatives, the stress components at the end of the step, Pa, and 1 in plastic flow or 0."""
+        """Return, with derivatives, the final stress components, Pa, and a flag: 1 in plastic flow, else 0."""
         x, axes = eigen(trial["b"])
         with np.errstate(invalid="ignore", divide="ignore"):  # in a diverging iterate, which is rejected later
             e = np.log(x) / 2
@@ -227,7 +227,7 @@ class _Return:
         return t, slopes, self._violation(t, multipliers.T)
 
     def _at(self, t: NDArray, conditions: Callable) -> tuple[NDArray, NDArray, NDArray]:
-        """Return stresses t at a vertex, zero derivatives and the violation; conditions: function, as `_in_apex`."""
+        """Return stresses t at a vertex, zero derivatives and the violation; conditions: function like `_in_apex`."""
         drop = self._trial - t
         mean = drop.mean(axis=1)
         plastic = drop / (2 * self._G)[:, None] + (mean / (3 * self._K) - mean / (2 * self._G))[:, None]
@@ -239,11 +239,11 @@ class _Return:
         return [total, self._q * total + difference * x[:, 2], self._q * total + difference * (x[:, 1] + x[:, 2])]
 
     def _in_triaxial(self, x: NDArray) -> list[NDArray]:
-        """As `_in_apex`, for the vertex of two faces with t_2 = t_3 and the cut-off of t_1."""
+        """Like `_in_apex`, for the vertex of two faces with t_2 = t_3 and the cut-off of t_1."""
         return [-x[:, 1], -x[:, 2], x[:, 0] + self._p / self._q * (x[:, 1] + x[:, 2])]
 
     def _in_extension(self, x: NDArray) -> list[NDArray]:
-        """As `_in_apex`, for the vertex of two faces with t_1 = t_2 and the cut-offs of t_1 and t_2."""
+        """Like `_in_apex`, for the vertex of two faces with t_1 = t_2 and the cut-offs of t_1 and t_2."""
         return [x[:, 0], x[:, 1], -x[:, 2], x[:, 0] + x[:, 1] + self._p / self._q * x[:, 2]]
 
 

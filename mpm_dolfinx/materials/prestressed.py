@@ -20,7 +20,7 @@ from mpm_dolfinx.forms.axes import block, embedded, planar
 from mpm_dolfinx.materials.skeleton import Field, Skeleton
 
 AT_REST = " at rest"
-"""Suffix of the names of state variables as seeded; a point has yielded if its state differs from these values."""
+"""Suffix of the names of seeded values of state variables; a point has yielded if its state differs from them."""
 
 
 def stressed(m: Skeleton, knows_space: bool) -> Skeleton:

@@ -99,7 +99,7 @@ class Skeleton:
         returns a dict.  Each unknown has a pair: its values (n, ...), and a dict of its derivatives (n, ..., ...) by
         name of the trial value.  This suits return mappings with many cases, and existing codes.  Usual unknowns are
         stress and new state.  A derivative may be a function without arguments, called when a tangent is assembled.  A
-        missing derivative is zero.  Without a solution, values are NaN or infinite, and the time step is reduced.  If
+        missing derivative is zero.  If there is no solution, return NaN or infinity; the time step is then reduced.  If
         `energy` is not stationary in the unknowns, second derivatives are missing: Newton's method is slow.
     trial
         Function (F, ...) -> {name: UFL}.  Residuals depend on F through these trial values only; without `trial` they
@@ -288,12 +288,12 @@ class Skeleton:
         return self.bulk + 4 / 3 * self.shear
 
     def pressure_damping(self) -> float:
-        """Return the damping tau, 1/Pa: 1/4 of the jump stabilisation of 2 x 2 cells, or 1/2 for laws with a state.
+        """Return the damping coefficient tau, 1/Pa: 1/4, or 1/2 for laws with a state, of the value for 2 x 2 cells.
 
         The full value is 3 alpha^2 / (8 (lambda + 3G)).  A quarter gives better conditioning and smears less (Silvester
-        and Kechkar 1990; Camargo, White and Borja 2021).  The value for 2 x 2 x 2 cells is down to 0.44 times as large.
+        and Kechkar 1990; Camargo, White and Borja 2021).  The value for 2 x 2 x 2 cells is up to 56 % smaller.
         In 3D the smaller value would not damp pressures that alternate along two axes only, like checkerboards in plane
-        strain.  Only the increment of each step is damped, so an oscillation from the onset of yield remains.
+        strain.  Only increments of the pressure are damped, so an oscillation from the onset of yield remains.
         """
         lam = self.bulk - 2 * self.shear / 3
         return (0.5 if self.state else 0.25) * self.biot**2 * 3 / (8 * (lam + 3 * self.shear))
@@ -333,7 +333,7 @@ def _check(obj, name: str, test: Callable, allowed: str) -> None:
 class Hencky(Skeleton):
     """Hencky's law: psi = lambda/2 (ln J)^2 + G sum_i (ln lambda_i)^2, with the principal stretches lambda_i.
 
-    Plane strain in 2D.  Source: Hencky (1928).  A small constant under a square root keeps the derivatives of equal
+    In 2D: plane strain.  Source: Hencky (1928).  A small constant under a square root keeps the derivatives of equal
     eigenvalues of C = F^T F finite.  Only the deviatoric part contains this constant, with zero derivative at F = I.
     The stress at F = I is therefore exactly zero.  Parameters as for `Skeleton`.
     """
@@ -388,7 +388,7 @@ def _eigenvalues(C, separation: float = SEPARATION):
 class NeoHookean(Skeleton):
     """Compressible neo-Hookean law: psi = G/2 (F:F - d - 2 ln J) + lambda/2 (ln J)^2.
 
-    Plane strain in 2D.  Simo and Pister (1984).  Parameters as for `Skeleton`.
+    In 2D: plane strain.  Source: Simo and Pister (1984).  Parameters as for `Skeleton`.
     """
 
     @staticmethod
@@ -403,7 +403,7 @@ class NeoHookean(Skeleton):
 class LinearElastic(Skeleton):
     """Linear elasticity of small strain: psi = lambda/2 (tr eps)^2 + G eps:eps, eps = sym F - I.
 
-    Not objective, so only for small rotations.  Parameters as for `Skeleton`.
+    The law is not objective; use it for small rotations only.  Parameters as for `Skeleton`.
     """
 
     linear: ClassVar[bool] = True
@@ -440,7 +440,7 @@ def filled(p, suction):
 class unsaturated:
     """Conductivity law for flow below a free surface; use it as `conductivity_law` of a material.
 
-    The conductivity falls from k at p = `suction` to `least` k at p = -`suction`, by a smooth cubic (Bathe and
+    The conductivity falls from k at p = `suction` to `least` * k at p = -`suction`, by a smooth cubic (Bathe and
     Khoshgoftaar 1979).  The drainable porosity empties along the same cubic; other pores stay full.  The soil's weight
     is that with all pores full.  The law uses the pressure at the start of each substep.  Steady flow therefore needs
     steps of about h^2 / c_v, with the cell size h and the coefficient of consolidation c_v.  In such a step a free
@@ -449,11 +449,11 @@ class unsaturated:
     Parameters
     ----------
     suction
-        Half width of the transition, Pa, > 0.  Recommended: 0.5 to 1 times (unit weight of water) (cell height).
+        Half width of the transition, Pa, > 0.  Recommended: 0.5 to 1 times unit weight of water times cell height.
     least
         Conductivity of drained soil, divided by that of saturated soil, in (0, 1).
     specific_yield
-        Drainable porosity, in [0, 1), at most the porosity.  With 0, a free surface falls at once (for steady flow).
+        Drainable porosity, in [0, 1), at most the porosity.  With 0, a free surface falls at once, for steady flow.
     """
 
     suction: float
@@ -480,7 +480,7 @@ class Fluid:
     bulk
         Bulk modulus K_w, Pa, > 0; infinite for an incompressible fluid.
     density
-        Density rho_w at zero pressure, kg/m^3, > 0, used for the weight; the flowing mass has rho_w exp(p / K_w).
+        Density rho_w at zero pressure, kg/m^3, > 0, used for the weight; flowing fluid has rho_w exp(p / K_w).
     gravity
         Acceleration g that defines hydraulic conductivities, m/s^2, > 0.  By default the scene's gravity if it is a
         constant vector other than zero, else 9.81.  With units other than m and s, this argument is required in scenes

@@ -97,7 +97,7 @@ class SofteningDruckerPrager(DruckerPrager):
 
 
 def _softened(trial: Trial, bulk, shear, eta, xi, eta_flow, hardened, cohesion, residual, strain, drag) -> dict:
-    """As `drucker_prager.returned`, with softening; strain: plastic shear strain at which the cohesion is c_r."""
+    """Like `drucker_prager.returned`, with softening; strain: plastic shear strain at which the cohesion is c_r."""
     end = xi * strain  # in terms of `hardened`
     moduli = trial, bulk, shear, eta, xi, eta_flow
     falling = returned(*moduli, cohesion, (residual - cohesion) / end, hardened, drag)

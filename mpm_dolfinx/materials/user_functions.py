@@ -9,7 +9,7 @@ points
     `points.value(f)` and `points.grad(f)` are the value and gradient of f = u or v; the gradient is (3, 3) in
     axisymmetry, with f_r / r.  `points.F` is the deformation gradient at the start of the step, in the shape of grad u,
     with the volume ratio as determinant.  `points.position` and `points.displacement` are values at the start of the
-    step; displacements count from the start of the run, or since a stage set them to zero.  Other names: fields of
+    step; displacements count from the start of the run, or from a stage that set them to zero.  Other names: fields of
     materials that are functions of position, and the laws' state.
 t
     Time at which the balances hold, s, a UFL constant: the end of the step or of its first substep.
@@ -58,7 +58,7 @@ def call(function: Callable, kind: str = "UFL", /, **available):
     Raises
     ------
     ValueError
-        The function has an unknown argument, or raises.
+        The function has an unknown argument, or raises an error.
     """
     names = list(signature(function).parameters)
     for name in names:
@@ -93,7 +93,7 @@ def expression(function: Callable, shapes: Sequence[tuple[int, ...]], of: str = 
 
 
 def _check_parts(what: str, out: ufl.core.expr.Expr) -> None:
-    """Raise ValueError for infinite numbers and NaN, and for sums over an index of two sizes, which new UFL accepts."""
+    """Raise ValueError for infinite numbers and NaN, and for sums over an index of two sizes, which UFL may accept."""
     for part in unique_pre_traversal(out):
         if isinstance(part, ufl.constantvalue.RealValue) and not np.isfinite(float(part)):
             raise ValueError(f"{what}: contains {float(part)}, must be finite")

@@ -20,7 +20,7 @@ from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
 
 
 def suction_sums(points: FormPoints, F, slopes: Sequence, locks: bool) -> CellSums | None:
-    """Return the sums over the pieces of one part in each cell that `OfSuction` needs; None if it needs none.
+    """Return the sums that `OfSuction` needs, over the pieces of one part in each cell; None if it needs no sums.
 
     points: integration points of the pieces; locks: whether their law uses the mean dilatation; F: deformation gradient
     (d, d), a UFL variable; slopes: UFL derivatives of stresses with respect to the pressure, empty for laws without

@@ -7,8 +7,8 @@ derivative.  Nearly empty cells then affect neither the conditioning nor the acc
 increment like a viscosity, so it must not act on load-bearing cells:
 
 * The strength s of a face falls from 1 to 0 while the emptier cell's filling rises from 0 to `RATIO` times the fuller
-  cell's.  A second factor is a squared ratio: the fuller cell's filling to the largest filling next to the emptier one.
-  Nearly empty cells thus follow full ones easily.  A penalty between equally filled cells would resist kinks of a body.
+  cell's.  A second factor is the squared ratio of the fuller cell's filling to the largest filling of the emptier
+  cell's neighbours.  A penalty between equally filled cells would resist kinks of a body.
 * The scale is the shear modulus. With lambda + 2G, nearly empty cells of nearly incompressible bodies would copy the
   stretch of the full neighbour, against their own volume constraint.  In flowing soil the modulus `stiffness` is < 2G.
 
@@ -38,11 +38,11 @@ GHOST = 0.05
 YIELDING = 0.02
 """Smallest reduction factor of the penalty for nearly incompressible laws with a state."""
 RATIO = 0.3
-"""Ratio of volume fractions of two neighbours below which their face has the penalty.  Halving this value changes the
+"""A face has the penalty if its cells' volume fractions have a ratio below this number.  Halving this value changes the
 result of scene "soil" in tests/plateaus.py by 1.3e-03 (relative), doubling it by 5.9e-04, and finer cells by 3.0e-02.
 """
 SPARSE, FULL = 0.2, 0.9
-"""With integration at points: strength of the penalty, and volume fraction below which all faces of a cell have it."""
+"""Penalty with integration at points: its strength, and the volume fraction of the fullest cells with this penalty."""
 
 
 def stiffness(material: Skeleton) -> NDArray[np.float64]:
@@ -50,7 +50,7 @@ def stiffness(material: Skeleton) -> NDArray[np.float64]:
 
     In nearly empty cells of flowing soil the volume constraint opposes the penalty. With 2G, ten times the penalty
     raises a footing's limit load by 0.004 % at nu = 0.3, by 0.3 % at 0.49 and by 0.75 % at 0.499. At low nu the penalty
-    is not reduced: a smaller one makes Newton's method fail in frictional soil at deep penetration.
+    is not reduced: a smaller penalty makes Newton's method fail in frictional soil at deep penetration.
     """
     share = np.minimum(1.0, 4 * material.shear / material.oedometric) ** 2 if material.state else 1.0
     return 2 * np.maximum(YIELDING, share) * material.shear
@@ -116,8 +116,7 @@ class GhostPenalty:
         """Set the volume fractions and moduli of the cells `own` (n,), owned cells that contain material.
 
         Return all active local cells, ascending.  volume (n,), m^d: volume of the material in each cell; moduli: two
-        arrays (n,), first `modulus` times this volume, then `shear` times this volume.
-        `fill` must be zero before the call.
+        arrays (n,), `modulus` times this volume and `shear` times this volume. `fill` must be zero before the call.
         """
         grid, fill = self.grid, self.fill.x.array
         fill[own] = volume / grid.volumes(own)
@@ -142,7 +141,7 @@ class GhostPenalty:
 
 
 class GhostLoads(Loads):
-    """Ghost penalty on all inner faces of partly filled cells, and its part on cells at walls of the grid."""
+    """Ghost penalty on all inner faces of partly filled cells, and on the faces among them at walls of the grid."""
 
     def __init__(self, everywhere: FacetSum, at_walls: FacetSum):
         self._everywhere, self._at_walls = everywhere, at_walls

@@ -102,7 +102,7 @@ class GivenDisplacements(Acting):
     def check_start(self, place: Place) -> None:
         """Warn, once for each condition, if its side must jump at the start of a stage with inertia.
 
-        A gap is a jump if it strains the cell at the side by more than stress over modulus there.
+        A gap is a jump if it strains the cell at the side by more than the stress there, divided by the modulus.
         """
         if not (place.inertia and place.dt):
             return
@@ -144,7 +144,7 @@ class GivenDisplacements(Acting):
         return HoldLoads(self, forms, data, held, row, own, place)
 
     def _held_points(self, place: Place, ends: Sequence[float]) -> HeldPoints:
-        """Return the integration points on sides, each on the process with its constraint, see `inner_cells`.
+        """Return the integration points on sides, each on the process of its constraint, see `inner_cells`.
 
         ends: start and end of the step, s; empty if the displacement is zero.
         """
@@ -226,7 +226,7 @@ class GivenDisplacements(Acting):
             start, end = (self._given(hold, t, p.X) for t in (place.start, place.t))
             gaps = (p.origin(of) + given - p.now(of) for of, given in ((before, start), (points, end)))
             old, new, increment = (np.linalg.norm(v[:, axes], axis=1) for v in (*gaps, end - start))
-            if place.begins:  # a value that does not begin at the present position, by more than penalties give way
+            if place.begins:  # a prescribed value that begins farther from the present position than penalties yield
                 jump = np.linalg.norm((p.origin(before) + end - p.now(before))[:, axes], axis=1)
                 sudden = HOLD * jump > self._grid.least
                 old, increment = np.where(sudden, 0.0, old), np.where(sudden, jump, increment)
@@ -240,7 +240,7 @@ class GivenDisplacements(Acting):
     def under_held(
         self, ids: NDArray[np.int64], tracked: NDArray[np.float64], volume: NDArray[np.float64], corners: NDArray
     ) -> NDArray[np.float64]:
-        """Return corners (n, 2^d, d), m, of the particle domains `ids`, after domains at a held side become prisms.
+        """Return corners (n, 2^d, d), m, of the particle domains `ids`; domains at a held side are replaced by prisms.
 
         tracked, m: tracked corners; volume (n,): domain volumes, in axisymmetry areas of their sections.  A prism
         has this volume, and the tracked corners on the held face.  If the face moved, the penalty would pull it back.
@@ -295,9 +295,9 @@ class HoldLoads(Loads):
     def augment(self, at: At) -> bool:
         """Add the penalty forces on cell means to the multipliers of the means, on sides that lag behind.
 
-        A body such as one of sealed water resists the side's motion more stiffly than a single cell would.  The updates
-        end if the side's mean gap no longer falls by half: the cells cannot follow the side any further.  Means are
-        over the faces of each connected part of the bodies.
+        A whole body, for example with sealed water, may resist the side's motion more stiffly than a single cell.  The
+        updates end if the side's mean gap no longer falls by half: the cells cannot follow the side any further.  The
+        mean is over the faces of each connected part of the bodies.
         """
         if not self._place.dt:
             return False

@@ -25,12 +25,12 @@ from mpm_dolfinx.parallel.exchange import over_all
 ALIGNED = 1e-2
 """Largest slope of a side against a grid axis at which cells can follow all points of the side at constant volume."""
 WEAK = 8.0
-"""Pointwise penalty stiffness for deviations from the means, divided by (modulus + 10 stress) over cell size.  Halving
+"""Pointwise penalty stiffness for deviations from the means, in units of (modulus + 10 stress) / cell size.  Halving
 this value changes the result of scene "soil" in tests/plateaus.py by 5.0e-06 (relative), doubling it by 7.9e-06, and
 finer cells by 3.0e-02.
 """
 EVERYWHERE = 1e2
-"""Normal penalty stiffness at points of sides with slopes below `ALIGNED`, divided by resistance over cell size.
+"""Normal penalty stiffness at points of sides with slopes below `ALIGNED`, in units of resistance / cell size.
 Halving this value changes the result of scene "soil" in tests/plateaus.py by 2.2e-05 (relative), doubling it by
 1.7e-05, and finer cells by 3.0e-02.
 """
@@ -39,7 +39,7 @@ TENSE = 10
 Halving this value changes the result of scene "soil" in tests/plateaus.py by 2.8e-06 (relative), doubling it by
 4.7e-06, and finer cells by 3.0e-02.
 """
-CARRIED = 0.3  # largest plausible traction increment of a step over (resisting modulus + TENSE * stress of the body)
+CARRIED = 0.3  # largest plausible traction increment of a step, divided by (resisting modulus + TENSE * stress)
 
 
 class HeldPoints(NamedTuple):
@@ -48,7 +48,7 @@ class HeldPoints(NamedTuple):
     number: NDArray[np.int64]  # (n,) index of the condition
     cell: NDArray[np.int32]  # (n,) local cell
     area: NDArray[np.float64]  # (n,) reference area, m^(d-1)
-    modulus: NDArray[np.float64]  # (n,) penalty modulus times area, N; down to `undrained`: at the last grid reset
+    modulus: NDArray[np.float64]  # (n,) penalty modulus times area, N; this to `undrained` at the last grid reset
     tension: NDArray[np.float64]  # (n,) norm of the stress times area, N
     resistance: NDArray[np.float64]  # (n,) resisting modulus times area, N
     firm: NDArray[np.float64]  # (n,) confined modulus times area, N, with a limited contribution of the fluid
@@ -176,7 +176,7 @@ class HeldCells:
         Where a side ends at a wall, its penalties omit nodes that the wall fixes. Otherwise the free nodes of the cell
         would compensate for the fixed ones, with an oscillation along the side. The prescribed displacement is also
         extrapolated to the wall. If this value exceeds half of the cell's mean, at the start or the end of the step,
-        the displacement must vary over the cell. The penalty is then omitted if others hold a free node of the cell.
+        the displacement must vary over the cell. A penalty is then omitted if others hold a free node of the cell.
 
         given (conditions,): whether each prescribes component `axis`; free (nodes,): whether no wall fixes the node.
 
@@ -208,7 +208,7 @@ class HeldCells:
     def _held_beside(
         self, number: NDArray[np.int64], nodes: NDArray[np.int32], N: NDArray[np.float64], stuck: NDArray[np.bool_]
     ) -> NDArray[np.bool_]:
-        """Return whether each penalty (k,) is at a wall, with a free node that its condition holds away from walls too.
+        """Return which penalties (k,) at a wall have a free node that the same condition also holds away from walls.
 
         number (k,): index of the condition; nodes, N (k, 2^d): nodes, shape functions; stuck (k, 2^d): nodes at a wall.
         """

@@ -101,7 +101,7 @@ def moving(
     base: NDArray[np.float64],
     rings: bool = False,
 ) -> dict[str, NDArray[np.float64]]:
-    """Return the point data `VELOCITY` and `RATE` of a given velocity field.
+    """Return the point data `VELOCITY` and `RATE` of a velocity field.
 
     Parameters
     ----------

@@ -133,8 +133,8 @@ class FBar:
     def _slopes(self, law: type[Skeleton], F, Fbar, values: Mapping[str, object]) -> tuple:
         """Return the derivatives of both results of `_stress` with respect to F and theta.
 
-        In 2D a law without an energy is differentiated with respect to Fbar only: tangents take half of the time.  With
-        Fbar = s F,
+        In 2D a law without an energy is differentiated with respect to Fbar only, which halves the time for tangents.
+        With Fbar = s F,
 
             dtau = s C : dF + (theta dtau/dtheta) (dtheta / theta - F^-T : dF),   C = dtau/dFbar,
 
@@ -184,7 +184,7 @@ class MeanDilatation:
     def total(
         self, data: QuadratureData, sums: Sequence[NDArray[np.float64]]
     ) -> tuple[NDArray[np.int32], NDArray[np.float64], NDArray[np.float64]]:
-        """Return the cells with F-bar, totals (cells, k) of `sums` over all parts, volumes (cells, 1) with F-bar."""
+        """Return the cells with F-bar, totals (cells, k) of `sums` over all parts, and `_volume_of` the cells."""
         return self._cells(data).filled, self._cells(data).total(sums), self._volume_of(data)
 
     def update(self, data: QuadratureData, solve: Callable[[], None]) -> None:

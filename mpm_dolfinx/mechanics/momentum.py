@@ -66,7 +66,7 @@ class MomentumForms:
         All integration points.
     laws
         Classes of the skeletons' laws, each with its integration points and whether it uses F-bar, see
-        `MeanDilatation`. The points have F, the law's parameters and state and, with fluid, biot.
+        `MeanDilatation`. The points have F, the law's parameters and state and, with fluid, `biot`.
     pressure
         DG0 pore pressure, None without fluid.
     gravity : (d,), m/s^2
@@ -319,7 +319,7 @@ class MomentumSystem:
         self.rounding = self.unknowns.vector()
         """Rounding error of the residual at each unknown, N."""
         self.of_whole = self.unknowns.vector()
-        """For each unknown: norm, N, over its connected part, if all unknowns there had its rounding error."""
+        """For each unknown: norm, N, of a residual equal to its rounding error in its whole connected part."""
         self.K = matrix(self.unknowns, self.unknowns, 3**d * d)
         self.residual, self.step = self.unknowns.vector(), self.unknowns.vector()
         held = active[~among(active, dofs)]

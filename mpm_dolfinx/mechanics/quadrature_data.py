@@ -23,10 +23,10 @@ from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.material_points import ACROSS, MaterialPoints, in_plane, in_space
 
 STIFF_DRY = 50
-"""Weight of the corner-based volume ratio J_n of a cell (`cell_ratios`), in units of G / (lambda + 2G), at most 1.
+"""In dry bodies: weight of a cell's corner-based volume ratio J_n (`cell_ratios`), in units of G / (lambda + 2G).
 
-The incremental volume ratio of the points has the remaining weight. With nu = 0.4999 and a weight of 1, the stress
-change at a reset of the grid would exceed the stresses in the bodies.
+It is at most 1; the incremental volume ratio of the points has the rest. With nu = 0.4999 and a weight of 1, the
+stress change at a reset of the grid would exceed the stresses in the bodies.
 """
 STIFF_WET = 8
 """Value of (lambda + 2G) / G above which the corner-based ratio loses weight in wet bodies.
@@ -60,7 +60,7 @@ class QuadratureData:
     pieces: PointData  # all integration points
     parts: tuple[PointData, ...]  # integration points of each part
     rows: tuple[NDArray[np.int64] | slice, ...]  # indices in `pieces` of each part's integration points
-    of_points: PointData  # as `pieces`, but volumes and F are not scaled for F-bar; for user-defined terms
+    of_points: PointData  # like `pieces`, but volumes and F are not scaled for F-bar; for user-defined terms
 
     def increments(self, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return I + grad u (m, d, d) at the positions where laws use it, of displacements `nodal` (nodes, d), m."""

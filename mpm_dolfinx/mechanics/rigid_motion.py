@@ -20,7 +20,7 @@ from mpm_dolfinx.parallel.exchange import over_all
 TURNS = 1e-3
 """Smallest rotation that is used as an initial guess, rad."""
 MEETS = 0.1
-"""Largest root mean square gap after a rotation, relative to the one after the best translation."""
+"""Largest root mean square gap after a rotation, relative to the gap after the best translation."""
 ITERATIONS = 9
 
 
@@ -42,7 +42,7 @@ def rigid_motion(
 
     Returns
     -------
-    None for a pure translation, or if a translation fits the prescribed displacements nearly as well.
+    The displacements; None if they are a pure translation, or if a translation fits nearly as well.
     """
     d = x.shape[1]
     e = holds["direction"]

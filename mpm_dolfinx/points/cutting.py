@@ -173,7 +173,7 @@ def cut(grid: Grid, corners: NDArray[np.float64], second: bool = False, faces: b
 
     Returns
     -------
-    The pieces.  Pieces below 1e-12 of their domain are left out; the fractions of every domain sum to one.
+    The pieces of at least 1e-12 of their domain's volume; the fractions of every domain sum to one.
     """
     chunks = _chunks(len(corners), grid.dim)
     if len(chunks) == 1:

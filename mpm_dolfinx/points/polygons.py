@@ -89,9 +89,9 @@ class Polygons:
         return out
 
     def simplified(self, near: float) -> Polygons:
-        """Return the polygons without vertices nearer than `near`, m, to the next one, or to a line within one edge.
+        """Return the polygons without vertices within `near`, m, of the next one, or inside a straight edge.
 
-        Rounding would otherwise divide a trapezoid with such a vertex: its diagonals divide the area equally evenly.
+        A trapezoid with such a vertex has two diagonals that divide it equally well; rounding would select one.
         """
         used = np.arange(self.edge.shape[1]) < self.count[:, None]
         out = _packed(self.x, self.edge, used & (np.abs(self.after - self.x).max(axis=2) > near))

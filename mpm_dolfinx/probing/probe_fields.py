@@ -134,7 +134,7 @@ class _Around:
     def _connected(self, same: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Return whether the fit uses each cell (m, cells), and whether open faces connect it to the probe's cell.
 
-        If no cell has only the probe's soil, as in thin layers, the fit uses cells with only its material, or else all.
+        If no cell contains only the probe's soil, the fit uses cells with only its material; if there are none, all.
 
         same (m, cells, 3): whether a cell has only the probe's conductivity, conductivity law, and material.
         """
@@ -230,7 +230,7 @@ class _Around:
     def _drained(self, weight: NDArray[np.float64]) -> tuple[NDArray, ...]:
         """Return data of drained sides: probe index, offset, head, weight, and whether the side is in the probe's cell.
 
-        For each side of a cell, the fit uses the mean head over the side's faces: single heads cause false gradients.
+        For each side of a cell, the fit uses the mean head over its faces; heads of single faces give false gradients.
         """
         sides, d = self._sides, self._grid.dim
         probe, place = np.nonzero(self._counts & (self._local >= 0))

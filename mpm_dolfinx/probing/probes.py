@@ -86,7 +86,7 @@ def positions(x0: ArrayLike, dim: int) -> NDArray[np.float64]:
 
 
 def probes(bodies: Sequence[Body], x0: ArrayLike, *, stress: bool = False) -> Probes:
-    """Return probes: material particles at which a run records results, for `probes` of `Simulation.run`.
+    """Return probes: material particles at which a run records results; the argument `probes` of `Simulation.run`.
 
     A run records displacement and position, with fluid also the pore pressure, and on request the stress; see `Row`.
 

@@ -62,9 +62,9 @@ class Simulation:
         Initial pore pressure, Pa: a number, or a function of positions x (n, d) such as `hydrostatic`; with fluid only.
     initial_stress
         Initial effective stress, tension positive: `K0`, a function of positions x (n, d) that returns normal stresses
-        (n, 3) or tensors (n, 3, 3), Pa, or one of these for some bodies, {index: ...}. Fills start without stress
-        unless they are listed. At the start the stress is balanced with the loads, at the given pore pressures: under
-        constant loads the first step then causes no displacement.
+        (n, 3) or tensors (n, 3, 3), Pa, or one of these for some bodies, {index: ...}. Bodies that a stage adds start
+        without stress unless they are listed. At the start the stress is balanced with the loads, at the initial pore
+        pressures: under constant loads the first step then causes no displacement.
     terms
         User-defined terms in UFL: functions for the balance of momentum, see `user_functions`; such functions on a
         side, `OnSide`; and terms in the storage of fluid, `Source`.
@@ -269,7 +269,7 @@ class Simulation:
         Parameters
         ----------
         walls, gravity
-            As for the scene; `gravity` only if the scene has gravity.
+            New walls and gravity, as for the scene; `gravity` only if the scene has gravity.
         inertia
             Whether bodies have inertia from now on; only if the scene allows it. Bodies then start without velocity.
         conditions

@@ -26,7 +26,7 @@ from mpm_dolfinx.stepping.state import StepControl
 MIN_CUT, MIN_CUT_BY_ERROR = 2.0**-10, 2.0**-30
 """Smallest reduced step, divided by the nominal step: first of equal steps, then of adaptive steps.
 
-Adaptive steps grow over decades. At the onset of sliding they must shrink to the time scale of sliding.
+Adaptive steps may grow by several powers of ten. At the onset of sliding they must shrink to its time scale.
 """
 FINEST = NEAR**2
 """Smallest adaptive step divided by the time.  Without it, steps would become ever smaller at a singularity in time.
@@ -34,18 +34,18 @@ FINEST = NEAR**2
 Source: epsilon, a smaller step changes less than four digits of the time.
 """
 SAFETY, SHRINKS, GROWS, KEEPS = 0.9, 0.2, 5.0, 1.2
-"""Factor of the next adaptive step: `SAFETY` times a power of tolerance over error, from `SHRINKS` to `GROWS`.
+"""Factor of the next adaptive step: `SAFETY` times a power of tolerance / error, from `SHRINKS` to `GROWS`.
 
 A factor from 1 to `KEEPS` counts as 1.  Source: Hairer, Norsett and Wanner (1993), eq. 4.13; for `KEEPS` Hairer and
 Wanner (1996), IV.8.
 """
 RINGS = 5e-3
-"""Sudden pressure change, divided by the largest change so far, above which two half steps replace a step.
+"""If a sudden pressure change exceeds this fraction of the largest change so far, two half steps replace the step.
 
 The stability function is never below -0.21, so an undetected jump overshoots by at most a thousandth.
 """
 AGAIN = 2.0
-"""A pressure jumps if it changes by more than `AGAIN` times the rate in the first substep of the previous step."""
+"""A pressure jumps if its rate is more than `AGAIN` times the rate in the first substep of the previous step."""
 MOST = SAME / EPSILON
 """Largest number of output intervals. Source: exact; with more intervals, `SAME` times a step is below rounding."""
 RESOLVED = 10
@@ -92,7 +92,7 @@ class StepSize:
         return size if self.by_error else self.longest
 
     def fitted(self, left: float, small: float) -> float:
-        """Return the length of the next step, s: `small`, adjusted to the output time that follows after `left`, s."""
+        """Return the length of the next step, s: `small`, adjusted to the next output time, `left` seconds away."""
         if self.by_error:  # avoids a tiny step before an output
             small = min(small, self.longest)  # `small` may be longer if an earlier run had other steps
             return left if left <= min(1.05 * small, (1 + SAME) * self.longest) else min(small, left / 2)
@@ -148,7 +148,7 @@ class StepSize:
 
         A step leaves at most a fifth of a jump. A change that is equally sudden in successive steps is therefore no
         jump. For example, an edge pushed into a body causes such changes, because the grid is reset in every step.
-        Nor are changes of a body that are only rounding, compared with those of other bodies.
+        Nor are changes of a body that are rounding errors compared with the changes of other bodies.
         """
         excess = report.sudden - AGAIN * size * np.asarray(control.first)
         return bool((excess > np.maximum(RINGS * np.asarray(control.change), NEAR * max(control.change))).any())
@@ -244,7 +244,7 @@ class Times:
         return [start + k * dt for k in range(done + 1, count)] + [self.end] * (count > done)
 
     def next(self, t: float) -> float:
-        """Return the latest time, s, that a run may reach after an output at time t, s, before the next one."""
+        """Return the latest time, s, that a run may reach between the output at time t, s, and the next."""
         return max([*self.after(t)[:1], t]) + SAME * self.interval
 
 

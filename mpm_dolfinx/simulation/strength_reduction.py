@@ -50,10 +50,10 @@ LACKS = 0.25
 """Largest overload, divided by `rtol`, of a trial that comes to rest.
 
 A trial that slides starts with an overload of 0.9 times the missing strength in a uniform block, 0.6 times in a slope.
-By the end the overload has halved. With values of 1/8 and 1/2 the slope's factor changes by 1.1 and 0.5 %.
+By its end the overload has halved. With values of 1/8 and 1/2 the slope's factor changes by 1.1 and 0.5 %.
 """
 STRAINS = 4.0
-"""Strain in a trial of a marginal slide, divided by the smaller of the trial's overload and elastic strain at yield.
+"""Strain in a trial of a marginal slide, divided by the trial's overload, or the elastic strain at yield if smaller.
 
 Stresses of soil that begins to flow redistribute within strains of a few times that at yield.  In soft soil such large
 strains would change the shape of the body; a larger viscosity limits them.  If this number is halved or doubled, the
@@ -88,9 +88,10 @@ def factor_of_safety(
 ) -> Safety:
     """Return the factor of safety by strength reduction: the largest divisor of the strength without failure.
 
-    The simulation is unchanged. A scene that cannot stand need not be run: trials start from an elastic step of dt.
-    Suction, as part of the effective stress, adds to the strength. Tool friction is not divided. If a thin weak surface
-    layer slides alone, the factor depends on `rtol` and the layer's share of the load. All processes must call this.
+    The simulation is unchanged. A scene that cannot stand need not be run: trials start after a step of length `dt` in
+    which the soil cannot yield. Suction, as part of the effective stress, adds to the strength. Friction of tools is
+    not divided. If a thin weak surface layer slides alone, the factor depends on `rtol` and the layer's share of the
+    load. All processes must call this.
 
     Parameters
     ----------
@@ -98,7 +99,7 @@ def factor_of_safety(
         Scene under its loads, which must be constant in time from now on.
     dt
         Length of a step, s, > 0: long compared with viscous time scales of laws and terms. With flow of fluid `dt` is
-        required: short for undrained, long for drained failure.
+        required: short for undrained failure, long for drained failure.
     rtol
         Final relative difference of the bounds, in [1e-4, 0.5].
     steps
@@ -119,7 +120,7 @@ def factor_of_safety(
     if simulation.state.stage.inertia:
         raise ValueError("factor_of_safety: bodies have inertia, must be quasi-static: stage(inertia=False)")
     if dt is None and simulation.scene.flows:
-        raise ValueError("dt = None: must be given where fluid flows: short for undrained, long for drained failure, s")
+        raise ValueError("dt = None, must be given in s if fluid flows: short for undrained, long for drained failure")
     positive = {"allowed": "> 0 and finite", "test": lambda v: (0 < v) & (v < np.inf)}
     dt, steps = float(numbers("dt", 1.0 if dt is None else dt, **positive)), whole("steps", steps, 8)
     rtol = float(numbers("rtol", rtol, allowed="in [1e-4, 0.5]", test=lambda v: (1e-4 <= v) & (v <= 0.5)))

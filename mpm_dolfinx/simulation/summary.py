@@ -113,7 +113,7 @@ def table(scene: Scene, state: State) -> str:
 
 
 def imbalance(scene: Scene, state: State) -> dict[str, float]:
-    """Return the largest number on a process, divided by the mean, of points, of pieces and of active cells.
+    """Return for points, pieces and active cells the largest number on a process, divided by the mean over processes.
 
     The ratio 1 means perfect balance. Ratios of pieces and cells are also 1 before the first step. The time of a step
     is proportional to the number of pieces. All processes must call it.

@@ -23,7 +23,7 @@ class Tangent:
     """Derivatives of the residuals with respect to displacements and pressures, for a step by backward Euler.
 
     Forces change by `stiffness` du + `pressure` dp, N, and fluid contents by `content` du + `storage` dp, m^d, for du
-    (n,), m, and dp (m,), Pa; in plane strain per metre of thickness. Without fluid, `pressure` and all below are None.
+    (n,), m, and dp (m,), Pa; in plane strain per metre. Without fluid, `pressure` and the fields after it are None.
 
     Parameters
     ----------

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Time loop: steps, reduced where they do not converge and grown again, and histories of a run."""
+"""Time loop and histories of a run; steps that do not converge are reduced, and later steps grow again."""
 
 from __future__ import annotations
 
@@ -95,14 +95,14 @@ def run(
         Output times, increasing, in (t, t_end]; t_end is always an output time. Steps end at output times.
     first_step, max_step
         With `rtol`: first trial step of a new run, and longest step, s, > 0. The default first step is 18 rtol times
-        the time for diffusion through a cell, but 0.001 to 1 times the first output interval; with inertia at most the
-        time in which a wave crosses a cell.
+        the diffusion time of a cell, but at least 0.001 and at most 1 times the first output interval. With inertia it
+        is at most the time in which a wave crosses a cell.
     until
         One function of the simulation, or several, that end the run before t_end. An event occurs when a returned
         number changes sign within a step, or a returned boolean becomes True. A condition that holds at the start is no
         event. Example of a number: `lambda s: -s.points.displacement[:, 1].min() - 0.1`. Trial steps locate the event:
         the run ends at the first state found after it, at most a thousandth of the step later. This state is an output;
-        `Result.event` has the function's index and the time. Values must be equal on all processes. An event completes
+        `Result.event` has the function's index and the time. All processes must return equal values. An event completes
         the histories, as t_end does; a later run without `until` continues them.
     probes
         Material particles with recorded results.
@@ -127,7 +127,7 @@ def run(
     ValueError
         An argument is invalid, or a function of time returns an invalid value.
     GaveUp
-        A step failed, however short; the exception has the histories so far. The last good step has set `state`.
+        A step failed, however short. The exception has the histories so far; `state` is the end of the last good step.
     """
     comm = simulation.scene.grid.comm
     simulation.scene.check(simulation.state)
@@ -368,7 +368,7 @@ def _advance(simulation: Simulated, rule: StepSize, target: float, verbose: bool
 def _by_euler(simulation: Simulated, dt: float, failed: StepFailed) -> tuple[State, Report] | None:
     """Return the state after a step of dt, s, by backward Euler, and its report; None if this step fails too.
 
-    After a jump of the loads the second substep of SDIRK2 overshoots. Soil may be too weak for this.
+    After a jump of the loads the second substep of SDIRK2 overshoots. Soil may be too weak for the overshoot.
     """
     if isinstance(failed, LeftGrid) or len(simulation.scene.substeps) == 1:
         return None

@@ -7,14 +7,14 @@ ordering, ms: blocks 110 and 60, scalar 430 and 150, MUMPS 260 and 155, UMFPACK 
 solve takes 4 ms (MUMPS 15, CHOLMOD 9). Copying the entries into blocks takes a tenth of the factorisation. On two
 processes MUMPS factorises in the same time, and solves in 25 ms. With few processes, one process therefore holds the
 factors of displacements, which many solves use. Another holds the factors of pressures, computed at the same time.
-Both factorisations on all of four processes took 1.7 times as long, because these share the memory's bandwidth.
+When all of four processes shared both factorisations, the memory's bandwidth made them take 1.7 times as long.
 
 Large bodies need nested dissection. With 504000 unknowns in 2D, a repeated factorisation ordered by grid lines
 (`dissection`) takes 3.0 s, and the factors have 4.6e7 entries. With PETSc's nested dissection these values are 5.1 s
 and 5.0e7, with minimum degree 6 to 12 s and 7.5e7; with MUMPS 6.2 s and 5.3e7. With a tenth of the unknowns the first
-three take 80, 110 and 120 ms; with fewer unknowns, equal times.
+three orderings take 80, 110 and 120 ms; with still fewer unknowns they take equal times.
 
-The figures are for the reference BLAS; only MUMPS, UMFPACK and CHOLMOD use BLAS. With OpenBLAS MUMPS takes 1/2 to 1/3
+The figures are for the reference BLAS; only MUMPS, UMFPACK and CHOLMOD use BLAS. With OpenBLAS, MUMPS takes 1/3 to 1/2
 of the time.
 """
 
@@ -80,7 +80,7 @@ def _preonly(A: PETSc.Mat, name: str) -> PETSc.KSP:
 def renew(A: PETSc.Mat) -> None:
     """Rebuild the sparsity pattern of a matrix in PETSc after sums with other matrices.
 
-    PETSc has grouped rows with equal patterns before the sums. LU factors with these old groups are wrong.
+    Before the sums, PETSc has grouped rows with equal patterns. LU factors with these old groups would be wrong.
     """
     A.setPreallocationCSR([part.copy() for part in A.getValuesCSR()])
 
@@ -88,7 +88,7 @@ def renew(A: PETSc.Mat) -> None:
 def solved(ksp: PETSc.KSP, name: str) -> int:
     """Return the number of iterations of a solver's last solve; raise NotConverged if it failed.
 
-    Results after the largest number of iterations, or with an indefinite tangent, are left to the line search.
+    Results after the largest number of iterations, or with an indefinite tangent, are judged by the line search.
     """
     count, reason = ksp.getIterationNumber(), ksp.getConvergedReason()
     if reason < 0 and reason not in TOLERABLE:

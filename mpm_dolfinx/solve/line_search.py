@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: MIT
 """Line search: length of a Newton step, see `Newton._line_search`.
 
-Without yield the step is full, even if the residual grows, because rotations of a bending body cause a spurious stretch
-at first order. The step is halved while a law cannot be evaluated at its end, or the residual grows enormously.
+Without yield the step is full, even if the residual grows, because linearised rotations of a bending body cause a
+spurious stretch. The step is halved while a law cannot be evaluated at its end, or the residual grows enormously.
 
-In yielding soil the step is full if the residual forces at its end do less than half of the initial work along it; if
-the residual falls, up to all of this work is allowed. Otherwise bracketed secants look for the step length at which the
-work is zero, until it is less than half of the initial work (Matthies and Strang 1979). Near zero work, soil that
-unloads is elastic, also in the next tangent. The work of the fluid's residual is added, because the forces alone do
-nearly no work if only the fluid is out of balance. Shorter steps with smaller residuals would lead to more short steps.
+In yielding soil the step is full if the residual forces at its end do less than half of their initial work along it, or
+if the residual falls and they do at most all of this work. Otherwise bracketed secants look for the step length at
+which the work is zero. They end at less than half of the initial work (Matthies and Strang 1979). At nearly zero work,
+soil that unloads is elastic in the next tangent. The work of the fluid's residual is added, because forces do nearly no
+work if only the fluid is out of balance. Shorter steps with smaller residuals would lead to more short steps.
 Soil that has lost its strength needs several secants: with one secant, a slumping bank takes twice the Newton steps.
 
 Flowing soil has almost no stiffness along its mechanisms, and negative stiffness with non-associated flow: full steps
@@ -31,16 +31,16 @@ from dataclasses import dataclass
 import numpy as np
 
 EXPLODES, SHORTEST = 1e4, 1e-3
-"""Growth of the residual above which a step without yield is halved, and smallest fraction of the full step.
+"""Largest growth of the residual in a step without yield, and smallest fraction of the full step.
 
-With 1e3 or 1e5 as the limit, scenes take the same steps: the growth is below 1e3, or the residual is not finite.
+With 1e3 or 1e5 as largest growth, scenes take the same steps: it is below 1e3, or the residual is not finite.
 """
 WORK = 0.5
 """Largest ratio of the work at the end of a step to the work at its start (Matthies and Strang 1979)."""
 FIRM = 0.1
 """Fraction, <= 1, of elastic shear stiffness in the tangent of yielding soil, divided by the relative residual.
 
-With 0.05, 0.1 and 0.2 a footing on 9 cells takes 291, 293 and 293 Newton steps, pushed ground 42, 41 and 43.
+With 0.05, 0.1 and 0.2 a footing on 9 cells takes 291, 293 and 293 Newton steps; pushed ground takes 42, 41 and 43.
 """
 
 
@@ -72,7 +72,7 @@ class Search:
     """Largest growth of the residual at the end of a step."""
 
     def after(self, work: float, growth: float) -> Search | None:
-        """Return the next trial, or None if the search ends; work: last trial's work over the initial work, or nan.
+        """Return the next trial, or None if the search ends; work: last trial's work / initial work, or nan.
 
         growth: factor by which the residual grew. A full step that does not increase the residual ends the search if
         |work| <= 1. A secant gives the next trial, or bisection if one of the bounds stays a second time.

@@ -9,18 +9,18 @@ from the right with the upper block triangle. In this triangle the fixed-stress 
 Schur complement C + B K^-1 B^T, with the fixed-stress coefficient beta and the cell volumes V. One multigrid cycle
 approximates K^-1, another one P^-1.
 
-In 3D GMRES takes 7 to 12 iterations to 1e-3, each with one cycle on K.  Other methods were slower; they were tested
+In 3D GMRES takes 7 to 12 iterations to 1e-3, each with one cycle on K.  Other methods are slower; they were tested
 with algebraic multigrid and Jacobi smoothing, where GMRES takes 10 to 15.  Conjugate gradients on the Schur complement
 took 3 iterations, but 35 to 60 cycles in their inner solves.  Flexible GMRES with inner solves to 0.1 or 0.01 took 12
 to 24 cycles.  MINRES with the diagonal blocks took 17 to 23 cycles, and left a residual five times as large.  In 2D
 GMRES takes 8 iterations to 1e-5, and 12 with algebraic multigrid on P.
 
-At nu = 0.499 the cycle is poor, and GMRES takes more than 100 iterations with 14^3 cells.  If a solve takes too many
-iterations (see `plan`), or is predicted to, factors of K replace the cycle.  They are kept until a solve with them
+At nu = 0.499 the cycle is inaccurate, and GMRES takes more than 100 iterations with 14^3 cells.  If a solve takes too
+many iterations (see `plan`), or is predicted to, factors of K replace the cycle.  They are kept until a solve with them
 takes too many iterations.  With factors of an earlier tangent a solve takes about 10 iterations, with new factors 4 to
-6.  A step takes 6.2 s, but 8.5 s with new factors for each tangent; four steps of yielding soil, 12^3 cells, 33 s and
-41 s.  MUMPS factorises 3190 unknowns in 0.2 s, 8610 in 1.4 s (PETSc in 3.4 s).  Solves then take up to 19 iterations
-(22 at nu = 0.49 with contrasts of 1e3).
+6.  A step takes 6.2 s with kept factors, 8.5 s with new factors for each tangent.  Four steps of yielding soil with
+12^3 cells take 33 s and 41 s.  MUMPS factorises 3190 unknowns in 0.2 s, 8610 in 1.4 s (PETSc in 3.4 s).  Solves then
+take up to 19 iterations (22 at nu = 0.49 with contrasts of 1e3).
 
 In 2D yielding soil would take 20 to 500 iterations (a footing on 41 cells, with any smoother). Shear bands are one cell
 wide, and coarse grids cannot represent them. With a viscosity of 0.05 GMRES takes 28 iterations, and 0.9 times as long
@@ -48,7 +48,7 @@ from mpm_dolfinx.solve.solver_choice import SolverPlan
 LEAST = 1e-4
 """Smallest scale of the fluid residual, divided by the volume that the residual forces displace in a drained body.
 
-Sealed bodies exchange nearly no fluid. Where the two scales had a ratio of 5e5, rounding left 2e-5 of a residual.
+Sealed bodies exchange nearly no fluid. With a ratio of 5e5 between both scales, rounding left 2e-5 of a residual.
 """
 
 IDLE = object()

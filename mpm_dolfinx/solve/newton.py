@@ -42,7 +42,7 @@ from mpm_dolfinx.solve.factors import negative_pivots
 from mpm_dolfinx.solve.line_search import FIRM, Halving, Search
 from mpm_dolfinx.solve.schur import Kept, LinearSolvers
 
-INNER = 1e-3  # momentum tolerance over storage error; it is small because unconverged rotations change volumes
+INNER = 1e-3  # momentum tolerance / storage error; it is small because unconverged rotations change volumes
 MOMENTUM_STEPS = 10
 REBALANCED = 6  # largest number of iterations if contacts change, divided by the number if they do not
 LOOSEST = 1e-2
@@ -59,12 +59,12 @@ ERROR = 1 / 20
 
 For a mode with decay rate l, the stability function of sdirk2 gives an error of 0.081 dt |l| e in a step, at most 0.28
 e.  A pressure that follows a varying load has an error of at most 0.14 e.  With little decay in a step such errors add
-up, to 0.081 e.  Errors, measured against steps an eighth as long, are 0.05 to 0.08 e under loads and drained pressures
-that rise or oscillate; 0.01 to 0.04 e with an oscillating source; 0.01 to 0.05 e late in a consolidation; 0.17 e in a
-first step of a load that grows from zero; 0.26 e after a jump.  The largest error of a run is 0.7 to 5 times e / 20.
+up, to 0.081 e.  Measured against steps an eighth as long, errors are 0.05 to 0.08 e if loads rise or oscillate, or the
+pressure prescribed on a drained side oscillates.  They are 0.01 to 0.04 e with an oscillating source, 0.01 to 0.05 e
+late in a consolidation, 0.17 e in a first step from zero load, 0.26 e after a jump, and in a run at most 5 e / 20.
 """
 SUDDEN = np.sqrt(2)
-"""If a pressure's change in the second substep, over that in the first, is below this value, sdirk2 overshoots.
+"""If a pressure changes in the second substep by less than this multiple of its change in the first, sdirk2 overshoots.
 
 With z = -(decay rate) dt, the stability function (1 + (1 - 2 gamma) z) / (1 - gamma z)^2 changes its sign at z = -1 -
 sqrt(2). The changes there are -gamma z / (1 - gamma z) = sqrt(2) - 1 and 2 - sqrt(2). The ratio is (1 - gamma) / gamma
@@ -117,7 +117,7 @@ def solve_substep(
     momentum, storage
         The balances; storage is None without fluid.
     ahead
-        Function that returns (u, p) extrapolated from the last steps, in active dofs and cells, or None.
+        Function that returns (u, p), extrapolated from the last steps, at active dofs and cells; or None.
     as_reset, key
         See `OnGrid.as_reset`. Linear laws use the tangent at the reset while the key stays the same.
     report
@@ -164,8 +164,8 @@ def note_pressures(
 ) -> None:
     """Store the pressure changes and the estimated pressure error of a step in the report.
 
-    The difference between the step and a first-order step is the fluid volume `seconds` (Q2 - Q1). The fixed-stress
-    operator converts this volume into a pressure that stays bounded for stiff modes, as in Hosea and Shampine (1996).
+    The step and a first-order step differ by the fluid volume `seconds` times the change of rates between substeps. The
+    fixed-stress operator converts it into a pressure that is bounded for stiff modes, as in Hosea and Shampine (1996).
     Cells are weighted by their filling. The error of the step is assumed to be `ERROR` times this pressure.
 
     seconds: factor, s, of the rates of the first substep; dt: length of the step, s; of_bodies: `Motion.of_bodies`, a
@@ -214,7 +214,7 @@ class Newton:
             self._vectors.append((storage.forms.p.x, active.cells))
 
     def newton(self, as_reset: AsReset, key: Hashable, serves: bool, ahead: Callable | None) -> Errors:
-        """Solve both balances by Newton's method; a tangent is kept while it converges, with linear laws many steps.
+        """Solve both balances by Newton's method; a tangent is kept while it converges, in linear laws many steps.
 
         serves: whether the tangent of the previous substep may be reused; ahead: see `solve_substep`.
         """

@@ -31,9 +31,9 @@ class Numerics:
         Time integration: "sdirk2" (second order) or "backward-euler".
     renewal
         Whether to replace particle domains of yielded soil that are longer than a cell, see `stepping/renewal.py`. It
-        requires soil that yields, dry or saturated, in 2D, no `Contact`, in axisymmetry no inertia, and "domain".
+        requires quadrature "domain", yielding soil, dry or saturated, in 2D, no `Contact`, in axisymmetry no inertia.
     keep_volumes
-        Whether yielded domains keep the volumes of their points, see `domains/kept_volumes.py`. It requires "domain".
+        Whether yielded domains keep the volumes of their points, see `domains/kept_volumes.py`; only with "domain".
     petsc_options
         PETSc options for the solvers, see `Scheme`.
 

@@ -7,9 +7,9 @@
 K, B and C: see `newton`. Elimination of du gives S = C + B K^-1 B^T. Conjugate gradients (or FGMRES) solve with S,
 preconditioned with the fixed-stress operator. For large bodies GMRES solves for both unknowns (`monolithic`).
 
-PETSc's PCFIELDSPLIT with the same two solvers (full Schur factorisation) takes as many iterations, to the same digits.
-A solve takes 0.8 to 1 times the time of a solve here. But PCFIELDSPLIT needs a copy of -B^T for each tangent, and
-fixed-stress iterations would still need the blocks.
+PETSc's PCFIELDSPLIT with the same two solvers (full Schur factorisation) takes equally many iterations, with the same
+digits, in 0.8 to 1 times the time of the present solves. But PCFIELDSPLIT needs a copy of -B^T for each tangent,
+and fixed-stress iterations would still need the blocks.
 """
 
 from __future__ import annotations

@@ -24,20 +24,20 @@ class Thresholds:
         Number of unknown displacements in 3D from which multigrid is used. Five load steps of a square beam take, with
         a direct solver and multigrid, s: 0.5 and 0.5 (1200 unknowns), 2.5 and 1.4 (2600), 8.2 and 2.1 (4900).
     multigrid_2d
-        The same number in wet 2D scenes without yield. Linear solvers in a step of the beam take, s: 0.06 and 0.05
-        (10400 unknowns), 0.19 and 0.14 (25500), 0.53 and 0.32 (51000), 2.3 and 1.0 (151000).
+        The same limit in wet 2D scenes without yield. In a step of the beam, direct solver and multigrid take, s: 0.06
+        and 0.05 (10400 unknowns), 0.19 and 0.14 (25500), 0.53 and 0.32 (51000), 2.3 and 1.0 (151000).
     mumps
         Number of unknown displacements of wet unsymmetric problems from which MUMPS is used, on all processes. Factors
         and a solve take, with 196000 unknowns: PETSc 2.6 and 0.02 s, MUMPS with OpenBLAS 0.7 and 0.09 s; with 51000
         unknowns: PETSc 0.25 and 0.004 s, MUMPS 0.12 and 0.02 s. A Newton step takes five to ten solves.
     gathering
-        Largest number of processes for which a single process holds the factors that many solves use. Factorisations
-        on all of four processes took 1.7 times as long, because these share the memory's bandwidth.
+        Largest number of processes for which a single process holds the factors that many solves use. When all of four
+        processes shared the factorisations, the memory's bandwidth made these take 1.7 times as long.
     fallback_3d
         Largest number of unknown displacements in 3D for which a direct solver may replace multigrid. MUMPS takes 8 s
         and 0.2 GB for this number, with unsymmetric K 15 s and 0.4 GB.
     many
-        Iterations of a solve above which a direct solver replaces multigrid, or the next tangent renews the factors of
+        If a solve takes more iterations, a direct solver replaces multigrid, or the next tangent renews the factors of
         the fixed-stress operator.  Limits of 12, 25, 50 and 500 give equally many Newton steps (footing, 9 cells).
     coarsest
         Largest number of unknowns of multigrid's coarsest grid, which has a direct solver.

@@ -343,7 +343,7 @@ class Motion:
         return points.strained(F, corners=corners, x=centroids(corners)), keeps, folded
 
     def _own(self, stage: Stage, points: MaterialPoints) -> NDArray[np.bool_]:
-        """Return a mask (n, 2^d, d) of components of corners: neither prescribed by conditions nor fixed by walls."""
+        """Return a mask (n, 2^d, d) of the components of corners that neither conditions prescribe nor walls fix."""
         fixed = fixed_corners(self._momentum.grid, stage.conditions["walls"], points.corners)
         return ~(given(stage.lattices, points) | fixed)
 

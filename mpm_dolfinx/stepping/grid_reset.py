@@ -209,7 +209,7 @@ class OnGrid(Keyed):
 
     @contextmanager
     def as_reset(self, state: State) -> Iterator[QuadratureData]:
-        """Yield the integration points at the last reset; within the context u is 0, and p as at the reset."""
+        """Yield the integration points at the last reset; within the context u is 0, and p is that at the reset."""
         at = [(self._u.x.array, self._momentum.active.now.dofs)]
         if self._storage is not None:
             at += [(f.x.array, self.cells) for f in (self._storage.p, self._storage.p_n)]
@@ -420,7 +420,7 @@ class OnGrid(Keyed):
         return self.cut.valid(points, part, count)[part]
 
     def parts_of_cells(self, loads: Sequence[Loads]) -> tuple[NDArray[np.int64], int]:
-        """Return the connected parts of cells, as `ActiveSet.parts_of_cells`; parts that may touch are one part."""
+        """Return the connected parts of cells, like `ActiveSet.parts_of_cells`; parts that may touch are one part."""
         if self.cut.grid.copies == 1:
             return self.active.parts_of_cells
         pairs = np.concatenate([one.within_reach() for one in loads])
@@ -497,7 +497,7 @@ class System:
         return LinearSolvers(self.plan, self._scheme, self.momentum, self.storage)
 
     def end_step(self) -> None:
-        """Delete coarse grids without a kept tangent, to free memory before the points move."""
+        """Delete multigrid's coarse grids if no tangent is kept, to free memory before the points move."""
         if "solvers" in vars(self) and self.plan.iterative and self.solvers.tangent.value is None:
             del self.solvers
             collect_garbage(self.momentum.unknowns.comm)
@@ -582,7 +582,7 @@ class Assembled(Keyed):
     ) -> tuple[list[Feeds], Callable[[bool], Outflow]]:
         """Return the fluid conditions, and a function `outflow(begins)` for the fluxes at u; begins: see `mobility`.
 
-        Fluxes at the start are reused where points keep their pieces, if only u could change the fluxes.
+        Without a conductivity law, cells whose points all keep their pieces have the flux geometry of the last reset.
 
         state: at the start of the step; weight (d,), N/m^3: unit weight of the fluid, with gravity; data: integration
         points; t: time of the pressures and fluxes on open sides, s; dt: length of the step, s.
@@ -646,7 +646,7 @@ def assembled(
     loads: Sequence[Loads],
     begins: bool,
 ) -> Assembled:
-    """Return the matrices for cut domains and a stage; begins: raise an error if a part of a body lacks support.
+    """Return the matrices for cut domains and a stage; begins: whether every part of a body must have support.
 
     Raises
     ------

@@ -56,10 +56,10 @@ DEPTH, PATIENCE, LESS = 40, 16, 0.7
 """Anderson mixing of `DEPTH` iterations ends when `PATIENCE` successive residuals exceed `LESS` times the best one.
 
 Tests: a wet bank, elastic or frictional, and blocks on a rough base, one of them half supported. With 40 and 16, or 80
-and 24, the number of iterations is the same, and relative forces of 4e-5 to 3e-9 remain; with 40 and 8 up to 6e-3.
+and 24, iterations are equally many and leave relative forces of 4e-5 to 3e-9; with 40 and 8 they leave up to 6e-3.
 """
 REMARKABLE = 0.05
-"""Change of stress by balancing, divided by the largest initial stress, above which there is a warning.
+"""Largest change of stress by balancing without a warning, divided by the largest initial stress.
 
 The value is also the largest allowed relative residual of the forces, which is due to errors of the discretisation.
 """
@@ -146,8 +146,8 @@ def begin_stage(
     if scene.initial.given:
         gravity = after.gravity_at(state.t)
     if add and over_all(scene.grid.comm, int((bare.id >= sum(map(len, scene.bodies))).any())):
-        what = f"stage: add: body {add[0]}, while domains of other bodies have been renewed"
-        raise ValueError(f"{what}, must be added before, or without Numerics(renewal=True)")
+        what = f"stage: add: body {add[0]} after a renewal of domains"
+        raise ValueError(f"{what}, must be added before the first renewal, or without Numerics(renewal=True)")
     bare = _without_extra(scene, bare, add, fields) if add else bare
     points, new = _filled(scene, bare.of(removed, kept=False), standing, add, gravity)
     others = before.data_names(before.named.keys() - after.same(before))
@@ -213,7 +213,7 @@ def _kept_at_rest(scene: Scene, state: State) -> State:
     """Return the state on the grid of the next step, with the forces `State.held` that keep it at rest there.
 
     Bodies are in equilibrium under the loads of the present stage.  A reset of the grid leaves a small imbalance.
-    There are no such forces with contact, which pushes the penetrations out that the last step has left.
+    With contact there are no such forces, because contact removes penetrations that the last step has left.
     """
     start, forms = set_up(scene, state, 0.0), scene.momentum
     state, system = start.state, start.matrices.momentum

@@ -36,7 +36,7 @@ def with_lines(grid: Grid, state: State, left: Callable[[State], State]) -> Stat
     Parameters
     ----------
     left
-        Function that returns a state ready for a reset; it is called while the grid has the lines of the state.
+        Function that adds pressures of pieces to a state with kept pieces, for a reset; called before the grid moves.
     """
     before = grid.seeded if state.lines is None else [state.lines[letter] for letter in sorted(state.lines)]
     grid.move(before)

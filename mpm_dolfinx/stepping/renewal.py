@@ -10,7 +10,7 @@ are filled anew:
   there becomes `EDGES` edges, with the same ends, area and sharp corners; in axisymmetry with the same volume.
 
 Remainders of old domains outside these cells become domains. Masses, volumes and the mass of the fluid are exact in
-each cell, also mass-weighted sums of other point data, such as the logarithm of the elastic left Cauchy-Green tensor.
+each cell, as are mass-weighted sums of other point data, such as the logarithm of the elastic left Cauchy-Green tensor.
 These data are means over the overlap of old and new domains, shifted to the new centroids by fitted slopes, within the
 range of the old values. With inertia, the centre of mass, the momentum and the angular momentum of each cell are exact
 too. Cells with elastic soil, several bodies, several surface crossings, or domains on a side whose displacement a
@@ -45,7 +45,7 @@ from mpm_dolfinx.points.material_points import ACROSS, MaterialPoints, body_of, 
 from mpm_dolfinx.stepping.state import State, Stay
 
 LONGEST = 1.0
-"""Largest length of a domain, in cell sizes; longer ones should bend, but have straight edges. Source: definition."""
+"""Largest length of a domain, in cell sizes; edges of longer domains would have to bend. Source: definition."""
 
 
 class Renewal:

@@ -56,7 +56,7 @@ class Result:
     memory
         Peak memory of all processes with libraries, MB.
     imbalance
-        Largest number on a process divided by the mean, of points, pieces and cells: `summary.imbalance` at the end.
+        For points, pieces and cells: largest number on a process, divided by the mean, see `summary.imbalance`.
     """
 
     rows: Rows = field(default_factory=Rows, repr=False)
@@ -144,12 +144,12 @@ class Result:
     def energies(self) -> ByName[NDArray[np.float64]]:
         """Energies and works (times,), J (J/m in plane strain), of a `run(energies=True)`, by name.
 
-        `kinetic` and `elastic` are energies of the bodies and free tools; `elastic` is 0 for laws without an energy.
+        `kinetic`, `elastic` are energies of bodies and free tools; `elastic` is 0 for laws of unknown elastic energy.
         Works since the start of the run: `external`, work of all loads; `viscous`, of quiet sides and user's terms;
         `friction`, of slip at tools and between groups; `internal`, of the stresses. `dissipated` is `internal` minus
-        `elastic`, in wet bodies with the work of flow and storage of water. With `Numerics(renewal=True)`, `renewal` is
-        the kinetic and elastic energy that renewed domains have lost. `kinetic` + `elastic` + `dissipated` +
-        `viscous` + `friction` + `renewal` - `external` is constant, up to losses of the method.
+        `elastic`; in wet bodies it includes the work of flow and storage of water. With `Numerics(renewal=True)`,
+        `renewal` is the kinetic and elastic energy that renewed domains have lost. `kinetic` + `elastic` + `dissipated`
+        + `viscous` + `friction` + `renewal` - `external` is constant, up to numerical dissipation.
         """
         return self.outcome("energy")
 

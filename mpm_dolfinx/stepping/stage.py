@@ -135,7 +135,7 @@ class Stage:
         return {data for one in self.acting for name, of in one.kept(0).items() if name in names for data in of}
 
     def same(self, before: Stage) -> set[str]:
-        """Return names of conditions that are the same object in the previous stage, or whose name the user gave."""
+        """Return names of conditions that are the same object in both stages, or have a user's name in both."""
         shared = ((name, one) for name, one in self.given.items() if name in before.given)
         return {name for name, one in shared if one is before.given[name] or getattr(one, "name", None) == name}
 
@@ -204,7 +204,7 @@ def stage(
     bodies, materials
         All bodies and materials of the scene.
     momentum, fed
-        Forms with the loads of all stages, and terms of all stages in the balance of fluid.
+        Forms, with the loads that act in all stages, and terms in the balance of fluid that act in all stages.
     conditions
         walls, conditions, gravity and inertia: see `Simulation`.
     present

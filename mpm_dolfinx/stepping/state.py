@@ -106,7 +106,7 @@ class Trend:
         _freeze(vars(self))
 
     def over(self, seconds: float, implicit: bool = False, first: float = 0.0) -> NDArray[np.float64]:
-        """Return changes (n, ...) in a time (s) by the polynomial through the last states.
+        """Return the changes (n, ...) in a time `seconds`, s, from the polynomial through the last states.
 
         implicit: whether the rate at the end of the time replaces its mean.  If `first` > 0, the implicit change in
         a first substep of this length (s), times seconds / first, is subtracted.
@@ -196,7 +196,7 @@ class State:
 
     @property
     def as_cut(self) -> MaterialPoints:
-        """Points at the positions at which the next step cuts them; if they keep their pieces, at the last reset."""
+        """Points as they are cut: at the positions of the last reset if they keep their pieces, else at the present."""
         if self.stay is None:
             return self.points
         return self.stay.points if self.stay.keeps is None else self.stay.points.where(self.stay.keeps, self.points)

@@ -14,8 +14,8 @@ Its content changes by S(p) times the change in saturated soil, plus the change 
 have chi = S = k_r = 1.  If pressures are constant in the cells, the two-point flux is kappa J |F^-T N|^2 (p+ - p-)/h,
 with the distance h of the cells' centres, and with the mean of k_r between the pressures of both cells.  This flux is
 not consistent under shear.  In axisymmetry F contains the circumferential stretch, and integrals extend over the full
-circumference.  Materials, retention, user-defined terms and time integration are the code of the material point method.
-The two methods differ only in discretisation.
+circumference.  Materials, retention, user-defined terms and time integration have the same code as in the material
+point method.  The two methods differ only in discretisation.
 """
 
 from __future__ import annotations
@@ -437,7 +437,7 @@ class BiotFEM:
     def _solver(self) -> PETSc.SNES:
         """Return Newton's method with full steps and a direct solver.
 
-        A line search is very slow where a slender body rotates: rotations cause a spurious stretch at first order.
+        A line search is very slow where a slender body rotates, because linearised rotations stretch it.
         """
         options, prefix = PETSc.Options(), "mpm_reference_"
         if not options.hasName(f"{prefix}snes_linesearch_type"):
@@ -480,7 +480,7 @@ class BiotFEM:
         return _compat.petsc_vec(out)
 
     def step(self, dt: float) -> tuple[int, float]:
-        """Advance by dt, s, > 0; return Newton iterations and relative residual.  `NotConverged` leaves the state."""
+        """Advance by dt, s, > 0; return Newton iterations and relative residual.  `NotConverged` changes no state."""
         numbers("dt", dt, test=lambda v: (0 < v) & (v < np.inf), allowed="> 0 and finite")
         newton, worst = 0, 0.0
         for substep in self._substeps:
@@ -591,7 +591,7 @@ class BiotFEM:
         """
         steps = round((t_end - self.t) / dt) if dt > 0 else 0
         if steps < 1 or abs(steps * dt - (t_end - self.t)) > NEAR * dt:
-            raise ValueError(f"dt = {dt!r}, t_end = {t_end!r}: dt must divide the {t_end - self.t:g} s left")
+            raise ValueError(f"dt = {dt!r}, t_end = {t_end!r}: dt must divide the remaining {t_end - self.t:g} s")
         x = positions(probes, self.grid.dim)
         out = np.flatnonzero(self.grid.outside(x - self.grid.base))
         if len(out):

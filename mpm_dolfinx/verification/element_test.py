@@ -114,8 +114,8 @@ def element_test(
         constant normal stress, F_xx = F_zz = 1), "shear undrained" (simple shear at constant volume), "wetting
         isotropic" (constant net stresses), "wetting oedometer" (constant axial net stress, no lateral strain).
     strain
-        Final value, or successive turning points: logarithmic axial strain, compression positive, which in an isotropic
-        test all axes have; in shear F_xy; in wetting the suction, Pa, >= 0.
+        Final value, or successive turning points, of the prescribed quantity: logarithmic axial strain (in an isotropic
+        test, along all axes), compression positive; in shear F_xy; in wetting the suction, Pa, >= 0.
     steps
         Number of equal steps to each turning point.
     confinement

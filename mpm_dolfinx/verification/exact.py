@@ -171,7 +171,7 @@ class Mandel:
 
         x, y (...): positions, m, in [0, a] and [0, b]; each broadcasts with times t (...), s, > 0.
         Returns (u_x, u_y), m; u_x is independent of y, u_y of x. Source: computed from the pressure and the force on
-        the plate, with zero total stress at the lateral side. It equals the displacement in papers cited for the class.
+        the plate, with zero total stress at the lateral side. It agrees with the papers cited for the class.
         """
         x, y = np.asarray(x, dtype=float), _within("y", y, self.b)
         plane = self.bulk + self.shear / 3  # lambda + G
