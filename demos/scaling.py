@@ -141,7 +141,9 @@ def measure(dim: int, points: float) -> dict:
 def held(root: object, buffers: bool = True) -> tuple[dict[str, int], set[int]]:
     """Return the bytes of all arrays that an object reaches on this process, by kind; and the lengths of their axes.
 
-    Shared memory counts once.  buffers: whether to count the buffers of integrands too, which have a fixed largest number of rows.
+    Shared memory counts once.
+
+    buffers: whether to count the buffers of integrands too, which have a fixed largest number of rows.
     """
     objects, seen = [root], set()
     arrays: dict[int, NDArray] = {}

@@ -73,7 +73,8 @@ def test_only_what_is_made_with_the_mesh_makes_it():
     for name in ("_repr_html_", "_ipython_display_", "shape_", "__array__"):
         assert not hasattr(grid, name)
     assert grid._cells is None
-    own = {"cellwise", "memory", "at", "_index", "_window"}  # of these spaces, and of places between lines, the grid has methods
+    # of these spaces, of places between lines, and of local cells the grid has methods
+    own = {"cellwise", "memory", "at", "_index", "_window"}
     made = vars(shared._of_process).keys() - own
     assert {"mesh", "cell_nodes"} <= made
     for name in made:

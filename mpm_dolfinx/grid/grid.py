@@ -192,9 +192,9 @@ class Cells:
         self._index = [grid.nodes_along(x[:, :d]) for x in (node_x, mesh.geometry.x)] if grid.follow is not None else []
         index = np.array(np.unravel_index(self.cell_number % grid.cells, tuple(grid.shape)))
         low = index.min(axis=1, keepdims=True) if self.num_local else np.zeros((d, 1), dtype=np.int64)
-        locals = np.full((grid.copies, *(index - low + 1).max(axis=1, initial=0)), -1, dtype=np.int32)
-        locals[(self.cell_number // grid.cells, *(index - low))] = np.arange(self.num_local)
-        self._window = low, locals
+        table = np.full((grid.copies, *(index - low + 1).max(axis=1, initial=0)), -1, dtype=np.int32)
+        table[(self.cell_number // grid.cells, *(index - low))] = np.arange(self.num_local)
+        self._window = low, table
         topology = mesh.topology
         topology.create_connectivity(d, d - 1)
         topology.create_connectivity(d - 1, d)
@@ -214,14 +214,14 @@ class Cells:
 
     def local(self, grid: Grid, number: NDArray[np.int64]) -> NDArray[np.int32]:
         """Return the local index of the cells with lexicographic indices `number`; -1 for cells of other processes."""
-        low, locals = self._window  # local indices, or -1, of all cells of each copy from index `low` (d, 1) on
-        if locals.size == grid.all_cells:
-            return locals.ravel()[number]
+        low, table = self._window  # local indices, or -1, of all cells of each copy from index `low` (d, 1) on
+        if table.size == grid.all_cells:
+            return table.ravel()[number]
         copy, cell = np.divmod(np.ravel(number), grid.cells)
         index = np.array(np.unravel_index(cell, tuple(grid.shape))) - low
         out = np.full(len(cell), -1, dtype=np.int32)
-        inside = ((index >= 0) & (index < np.array(locals.shape[1:])[:, None])).all(axis=0)
-        out[inside] = locals[(copy[inside], *index[:, inside])]
+        inside = ((index >= 0) & (index < np.array(table.shape[1:])[:, None])).all(axis=0)
+        out[inside] = table[(copy[inside], *index[:, inside])]
         return out.reshape(np.shape(number))
 
     @cached_property

@@ -25,10 +25,11 @@ class Partition:
         self.shape = load.shape
         self.low, self.count = np.zeros((2, processes, load.ndim), dtype=np.int64)
         """First index (processes, d) of each process's box, and numbers of cells (processes, d) along its edges."""
-        self._cuts: list[tuple[int, int, int, int]] = []  # axis, first cell beyond, first rank below and beyond
+        cuts: list[tuple[int, int, int, int]] = []  # axis, first cell beyond, first rank below and beyond
         filled = load > 0
         weight = load + (EMPTY * load[filled].mean() if filled.any() else 1.0)
-        self._bisect(weight, filled, np.zeros(load.ndim, dtype=np.int64), 0, processes)
+        self._bisect(weight, filled, np.zeros(load.ndim, dtype=np.int64), (0, processes), cuts)
+        self._cuts = cuts
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Partition) and bool((self.low == other.low).all() & (self.count == other.count).all())
@@ -36,13 +37,20 @@ class Partition:
     __hash__ = None
 
     def _bisect(
-        self, weight: NDArray[np.float64], filled: NDArray[np.bool_], low: NDArray[np.int64], first: int, count: int
+        self,
+        weight: NDArray[np.float64],
+        filled: NDArray[np.bool_],
+        low: NDArray[np.int64],
+        ranks: tuple[int, int],
+        cuts: list[tuple[int, int, int, int]],
     ) -> None:
-        """Distribute a box of cells from index `low` (d,) on among `count` ranks from `first` on.
+        """Distribute a box of cells from index `low` (d,) on among ranks, and add its cuts to `cuts`.
 
-        Arrays are views of the arrays of the whole grid.  If there are enough cells, each rank gets at least one; this
-        has priority over equal loads.
+        If there are enough cells, each rank gets at least one; this has priority over equal loads.
+
+        ranks: first rank and number of ranks.  Arrays are views of the arrays of the whole grid.
         """
+        first, count = ranks
         if count == 1 or weight.size == 1:
             self.low[first], self.count[first] = low, weight.shape
             return
@@ -53,18 +61,18 @@ class Partition:
             layers = weight.sum(axis=tuple(a for a in range(weight.ndim) if a != axis))
         cells = np.arange(1, len(layers)) * (weight.size // len(layers))  # below each plane
         # ranks below each plane: half, unless ranks stay idle
-        ranks = np.clip(count // 2, count - (weight.size - cells), cells)
-        even = (ranks == count // 2) | (ranks != count // 2).all()
-        off = np.abs(np.cumsum(layers)[:-1] - layers.sum() * ranks / count)
+        below = np.clip(count // 2, count - (weight.size - cells), cells)
+        even = (below == count // 2) | (below != count // 2).all()
+        off = np.abs(np.cumsum(layers)[:-1] - layers.sum() * below / count)
         plane = int(np.argmin(np.where(even, off, np.inf)))
-        half, plane = int(ranks[plane]), plane + 1
+        half, plane = int(below[plane]), plane + 1
         parts = [np.moveaxis(array, axis, 0) for array in (weight, filled)]
         lower, upper = ([np.moveaxis(p[side], 0, axis) for p in parts] for side in (slice(plane), slice(plane, None)))
         beyond = low.copy()
         beyond[axis] += plane
-        self._cuts.append((axis, int(beyond[axis]), first, first + half))
-        self._bisect(*lower, low, first, half)
-        self._bisect(*upper, beyond, first + half, count - half)
+        cuts.append((axis, int(beyond[axis]), first, first + half))
+        self._bisect(*lower, low, (first, half), cuts)
+        self._bisect(*upper, beyond, (first + half, count - half), cuts)
 
     def owner(self, index: NDArray[np.int64]) -> NDArray[np.int32]:
         """Return the owner ranks (...) of cells with indices (d, ...) along the axes."""
@@ -93,9 +101,7 @@ def _extent(filled: NDArray[np.bool_], axis: int) -> int:
     return int(layers[-1] - layers[0] + 1)
 
 
-def destinations(
-    partition: Partition, cells: NDArray[np.int64]
-) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+def destinations(partition: Partition, cells: NDArray[np.int64]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     """Return the ranks that hold each cell, the owner first, in one list; and the start of each cell in this list.
 
     Processes that own a neighbour across a face hold the cell as a ghost.  cells (n,): lexicographic indices.

@@ -589,9 +589,7 @@ def _by_place(m: Skeleton) -> list[str]:
     return [name for name in constants_of(m) if callable(getattr(m, name))]
 
 
-def _evaluated(
-    grid: Grid, m: Skeleton, X: NDArray[np.float64], ids: NDArray[np.int64]
-) -> tuple[Skeleton, Skeleton]:
+def _evaluated(grid: Grid, m: Skeleton, X: NDArray[np.float64], ids: NDArray[np.int64]) -> tuple[Skeleton, Skeleton]:
     """Return a material at its points of this process, and at its first point of all processes, as arrays.
 
     A process without points of the material has the values at the first point.

@@ -68,7 +68,6 @@ class QuadratureData:
         out, nodes = np.empty((n, d, d)), self.pieces.points.grid.cell_nodes
         for rows, part in zip(self.rows, self.parts, strict=True):
             own = np.arange(n)[rows]
-            part.forget()
             for chunk in in_chunks(len(own)):
                 at_nodes = nodal[nodes[part.cells[chunk]]].transpose(0, 2, 1)
                 out[own[chunk]] = np.eye(d) + at_nodes @ part.places.shape_gradients(chunk)
