@@ -31,12 +31,15 @@ because the cost of factorisations is not proportional to n / P.
 from __future__ import annotations
 
 import argparse
+import gc
 import json
 import os
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
+from types import FunctionType, ModuleType
 
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -44,13 +47,18 @@ from petsc4py import PETSc
 import common
 import numpy as np
 import poroelastic_beam as beam
+from dolfinx import fem
+from dolfinx.mesh import Mesh
+from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 import mpm_dolfinx as mpm
+from mpm_dolfinx.forms import point_forms
 from mpm_dolfinx.parallel.exchange import traffic
+from mpm_dolfinx.simulation.summary import peak_memory
 from mpm_dolfinx.simulation.timeloop import PARTS
 
-SIZES = {
+SIZES: dict[str, dict[int, Sequence[float]]] = {
     "quick": {2: (500, 2000), 3: (200, 1000)},
     "default": {2: (1e3, 3e3, 1e4, 3e4, 1e5), 3: (1e3, 3e3, 1e4, 3e4)},
     "largest": {2: (1e3, 3e3, 1e4, 3e4, 1e5, 3e5, 1e6), 3: (1e3, 3e3, 1e4, 3e4, 1e5, 3e5)},
@@ -106,6 +114,7 @@ def measure(dim: int, points: float) -> dict:
     profile = {part: wall * seconds / best.wall for part, wall in best.profile.items()}
     on_grid, matrices = simulation.scene.last
     most = np.max(comm.allgather((sent() - before) / STEPS), axis=0).tolist()
+    counted = comm.allgather(held(simulation)[0])
     names = ("exchange_messages", "exchange_bytes", "solver_messages", "solver_bytes", "solver_reductions")
     return {
         "dim": dim,
@@ -122,9 +131,51 @@ def measure(dim: int, points: float) -> dict:
         **profile,
         "rest": seconds - sum(profile.values()),
         "memory_MB": best.memory,
+        "most_MB": max(comm.allgather(peak_memory())),
+        "counted_MB": max(sum(kinds.values()) for kinds in counted) / 2**20,
         "imbalance": best.imbalance.get("pieces", 1.0),
         **dict(zip(names, most, strict=True)),
     }
+
+
+def held(root: object, buffers: bool = True) -> tuple[dict[str, int], set[int]]:
+    """Return the bytes of all arrays that an object reaches on this process, by kind; and the lengths of their axes.
+
+    Shared memory counts once.
+
+    buffers: whether to count the buffers of integrands too, which have a fixed largest number of rows.
+    """
+    objects, seen = [root], set()
+    arrays: dict[int, NDArray] = {}
+    out = dict.fromkeys(("arrays", "mesh", "matrices"), 0)
+    while objects:
+        one = objects.pop()
+        if id(one) in seen or isinstance(one, (type, ModuleType)):
+            continue
+        seen.add(id(one))
+        if isinstance(one, np.ndarray):
+            while isinstance(one.base, np.ndarray):
+                one = one.base
+            arrays[one.__array_interface__["data"][0]] = one
+        elif isinstance(one, PETSc.Mat):
+            if one.handle and "aij" in one.getType():  # others have no entries of their own
+                entries = int(one.getInfo(PETSc.Mat.InfoType.LOCAL)["nz_allocated"])
+                out["matrices"] += entries * (8 + np.dtype(PETSc.IntType).itemsize)
+        elif isinstance(one, PETSc.Vec):
+            out["matrices"] += 8 * one.getLocalSize() if one.handle and one.getType() else 0
+        elif isinstance(one, fem.Function):
+            objects.append(one.x.array)
+            objects.append(one.function_space)
+        elif isinstance(one, Mesh):
+            pairs = np.ndindex(*[one.topology.dim + 1] * 2)
+            links = [one.topology.connectivity(*pair) for pair in pairs]
+            out["mesh"] += one.geometry.x.nbytes + sum(4 * len(link.array) for link in links if link is not None)
+        elif isinstance(one, FunctionType):  # its globals are of no scene
+            objects += [one.__closure__, one.__defaults__]
+        elif buffers or not isinstance(one, point_forms.Rows):
+            objects.extend(gc.get_referents(one))
+    lengths = {length for array in arrays.values() for length in array.shape}
+    return out | {"arrays": sum(array.nbytes for array in arrays.values())}, lengths
 
 
 def in_own_process(dim: int, points: float, processes: int) -> dict:
@@ -208,6 +259,8 @@ def by_processes(rows: list[dict]) -> str:
         "processes": "processes",
         "step (s)": "step",
         "memory (MB)": "memory_MB",
+        "of a process": "most_MB",
+        "counted": "counted_MB",
         "imbalance": "imbalance",
         "exchange: messages": "exchange_messages",
         "bytes": "exchange_bytes",
@@ -296,6 +349,7 @@ def main(argv: list[str] | None = None) -> dict:
     size = parser.add_mutually_exclusive_group()
     size.add_argument("--quick", action="store_true", help="a few small sizes")
     size.add_argument("--largest", action="store_true", help="up to 1e6 points in 2D, 3e5 in 3D: a quarter of an hour")
+    size.add_argument("--points", type=float, nargs="+", help="numbers of points, instead of these sizes")
     add("--processes", type=int, nargs="+", default=[1], help="numbers of processes; under mpirun: its own")
     add("--one", nargs=2, help=argparse.SUPPRESS)  # a run in a process of its own: dimension, points
     o = parser.parse_args(argv)
@@ -308,6 +362,7 @@ def main(argv: list[str] | None = None) -> dict:
             print(json.dumps(row))
         return {"converged": True}
     sizes = SIZES["quick" if o.quick else "largest" if o.largest else "default"]
+    sizes = dict.fromkeys((2, 3), o.points) if o.points else sizes
     with common.results(o) as out:
         rows = out["rows"] = []
         for dim, points in [(each, points) for each in o.dims for points in sizes[each]]:

@@ -48,7 +48,7 @@ assert abs(pieces.fraction.sum() - 1) < 1e-14
 # cut.
 
 points = FormPoints(grid)
-cells = grid.local(grid.number(grid.index(pieces.x)))
+cells = grid.locals[grid.number(grid.index(pieces.x))]
 data = points.at(cells, pieces.x, pieces.fraction * volumes(domain)[pieces.point])
 
 V = _compat.function_space(grid.mesh, "Lagrange", 1)
@@ -70,7 +70,7 @@ assert abs(per_cell.sum() - exact) < 1e-15
 BULK, SHEAR, WEIGHT = 1e5, 6e4, 1e4  # Pa, Pa, N/m^3
 corners = mpm.box(grid, [0, 0], [0.4, 0.95], per_cell=2).corners()
 pieces, volume = cut(grid, corners), volumes(corners)
-cells = grid.local(grid.number(grid.index(pieces.x)))
+cells = grid.locals[grid.number(grid.index(pieces.x))]
 
 points = FormPoints(grid, F=(2, 2))
 u = fem.Function(_compat.function_space(grid.mesh, "Lagrange", 1, (2,)))
@@ -114,7 +114,7 @@ assert size < 1e-8
 # pieces of each domain.  Then u is set to zero, and the next step starts on the undeformed grid.
 
 nodal, x = u.x.array.reshape(-1, 2), corners.reshape(-1, 2)
-at = grid.local(grid.number(grid.index(x)))
+at = grid.locals[grid.number(grid.index(x))]
 moved = corners + np.einsum("nk,nka->na", grid.shape_values(at, x), nodal[grid.cell_nodes[at]]).reshape(corners.shape)
 gradient = np.einsum("mka,mkb->mab", nodal[grid.cell_nodes[cells]], grid.shape_gradients(cells, pieces.x))
 Delta = np.tile(np.eye(2), (len(corners), 1, 1))

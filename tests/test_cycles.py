@@ -198,7 +198,7 @@ def test_corners_follow_quadratic_fields_exactly_and_kinks_at_grid_lines(dim):
     x = rng.uniform(0, 1, (200, dim))
     Q = rng.normal(size=(dim, dim, dim))
     active = np.ones(len(grid.node_x), dtype=bool)
-    cells = grid.local(grid.number(grid.index(x)))
+    cells = grid.locals[grid.number(grid.index(x))]
 
     def moved(field):
         return followed(grid, cells, x, field(grid.node_x), active).sum(axis=0)

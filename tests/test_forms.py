@@ -30,7 +30,7 @@ class Scene:
         self.grid = grid = GRIDS[dim]
         self.points = FormPoints(grid, **fields)
         x = rng.uniform(grid.low, grid.low + 0.7 * (grid.upper - grid.lower), (n, dim))
-        self.cells = grid.local(grid.number(grid.index_from_base(x)))
+        self.cells = grid.locals[grid.number(grid.index_from_base(x))]
         self.weight = rng.uniform(0.5, 2, n)
         self.x, self.rng = x, rng
         self.N, self.dN = grid.shape_values(self.cells, x), grid.shape_gradients(self.cells, x)

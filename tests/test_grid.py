@@ -17,7 +17,7 @@ def grid(request):
 
 def test_a_point_is_found_in_the_cell_that_holds_it(grid):
     x = np.random.default_rng(1).uniform(grid.low, grid.high, (200, grid.dim))
-    cells = grid.local(grid.number(grid.index_from_base(x)))
+    cells = grid.locals[grid.number(grid.index_from_base(x))]
     assert (np.abs(x - grid.midpoints[cells]) <= grid.h / 2 * (1 + 1e-12)).all()
 
 
@@ -29,7 +29,7 @@ def test_points_on_the_upper_wall_belong_to_the_last_cell(grid):
 
 def test_shape_functions_interpolate_multilinear_fields_with_their_gradients(grid):
     x = np.random.default_rng(2).uniform(grid.low, grid.high, (50, grid.dim))
-    cells = grid.local(grid.number(grid.index_from_base(x)))
+    cells = grid.locals[grid.number(grid.index_from_base(x))]
     N, dN = grid.shape_values(cells, x), grid.shape_gradients(cells, x)
 
     def f(y):
@@ -73,7 +73,8 @@ def test_only_what_is_made_with_the_mesh_makes_it():
     for name in ("_repr_html_", "_ipython_display_", "shape_", "__array__"):
         assert not hasattr(grid, name)
     assert grid._cells is None
-    own = {"cellwise", "memory", "at", "_index"}  # of these spaces, and of places between lines, the grid has methods
+    # of these spaces, of places between lines, and of local cells the grid has methods
+    own = {"cellwise", "memory", "at", "_index", "_window"}
     made = vars(shared._of_process).keys() - own
     assert {"mesh", "cell_nodes"} <= made
     for name in made:

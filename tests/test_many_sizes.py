@@ -88,7 +88,7 @@ def test_points_and_nodes_are_found_and_shape_functions_are_exact_for_linear_fie
     for dim, axisymmetric in KINDS:
         grid = uneven(dim, axisymmetric)
         x = np.random.default_rng(1).uniform(grid.low, grid.high, (200, dim))
-        cells = grid.local(grid.number(grid.index_from_base(x)))
+        cells = grid.locals[grid.number(grid.index_from_base(x))]
         assert (np.abs(x - grid.midpoints[cells]) <= grid.sizes(cells) / 2 * (1 + 1e-12)).all()
         assert grid.in_cells(grid.node_x) == pytest.approx(grid.node_places(np.arange(len(grid.node_x)))[:, :-1])
         A = np.random.default_rng(2).normal(size=(dim, dim))

@@ -13,14 +13,15 @@ import numpy as np
 import pytest
 import slump
 
-from mpm_dolfinx.grid.partition import boxes, owners
+from mpm_dolfinx.grid.partition import Partition, boxes
 
 
 def mpirun(processes: int, script: str, *arguments: str) -> None:
     """Run a script of this folder by mpirun; a failing rank aborts all. The limit is one of hanging."""
     here = Path(__file__).parent
     environment = dict(os.environ)  # given whole: mpirun must not see the MPI variables of this process
-    environment["PYTHONPATH"] = os.pathsep.join([str(here), str(here.parent), environment.get("PYTHONPATH", "")])
+    folders = (here, here.parent, here.parent / "demos")
+    environment["PYTHONPATH"] = os.pathsep.join([*map(str, folders), environment.get("PYTHONPATH", "")])
     command = ["mpirun", "--oversubscribe", "-n", str(processes), sys.executable, "-m", "mpi4py", script, *arguments]
     done = subprocess.run(command, cwd=here, env=environment, capture_output=True, text=True, timeout=900)
     assert done.returncode == 0, done.stderr[-3000:]
@@ -81,7 +82,10 @@ def test_no_process_is_left_without_a_cell_where_there_are_as_many():
     for _ in range(400):
         shape, processes = tuple(rng.integers(1, 6, rng.integers(2, 4))), int(rng.integers(2, 9))
         load = rng.integers(0, 5, shape) * (rng.random(shape) < rng.random())
-        counts = np.bincount(owners(boxes(load.astype(float), processes), shape).ravel(), minlength=processes)
+        partition = Partition(boxes(load.astype(float), processes), shape)
+        owner = partition.owner(np.indices(shape)).ravel()
+        counts = np.bincount(owner, minlength=processes)
+        assert all((np.flatnonzero(owner == rank) == partition.cells(rank)).all() for rank in range(processes))
         assert len(counts) == processes and np.count_nonzero(counts) == min(processes, load.size), (shape, processes)
 
 
@@ -121,3 +125,14 @@ def test_a_second_scene_on_a_grid_is_as_even_as_alone(tmp_path):
     """It kept the processes' cells of the first scene, and of bodies before their maps: all points lay on one."""
     mpirun(2, "mpi_second_scene.py", str(tmp_path / "out.npz"))
     assert np.load(tmp_path / "out.npz")["imbalance"].max() < 1.3
+
+
+def test_no_process_holds_arrays_of_the_whole_scene(tmp_path):
+    """Of 1e4 points, many are at borders between processes, so that each of four holds more than a quarter: 0.309."""
+    for processes in (1, 4):
+        mpirun(processes, "mpi_held.py", str(tmp_path / f"{processes}.npz"), "1e4")
+    one, four = (dict(np.load(tmp_path / f"{processes}.npz")) for processes in (1, 4))
+    assert one["whole"][0] > 0 and not four["whole"].any(), "lengths of bodies and of the grid"
+    assert four["points"].sum() == one["points"][0] and (four["asked"] <= four["points"]).all()
+    assert four["asked"].sum() == one["asked"][0] > 0
+    assert (four["held"] < 0.33 * one["held"][0]).all()

@@ -74,7 +74,7 @@ def layer(cells, damping=1.0, ghost=1.0, filled=0.5):
         patch.setattr("mpm_dolfinx.mechanics.ghost_penalty.GHOST", ghost * GHOST)
         s = mpm.Simulation(grid, [body], [soil], fluid=mpm.Fluid(bulk=np.inf), walls=walls, conditions=tractions)
         s.run(1.0, 1.0, progress=False)
-    cells_pressure = s.scene.storage.p.x.array[s.grid.local(s.grid.number(s.grid.index(body.centre)))]
+    cells_pressure = s.scene.storage.p.x.array[s.grid.locals[s.grid.number(s.grid.index(body.centre))]]
     return s.points.corners.mean(axis=1) - body.centre, s.points.pressure, *exact(body.centre), cells_pressure
 
 

@@ -27,6 +27,8 @@ def overburden(
     corners (n, 2^d, d), m: corners of the particle domains of all bodies; the last axis is vertical. unit_weight (n,),
     N/m^3: unit weights of the domains; x (k, d), m: positions in the domains.
     """
+    if not len(x):
+        return np.zeros(0), np.zeros(0)
     least = np.ptp(corners[..., :-1], axis=1).min(initial=np.inf)
     aside = SAME * least * np.sqrt([2.0, 3.0])[: x.shape[1] - 1] * (1 - 2 * corner_bits(x.shape[1] - 1))
     weight, surface = np.mean([_along(corners, unit_weight, x, x[:, :-1] + one) for one in aside], axis=0)

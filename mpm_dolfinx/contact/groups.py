@@ -128,4 +128,4 @@ def grouped(
     group = np.zeros(len(bodies), dtype=np.int64)
     for number, members in enumerate(groups_of(contacts, len(bodies))):
         group[list(members)] = number
-    return GridOfGroups(grid, np.repeat(group, [len(body) for body in bodies]))
+    return GridOfGroups(grid, group, np.cumsum([0, *map(len, bodies[:-1])]))

@@ -127,7 +127,7 @@ class Contacts(Touching):
             now = facets if present is seen else self._facets(cut, others, present)
             cell = self._under(facets, pairs.facet, _on(facets.cut[pairs.facet], pairs.t))
             if present is not points:
-                near = np.isin(patches.cell[pairs.row] * len(grid.owners) + cell, cell_pairs())
+                near = np.isin(patches.cell[pairs.row] * grid.all_cells + cell, cell_pairs())
                 slides = not near[pairs.gap < CLEAR * self._sizes(patches.now(present)[pairs.row])].all()
                 off += f"{line(self.contacts[number])}: bodies slide by more than a cell" * slides
                 pairs, cell = Pairs(*(values[near] for values in pairs)), cell[near]
@@ -156,7 +156,7 @@ class Contacts(Touching):
         cell, other, sent = (exchange.send(columns) for columns in (cell, other, values))
         number, sign, place = sent[:, :3].T.astype(np.int64)
         x, y, n, offset, shear = np.split(sent[:, 6:], 5, axis=1)
-        own = number, grid.local(cell), *sent[:, 3:6].T, shear, x, sign
+        own = number, grid.locals[cell], *sent[:, 3:6].T, shear, x, sign
         pairs = FacePairs(grid, *own, other, y, n, offset, place)
         return ContactLaw(self.names, self.contacts, pairs), Origin(
             exchange, at, values[:, 0].astype(np.int64), values[:, 3]
@@ -173,7 +173,7 @@ class Contacts(Touching):
         """
         grid = self.grid
         keys = []
-        count = len(self.grid.owners)
+        count = self.grid.all_cells
         for (_, faces, *_), (facets, pairs) in zip(self._faces, found, strict=True):
             patches = cut.surface(faces)
             where = _on(facets.cut[pairs.facet], pairs.t)
@@ -241,8 +241,8 @@ class Contacts(Touching):
         """
         grid, inside = self.grid, x - NEAR * self.grid.least * facets.outward[chosen]
         number = grid.number(grid.index_from_base(inside)) + facets.cell[chosen] // grid.cells * grid.cells
-        keys = np.unique(facets.face * len(grid.owners) + facets.cell)
-        return np.where(np.isin(facets.face[chosen] * len(grid.owners) + number, keys), number, facets.cell[chosen])
+        keys = np.unique(facets.face * grid.all_cells + facets.cell)
+        return np.where(np.isin(facets.face[chosen] * grid.all_cells + number, keys), number, facets.cell[chosen])
 
     def near(self, cut: CutDomains, points: MaterialPoints, corners: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return which corners (n, 2^d, d) are near another group; points: points at the start of the step."""
@@ -310,7 +310,7 @@ class ContactLoads(ContactProblem):
 
     def within_reach(self) -> NDArray[np.int64]:
         """Return the pairs of cells of bodies that may touch in the step."""
-        return np.stack(np.divmod(self._cell_pairs(), len(self.grid.owners)), axis=1)
+        return np.stack(np.divmod(self._cell_pairs(), self.grid.all_cells), axis=1)
 
     def near(self, points: MaterialPoints, corners: NDArray[np.float64]) -> NDArray[np.bool_] | bool:
         """Return which corners are near other groups."""

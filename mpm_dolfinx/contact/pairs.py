@@ -152,7 +152,7 @@ def shape_values_in(grid: Grid, cells: NDArray[np.int64], x: NDArray[np.float64]
 
 def on_owners(grid: Grid, cells: NDArray[np.int64]) -> NDArray[np.int32]:
     """Return the local indices of lexicographic cells of any process, on the processes that own them."""
-    return grid.local(Exchange(grid.comm, grid.owner(cells)).send(cells))
+    return grid.locals[Exchange(grid.comm, grid.owner(cells)).send(cells)]
 
 
 def at_nodes(
@@ -171,7 +171,7 @@ def at_nodes(
     column = numbers[grid.cell_nodes[cell]]
     if other is not None:
         exchange = Exchange(grid.comm, grid.owner(other))
-        columns = exchange.back(numbers[grid.cell_nodes[grid.local(exchange.send(other))]])
+        columns = exchange.back(numbers[grid.cell_nodes[grid.locals[exchange.send(other)]]])
         column = np.concatenate([column, columns], axis=1)
     column = column.swapaxes(1, 2)
     value, m = np.broadcast_to(value[:, None], (len(value), d, value.shape[1])), len(cell) * d

@@ -228,7 +228,7 @@ class ContactProblem(Loads):
     def _pattern_of_pairs(self, unknowns: Unknowns) -> PETSc.Mat:
         """Return a matrix with all entries that pairs between groups may have in the step."""
         grid, d = self.grid, self.grid.dim
-        cell, other = np.divmod(self._cell_pairs(), len(grid.owners))
+        cell, other = np.divmod(self._cell_pairs(), grid.all_cells)
         exchange = Exchange(grid.comm, grid.owner(cell))
         cell, other = exchange.send(cell), exchange.send(other)
         key, of = np.unique(cell, return_inverse=True)
@@ -238,7 +238,7 @@ class ContactProblem(Loads):
             all_of = scipy.sparse.csr_matrix((np.ones(m), (of, np.arange(m))), shape=(len(key), m))
             together = all_of.T @ all_of
         all_of = scipy.sparse.kron(together, np.ones((d, d)), format="csr")
-        B = at_nodes(grid, unknowns, grid.local(cell), np.ones((m, 2 ** (d + 1))), other)
+        B = at_nodes(grid, unknowns, grid.locals[cell], np.ones((m, 2 ** (d + 1))), other)
         return petsc_matrix(all_of, m * d, grid.comm, own=True).PtAP(B)
 
     def coupling(self, at: At) -> PETSc.Mat:

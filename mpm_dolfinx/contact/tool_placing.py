@@ -232,7 +232,7 @@ class Tools(Touching):
         number, *own = sent[:, :4].T
         now, carried, shear = np.split(sent[:, 4:], 3, axis=1)
         acts = np.ones(len(number)), self.tools, poses
-        pairs = ToolPairs(grid, number.astype(np.int64), grid.local(cell), *own, shear, places, *acts, now, carried)
+        pairs = ToolPairs(grid, number.astype(np.int64), grid.locals[cell], *own, shear, places, *acts, now, carried)
         origin = Origin(exchange, patches.at[at], values[:, 0].astype(np.int64), values[:, 1])
         along = np.array([tool.along(d) for tool in self.tools])
         pushes = Pushes([line(tool) for tool in self.tools], self.by_loads.before, along, np.array(loads))

@@ -53,7 +53,7 @@ def check_held(
         both, sides = [part[cell]], 1
         if other is not None:
             exchange, sides = Exchange(grid.comm, grid.owner(other)), 2
-            both.append(exchange.back(part[grid.local(exchange.send(other))]))
+            both.append(exchange.back(part[grid.locals[exchange.send(other)]]))
         number = np.concatenate([number, *both])
         against = np.concatenate([against, *(both[::-1] if sides == 2 else [np.zeros(len(cell), dtype=np.int64)])])
         x, direction = np.concatenate([x, *[place] * sides]), np.concatenate([direction, *[along] * sides])

@@ -128,7 +128,7 @@ class CutDomains(Keyed):
         """Function that sends values of the pieces to the owners of their cells."""
         self.to_pieces = exchange.back
         """Function that sends values of the pieces from the owners of their cells to the processes of the points."""
-        self.cells, self.x = grid.local(exchange.send(self.pieces.cell)), exchange.send(self.pieces.x)
+        self.cells, self.x = grid.locals[exchange.send(self.pieces.cell)], exchange.send(self.pieces.x)
         """Owned cells (m,) of the pieces, and centroids (m, d), m, of the pieces."""
         self.mixed = exchange.send(self.pieces.mixed) if grid.dim == 3 and domains else None
         """In 3D: mean products of the offsets in each piece from its centroid, see `Pieces`."""
@@ -246,7 +246,7 @@ class CutDomains(Keyed):
         # rounding must not assign a corner on a grid line to a cell outside the domain
         cell = self._filled_cell(at, x + NEAR * (self.points.x[at] - x))
         exchange = Exchange(grid.comm, grid.owner(cell))
-        return exchange, grid.local(exchange.send(cell)), exchange.send(x)
+        return exchange, grid.locals[exchange.send(cell)], exchange.send(x)
 
     def total_displacement(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return total displacements (m, d), m, of the pieces' centroids, computed from the corners of the domains."""
@@ -263,7 +263,7 @@ class CutDomains(Keyed):
 
     def _filled_cell(self, at: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:
         """Return the cell (m,) of each x; if the domain has no piece in this cell, the cell of its largest piece."""
-        pieces, cells = self.pieces, len(self.grid.owners)
+        pieces, cells = self.pieces, self.grid.all_cells
         cell = self.grid.number(self.grid.index_from_base(x)) + self.grid.copy(self.points.id[at])
         key, keys = at * cells + cell, pieces.point * cells + pieces.cell
         if not len(key):

@@ -25,7 +25,7 @@ from mpm_dolfinx.base.tolerances import NEAR, SAME
 from mpm_dolfinx.base.validation import flag, instance, line, numbers
 from mpm_dolfinx.grid.following import check_follow
 from mpm_dolfinx.grid.lines import MOST, checked, equal, rounding
-from mpm_dolfinx.grid.partition import UNEVEN, better, boxes, destinations, owners
+from mpm_dolfinx.grid.partition import UNEVEN, Partition, better, boxes, destinations
 from mpm_dolfinx.parallel.exchange import Exchange, over_all
 
 SIDES = {
@@ -79,6 +79,8 @@ def in_chunks(count: int) -> list[slice]:
 def sum_by(index: NDArray, values: NDArray[np.float64], size: int) -> NDArray[np.float64]:
     """Return the sums (..., size) of values (..., n) with equal index (n,), as floats also if there are no values."""
     shape = values.shape[:-1]
+    if shape and len(index) > CHUNK:  # the index of all rows together would take as much memory as the values
+        return np.array([sum_by(index, row, size) for row in values])
     if shape:
         index = (index + size * np.arange(prod(shape))[:, None]).ravel()
     sums = np.bincount(index, weights=values.ravel(), minlength=size * prod(shape))
@@ -154,6 +156,29 @@ class Spacing(NamedTuple):
     snap: NDArray[np.float64]
 
 
+class LocalCells:
+    """Local indices of cells by lexicographic index, as an array: `[number]` is -1 for cells of other processes.
+
+    number (cells,): lexicographic indices of the local cells.  Memory: a table of the box around these cells.
+    """
+
+    def __init__(self, grid: Grid, number: NDArray[np.int64]):
+        self._shape, self._cells = tuple(grid.shape), grid.cells
+        index = np.array(np.unravel_index(number % grid.cells, self._shape))
+        self._low = index.min(axis=1, keepdims=True) if len(number) else np.zeros((grid.dim, 1), dtype=np.int64)
+        extent = (index - self._low + 1).max(axis=1, initial=0)
+        self.table = np.full((grid.copies, *extent), -1, dtype=np.int32)
+        self.table[(number // grid.cells, *(index - self._low))] = np.arange(len(number))
+
+    def __getitem__(self, number: NDArray[np.int64]) -> NDArray[np.int32]:
+        copy, cell = np.divmod(np.ravel(number), self._cells)
+        index = np.array(np.unravel_index(cell, self._shape)) - self._low
+        out = np.full(len(cell), -1, dtype=np.int32)
+        inside = ((index >= 0) & (index < np.array(self.table.shape[1:])[:, None])).all(axis=0)
+        out[inside] = self.table[(copy[inside], *index[:, inside])]
+        return out.reshape(np.shape(number))
+
+
 class Cells:
     """The cells of a grid on this process, ghosts included, in the numbering of the mesh.
 
@@ -167,19 +192,19 @@ class Cells:
         Current positions of nodes and cells.
     cell_number
         Lexicographic index of each local cell.
-    boxes : (ranks, 2, d)
-        First cell index along each axis, and last index plus one, of the cells of each process.
-    locals, owners
-        Local index, -1 if not on this process, and owner rank of all cells of the grid, one copy after the other.
+    partition
+        Boxes of cells of all processes.
+    locals
+        Local index of each cell of the grid, one copy after the other; -1 if not on this process.
     cell_facets : (cells, 2d)
         Facets of each cell.
     facet_cells : (facets, 2)
         Cells at each facet, -1 outside the boundary.
     """
 
-    def __init__(self, grid: Grid, mesh: Any, boxes: NDArray[np.int64], owners: NDArray[np.int32]):
-        self.mesh, self.boxes = mesh, boxes
-        self.owners = owners
+    def __init__(self, grid: Grid, mesh: Any, partition: Partition):
+        self.mesh = mesh
+        self.partition = partition
         d = grid.dim
         nodes = _compat.function_space(mesh, "Lagrange", 1)
         self.num_owned, self.num_local = _compat.num_cells(mesh)
@@ -192,12 +217,16 @@ class Cells:
         self.signs = np.concatenate(grid.comm.allgather(np.sign(corners[:1] - midpoints[:1, None])))[0]
         self.cell_number = grid.number(grid.index_from_base(midpoints))
         if grid.copies > 1:
-            brought = np.concatenate(grid.comm.allgather((owners == grid.comm.rank).nonzero()[0]))
-            self.cell_number = brought[np.asarray(mesh.topology.original_cell_index)]
+            brought, cells = np.asarray(mesh.topology.original_cell_index), partition.count.prod(axis=1)
+            start = np.cumsum([0, *(grid.copies * cells)])
+            rank = start.searchsorted(brought, side="right") - 1
+            copy, k = np.divmod(brought - start[rank], cells[rank])
+            self.cell_number = partition.numbered(rank, k) + copy * grid.cells
         self.at = CellPlaces(node_x, midpoints, None if grid.even else grid.sizes_of(self.cell_number))
         self._index = [grid.nodes_along(x[:, :d]) for x in (node_x, mesh.geometry.x)] if grid.follow is not None else []
-        self.locals = np.full(len(owners), -1, dtype=np.int32)
-        self.locals[self.cell_number] = np.arange(self.num_local)
+        self.locals = LocalCells(grid, self.cell_number)
+        if self.locals.table.size == grid.all_cells:
+            self.locals = self.locals.table.ravel()
         topology = mesh.topology
         topology.create_connectivity(d, d - 1)
         topology.create_connectivity(d - 1, d)
@@ -488,14 +517,14 @@ class Grid:
         return np.minimum(np.maximum(self.lines[axis].searchsorted(x, side="right") - 1, 0), self.shape[axis] - 1)
 
     mesh = of_cells("mesh")
-    owners, boxes = map(of_cells, ("owners", "boxes"))
+    partition = of_cells("partition")
+    locals = of_cells("locals")
     num_owned = of_cells("num_owned")
     num_local = of_cells("num_local")
     cell_nodes = of_cells("cell_nodes")
     node_x, midpoints = map(of_places, ("node_x", "midpoints"))
     signs = of_cells("signs")
     cell_number = of_cells("cell_number")
-    locals = of_cells("locals")
     cell_facets = of_cells("cell_facets")
     facet_cells = of_cells("facet_cells")
     facets_owned = of_cells("facets_owned")
@@ -521,7 +550,7 @@ class Grid:
         new = boxes(load.reshape(self.shape), self.comm.size)
         if self._cells is None:
             self._cells = self._made(new)
-        elif not keep and (self.boxes != new).any():  # distributed for an earlier scene
+        elif not keep and (self.partition.boxes != new).any():  # distributed for an earlier scene
             return self.distributed(new)
         return self
 
@@ -535,11 +564,11 @@ class Grid:
         if counts.max() <= UNEVEN * counts.mean():
             return None
         load = np.bincount(number, minlength=self.cells).astype(float)
-        return better(over_all(self.comm, load).reshape(self.shape), self.boxes)
+        return better(over_all(self.comm, load).reshape(self.shape), self.partition.boxes)
 
     def check_boxes(self, boxes: NDArray[np.int64]) -> None:
         """Raise ValueError for boxes (ranks, 2, d) that do not fill the grid exactly once."""
-        owners(boxes, tuple(self.shape))
+        Partition(boxes, tuple(self.shape))
 
     def distributed(self, boxes: NDArray[np.int64]) -> Grid:
         """Return an equal grid, with the present lines, whose mesh is distributed by these boxes (ranks, 2, d)."""
@@ -552,15 +581,15 @@ class Grid:
         return Grid(**self.given, comm=self.comm, axisymmetric=self.axisymmetric)
 
     def _made(self, boxes: NDArray[np.int64]) -> Cells:
-        """Create the mesh, and return its cells.  `boxes` (ranks, 2, d) are the cells of the processes, see `Cells`."""
-        owner = owners(boxes, tuple(self.shape))
-        own = (owner.ravel() == self.comm.rank).nonzero()[0]
+        """Create the mesh, and return its cells.  `boxes` (ranks, 2, d): cells of each process, see `Partition`."""
+        partition = Partition(boxes, tuple(self.shape))
+        own = partition.cells(self.comm.rank)
         nodes = np.concatenate([self.corners(own) + copy * self.nodes for copy in range(self.copies)])
-        ranks, first = destinations(owner, own)
+        ranks, first = destinations(partition, own)
         each = np.tile(np.diff(first), self.copies)
         where = np.tile(ranks, self.copies), np.concatenate([[0], np.cumsum(each)]).astype(np.int32)
         mesh = _compat.box_mesh(self.comm, nodes, self._nodes(), *where)
-        return Cells(self, mesh, boxes, np.tile(owner.ravel(), self.copies))
+        return Cells(self, mesh, partition)
 
     def corners(self, cells: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return the lexicographic indices (n, 2^d) of the nodes of cells."""
@@ -584,6 +613,11 @@ class Grid:
     def cells(self) -> int:
         """Number of cells of one copy."""
         return prod(self.shape.tolist())
+
+    @cached_property
+    def all_cells(self) -> int:
+        """Number of cells of all copies."""
+        return self.copies * self.cells
 
     @property
     def nodes(self) -> int:
@@ -640,11 +674,9 @@ class Grid:
 
     def owner(self, number: NDArray[np.int64]) -> NDArray[np.int32]:
         """Return the owner rank of the cells with lexicographic indices `number`."""
-        return self.owners[number]
-
-    def local(self, number: NDArray[np.int64]) -> NDArray[np.int32]:
-        """Return the local index of the cells with lexicographic indices `number`; -1 for cells of other processes."""
-        return self.locals[number]
+        if self.comm.size == 1:
+            return np.zeros(number.shape, dtype=np.int32)
+        return self.partition.owner(np.array(np.unravel_index(number % self.cells, tuple(self.shape))))
 
     def gathered(self, rows: Sequence[tuple], width: int) -> tuple[NDArray, NDArray, NDArray]:
         """Send rows (cells, positions, values) to the owners of cells; return local cells, positions and values."""
@@ -652,7 +684,7 @@ class Grid:
         parts = [np.concatenate(column) for column in zip(empty, *rows, strict=True)]
         travel = Exchange(self.comm, self.owner(parts[0]))
         cell, x, values = map(travel.send, parts)
-        return self.local(cell), x, values
+        return self.locals[cell], x, values
 
     def node_places(self, nodes: NDArray[np.integer]) -> NDArray[np.int64]:
         """Return for local nodes (n,) the indices along the axes and, in column d, the index of the copy."""
@@ -667,7 +699,7 @@ class Grid:
         return np.ravel_multi_index(tuple(index), tuple(self.shape + 1)) + copy * self.nodes
 
     def from_other(self, other: Grid, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return nodal values (unknowns,) from those on an equal grid with other owners; node i passes by rank i % P."""
+        """Return nodal values (unknowns,) from those on an equal grid with other owners; node i by rank i % P."""
         rows = nodal.reshape(-1, self.dim)
         some = rows.any(axis=1)
         old, new = other.node_numbers()[some], self.node_numbers()
@@ -772,13 +804,14 @@ class GridOfGroups(Grid):
 
     The copies coincide in space.  The same process owns corresponding cells of all copies.
 
-    grid: grid of the bodies; group (points,): index, from 0, of the group of each material point of the scene, in the
-    order of ids.
+    grid: grid of the bodies; group (bodies,): index, from 0, of the group of each body; starts (bodies,): id of the
+    first material point of each body.
     """
 
-    def __init__(self, grid: Grid, group: NDArray[np.int64]):
+    def __init__(self, grid: Grid, group: NDArray[np.int64], starts: NDArray[np.int64]):
         super().__init__(**grid.given, comm=grid.comm)
-        self._group, self._copies = group.astype(np.int16), int(group.max()) + 1
+        self._group, self._starts = group, starts
+        self._copies = int(group.max()) + 1
         if self.dim * self.copies * self.nodes > MOST:
             what = f"grid: has {self.nodes:.3g} nodes for each of {self.copies} groups"
             raise ValueError(f"{what}, must be below {MOST // (self.dim * self.copies)}")
@@ -789,8 +822,8 @@ class GridOfGroups(Grid):
         return self._copies
 
     def _again(self) -> Grid:
-        return GridOfGroups(self, self._group)
+        return GridOfGroups(self, self._group, self._starts)
 
     def copy(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return, for material points with these ids (n,), the index of the first cell of their copy of the box."""
-        return self._group[ids] * np.int64(self.cells)
+        return self._group[self._starts.searchsorted(ids, side="right") - 1] * np.int64(self.cells)

@@ -19,6 +19,61 @@ EMPTY = 1e-2
 """Weight of an empty cell divided by the mean weight of a filled cell, for memory and time that empty cells need."""
 
 
+class Partition:
+    """Boxes of cells, one for each process.
+
+    Parameters
+    ----------
+    boxes : (ranks, 2, d)
+        First cell index along each axis, and last index plus one, of the cells of each process.
+    shape : (d,)
+        Number of cells of the grid along each axis.
+
+    Raises
+    ------
+    ValueError
+        The boxes do not fill the grid exactly once.
+    """
+
+    def __init__(self, boxes: NDArray[np.int64], shape: tuple[int, ...]):
+        self.boxes, self.shape = boxes, shape
+        self.low, high = boxes[:, 0], boxes[:, 1]
+        self.count = high - self.low
+        """Number of cells (ranks, d) along the edges of each box."""
+        within = (boxes >= 0).all() and (high <= shape).all() and (self.count >= 0).all()
+        if not within or self.count.prod(axis=1).sum() != np.prod(shape) or self._overlap():
+            raise ValueError("partition: boxes of cells do not fill the grid exactly once")
+
+    def _overlap(self) -> bool:
+        """Return whether two boxes share a cell."""
+        low, high = self.boxes[self.count.all(axis=1)].transpose(1, 0, 2)
+        return any(((low[k] < high[:k]) & (low[:k] < high[k])).all(axis=1).any() for k in range(1, len(low)))
+
+    def owner(self, index: NDArray[np.int64]) -> NDArray[np.int32]:
+        """Return the owner ranks (...) of cells with indices (d, ...) along the axes."""
+        cells = index.reshape(len(index), -1)
+        out = np.zeros(cells.shape[1], dtype=np.int32)
+        if cells.size:
+            near = (self.low <= cells.max(axis=1)) & (cells.min(axis=1) < self.boxes[:, 1])
+            for rank in np.flatnonzero(near.all(axis=1)):
+                low, high = self.boxes[rank, :, :, None]
+                out[((low <= cells) & (cells < high)).all(axis=0)] = rank
+        return out.reshape(index.shape[1:])
+
+    def cells(self, rank: int) -> NDArray[np.int64]:
+        """Return the lexicographic indices (n,) of the cells of a process, ascending."""
+        return self.numbered(np.full(self.count[rank].prod(), rank), np.arange(self.count[rank].prod()))
+
+    def numbered(self, rank: NDArray[np.int64], k: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the lexicographic index (n,) of the k-th cell (n,), from 0, of each process `rank` (n,)."""
+        out, stride = np.zeros_like(k), 1
+        for axis in reversed(range(len(self.shape))):
+            k, place = np.divmod(k, self.count[rank, axis])
+            out += (self.low[rank, axis] + place) * stride
+            stride *= self.shape[axis]
+        return out
+
+
 def boxes(load: NDArray[np.float64], processes: int) -> NDArray[np.int64]:
     """Return the boxes of cells of all ranks (ranks, 2, d): first cell index along each axis, and last index plus one.
 
@@ -28,22 +83,6 @@ def boxes(load: NDArray[np.float64], processes: int) -> NDArray[np.int64]:
     weight = load + (EMPTY * load[filled].mean() if filled.any() else 1.0)
     out = np.zeros((processes, 2, load.ndim), dtype=np.int64)
     _bisect(weight, filled, np.zeros(load.ndim, dtype=np.int64), out)
-    return out
-
-
-def owners(of: NDArray[np.int64], shape: tuple[int, ...]) -> NDArray[np.int32]:
-    """Return the owner rank of each cell, as an array with the shape of the grid, from the boxes `of` (ranks, 2, d).
-
-    Raises
-    ------
-    ValueError
-        The boxes do not fill the grid exactly once.
-    """
-    out, sizes = np.full(shape, -1, dtype=np.int32), of[:, 1] - of[:, 0]
-    for rank, (low, high) in enumerate(of):
-        out[tuple(map(slice, low, high))] = rank
-    if (sizes < 0).any() or sizes.prod(axis=1).sum() != out.size or (out < 0).any():
-        raise ValueError("partition: boxes of cells do not fill the grid exactly once")
     return out
 
 
@@ -95,20 +134,18 @@ def _extent(filled: NDArray[np.bool_], axis: int) -> int:
     return int(layers[-1] - layers[0] + 1)
 
 
-def destinations(owner: NDArray[np.int32], cells: NDArray[np.int64]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+def destinations(partition: Partition, cells: NDArray[np.int64]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     """Return the ranks that hold each cell, the owner first, in one list; and the start of each cell in this list.
 
-    Processes that own a neighbour across a face hold the cell as a ghost.
-
-    owner: owner rank of each cell, with the shape of the grid; cells (n,): lexicographic indices of the cells.
+    Processes that own a neighbour across a face hold the cell as a ghost.  cells (n,): lexicographic indices.
     """
-    index, shape = np.array(np.unravel_index(cells, owner.shape)), np.array(owner.shape)[:, None]
-    ranks = [owner.ravel()[cells]]
-    for axis in range(owner.ndim):
+    index, shape = np.array(np.unravel_index(cells, partition.shape)), np.array(partition.shape)[:, None]
+    ranks = [partition.owner(index)]
+    for axis in range(len(shape)):
         for step in (-1, 1):
             neighbour = index.copy()
             neighbour[axis] += step
-            ranks.append(owner[tuple(np.clip(neighbour, 0, shape - 1))])
+            ranks.append(partition.owner(np.clip(neighbour, 0, shape - 1)))
     ranks = np.stack(ranks, axis=1)
     new = np.ones(ranks.shape, dtype=bool)
     for k in range(1, ranks.shape[1]):

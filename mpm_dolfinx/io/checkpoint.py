@@ -94,7 +94,7 @@ def save(simulation: Simulation, file: Path) -> None:
         nodal |= _nodal_of_all(simulation.grid, name, getattr(state, name))
     note = {"version": VERSION, "t": state.t, "resets": state.resets, "begins": state.begins}
     note |= {"scene": describe(simulation), "result": _scalars(state.result), "control": vars(state.control)}
-    note["partition"] = simulation.grid.boxes.tolist()
+    note["partition"] = simulation.grid.partition.boxes.tolist()
 
     def write() -> int:
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -142,7 +142,8 @@ def resume(simulation: Simulation, file: str | os.PathLike) -> Result:
     found: list[State] = []  # rank 0 reads all points and pieces, and sends them to their owners
     bare, boxes = at_root(comm, read)
     state = found[0] if found else bare
-    if len(boxes) == comm.size > 1 and (boxes != simulation.grid.boxes).any():  # on as many processes: the same bits
+    # on as many processes, the same distribution gives the same bits
+    if len(boxes) == comm.size > 1 and (boxes != simulation.grid.partition.boxes).any():
         distribute_by(simulation, boxes)
     nodal = {name: _nodal_here(simulation.grid, getattr(state, name)) for name in NODAL}
     if state.lines is not None:

@@ -96,7 +96,7 @@ class LawAtPoints:
     ) -> PointData:
         """Return form data at the points with indices `rows`; values: F, parameters, state (n, ...) of all points."""
         x = points.x[rows]
-        cells = self.grid.local(self.grid.number(self.grid.index_from_base(x)))
+        cells = self.grid.locals[self.grid.number(self.grid.index_from_base(x))]
         inputs = {name: values[name][rows] for name in ("F", *self._shapes)}
         inputs["F"] = inputs["F"][:, : self._stretches, : self._stretches]
         return self.points.at(cells, x, points.volume0[rows], **inputs)

@@ -7,8 +7,12 @@ import zlib
 from collections.abc import Callable, Collection, Sequence
 from copy import copy
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from inspect import signature
+from itertools import pairwise
+from operator import itemgetter
+
+from mpi4py import MPI
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +26,7 @@ from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.materials.evaluate import LawAtPoints, SoftnessAtPoints, knows_space, mean_size, sampled
 from mpm_dolfinx.materials.prestressed import AT_REST, stressed
 from mpm_dolfinx.materials.skeleton import BY_SCENE, DRIED, Fluid, Skeleton, constants_of
-from mpm_dolfinx.parallel.exchange import first
+from mpm_dolfinx.parallel.exchange import Exchange, everywhere, first, over_all
 from mpm_dolfinx.points.material_points import ACROSS, MaterialPoints
 from mpm_dolfinx.pores.retention import Retentions, SaturationAt, scale_of
 from mpm_dolfinx.pores.retention import sampled as drained
@@ -55,9 +59,10 @@ class SceneMaterials:
     materials
         Materials, in the order of the bodies' material indices.
     bodies
-        All bodies; fields are evaluated at their reference positions.
+        All bodies.
     points
-        Material points of this process, as seeded.
+        Material points of this process, as seeded.  Each process evaluates fields at the reference positions of its
+        points.
     fluid
         Pore fluid, if there is one.
     prestressed
@@ -77,11 +82,17 @@ class SceneMaterials:
         self.fluid = fluid
         seeded: dict[str, NDArray[np.float64]] = dict(points.data)
         self._used = _used(bodies, len(materials))  # a material without a body has no effect
-        evaluated = [_evaluated(materials[i], bodies, i) for i in self._used]
-        locks = [bool(np.any(m.nearly_incompressible)) for m in evaluated]
+        rows = {i: (points.material == i).nonzero()[0] for i in self._used}
+        places = {i: _places(bodies, i, points.id[own]) for i, own in rows.items()}
+
+        def at_points() -> list[tuple[Skeleton, Skeleton]]:
+            """Return each material at its points of this process, and at its first point of all processes."""
+            return [_evaluated(grid, materials[i], places[i], points.id[rows[i]]) for i in self._used]
+
+        evaluated, at_first = zip(*at_points(), strict=True)
+        locks = [over_all(grid.comm, bool(np.any(m.nearly_incompressible)), MPI.LOR) for m in evaluated]
         in_space = [grid.stretches == 2 and (prestressed or lock) for lock in locks]
-        each = zip(self._used, evaluated, in_space, strict=True)
-        known = [not needed or knows_space(grid, _at_one(materials[i], m)) for i, m, needed in each]
+        known = [not needed or knows_space(grid, m) for m, needed in zip(at_first, in_space, strict=True)]
         self.stretches = 3 if any(np.logical_and(locks, known)) else grid.stretches
         """Number of rows of the deformation gradients that laws receive, 2 or 3."""
         if self.across:
@@ -89,7 +100,7 @@ class SceneMaterials:
         if prestressed:
             whole = dict(zip(self._used, known, strict=True))
             materials = [stressed(m, whole.get(i, True)) for i, m in enumerate(materials)]
-            evaluated = [_evaluated(materials[i], bodies, i) for i in self._used]
+            evaluated = [m for m, _ in at_points()]
         self.materials, self._evaluated = materials, evaluated
         used = [materials[i] for i in self._used]
         self._fields = [_by_place(m) for m in materials]
@@ -102,18 +113,16 @@ class SceneMaterials:
         self._part = np.array([self._parts.index(own[i]) if i in own else 0 for i in range(len(materials))])
         self.symmetric = all(m.symmetric for m in used)
         """Whether the tangents of all materials are symmetric."""
-        self.uneven = any(
-            max(float(np.max(y)) for y in moduli) > 2 * min(float(np.min(y)) for y in moduli)
-            for moduli in ([m.oedometric for m in evaluated], [m.shear for m in evaluated])
-        )
+        moduli = [m.oedometric for m in evaluated], [m.shear for m in evaluated]
+        self.uneven = any(most > 2 * least for least, most in (_ends(grid, of) for of in moduli))
         """Whether stiffness differs between points by more than a factor of two."""
         self.conducts = any(m.conductivity_law or np.any(np.asarray(m.conductivity) > 0) for m in evaluated) or any(
             callable(m.conductivity) for m in used
         )
         """Whether fluid flows in the scene, or may flow in a later stage."""
-        conductivity = np.concatenate([np.ravel(m.conductivity) for m in evaluated])
+        least, most = _ends(grid, [m.conductivity for m in evaluated])
         by_place = any(callable(m.conductivity) for m in materials) or any(map(_names_place, self.conductivity_laws))
-        self.layered = by_place or len({m.conductivity_law for m in used}) > 1 or bool(np.ptp(conductivity))
+        self.layered = by_place or len({m.conductivity_law for m in used}) > 1 or most > least
         self.layered = self.layered or len({m.retention for m in used}) > 1
         """Whether the conductivity may differ between points."""
         self.checksums: dict[str, int | list[float]] = {
@@ -130,14 +139,13 @@ class SceneMaterials:
         """Shape of each parameter and of each state variable."""
         for i, m in zip(self._used, evaluated, strict=True):
             values = {name: getattr(m, name) for name in self._fields[i]}
-            count = sum(len(body) for body in bodies if body.material == i)
-            self._add_shapes(_expanded(m, values, count), seeded, len(points))
-            found, rows = _rows(bodies, i, points.id)
+            count, own = max(1, len(rows[i])), rows[i]
+            everywhere(grid.comm, partial(self._add_shapes, _expanded(m, values, count), seeded, len(points)))
             for name, value in values.items():
-                content = np.ascontiguousarray(value).tobytes()
-                self.checksums[f"checksum of {name} of material {i}"] = zlib.crc32(content)
                 filled = np.zeros((len(points), *value.shape[1:]))
-                filled[found] = value[rows]
+                filled[own] = value[: len(own)]
+                checksum = _checksum(grid, points.id[own], filled[own], sum(map(len, bodies)))
+                self.checksums[f"checksum of {name} of material {i}"] = checksum
                 seeded[name] = filled + seeded[name] if name in seeded else filled
         seeded |= {name: np.maximum(-points.pressure, 0.0) for name in DRIED if name in seeded}
         if prestressed and "plastic" in seeded:
@@ -160,8 +168,8 @@ class SceneMaterials:
 
     def check_cells(self) -> None:
         """Raise ValueError if cells are too large for a softening law; called when the cells are made or have moved."""
-        for m in self._evaluated:
-            m.check_cells(mean_size(self.grid))
+        size = mean_size(self.grid)
+        everywhere(self.grid.comm, lambda: [m.check_cells(size) for m in self._evaluated])
 
     @property
     def across(self) -> bool:
@@ -581,35 +589,45 @@ def _by_place(m: Skeleton) -> list[str]:
     return [name for name in constants_of(m) if callable(getattr(m, name))]
 
 
-def _evaluated(m: Skeleton, bodies: Sequence[Body], material: int) -> Skeleton:
-    """Return a material with its constants evaluated at all points of the material, see `_places`."""
-    return m.at(_places(bodies, material) if _by_place(m) else np.empty((0, 0)))
+def _evaluated(grid: Grid, m: Skeleton, X: NDArray[np.float64], ids: NDArray[np.int64]) -> tuple[Skeleton, Skeleton]:
+    """Return a material at its points of this process, and at its first point of all processes, as arrays.
+
+    A process without points of the material has the values at the first point.
+
+    X (n, d), m, and ids (n,): reference positions and ids of the points of this process.
+    """
+    names = _by_place(m)
+    out = everywhere(grid.comm, lambda: m.at(X) if len(X) or not names else m)
+    row = [(int(ids[0]), {name: getattr(out, name)[:1] for name in names})] if len(X) else []
+    found = over_all(grid.comm, row) if names else []
+    values = min(found, key=itemgetter(0))[1] if found else {}
+    out = out if len(X) else replace(out, **values)
+    return out, _expanded(out, values, 1)
 
 
-def _at_one(m: Skeleton, evaluated: Skeleton) -> Skeleton:
-    """Return the material at its first point: each constant is an array with one value."""
-    return _expanded(evaluated, {name: getattr(evaluated, name)[:1] for name in _by_place(m)}, 1)
+def _places(bodies: Sequence[Body], material: int, ids: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return the reference positions (n, d), m, of points (n,) with a material; ids: ascending."""
+    starts = np.cumsum([0, *map(len, bodies)])
+    at = ids.searchsorted(starts)
+    each = zip(bodies, starts[:-1], pairwise(at), strict=True)
+    own = [body.centre_of(ids[slice(*of)] - start) for body, start, of in each if body.material == material]
+    return np.concatenate(own)
 
 
-def _places(bodies: Sequence[Body], material: int) -> NDArray[np.float64]:
-    """Return the reference positions (n, d), m, of all points of a material on all processes."""
-    return np.concatenate([body.centre for body in bodies if body.material == material])
+def _ends(grid: Grid, values: Sequence) -> tuple[float, float]:
+    """Return the least and the largest of some numbers and arrays, over all processes."""
+    flat = np.concatenate([np.ravel(one) for one in values])
+    least, most = over_all(grid.comm, np.array([flat.min(), -flat.max()]), MPI.MIN)
+    return float(least), -float(most)
 
 
-def _rows(bodies: Sequence[Body], material: int, ids: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the indices (m,) of points with a material, and their rows in the result of `_places`."""
-    found = []
-    rows = []
-    start = 0
-    before = 0
-    for body in bodies:
-        if body.material == material:
-            of_body = ((ids >= start) & (ids < start + len(body))).nonzero()[0]
-            found.append(of_body)
-            rows.append(ids[of_body] - start + before)
-            before += len(body)
-        start += len(body)
-    return np.concatenate(found), np.concatenate(rows)
+def _checksum(grid: Grid, ids: NDArray[np.int64], rows: NDArray[np.float64], total: int) -> int:
+    """Return the checksum of rows (n, ...) of the points of all processes, in the order of ids, all below `total`."""
+    exchange, checksum = Exchange(grid.comm, (ids * grid.comm.size // total).astype(np.int32)), 0
+    content = exchange.send(rows)[exchange.send(ids).argsort()].tobytes()
+    for rank in range(grid.comm.size):
+        checksum = grid.comm.bcast(zlib.crc32(content, checksum), root=rank)
+    return checksum
 
 
 def _expanded(m: Skeleton, values: dict[str, NDArray[np.float64]], n: int) -> Skeleton:

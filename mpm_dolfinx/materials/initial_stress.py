@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import compress
 
 from mpi4py import MPI
 
@@ -22,7 +21,7 @@ from mpm_dolfinx.materials.fields import SceneMaterials
 from mpm_dolfinx.materials.prestressed import AT_REST
 from mpm_dolfinx.materials.skeleton import STANDARD_GRAVITY, Field
 from mpm_dolfinx.materials.trial import PLANE, SPACE
-from mpm_dolfinx.parallel.exchange import first, over_all
+from mpm_dolfinx.parallel.exchange import Exchange, first, over_all
 from mpm_dolfinx.points.material_points import MaterialPoints, unstretched
 
 EXACT, CLOSE = 1e-13, SAME  # errors relative to the largest initial stress, to end Newton's method, to accept a result
@@ -198,15 +197,32 @@ class InitialStresses:
         surcharges = [stress.surcharge for stress in self.given.values() if isinstance(stress, K0)]
         if not np.any(gravity) and not any(callable(surcharge) or surcharge for surcharge in surcharges):
             raise ValueError("initial_stress: K0 has neither gravity at the start nor surcharge, must have one of them")
-        # the densities of all points on all processes
-        seeded, total = materials.seeded, np.zeros(self._start[-1])
-        total[seeded.id] = materials.present_density(seeded)
-        total = over_all(materials.grid.comm, total)
-        used = np.repeat(present, [len(body) for body in self._bodies])
-        corners = np.concatenate([body.corners() for body in compress(self._bodies, present)])
-        base = materials.grid.base
-        weight, surface = overburden(corners - base, -gravity[-1] * total[used], points.x)
-        return [weight, surface + base[-1], materials.pore_stress(points)]
+        grid, seeded = materials.grid, materials.seeded.of_bodies(present, self._start)
+        weights = -gravity[-1] * materials.present_density(seeded)
+        corners, weights = _in_columns(grid.comm, seeded.id, seeded.corners, weights, points.corners)
+        weight, surface = overburden(corners, weights, points.x)
+        return [weight, surface + grid.base[-1], materials.pore_stress(points)]
+
+
+def _in_columns(
+    comm: MPI.Intracomm,
+    ids: NDArray[np.int64],
+    corners: NDArray[np.float64],
+    unit_weight: NDArray[np.float64],
+    above: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return corners and unit weights of all domains above and below domains of this process, in the order of ids.
+
+    ids (n,), corners (n, 2^d, d), m, unit_weight (n,), N/m^3: domains of this process, present in the scene; above
+    (k, 2^d, d), m: corners of the domains whose columns this process needs.
+    """
+    ends = [above[..., :-1].min(axis=(0, 1), initial=np.inf), above[..., :-1].max(axis=(0, 1), initial=-np.inf)]
+    low, high = corners[..., :-1].min(axis=1), corners[..., :-1].max(axis=1)
+    rows = [((low <= most) & (high >= least)).all(axis=1).nonzero()[0] for least, most in comm.allgather(ends)]
+    sent = np.concatenate(rows)
+    exchange = Exchange(comm, np.arange(comm.size, dtype=np.int32).repeat(list(map(len, rows))))
+    order = exchange.send(ids[sent]).argsort()
+    return exchange.send(corners[sent])[order], exchange.send(unit_weight[sent])[order]
 
 
 def stressed(

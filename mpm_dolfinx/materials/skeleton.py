@@ -23,7 +23,10 @@ from mpm_dolfinx.materials.user_functions import expression
 from mpm_dolfinx.pores.retention import check_retention
 
 Field = float | Sequence[float] | Callable[[NDArray[np.float64]], ArrayLike]
-"""A constant (number or vector), or a function of the reference positions X (n, d), m, that returns (n, ...)."""
+"""A constant (number or vector), or a function of the reference positions X (n, d), m, that returns (n, ...).
+
+X are points of one process; values must not depend on the other positions, as a mean does.
+"""
 
 BY_SCENE = ("dt", "cell_size")
 """Arguments that laws receive from the scene: time since the start of the step, s; mean edge length of a cell, m."""

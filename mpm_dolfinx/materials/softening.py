@@ -69,9 +69,11 @@ class SofteningDruckerPrager(DruckerPrager):
 
     def check_cells(self, cell_size: float) -> None:
         stiff = self.shear + self.bulk * self.eta * self.eta_flow
-        least = np.max(np.asarray(self.xi * (self.cohesion - self.residual) * cell_size / stiff))
-        if least >= np.min(self.slip):
-            what = f"{type(self).__name__}: slip = {np.min(self.slip):g}, must be > {least:.3g} m in cells of"
+        least = self.xi * (self.cohesion - self.residual) * cell_size / stiff
+        least, slip = (np.ravel(values) for values in np.broadcast_arrays(least, self.slip))
+        if (least >= slip).any():
+            worst = (least / slip).argmax()
+            what = f"{type(self).__name__}: slip = {slip[worst]:g}, must be > {least[worst]:.3g} m in cells of"
             raise ValueError(f"{what} {cell_size:g} m, else the soil softens faster than it unloads")
 
     @staticmethod

@@ -219,14 +219,12 @@ class MeanDilatation:
         matrices = b[:, :, None] * columns[:, None, :] + rows[:, :, None] * b[:, None, :]
         insert(A, self._grid, self._cells(data).filled, matrices)
 
-    def averaged(self, delta: NDArray[np.float64], data: QuadratureData) -> NDArray[np.float64]:
-        """Return the gradients Delta (m, d, d) of the pieces, scaled to the cell's volume ratio where F-bar is used."""
-        delta = delta.copy()
+    def average(self, delta: NDArray[np.float64], data: QuadratureData) -> None:
+        """Scale the gradients Delta (m, d, d) of the pieces to the cell's volume ratio where F-bar is used."""
         for number in self.numbers:
             rows = data.rows[number]
             theta, own = self.theta.x.array[data.parts[number].cells], delta[rows]
             delta[rows] = with_ratio(own, theta)
-        return delta
 
     def _parts(self, data: QuadratureData) -> list[PointData]:
         return [data.parts[number] for number in self.numbers]

@@ -15,7 +15,7 @@ from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.domains.domain_gradient import cell_ratios
 from mpm_dolfinx.domains.domain_slopes import LinearGradients
 from mpm_dolfinx.forms.point_forms import FormPoints, Places, PointData
-from mpm_dolfinx.grid.grid import sum_by
+from mpm_dolfinx.grid.grid import in_chunks, sum_by
 from mpm_dolfinx.materials.evaluate import ConductivityAtPieces
 from mpm_dolfinx.materials.fields import SceneMaterials
 from mpm_dolfinx.materials.skeleton import Skeleton
@@ -62,14 +62,15 @@ class QuadratureData:
     rows: tuple[NDArray[np.int64] | slice, ...]  # indices in `pieces` of each part's integration points
     of_points: PointData  # like `pieces`, but volumes and F are not scaled for F-bar; for user-defined terms
 
-    def shape_gradients(self) -> NDArray[np.float64]:
-        """Return the gradients (m, 2^d, d), 1/m, of the shape functions at the positions where laws use them."""
-        if self.parts[0] is self.pieces:
-            return self.pieces.places.shape_gradients(slice(None))
+    def increments(self, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return I + grad u (m, d, d) at the positions where laws use it, of displacements `nodal` (nodes, d), m."""
         n, d = self.pieces.x.shape
-        out = np.empty((n, 2**d, d))
+        out, nodes = np.empty((n, d, d)), self.pieces.points.grid.cell_nodes
         for rows, part in zip(self.rows, self.parts, strict=True):
-            out[rows] = part.places.shape_gradients(slice(None))
+            own = np.arange(n)[rows]
+            for chunk in in_chunks(len(own)):
+                at_nodes = nodal[nodes[part.cells[chunk]]].transpose(0, 2, 1)
+                out[own[chunk]] = np.eye(d) + at_nodes @ part.places.shape_gradients(chunk)
         return out
 
 

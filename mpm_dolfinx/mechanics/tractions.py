@@ -113,7 +113,7 @@ def owners(grid: Grid, patches: Sequence[Patches]) -> tuple[Exchange, Places]:
     """Return the exchange of patch data with the processes that own the cells, and the positions there."""
     cell, x = (np.concatenate([getattr(p, name) for p in patches]) for name in ("cell", "x"))
     travel = Exchange(grid.comm, grid.owner(cell))
-    return travel, Places(grid, grid.local(travel.send(cell)), travel.send(x))
+    return travel, Places(grid, grid.locals[travel.send(cell)], travel.send(x))
 
 
 class PressureForms:

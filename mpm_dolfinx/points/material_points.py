@@ -7,7 +7,7 @@ of laws, data of conditions and, with inertia, velocity and rate of F.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from operator import attrgetter
 from types import MappingProxyType
@@ -222,6 +222,11 @@ class MaterialPoints:
     def of(self, ids: NDArray[np.int64], kept: bool = True) -> MaterialPoints:
         """Return the points with the given ids; if `kept` is false, all other points."""
         rows = np.isin(self.id, ids) == kept
+        return self if rows.all() else self.map(lambda values: values[rows])
+
+    def of_bodies(self, chosen: Sequence[bool], starts: NDArray[np.int64]) -> MaterialPoints:
+        """Return the points of the chosen bodies; starts: see `body_of`."""
+        rows = np.asarray(chosen)[body_of(self.id, starts)]
         return self if rows.all() else self.map(lambda values: values[rows])
 
     def migrated(self, exchange: Exchange) -> MaterialPoints:

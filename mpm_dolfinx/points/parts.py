@@ -137,7 +137,7 @@ def joined_parts(
     pairs (m, 2): lexicographic indices of active cells; each process may have other pairs. All processes must call it.
     """
     cells, at = np.unique(np.concatenate(grid.comm.allgather(np.unique(pairs, axis=0))), return_inverse=True)
-    of = np.where(grid.owner(cells) == grid.comm.rank, part[grid.local(cells)], 0)
+    of = np.where(grid.owner(cells) == grid.comm.rank, part[grid.locals[cells]], 0)
     one, other = over_all(grid.comm, of, MPI.MAX)[at].reshape(-1, 2).T - 1
     joins = coo_array((np.ones(len(one)), (one, other)), shape=(count, count))
     total, new = connected_components(joins, directed=False)

@@ -123,7 +123,7 @@ class _Around:
         shift = 0 * one if mobility.shift is None else mobility.shift
         share = contents.open[filled].reshape(len(filled), 2 * grid.dim)
         rows = np.column_stack([one[:, 0], p, contents.centroid[filled], kappa, shift, held, share])
-        local = np.where(number >= 0, grid.local(np.maximum(number, 0)), -1)
+        local = np.where(number >= 0, grid.locals[np.maximum(number, 0)], -1)
         local[local >= grid.num_owned] = -1
         own = local >= 0  # a cell of this process may be empty
         local[own] = np.where(on_grid.active.contains[local[own]], local[own], -1)

@@ -165,7 +165,8 @@ class Simulation:
 
     @state.setter
     def state(self, state: State) -> None:
-        if isinstance(state, State) and state.stage.materials in self.scene.former:
+        materials = state.stage.materials if isinstance(state, State) else None
+        if materials is not self.scene.materials and materials in self.scene.former:
             state = self.scene.adopted(state)  # stored before the cells were distributed anew
         self._state = state
 
@@ -326,7 +327,7 @@ class Simulation:
         """Return the state after a step of dt, s, and its report; `state` is unchanged; how: substeps to be used."""
         numbers("dt", dt, test=lambda v: (0 < v) & (v < np.inf), allowed="> 0 and finite")
         try:
-            return step(self.scene, self.state, dt, *how)
+            return step(self.scene, self._state, dt, *how)
         except StepFailed:
             raise
         except BaseException as error:  # the step may have been interrupted anywhere

@@ -26,7 +26,7 @@ from mpm_dolfinx.domains.lattice import filtered, given, seeded
 from mpm_dolfinx.domains.pressure_transport import PiecePressures, Reconstruction
 from mpm_dolfinx.flow.storage import StorageForms
 from mpm_dolfinx.forms.point_forms import PointData
-from mpm_dolfinx.grid.grid import REACH, Grid, sum_by
+from mpm_dolfinx.grid.grid import REACH, Grid, in_chunks, sum_by
 from mpm_dolfinx.materials.fields import SceneMaterials
 from mpm_dolfinx.mechanics.momentum import MomentumForms
 from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
@@ -275,15 +275,16 @@ class Motion:
         d = self._materials.stretches
         F = pieces["F"].reshape(-1, grid.stretches, grid.stretches)
         F = F if d == grid.stretches else in_space(F, pieces[ACROSS][:, 0])
-        at_nodes = nodal[grid.cell_nodes[pieces.cells]].transpose(0, 2, 1)
-        delta = np.eye(grid.dim) + at_nodes @ data.shape_gradients()
+        delta = data.increments(nodal)
         if d > grid.dim:
             delta = np.pad(delta, ((0, 0), (0, 1), (0, 1)))
             delta[:, 2, 2] = pieces.places.stretch(nodal) if grid.axisymmetric else 1.0
         if self._momentum.dilatation is not None:
-            delta = self._momentum.dilatation.averaged(delta, data)
-        F = delta @ F
-        columns = np.concatenate([F.reshape(-1, d * d), determinant(F)[:, None]], axis=1)
+            self._momentum.dilatation.average(delta, data)
+        columns = np.empty((len(F), d * d + 1))
+        for part in in_chunks(len(F)):  # products of all pieces at once would take as much memory as a step
+            product = delta[part] @ F[part]
+            columns[part, :-1], columns[part, -1] = product.reshape(-1, d * d), determinant(product)
         mean = cut.mean(cut.to_pieces(columns))
         F, J = mean[:, :-1].reshape(n, d, d), mean[:, -1]
         F = with_ratio(F, J)

@@ -27,8 +27,8 @@ class Distributed(Protocol):
 
 def distribute(simulation: Distributed) -> None:
     """Distribute the cells anew before a step that resets the grid, if uneven numbers of points become more even."""
-    grid, state = simulation.scene.grid, simulation.state
-    if grid.comm.size == 1 or state.stays or simulation.scene.extended:
+    grid = simulation.scene.grid
+    if grid.comm.size == 1 or (state := simulation.state).stays or simulation.scene.extended:
         return
     if state.lines is not None:
         grid.move([state.lines[letter] for letter in sorted(state.lines)])

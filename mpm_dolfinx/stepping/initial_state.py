@@ -80,7 +80,7 @@ def first_state(scene: Scene, conditions: Mapping[str, Any], later: Sequence[int
     warn_levels(comm, scene.fluid, gravity, [("pressure", scene.initial.pressure), *waters(first.named)])
     if scene.fluid and scene.materials.conducts:
         warn_units(comm, scene.fluid, gravity)
-    points = scene.materials.seeded.of(scene.ids(present))
+    points = scene.seeded(present)
     points = scene.initial.of(scene.materials, points, present, first.gravity_at(0.0) if scene.initial.given else None)
     pieces = None
     scene.rests_at(first, 0.0)
@@ -303,7 +303,7 @@ def _filled(
     new = scene.materials.seeded.of(np.empty(0, np.int64))
     while waiting:
         fill = next((body for body in waiting if touches(scene.bodies, standing, body)), waiting[0])
-        placed = scene.materials.seeded.of(scene.ids(np.arange(len(scene.bodies)) == fill))
+        placed = scene.seeded(np.arange(len(scene.bodies)) == fill)
         placed = put(scene.grid, scene.bodies, standing, fill, points, placed)
         placed = scene.initial.of(
             scene.materials, placed, [i in (*standing, *add) for i in range(len(scene.bodies))], gravity

@@ -142,7 +142,7 @@ class Scene:
         """Whether fluid flows, or sources add it."""
         return self.storage is not None and (self.materials.conducts or bool(self.storage.feeding))
 
-    @property
+    @cached_property
     def fluid(self) -> Fluid | None:
         """Pore fluid."""
         return self.materials.fluid
@@ -333,6 +333,10 @@ class Scene:
             return assembled(*problems, on_grid, stage, as_cut(), begins)
 
         return self._assembled((on_grid.key, stage, *(one.key for one in now)), make, self.grid.comm)
+
+    def seeded(self, chosen: Sequence[bool]) -> MaterialPoints:
+        """Return the points of the chosen bodies on this process, as seeded."""
+        return self.materials.seeded.of_bodies(chosen, np.cumsum([0, *map(len, self.bodies)]))
 
     def ids(self, chosen: Sequence[bool]) -> NDArray[np.int64]:
         """Return the ids of all points of the chosen bodies."""

@@ -627,7 +627,7 @@ class BiotFEM:
         grid = self.grid
         out = np.zeros((len(x), size))
         x = x - self.grid.base
-        cells = grid.local(grid.number(grid.index_from_base(x)))
+        cells = grid.locals[grid.number(grid.index_from_base(x))]
         local = np.flatnonzero((cells >= 0) & (cells < grid.num_owned))
         if len(local):
             out[local] = f.eval(np.pad(x[local], ((0, 0), (0, 3 - grid.dim))), cells[local]).reshape(-1, size)

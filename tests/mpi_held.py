@@ -1,0 +1,32 @@
+# SPDX-License-Identifier: MIT
+"""Move two wet soils with fields of materials, on any number of processes; write the memory of all arrays."""
+
+import sys
+
+import numpy as np
+import scaling
+
+import mpm_dolfinx as mpm
+
+points, seen = float(sys.argv[2]), []
+
+
+def stiffness(X):
+    seen.append(len(X))
+    return 4e6 * (2 - X[:, 1])
+
+
+h = 2 * np.sqrt(2 / points)
+grid = mpm.Grid([0, 0], [2 + 4 * h, 1 + 4 * h], [round(2 / h) + 4, round(1 / h) + 4])
+bodies = [mpm.box(grid, [0, 0], [2, 0.3]), mpm.box(grid, [0, 0.3], [2, 1], material=1)]
+sand = mpm.DruckerPrager(bulk=stiffness, shear=2e6, friction=30, dilation=5, cohesion=1e4, conductivity=1e-4)
+gel = mpm.NeoHookean(bulk=2e6, shear=lambda X: 1e6 * (1 + X[:, 0]), conductivity=1e-5)
+WHOLE = {*map(len, bodies), grid.cells, grid.nodes}
+acting = {"conditions": [mpm.Traction("top", lambda t: (1e3 * t, -1e4 * t)), mpm.Drained("top")]}
+walls = {"bottom": "xy", "left": "x", "right": "x"}
+s = mpm.Simulation(grid, bodies, [sand, gel], fluid=mpm.Fluid(), walls=walls, **acting)
+s.step(0.1)
+bytes_of, lengths = scaling.held(s, buffers=False)
+rows = grid.comm.gather((len(s.points), sum(seen), sum(bytes_of.values()), len(lengths & WHOLE)))
+if rows:
+    np.savez(sys.argv[1], **dict(zip(("points", "asked", "held", "whole"), np.array(rows).T, strict=True)))
