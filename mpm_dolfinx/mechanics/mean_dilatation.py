@@ -44,7 +44,7 @@ from mpm_dolfinx.points.material_points import ACROSS, with_ratio
 
 
 class SumsOfPart(NamedTuple):
-    """Sums over the integration points of one part in each cell, for theta and pi: see `MeanDilatation`."""
+    """Sums in each cell over one part of the scene's integration points, for theta and pi: see `MeanDilatation`."""
 
     ratio: CellSums
     stress: StressAtPoints
