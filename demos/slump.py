@@ -16,7 +16,7 @@ in UFL.  Inertia is neglected.  On one process.
    The bank slumps, and its crest is carried along by the flowing soil.  In front of the initial toe, the water carries
    more than half of the weight.  At rest the bank is twice as long as before; then the excess pressure drains.  The
    final inclination of the slope is 23.5 degrees, and 29.3 degrees in its steepest part of length H / 3.  The friction
-   angle is 25 degrees; a Drucker-Prager cone without dilation mobilises only 24.2 degrees, the arcsine of its slope.
+   angle is 25 degrees; a Drucker-Prager cone without dilation mobilises only 24.2 degrees, arcsine of the cone's slope.
    The remaining cohesion, a hundredth of gamma' H, makes the slope slightly steeper.  Twice the number of cells or
    steps, or half the viscosity, changes run-out and height by less than 2 %.
 

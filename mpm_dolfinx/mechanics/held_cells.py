@@ -35,7 +35,7 @@ Halving this value changes the result of scene "soil" in tests/plateaus.py by 2.
 1.7e-05, and finer cells by 3.0e-02.
 """
 TENSE = 10
-"""Factor on a side's stress in the modulus of the penalty, because a side buckles if its stress exceeds the penalty.
+"""Factor on a side's stress in the modulus of the penalty: a side would buckle if its stress exceeded this modulus.
 Halving this value changes the result of scene "soil" in tests/plateaus.py by 2.8e-06 (relative), doubling it by
 4.7e-06, and finer cells by 3.0e-02.
 """
@@ -175,8 +175,8 @@ class HeldCells:
 
         Where a side ends at a wall, its penalties omit nodes that the wall fixes. Otherwise the free nodes of the cell
         would compensate for the fixed ones, with an oscillation along the side. The prescribed displacement is also
-        extrapolated to the wall. If this value exceeds half of the cell's mean, at the start or the end of the step,
-        the displacement must vary over the cell. A penalty is then omitted if others hold a free node of the cell.
+        extrapolated to the wall. If the result exceeds half of the mean over the cell, at the start or the end of the
+        step, the displacement must vary over the cell. The penalty is then omitted if others hold a free node there.
 
         given (conditions,): whether each prescribes component `axis`; free (nodes,): whether no wall fixes the node.
 

@@ -2,7 +2,7 @@
 """F-bar: one volume ratio per cell, against volumetric locking of nearly incompressible skeletons.
 
 Four volume constraints per cell suppress the bending modes of a Q1 quadrilateral, with errors of up to 50 % at nu =
-0.499. F-bar scales the law's deformation gradient so that its volume ratio in the step is theta, the mean of the cell,
+0.499. F-bar scales the law's deformation gradient so that its volume ratio in the step is theta, a mean over the cell,
 
     Fbar = (theta J_n / det F)^(1/3) F,     theta = sum w det(Delta) / sum w   over the locking pieces of the cell.
 

@@ -319,7 +319,7 @@ class MomentumSystem:
         self.rounding = self.unknowns.vector()
         """Rounding error of the residual at each unknown, N."""
         self.of_whole = self.unknowns.vector()
-        """For each unknown: norm, N, of a residual equal to its rounding error in its whole connected part."""
+        """For each unknown: norm, N, of the residual's rounding errors in the connected part of this unknown."""
         self.K = matrix(self.unknowns, self.unknowns, 3**d * d)
         self.residual, self.step = self.unknowns.vector(), self.unknowns.vector()
         held = active[~among(active, dofs)]
