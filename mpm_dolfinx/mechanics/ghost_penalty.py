@@ -3,11 +3,11 @@
 
 The term gamma s 2G h/3 int [d_n u].[d_n v] dS acts on the displacement increment u of the step. gamma is `GHOST`, and s
 is the strength of a face (see below). G is the shear modulus, h the cell size, and [d_n u] the jump of the normal
-derivative.  Nearly empty cells then affect neither the conditioning nor the accuracy. The penalty resists each step's
-increment like a viscosity, so it must not act on load-bearing cells:
+derivative.  Nearly empty cells then hardly affect conditioning and accuracy.  The penalty resists each step's increment
+like a viscosity, so it must not act on load-bearing cells:
 
 * The strength s of a face falls from 1 to 0 while the emptier cell's filling rises from 0 to `RATIO` times the fuller
-  cell's.  A second factor is the squared ratio of the fuller cell's filling to the largest filling of the emptier
+  cell's.  A second factor of s is the squared ratio of the fuller cell's filling to the largest filling of the emptier
   cell's neighbours.  A penalty between equally filled cells would resist kinks of a body.
 * The scale is the shear modulus. With lambda + 2G, nearly empty cells of nearly incompressible bodies would copy the
   stretch of the full neighbour, against their own volume constraint.  In flowing soil the scale is less than 2G.

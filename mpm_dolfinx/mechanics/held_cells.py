@@ -114,8 +114,8 @@ class HeldCells:
         Stiffness of each penalty and component, N/m.  The stiffness on a mean, normal to a side parallel to the grid,
         follows from the confined modulus.
     limit : (2, k, d)
-        Largest plausible force of each of k penalties on means, N: for the skeleton, and for undrained soil if the side
-        is at its prescribed position.  Larger forces are artefacts.
+        Largest plausible force of each of k penalties on means, N: first for the skeleton, then for undrained soil.
+        The latter applies if the side is at its prescribed position.  Larger forces are numerical artefacts.
     way
         Increment (d,) of the prescribed displacement in the step, m, for each penalty.
     """
