@@ -22,9 +22,9 @@ in UFL.  Inertia is neglected.  On one process.
 
 The cohesion is a function of position, so the points carry it (`points.data["cohesion"]`).  A function in `observe`
 reduces it after each step.  A step that does not converge is cut, and repeated with the same strength.  The shorter
-step converges because a viscous stress limits the velocity of the bank, also a term in UFL: 2 eta times the strain
-rate. eta / T is a hundredth of gamma' H; part 1 has no viscosity.  A mesh could not represent this deformation, because
-the vertical side of the bank finally lies on the floor, and plastic strains are several hundred per cent.
+step converges because a viscous stress of 2 eta times the strain rate, also a term in UFL, limits the velocity of the
+bank.  eta / T is a hundredth of gamma' H; part 1 has no viscosity.  A mesh could not represent this deformation,
+because the vertical side of the bank finally lies on the floor, and plastic strains are several hundred per cent.
 """
 
 from __future__ import annotations

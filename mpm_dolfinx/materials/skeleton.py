@@ -119,7 +119,7 @@ class Skeleton:
 
     Examples
     --------
-    A user-defined law is a frozen dataclass (the README shows a law with fibres)::
+    A user-defined law is a frozen dataclass (demos/README.md shows a law with fibres)::
 
         @dataclass(frozen=True)
         class Stiffening(mpm.NeoHookean):

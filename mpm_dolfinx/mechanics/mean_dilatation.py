@@ -184,7 +184,7 @@ class MeanDilatation:
     def total(
         self, data: QuadratureData, sums: Sequence[NDArray[np.float64]]
     ) -> tuple[NDArray[np.int32], NDArray[np.float64], NDArray[np.float64]]:
-        """Return the cells with F-bar, totals (cells, k) of `sums` over all parts, and `_volume_of` the cells."""
+        """Return the cells with F-bar, totals (cells, k) of `sums` over all parts, and the result of `_volume_of`."""
         return self._cells(data).filled, self._cells(data).total(sums), self._volume_of(data)
 
     def update(self, data: QuadratureData, solve: Callable[[], None]) -> None:

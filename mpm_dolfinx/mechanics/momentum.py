@@ -4,7 +4,7 @@
 The displacement increment of the step is u, Delta = I + grad u, F = Delta F_n, J_n = det F_n, J_Delta = det Delta. The
 residual is the derivative of
 
-    int psi(F) / J_n - alpha p J_Delta dV_n  -  loads,
+    int [psi(F) / J_n - alpha p J_Delta] dV_n  -  work of the loads,
 
 that is int (P' - alpha p J_Delta Delta^-T) : grad v dV_n = int rho g . v dV_n + tractions.  psi is the energy of the
 skeleton, alpha Biot's coefficient, and p the pore pressure. P' is the first Piola-Kirchhoff effective stress relative
