@@ -48,7 +48,7 @@ class HeldPoints(NamedTuple):
     number: NDArray[np.int64]  # (n,) index of the condition
     cell: NDArray[np.int32]  # (n,) local cell
     area: NDArray[np.float64]  # (n,) reference area, m^(d-1)
-    modulus: NDArray[np.float64]  # (n,) penalty modulus times area, N; this to `undrained` at the last grid reset
+    modulus: NDArray[np.float64]  # (n,) penalty modulus times area, N; up to `undrained`: at the last reset
     tension: NDArray[np.float64]  # (n,) norm of the stress times area, N
     resistance: NDArray[np.float64]  # (n,) resisting modulus times area, N
     firm: NDArray[np.float64]  # (n,) confined modulus times area, N, with a limited contribution of the fluid

@@ -469,7 +469,7 @@ class MomentumProblem:
         b, norms = self._unbalanced()
         system.held.gather(b, system.held_residual)  # without penalties; `wall_forces` adds their part on fixed nodes
         if pulls := [one.pulls for one in self.loads if one.stiff]:
-            # not in the scale: at the start of a step they far exceed the forces
+            # penalty forces are not in the scale: at the start of a step they far exceed the other forces
             b[system.touched] -= self.forms.summed(1, pulls)[system.touched]
         r = system.unknowns.gather(b, system.residual)
         step = system.unknowns.gather(forms.nodal.ravel(), system.step)
