@@ -319,7 +319,7 @@ class MomentumSystem:
         self.rounding = self.unknowns.vector()
         """Rounding error of the residual at each unknown, N."""
         self.of_whole = self.unknowns.vector()
-        """For each unknown: norm, N, of the residual's rounding errors in the connected part of this unknown."""
+        """For each unknown: norm, N, of a vector with its rounding error at all unknowns of its connected part."""
         self.K = matrix(self.unknowns, self.unknowns, 3**d * d)
         self.residual, self.step = self.unknowns.vector(), self.unknowns.vector()
         held = active[~among(active, dofs)]
@@ -529,8 +529,8 @@ class MomentumProblem:
         """Return two relative residuals of each connected part; r: residuals, N; scales (parts,): force scales, N.
 
         For the first, the rounding error at each node is subtracted from the residual.  With `first` it is not
-        subtracted, so that even a load below this error causes a solve.  For the second, the force scale of a part is
-        at least the rounding error divided by the tolerance.  A residual within rounding then counts as converged.
+        subtracted, so that even a load below this error causes a solve.  For the second, the force scale at an
+        unknown is at least `of_whole` divided by the tolerance.  A residual within rounding then counts as converged.
         """
         system, parts = self.system, self.system.of_parts
         both = np.zeros((2, system.unknowns.size))
