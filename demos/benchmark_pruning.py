@@ -73,7 +73,7 @@ def block(
 
 
 def meshed(grid: mpm.Grid, cells: int):
-    """Return the block with the same particle domains, made from a mesh."""
+    """Return the block, made from a mesh, with the same particle domains as by `mpm.box`."""
     square = mesh.create_rectangle(MPI.COMM_SELF, [[0, 0], [1, 1]], [2 * cells] * 2, mesh.CellType.quadrilateral)
     top = np.sort(mesh.locate_entities_boundary(square, 1, lambda x: np.isclose(x[1], 1)))
     tags = mesh.meshtags(square, 1, top, np.ones(len(top), dtype=np.int32))

@@ -6,8 +6,8 @@ The load parameter is alpha = P L² / (E I) = 1, 2, 5 and 10, with P per depth a
 tip deflection is 0.81 L, and the shortening 0.56 L.  E = 12 MPa and nu = 0, so plane strain equals plane stress.  Of
 the package's laws, neo-Hooke's is closest to the linear law of a rod: its stress is E (e - e²/2 + ...) at a strain e.
 
-There are two references.  The elastica (Bisshopp & Drucker 1945) has no stretch and shear.  The geometrically exact rod
-(Reissner 1972, Simo 1985) has the stiffnesses E A, 5/6 G A and E I.  On one process.
+There are two references.  The elastica (Bisshopp & Drucker 1945) neither stretches nor shears.  The geometrically exact
+rod (Reissner 1972, Simo 1985) has the stiffnesses E A, 5/6 G A and E I.  On one process.
 
 Errors `v_1` to `v_10`: difference between the tip deflections v of beam and rod, divided by L, at each alpha.  `u_1` to
 `u_10`: the same for the shortening u.  With 8 cells over the height and 40 steps, `v` is 0.05, 0.11, 0.13, 0.12 %, and

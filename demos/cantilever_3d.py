@@ -5,7 +5,7 @@ A dry beam of 1 m x 0.1 m x 0.1 m, clamped at x = 0, carries a dead load P on it
 square section has the same stiffness about all axes.  The beam must therefore bend in the direction of the load, like
 the geometrically exact rod with stretch and shear (Reissner 1972, Simo 1985).  The load parameter is alpha = P
 L² / (E I).  The material is elastic, so the deflection must not depend on the number of steps.  This tests the exact
-integration of the particle domains.  Runs on any number of processes; --profile prints the cost of a step.
+integration over the particle domains.  Runs on any number of processes; --profile prints the cost of a step.
 
 Errors divided by L: `v` of the tip deflection and `u` of the shortening, compared with the rod.  `w` is the
 displacement normal to the plane of bending.  `drift` is the largest distance of the tip from its position in the run

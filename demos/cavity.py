@@ -7,8 +7,8 @@ first-order accurate in the step.  With eight cells and steps of a fifth of a ce
 steps, without a grid, also has an error: pore pressures in normally consolidated clay are 1.5 % too low at a = 1.1 a0.
 
 1. Undrained: saturated Modified Cam Clay at two overconsolidation ratios, expanded so fast that no water flows.  The
-   initial pressure acts on the outer boundary.  In incompressible soil the motion is exact: a point moves from radius R
-   to r, r^2 - a^2 = R^2 - a0^2, as the cavity grows to radius a.
+   initial pressure acts on the outer boundary.  In incompressible soil the exact motion is known: a point moves from
+   radius R to r, r^2 - a^2 = R^2 - a0^2, as the cavity grows to radius a.
 2. Then the wall is fixed, the clay drains at the outer boundary, and excess pressures dissipate.
 3. Drained: a well in Modified Cam Clay (Chen and Abousleiman 2013) and cavities in Mohr-Coulomb sand, phi = 30
    degrees, without and with associated dilation (Yu and Houlsby 1991).  These solutions are for infinite soil.  The

@@ -3,7 +3,7 @@
 
 Columns of width L and height a L, a = 0.5, 1, 4 and 8, stand against a smooth wall on a rough floor.  Their right side
 is released suddenly.  Lube et al. (2005) measured sand, sugar and rice in a channel, with angles of repose near 31
-degrees.  In these experiments the front moves by 1.2 a L up to a = 1.8, and by 1.9 a^(2/3) L from a = 2.8 on.
+degrees.  In these experiments the front moves by 1.2 a L for a < 1.8, and by 1.9 a^(2/3) L for a > 2.8.
 
 The sand follows the Mohr-Coulomb law without dilation.  In simple shear its shear strength is sin phi times the normal
 stress (Davis 1968), so sin phi = tan 31 degrees.  In fast flow the friction coefficient grows by 0.93 I, with the

@@ -37,14 +37,14 @@ import numpy as np
 import mpm_dolfinx as mpm
 
 R, WIDE, BELOW = 1.0, 20.0, 12.0  # m: radius of the shaft and of the clay; clay below the final depth
-STRENGTH, ROUGH, INDEX = 1e3, 0.3, 100.0  # Pa: s_u; adhesion / s_u; G / s_u
+STRENGTH, ROUGH, INDEX = 1e3, 0.3, 100.0  # s_u, Pa; adhesion and G, divided by s_u
 SHEAR = INDEX * STRENGTH
 HALF_ANGLE = 30.0  # degrees, between axis and flank of the cone
 FINE, ABOVE, RATIO = 2.0, 6.5, 1.3  # m: radius of the small cells; cells above the surface; ratio of neighbouring cells
 AROUND = 1.0, 2.5  # m: small cells below and above the tip, if grid lines follow the cone
-WAY = np.linspace(0.5, 1, 101)  # depths, over the final depth, at which runs are compared
+WAY = np.linspace(0.5, 1, 101)  # depths, divided by the final depth, at which runs are compared
 STEP, WET_STEP = 1 / 6, 1 / 12  # motion of the cone in a step, in cell sizes: undrained and saturated clay
-LAST = 3.0  # radii, over which the steady resistance is averaged
+LAST = 3.0  # distance, in radii, over which the steady resistance is averaged
 FAST = 1000.0  # V = v 2 R / c_v, of the push in wet clay
 UNDRAINED = {"bulk": 50 * SHEAR, "shear": SHEAR, "friction": 0.0, "dilation": 0.0, "cohesion": STRENGTH}
 WET = mpm.MohrCoulomb(**UNDRAINED | {"bulk": 2 * SHEAR}, conductivity=1e-9)
@@ -232,8 +232,9 @@ def main(argv: list[str] | None = None) -> dict:
 def following(o: Namespace, clay: mpm.Skeleton, fixed: Push) -> dict[str, float]:
     """Push the cone on grid lines that follow it; print and return its resistance and its cells, relative to others.
 
-    load, last: mean over the second half of the way, and final value, over those of the run on fixed lines, less 1;
-    cells: number of cells over that of equal small cells in the same grid; fixed: over that of the fixed lines.
+    load, last: relative difference of the mean of N over the second half of the way, and of the final N, from the run
+    on fixed lines.  cells, fixed: number of cells, divided by that of equal small cells in the same grid, and by that of
+    the grid with fixed lines.
     """
     run, halfway = push(o.cells, o.depth * R, clay, follow=True), o.depth / 2
     mean, beside = (np.interp(WAY * o.depth, each.depth, each.N).mean() for each in (run, fixed))

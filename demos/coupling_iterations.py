@@ -6,10 +6,10 @@ poroelastic beam, undeformed and bent) and a footing on a column.  Only the prod
 matters.  This product ranges from 1e-23 m (1e-14 m/s, 1e-9 s) to 1e11 m (1e2 m/s, 1e9 s).  The bulk modulus of the
 water ranges from 1e4 Pa to infinity.
 
-Three schemes are compared.  The package uses conjugate gradients on the Schur complement S = C + B K^-1 B^T.  C is the
-matrix of storage and flow, K the stiffness matrix, and B the coupling matrix.  The preconditioner is the filtered
-fixed-stress operator C + beta (V - 3/4 L), with the cell volumes V and a five-point Laplacian L.  The second scheme
-uses the plain operator, C + beta V, as preconditioner.  The third scheme is the plain fixed-stress (Richardson)
+Three schemes are compared.  The first is the package's: conjugate gradients on the Schur complement S = C + B K^-1 B^T.
+C is the matrix of storage and flow, K the stiffness matrix, and B the coupling matrix.  The preconditioner is the
+filtered fixed-stress operator C + beta (V - 3/4 L), with the cell volumes V and a five-point Laplacian L.  The second
+scheme has the plain operator, C + beta V, as preconditioner.  The third scheme is the plain fixed-stress (Richardson)
 iteration, with beta = 0.5, 0.75 and 1 times alpha²/K_dr (Biot's coefficient alpha, drained bulk modulus K_dr).  With
 beta = 1/K_w (K_w: bulk modulus of the water) this iteration diverges.  An iteration consists of one solve of the
 storage and one solve of the momentum.

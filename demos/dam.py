@@ -73,7 +73,7 @@ class Dam:
 
 
 def run(h: float = 0.5, steps: int = 10) -> Dam:
-    """Run the dam on cells of size h, m, in `steps` steps of each length in `SETTLES`, then in drawdown."""
+    """Run the dam on cells of size h, m: first `steps` steps of each length in `SETTLES`, then the drawdown."""
     grid = mpm.Grid([0, 0], [BASE + 2, HEIGHT + 1], np.rint(np.array([BASE + 2, HEIGHT + 1]) / h).astype(int))
 
     def trapezoid(X: np.ndarray) -> np.ndarray:

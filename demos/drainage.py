@@ -7,7 +7,7 @@ saturation.  The reference is a converged solution with 400 finite volumes, for 
 (1965), with the constants of Lewis and Schrefler (1998).
 
 Errors at 5, 10, 30 and 120 minutes: the largest pressure error at five heights, divided by the suction at the highest
-place; the relative error of the settlement; the relative error of the outflow at the foot.  On one process.
+of them; the relative error of the settlement; the relative error of the outflow at the foot.  On one process.
 """
 
 from __future__ import annotations

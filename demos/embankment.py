@@ -4,9 +4,9 @@
 The scene is half of the section; x = 0 is a plane of symmetry.  On 6 m of clay, a lift of 1 m with slopes of 1:2 is
 built every 90 days.  After four lifts the clay consolidates for ten years.  Each lift is a polygon with named edges
 (`mpm.polygon`, by gmsh).  A lift is placed on the settled ground and filled up to its design level, so it is thicker
-than 1 m.  Pressures are in excess of the sea above, and weights are buoyant.  The weight of the lifts is a term in UFL;
-the clay is in equilibrium with its own weight from the start.  The surface below a lift is no longer drained; the lift
-is drained at its slope and crest.  On one process.
+than 1 m.  Pressures are in excess of the hydrostatic pressure of the sea, and weights are buoyant.  The weight of the
+lifts is a term in UFL; the clay is in equilibrium with its own weight from the start.  The surface below a lift is no
+longer drained; the lift is drained at its slope and crest.  On one process.
 
 Check: at the end the lowest points of the clay carry the weight of all lifts.  `carried` is the integral of the
 effective stress at these points, divided by this weight; it is 1 in equilibrium.

@@ -102,7 +102,7 @@ class SaintVenantKirchhoff(mpm.Skeleton):
 
 
 def layered(X: np.ndarray) -> np.ndarray:
-    """Return a modulus, Pa, at reference positions (n, 2), which doubles from each quarter of the height downwards."""
+    """Return a modulus, Pa, at reference positions (n, 2); it doubles from each quarter of the height to the next."""
     return 1e6 * 2.0 ** np.floor(4 * (1 - X[:, 1]))
 
 

@@ -41,8 +41,8 @@ With --square, square and circular footings, rough and smooth, are pushed into T
 footings are tools: below a smooth prescribed displacement, faces of the soil would move outward and enlarge the
 footing.  A quarter of the square is computed in 3D, also on several processes.  N_c is the limit load, divided by area
 and c.  Bounds for a rough square are 5.52 and 6.22 (Salgado et al. 2004), for a smooth one 2 + pi and 5.71 (Shield and
-Drucker 1955).  Circles are computed in axisymmetry, with about twice as many cells over the width.  Exact limit loads
-are 6.05 for rough circles (Cox, Eason and Hopkins 1961), and 5.69 for smooth ones (Shield 1955).
+Drucker 1955).  Circles are computed in axisymmetry, with about twice as many cells over the width.  Exact values of N_c
+are 6.05 for rough circles (Cox, Eason and Hopkins 1961), and 5.69 for smooth circles (Shield 1955).
 
 With non-associated flow the solution is not unique.  Shear bands are one cell wide and change their position between
 steps, more often on finer cells (Rudnicki and Rice 1975).  On fine grids many steps are therefore cut.  The option

@@ -104,7 +104,7 @@ class Outcome:
 
 
 def modulus(tissue: Tissue) -> tuple[float, float, float]:
-    """Return the modulus, stress over strain, Pa, by material points, by elements, and at uniform strain (Voigt)."""
+    """Return the moduli, Pa, by material points, by elements, and at uniform strain (Voigt)."""
     simulation, top = tissue.scene(SMALL, wet=False)
     points = simulation.run(RAMP, RAMP, probes=top, progress=False).displacement[-1][0, 1]
     n = len(tissue.grey)

@@ -19,8 +19,8 @@ seeding, N is lower for one or two steps.  Errors refer to the mean of N over th
 the range of N there, divided by this mean.
 
 Saturated ("wet") clay is also computed: a smooth bar is pushed through it by one diameter, at three rates V = v D /
-c_v.  The water on top has the same pressure, so the clay starts without effective stress.  Wet clay is seeded only
-once.  Domains longer than a cell are replaced by new domains (renewal).
+c_v.  The water on top has the pressure that loads the clay, so the clay starts without effective stress.  Wet clay is
+seeded only once.  Domains longer than a cell are replaced by new domains (renewal).
 
 With --follow the bar is pushed once more, on grid lines that follow it.  Small cells then move with the bar, and the
 larger cells widen behind the bar and narrow ahead of the bar.  The number of cells does not change.

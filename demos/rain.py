@@ -6,12 +6,12 @@ stands on a water table 5 m below the surface, under the component of gravity no
 rest.  Then vertical rain of nine tenths of the conductivity falls until the flow is steady.  At a vertical depth d the
 factor of safety is
 
-    FS = tan phi / tan b + 2 c / (gamma d sin 2b) + chi s / (gamma d) (tan b + cot b) tan phi
+    FS = tan phi / tan b + 2 c / (gamma d sin 2b) + chi s (tan b + cot b) tan phi / (gamma d)
 
-with the suction stress chi s of Bishop and a constant unit weight gamma.  At rest and in steady flow the suction s of
-exponential soil is known exactly: exp(-alpha s / gamma_w) = q / k + (1 - q / k) exp(-alpha z cos^2 b), where alpha is
-Gardner's constant, gamma_w the unit weight of water, q the rain, k the conductivity, and z the height above the water
-table.
+with friction angle phi, cohesion c, Bishop's suction stress chi s and a constant unit weight gamma.  At rest and in
+steady flow the suction s of exponential soil is known exactly: exp(-alpha s / gamma_w) = q / k + (1 - q / k) exp(-alpha
+z cos^2 b), where alpha is Gardner's constant, gamma_w the unit weight of water, q the rain, k the conductivity, and z
+the height above the water table.
 
 Source: Lu and Godt (2008) for vertical flow; here the component of gravity normal to the slope replaces gravity.
 Errors: the largest relative error of FS at depths of 1, 2, 3 and 5 m, at rest and in steady flow.

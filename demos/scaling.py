@@ -21,11 +21,12 @@ With runs on one and on several processes, a cost model is fitted to the seconds
 
     T = e + a n / P + b H + c log2 P,
 
-where the terms are a fixed cost, the work for the points (in a measured run, times its imbalance), the work for the
-halo, and messages of any size.  The coefficients, all >= 0, are fitted by least squares of relative errors.  H is the
-number of points along the faces between processes, for a cube that is halved repeatedly.  If a run has more processes
-than the machine has processors, its message counts are used, but not its times.  In 2D the model excludes the solvers,
-because the cost of factorisations is not proportional to n / P.
+where the terms are a fixed cost, the work for the points (in a measured run, times its imbalance), the work for points
+at faces between processes, and a cost of messages that does not depend on their size.  The coefficients, all >= 0, are
+fitted by least squares of relative errors.  H is the number of points along the faces that a process shares with
+others, for a cube that is halved repeatedly.  If a run has more processes than the machine has processors, its message
+counts are used, but not its times.  In 2D the model excludes the solvers: the cost of factorisations is not
+proportional to n / P.
 """
 
 from __future__ import annotations

@@ -16,15 +16,15 @@ in UFL.  Inertia is neglected.  On one process.
    The bank slumps, and its crest is carried along by the flowing soil.  In front of the initial toe, the water carries
    more than half of the weight.  At rest the bank is twice as long as before; then the excess pressure drains.  The
    final inclination of the slope is 23.5 degrees, and 29.3 degrees in its steepest part of length H / 3.  The friction
-   angle is 25 degrees; a Drucker-Prager cone without dilation mobilises only 24.2 degrees, the arcsine of its slope.
+   angle is 25 degrees; a Drucker-Prager cone without dilation mobilises only 24.2 degrees, arcsine of the cone's slope.
    The remaining cohesion, a hundredth of gamma' H, makes the slope slightly steeper.  Twice the number of cells or
    steps, or half the viscosity, changes run-out and height by less than 2 %.
 
 The cohesion is a function of position, so the points carry it (`points.data["cohesion"]`).  A function in `observe`
 reduces it after each step.  A step that does not converge is cut, and repeated with the same strength.  The shorter
-step converges because a viscous stress limits the velocity of the bank, also a term in UFL: 2 eta times the strain
-rate. eta / T is a hundredth of gamma' H; part 1 has no viscosity.  A mesh could not represent this deformation, because
-the vertical side of the bank finally lies on the floor, and plastic strains are several hundred per cent.
+step converges because a viscous stress of 2 eta times the strain rate, also a term in UFL, limits the velocity of the
+bank.  eta / T is a hundredth of gamma' H; part 1 has no viscosity.  A mesh could not represent this deformation,
+because the vertical side of the bank finally lies on the floor, and plastic strains are several hundred per cent.
 """
 
 from __future__ import annotations

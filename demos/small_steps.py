@@ -42,13 +42,16 @@ from mpm_dolfinx.verification.exact import terzaghi_pressure
 HEIGHT, SOIL = terzaghi.HEIGHT, terzaghi.SOIL
 T_END = 0.1
 CASES = {"resting": (0.0, 0.0), "moving": (0.5, 0.0), "moving, soft water": (0.5, 1.0)}
-"""For each column: base displacement over height; storage coefficient of the water times the oedometric modulus M."""
-STRIP_STEPS = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)  # length of the step over time of consolidation of the layer
+"""For each column: base displacement divided by height; storage coefficient of the water times oedometric modulus M."""
+STRIP_STEPS = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)  # length of the step, divided by the time of consolidation
 
 
 @dataclass
 class Run:
-    """A column at `T_END`: depths z of centroids over height, pressures over p0, errors (module's docstring)."""
+    """A column at `T_END`: depths z of the centroids, pressures, and the errors that the module's docstring defines.
+
+    Depths are divided by the height, pressures by p0.
+    """
 
     z: NDArray[np.float64]
     p: NDArray[np.float64]

@@ -53,7 +53,7 @@ ELEMENTS = np.array(
         [-0.129321, -0.090335, -0.006179],
     ]
 )
-"""Upward displacements at `TIMES` and `PLACES` over `HEIGHT`; Taylor-Hood elements for q/E = 0.25, extrapolated."""
+"""Upward displacements at `TIMES` and `PLACES`, divided by `HEIGHT`: extrapolated Taylor-Hood elements, q/E = 0.25."""
 WALLS = {"left": "x", "right": "x", "bottom": "y"}
 
 

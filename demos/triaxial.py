@@ -4,7 +4,7 @@
 Modified Cam Clay is tested at three overconsolidation ratios R, drained and undrained, from the same isotropic stress
 p_0.  P and Q are the mean and the deviatoric Kirchhoff stress, p and q those of Cauchy, t_i the principal Kirchhoff
 stresses.  The size of the yield surface is P_c.  In an undrained test the volume is constant, so the test ends at P_cs
-= P_0 (R/2)^(1 - kappa/lambda), Q = M P_cs.  During yield Q = M sqrt(P (P_c - P)).  In a drained test the stress path is
+= p_0 (R/2)^(1 - kappa/lambda), Q = M P_cs.  During yield Q = M sqrt(P (P_c - P)).  In a drained test the stress path is
 q = 3 (p - p_0), and ends at q = M p.  Tests of Mohr-Coulomb sand, in compression and in extension, end at t_1 (1 + sin
 phi) - t_3 (1 - sin phi) = 2 c cos phi, with the principal stresses t_1 and t_3.
 

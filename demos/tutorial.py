@@ -108,7 +108,7 @@ for iteration in range(8):
     unknowns.add(u, -1.0, change)
 assert size < 1e-8
 
-# 4. The points move, and the grid forgets.
+# 4. The points move, and the grid is reset.
 #
 # Corners move by the displacement u of the grid.  F is multiplied by 1 + grad u, here with the mean gradient over the
 # pieces of each domain.  Then u is set to zero, and the next step starts on the undeformed grid.
@@ -126,7 +126,7 @@ apart = np.abs(np.linalg.det(F_n) * volume / volumes(moved) - 1).max()
 print(f"4. the column has sunk by {settlement:.5f} m; det F and the volume ratio of the corners differ by {apart:.0e}")
 assert apart < 1e-3
 
-# 5. The same by the package.
+# 5. The same column, computed by the package.
 #
 # The package also moves corners by second differences of u, and computes F from the corners.  It treats nearly empty
 # cells, locking, surfaces, water, time integration and several processes.

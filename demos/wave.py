@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: MIT
 """Waves in soil columns, dry and saturated, against exact solutions.
 
-1. A sudden load q acts on a dry column of height L = 10 m.  Its base is rigid and reflects the wave, or absorbs the
+1. A sudden load q acts on a dry column of height L = 10 m.  The base either reflects the wave, if rigid, or absorbs the
    wave.  With the wave velocity c and the density rho, the stress on the base is zero until L / c.  Then it is 2 q on a
    rigid base, until 3 L / c, and q on an absorbing base.  Behind the front the velocity of the soil is q / (rho c).
    Stresses oscillate behind a front, so their means are compared.
-2. A harmonic load on a saturated column of 10 m, drained at its top (Zienkiewicz, Chang and Bettess 1980), is slow or
-   fast.  The complex amplitudes of settlement and pore pressures in the steady oscillation are compared.  In the slow
+2. A slow or a fast harmonic load acts on a saturated column of 10 m, drained at its top (Zienkiewicz, Chang and Bettess
+   1980).  The complex amplitudes of settlement and pore pressures in the steady oscillation are compared.  In the slow
    case, water drains only from a layer of 0.3 m below the top.
 3. The same column, with incompressible water and grains and k = 0.01 m/s, takes a sudden load (after de Boer, Ehlers
    and Liu 1993).  Until a wave returns from the base, the settlement of the top at the time t is q / (M a^(1/2))

@@ -16,7 +16,7 @@ compaction, and let h follow from the plastic multiplier: 6G dgamma / M^2 = exp(
     P = P_t exp(-a),   Q = Q_t exp(-h),   P_c = P_c,n exp(rho a),   rho = kappa / (lambda - kappa),
     (6G kappa / M^2) a = (exp(h) - 1) (2P - P_c).
 
-The local unknown is d = 2 (h - a).  The stress ratio at the end follows from d, Q / (M P) = sqrt(w) exp(-d/2).  On the
+The local unknown is d = 2 (h - a).  The stress ratio at the end follows from d: Q / (M P) = sqrt(w) exp(-d/2).  On the
 yield surface a = (ln(P_t / P_c,n) + ln(1 + w exp(-d))) / (1 + rho).  The equation for d is smooth and monotone, even at
 isotropic stresses and at the critical state (a = 0).
 

@@ -330,7 +330,7 @@ class SceneMaterials:
         return out
 
     def changed(self, what: str, points: MaterialPoints, named: Collection[str]) -> MaterialPoints:
-        """Return the points after a change of the fields `named`; fields that depend on these are updated.
+        """Return the points after a change of the fields `named`; fields that depend on `named` are updated.
 
         Raises
         ------

@@ -36,7 +36,7 @@ class K0:
     The vertical effective stress is the overburden of soil and fluid plus the surcharge, minus the Biot coefficient
     times the pore pressure (times chi in unsaturated soil).  The horizontal effective stresses, in axisymmetry radial
     and circumferential, are K0 times the vertical one.  The stresses are exact for level ground with level layers.
-    Otherwise an equilibrium step follows.  A warning is given if it changes stresses by more than 5 %, as on slopes.
+    Other stresses are balanced, without motion of the points.  Changes of more than 5 %, as on slopes, cause a warning.
 
     Parameters
     ----------

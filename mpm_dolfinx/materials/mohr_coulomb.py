@@ -209,7 +209,7 @@ class _Return:
     def _violation(self, t: NDArray, multipliers: Sequence[NDArray]) -> NDArray:
         """Return the largest violation (n,), Pa, of three conditions.
 
-        These are yield functions <= 0, principal stresses t in descending order, and multipliers >= 0 (times 2G).
+        The conditions are: yield functions <= 0, principal stresses t in descending order, 2G times multipliers >= 0.
         """
         multipliers = [-2 * self._G * m for m in multipliers]
         return np.max([self._surface.outside(t), t[:, 1] - t[:, 0], t[:, 2] - t[:, 1], *multipliers], axis=0)

@@ -122,7 +122,7 @@ class Skeleton:
 
     Examples
     --------
-    A user-defined law is a frozen dataclass (the README shows a law with fibres)::
+    A user-defined law is a frozen dataclass (demos/README.md shows a law with fibres)::
 
         @dataclass(frozen=True)
         class Stiffening(mpm.NeoHookean):
@@ -288,12 +288,12 @@ class Skeleton:
         return self.bulk + 4 / 3 * self.shear
 
     def pressure_damping(self) -> float:
-        """Return the damping coefficient tau, 1/Pa: 1/4, or 1/2 for laws with a state, of the value for 2 x 2 cells.
+        """Return the damping coefficient tau, 1/Pa: 1/4, or 1/2 for laws with a state, of the macroelement's value.
 
-        The full value is 3 alpha^2 / (8 (lambda + 3G)).  A quarter gives better conditioning and smears less (Silvester
-        and Kechkar 1990; Camargo, White and Borja 2021).  The value for 2 x 2 x 2 cells is up to 56 % smaller.
-        In 3D the smaller value would not damp pressures that alternate along two axes only, like checkerboards in plane
-        strain.  Only increments of the pressure are damped, so an oscillation from the onset of yield remains.
+        For macroelements of 2 x 2 cells this value is 3 alpha^2 / (8 (lambda + 3G)).  A quarter of it gives better
+        conditioning and smears less (Silvester and Kechkar 1990; Camargo, White and Borja 2021).  The value for 2 x 2 x
+        2 cells is up to 56 % smaller.  It would not damp pressures that alternate along two axes only, like
+        checkerboards in plane strain.  Only pressure increments are damped; oscillations due to first yield remain.
         """
         lam = self.bulk - 2 * self.shear / 3
         return (0.5 if self.state else 0.25) * self.biot**2 * 3 / (8 * (lam + 3 * self.shear))
@@ -453,7 +453,7 @@ class unsaturated:
     least
         Conductivity of drained soil, divided by that of saturated soil, in (0, 1).
     specific_yield
-        Drainable porosity, in [0, 1), at most the porosity.  With 0, a free surface falls at once, for steady flow.
+        Drainable porosity, in [0, 1), at most the porosity.  Use 0 for steady flow only: a free surface falls at once.
     """
 
     suction: float

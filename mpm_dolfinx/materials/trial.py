@@ -2,7 +2,7 @@
 """Trial elastic strain of multiplicative plasticity, and isotropic functions, in UFL and in numpy.
 
 In UFL, isotropic functions of a tensor are Newton's interpolation polynomials at its eigenvalues.  They are exact for
-smooth functions of each eigenvalue.  They remain smooth at equal eigenvalues, because the nodes are kept separate.
+smooth functions of each eigenvalue.  They remain smooth at equal eigenvalues, because `_eigenvalues` separates them.
 If the principal values have kinks and depend on all three eigenvalues, `Coaxial` gives exact derivatives in numpy.
 """
 

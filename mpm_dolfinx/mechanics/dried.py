@@ -60,5 +60,5 @@ class OfSuction:
 
 
 def _padded(values: NDArray[np.float64], width: int) -> NDArray[np.float64]:
-    """Return rows of the given width, filled up with zeros."""
+    """Return values (m, n), padded with zeros to rows of the given width."""
     return np.pad(values, ((0, 0), (0, width - values.shape[1])))

@@ -3,14 +3,14 @@
 
 The term gamma s 2G h/3 int [d_n u].[d_n v] dS acts on the displacement increment u of the step. gamma is `GHOST`, and s
 is the strength of a face (see below). G is the shear modulus, h the cell size, and [d_n u] the jump of the normal
-derivative.  Nearly empty cells then affect neither the conditioning nor the accuracy. The penalty resists each step's
-increment like a viscosity, so it must not act on load-bearing cells:
+derivative.  Nearly empty cells then hardly affect conditioning and accuracy.  The penalty resists each step's increment
+like a viscosity, so it must not act on load-bearing cells:
 
 * The strength s of a face falls from 1 to 0 while the emptier cell's filling rises from 0 to `RATIO` times the fuller
-  cell's.  A second factor is the squared ratio of the fuller cell's filling to the largest filling of the emptier
+  cell's.  A second factor of s is the squared ratio of the fuller cell's filling to the largest filling of the emptier
   cell's neighbours.  A penalty between equally filled cells would resist kinks of a body.
 * The scale is the shear modulus. With lambda + 2G, nearly empty cells of nearly incompressible bodies would copy the
-  stretch of the full neighbour, against their own volume constraint.  In flowing soil the modulus `stiffness` is < 2G.
+  stretch of the full neighbour, against their own volume constraint.  In flowing soil the scale is less than 2G.
 
 With integration at the material points, any cell may hold too few points for its nodes. Then all faces of cells that
 are not full have a penalty of strength 0.2.
@@ -38,7 +38,7 @@ GHOST = 0.05
 YIELDING = 0.02
 """Smallest reduction factor of the penalty for nearly incompressible laws with a state."""
 RATIO = 0.3
-"""A face has the penalty if its cells' volume fractions have a ratio below this number.  Halving this value changes the
+"""Ratio of the emptier to the fuller cell's filling below which a face has the penalty.  Halving this value changes the
 result of scene "soil" in tests/plateaus.py by 1.3e-03 (relative), doubling it by 5.9e-04, and finer cells by 3.0e-02.
 """
 SPARSE, FULL = 0.2, 0.9

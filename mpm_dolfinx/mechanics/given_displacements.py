@@ -2,7 +2,7 @@
 """Prescribed displacements of sides, by penalties on cell means and weaker penalties at points; see `held_cells`.
 
 If a side lags behind its prescribed displacement, each component in each cell gets a multiplier, by the method of
-multipliers (Hestenes 1969).  With multipliers the means are exact, whatever the resistance of the body.
+multipliers (Hestenes 1969).  Multipliers remove the lag of the means, unless the cells cannot follow the side.
 """
 
 from __future__ import annotations
@@ -243,7 +243,7 @@ class GivenDisplacements(Acting):
         """Return corners (n, 2^d, d), m, of the particle domains `ids`; domains at a held side are replaced by prisms.
 
         tracked, m: tracked corners; volume (n,): domain volumes, in axisymmetry areas of their sections.  A prism
-        has this volume, and the tracked corners on the held face.  If the face moved, the penalty would pull it back.
+        has this volume, and keeps the tracked corners on the held face: the penalty would pull a moved face back.
         """
         index = np.arange(2**self._grid.dim)
         for _, faces, _ in self._holds:
@@ -357,7 +357,7 @@ class HoldLoads(Loads):
     def guess(self, parts: Parts, nodal: NDArray[np.float64]) -> NDArray[np.float64] | None:
         """Return an initial guess of u; None if the conditions rotate no connected part of the bodies.
 
-        Parts that the conditions rotate have their rigid motions, other parts the displacements `nodal`.
+        A part that the conditions rotate gets the nearest rigid motion, other parts get the displacements `nodal`.
         """
         grid = self.data.points.grid
         if grid.axisymmetric:

@@ -35,7 +35,7 @@ Halving this value changes the result of scene "soil" in tests/plateaus.py by 2.
 1.7e-05, and finer cells by 3.0e-02.
 """
 TENSE = 10
-"""Factor on a side's stress in the modulus of the penalty, because a side buckles if its stress exceeds the penalty.
+"""Factor on a side's stress in the modulus of the penalty: a side would buckle if its stress exceeded this modulus.
 Halving this value changes the result of scene "soil" in tests/plateaus.py by 2.8e-06 (relative), doubling it by
 4.7e-06, and finer cells by 3.0e-02.
 """
@@ -48,7 +48,7 @@ class HeldPoints(NamedTuple):
     number: NDArray[np.int64]  # (n,) index of the condition
     cell: NDArray[np.int32]  # (n,) local cell
     area: NDArray[np.float64]  # (n,) reference area, m^(d-1)
-    modulus: NDArray[np.float64]  # (n,) penalty modulus times area, N; this to `undrained` at the last grid reset
+    modulus: NDArray[np.float64]  # (n,) penalty modulus times area, N; up to `undrained`: at the last reset
     tension: NDArray[np.float64]  # (n,) norm of the stress times area, N
     resistance: NDArray[np.float64]  # (n,) resisting modulus times area, N
     firm: NDArray[np.float64]  # (n,) confined modulus times area, N, with a limited contribution of the fluid
@@ -114,8 +114,8 @@ class HeldCells:
         Stiffness of each penalty and component, N/m.  The stiffness on a mean, normal to a side parallel to the grid,
         follows from the confined modulus.
     limit : (2, k, d)
-        Largest plausible force of each of k penalties on means, N: for the skeleton, and for undrained soil if the side
-        is at its prescribed position.  Larger forces are artefacts.
+        Largest plausible force of each of k penalties on means, N: first for the skeleton, then for undrained soil.
+        The latter applies if the side is at its prescribed position.  Larger forces are numerical artefacts.
     way
         Increment (d,) of the prescribed displacement in the step, m, for each penalty.
     """
@@ -175,8 +175,8 @@ class HeldCells:
 
         Where a side ends at a wall, its penalties omit nodes that the wall fixes. Otherwise the free nodes of the cell
         would compensate for the fixed ones, with an oscillation along the side. The prescribed displacement is also
-        extrapolated to the wall. If this value exceeds half of the cell's mean, at the start or the end of the step,
-        the displacement must vary over the cell. A penalty is then omitted if others hold a free node of the cell.
+        extrapolated to the wall. If the result exceeds half of the mean over the cell, at the start or the end of the
+        step, the displacement must vary over the cell. The penalty is then omitted if others hold a free node there.
 
         given (conditions,): whether each prescribes component `axis`; free (nodes,): whether no wall fixes the node.
 

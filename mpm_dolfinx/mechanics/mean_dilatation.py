@@ -2,7 +2,7 @@
 """F-bar: one volume ratio per cell, against volumetric locking of nearly incompressible skeletons.
 
 Four volume constraints per cell suppress the bending modes of a Q1 quadrilateral, with errors of up to 50 % at nu =
-0.499. F-bar scales the law's deformation gradient so that its volume ratio in the step is theta, the mean of the cell,
+0.499. F-bar scales the law's deformation gradient so that its volume ratio in the step is theta, a mean over the cell,
 
     Fbar = (theta J_n / det F)^(1/3) F,     theta = sum w det(Delta) / sum w   over the locking pieces of the cell.
 
@@ -44,7 +44,7 @@ from mpm_dolfinx.points.material_points import ACROSS, with_ratio
 
 
 class SumsOfPart(NamedTuple):
-    """Sums over the integration points of one part in each cell, for theta and pi: see `MeanDilatation`."""
+    """Sums in each cell over one part of the scene's integration points, for theta and pi: see `MeanDilatation`."""
 
     ratio: CellSums
     stress: StressAtPoints
@@ -184,7 +184,7 @@ class MeanDilatation:
     def total(
         self, data: QuadratureData, sums: Sequence[NDArray[np.float64]]
     ) -> tuple[NDArray[np.int32], NDArray[np.float64], NDArray[np.float64]]:
-        """Return the cells with F-bar, totals (cells, k) of `sums` over all parts, and `_volume_of` the cells."""
+        """Return the cells with F-bar, totals (cells, k) of `sums` over all parts, and the result of `_volume_of`."""
         return self._cells(data).filled, self._cells(data).total(sums), self._volume_of(data)
 
     def update(self, data: QuadratureData, solve: Callable[[], None]) -> None:

@@ -4,7 +4,7 @@
 The displacement increment of the step is u, Delta = I + grad u, F = Delta F_n, J_n = det F_n, J_Delta = det Delta. The
 residual is the derivative of
 
-    int psi(F) / J_n - alpha p J_Delta dV_n  -  loads,
+    int [psi(F) / J_n - alpha p J_Delta] dV_n  -  work of the loads,
 
 that is int (P' - alpha p J_Delta Delta^-T) : grad v dV_n = int rho g . v dV_n + tractions.  psi is the energy of the
 skeleton, alpha Biot's coefficient, and p the pore pressure. P' is the first Piola-Kirchhoff effective stress relative
@@ -319,7 +319,7 @@ class MomentumSystem:
         self.rounding = self.unknowns.vector()
         """Rounding error of the residual at each unknown, N."""
         self.of_whole = self.unknowns.vector()
-        """For each unknown: norm, N, of a residual equal to its rounding error in its whole connected part."""
+        """For each unknown: norm, N, of a vector with its rounding error at all unknowns of its connected part."""
         self.K = matrix(self.unknowns, self.unknowns, 3**d * d)
         self.residual, self.step = self.unknowns.vector(), self.unknowns.vector()
         held = active[~among(active, dofs)]
@@ -469,7 +469,7 @@ class MomentumProblem:
         b, norms = self._unbalanced()
         system.held.gather(b, system.held_residual)  # without penalties; `wall_forces` adds their part on fixed nodes
         if pulls := [one.pulls for one in self.loads if one.stiff]:
-            # not in the scale: at the start of a step they far exceed the forces
+            # penalty forces are not in the scale: at the start of a step they far exceed the other forces
             b[system.touched] -= self.forms.summed(1, pulls)[system.touched]
         r = system.unknowns.gather(b, system.residual)
         step = system.unknowns.gather(forms.nodal.ravel(), system.step)
@@ -529,8 +529,8 @@ class MomentumProblem:
         """Return two relative residuals of each connected part; r: residuals, N; scales (parts,): force scales, N.
 
         For the first, the rounding error at each node is subtracted from the residual.  With `first` it is not
-        subtracted, so that even a load below this error causes a solve.  For the second, the force scale of a part is
-        at least the rounding error divided by the tolerance.  A residual within rounding then counts as converged.
+        subtracted, so that even a load below this error causes a solve.  For the second, the force scale at an
+        unknown is at least `of_whole` divided by the tolerance.  A residual within rounding then counts as converged.
         """
         system, parts = self.system, self.system.of_parts
         both = np.zeros((2, system.unknowns.size))

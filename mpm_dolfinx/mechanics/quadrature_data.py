@@ -25,8 +25,8 @@ from mpm_dolfinx.points.material_points import ACROSS, MaterialPoints, in_plane,
 STIFF_DRY = 50
 """In dry bodies: weight of a cell's corner-based volume ratio J_n (`cell_ratios`), in units of G / (lambda + 2G).
 
-It is at most 1; the incremental volume ratio of the points has the rest. With nu = 0.4999 and a weight of 1, the
-stress change at a reset of the grid would exceed the stresses in the bodies.
+The weight is at most 1; the incremental volume ratio of the points has the remaining weight. With nu = 0.4999 and a
+weight of 1, the stress change at a reset of the grid would exceed the stresses in the bodies.
 """
 STIFF_WET = 8
 """Value of (lambda + 2G) / G above which the corner-based ratio loses weight in wet bodies.
@@ -40,7 +40,7 @@ SHARE = 0.5
 """Fraction of the gradient's deviation from its cell mean that laws use in cells of flowing, dilatant soil.
 
 Dilatant flow has a volume strain rate of sin psi times its shear rate. This condition at four points over-constrains a
-Q1 cell, even with F-bar. For a footing with associated flow, phi = 20 degrees, on 9 and 17 cells, the load is then 4.4
+Q1 cell, even with F-bar. With the full deviation, the load of a footing (phi = psi = 20 degrees, 9 and 17 cells) is 4.4
 and 3.4 % too large, and still rises. With one point per cell the load is 6.6 and 3.2 % too small, and constant.
 """
 

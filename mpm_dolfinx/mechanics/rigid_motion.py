@@ -2,7 +2,7 @@
 """The rigid motion nearest to prescribed displacements: initial guess of Newton's method for bodies that rotate.
 
 A linearised rotation by an angle a causes a spurious stretch of a^2 / 2. Soil may yield at this stretch. Newton's
-method would then fail in steps of any length.
+method may then fail, even in short steps.
 """
 
 from __future__ import annotations

@@ -174,7 +174,7 @@ class PressureLoads(Loads):
 def closed(grid: Grid, free: NDArray[np.bool_], pressures: Sequence[tuple[Pressure, Surface]]) -> bool:
     """Return whether each surface of equal pressure is closed, or ends on walls that fix the normal displacement.
 
-    A surface counts as open if corners of its faces lie on the edges of other faces.
+    A surface does not count as closed if corners of its faces lie on the edges of other faces.
 
     free (nodes, d): whether walls leave each displacement component free; pressures: pressures and their faces.
     """
