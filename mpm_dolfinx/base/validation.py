@@ -13,8 +13,8 @@ x : (m, d), m
     Positions of the same places at the start of the step, for example to prescribe a water level.
 
 A single parameter with another name receives the time.  With several parameters, other names raise an error.
-Parameters with a default receive no argument, unless all have one.  Material constants are functions of X.  Initial
-pressures and stresses are functions of x, the seeded positions.
+Parameters with a default receive no argument, unless all have a default.  Material constants are functions of X.
+Initial pressures and stresses are functions of x, the seeded positions.
 
 A function of position returns a number or an array (m,).  Where vectors are allowed, it may also return a vector (d,)
 or an array (m, d).  Places are repeated until m exceeds d, so that the shape of the array is unambiguous.

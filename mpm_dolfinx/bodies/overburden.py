@@ -22,7 +22,7 @@ def overburden(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the overburden stress (k,), Pa, at positions, and the level (k,), m, of the ground surface above them.
 
-    Both are means over vertical lines close to the position, on all sides: a border of domains may lie above it.
+    Both are means over vertical lines beside the position, on all sides, because domains may meet exactly above it.
 
     corners (n, 2^d, d), m: corners of the particle domains of all bodies; the last axis is vertical. unit_weight (n,),
     N/m^3: unit weights of the domains; x (k, d), m: positions in the domains.

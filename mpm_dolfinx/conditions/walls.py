@@ -52,7 +52,7 @@ def fixed_corners(grid: Grid, walls: Mapping[str, str], corners: NDArray[np.floa
 def stopped(
     grid: Grid, walls: Mapping[str, str], corners: NDArray[np.float64], before: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return corners (n, 2^d, d), m, moved back into the grid where walls fix the normal or `before` is inside."""
+    """Return corners (n, 2^d, d), m, moved into the grid if walls fix the normal component or `before` is inside."""
     shut = np.zeros((2, grid.dim), dtype=bool)
     for name, axes in walls.items():
         axis, end = SIDES[grid.dim][name]

@@ -108,11 +108,11 @@ def warn_smeared(
 
 
 def _losses(cut: CutDomains, volume: NDArray[np.float64], modulus: NDArray[np.float64]) -> tuple[NDArray, ...]:
-    """Return for owned cells (n,): loss times volume, m^d, modulus ratio, and index of a piece of softest material.
+    """Return for owned cells (n,): loss times volume, m^d; ratio of moduli; index of a piece of the softest material.
 
-    With moduli M and volume fractions s in a cell, layers in series have the compliance sum s/M.  Equal strain in the
-    cell gives 1 / sum s M instead.  The loss is the difference of both compliances, divided by the
-    largest 1/M.  For two moduli of ratio r < 1, the loss is at most (1 - sqrt(r))^2 of the cell.
+    With moduli M and volume fractions s in a cell, layers in series have the compliance sum (s / M).  Equal strain in
+    the cell gives 1 / sum (s M) instead.  The loss is the difference of both compliances, divided by the largest 1 / M.
+    For two moduli of ratio r < 1, the loss is at most (1 - sqrt(r))^2 of the cell.
     """
     n, order = cut.grid.num_owned, np.argsort(-modulus, kind="stable")
     softest, hardest = (np.zeros(n, dtype=np.int64) for _ in range(2))

@@ -337,7 +337,7 @@ class FluxForms:
         h0, h1, across = across_faces(grid, n0)
 
         def opening(side, sign):
-            """Covered fraction of the face in the direction sign * n0, in axisymmetry times `Grid.around`."""
+            """Open fraction (covered by material) of the face along sign * n0, in axisymmetry times `Grid.around`."""
             lower, upper = self.lower_face(side), self.upper_face(side)
             return sum(
                 ufl.conditional(ufl.gt(sign * n0[a], 0.5), upper[a], 0.0)

@@ -167,7 +167,7 @@ class Places(Keyed):
     x : (n, d), m
         Positions of the points.
     mixed : (n, d), m^2
-        In 3D: mean products of the offsets in a piece about its centroid, see `Pieces`; None: zero, for points.
+        In 3D: mean products of the offsets in a piece about its centroid, see `Pieces`; None (zero) for points.
     hoop : (n, 4)
         In axisymmetry: moments of the pieces in the plane, see `Pieces`; None for points.
     """
