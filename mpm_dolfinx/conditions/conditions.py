@@ -442,7 +442,7 @@ class Displacement(Condition):
     ------
     ValueError
         Raised by the scene or a step: no point on the side; invalid value or components; a moving component that a wall
-        fixes; another `Displacement` of the component on the same part of a face, or different values at an edge.
+        fixes; another `Displacement` of the component on the same part of a face, or different values at a common edge.
     """
 
     side: str

@@ -324,7 +324,7 @@ class ContactLoads(ContactProblem):
 def _ranks(setting: Setting) -> NDArray[np.int64]:
     """Return the rank (points,) of the connected part of each point, by surface area and then by extent.
 
-    The ranking of two parts is the same in all stages, in any order of the bodies, and with any other parts.
+    The ranking of two parts is the same in all stages and for any order of the bodies, whatever other parts exist.
     """
     grid, bodies = setting.grid, setting.sides.bodies
     corners = np.concatenate([body.corners() for body in bodies])

@@ -39,7 +39,7 @@ FACING = 0.5  # smallest cosine between the normal of a face that faces the tool
 
 
 def _box(x: NDArray[np.float64]) -> list[tuple[NDArray[np.float64], MPI.Op]]:
-    """Return both corners (d,) of the bounding box of positions (m, d), each with its reduction over processes."""
+    """Return both corners (d,) of the bounding box of positions (m, d), each with its MPI reduction over processes."""
     return [(x.min(axis=0, initial=np.inf), MPI.MIN), (x.max(axis=0, initial=-np.inf), MPI.MAX)]
 
 

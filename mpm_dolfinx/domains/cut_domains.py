@@ -237,7 +237,7 @@ class CutDomains(Keyed):
 
     @cached_property
     def _followed(self) -> tuple[Exchange, NDArray[np.int32], NDArray[np.float64]]:
-        """Exchange with owners of cells; cells and positions (m, d), m, of corners (without `domains`: of points)."""
+        """Exchange with owners of cells; cells and positions (m, d), m, of all corners (of points if not `domains`)."""
         grid = self.grid
         n = len(self.points)
         d = self.grid.dim

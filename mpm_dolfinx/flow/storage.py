@@ -178,7 +178,7 @@ class StorageForms:
         return [sums[:, 0], *[sums[:, start : start + count] for start in range(1, sums.shape[1], count)]]
 
     def drained(self, data: PointData) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return for filled cells (n,) the storage due to saturation s, m^d/Pa, and int s d(chi p)/dp dV, m^d."""
+        """Return the storage (n,) of filled cells due to their saturation S, m^d/Pa, and int S d(chi p)/dp dV, m^d."""
         capacity, coupled = self._capacity(data).T
         return capacity, coupled
 
@@ -367,7 +367,7 @@ class StorageProblem:
     before
         Outflow volumes from the rate of the previous substep.
     softness : (m,)
-        Softness of the pieces, see `SoftnessAtPoints`; one if no law can yield.
+        Softness of the pieces, see `SoftnessAtPoints`; 1 if no law can yield.
     defect : (n,), m^d
         Part of the volume defect in the active owned cells that is corrected by the end of the substep.
     inertial
@@ -485,7 +485,7 @@ class StorageProblem:
         return volumes / (self.forms.derivatives(self.data)[0] + self._contents.fixed_stress)
 
     def filling(self, error: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return errors (n,) of the water content due to pressure errors (n,), Pa, and its changes (n,) in the step."""
+        """Return errors (n,) of the water content due to pressure errors (n,), Pa, and the content's changes (n,)."""
         capacity, _ = self.forms.drained(self.data)
         change = self.forms.change(self.data)[self.system.unknowns.owned]
         share = self.fill / self._contents.volume
@@ -545,7 +545,7 @@ class StorageProblem:
         """Return a function from changes of displacements (a vector), m, to changes of outflow volumes (n,), m^d.
 
         The function uses a matrix-free finite difference (Knoll and Keyes 2004) of the conductivity laws and of the
-        geometry of the fluxes.  Then `set_fluxes` resets the fluxes to u.  `dofs` are the active dofs of u.
+        geometry of the fluxes.  The caller then resets the fluxes with `set_fluxes`.  `dofs` are the active dofs of u.
         """
         h = self.forms.grid.least
         base, density = self._rates(self._flow(False)).cells, self._density
