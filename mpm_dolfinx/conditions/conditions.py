@@ -145,8 +145,8 @@ class Quiet(Condition):
     Raises
     ------
     ValueError
-        Raised by the scene: bodies without inertia; bodies that had inertia before it became quiet; no point on the
-        side; another `Quiet`, or a `Displacement` of all components, on the same part of a face; a wall of the grid
+        Raised by the scene: bodies without inertia; bodies that had inertia before the side became quiet; no point on
+        it; another `Quiet`, or a `Displacement` of all components, on the same part of a face; a wall of the grid
         that fixes the side; a weight that changes as the stage begins, because the traction at rest does not change.
     """
 

@@ -38,7 +38,7 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.points.parts import parts_of_domains
 
 REACH = 2.0
-"""Largest gap, divided by the cell size, that may close in a step.  Steps with larger motion are rejected."""
+"""Largest gap, divided by the cell size, that may close in a step.  Motions above half of it are rejected."""
 CLEAR = 0.5
 """Gap, divided by the cell size, above which faces cannot touch before the next update of the pairs."""
 DEEP = 0.25

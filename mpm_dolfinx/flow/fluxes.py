@@ -147,7 +147,7 @@ class OpenSides:
         return conductance, self.given + conductance * self.outer(at, flow)
 
     def outer(self, at: NDArray[np.int64], flow: Conduction) -> NDArray[np.float64]:
-        """Return the mass potentials (m,), Pa, at outside pressures minus hydrostatic drops from centroids to faces."""
+        """Return the mass potentials (m,), Pa, at the outside pressures less the hydrostatic drops from centroids."""
         outer = self.pressure if flow.weight is None else self.pressure - flow.deformed(at, self.offset) @ flow.weight
         return mass_potential(outer, flow.bulk)
 
