@@ -626,8 +626,8 @@ class StorageProblem:
     ) -> None:
         """Assemble the derivatives C = d/dp and B = d/du of the residual at (u, p), for the problem's pieces or `data`.
 
-        If a law depends on suction, `of_suction` has pairs of cells (c,) and derivatives (c, n), m^(d-1), of their nodal
-        forces with respect to p.
+        If a law depends on suction, `of_suction` has pairs of cells (c,) and of derivatives (c, n), m^(d-1),
+        of their nodal forces with respect to p.
         """
         forms = self.forms
         system = self.system
