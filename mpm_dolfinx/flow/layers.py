@@ -175,7 +175,7 @@ class MixedCells:
         """Return the flow paths (n, d, 2, ...) of the mixed cells, see `Paths`.
 
         kappa (m,), m^2/(Pa s): mobilities of all pieces at saturation; law (m,): indices of their retention curves,
-        less than `laws`; shift (n, d), m: vectors from the centroids of filled cells to their pressure positions; None if
+        < `laws`; shift (n, d), m: vectors from the centroids of filled cells to their pressure positions; None if
         all are zero.
         """
         kappa, law = kappa[self._rows], law[self._rows]
