@@ -227,7 +227,7 @@ def check_names(what: str, function: Callable, among: Sequence[str]) -> tuple[st
     Raises
     ------
     ValueError
-        The parameters have other names, or names that are not allowed here.
+        The parameters have other names, or names that are not in `among`.
     """
     names = takes(function)
     if names is not None and set(names) <= set(among):

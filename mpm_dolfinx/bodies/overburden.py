@@ -66,7 +66,7 @@ def _along(corners: NDArray, unit_weight: NDArray, x: NDArray, places: NDArray) 
 def _hits(corners: NDArray, at: NDArray) -> Iterator[tuple[NDArray, NDArray, NDArray]]:
     """Yield for each face: indices (k,) of the vertical lines that cross it, heights (k,), m, and signs (k,).
 
-    Line i is at `at[i]` (d-1,); its domain has `corners[i]` (2^d, d).  A sign is 1 if a rising line exits, else -1.
+    Line i is at `at[i]` (d-1,); its domain has `corners[i]` (2^d, d).  A rising line has sign 1 at exit, -1 at entry.
     """
     d = corners.shape[2]
     for face, turn in zip(FACES[d], FACE_SIGNS, strict=False):

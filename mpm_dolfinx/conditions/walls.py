@@ -67,7 +67,7 @@ def wall_forces(
     """Return the force (d,), N, of each wall by name; all processes must call this function.
 
     If several walls fix a component of a node, the wall normal to this component carries the force.  If none of
-    these walls is normal to it, all carry the force evenly.  The axis of revolution has no area and no radial force.
+    these walls is normal to it, they share the force equally.  The axis of revolution has no area and no radial force.
 
     dofs (n,): local degrees of freedom, unrolled; repetitions are allowed.  Free components are ignored.  forces (n,),
     N: forces on these degrees of freedom.

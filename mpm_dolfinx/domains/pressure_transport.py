@@ -81,7 +81,7 @@ class PiecePressures:
         return self._each(lambda values: values[rows])
 
     def joined(self, other: PiecePressures) -> PiecePressures:
-        """Return these pieces and `other`, pieces of points that are new on the grid; all of them are to be moved."""
+        """Return these pieces and `other`, the pieces of points new on the grid; all are pieces to be moved."""
         pairs = {name: (getattr(self, name), values) for name, values in other.arrays.items()}
         return PiecePressures(**{name: np.concatenate(both) for name, both in pairs.items()})._ordered()
 

@@ -24,7 +24,7 @@ next steps correct fractions of this defect (`defect`), at a constant rate over 
 If no fluid flows within a step, Q1 displacements with DG0 pressures violate the inf-sup condition: pressures that
 alternate from cell to cell have no effect.  Therefore jumps of the pressure increment of the step are stabilised by the
 term max(0, tau d - dt kappa / d) A [p - p_n].  Here tau is the strength of the stabilisation, 1/Pa, and d = d+ + d-.
-dt, s, is here the step times the coefficient of Q(u, p) in `time_integration`: 1 or gamma.  The term raises the
+In this term dt, s, is the step times the coefficient of Q(u, p) in `time_integration`: 1 or gamma.  The term raises the
 coefficient dt kappa A / d of a face to tau d A if this is larger.  The term is conservative, and zero in steady states.
 For elastic soil, tau is a quarter of Silvester and Kechkar's patch value (Camargo, White and Borja 2021).  Soil in
 plastic flow needs a tau up to a hundred times larger.  The increase of tau acts on second differences only
