@@ -141,7 +141,7 @@ class Reconstruction:
         return slope * scale[:, None], p[cells, None] + np.array([low, high]).T
 
     def _differences(self, pressures: CellPressures) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-        """Return pressure differences, Pa, and slopes, Pa/m, to neighbours or drained sides, and where these exist.
+        """Return pressure differences, Pa, slopes, Pa/m, and masks of the neighbours and of the drained sides of cells.
 
         All four arrays have the shape (n, d, 2), by axis and end, and are zero without a neighbour or drained side.
         """
