@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Quiet and crash-safe compilation of dolfinx's forms and function spaces, with error messages of one line.
 
-FFCx marks a library in the cache before compiling it.  Other programs wait ten seconds for a marked library.  An
-aborted run leaves its mark behind, and all later runs fail.  Here each library is compiled in a separate folder and
-moved into the cache when complete.  Incomplete or broken libraries in the cache are compiled again.
+FFCx marks a library by a `.c` file in the cache before compiling it.  Other programs wait ten seconds for a marked
+library.  An aborted run leaves its mark behind, and all later runs fail.  Here each library is compiled in a separate
+folder and moved into the cache when complete.  Incomplete or broken libraries in the cache are compiled again.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from mpm_dolfinx.parallel.exchange import at_root, first
 WORKSHOP = ".mpm_dolfinx-"
 """Prefix of the folders in which libraries are compiled."""
 ABANDONED = 600.0
-"""Age, s, after which the mark that another program left on a library is ignored."""
+"""Age, s, above which the mark of another program (a `.c` file without `.c.cached`) is ignored."""
 DAY = 86400.0  # Source: definition
 logger = logging.getLogger("mpm_dolfinx")
 _settings = jit.get_options if hasattr(jit, "get_options") else jit.get_parameters  # OLD
@@ -164,7 +164,7 @@ def _library(place: Path, name: str) -> Path | None:
 
 
 def _is_complete(place: Path, name: str) -> bool:
-    """Return whether the cache holds a complete library: its source, the mark of readiness, and an untruncated file.
+    """Return whether the cache holds a complete library: files `.c` and `.c.cached`, and an untruncated library.
 
     Python's loader does not notice truncation: the run ends with a bus error at the first missing page.
     """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The package's only kind of cache: the last value together with its key.  Keys are compared by value."""
+"""Cache of the last value together with its key.  Keys are compared by value."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Latest(Generic[T]):
 
     The cache is empty during the computation of a value, so an exception leaves no incomplete value behind.
 
-    derived: caches of values that depend on this value; they are emptied together with this one.
+    derived: caches of values that depend on this value; they are emptied together with this cache.
     """
 
     def __init__(self, *derived: Latest) -> None:

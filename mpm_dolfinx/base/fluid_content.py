@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from mpm_dolfinx.base.tolerances import EPSILON
 
 SERIES = (120 * EPSILON) ** 0.25
-"""Argument z below which sinh(z) / z is computed as 1 + z^2 / 6.  Source: the next term, z^4 / 120, is epsilon here."""
+"""Argument z below which sinh(z) / z is computed as 1 + z^2 / 6.  Source: the next term, z^4 / 120, is then epsilon."""
 
 
 def change_of_content(alpha, a, storage, J, dp):

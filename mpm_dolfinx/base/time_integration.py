@@ -42,7 +42,7 @@ METHODS = {
 def in_step(
     share: float, start: NDArray[np.float64], now: NDArray[np.float64], end: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the displacement to prescribe at the end of the first substep, so that the velocity there is exact.
+    """Return the displacement to prescribe at the end of the first substep, so that the velocity there is second-order.
 
     The method computes this velocity v from the increment of displacement, which equals `share` dt v.  With the exact
     displacement, v is first-order accurate, and accelerations do not converge.  This function takes v from the parabola

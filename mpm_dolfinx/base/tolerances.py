@@ -23,9 +23,7 @@ NEAR = 8 * float(np.finfo(np.float32).eps)
 Source: epsilon of single precision (IEEE 754), for a few operations.
 """
 TINY = float(np.finfo(float).tiny) / EPSILON
-"""Lower bound of divisors, or a number added to divisors.  Source: IEEE 754.
-
-Quotients of numbers below 1 / epsilon stay finite.
-"""
+"""Lower bound of divisors, or a number added to divisors.  Quotients of numbers below 1 / epsilon then stay finite.
+Source: IEEE 754."""
 FOREVER = 1 / EPSILON**2
 """Time step, s, so long that rates of quantities below 1 / epsilon are below epsilon.  Source: epsilon squared."""

@@ -13,8 +13,8 @@ x : (m, d), m
     Positions of the same places at the start of the step, for example to prescribe a water level.
 
 A single parameter with another name receives the time.  With several parameters, other names raise an error.
-Parameters with a default receive no argument, unless all have one.  Material constants are functions of X.  Initial
-pressures and stresses are functions of x, the seeded positions.
+Parameters with a default receive no argument, unless all have a default.  Material constants are functions of X.
+Initial pressures and stresses are functions of x, the seeded positions.
 
 A function of position returns a number or an array (m,).  Where vectors are allowed, it may also return a vector (d,)
 or an array (m, d).  Places are repeated until m exceeds d, so that the shape of the array is unambiguous.
@@ -227,7 +227,7 @@ def check_names(what: str, function: Callable, among: Sequence[str]) -> tuple[st
     Raises
     ------
     ValueError
-        The parameters have other names, or names that are not allowed here.
+        The parameters have other names, or names that are not in `among`.
     """
     names = takes(function)
     if names is not None and set(names) <= set(among):

@@ -280,8 +280,8 @@ def _clipped(
 def _free(own: Faces, others: Sequence[Faces]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Return the parts of faces that touch no other body: their faces (n,), and corners (n, 4, 2) in face coordinates.
 
-    A part is a rectangle if all faces that cover its face have edges parallel to its edges.  Otherwise it is a triangle
-    with a repeated last corner.
+    A part is a rectangle if the edges of its face are parallel to the edges of all covering faces.  Otherwise it is a
+    triangle with a repeated last corner.
     """
     on = [covers(own, other) for other in others]
     if not on:

@@ -2,7 +2,7 @@
 """Cell types of meshes: their facets, and their division into particle domains.
 
 A triangle is divided into three quadrilaterals, a tetrahedron into four hexahedra with plane faces: one domain for each
-vertex.  Each corner of a domain is the mean of several vertices, or its own vertex.  A wedge is divided
+vertex.  Each corner of a domain is the mean of several vertices, or the vertex of the domain.  A wedge is divided
 like its triangle; a pyramid consists of two tetrahedra.  Neighbouring cells divide their common facet in the same way.
 The exception is a quadrilateral facet of a hexahedron, which is not divided.
 """
@@ -137,8 +137,8 @@ class Polytopes:
     ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Return the indices (k,) of the pairs of cells i, j (m,) that overlap, and the depths (k,), m, of overlap.
 
-        Two convex cells overlap if no plane separates them.  It is sufficient to try planes parallel to a facet or, in
-        3D, to an edge of each cell.  An overlap shallower than `slack` (m,), m, is ignored.
+        Two convex cells overlap if no plane separates them.  It is sufficient to try planes parallel to a facet of
+        either cell, and in 3D to two edges, one of each cell.  Overlaps shallower than `slack` (m,), m, are ignored.
         """
         left, depth = np.arange(len(i)), np.full(len(i), np.inf)
         for normals in self._planes():

@@ -266,7 +266,7 @@ def _box_overlaps(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return pairs of cells, as two arrays (n,): one of the cells `outer`, and a cell whose bounding box overlaps.
 
-    Boxes are grouped by size, in octaves.  Otherwise small boxes would be searched with the radius of the largest box.
+    Boxes are grouped by size, in octaves.  In one group, small boxes would be searched with the largest box's radius.
     """
     octave, middle = np.frexp(size.max(axis=1))[1], (boxes[:, 0] + boxes[:, 1]) / 2
     of = [[rows[octave[rows] == k] for k in np.unique(octave[rows])] for rows in (outer, np.arange(len(boxes)))]

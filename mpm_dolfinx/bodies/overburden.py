@@ -22,7 +22,7 @@ def overburden(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the overburden stress (k,), Pa, at positions, and the level (k,), m, of the ground surface above them.
 
-    Both are means over vertical lines close to the position, on all sides: a border of domains may lie above it.
+    Both are means over vertical lines beside the position, on all sides, because domains may meet exactly above it.
 
     corners (n, 2^d, d), m: corners of the particle domains of all bodies; the last axis is vertical. unit_weight (n,),
     N/m^3: unit weights of the domains; x (k, d), m: positions in the domains.
@@ -68,7 +68,7 @@ def _along(corners: NDArray, unit_weight: NDArray, x: NDArray, places: NDArray) 
 def _hits(corners: NDArray, at: NDArray) -> Iterator[tuple[NDArray, NDArray, NDArray]]:
     """Yield for each face: indices (k,) of the vertical lines that cross it, heights (k,), m, and signs (k,).
 
-    Line i is at `at[i]` (d-1,); its domain has `corners[i]` (2^d, d).  A sign is 1 if a rising line exits, else -1.
+    Line i is at `at[i]` (d-1,); its domain has `corners[i]` (2^d, d).  A rising line has sign 1 at exit, -1 at entry.
     """
     d = corners.shape[2]
     for face, turn in zip(FACES[d], FACE_SIGNS, strict=False):

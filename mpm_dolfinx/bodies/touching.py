@@ -51,7 +51,7 @@ class Faces:
         return cls.of(body, *body.outer())
 
     def edge(self) -> NDArray[np.float64]:
-        """Return the length (m,), m, of the shortest edge of each face; the unit width of plane strain is no edge."""
+        """Return the length (m,), m, of the shortest edge of each face; the unit width in plane strain is ignored."""
         c = self.corners
         pairs = [(1, 0), (3, 2), (2, 0), (3, 1)] if (self.index[:, 0] != self.index[:, 2]).any() else [(1, 0)]
         return np.min([np.linalg.norm(c[:, i] - c[:, j], axis=1) for i, j in pairs], axis=0)
@@ -329,8 +329,8 @@ def uncovered(
 def separation(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the gaps (n,), m, between convex domains a and b (n, 2^d, d), m; a negative gap is the depth of overlap.
 
-    Domains overlap unless a plane separates them.  The plane may be parallel to a face or, in 3D, to an edge of each
-    domain.
+    Domains overlap unless a plane separates them.  The plane may be parallel to a face of either domain or,
+    in 3D, to two edges, one of each domain.
     """
     d = a.shape[2]
     out = _between_planes(a, b, (face_vectors(c, face) for c in (a, b) for face in range(2 * d)))

@@ -145,8 +145,8 @@ class Quiet(Condition):
     Raises
     ------
     ValueError
-        Raised by the scene: bodies without inertia; bodies that had inertia before it became quiet; no point on the
-        side; another `Quiet`, or a `Displacement` of all components, on the same part of a face; a wall of the grid
+        Raised by the scene: bodies without inertia; bodies that had inertia before the side became quiet; no point on
+        it; another `Quiet`, or a `Displacement` of all components, on the same part of a face; a wall of the grid
         that fixes the side; a weight that changes as the stage begins, because the traction at rest does not change.
     """
 
@@ -320,7 +320,7 @@ class Rain(Flux):
     prescribed rate until the pressure at the side falls to `driest`.  Water can also seep out of the side.
     `outflows` of the simulation are the flow through the side; `simulation.outcome("runoff")` is the run-off, m^3/s
     (m^2/s in plane strain).  Three outcomes are volumes, m^3 (m^2), since the condition began.  `outcome("flowed")` is
-    outflow of each open side, `outcome("ran_off")` run-off and seepage here, `outcome("ponded")` ponded water.
+    outflow of each open side, `outcome("ran_off")` its run-off and seepage, `outcome("ponded")` ponded water.
 
     Parameters
     ----------
@@ -414,7 +414,7 @@ def holding(material: Skeleton) -> NDArray[np.float64]:
 
     A Q1 field with constant volumetric strain in each cell cannot follow a curved side.  The penalty converts the
     difference into pressure, so it must not be stiff compared with the shear stiffness.  In an undrained cavity, a
-    penalty of 3e2 (lambda + 2G) gives up to 1.9 times the exact pressure, and one of 30 (4G) 1.01 times this pressure.
+    penalty of 300 times lambda + 2G gives up to 1.9 times the exact pressure, one of 30 times 4G gives 1.01 times it.
     """
     return (YIELDING if material.state else 1.0) * resistance(material)
 
@@ -442,7 +442,7 @@ class Displacement(Condition):
     ------
     ValueError
         Raised by the scene or a step: no point on the side; invalid value or components; a moving component that a wall
-        fixes; another `Displacement` of the component on the same part of a face, or different values at an edge.
+        fixes; another `Displacement` of the component on the same part of a face, or different values at a common edge.
     """
 
     side: str

@@ -52,7 +52,7 @@ def fixed_corners(grid: Grid, walls: Mapping[str, str], corners: NDArray[np.floa
 def stopped(
     grid: Grid, walls: Mapping[str, str], corners: NDArray[np.float64], before: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return corners (n, 2^d, d), m, moved back into the grid where walls fix the normal or `before` is inside."""
+    """Return corners (n, 2^d, d), m, moved into the grid if walls fix the normal component or `before` is inside."""
     shut = np.zeros((2, grid.dim), dtype=bool)
     for name, axes in walls.items():
         axis, end = SIDES[grid.dim][name]
@@ -67,7 +67,7 @@ def wall_forces(
     """Return the force (d,), N, of each wall by name; all processes must call this function.
 
     If several walls fix a component of a node, the wall normal to this component carries the force.  If none of
-    these walls is normal to it, all carry the force evenly.  The axis of revolution has no area and no radial force.
+    these walls is normal to it, they share the force equally.  The axis of revolution has no area and no radial force.
 
     dofs (n,): local degrees of freedom, unrolled; repetitions are allowed.  Free components are ignored.  forces (n,),
     N: forces on these degrees of freedom.

@@ -63,7 +63,7 @@ class Origin:
 
 
 def joined(both: Sequence[Origin], kept: Sequence[NDArray[np.bool_]]) -> tuple[Origin, NDArray[np.int64]]:
-    """Return the joint origin of the pairs flagged in `kept`, and indices (n,) of these pairs after the exchange."""
+    """Return one `Origin` of all pairs flagged in `kept`, and indices (n,) of these pairs after the exchange."""
     columns, start = [], 0
     comm = both[0].exchange.comm
     for of, rows in zip(both, kept, strict=True):

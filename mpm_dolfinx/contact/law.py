@@ -18,8 +18,9 @@ k_t.
 The set of slipping cells is updated after Newton steps (active-set method).  With an update in each residual, cells
 would alternate between stick and slip, because slip has no stiffness.  All cells start in stick, whatever their
 traction.  Only near equilibrium does a cell with reversed slip return to stick; it may slip again.  A sticking cell
-that opens is set to slip; if it had returned from slip to stick before, it never sticks again.  Otherwise shear alone
-could open and close the contact under a round tool at first contact, where the mean normal is inclined.
+that opens is set to slip.  If it had returned from slip to stick before, it then slips until the pairs are updated or
+the substep ends.  Without this rule, shear alone could open and close cells again and again under a
+round tool at first contact, where mean normals are inclined.
 """
 
 from __future__ import annotations
@@ -277,7 +278,7 @@ class ContactLaw:
     def tractions(self, touch: Touch, at: Geometry) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the pressures (m,) and shear tractions (m, d), Pa, of the pairs.
 
-        In stick, pairs keep their deviations from the mean shear traction of a cell: repeated averages cause creep.
+        In stick, pairs keep their deviations from the cell's mean shear traction: repeated averaging would cause creep.
         """
         off = (at.shear - self.mean(at.shear)[self.of]) * touch.sticks[self.of, None]
         return touch.push, touch.shear[self.of] + off

@@ -38,7 +38,7 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.points.parts import parts_of_domains
 
 REACH = 2.0
-"""Largest gap, divided by the cell size, that may close in a step.  Steps with larger motion are rejected."""
+"""Largest gap, divided by the cell size, that may close in a step.  Motions above half of it are rejected."""
 CLEAR = 0.5
 """Gap, divided by the cell size, above which faces cannot touch before the next update of the pairs."""
 DEEP = 0.25
@@ -324,7 +324,7 @@ class ContactLoads(ContactProblem):
 def _ranks(setting: Setting) -> NDArray[np.int64]:
     """Return the rank (points,) of the connected part of each point, by surface area and then by extent.
 
-    The ranking of two parts is the same in all stages, in any order of the bodies, and with any other parts.
+    The ranking of two parts is the same in all stages and for any order of the bodies, whatever other parts exist.
     """
     grid, bodies = setting.grid, setting.sides.bodies
     corners = np.concatenate([body.corners() for body in bodies])

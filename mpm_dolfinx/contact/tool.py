@@ -81,7 +81,7 @@ class Tool:
         Counterclockwise rotation about `centre`, before the displacement; only in 2D, not in axisymmetry.
     centre : (d,), m
         Centre of rotation, reference of moments, and centre of mass of a free tool.  The centre moves with the tool.
-        By default the centroid of a free disc or polygon, else the origin.
+        By default the centroid of a free disc or polygon; the origin for other tools.
     friction
         Coulomb's coefficient mu, >= 0.
     adhesion

@@ -39,7 +39,7 @@ FACING = 0.5  # smallest cosine between the normal of a face that faces the tool
 
 
 def _box(x: NDArray[np.float64]) -> list[tuple[NDArray[np.float64], MPI.Op]]:
-    """Return both corners (d,) of the bounding box of positions (m, d), each with its reduction over processes."""
+    """Return both corners (d,) of the bounding box of positions (m, d), each with its MPI reduction over processes."""
     return [(x.min(axis=0, initial=np.inf), MPI.MIN), (x.max(axis=0, initial=-np.inf), MPI.MAX)]
 
 
@@ -142,7 +142,7 @@ class Tools(Touching):
     def _posed(self, tool: Tool, start: float, t: float) -> Pose:
         """Return the pose of a tool at time t (s), the end of a substep.
 
-        With inertia, the first of two substeps needs the displacement that gives the exact velocity, see `in_step`.
+        With inertia, the first of two substeps needs the displacement for a second-order velocity, see `in_step`.
         """
         pose = self._pose(tool, t)
         if self._end is None or not start < t < self._end or tool.free:

@@ -59,7 +59,7 @@ def bodies_in(cut: CutDomains, bodies: Sequence[Body], cell: int) -> tuple[list[
 LOSS = 0.03
 """A warning is issued if a soft material loses more than this fraction of its deformation in mixed cells."""
 AGAIN = 2.0
-"""Factor by which the lost fraction must grow until the next warning; moving interfaces change this fraction."""
+"""Factor by which the lost fraction must grow before the next warning, because moving interfaces change it."""
 FINE = 0.1
 """Smallest lost fraction of a cell's deformation that counts; stiffness contrasts below 2.1 lose less."""
 
@@ -108,11 +108,11 @@ def warn_smeared(
 
 
 def _losses(cut: CutDomains, volume: NDArray[np.float64], modulus: NDArray[np.float64]) -> tuple[NDArray, ...]:
-    """Return for owned cells (n,): loss times volume, m^d, modulus ratio, and index of a piece of softest material.
+    """Return for owned cells (n,): loss times volume, m^d; ratio of moduli; index of a piece of the softest material.
 
-    With moduli M and volume fractions s in a cell, layers in series have the compliance sum s/M.  Equal strain in the
-    cell gives 1 / sum s M instead.  The loss is the difference of both compliances, divided by the
-    largest 1/M.  For two moduli of ratio r < 1, the loss is at most (1 - sqrt(r))^2 of the cell.
+    With moduli M and volume fractions s in a cell, layers in series have the compliance sum (s / M).  Equal strain in
+    the cell gives 1 / sum (s M) instead.  The loss is the difference of both compliances, divided by the largest 1 / M.
+    For two moduli of ratio r < 1, the loss is at most (1 - sqrt(r))^2 of the cell.
     """
     n, order = cut.grid.num_owned, np.argsort(-modulus, kind="stable")
     softest, hardest = (np.zeros(n, dtype=np.int64) for _ in range(2))
@@ -135,7 +135,7 @@ SLENDER_WET = 2  # length divided by thickness from which on a wet body counts a
 
 
 def warn_thin(grid: Grid, bodies: Sequence[Body], walls: Mapping[str, str], wet: bool) -> None:
-    """Warn about each slender body that can bend and has too few points over its thickness.
+    """Warn about each slender body that can bend, with one point per cell and too few over its thickness.
 
     The increment of stress is constant in a cut domain, so n points over the thickness give 1 - 1/n^2 of the bending
     stiffness in a single step, and more in several steps (`domain_slopes`).  A body with one point over its thickness

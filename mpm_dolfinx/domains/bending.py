@@ -9,10 +9,10 @@ and the sawtooth remains as stress.  The corner displacement therefore contains 
 
 with the shape functions N_i, the nodal displacements u_i, and the position t_a along axis a in the cell, from 0 to 1.
 This field is exact for quadratic displacements, equal to Q1 at the nodes, and continuous.  D_a belongs to the cell edge
-along axis a that ends at node i.  D_a is the smaller, in absolute value, of the second differences at both ends
-of this edge, or zero if their signs differ.  If only one end has a second difference, D_a is this one.  If cell sizes
-vary, D_a is the squared edge length times the second derivative of a parabola through three nodes.  Physical kinks,
-for example at the boundary of two materials, are kept.
+along axis a that ends at node i.  D_a is the smaller, in absolute value, of the second differences at both ends of this
+edge, or zero if their signs differ.  If only one end has a second difference, D_a is this difference.  If cell sizes
+vary, D_a is the squared edge length times the second derivative of a parabola through three nodes.  Physical kinks, for
+example at the boundary of two materials, are kept.
 """
 
 from __future__ import annotations

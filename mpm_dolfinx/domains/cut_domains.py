@@ -23,7 +23,7 @@ from mpm_dolfinx.points.cutting import Pieces, cut, cut_faces
 from mpm_dolfinx.points.material_points import MaterialPoints, middle
 
 STILL = 3e-4
-"""Largest motion of corners, divided by the cell size, for which a cut remains valid.  Otherwise domains are cut again.
+"""Largest motion of corners, divided by the cell size, for which a cut remains valid.  Larger motions need a new cut.
 
 Compared with a new cut in every step, pressures in a consolidating column of ten cells change by 7e-5 of the load.  The
 settlement changes by 3e-5 of its value.  Both changes are proportional to STILL.
@@ -188,7 +188,7 @@ class CutDomains(Keyed):
         return self.surfaces([faces])[0]
 
     def surfaces(self, several: Sequence[Surface]) -> list[Patches]:
-        """Return the quadrature points of several surfaces.  All are cut together, in the time of one surface."""
+        """Return the quadrature points of several surfaces, which are cut together in the time of one."""
         if new := [faces for faces in dict.fromkeys(several) if faces not in self._patches]:
             self._patches.update(zip(new, self._cut_surfaces(new), strict=True))
         return [self._patches[faces] for faces in several]
@@ -237,7 +237,7 @@ class CutDomains(Keyed):
 
     @cached_property
     def _followed(self) -> tuple[Exchange, NDArray[np.int32], NDArray[np.float64]]:
-        """Exchange with owners of cells; cells and positions (m, d), m, of corners (without `domains`: of points)."""
+        """Exchange with owners of cells; cells and positions (m, d), m, of all corners (of points if not `domains`)."""
         grid = self.grid
         n = len(self.points)
         d = self.grid.dim

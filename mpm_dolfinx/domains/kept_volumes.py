@@ -9,8 +9,8 @@ overfill.  After a step the corners of yielded domains therefore move by the vec
     sum_p V_p e_p^2 + SOFT^2 sum_p V_p mean |d / h|^2,  V_p e_p = V_p - V - dV/dx d,
 
 V_p is the volume of a point and V that of its domain; the mean is over the domain's corners; h are edges of cells.
-Both sums are integrals over the soil: a 3D slice moves as in plane strain.  Shared corners move together.  Corners of
-elastic domains and held corners do not move.  Kugelstadt et al. (2019) correct densities of cells in this way.
+Both sums are integrals over the soil, so a 3D slice moves as in plane strain.  Shared corners move together.  Corners
+of elastic domains and held corners do not move.  Kugelstadt et al. (2019) correct densities of cells in this way.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Lattice of the seeded corners of a body, and a third-difference filter of their displacements.
 
-A displacement wave of the corners with a wavelength of two domains does not move the nodes of the grid, so no stress
-resists it.  Corners that cross grid lines excite such waves, and the waves would grow from one load cycle to the next.
+Nodes cannot represent a displacement wave of the corners with a wavelength of two domains, so no nodal force resists
+it.  Corners that cross grid lines excite such waves, and the waves would grow from one load cycle to the next.
 The filter damps them when the grid is reset.  For each axis a in turn,
 
     d <- d - D_a^T (s / 64) D_a d.

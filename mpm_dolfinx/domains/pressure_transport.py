@@ -81,7 +81,7 @@ class PiecePressures:
         return self._each(lambda values: values[rows])
 
     def joined(self, other: PiecePressures) -> PiecePressures:
-        """Return these pieces and `other`, pieces of points that are new on the grid; all of them are to be moved."""
+        """Return these pieces and `other`, the pieces of points new on the grid; all are pieces to be moved."""
         pairs = {name: (getattr(self, name), values) for name, values in other.arrays.items()}
         return PiecePressures(**{name: np.concatenate(both) for name, both in pairs.items()})._ordered()
 
@@ -141,7 +141,7 @@ class Reconstruction:
         return slope * scale[:, None], p[cells, None] + np.array([low, high]).T
 
     def _differences(self, pressures: CellPressures) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-        """Return pressure differences, Pa, and slopes, Pa/m, to neighbours or drained sides, and where these exist.
+        """Return pressure differences, Pa, slopes, Pa/m, and masks of the neighbours and of the drained sides of cells.
 
         All four arrays have the shape (n, d, 2), by axis and end, and are zero without a neighbour or drained side.
         """

@@ -25,13 +25,13 @@ from mpm_dolfinx.points.polygons import NONE, Polygons
 from mpm_dolfinx.points.surface_in_cells import BOX, EDGES, RING, Region, resampled
 
 GAP = 0.01
-"""Largest gap between faces of two domains that count as one surface, divided by the cell size.  Halving this value
+"""Largest gap, divided by the cell size, at which faces of two domains count as one surface.  Halving this value
 changes the result of scene "flow" in tests/plateaus.py by 2.5e-05 (relative), doubling it by 0.0e+00, and
 finer cells by 9.0e-02."""
 CRUMB = NEAR
 """Area of a part of a domain, divided by its cell's area, below which other parts receive its mass.  Source: `NEAR`."""
 SMALL = (0.5 / EDGES) ** 2
-"""Area in cell areas.  A cell in which renewal would leave a smaller part of a domain is renewed too.  Source:
+"""Smallest part of a domain, in cell areas, that renewal leaves.  A cell with a smaller part is renewed too.  Source:
 definition, a square with half the length of an edge of the surface, which has `EDGES` edges in a cell."""
 COVERED = 0.25
 """Largest difference between the area of the pieces in a renewed cell and its filled area, in cell areas.  Source:
@@ -375,7 +375,7 @@ class RefilledCells:
 
     @cached_property
     def remainders(self) -> tuple[New, NDArray[np.int64]]:
-        """New domains from pieces of removed domains outside the renewed cells, in a group per piece; the pieces."""
+        """New domains, a group for each piece of a removed domain outside the renewed cells; and these pieces."""
         pieces, points = self.pieces, self.points
         left = np.flatnonzero(self.affected[pieces.point] & ~self.chosen[self.cell])
         left = left[self._areas[left] > CRUMB * self._volume(self.cell[left])]

@@ -2,7 +2,8 @@
 """Energies of bodies with inertia, and the work of forces on them.
 
 The work of forces f in a step is dt sum b_i f_i . v_i over its substeps, with the weights b_i of the time integration.
-This work minus the change of kinetic energy is the numerical dissipation of the method and of grid resets.
+The work of loads, less the work of stresses, viscous resistance and friction, is the work of all forces.  Without
+renewal, this sum minus the change of kinetic energy is the numerical dissipation of the method and of grid resets.
 """
 
 from __future__ import annotations

@@ -20,9 +20,9 @@ def motion_error(
     """Return estimated error and size of a step's motion, both as square roots of twice an energy, J^(1/2).
 
     The substeps end with the velocities v1, v2 and accelerations a1, a2.  The difference to a first-order step is
-    `seconds` * (a2 - a1) in velocities and `seconds` * (v2 - v1) in displacements.  A solve with the substep's matrix
-    bounds the estimate for unresolved modes (Hosea and Shampine 1996).  The estimate is `ERROR` times this difference.
-    The error of a resolved mode of angular frequency omega in a step dt is 0.081 omega dt times this difference.
+    `seconds` * (a2 - a1) in velocities and `seconds` * (v2 - v1) in displacements.  The estimate is `ERROR` times this
+    difference.  The error of a resolved mode of angular frequency omega in a step dt is 0.081 omega dt times this
+    difference.  A solve with the substep's matrix bounds the estimate for unresolved modes (Hosea and Shampine 1996).
 
     solvers, K, mass: linear solvers, momentum tangent and mass of the last substep; flights: states of motion after the
     two substeps; seconds, own: time weights, s, which the last substep gives to the rate in the first substep

@@ -55,7 +55,7 @@ def velocities(
 
     The correction is a rigid motion of each group of domains; it restores momentum and angular momentum of the group.
 
-    corners (n, 4, 2), x (n, 2), m, group (n,): corners, place, group of new domains; masses: of old, of new points, kg.
+    corners (n, 4, 2), x (n, 2), m, group (n,): corners, place, group of new domains; masses: of old and new points, kg.
     """
     points = work.points
     n, count = len(x), int(group.max()) + 1
@@ -77,7 +77,7 @@ def velocities(
 
 
 def centred(work: RefilledCells, group: NDArray, x: NDArray, mass: NDArray, old: NDArray) -> NDArray[np.float64]:
-    """Return masses (n,), kg, of new domains at x (n, 2), m, changed within each cell so that the centre of mass stays.
+    """Return masses (n,), kg, of new domains at x (n, 2), m, changed within each cell so that its centre of mass stays.
 
     group (n,): group of each new domain; old (points,): masses of the old domains.  A mass changes by at most half;
     if this limit applies, the centre moves.  Outside the renewed cells a group is one domain, and its mass stays.

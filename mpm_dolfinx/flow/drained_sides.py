@@ -186,7 +186,7 @@ class UnsaturatedFaces(OpenFaces):
     def nonorthogonal(
         self, fluid: Fluid, correction: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64] | float, NDArray[np.float64] | float]:
-        """Return the non-orthogonal correction, here no flow but only a fraction of the two-point flux, in [-1, 1].
+        """Return the non-orthogonal correction: zero flow, and a fraction of the two-point flux in [-1, 1].
 
         Conductivities change by orders of magnitude in a step, so the correction must be proportional to the flux.
         The limits -1 and 1 keep the correction from emptying the soil.
@@ -253,7 +253,7 @@ class SideFeeds(Feeds):
     """Flow through open sides in a substep.
 
     sides: faces of the open sides; wet: data of the substep; names: names of the conditions; ponds: largest pond
-    depths, m, or None without rain.  `OpenSides.number` are indices in both lists.
+    depths, m, or None without rain.  `OpenSides.number` are indices in `names` and `ponds`.
     """
 
     def __init__(self, sides: OpenSides, wet: Wet, names: tuple[str, ...], ponds: tuple[float | None, ...]):
@@ -272,7 +272,7 @@ class SideFeeds(Feeds):
     def _pond(
         self, sides: OpenSides, ponds: tuple[float | None, ...], dt: float
     ) -> tuple[OpenSides, NDArray[np.float64]]:
-        """Return the sides with pressures of ponds and their supply in a time dt, s; and the capacities of ponds, m^d.
+        """Return the sides with the pressures and supply (in a time dt, s) of ponds; and the ponds' capacities, m^d.
 
         `ponds` are the largest depths of the ponds, m.
         """
@@ -312,7 +312,7 @@ class SideFeeds(Feeds):
         return UnsaturatedFaces(at, conductance, sides.given, self._seeps, offset, *rest)
 
     def begin(self, at: OpenFaces, fluid: Fluid, difference: NDArray[np.float64]) -> None:
-        """See `Feeds`.  Seepage faces become open if uncorrected cell pressures cause outflow."""
+        """See `Feeds`.  Seepage faces open if their two-point flux (without non-orthogonal correction) is no inflow."""
         self._flows = at.outflow(fluid) >= 0
         self._nonorthogonal, self._share = at.nonorthogonal(fluid, difference)
 

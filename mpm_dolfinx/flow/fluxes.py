@@ -147,7 +147,7 @@ class OpenSides:
         return conductance, self.given + conductance * self.outer(at, flow)
 
     def outer(self, at: NDArray[np.int64], flow: Conduction) -> NDArray[np.float64]:
-        """Return the mass potentials (m,), Pa, at outside pressures minus hydrostatic drops from centroids to faces."""
+        """Return the mass potentials (m,), Pa, at the outside pressures less the hydrostatic drops from centroids."""
         outer = self.pressure if flow.weight is None else self.pressure - flow.deformed(at, self.offset) @ flow.weight
         return mass_potential(outer, flow.bulk)
 
@@ -337,7 +337,7 @@ class FluxForms:
         h0, h1, across = across_faces(grid, n0)
 
         def opening(side, sign):
-            """Covered fraction of the face in the direction sign * n0, in axisymmetry times `Grid.around`."""
+            """Open fraction (covered by material) of the face along sign * n0, in axisymmetry times `Grid.around`."""
             lower, upper = self.lower_face(side), self.upper_face(side)
             return sum(
                 ufl.conditional(ufl.gt(sign * n0[a], 0.5), upper[a], 0.0)

@@ -6,10 +6,10 @@ harmonic mean along each line (Cardwell and Parsons 1945).  This mobility is exa
 the grid, for flow along and across them.  Inclined layers must be at least a cell thick.  Only then a seam of low
 conductivity blocks all lines of some cell, and a drain contains complete lines.
 
-The pressure of a cell refers to its pressure position: here steady flow along a line has the line's mean pressure.  Let
-R be the resistance of the line, and let s increase from 0 to 1 along the line.  The resistance from this position to
-the lower end is int (1 - s) dR, to the upper end int s dR.  The sum of these resistances is exact for lines through
-several cells.  For layers inclined by more than `INCLINED` the position moves to the more conductive end.  Otherwise a
+A cell's pressure refers to its pressure position: there steady flow along a line has the line's mean pressure.  Let R
+be the resistance of the line, and let s increase from 0 to 1 along the line.  The resistance from this position to the
+lower end is int (1 - s) dR, to the upper end int s dR.  The sum of these resistances is exact for lines through several
+cells.  For layers inclined by more than `INCLINED` the position moves to the more conductive end.  Without this shift a
 drain would be interrupted between rows of cells.  The shape of a piece is approximated by the bounding box of its
 domain in the cell.
 
@@ -175,7 +175,7 @@ class MixedCells:
         """Return the flow paths (n, d, 2, ...) of the mixed cells, see `Paths`.
 
         kappa (m,), m^2/(Pa s): mobilities of all pieces at saturation; law (m,): indices of their retention curves,
-        below `laws`; shift (n, d), m: vectors from the centroids of filled cells to their pressure positions; None if
+        < `laws`; shift (n, d), m: vectors from the centroids of filled cells to their pressure positions; None if
         all are zero.
         """
         kappa, law = kappa[self._rows], law[self._rows]

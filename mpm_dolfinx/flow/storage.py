@@ -23,11 +23,11 @@ next steps correct fractions of this defect (`defect`), at a constant rate over 
 
 If no fluid flows within a step, Q1 displacements with DG0 pressures violate the inf-sup condition: pressures that
 alternate from cell to cell have no effect.  Therefore jumps of the pressure increment of the step are stabilised by the
-term max(0, tau d - dt kappa / d) A [p - p_n].  Here tau is the strength of the stabilisation, 1/Pa, and
-d = d+ + d-.  dt, s, is here the step times the coefficient of Q(u, p) in `time_integration`: 1 or gamma.  The term
-raises the coefficient dt kappa A / d of a face to tau d A if it is smaller.  It is conservative, and zero in steady
-states.  For elastic soil, tau is a quarter of Silvester and Kechkar's patch value (Camargo, White and Borja 2021).
-Soil in plastic flow needs a tau up to a hundred times larger.  The increase of tau acts on second differences only
+term max(0, tau d - dt kappa / d) A [p - p_n].  Here tau is the strength of the stabilisation, 1/Pa, and d = d+ + d-.
+In this term dt, s, is the step times the coefficient of Q(u, p) in `time_integration`: 1 or gamma.  The term raises the
+coefficient dt kappa A / d of a face to tau d A if this is larger.  The term is conservative, and zero in steady states.
+For elastic soil, tau is a quarter of Silvester and Kechkar's patch value (Camargo, White and Borja 2021).  Soil in
+plastic flow needs a tau up to a hundred times larger.  The increase of tau acts on second differences only
 (`second_differences`), because damping of jumps would smear steep pressures.
 """
 
@@ -178,7 +178,7 @@ class StorageForms:
         return [sums[:, 0], *[sums[:, start : start + count] for start in range(1, sums.shape[1], count)]]
 
     def drained(self, data: PointData) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return for filled cells (n,) the storage due to saturation s, m^d/Pa, and int s d(chi p)/dp dV, m^d."""
+        """Return the storage (n,) of filled cells due to their saturation S, m^d/Pa, and int S d(chi p)/dp dV, m^d."""
         capacity, coupled = self._capacity(data).T
         return capacity, coupled
 
@@ -367,7 +367,7 @@ class StorageProblem:
     before
         Outflow volumes from the rate of the previous substep.
     softness : (m,)
-        Softness of the pieces, see `SoftnessAtPoints`; one if no law can yield.
+        Softness of the pieces, see `SoftnessAtPoints`; 1 if no law can yield.
     defect : (n,), m^d
         Part of the volume defect in the active owned cells that is corrected by the end of the substep.
     inertial
@@ -485,7 +485,7 @@ class StorageProblem:
         return volumes / (self.forms.derivatives(self.data)[0] + self._contents.fixed_stress)
 
     def filling(self, error: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return errors (n,) of the water content due to pressure errors (n,), Pa, and its changes (n,) in the step."""
+        """Return errors (n,) of the water content due to pressure errors (n,), Pa, and the content's changes (n,)."""
         capacity, _ = self.forms.drained(self.data)
         change = self.forms.change(self.data)[self.system.unknowns.owned]
         share = self.fill / self._contents.volume
@@ -545,7 +545,7 @@ class StorageProblem:
         """Return a function from changes of displacements (a vector), m, to changes of outflow volumes (n,), m^d.
 
         The function uses a matrix-free finite difference (Knoll and Keyes 2004) of the conductivity laws and of the
-        geometry of the fluxes.  Then `set_fluxes` resets the fluxes to u.  `dofs` are the active dofs of u.
+        geometry of the fluxes.  The caller then resets the fluxes with `set_fluxes`.  `dofs` are the active dofs of u.
         """
         h = self.forms.grid.least
         base, density = self._rates(self._flow(False)).cells, self._density
@@ -626,8 +626,8 @@ class StorageProblem:
     ) -> None:
         """Assemble the derivatives C = d/dp and B = d/du of the residual at (u, p), for the problem's pieces or `data`.
 
-        If a law depends on suction, `of_suction` are cells (c,), and derivatives (c, n), m^(d-1), of their nodal forces
-        with respect to p.
+        If a law depends on suction, `of_suction` has pairs of cells (c,) and of derivatives (c, n), m^(d-1),
+        of their nodal forces with respect to p.
         """
         forms = self.forms
         system = self.system

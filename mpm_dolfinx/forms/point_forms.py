@@ -167,7 +167,7 @@ class Places(Keyed):
     x : (n, d), m
         Positions of the points.
     mixed : (n, d), m^2
-        In 3D: mean products of the offsets in a piece about its centroid, see `Pieces`; None: zero, for points.
+        In 3D: mean products of the offsets in a piece about its centroid, see `Pieces`; None (zero) for points.
     hoop : (n, 4)
         In axisymmetry: moments of the pieces in the plane, see `Pieces`; None for points.
     """
@@ -316,7 +316,7 @@ class PointData(Keyed):
 
 
 Packed = tuple[NDArray[np.float64], list[tuple[slice, NDArray[np.float64], NDArray[np.intp]]]]
-"""Coefficients, one row per point; and for each grid function among them its columns, its values, the rows' dofs."""
+"""Coefficients, one row per point; and for each grid function its columns, its values, and the dofs of each row."""
 
 
 class Rows:
@@ -389,8 +389,8 @@ class PointForm:
     """A form with the measure `points.dx`, compiled once and assembled for any positions of the points.
 
     form: linear or bilinear UFL form; all integrals use `points.dx`.  points: points of the form; dense: whether the
-    values of a DG0 test function are numbered over the cells with points only, not over all cells. Kernels are then
-    called for other cells, as in `PointExpression`, so all cells must be equal.
+    values of a DG0 test function are numbered over the cells with points only, not over all cells. If so, kernels
+    are called for other cells, as in `PointExpression`, so all cells must be equal.
     """
 
     def __init__(self, form: ufl.Form, points: FormPoints, dense: bool = False):
