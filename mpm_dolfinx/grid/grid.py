@@ -503,8 +503,8 @@ class Grid:
     def shared(self, load: NDArray[np.float64], keep: bool) -> Grid:
         """Return a grid with cells distributed by their loads: this grid, or an equal grid with another mesh.
 
-        load (cells,): load of each cell, such as its number of points, >= 0; keep: whether to keep an existing mesh for
-        any distribution, because other objects were created on this mesh.
+        load (cells,): load of each cell, such as its number of points, >= 0; keep: whether to return this grid
+        even if its mesh is distributed by other loads, because other objects were created on this mesh.
         """
         owner = owners(load.reshape(self.shape), self.comm.size)
         if self._cells is None:

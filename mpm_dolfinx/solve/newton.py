@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Equations of a substep: balance of momentum and storage of fluid, coupled by u and p.
 
-Unconnected parts of the bodies balance independently. Each part has its own forces, fluid and lengths of Newton steps,
-which do not depend on the state and the stiffness of other parts.
+Unconnected parts of the bodies balance independently. The residuals of each part are divided by its forces and its
+exchanged fluid volume, and a line search sets its step length, whatever the state and stiffness of other parts.
 
 A Newton step of the two problems reads
 
@@ -168,7 +168,7 @@ def note_pressures(
     fixed-stress operator converts it into a pressure that is bounded for stiff modes, as in Hosea and Shampine (1996).
     Cells are weighted by their filling. The error of the step is assumed to be `ERROR` times this pressure.
 
-    seconds: factor, s, of the rates of the first substep; dt: length of the step, s; of_bodies: `Motion.of_bodies`, a
+    seconds: time weight, s, of the first substep's rates; dt: length of the step, s; of_bodies: `Motion.of_bodies`, a
     function of active owned cells (n,) and values (k, n) that returns the largest values (k, bodies) in each body.
     """
     if storage is None or not report.newton:
