@@ -4,7 +4,7 @@
 In grids of equal cells, points are located by arithmetic, in other grids by a search along each axis.  Methods such as
 `sizes` and `volumes` return cell sizes.  For equal cells they return a single row (`h`) or a single number.
 
-The mesh is created at its first use.  Before, a simulation distributes the cells by their numbers of points.
+The mesh is created at its first use.  Before that, a simulation distributes the cells by their numbers of points.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ TURN = 2 * np.pi
 CHUNK = 2**14
 """Number of rows of an array that are processed together.  It limits the size of temporary arrays."""
 SNAP = 1e-10
-"""Vertices nearer to a grid plane than this, in cell sizes, count as on it; `Grid.snap` allows for rounding errors."""
+"""Vertices nearer to a grid plane than this, in cell sizes, count as vertices on it; `Grid.snap` allows for rounding errors."""
 ORDER = "the order is Grid(lower, upper, cells)"
 MANY = "grid: h is undefined for unequal cells, must be replaced by sizes"
 
@@ -59,7 +59,7 @@ def _faces(dim: int) -> NDArray[np.int64]:
 FACES = {d: _faces(d) for d in (2, 3)}
 """Indices (2d, 2^(d-1)) of the corners of the faces of a box: of a cell, or of a particle domain."""
 FACE_SIGNS = (-1, 1, 1, -1, -1, 1)
-"""Orientation (6,) of faces with corners in the order of `FACES`: 1 outward, -1 inward.  In 2D, the first four hold."""
+"""Orientation (6,) of faces with corners in the order of `FACES`: 1 outward, -1 inward.  In 2D only the first four entries apply."""
 ABOUT_MIDDLE = ((0, 1, 4), (1, 3, 4), (3, 2, 4), (2, 0, 4))
 """Triangles of a face in 3D: two corners and the middle, without a preferred diagonal."""
 
@@ -77,7 +77,7 @@ def in_chunks(count: int) -> list[slice]:
 
 
 def sum_by(index: NDArray, values: NDArray[np.float64], size: int) -> NDArray[np.float64]:
-    """Return the sums (..., size) of values (..., n) with equal index (n,), as floats also if there are no values."""
+    """Return the sums (..., size) of values (..., n) with equal index (n,), as floats even if there are no values."""
     shape = values.shape[:-1]
     if shape:
         index = (index + size * np.arange(prod(shape))[:, None]).ravel()
@@ -105,7 +105,7 @@ def polynomial(
 
 
 def ranges(first: NDArray[np.int64], count: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the integers in m ranges with these first integers and counts: indices (n,) of ranges, and values (n,)."""
+    """Return index of range (n,), and value (n,), of all integers in m ranges with these first integers and counts."""
     of = np.arange(len(count)).repeat(count)
     return of, np.arange(len(of)) + np.repeat(first - (np.cumsum(count) - count), count)
 

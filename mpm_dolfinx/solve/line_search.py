@@ -33,7 +33,7 @@ import numpy as np
 EXPLODES, SHORTEST = 1e4, 1e-3
 """Largest growth of the residual in a step without yield, and smallest fraction of the full step.
 
-With 1e3 or 1e5 as largest growth, scenes take the same steps: it is below 1e3, or the residual is not finite.
+With 1e3 or 1e5 as largest growth, scenes take the same steps: the growth is below 1e3, or the residual is not finite.
 """
 WORK = 0.5
 """Largest ratio of the work at the end of a step to the work at its start (Matthies and Strang 1979)."""
@@ -75,7 +75,7 @@ class Search:
         """Return the next trial, or None if the search ends; work: last trial's work / initial work, or nan.
 
         growth: factor by which the residual grew. A full step that does not increase the residual ends the search if
-        |work| <= 1. A secant gives the next trial, or bisection if one of the bounds stays a second time.
+        |work| <= 1. A secant gives the next trial, or bisection if the same bound stays twice.
         """
         if not np.isfinite(work):
             end = self.step < 2 * SHORTEST

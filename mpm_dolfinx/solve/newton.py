@@ -67,8 +67,8 @@ SUDDEN = np.sqrt(2)
 """If a pressure changes in the second substep by less than this multiple of its change in the first, sdirk2 overshoots.
 
 With z = -(decay rate) dt, the stability function (1 + (1 - 2 gamma) z) / (1 - gamma z)^2 changes its sign at z = -1 -
-sqrt(2). The changes there are -gamma z / (1 - gamma z) = sqrt(2) - 1 and 2 - sqrt(2). The ratio is (1 - gamma) / gamma
-if pressures follow loads.  Source: exact, the ratio of these changes.
+sqrt(2). At this z the two substeps change a pressure by -gamma z / (1 - gamma z) = sqrt(2) - 1 and 2 - sqrt(2). If
+pressures follow loads, the ratio is (1 - gamma) / gamma.  Source: exact, the ratio of these changes.
 """
 
 
@@ -214,7 +214,7 @@ class Newton:
             self._vectors.append((storage.forms.p.x, active.cells))
 
     def newton(self, as_reset: AsReset, key: Hashable, serves: bool, ahead: Callable | None) -> Errors:
-        """Solve both balances by Newton's method; a tangent is kept while it converges, in linear laws many steps.
+        """Solve both balances by Newton's method; converging tangents are kept, with linear laws over many steps.
 
         serves: whether the tangent of the previous substep may be reused; ahead: see `solve_substep`.
         """
@@ -277,7 +277,7 @@ class Newton:
     def _begin(self, ahead: Callable | None) -> tuple[Errors, list[NDArray[np.float64]] | None]:
         """Return the errors at the chosen start, and the present (u, p) if another start was chosen, else None.
 
-        `ahead` is chosen if the square of its residual is small; else the guess of least residual, in each part.
+        `ahead` is chosen if the square of its residual is small; else each part starts at its guess of least residual.
         """
         start = self._iterate()
         if ahead is not None:
@@ -331,9 +331,9 @@ class Newton:
     def _stable(self, found: Errors) -> Errors:
         """Return the errors; raise NotConverged at an unstable equilibrium: smaller steps find the path that leaves it.
 
-        The tangent of an unstable equilibrium has negative eigenvalues. Only dry bodies are checked, because water
-        delays buckling. A tangent that is kept for the whole step shows an instability only in the next step. Where
-        only soft springs resist a motion, an equilibrium within tolerance may seem unstable, so it is corrected once.
+        The tangent of an unstable equilibrium has negative eigenvalues. Only dry bodies with symmetric,
+        factorised tangents are checked: water delays buckling. A tangent kept for a step shows an instability only in
+        the next. If only soft springs resist a motion, a solution may seem unstable, and is therefore corrected once.
         """
         plan = self._solvers.plan
         if not self.report.newton or self._storage is not None or not plan.symmetric or plan.iterative:
@@ -397,8 +397,8 @@ class Newton:
         start (parts,): forces at the start of the step, N. Forces at other iterates are not part of the scale: after a
         diverging iterate every residual would seem small.
 
-        Residuals within round-off are returned as 0.  The history has their norms, with scales of at least the
-        round-off divided by the tolerance.
+        Residuals within round-off are returned as 0.  In the history their norms are divided by scales of at
+        least the round-off divided by the tolerance.
         """
         first = not self.report.history
         with _compat.Timer("residual"):
@@ -496,7 +496,7 @@ class Newton:
                 return errors
 
     def _tried(self, before: Errors | None) -> tuple[Errors | None, NotConverged | None]:
-        """Return the errors after a trial step and None; if a law fails, infinite errors or None, and the exception."""
+        """Return errors after a trial step, and None; if a law fails, return infinite errors or None, and the exception."""
         try:
             return self._errors(before and before.start), None
         except NotConverged as failed:

@@ -106,7 +106,7 @@ class BiotFEM:
     cells : (d,)
         Number of cells along each axis, at least 1.
     material, fluid
-        Skeleton without state, and pore fluid.  Time steps may not converge for steep retention (n > 2.5, air entry).
+        Skeleton without state, and pore fluid.  Steps may not converge for steep retention (n > 2.5, or an air entry).
     walls
         Sides of the box, each with the displacement components that are zero there, such as {"left": "xy"}.
     conditions
