@@ -21,6 +21,9 @@ between cone and shaft dissipates.  The remaining fraction is compared with the 
 Geotechnique 41), a function of T* = c_v t / (R^2 sqrt(G / s_u)).  That curve is for a deep cone.  Near the surface
 pressures dissipate faster: half of the pressure has dissipated at T* = 0.03 with the tip three radii deep, and at T* =
 0.08 with the tip five radii deep.
+
+With --follow the cone is pushed once more into undrained clay, on grid lines that follow it.  The small cells then
+surround only the cone, and move with it.  Both runs start with the same points.
 """
 
 from __future__ import annotations
@@ -38,6 +41,8 @@ STRENGTH, ROUGH, INDEX = 1e3, 0.3, 100.0  # Pa: s_u; adhesion / s_u; G / s_u
 SHEAR = INDEX * STRENGTH
 HALF_ANGLE = 30.0  # degrees, between axis and flank of the cone
 FINE, ABOVE, RATIO = 2.0, 6.5, 1.3  # m: radius of the small cells; cells above the surface; ratio of neighbouring cells
+AROUND = 1.0, 2.5  # m: small cells below and above the tip, if grid lines follow the cone
+WAY = np.linspace(0.5, 1, 101)  # depths, over the final depth, at which runs are compared
 STEP, WET_STEP = 1 / 6, 1 / 12  # motion of the cone in a step, in cell sizes: undrained and saturated clay
 LAST = 3.0  # radii, over which the steady resistance is averaged
 FAST = 1000.0  # V = v 2 R / c_v, of the push in wet clay
@@ -61,28 +66,37 @@ class Push:
     """Results of each step: depth divided by R; N, force on the cone divided by pi R^2 s_u.
 
     frame: final corners (n, 4, 2), m, a field (n,), and the outline of the cone (k, 2), m; seeded: number of points at
-    the start.
+    the start; cells: number of grid cells, and of equal small cells in the same grid.
     """
 
     depth: list[float] = field(default_factory=list)
     N: list[float] = field(default_factory=list)
     frame: tuple = ()
     seeded: int = 0
+    cells: tuple[int, int] = (0, 0)
     result: mpm.Result | None = None
 
 
-def scene(cells: int, depth: float, clay: mpm.Skeleton, speed: float, end: float, fluid: mpm.Fluid | None):
+def scene(
+    cells: int,
+    depth: float,
+    clay: mpm.Skeleton,
+    speed: float,
+    end: float,
+    fluid: mpm.Fluid | None,
+    follow: bool = False,
+):
     """Return a simulation of the cone on the surface of the clay, and half of its outline (k, 2), m.
 
     cells: number of cells over the radius R, minus one half; depth: greatest depth of the cone, m; speed: velocity of
-    the cone, m/s, until the time `end`, s.
+    the cone, m/s, until the time `end`, s; follow:
+    whether grid lines follow the cone.
     """
     h = R / (cells + 0.5)
     low, fine = -(np.ceil(depth / h) + 2 * cells + 0.5) * h, np.ceil(FINE / h) * h
-    zone = [[0, low], [fine, ABOVE * h]]
-    lines = mpm.graded([0, low - BELOW], [WIDE, ABOVE * h], [zone], h, RATIO)
-    grid = mpm.Grid(lines=lines, axisymmetric=True)
-    body = mpm.box(grid, [0, low - BELOW], [WIDE, 0])
+    start, wide = [0, low - BELOW], [WIDE, ABOVE * h]
+    grid = mpm.Grid(lines=mpm.graded(start, wide, [[[0, low], [fine, ABOVE * h]]], h, RATIO), axisymmetric=True)
+    body = mpm.box(grid, start, [WIDE, 0])
     beta = np.radians(HALF_ANGLE)
     centre = np.array([R - h, ((R - h) * np.cos(beta) + h) / np.sin(beta)])
     angle = np.linspace(-beta, 0, 4)
@@ -98,6 +112,10 @@ def scene(cells: int, depth: float, clay: mpm.Skeleton, speed: float, end: float
     tip = [(0.0, 0.0), *edge]
     cone = mpm.Tool(mpm.Convex(whole(tip)[1:]), moved, adhesion=ROUGH * STRENGTH, name="cone")
     shaft = mpm.Tool(mpm.Convex(whole([edge[-1], (R, top)])), moved, name="shaft")
+    if follow:
+        below, above = ((np.ceil(far / h) + 0.5) * h for far in AROUND)
+        lines = mpm.graded(start, [WIDE, above + ABOVE * h], [[[0, -below], [fine, above]]], h, RATIO)
+        grid = mpm.Grid(lines=lines, follow=cone, axisymmetric=True)
     acting = {"walls": {"left": "x", "right": "x", "bottom": "y"}, "conditions": [cone, shaft], "fluid": fluid}
     if fluid is not None:
         acting["conditions"] += [mpm.Drained("right")]
@@ -105,10 +123,13 @@ def scene(cells: int, depth: float, clay: mpm.Skeleton, speed: float, end: float
     return mpm.Simulation(grid, [body], [clay], numerics=numerics, **acting), np.array([*tip, (R, top)])
 
 
-def push(cells: int, depth: float, clay: mpm.Skeleton) -> Push:
-    """Push the cone to `depth`, m, into undrained clay."""
+def push(cells: int, depth: float, clay: mpm.Skeleton, follow: bool = False) -> Push:
+    """Push the cone to `depth`, m, into undrained clay; grid lines may follow the cone."""
     out = Push()
-    simulation, outline = scene(cells, depth, clay, 1.0, depth, None)
+    simulation, outline = scene(cells, depth, clay, 1.0, depth, None, follow)
+    lines = simulation.grid.lines
+    equal = np.prod([round(np.ptp(x) / np.diff(x).min()) for x in lines])
+    out.cells = int(simulation.grid.shape.prod()), int(equal)
     out.seeded = len(simulation.points)
 
     def see(s: mpm.Simulation) -> None:
@@ -176,6 +197,7 @@ def main(argv: list[str] | None = None) -> dict:
     parser.add_argument("--depth", type=float, default=10.0, help="depth of the tip, divided by R")
     parser.add_argument("--wet-depth", type=float, default=5.0, help="the same in saturated clay; 0: none")
     parser.add_argument("--mises", action="store_true", help="von Mises's law in place of Tresca's, in undrained clay")
+    parser.add_argument("--follow", action="store_true", help="push the cone again, on grid lines that follow")
     o = parser.parse_args(argv)
     if not 2 <= o.cells <= 16 or not 0 < o.depth <= 20:
         parser.error(f"--cells {o.cells}: must be 2 to 16; --depth {o.depth}: must be in (0, 20]")
@@ -193,6 +215,8 @@ def main(argv: list[str] | None = None) -> dict:
         found = f"N = {last.mean():.2f} in the last {LAST:g} radii, Lu et al. {published():.2f}"
         found += f"; {run.result.cuts} of {run.result.steps} steps cut"
         print(f"{found}; {run.result.points} points, {run.seeded} seeded", flush=True)
+        if o.follow:
+            out["follow"] = following(o, clay, run)
         wet = None
         if o.wet_depth:
             wet = push_wet(o.cells, o.wet_depth * R)
@@ -202,6 +226,27 @@ def main(argv: list[str] | None = None) -> dict:
             print(f"{found}, half dissipated at T* = {out['wet']['T50']:.3f} (Teh and Houlsby {TEH[3]})", flush=True)
         draw(o, run, wet)
         out["converged"] = run.result.cuts <= 0.1 * run.result.steps
+    return out
+
+
+def following(o: Namespace, clay: mpm.Skeleton, fixed: Push) -> dict[str, float]:
+    """Push the cone on grid lines that follow it; print and return its resistance and its cells, relative to others.
+
+    load, last: mean over the second half of the way, and final value, over those of the run on fixed lines, less 1;
+    cells: number of cells over that of equal small cells in the same grid; fixed: over that of the fixed lines.
+    """
+    run, halfway = push(o.cells, o.depth * R, clay, follow=True), o.depth / 2
+    mean, beside = (np.interp(WAY * o.depth, each.depth, each.N).mean() for each in (run, fixed))
+    out = {"load": float(mean / beside - 1), "last": run.N[-1] / fixed.N[-1] - 1, "cuts": run.result.cuts}
+    out |= {"cells": run.cells[0] / run.cells[1], "fixed": run.cells[0] / fixed.cells[0]}
+    found = (
+        f"lines that follow: mean N from {halfway:g} radii on {mean:.2f}, fixed lines {beside:.2f} ({out['load']:+.1%})"
+    )
+    print(
+        f"{found}; final N {out['last']:+.1%}; {run.cells[0]} cells, fixed {fixed.cells[0]}, equal {run.cells[1]}; ",
+        end="",
+    )
+    print(f"{run.result.cuts} of {run.result.steps} steps cut", flush=True)
     return out
 
 

@@ -13,8 +13,8 @@ SOIL = mpm.Hencky(2e5, 1e5, porosity=0.4, conductivity=1e-4)
 
 def pushed(load=None):
     """Return a wet block under a disc that follows a path, or sinks under a load, and lines that follow the disc."""
-    lines = mpm.graded([0, 0], [2, 2], [[[0.5, 0.8], [1.1, 1.4]]], 0.1, 1.2)
-    path = {"displacement": lambda t: (0.3 * t, -0.2 * t)} if load is None else {"load": load, "direction": (0.3, -1)}
+    lines = mpm.graded([0, 0], [2, 2], [[[0.65, 0.88], [0.98, 1.24]]], 0.03, 1.25)
+    path = {"displacement": lambda t: (0.42 * t, -0.1 * t)} if load is None else {"load": load, "direction": (0.3, -1)}
     disc = mpm.Tool(mpm.Ball((0.8, 1.1), 0.1), friction=0.2, **path)
     grid = mpm.Grid(lines=lines, follow=disc)
     walls = {"left": "x", "right": "x", "bottom": "xy"}

@@ -191,6 +191,17 @@ def test_scenes_whose_domains_are_renewed_show_the_same_in_any_frame(monkeypatch
     assert not count["differs"] and count["same"], count
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [17, 24])
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_weak_soil_without_equilibrium_is_told_as_such(monkeypatch, seed):
+    """A plate flattened domains (nan); trial displacements closed pores (a negative conductivity)."""
+    monkeypatch.setattr(renewal, "LONGEST", SOON)
+    with pytest.raises(mpm.GaveUp, match="may have no equilibrium") as told:
+        run(flowing(seed, laws=["DruckerPrager"]), Frame.plain(2))
+    assert "nan" not in str(told.value) and "conductivity" not in str(told.value)
+
+
 @pytest.mark.skipif("INVARIANCE_SEED" not in os.environ, reason="asks for a seed")
 def test_a_scene_is_reproduced(monkeypatch):
     """INVARIANCE_DRAW=newer (or draining, flowing) says by which function."""

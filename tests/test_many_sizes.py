@@ -76,6 +76,14 @@ def test_graded_lines_meet_the_boxes_and_grow_by_the_ratio(largest):
             assert width[inside] == pytest.approx(0.1) and inside.sum() == round((box[1][a] - box[0][a]) / 0.1)
 
 
+@pytest.mark.parametrize("gap", [1e-3, 0.05, 0.1])
+def test_no_cell_is_narrow_where_boxes_are_near_each_other_or_a_side(gap):
+    """Lines that follow a tool would follow such a cell: it would be the smallest."""
+    near = mpm.graded([0, 0], [1, 1], [[[0, 0], [0.4, 1]], [[0.4 + gap, 0], [1, 1 - gap]]], 0.1)
+    for x in near:
+        assert np.diff(x) == pytest.approx(0.1)
+
+
 def test_points_and_nodes_are_found_and_shape_functions_are_exact_for_linear_fields():
     for dim, axisymmetric in KINDS:
         grid = uneven(dim, axisymmetric)
@@ -390,6 +398,17 @@ def test_bodies_in_contact_press_each_other_evenly_between_lines_at_random():
     exact = 1e6 * np.log(stretch) / stretch
     assert s.tool_forces.array[0, 1] == pytest.approx(exact, rel=1e-3)
     assert np.abs(s.effective_stress()[:, 1, 1] / exact - 1).max() < 2e-3
+
+
+@pytest.mark.parametrize(("start", "way", "cut"), [(0.2, 0.04, False), (0.2, 0.12, True), (2.0, 0.12, False)])
+def test_bodies_slide_in_a_step_by_a_cell_of_the_size_where_they_are(start, way, cut):
+    """In cells of 0.05 m up to x = 1.2 m, of 0.2 m beyond; y is divided equally."""
+    grid = mpm.Grid(lines=[np.append(np.linspace(-0.4, 1.2, 33), np.linspace(1.4, 3.4, 11)), np.linspace(0, 1.2, 13)])
+    ends = ((start - 0.2, 0), (start + 1, 0.4)), ((start, 0.4), (start + 0.4, 0.8))
+    hold = mpm.Displacement("top", lambda t: (way * t, -0.004 * t), region=([-0.4, 0.7], [3.4, 1.2]))
+    more = {"walls": {"bottom": "xy"}, "conditions": [hold, mpm.Contact(0, 1)]}
+    s = mpm.Simulation(grid, [mpm.box(grid, *each) for each in ends], [SOFT], **more)
+    assert bool(s.run(1.0, 1.0, progress=False).cuts) is cut
 
 
 @pytest.mark.slow

@@ -71,23 +71,31 @@ def test_sealed_soil_keeps_its_water_and_its_stress_while_lines_jump():
     assert np.abs(held[1] - held[0]).max() > 0.1 * held[0].mean()
 
 
-def test_smallest_cells_move_with_the_tool_and_the_others_grow_from_them():
+def test_smallest_cells_move_with_the_tool_by_whole_cells_and_the_others_grow_from_them():
     given = [np.array(x) for x in mpm.graded([0, -4], [4, 4], [[[0, -1], [1, 1]]], 0.125, 1.3)]
     lines = carried(given, np.array([0.0, -0.9]))
     assert (lines[0] == given[0]).all() and len(lines[1]) == len(given[1])
     assert lines[1][[0, -1]].tolist() == [-4, 4]
     width, before = np.diff(lines[1]), np.diff(given[1])
     fine = before < 0.126
-    assert width[fine] == pytest.approx(0.125) and given[1][:-1][fine][0] - lines[1][:-1][fine][0] == pytest.approx(0.9)
+    assert width[fine] == pytest.approx(0.125) and lines[1][:-1][fine] == pytest.approx(given[1][:-1][fine] - 7 * 0.125)
     grown = width[~fine] / before[~fine]
     below, above = np.split(grown, [np.flatnonzero(fine)[0]])
     for side in (below[::-1], above):  # powers of a common factor
         assert side == pytest.approx(side[0] ** np.arange(1, len(side) + 1))
     assert below.max() < 1 < above.min() and width.min() > 0.1249
-    assert all((x == y).all() for x, y in zip(carried(given, np.zeros(2)), given, strict=True))
+    for stays in (0.0, 0.124, -0.124):
+        assert all((x == y).all() for x, y in zip(carried(given, np.array([0.0, stays])), given, strict=True))
+    for way in (0.3, 3 * (0.1 + 1e-17) * 1.25):  # the same cell, whatever rounding
+        up, down = (carried(given, np.array([0.0, sign * way]))[1][:-1][fine][0] for sign in (1, -1))
+        assert (
+            up - given[1][:-1][fine][0]
+            == pytest.approx(0.125 * int(way / 0.125 + 1e-6))
+            == given[1][:-1][fine][0] - down
+        )
 
 
-@pytest.mark.parametrize("load", [None, lambda t: 2e3 * t])
+@pytest.mark.parametrize("load", [None, lambda t: 1e5 * t])
 def test_a_run_goes_on_from_a_checkpoint_with_the_same_bits(load, tmp_path):
     """Of a tool that moves as told, and of one under a load, whose way is in the checkpoint."""
     file, ends = tmp_path / "kept", []
@@ -99,7 +107,7 @@ def test_a_run_goes_on_from_a_checkpoint_with_the_same_bits(load, tmp_path):
             result = mpm.resume(s, file)
         s.run(0.1, 0.025, progress=False, after=result)
         ends.append((s.points.corners, s.points.pressure, *s.grid.lines))
-        assert (s.grid.lines[1] != s.grid.seeded[1]).any()
+        assert any((x != y).any() for x, y in zip(s.grid.lines, s.grid.seeded, strict=True))
     assert all((one == other).all() for one, other in zip(*ends, strict=True))
 
 
@@ -190,7 +198,7 @@ def test_lines_that_cannot_follow_are_refused_in_one_line(make, name, value):
 
 @pytest.mark.slow
 def test_a_cone_meets_the_force_that_it_meets_in_lines_that_are_fine_all_along_its_way():
-    """Blunt, rough, from the surface of clay by two cells, in axisymmetry: the mean over the second half of the way."""
+    """Blunt, rough, from the surface of clay by two cells, in axisymmetry: in every step."""
     clay, h, way, wide = mpm.DruckerPrager(5e6, 1e5, friction=0.0, dilation=0.0, cohesion=1e3), 0.1, 0.2, 0.6
     forces = []
     for follow in (False, True):
@@ -201,7 +209,7 @@ def test_a_cone_meets_the_force_that_it_meets_in_lines_that_are_fine_all_along_i
         body = mpm.box(mpm.Grid([0, 0], [2, 3], [20, 30], axisymmetric=True), [0, 0], [2, 2])
         walls = {"left": "x", "right": "x", "bottom": "y"}
         s = mpm.Simulation(grid, [body], [clay], walls=walls, conditions=[cone])
-        result = s.run(way, h / 6, progress=False)
+        result = s.run(way, h / 12, progress=False)
+        assert result.cuts == 0 and any((x != y).any() for x, y in zip(grid.lines, grid.seeded, strict=True)) == follow
         forces.append(-result.tool_forces["tool"][1:, 1])
-    mean = [force[len(force) // 2 :].mean() for force in forces]
-    assert mean[1] == pytest.approx(mean[0], rel=0.01), forces
+    assert forces[1] == pytest.approx(forces[0], rel=1e-4)

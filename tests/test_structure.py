@@ -62,6 +62,7 @@ def test_no_folder_has_more_than_fourteen_files():
 
 CHANGES = {
     ("Simulation", "state"): "the one state",
+    ("Simulation", "_state"): "the same, on the present grid",
     ("Grid", "_cells"): "the mesh, made at its first use",
     ("Grid", "_spacing"): "the lines of a grid that follows, set from the state before they are read",
     ("Cells", "at"): "the positions of nodes and cells between these lines",

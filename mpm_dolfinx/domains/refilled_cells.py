@@ -16,10 +16,8 @@ from mpm_dolfinx.points.cutting import (
     cut,
     domain_volumes,
     on_planes,
-    simplex_volumes,
     sliced,
     slices_in_cells,
-    vertices,
     volumes,
 )
 from mpm_dolfinx.points.material_points import MaterialPoints
@@ -82,11 +80,13 @@ def ring_lengths(grid: Grid, x: NDArray[np.float64]) -> NDArray[np.float64] | fl
 
 def misshapen(grid: Grid, corners: NDArray[np.float64], longest: float) -> NDArray[np.bool_]:
     """Return which domains (n, 4, 2) have an inverted part, or an edge longer than `longest` times the cell size."""
-    ring = corners[:, RING] / grid.h if grid.even else grid.in_cells(corners)[:, RING]
-    edge = np.roll(ring, -1, axis=1) - ring
-    parts = simplex_volumes(vertices(np.ascontiguousarray(corners.transpose(1, 2, 0))))
-    inverted = parts.min(axis=0, initial=0.0) < -CRUMB * grid.sizes_at(corners.mean(axis=1)).prod(axis=-1)
-    return ((edge**2).sum(axis=2).max(axis=1) > longest**2) | inverted
+    ring = np.ascontiguousarray(corners.transpose(1, 2, 0))[RING]
+    middle = ring.sum(axis=0) / 4
+    place = ring / grid.h[:, None] if grid.even else grid.in_cells(ring.swapaxes(1, 2)).swapaxes(1, 2)
+    (a, b), edge = (ring - middle).swapaxes(0, 1), np.roll(place, -1, axis=0) - place
+    twice = a * np.roll(b, -1, axis=0) - b * np.roll(a, -1, axis=0)
+    inverted = twice.min(axis=0) < -2 * CRUMB * grid.sizes_at(middle.T).prod(axis=-1)
+    return ((edge**2).sum(axis=1).max(axis=0) > longest**2) | inverted
 
 
 class RefilledCells:

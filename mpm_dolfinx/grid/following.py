@@ -60,6 +60,7 @@ def lines_at(
 def carried(lines: Sequence[NDArray[np.float64]], shift: NDArray[np.float64]) -> list[NDArray[np.float64]]:
     """Return lines (n,), m, along each axis, after a displacement `shift` (d,), m, of the smallest cells.
 
+    The smallest cells move by whole cells, rounded towards zero.  A tool therefore crosses them like fixed cells.
     Between the smallest cells and a side, the edge of the k-th cell is multiplied by the k-th power of a common factor;
     k = 1 next to the smallest cells.  Cells still grow with the distance from these, but faster or slower.
 
@@ -73,6 +74,7 @@ def carried(lines: Sequence[NDArray[np.float64]], shift: NDArray[np.float64]) ->
         width = np.diff(x)
         small = np.flatnonzero(width <= width.min() * (1 + SAME))
         first, last = small[0], small[-1] + 1
+        step = np.trunc(step / width.min() + np.copysign(SAME, step)) * width.min()
         if step == 0 or last - first == len(width):
             out.append(x)
             continue

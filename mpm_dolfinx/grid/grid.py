@@ -25,8 +25,8 @@ from mpm_dolfinx.base.tolerances import NEAR, SAME
 from mpm_dolfinx.base.validation import flag, instance, line, numbers
 from mpm_dolfinx.grid.following import check_follow
 from mpm_dolfinx.grid.lines import MOST, checked, equal, rounding
-from mpm_dolfinx.grid.partition import destinations, owners
-from mpm_dolfinx.parallel.exchange import Exchange
+from mpm_dolfinx.grid.partition import UNEVEN, better, boxes, destinations, owners
+from mpm_dolfinx.parallel.exchange import Exchange, over_all
 
 SIDES = {
     2: {"left": (0, 0), "right": (0, 1), "bottom": (1, 0), "top": (1, 1)},
@@ -117,6 +117,15 @@ def among(numbers: NDArray[np.integer], chosen: NDArray[np.integer]) -> NDArray[
     return chosen[np.minimum(chosen.searchsorted(numbers), len(chosen) - 1)] == numbers
 
 
+def values_at(
+    chosen: NDArray[np.int64], numbers: NDArray[np.int64], values: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the values (n, k) of the numbers `chosen` (n,), from values (m, k) of ascending numbers (m,); else 0."""
+    at = numbers.searchsorted(chosen)
+    found = np.append(numbers, -1)[at] == chosen
+    return np.concatenate([values, np.zeros((1, values.shape[1]))])[np.where(found, at, len(numbers))]
+
+
 def across_faces(grid: Grid, n: Any) -> tuple[Any, Any, Any]:
     """Return the edge lengths, m, of the "+" and "-" cells along the normal n of a face, and their mean, as UFL."""
     h = grid.edge_in_forms()
@@ -158,6 +167,8 @@ class Cells:
         Current positions of nodes and cells.
     cell_number
         Lexicographic index of each local cell.
+    boxes : (ranks, 2, d)
+        First cell index along each axis, and last index plus one, of the cells of each process.
     locals, owners
         Local index, -1 if not on this process, and owner rank of all cells of the grid, one copy after the other.
     cell_facets : (cells, 2d)
@@ -166,8 +177,8 @@ class Cells:
         Cells at each facet, -1 outside the boundary.
     """
 
-    def __init__(self, grid: Grid, mesh: Any, owners: NDArray[np.int32]):
-        self.mesh = mesh
+    def __init__(self, grid: Grid, mesh: Any, boxes: NDArray[np.int64], owners: NDArray[np.int32]):
+        self.mesh, self.boxes = mesh, boxes
         self.owners = owners
         d = grid.dim
         nodes = _compat.function_space(mesh, "Lagrange", 1)
@@ -299,8 +310,9 @@ class Grid:
         Dimension of deformation gradients: d, or in axisymmetry 3, with the circumferential stretch as third component.
     mesh
         The dolfinx mesh, with coordinates relative to `base`, created at its first use.  On several processes, a second
-        scene with another distribution of points has a separate mesh and grid, `Simulation.grid`.  Scenes with terms or
-        sources always keep this mesh, because terms may be defined on it.
+        scene with another distribution of points has a separate mesh and grid, `Simulation.grid`.  The same holds for a
+        scene that distributes its cells anew.  Scenes with terms or sources always keep this mesh, because terms may be
+        defined on it.
     """
 
     def __init__(
@@ -476,7 +488,7 @@ class Grid:
         return np.minimum(np.maximum(self.lines[axis].searchsorted(x, side="right") - 1, 0), self.shape[axis] - 1)
 
     mesh = of_cells("mesh")
-    owners = of_cells("owners")
+    owners, boxes = map(of_cells, ("owners", "boxes"))
     num_owned = of_cells("num_owned")
     num_local = of_cells("num_local")
     cell_nodes = of_cells("cell_nodes")
@@ -498,7 +510,7 @@ class Grid:
     def share(self, load: NDArray[np.float64]) -> None:
         """Create the mesh, unless it exists, with cells distributed among processes by their loads (cells,)."""
         if self._cells is None:
-            self._cells = self._made(owners(load.reshape(self.shape), self.comm.size))
+            self._cells = self._made(boxes(load.reshape(self.shape), self.comm.size))
 
     def shared(self, load: NDArray[np.float64], keep: bool) -> Grid:
         """Return a grid with cells distributed by their loads: this grid, or an equal grid with another mesh.
@@ -506,24 +518,49 @@ class Grid:
         load (cells,): load of each cell, such as its number of points, >= 0; keep: whether to return this grid
         even if its mesh is distributed by other loads, because other objects were created on this mesh.
         """
-        owner = owners(load.reshape(self.shape), self.comm.size)
+        new = boxes(load.reshape(self.shape), self.comm.size)
         if self._cells is None:
-            self._cells = self._made(owner)
-        elif not keep and (self.owners[: self.cells] != owner.ravel()).any():  # distributed for an earlier scene
-            other = Grid(**self.given, comm=self.comm, axisymmetric=self.axisymmetric)
-            other._cells = other._made(owner)
-            return other
+            self._cells = self._made(new)
+        elif not keep and (self.boxes != new).any():  # distributed for an earlier scene
+            return self.distributed(new)
         return self
 
-    def _made(self, owner: NDArray[np.int32]) -> Cells:
-        """Create the mesh, and return its cells.  `owner` is the rank of each cell, with the shape of the grid."""
+    def better(self, x: NDArray[np.float64]) -> NDArray[np.int64] | None:
+        """Return boxes (ranks, 2, d) that distribute points at x (n, d), m, more evenly; None if the present ones do.
+
+        Points on all processes count.  The present boxes remain up to an imbalance of `UNEVEN`.
+        """
+        number = self.number(self.index_from_base(x))
+        counts = over_all(self.comm, np.bincount(self.owner(number), minlength=self.comm.size))
+        if counts.max() <= UNEVEN * counts.mean():
+            return None
+        load = np.bincount(number, minlength=self.cells).astype(float)
+        return better(over_all(self.comm, load).reshape(self.shape), self.boxes)
+
+    def check_boxes(self, boxes: NDArray[np.int64]) -> None:
+        """Raise ValueError for boxes (ranks, 2, d) that do not fill the grid exactly once."""
+        owners(boxes, tuple(self.shape))
+
+    def distributed(self, boxes: NDArray[np.int64]) -> Grid:
+        """Return an equal grid, with the present lines, whose mesh is distributed by these boxes (ranks, 2, d)."""
+        other = self._again()
+        other.seeded, other._spacing = self.seeded, self._spacing
+        other._cells = other._made(boxes)
+        return other
+
+    def _again(self) -> Grid:
+        return Grid(**self.given, comm=self.comm, axisymmetric=self.axisymmetric)
+
+    def _made(self, boxes: NDArray[np.int64]) -> Cells:
+        """Create the mesh, and return its cells.  `boxes` (ranks, 2, d) are the cells of the processes, see `Cells`."""
+        owner = owners(boxes, tuple(self.shape))
         own = (owner.ravel() == self.comm.rank).nonzero()[0]
         nodes = np.concatenate([self.corners(own) + copy * self.nodes for copy in range(self.copies)])
         ranks, first = destinations(owner, own)
         each = np.tile(np.diff(first), self.copies)
         where = np.tile(ranks, self.copies), np.concatenate([[0], np.cumsum(each)]).astype(np.int32)
         mesh = _compat.box_mesh(self.comm, nodes, self._nodes(), *where)
-        return Cells(self, mesh, np.tile(owner.ravel(), self.copies))
+        return Cells(self, mesh, boxes, np.tile(owner.ravel(), self.copies))
 
     def corners(self, cells: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return the lexicographic indices (n, 2^d) of the nodes of cells."""
@@ -623,6 +660,20 @@ class Grid:
         if self.copies > 1:
             copy[self.cell_nodes] = (self.cell_number // self.cells)[:, None]
         return np.column_stack([self.nodes_along(self.node_x[nodes]), copy[nodes]])
+
+    def node_numbers(self) -> NDArray[np.int64]:
+        """Return the lexicographic indices (nodes,), copy by copy, of the local nodes."""
+        *index, copy = self.node_places(np.arange(len(self.node_x))).T
+        return np.ravel_multi_index(tuple(index), tuple(self.shape + 1)) + copy * self.nodes
+
+    def from_other(self, other: Grid, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return nodal values (unknowns,) from those on an equal grid with other owners; node i passes by rank i % P."""
+        rows = nodal.reshape(-1, self.dim)
+        some = rows.any(axis=1)
+        old, new = other.node_numbers()[some], self.node_numbers()
+        store, fetch = (Exchange(self.comm, (node % self.comm.size).astype(np.int32)) for node in (old, new))
+        node, first = np.unique(store.send(old), return_index=True)
+        return fetch.back(values_at(fetch.send(new), node, store.send(rows[some])[first])).ravel()
 
     def cell_places(self, cells: NDArray[np.integer]) -> NDArray[np.int64]:
         """Return for local cells (n,) the indices along the axes and, in column d, the index of the copy."""
@@ -736,6 +787,9 @@ class GridOfGroups(Grid):
     def copies(self) -> int:
         """Number of groups."""
         return self._copies
+
+    def _again(self) -> Grid:
+        return GridOfGroups(self, self._group)
 
     def copy(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return, for material points with these ids (n,), the index of the first cell of their copy of the box."""

@@ -60,7 +60,8 @@ def graded(
     lower, upper : (d,), m
         Lower and upper corner of the grid; d = 2 or 3.
     fine : (boxes, 2, d), m
-        Lower and upper corners of the fine boxes, at least one box, inside the grid.
+        Lower and upper corners of the fine boxes, at least one box, inside the grid.  Boxes within a cell of each
+        other, or of a side of the grid, are joined along this axis: cells between them would be too narrow.
     size : number or (d,), m
         Largest edge lengths of the small cells, > 0.  Each box contains a whole number of cells.
     ratio
@@ -107,13 +108,13 @@ def _along(
     """Return the lines (n,), m, from low to high along an axis.  `fine` (k, 2) are the intervals of small cells, m."""
     joined: list[list[float]] = []
     for start, stop in sorted(fine.tolist()):
-        if joined and start <= joined[-1][1] + SAME * size:
+        if joined and start - joined[-1][1] <= size * (1 + SAME):
             joined[-1][1] = max(joined[-1][1], stop)
         else:
             joined.append([start, stop])
-    if joined[0][0] - low <= SAME * size:
+    if joined[0][0] - low < size * (1 - SAME):
         joined[0][0] = low
-    if high - joined[-1][1] <= SAME * size:
+    if high - joined[-1][1] < size * (1 - SAME):
         joined[-1][1] = high
     parts = [joined[0][0] - np.cumsum(_growing(joined[0][0] - low, size, ratio, largest))[::-1]]
     for k, (start, stop) in enumerate(joined):

@@ -11,29 +11,66 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+UNEVEN = 1.2
+"""Largest number of points of a process, divided by the mean, above which cells are distributed anew.  The answers do
+not depend on this number.  Source: definition, the documented limit of the imbalance.
+"""
 EMPTY = 1e-2
 """Weight of an empty cell divided by the mean weight of a filled cell, for memory and time that empty cells need."""
 
 
-def owners(load: NDArray[np.float64], processes: int) -> NDArray[np.int32]:
-    """Return the owner rank of each cell, as an array with the shape of the grid.
+def boxes(load: NDArray[np.float64], processes: int) -> NDArray[np.int64]:
+    """Return the boxes of cells of all ranks (ranks, 2, d): first cell index along each axis, and last index plus one.
 
     load (cells along each axis): load of a cell, such as its number of points, >= 0; processes: number of ranks, >= 1.
     """
     filled = load > 0
     weight = load + (EMPTY * load[filled].mean() if filled.any() else 1.0)
-    out = np.zeros(load.shape, dtype=np.int32)
-    _bisect(weight, filled, out, 0, processes)
+    out = np.zeros((processes, 2, load.ndim), dtype=np.int64)
+    _bisect(weight, filled, np.zeros(load.ndim, dtype=np.int64), out)
     return out
 
 
-def _bisect(weight: NDArray[np.float64], filled: NDArray[np.bool_], out: NDArray[np.int32], first: int, count: int):
-    """Distribute a box of cells among `count` ranks from `first` on.  Arrays are views of the arrays of the whole grid.
+def owners(of: NDArray[np.int64], shape: tuple[int, ...]) -> NDArray[np.int32]:
+    """Return the owner rank of each cell, as an array with the shape of the grid, from the boxes `of` (ranks, 2, d).
+
+    Raises
+    ------
+    ValueError
+        The boxes do not fill the grid exactly once.
+    """
+    out, sizes = np.full(shape, -1, dtype=np.int32), of[:, 1] - of[:, 0]
+    for rank, (low, high) in enumerate(of):
+        out[tuple(map(slice, low, high))] = rank
+    if (sizes < 0).any() or sizes.prod(axis=1).sum() != out.size or (out < 0).any():
+        raise ValueError("partition: boxes of cells do not fill the grid exactly once")
+    return out
+
+
+def better(load: NDArray[np.float64], of: NDArray[np.int64]) -> NDArray[np.int64] | None:
+    """Return the boxes (ranks, 2, d) of a new bisection if it is more even than the boxes `of`, else None.
+
+    A bisection that leaves more than `UNEVEN` must be better by this factor.  Otherwise each reset of the grid might
+    distribute few cells anew.
+    """
+    before, new = imbalance(load, of), boxes(load, len(of))
+    return new if before > UNEVEN and imbalance(load, new) < max(UNEVEN, before / UNEVEN) else None
+
+
+def imbalance(load: NDArray[np.float64], of: NDArray[np.int64]) -> float:
+    """Return the largest load of the boxes `of` (ranks, 2, d), divided by the mean; 1 without loads."""
+    each = np.array([load[tuple(map(slice, *box))].sum() for box in of])
+    return float(each.max() / each.mean()) if each.any() else 1.0
+
+
+def _bisect(weight: NDArray[np.float64], filled: NDArray[np.bool_], low: NDArray[np.int64], out: NDArray[np.int64]):
+    """Distribute a box of cells, with first cell `low` (d,), among ranks: set their boxes `out` (ranks, 2, d).
 
     If there are enough cells, each rank gets at least one; this has priority over equal loads.
     """
-    out[...] = first
+    count = len(out)
     if count == 1 or weight.size == 1:
+        out[0] = low, low + weight.shape
         return
     axis = int(np.argmax([_extent(filled, a) if filled.any() else n for a, n in enumerate(weight.shape)]))
     layers = weight.sum(axis=tuple(a for a in range(weight.ndim) if a != axis))
@@ -46,10 +83,10 @@ def _bisect(weight: NDArray[np.float64], filled: NDArray[np.bool_], out: NDArray
     off = np.abs(np.cumsum(layers)[:-1] - layers.sum() * ranks / count)
     plane = int(np.argmin(np.where(even, off, np.inf)))
     half, plane = int(ranks[plane]), plane + 1
-    parts = [np.moveaxis(array, axis, 0) for array in (weight, filled, out)]
+    parts = [np.moveaxis(array, axis, 0) for array in (weight, filled)]
     lower, upper = ([np.moveaxis(p[side], 0, axis) for p in parts] for side in (slice(plane), slice(plane, None)))
-    _bisect(*lower, first, half)
-    _bisect(*upper, first + half, count - half)
+    _bisect(*lower, low, out[:half])
+    _bisect(*upper, low + plane * np.eye(len(low), dtype=np.int64)[axis], out[half:])
 
 
 def _extent(filled: NDArray[np.bool_], axis: int) -> int:

@@ -22,22 +22,22 @@ from mpm_dolfinx.base.validation import instance, line, numbers, on_disk, path, 
 from mpm_dolfinx.conditions.acting import MOTIONS, Outcome
 from mpm_dolfinx.domains.pressure_transport import PiecePressures
 from mpm_dolfinx.domains.renewed_faces import PARENT, with_faces
-from mpm_dolfinx.grid.grid import Grid
+from mpm_dolfinx.grid.grid import Grid, values_at
 from mpm_dolfinx.io.writer import WRITABLE, replacing
 from mpm_dolfinx.parallel.exchange import at_root
 from mpm_dolfinx.parallel.messages import log
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.simulation.simulation import Simulation
+from mpm_dolfinx.stepping.distribution import distribute_by
 from mpm_dolfinx.stepping.result import Result
-from mpm_dolfinx.stepping.state import State, Stay, StepControl, Trend
+from mpm_dolfinx.stepping.state import NODAL, State, Stay, StepControl, Trend
 
-FORMAT, VERSION = "mpm_dolfinx checkpoint", 14  # Source: the format of the files
+FORMAT, VERSION = "mpm_dolfinx checkpoint", 15  # Source: the format of the files
 FOREIGN = "not a checkpoint of mpm_dolfinx, must be one"
 ZIP = b"PK\3\4"  # first bytes of a numpy archive
 LEAVE = ("pressure", "slope", "bounds")  # fields of pieces that are not stored if all points keep their pieces
-NODAL = ("velocity", "held", "rest")  # nodal fields of a State
 # metadata of a checkpoint, with their types
-NOTE = {"t": float, "resets": int, "begins": bool, "scene": dict, "result": dict, "control": dict}
+NOTE = {"t": float, "resets": int, "begins": bool, "scene": dict, "result": dict, "control": dict, "partition": list}
 
 
 @dataclass
@@ -94,6 +94,7 @@ def save(simulation: Simulation, file: Path) -> None:
         nodal |= _nodal_of_all(simulation.grid, name, getattr(state, name))
     note = {"version": VERSION, "t": state.t, "resets": state.resets, "begins": state.begins}
     note |= {"scene": describe(simulation), "result": _scalars(state.result), "control": vars(state.control)}
+    note["partition"] = simulation.grid.boxes.tolist()
 
     def write() -> int:
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -131,16 +132,18 @@ def resume(simulation: Simulation, file: str | os.PathLike) -> Result:
     instance("resume: simulation", simulation, Simulation)
     file, comm = path("checkpoint: file", file), simulation.grid.comm
 
-    def read() -> State:
+    def read() -> tuple[State, NDArray[np.int64]]:
         with on_disk("resume", "a checkpoint that can be read"):
             arrays, note = _read(file)
         _check_scene(file, note["scene"], describe(simulation))
         found.append(_state(file, arrays, note, simulation))
-        return _without_rows(found[0])
+        return _without_rows(found[0]), _partition(file, note["partition"], simulation.grid)
 
     found: list[State] = []  # rank 0 reads all points and pieces, and sends them to their owners
-    bare = at_root(comm, read)
+    bare, boxes = at_root(comm, read)
     state = found[0] if found else bare
+    if len(boxes) == comm.size > 1 and (boxes != simulation.grid.boxes).any():  # on as many processes: the same bits
+        distribute_by(simulation, boxes)
     nodal = {name: _nodal_here(simulation.grid, getattr(state, name)) for name in NODAL}
     if state.lines is not None:
         simulation.grid.move([state.lines[letter] for letter in sorted(state.lines)])
@@ -298,10 +301,14 @@ def _points(arrays: dict[str, NDArray], like: MaterialPoints, ids: NDArray[np.in
     return points
 
 
-def _nodes(grid: Grid) -> NDArray[np.int64]:
-    """Return the lexicographic indices of the nodes of this process."""
-    *index, copy = grid.node_places(np.arange(len(grid.node_x))).T
-    return np.ravel_multi_index(tuple(index), tuple(grid.shape + 1)) + copy * grid.nodes
+def _partition(file: Path, given: list, grid: Grid) -> NDArray[np.int64]:
+    """Return the boxes (ranks, 2, d) of the processes that have written a file; raise ValueError for others."""
+    try:
+        boxes = np.array(given, dtype=np.int64).reshape(-1, 2, grid.dim)
+        grid.check_boxes(boxes)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise ValueError(f"{file}: is cut short or damaged ({line(error)}), must be a whole checkpoint") from error
+    return boxes
 
 
 def _nodal_of_all(grid: Grid, name: str, nodal: NDArray[np.float64] | None) -> dict[str, NDArray]:
@@ -310,7 +317,7 @@ def _nodal_of_all(grid: Grid, name: str, nodal: NDArray[np.float64] | None) -> d
         return {}
     nodal = nodal.reshape(-1, grid.dim)
     some = nodal.any(axis=1)
-    parts = grid.comm.gather((_nodes(grid)[some], nodal[some])) or [(np.empty(0, np.int64), nodal[:0])]
+    parts = grid.comm.gather((grid.node_numbers()[some], nodal[some])) or [(np.empty(0, np.int64), nodal[:0])]
     node, rows = (np.concatenate(values) for values in zip(*parts, strict=True))
     node, first = np.unique(node, return_index=True)
     return {f"{name}/node": node, f"{name}/values": rows[first]}
@@ -320,11 +327,7 @@ def _nodal_here(grid: Grid, given: dict[str, NDArray] | None) -> NDArray[np.floa
     """Return the nodal values on this process, from the stored nodes with non-zero values; None if `given` is None."""
     if given is None:
         return None
-    node, values = given["node"], np.concatenate([given["values"], np.zeros((1, grid.dim))])
-    own_nodes = _nodes(grid)
-    at = np.searchsorted(node, own_nodes)
-    found = np.append(node, -1)[at] == own_nodes
-    return values[np.where(found, at, len(node))].ravel()
+    return values_at(grid.node_numbers(), given["node"], given["values"]).ravel()
 
 
 def _check_lines(arrays: dict[str, NDArray], grid: Grid) -> None:

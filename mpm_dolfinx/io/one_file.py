@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from xml.etree.ElementTree import SubElement
@@ -60,12 +61,24 @@ def one_file(folder: str | os.PathLike) -> Path:
         with h5py.File(Path(part) / "points.h5", "w") as writer.h5_file:
             for name, meaning in FIELDS["points.pvd: the domains of the material points"].items():
                 SubElement(writer.domain, "Information", Name=name, Value=meaning)
-            for k, (t, (file,)) in enumerate(entries):
-                _add(writer, k, t, meshio.vtu.read(file))
+            for k, (t, files) in enumerate(entries):
+                _add(writer, k, t, joined([meshio.vtu.read(file) for file in files]))
             writer.__exit__()
         for suffix in (".h5", ".xdmf"):
             os.replace(Path(part) / f"points{suffix}", folder / f"points{suffix}")
     return folder / "points.xdmf"
+
+
+def joined(pieces: Sequence[meshio.Mesh]) -> meshio.Mesh:
+    """Return the domains in the files of all processes as one mesh of unconnected cells, ordered by id."""
+    if len(pieces) == 1:
+        return pieces[0]
+    order = np.argsort(np.concatenate([piece.cell_data["id"][0] for piece in pieces]))
+    corners = np.concatenate([piece.points[piece.cells[0].data] for piece in pieces])[order]
+    names = pieces[0].cell_data
+    data = {name: [np.concatenate([piece.cell_data[name][0] for piece in pieces])[order]] for name in names}
+    cells = np.arange(corners[..., 0].size).reshape(corners.shape[:2])
+    return meshio.Mesh(corners.reshape(-1, 3), [(pieces[0].cells[0].type, cells)], cell_data=data)
 
 
 def _add(writer: TimeSeriesWriter, number: int, t: float, mesh: meshio.Mesh) -> None:

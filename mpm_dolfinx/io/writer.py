@@ -31,7 +31,7 @@ from mpm_dolfinx.base.validation import flag, instance, line_of, on_disk, path, 
 from mpm_dolfinx.contact.tool import Tool, motion_by_forces
 from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.io.units import text
-from mpm_dolfinx.parallel.exchange import at_root, to_root
+from mpm_dolfinx.parallel.exchange import at_root, together
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.simulation.simulation import Simulation
 from mpm_dolfinx.stepping.result import Result
@@ -47,8 +47,9 @@ class Writer:
 
     The folder receives
 
-    * `points.pvd`: the particle domains as solid cells.  Fields are displacement, pore pressure, F, J, all data of the
-      points, and the results of `Simulation.point_fields`: stresses, p', q, porosity;
+    * `points.pvd`: the particle domains as solid cells, in a file for each process with points.  Fields are
+      displacement, pore pressure, F, J, all data of the points, and the results of `Simulation.point_fields`: stresses,
+      p', q, porosity;
     * `history.csv`: one row for each output time, with counts and errors of `Result`, smallest and largest pressure,
       quantities at probes, forces of prescribed displacements and tools, and outflows.  Forces and outflows are nan
       before the first step of a stage;
@@ -152,18 +153,18 @@ class Writer:
             series.write_index()
 
     def _write_points(self, simulation: Simulation) -> None:
-        comm, file = simulation.grid.comm, self._points.next.with_suffix(".vtu")
-        points, wet = simulation.points, simulation.scene.fluid is not None
+        comm, wet = simulation.grid.comm, simulation.scene.fluid is not None
+        points = simulation.points
         points = replace(points, data={**points.data, **fields_of_points(simulation)})
-        points = points.migrated(to_root(comm, len(points)))
+        files = self._points.pieces(comm.allgather(len(points)))
 
         def write() -> None:
-            with replacing(file) as part:
+            with replacing(files[comm.rank]) as part:
                 mesh = solid(points, points.displacement, wet)
                 mesh.write(part, file_format="vtu")
 
-        at_root(comm, write)
-        self._points.entries.append((simulation.t, [file]))
+        together(comm, write if comm.rank in files else bool)
+        self._points.entries.append((simulation.t, list(files.values())))
         if self._tools is not None:
             file = self._tools.next.with_suffix(".vtu")
             at_root(comm, lambda: _write_tools(simulation, file))
@@ -359,6 +360,12 @@ class Series:
     @property
     def next(self) -> Path:
         return self.folder / f"{len(self.entries):06d}"
+
+    def pieces(self, counts: Sequence[int]) -> dict[int, Path]:
+        """Return the paths of the next files by rank, for the ranks with points; counts: number of points of each."""
+        names = {rank: f"{self.next.name}_p{rank}.vtu" for rank, count in enumerate(counts) if count}
+        names = names if len(counts) > 1 else {0: f"{self.next.name}.vtu"}
+        return {rank: self.folder / name for rank, name in names.items()}
 
     def _read(self) -> list[tuple[float, list[Path]]]:
         self.folder.mkdir(parents=True, exist_ok=True)

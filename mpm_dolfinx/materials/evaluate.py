@@ -307,7 +307,7 @@ class ConductivityAtPieces:
             conductivity=points.conductivity,
             F=F,
             J=J,
-            porosity=1 - (1 - points.porosity0) / J,
+            porosity=ufl.max_value(0.0, 1 - (1 - points.porosity0) / J),  # trial displacements may close pores
             porosity0=points.porosity0,
             x=points.position + points.moved_by(self._u),
             p=self._p,

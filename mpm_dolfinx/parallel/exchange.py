@@ -122,6 +122,18 @@ def everywhere(comm: MPI.Intracomm, ask: Callable[[], T]) -> T:
     return value
 
 
+def together(comm: MPI.Intracomm, action: Callable[[], object]) -> None:
+    """Perform an action on every process; if it raises on any process, all raise an error: their own, or the first."""
+    error = None
+    try:
+        action()
+    except Exception as raised:
+        error = raised
+    for one in [error, *comm.allgather(error)]:
+        if one is not None:
+            raise one
+
+
 def at_root(comm: MPI.Intracomm, action: Callable[[], T]) -> T:
     """Return on every process the result of `action` on rank 0; if `action` raises, all processes raise its error."""
     value = error = None

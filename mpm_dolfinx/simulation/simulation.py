@@ -31,6 +31,7 @@ from mpm_dolfinx.simulation import summary
 from mpm_dolfinx.simulation.tangent import tangent
 from mpm_dolfinx.simulation.timeloop import run
 from mpm_dolfinx.solve.numerics import DEFAULT, Numerics
+from mpm_dolfinx.stepping.distribution import distribute
 from mpm_dolfinx.stepping.initial_state import balanced, begin_stage, first_state
 from mpm_dolfinx.stepping.result import Result
 from mpm_dolfinx.stepping.scene import Scene
@@ -156,6 +157,17 @@ class Simulation:
     def bodies(self) -> tuple[Body, ...]:
         """All bodies."""
         return self.scene.bodies
+
+    @property
+    def state(self) -> State:
+        """The complete state between two steps."""
+        return self._state
+
+    @state.setter
+    def state(self, state: State) -> None:
+        if isinstance(state, State) and state.stage.materials in self.scene.former:
+            state = self.scene.adopted(state)  # stored before the cells were distributed anew
+        self._state = state
 
     @property
     def points(self) -> MaterialPoints:
@@ -306,6 +318,7 @@ class Simulation:
         ValueError
             A function of time returns an invalid value.
         """
+        distribute(self)
         self.state, report = self.advanced(dt)
         return report
 

@@ -33,6 +33,7 @@ from mpm_dolfinx.simulation.events import Event, Events, Simulated, Step
 from mpm_dolfinx.simulation.step_size import StepSize, Times, measured, step_rule
 from mpm_dolfinx.simulation.summary import imbalance, peak_memory
 from mpm_dolfinx.stepping.result import GaveUp, Result
+from mpm_dolfinx.stepping.distribution import distribute
 from mpm_dolfinx.stepping.scene import Scene
 from mpm_dolfinx.stepping.state import State, StepControl
 
@@ -298,6 +299,7 @@ class _Stopwatch:
 
 def _take_step(simulation: Simulated, rule: StepSize, target: float, verbose: bool, events: Events) -> bool:
     """Take one step towards the time `target`, s; return whether an event has ended the run."""
+    distribute(simulation)
     step, new = _advance(simulation, rule, target, verbose)
     found = events.within(step, new)
     if found is None:

@@ -308,10 +308,8 @@ class Motion:
         If Q1 cells would lock, F is scaled so that det F equals that of `deformed`. In yielded soil F is `deformed`:
         kinks of its motion are permanent, and the corners of domains in kinks would give a wrong F.
         """
-        cut = on_grid.cut
-        stage = state.stage
-        folded = 0
-        grid = cut.grid
+        cut, stage = on_grid.cut, state.stage
+        grid, folded = cut.grid, 0
         own = self._own(stage, state.points)
         near = np.zeros(moved.shape[:2], dtype=bool)
         for one in loads:
@@ -364,6 +362,8 @@ class Motion:
         corners[yielded] = stopped(grid, stage.conditions["walls"], corners[yielded], points.corners[yielded])
         for one in loads:
             corners = one.outside(corners, own)
+        if flat := over_all(grid.comm, int((volumes(corners) == 0).sum())):  # these cannot be cut into pieces
+            raise NotConverged(f"the step flattens domains, {flat} in all")
         return replace(points, corners=corners, x=centroids(corners))
 
     def _volume_defect(

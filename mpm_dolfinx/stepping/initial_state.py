@@ -48,7 +48,7 @@ from mpm_dolfinx.solve.newton import solve_substep
 from mpm_dolfinx.solve.schur import Kept, LinearSolvers, planned
 from mpm_dolfinx.stepping.balances import Start, at_rest
 from mpm_dolfinx.stepping.scene import Scene, When
-from mpm_dolfinx.stepping.stage import Condition, Stage, checked, stage
+from mpm_dolfinx.stepping.stage import Condition, Stage, checked
 from mpm_dolfinx.stepping.state import State, Stay
 from mpm_dolfinx.stepping.step import set_up
 
@@ -69,7 +69,7 @@ def first_state(scene: Scene, conditions: Mapping[str, Any], later: Sequence[int
     """Return the state of a scene in its first stage, with initial stresses that are not balanced yet."""
     present = [body not in later for body in range(len(scene.bodies))]
     check_apart(scene.grid, scene.bodies, present)
-    first = _stage(scene, conditions, present, later)
+    first = scene.stage(conditions, present, later)
     if scene.initial.given and (quiet := first.of(Quiet)):
         raise ValueError(
             f"{next(iter(quiet))}: cannot balance an initial stress, must begin a stage later: first prescribe the side"
@@ -119,7 +119,7 @@ def begin_stage(
     present = [(is_present and body not in remove) or body in add for body, is_present in enumerate(before.present)]
     later = [body for body in before.later if body not in add]
     conditions = _with_contacts(before, named.get("conditions", tuple(before.given.values())))
-    after = _stage(scene, {**before.conditions, **named, "conditions": conditions}, present, later)
+    after = scene.stage({**before.conditions, **named, "conditions": conditions}, present, later)
     _check_weight(after, before, state.t)
     if "gravity" in named or waters(after.given) != waters(before.given):
         warn_levels(scene.grid.comm, scene.fluid, after.conditions["gravity"], waters(after.named))
@@ -274,11 +274,6 @@ def _with_contacts(before: Stage, conditions: Sequence[Condition]) -> list[Condi
     if given and str([vars(one) for one in given]) != str([vars(one) for one in standing]):
         raise ValueError(f"stage: conditions: {line(given[0])}, must be the contacts of the scene, or left out")
     return [*(one for one in conditions if one not in given), *standing]
-
-
-def _stage(scene: Scene, conditions: Mapping[str, Any], present: Sequence[bool], later: Sequence[int]) -> Stage:
-    feeding = scene.storage.feeding if scene.storage else ()
-    return stage(scene.bodies, scene.materials, scene.momentum, feeding, conditions, present, later)
 
 
 def _warn_moved_on(scene: Scene, before: Stage, after: Stage) -> None:

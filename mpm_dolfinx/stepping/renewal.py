@@ -113,17 +113,16 @@ class Renewal:
         After a renewal the first process has all points. A failure raises NotConverged on all processes.
         """
         comm = self._grid.comm
-        free = self._free(state)
-        if not over_all(comm, int((free & self.long(state.points)).any())):
+        needs = self.long(state.points)
+        if not over_all(comm, int(needs.any() and (needs & self._free(state)).any())):
             return state, 0
         if comm.size > 1:
             state = state.migrated(np.zeros(len(state.points), dtype=np.int32), comm)
-            free = self._free(state)
         made, count = state, 0
         message = ""
         try:
             if comm.rank == 0:
-                made, count = self._renewed(state, free)
+                made, count = self._renewed(state)
         except (ValueError, ArithmeticError, IndexError, np.linalg.LinAlgError) as error:  # raised on all below
             message = str(error)
         if message := first(comm, message):
@@ -134,12 +133,12 @@ class Renewal:
         stay = made.stay and replace(made.stay, points=with_faces(made.stay.points))
         return replace(made, points=with_faces(made.points), stay=stay), count
 
-    def _renewed(self, state: State, free: NDArray[np.bool_]) -> tuple[State, int]:
+    def _renewed(self, state: State) -> tuple[State, int]:
         stage, points = state.stage, state.points
         signs = self._signs((stage,), lambda: self._signatures(stage.faces), MPI.COMM_SELF)
         needs, body = self.long(points), body_of(points.id, self._starts)
         moves = MOTION[0] in points.data
-        work = RefilledCells(self._grid, points, body, free, needs, self._faces(points), signs, moves)
+        work = RefilledCells(self._grid, points, body, self._free(state), needs, self._faces(points), signs, moves)
         if not work.chosen.any():
             return state, 0
         new = [work.full(), work.partial(), work.remainders[0]]

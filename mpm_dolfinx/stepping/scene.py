@@ -8,6 +8,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, replace
 from functools import cached_property, partial
 from typing import Any, NamedTuple
+from weakref import WeakSet
+
+from mpi4py import MPI
 
 import numpy as np
 from dolfinx import fem
@@ -41,8 +44,8 @@ from mpm_dolfinx.stepping.advance import Motion
 from mpm_dolfinx.stepping.grid_reset import Assembled, OnGrid, System, assembled
 from mpm_dolfinx.stepping.moving_lines import followed_tool, with_lines
 from mpm_dolfinx.stepping.renewal import Renewal
-from mpm_dolfinx.stepping.stage import Stage
-from mpm_dolfinx.stepping.state import State
+from mpm_dolfinx.stepping.stage import Stage, stage
+from mpm_dolfinx.stepping.state import NODAL, State
 
 
 class When(NamedTuple):
@@ -89,11 +92,14 @@ class Scene:
         velocity: ArrayLike | Callable | None = None,
     ):
         self.grid = grid
+        given = {"numerics": numerics, "weighs": weighs, "pressure": pressure, "extensions": extensions}
+        given |= {"initial": initial, "velocity": velocity}
+        self._on = partial(Scene, bodies=bodies, materials=materials, fluid=fluid, **given)
+        self.former: WeakSet[SceneMaterials] = WeakSet()
+        """Materials of this scene on grids with other distributions among processes."""
         self.bodies = tuple(bodies)
-        self.fluid = fluid
         self.numerics, scheme = numerics, numerics.scheme
-        terms, sources = self.extensions = extensions
-        """User-defined terms and sources."""
+        terms, sources = extensions
         pressure = weighed(pressure, fluid)
         self.initial = InitialStresses(self.bodies, initial, pressure)
         seeded = material_points(grid, bodies, pressure)
@@ -135,6 +141,21 @@ class Scene:
     def flows(self) -> bool:
         """Whether fluid flows, or sources add it."""
         return self.storage is not None and (self.materials.conducts or bool(self.storage.feeding))
+
+    @property
+    def fluid(self) -> Fluid | None:
+        """Pore fluid."""
+        return self.materials.fluid
+
+    @property
+    def extensions(self) -> tuple[Sequence[Callable], Sequence[Callable]]:
+        """User-defined terms and sources."""
+        return self._on.keywords["extensions"]
+
+    @property
+    def extended(self) -> bool:
+        """Whether the scene has user-defined terms or sources, which may be defined on the mesh."""
+        return any(map(len, self.extensions))
 
     @property
     def substeps(self) -> tuple[Substep, ...]:
@@ -191,6 +212,37 @@ class Scene:
         if self.materials.retentions is not None:
             gravity = stage.gravity_at(t) if self.materials.conducts else None
             self.materials.retentions.weight.value = 0.0 if gravity is None else self.fluid.density * gravity
+
+    def distributed(self, boxes: NDArray[np.int64]) -> Scene | None:
+        """Return an equal scene on a grid distributed by boxes (ranks, 2, d), see `Cells`.
+
+        The result is None if a function of position, such as a random field, does not return the same values again, or
+        if terms may be defined on the present mesh.
+        """
+        if self.extended:
+            return None
+        out = self._on(self.grid.distributed(boxes))
+        if not self.grid.comm.allreduce(out.materials.checksums == self.materials.checksums, op=MPI.LAND):
+            return None
+        out.former = self.former | {self.materials}
+        out.scheme, out._warned = self.scheme, self._warned
+        left = [getattr(look, "func", look) for look in self._looks]
+        out._looks = tuple(look for look in out._looks if getattr(look, "func", look) in left)
+        return out
+
+    def adopted(self, state: State) -> State:
+        """Return the state of an equal scene with another distribution, as a state of this scene."""
+        before = state.stage
+        given = {**before.conditions, "conditions": tuple(before.given.values())}
+        nodal = {name: rows for name in NODAL if (rows := getattr(state, name)) is not None}
+        nodal = {name: self.grid.from_other(before.materials.grid, rows) for name, rows in nodal.items()}
+        after = self.stage(given, before.present, before.later)
+        return replace(state, stage=after, **nodal).at_owners(self.grid)
+
+    def stage(self, conditions: Mapping[str, Any], present: Sequence[bool], later: Sequence[int]) -> Stage:
+        """Return a stage of the scene; conditions, present, later: see `stepping.stage.stage`."""
+        fed = self.storage.feeding if self.storage else ()
+        return stage(self.bodies, self.materials, self.momentum, fed, conditions, present, later)
 
     def check(self, state: State) -> None:
         """Raise ValueError for an object that is no state of this scene: its stage refers to other materials."""

@@ -120,6 +120,10 @@ class Trend:
         return np.add.reduce(self.rates * weights[:, None], axis=1)
 
 
+NODAL = ("velocity", "held", "rest")
+"""Nodal fields of a `State`."""
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class State:
     """All data of a scene that one step passes to the next; immutable: each step returns a new state.

@@ -1,0 +1,45 @@
+# SPDX-License-Identifier: MIT
+"""New distribution of the cells among processes at a reset of the grid, after bodies have moved, come or gone.
+
+The scene is compiled again on a grid with other owners; its forms need no new compilation.  The state is transferred as
+by a checkpoint: points and pieces move to the owners of their cells, nodal data to the nodes of each process, and the
+conditions of the stage find their faces again.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpm_dolfinx.parallel.messages import log
+from mpm_dolfinx.stepping.scene import Scene
+from mpm_dolfinx.stepping.state import State
+
+
+class Distributed(Protocol):
+    """A simulation, or a copy of it; scene and state are replaced together."""
+
+    scene: Scene
+    state: State
+
+
+def distribute(simulation: Distributed) -> None:
+    """Distribute the cells anew before a step that resets the grid, if uneven numbers of points become more even."""
+    grid, state = simulation.scene.grid, simulation.state
+    if grid.comm.size == 1 or state.stays or simulation.scene.extended:
+        return
+    if state.lines is not None:
+        grid.move([state.lines[letter] for letter in sorted(state.lines)])
+    boxes = grid.better(state.as_cut.x)
+    if boxes is not None and distribute_by(simulation, boxes):
+        log(grid.comm, "t = %g s: cells distributed anew among %d processes", state.t, grid.comm.size)
+
+
+def distribute_by(simulation: Distributed, boxes: NDArray[np.int64]) -> bool:
+    """Distribute the cells by boxes (ranks, 2, d), see `Cells`; return whether the scene allows it."""
+    new = simulation.scene.distributed(boxes)
+    if new is not None:
+        simulation.scene, simulation.state = new, new.adopted(simulation.state)
+    return new is not None

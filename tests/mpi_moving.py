@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: MIT
+"""Bodies that leave the cells of their processes: the state with and without a new distribution, and after restarts.
+
+Arguments: file of the results, and a checkpoint, written by the first run and resumed by a run on fewer processes.
+"""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+from helpers import gathered
+
+import mpm_dolfinx as mpm
+from mpm_dolfinx.grid import grid as grids
+
+T_END, DT = 0.375, 0.125
+TIGHT = mpm.Numerics(tolerance=1e-11, method="backward-euler")
+
+
+def carried():
+    """Return a wet block with friction under a disc; its bottom and the disc are carried along."""
+    grid = mpm.Grid([0, 0], [2, 1], [10, 5])
+    law = mpm.DruckerPrager(2e5, 1e5, friction=25, dilation=5, cohesion=3e3, porosity=0.4, conductivity=1e-4)
+    hold = mpm.Displacement("bottom", lambda t: (1.3 * t, 0.0))
+    disc = mpm.Tool(mpm.Ball((0.6, 0.902), 0.3), displacement=lambda t: (1.3 * t, -0.1 * t), name="disc")
+    body = mpm.box(grid, [0.1, 0.1], [1.1, 0.6])
+    acting = {"conditions": [hold, disc, mpm.Drained("top")], "fluid": mpm.Fluid()}
+    return mpm.Simulation(grid, [body], [law], walls={}, **acting, numerics=TIGHT)
+
+
+def dug():
+    """Return a block on a longer one, with inertia and friction between them, after an excavation at one end."""
+    grid = mpm.Grid([0, 0], [2, 1], [10, 5])
+    bodies = [mpm.box(grid, [x, 0], [x + 0.8, 0.2]) for x in (0.2, 1.0)] + [mpm.box(grid, [0.3, 0.2], [0.7, 0.6])]
+    push = mpm.Traction("left", lambda t: (2e3 * t, 0), region=((0.25, 0.25), (0.35, 0.6)))
+    acting = {"conditions": [mpm.Contact([0, 1], [2], friction=0.3), push], "inertia": True}
+    acting["gravity"] = lambda t: (0, -9.81 * min(t / 0.1, 1))
+    laws, walls = [mpm.Hencky(2e6, 1e6)], {"bottom": "xy"}
+    simulation = mpm.Simulation(grid, bodies, laws, walls=walls, **acting, numerics=TIGHT)
+    run(simulation, DT)
+    simulation.stage(remove=[1])
+    return simulation
+
+
+def run(simulation, t_end, **options):
+    """Run to a time; return the result."""
+    return simulation.run(t_end, DT, progress=False, **options)
+
+
+def state(simulation):
+    """Return the state on rank 0, and results of conditions."""
+    found = gathered(simulation)
+    found.pop("counts", None)
+    for quantity, of in simulation.state.outcome.items():
+        found |= {f"{quantity} {name}": value for name, value in of.items()}
+    return found
+
+
+if __name__ == "__main__":
+    out, file = map(Path, sys.argv[1:])
+    make = {"carried": carried, "dug": dug}[out.stem.split("-")[0]]
+    simulation = make()
+    comm = simulation.grid.comm
+    if file.exists():  # of another number of processes
+        result = run(simulation, T_END, after=mpm.resume(simulation, file))
+        found = state(simulation)
+        if not comm.rank:
+            np.savez(out, **found, imbalance=result.imbalance["points"] if comm.size > 1 else 1.0)
+        sys.exit()
+    before = simulation.grid
+    run(simulation, T_END - DT, checkpoint=mpm.Checkpoint(file, every=100))
+    assert (simulation.grid is before) == (comm.size == 1), "no process distributes anew, or one alone does"
+    result = run(simulation, T_END, after=simulation.result)
+    whole = state(simulation)
+    again = make()
+    run(again, T_END, after=mpm.resume(again, file))
+    resumed = state(again)
+    grids.UNEVEN = np.inf
+    still = make()
+    fixed = run(still, T_END)
+    left = state(still)
+    if not comm.rank:
+        same = all(np.array_equal(whole[name], resumed[name], equal_nan=True) for name in whole)
+        off = {n: np.abs(whole[n] - left[n]).max() / max(np.abs(left[n]).max(), 1e-300) for n in whole}
+        print(result.imbalance, fixed.imbalance, same, off)
+        ratios = [one.imbalance.get("points", 1.0) for one in (result, fixed)]
+        np.savez(out, **whole, same=same, off=max(off.values()), imbalance=ratios[0], fixed=ratios[1])
