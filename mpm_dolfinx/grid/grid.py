@@ -40,7 +40,7 @@ TURN = 2 * np.pi
 CHUNK = 2**14
 """Number of rows of an array that are processed together.  It limits the size of temporary arrays."""
 SNAP = 1e-10
-"""Vertices nearer to a grid plane than this, in cell sizes, count as vertices on it; `Grid.snap` allows for rounding errors."""
+"""Vertices nearer to a grid plane than this, in cell sizes, lie on it; `Grid.snap` allows for rounding errors."""
 ORDER = "the order is Grid(lower, upper, cells)"
 MANY = "grid: h is undefined for unequal cells, must be replaced by sizes"
 
@@ -59,7 +59,7 @@ def _faces(dim: int) -> NDArray[np.int64]:
 FACES = {d: _faces(d) for d in (2, 3)}
 """Indices (2d, 2^(d-1)) of the corners of the faces of a box: of a cell, or of a particle domain."""
 FACE_SIGNS = (-1, 1, 1, -1, -1, 1)
-"""Orientation (6,) of faces with corners in the order of `FACES`: 1 outward, -1 inward.  In 2D only the first four entries apply."""
+"""Orientation (6,) of faces with corners in the order of `FACES`: 1 outward, -1 inward.  2D: the first four."""
 ABOUT_MIDDLE = ((0, 1, 4), (1, 3, 4), (3, 2, 4), (2, 0, 4))
 """Triangles of a face in 3D: two corners and the middle, without a preferred diagonal."""
 
@@ -526,9 +526,9 @@ class Grid:
         return self
 
     def better(self, x: NDArray[np.float64]) -> NDArray[np.int64] | None:
-        """Return boxes (ranks, 2, d) that distribute points at x (n, d), m, more evenly; None if the present ones do.
+        """Return boxes (ranks, 2, d) that distribute points at x (n, d), m, more evenly; None if the present boxes remain.
 
-        Points on all processes count.  The present boxes remain up to an imbalance of `UNEVEN`.
+        Points on all processes count.  The present boxes remain if their imbalance is at most `UNEVEN`.
         """
         number = self.number(self.index_from_base(x))
         counts = over_all(self.comm, np.bincount(self.owner(number), minlength=self.comm.size))
@@ -667,7 +667,7 @@ class Grid:
         return np.ravel_multi_index(tuple(index), tuple(self.shape + 1)) + copy * self.nodes
 
     def from_other(self, other: Grid, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return nodal values (unknowns,) from those on an equal grid with other owners; node i passes by rank i % P."""
+        """Return nodal values (unknowns,) from an equal grid with other owners; rank i % P of P passes on node i."""
         rows = nodal.reshape(-1, self.dim)
         some = rows.any(axis=1)
         old, new = other.node_numbers()[some], self.node_numbers()

@@ -134,7 +134,7 @@ class _Around:
     def _connected(self, same: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Return whether the fit uses each cell (m, cells), and whether open faces connect it to the probe's cell.
 
-        The fit uses cells with only the probe's soil; if there are none, cells with only its material, else all filled ones.
+        The fit uses cells with only the probe's soil; if there are none, cells with only its material, else all filled.
 
         same (m, cells, 3): whether a cell has only the probe's conductivity, conductivity law, and material.
         """

@@ -42,7 +42,7 @@ Wanner (1996), IV.8.
 RINGS = 5e-3
 """If a sudden pressure change exceeds this fraction of the largest change so far, two half steps replace the step.
 
-The stability function is never below -0.21, so an undetected jump overshoots by at most a thousandth of that.
+The stability function is never below -0.21, so an undetected jump overshoots by at most 0.1 % of the largest change.
 """
 AGAIN = 2.0
 """A pressure jumps if its rate is more than `AGAIN` times the rate in the first substep of the previous step."""
@@ -130,9 +130,9 @@ class StepSize:
     def grown(self, size: float, report: Report, control: StepControl, failed: bool) -> StepControl:
         """Return the step control with the next trial step after a completed step, s; failed: see `next`.
 
-        Equal steps grow at once after a reduction, until a newly grown step fails too. Then `waits`, the
-        number of steps before they grow again, becomes 1, 3, 7 and so on. It is halved when a newly grown step
-        converges. `kept` counts the steps since the last reduction or growth: 0 directly after growth.
+        Equal steps grow at once after a reduction, until a newly grown step fails too. Then `waits`, the number
+        of steps before they grow again, becomes 1, 3, 7 and so on. It is halved when a newly grown step converges.
+        `kept` counts the steps since the last reduction or growth: 0 directly after growth.
         """
         small, whole = self.next(size, report, control, failed), size > (1 - SAME) * control.small
         if self.by_error:

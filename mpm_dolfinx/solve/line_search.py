@@ -6,9 +6,9 @@ spurious stretch. The step is halved while a law cannot be evaluated at its end,
 
 In yielding soil the step is full if the residual forces at its end do less than half of their initial work along it, or
 if the residual falls and they do at most all of this work. Otherwise bracketed secants look for the step length at
-which the work is zero. They end at less than half of the initial work (Matthies and Strang 1979). At nearly zero work,
-soil that unloads is elastic in the next tangent. The work of the fluid's residual is added, because forces do nearly no
-work if only the fluid is out of balance. Shorter steps with smaller residuals would lead to more short steps.
+which the work is zero. They end at less than half of the initial work (Matthies and Strang 1979): nearer to zero, soil
+may unload, and is then elastic in the next tangent. The work of the fluid's residual is added, because forces do nearly
+no work if only the fluid is out of balance. Shorter steps with smaller residuals would lead to more short steps.
 Soil that has lost its strength needs several secants: with one secant, a slumping bank takes twice the Newton steps.
 
 Flowing soil has almost no stiffness along its mechanisms, and negative stiffness with non-associated flow: full steps

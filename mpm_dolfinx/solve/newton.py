@@ -214,7 +214,7 @@ class Newton:
             self._vectors.append((storage.forms.p.x, active.cells))
 
     def newton(self, as_reset: AsReset, key: Hashable, serves: bool, ahead: Callable | None) -> Errors:
-        """Solve both balances by Newton's method; converging tangents are kept, with linear laws over many steps.
+        """Solve the balances by Newton's method; a tangent is kept while it converges, for linear laws over many steps.
 
         serves: whether the tangent of the previous substep may be reused; ahead: see `solve_substep`.
         """
@@ -496,7 +496,7 @@ class Newton:
                 return errors
 
     def _tried(self, before: Errors | None) -> tuple[Errors | None, NotConverged | None]:
-        """Return errors after a trial step, and None; if a law fails, return infinite errors or None, and the exception."""
+        """Return errors after a trial step, and None; if a law fails, infinite errors or None, and the exception."""
         try:
             return self._errors(before and before.start), None
         except NotConverged as failed:

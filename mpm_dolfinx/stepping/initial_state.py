@@ -55,8 +55,8 @@ from mpm_dolfinx.stepping.step import set_up
 DEPTH, PATIENCE, LESS = 40, 16, 0.7
 """Anderson mixing of `DEPTH` iterations ends when `PATIENCE` successive residuals exceed `LESS` times the best one.
 
-Tests: a wet bank, elastic or frictional, and blocks on a rough base, one of them half supported. Depths of 40 and
-80 with patience 16 and 24 need equal numbers of iterations, and leave relative forces of 4e-5 to 3e-9; 40 and 8 6e-3.
+Tests: a wet bank, elastic or frictional, and blocks on a rough base, one of them half supported. Depth and patience
+of 40 and 16, or 80 and 24, take equally many iterations and leave relative forces of 4e-5 to 3e-9, but 40 and 8 6e-3.
 """
 REMARKABLE = 0.05
 """Largest change of stress by balancing without a warning, divided by the largest initial stress.

@@ -3,8 +3,8 @@
 
 Stress is positive in tension, pore pressure in compression, as in the rest of the package.  The dimensionless time is
 T = c_v t / length².  The series of exponentials converges slowly for small T.  Below `SWITCH` a closed inverse of the
-Laplace transform is used, in which 1 replaces tanh X and coth X, X = sqrt(s).  Errors of both forms
-are at most of the order of erfc(1/sqrt(`SWITCH`)) < 2e-23, so both are exact to round-off.
+Laplace transform is used, in which 1 replaces tanh X and coth X, X = sqrt(s).  Errors of both forms are
+at most of the order of erfc(1/sqrt(`SWITCH`)) < 2e-23, so both are exact to round-off.
 """
 
 from __future__ import annotations
