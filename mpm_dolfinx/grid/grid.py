@@ -526,7 +526,7 @@ class Grid:
         return self
 
     def better(self, x: NDArray[np.float64]) -> NDArray[np.int64] | None:
-        """Return boxes (ranks, 2, d) that distribute points at x (n, d), m, more evenly; None to keep the present boxes.
+        """Return boxes (ranks, 2, d) that distribute points at x (n, d), m, more evenly; None to keep the present ones.
 
         Points on all processes count.  The present boxes remain if their imbalance is at most `UNEVEN`.
         """
