@@ -384,7 +384,7 @@ def _without_rows(state: State) -> State:
 
 
 def _named(prefix: str, values: dict) -> dict[str, NDArray]:
-    """Return the arrays in nested dictionaries, with slashes in their names."""
+    """Return the arrays of nested dictionaries by name, with slashes between the keys."""
     out = {}
     for name, value in values.items():
         out |= _named(f"{prefix}{name}/", value) if isinstance(value, Mapping) else {prefix + name: value}

@@ -100,7 +100,7 @@ class StepSize:
         return left if not left > (1 - SAME) * small else small
 
     def refused(self, size: float, report: Report, control: StepControl) -> float:
-        """Return the factor by which a solved step must be reduced to meet the error tolerance; 1 if it is accepted.
+        """Return the factor, < 1, that reduces a solved step so that it meets the error tolerance; 1 if it is accepted.
 
         After a jump of the loads one step overshoots by up to a fifth of the remaining change; two half steps do not.
         """

@@ -286,7 +286,7 @@ class _Weakened:
             raise GaveUp(f"factor_of_safety: {what}: {error}", error.result, error.history) from error
 
     def _overload(self, before: MaterialPoints, now: MaterialPoints) -> float:
-        """Return a step's viscous work, divided by the integral of the norm of deviatoric stress times that of strain.
+        """Return a step's viscous work, divided by the integral of |deviatoric stress| |deviatoric strain increment|.
 
         Points that moved to another process are excluded.
         """

@@ -139,8 +139,8 @@ class Gathered:
     rank
         Process that holds the factors.
 
-    `setUp` gathers a matrix. The factors are computed on demand, or by `factorise`: after all matrices have been
-    gathered, each process then computes its own factors at the same time.
+    `setUp` gathers a matrix. The factors are computed on demand, or by the function `factorise`: it first
+    gathers all matrices, so that the processes compute their factors at the same time.
     """
 
     def __init__(self, x: PETSc.Vec, factors: NodalFactors | SingleFactors, rank: int):

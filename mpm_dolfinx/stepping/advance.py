@@ -377,9 +377,9 @@ class Motion:
     ) -> dict[str, NDArray[np.float64]]:
         """Return the volume defect of the points (n,) after a step, per reference volume, and the correction `due`.
 
-        The step adds to the defect the increase of the fluid content, due to volume and cell pressures, minus the net
-        inflow, divided by alpha.  Both are fluid masses divided by the density at zero pressure. Soil with a free
-        surface has no defect, because its content excludes drained water. Points in `keeps` (n,) have no correction.
+        The step adds (c - q) / alpha to the defect, with the increase c of the fluid content, due to volume and cell
+        pressures, and the net inflow q: fluid masses divided by the density at zero pressure. Soil with a free surface
+        has no defect, because its content excludes drained water. Points in `keeps` (n,) have no correction.
         """
         before = state.points
         cut = on_grid.cut

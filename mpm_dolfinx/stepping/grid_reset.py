@@ -128,7 +128,7 @@ class OnGrid(Keyed):
 
     @property
     def mixes(self) -> bool:
-        """Whether cells contain several soils with a pressure-dependent ratio of conductivities."""
+        """Whether any cell contains several soils with a pressure-dependent ratio of conductivities."""
         return self._mixed is not None and self._storage.fluxes.relative is not None
 
     @cached_property
