@@ -248,7 +248,7 @@ def _outcomes(arrays: dict[str, NDArray], count: int) -> list[dict[str, dict[str
 
 
 def _like(outcome: dict[str, dict[str, NDArray]], now: Outcome) -> dict[str, dict[str, NDArray]]:
-    """Return the stored results of the current conditions; a condition without stored results keeps its current ones.
+    """Return the stored results of the current conditions; conditions without stored results are unchanged.
 
     Raise ValueError if shapes differ, or if the motion of a tool is not finite.
     """

@@ -210,7 +210,7 @@ def _released(
 
 
 def _kept_at_rest(scene: Scene, state: State) -> State:
-    """Return the state on the grid of the next step, with the forces `State.held` that keep it at rest there.
+    """Return the state on the grid of the next step, with the forces `State.held` that keep its bodies at rest.
 
     Bodies are in equilibrium under the loads of the present stage.  A reset of the grid leaves a small imbalance.
     With contact there are no such forces, because contact removes penetrations that the last step has left.

@@ -67,7 +67,7 @@ def terzaghi_pressure(z: ArrayLike, t: ArrayLike, height: float, cv: float, p0: 
     height, cv : m and m²/s, > 0; length, and coefficient of consolidation kappa / (S + alpha²/(K + 4G/3))
     p0 : Pa; pressure at t = 0+
 
-    Returns (...), Pa. Source: Terzaghi (1923); both series in Verruijt, Theory and Problems of Poroelasticity.
+    Returns (...), Pa. Source: Terzaghi (1923); series for all T: Verruijt, Theory and Problems of Poroelasticity.
     """
     _positive(height=height, cv=cv, t=t)
     zeta, T = np.broadcast_arrays(_within("z", z, height) / height, cv * np.asarray(t, dtype=float) / height**2)
