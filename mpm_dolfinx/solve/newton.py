@@ -58,9 +58,9 @@ ERROR = 1 / 20
 """Assumed pressure error of a run, divided by e, the estimated error of a first-order step (`note_pressures`).
 
 For a mode with decay rate l, the stability function of sdirk2 gives an error of 0.081 dt |l| e in a step, at most 0.28
-e.  A pressure that follows a varying load has an error of at most 0.14 e.  With little decay in a step the errors of steps
-add up, to 0.081 e.  Measured against steps an eighth as long, errors are 0.05 to 0.08 e if loads rise or oscillate, or
-the pressure prescribed on a drained side oscillates.  They are 0.01 to 0.04 e with an oscillating source, 0.01 to 0.05 e
+e.  A pressure that follows a varying load has an error of at most 0.14 e.  With little decay the errors of steps add
+up, to 0.081 e.  Measured against steps an eighth as long, errors are 0.05 to 0.08 e if loads rise or oscillate, or the
+pressure prescribed on a drained side oscillates.  They are 0.01 to 0.04 e with an oscillating source, 0.01 to 0.05 e
 late in a consolidation, 0.17 e in a first step from zero load, 0.26 e after a jump, and in a run at most 5 e / 20.
 """
 SUDDEN = np.sqrt(2)
