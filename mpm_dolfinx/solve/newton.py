@@ -2,7 +2,7 @@
 """Equations of a substep: balance of momentum and storage of fluid, coupled by u and p.
 
 Unconnected parts of the bodies balance independently. The residuals of each part are divided by its forces and its
-exchanged fluid volume, and a line search sets its step length, whatever the state and stiffness of other parts.
+exchanged fluid volume. A line search sets its step length, whatever the state and stiffness of other parts.
 
 A Newton step of the two problems reads
 

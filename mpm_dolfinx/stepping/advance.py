@@ -377,8 +377,8 @@ class Motion:
     ) -> dict[str, NDArray[np.float64]]:
         """Return the volume defect of the points (n,) after a step, per reference volume, and the correction `due`.
 
-        The step adds (c - q) / alpha to the defect, with the increase c of the fluid content, due to volume and cell
-        pressures, and the net inflow q: fluid masses divided by the density at zero pressure. Soil with a free surface
+        The step adds (c - q) / alpha to the defect. The fluid content increases by c, due to volume and cell pressures;
+        q is the net inflow. Both are fluid masses divided by the density at zero pressure. Soil with a free surface
         has no defect, because its content excludes drained water. Points in `keeps` (n,) have no correction.
         """
         before = state.points

@@ -262,8 +262,8 @@ class OnGrid(Keyed):
         The mean of the pieces' mass potentials in a cell is the cell's potential. The mean is weighted by `store` (m,),
         m^d/Pa, the storage of the pieces; in cells without storage by volume. t: time, s, of pressures on open sides.
 
-        With `water`, the sum of pore water in a cell is conserved, and the reconstruction acts on differences from the
-        hydrostatic pressures `at_rest`, if there is gravity.
+        With `water`, the sum of pore water in a cell is conserved. With gravity the reconstruction then acts on
+        differences from the hydrostatic pressures `at_rest`.
         """
         pieces = self.data.pieces
         contents = self.contents

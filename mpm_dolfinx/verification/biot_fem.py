@@ -9,9 +9,9 @@ reference configuration of a box, from the state n at the start of a step:
                + int int kappa J F^-1 (F^-T grad pi - rho rho_w g) . grad q dV dt  =  0
 
 with tractions t (dead or pressures), the mass m of soil and fluid, kappa = k/(rho_w g), rho = exp((p + p_n)/(2 K_w)).
-`fluid_content` defines the content zeta and the mass potential pi.  In unsaturated soil, kappa is multiplied by k_r,
-and rho [zeta - zeta_n] becomes S rho [zeta - zeta_n] + (S - S_n) J_n n_n exp(p_n/K_w), with the saturation S(p) and the
-porosity n_n.  In saturated pores chi = S = k_r = 1.  If cells have constant pressures, the two-point flux is kappa J
+`fluid_content` defines the content zeta and the mass potential pi.  In unsaturated soil, kappa is multiplied by k_r.
+There rho [zeta - zeta_n] becomes S rho [zeta - zeta_n] + (S - S_n) J_n n_n exp(p_n/K_w), with saturation S(p), porosity
+n_n.  In saturated pores chi = S = k_r = 1.  If cells have constant pressures, the two-point flux is kappa J
 |F^-T N|^2 (p+ - p-)/h, with the distance h of the cells' centres, and with the mean of k_r between their pressures. It
 is not consistent under shear.  In axisymmetry F contains the circumferential stretch, and integrals extend over the
 full circumference.  Materials, retention, user-defined terms and time integration have the same code as in the material
