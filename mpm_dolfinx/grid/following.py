@@ -62,12 +62,12 @@ def carried(lines: Sequence[NDArray[np.float64]], shift: NDArray[np.float64]) ->
 
     The smallest cells move by whole cells, rounded towards zero.  A tool therefore crosses them like fixed cells.
     Between the smallest cells and a side, the edge of the k-th cell is multiplied by the k-th power of a common factor;
-    k = 1 next to the smallest cells.  Cells therefore still grow with this distance, but faster or slower.
+    k = 1 next to the smallest cells.  Cells still grow with the distance from these, but faster or slower.
 
     Raises
     ------
     ValueError
-        The smallest cells touch a side and move along its normal, or other cells would become smaller than these.
+        The smallest cells touch a side and move along its normal, or other cells would become smaller still.
     """
     out = []
     for letter, x, step in zip("xyz", lines, shift.tolist(), strict=False):
@@ -88,7 +88,7 @@ def carried(lines: Sequence[NDArray[np.float64]], shift: NDArray[np.float64]) ->
 
 
 def _filled(width: NDArray[np.float64], length: float, more: float, least: float, letter: str) -> NDArray[np.float64]:
-    """Return edge lengths (n,), m, between the smallest cells and a side, after this distance has grown by `more`, m.
+    """Return edge lengths (n,), m, between the smallest cells and a side, whose distance has grown by `more`, m.
 
     `width` are the edge lengths before, `length` the distance before, `least` the smallest edge length, m.
     """

@@ -4,7 +4,7 @@
 In grids of equal cells, points are located by arithmetic, in other grids by a search along each axis.  Methods such as
 `sizes` and `volumes` return cell sizes.  For equal cells they return a single row (`h`) or a single number.
 
-The mesh is created at its first use.  Before, a simulation distributes the cells by their numbers of points.
+The mesh is created at its first use.  Before that, a simulation distributes the cells by their numbers of points.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ TURN = 2 * np.pi
 CHUNK = 2**14
 """Number of rows of an array that are processed together.  It limits the size of temporary arrays."""
 SNAP = 1e-10
-"""Vertices nearer to a grid plane than this, in cell sizes, count as on it; `Grid.snap` allows for rounding errors."""
+"""Vertices nearer to a grid plane than this, in cell sizes, lie on it; `Grid.snap` allows for rounding errors."""
 ORDER = "the order is Grid(lower, upper, cells)"
 MANY = "grid: h is undefined for unequal cells, must be replaced by sizes"
 
@@ -59,7 +59,7 @@ def _faces(dim: int) -> NDArray[np.int64]:
 FACES = {d: _faces(d) for d in (2, 3)}
 """Indices (2d, 2^(d-1)) of the corners of the faces of a box: of a cell, or of a particle domain."""
 FACE_SIGNS = (-1, 1, 1, -1, -1, 1)
-"""Orientation (6,) of faces with corners in the order of `FACES`: 1 outward, -1 inward.  In 2D, the first four hold."""
+"""Orientation (6,) of faces with corners in the order of `FACES`: 1 outward, -1 inward.  2D: the first four."""
 ABOUT_MIDDLE = ((0, 1, 4), (1, 3, 4), (3, 2, 4), (2, 0, 4))
 """Triangles of a face in 3D: two corners and the middle, without a preferred diagonal."""
 
@@ -77,7 +77,7 @@ def in_chunks(count: int) -> list[slice]:
 
 
 def sum_by(index: NDArray, values: NDArray[np.float64], size: int) -> NDArray[np.float64]:
-    """Return the sums (..., size) of values (..., n) with equal index (n,), as floats also if there are no values."""
+    """Return the sums (..., size) of values (..., n) with equal index (n,), as floats even if there are no values."""
     shape = values.shape[:-1]
     if shape and len(index) > CHUNK:  # the index of all rows together would take as much memory as the values
         return np.array([sum_by(index, row, size) for row in values])
@@ -107,7 +107,7 @@ def polynomial(
 
 
 def ranges(first: NDArray[np.int64], count: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the integers in m ranges with these first integers and counts: indices (n,) of ranges, and values (n,)."""
+    """Return index of range (n,), and value (n,), of all integers in m ranges with these first integers and counts."""
     of = np.arange(len(count)).repeat(count)
     return of, np.arange(len(of)) + np.repeat(first - (np.cumsum(count) - count), count)
 
@@ -544,8 +544,8 @@ class Grid:
     def shared(self, load: NDArray[np.float64], keep: bool) -> Grid:
         """Return a grid with cells distributed by their loads: this grid, or an equal grid with another mesh.
 
-        load (cells,): load of each cell, such as its number of points, >= 0; keep: whether to keep an existing mesh for
-        any distribution, because other objects were created on this mesh.
+        load (cells,): load of each cell, such as its number of points, >= 0; keep: whether to return this grid
+        even if its mesh is distributed by other loads, because other objects were created on this mesh.
         """
         new = boxes(load.reshape(self.shape), self.comm.size)
         if self._cells is None:
@@ -555,9 +555,9 @@ class Grid:
         return self
 
     def better(self, x: NDArray[np.float64]) -> NDArray[np.int64] | None:
-        """Return boxes (ranks, 2, d) that distribute points at x (n, d), m, more evenly; None if the present ones do.
+        """Return boxes (ranks, 2, d) that distribute points at x (n, d), m, more evenly; None to keep the present ones.
 
-        Points on all processes count.  The present boxes remain up to an imbalance of `UNEVEN`.
+        Points on all processes count.  The present boxes remain if their imbalance is at most `UNEVEN`.
         """
         number = self.number(self.index_from_base(x))
         counts = over_all(self.comm, np.bincount(self.owner(number), minlength=self.comm.size))
@@ -699,7 +699,7 @@ class Grid:
         return np.ravel_multi_index(tuple(index), tuple(self.shape + 1)) + copy * self.nodes
 
     def from_other(self, other: Grid, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return nodal values (unknowns,) from those on an equal grid with other owners; node i by rank i % P."""
+        """Return nodal values (unknowns,) from an equal grid with other owners; rank i % P of P passes on node i."""
         rows = nodal.reshape(-1, self.dim)
         some = rows.any(axis=1)
         old, new = other.node_numbers()[some], self.node_numbers()

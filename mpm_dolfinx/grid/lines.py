@@ -60,8 +60,8 @@ def graded(
     lower, upper : (d,), m
         Lower and upper corner of the grid; d = 2 or 3.
     fine : (boxes, 2, d), m
-        Lower and upper corners of the fine boxes, at least one box, inside the grid.  Boxes within a cell of each
-        other, or of a side of the grid, are joined along this axis: cells between them would be too narrow.
+        Lower and upper corners of the fine boxes, at least one box, inside the grid.  Small cells also
+        fill gaps narrower than a cell, along an axis, between two boxes or a box and a side of the grid.
     size : number or (d,), m
         Largest edge lengths of the small cells, > 0.  Each box contains a whole number of cells.
     ratio

@@ -249,7 +249,7 @@ def _outcomes(arrays: dict[str, NDArray], count: int) -> list[dict[str, dict[str
 
 
 def _like(outcome: dict[str, dict[str, NDArray]], now: Outcome) -> dict[str, dict[str, NDArray]]:
-    """Return the stored results of the current conditions; a condition without stored results keeps its current ones.
+    """Return the stored results of the current conditions; conditions without stored results are unchanged.
 
     Raise ValueError if shapes differ, or if the motion of a tool is not finite.
     """
@@ -385,7 +385,7 @@ def _without_rows(state: State) -> State:
 
 
 def _named(prefix: str, values: dict) -> dict[str, NDArray]:
-    """Return the arrays in nested dictionaries, with slashes in their names."""
+    """Return the arrays of nested dictionaries by name, with slashes between the keys."""
     out = {}
     for name, value in values.items():
         out |= _named(f"{prefix}{name}/", value) if isinstance(value, Mapping) else {prefix + name: value}

@@ -493,8 +493,8 @@ def cut_faces(
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Cut faces of domains by the grid; return integration points, exact for products of Q1 functions.
 
-    A face across a grid line must load the nodes on both sides in proportion to its parts. With one point per face, the
-    error would move nodes of partly filled cells in every step without limit.
+    A face across a grid line must load the nodes on each side in proportion to its part there. With one point per face,
+    the error would move nodes of partly filled cells in every step without limit.
 
     corners (faces, 2^(d-1), d), m: corners of the faces; triangles repeat their last corner; local (faces, 2^(d-1), e):
     coordinates of the corners, to be interpolated.

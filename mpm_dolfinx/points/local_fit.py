@@ -27,7 +27,7 @@ RADIUS = 3.0
 Source: exact. A parabola needs three points: at an end of the data these are at offsets of 0.5, 1.5 and 2.5.
 """
 UNTOLD = (0.0, 1e-10, 1e-6)
-"""Weights of coefficients of degrees 0, 1, 2, divided by the sum of data weights; they set undetermined ones.
+"""Weights of the small terms for coefficients of degrees 0, 1 and 2, divided by the sum of the data weights.
 
 Weights 0.01 or 100 times as large change the pressures of a consolidating column by 1e-5 of the load.
 """

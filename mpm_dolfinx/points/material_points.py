@@ -26,7 +26,7 @@ ACROSS = "stretch across"
 def body_of(ids: NDArray[np.int64], starts: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the index (n,) of each point's body; starts (bodies + 1,): first id of each body, and of renewed points.
 
-    Ids of renewed points belong to the bodies in turn.
+    Successive ids of renewed points belong to the bodies in turn: the first body, the second, and so on cyclically.
     """
     beyond = ids - starts[-1]
     return np.where(beyond < 0, starts.searchsorted(ids, side="right") - 1, beyond % max(1, len(starts) - 1))

@@ -79,7 +79,8 @@ def largest_of_bodies(
 ) -> NDArray[np.float64]:
     """Return the largest values (k, bodies) in the connected parts of each body, over all processes; 0 without parts.
 
-    part (m,): index, from 0, of each column's part; inside (bodies, parts): which parts hold a body's points here.
+    part (m,): index, from 0, of the connected part of each column of `values` (k, m); inside (bodies, parts): whether a
+    part contains points of a body on this process.
     """
     largest = largest_of_parts(comm, part, values.T, inside.shape[1]).T[:, None]
     inside = over_all(comm, inside.astype(int), MPI.MAX) > 0

@@ -15,7 +15,7 @@ EDGES = 4
 "flow" in tests/plateaus.py by 1.6e-03 (relative), doubling it by 1.5e-03, and finer cells by 9.0e-02.
 """
 BENT = 1 - 3**0.5 / 2
-"""Largest deviation of a surface without a corner from its chord, in cell sizes; flat parts are divided evenly.
+"""Largest deviation of a surface without a corner from its chord, in cell sizes; flatter parts are divided evenly.
 
 Source: exact for a chord and a radius of one cell size; the grid cannot resolve a circle of smaller radius.
 """

@@ -97,7 +97,7 @@ class VanGenuchten(Retention):
         Exponent for the connectivity of the pores, a number.
     air_entry
         Suction below which all pores are saturated, Pa, >= 0 (Ippisch, Vogel and Bastian 2006).  If n < 2, zero air
-        entry gives the permeability an infinite slope at s = 0.  The weight of a few centimetres of water is usual.
+        entry gives the permeability an infinite slope at s = 0.  Usual: the pressure of a few centimetres of water.
     """
 
     n: float = 2.0

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Present centroids, displacements, pressures and stresses in the cells."""
+"""Fields in the cells at the present time: centroids, displacements, pressures and stresses."""
 
 from __future__ import annotations
 

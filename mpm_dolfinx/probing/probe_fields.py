@@ -134,7 +134,7 @@ class _Around:
     def _connected(self, same: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Return whether the fit uses each cell (m, cells), and whether open faces connect it to the probe's cell.
 
-        If no cell contains only the probe's soil, the fit uses cells with only its material; if there are none, all.
+        The fit uses cells with only the probe's soil; if there are none, cells with only its material, else all filled.
 
         same (m, cells, 3): whether a cell has only the probe's conductivity, conductivity law, and material.
         """

@@ -42,7 +42,7 @@ Wanner (1996), IV.8.
 RINGS = 5e-3
 """If a sudden pressure change exceeds this fraction of the largest change so far, two half steps replace the step.
 
-The stability function is never below -0.21, so an undetected jump overshoots by at most a thousandth.
+The stability function is never below -0.21, so an undetected jump overshoots by at most 0.1 % of the largest change.
 """
 AGAIN = 2.0
 """A pressure jumps if its rate is more than `AGAIN` times the rate in the first substep of the previous step."""
@@ -100,7 +100,7 @@ class StepSize:
         return left if not left > (1 - SAME) * small else small
 
     def refused(self, size: float, report: Report, control: StepControl) -> float:
-        """Return the factor by which a solved step must be reduced to meet the error tolerance; 1 if it is accepted.
+        """Return the factor, < 1, that reduces a solved step so that it meets the error tolerance; 1 if it is accepted.
 
         After a jump of the loads one step overshoots by up to a fifth of the remaining change; two half steps do not.
         """
@@ -130,9 +130,9 @@ class StepSize:
     def grown(self, size: float, report: Report, control: StepControl, failed: bool) -> StepControl:
         """Return the step control with the next trial step after a completed step, s; failed: see `next`.
 
-        Equal steps grow at once after a reduction, until a newly grown step fails too. Then they grow after one more
-        step, after three, seven and so on. When a newly grown step converges, this number is halved. `waits` is the
-        number of steps to wait. `kept` counts the steps since the last reduction or growth: 0 directly after growth.
+        Equal steps grow at once after a reduction, until a newly grown step fails too. Then `waits`, the number
+        of steps before they grow again, becomes 1, 3, 7 and so on. It is halved when a newly grown step converges.
+        `kept` counts the steps since the last reduction or growth: 0 directly after growth.
         """
         small, whole = self.next(size, report, control, failed), size > (1 - SAME) * control.small
         if self.by_error:
@@ -148,7 +148,7 @@ class StepSize:
 
         A step leaves at most a fifth of a jump. A change that is equally sudden in successive steps is therefore no
         jump. For example, an edge pushed into a body causes such changes, because the grid is reset in every step.
-        Nor are changes of a body that are rounding errors compared with the changes of other bodies.
+        Changes that are rounding errors, compared with the changes of other bodies, are no jumps either.
         """
         excess = report.sudden - AGAIN * size * np.asarray(control.first)
         return bool((excess > np.maximum(RINGS * np.asarray(control.change), NEAR * max(control.change))).any())
@@ -244,7 +244,7 @@ class Times:
         return [start + k * dt for k in range(done + 1, count)] + [self.end] * (count > done)
 
     def next(self, t: float) -> float:
-        """Return the latest time, s, that a run may reach between the output at time t, s, and the next."""
+        """Return the latest end, s, of steps towards the first output after time t, s: its time plus rounding."""
         return max([*self.after(t)[:1], t]) + SAME * self.interval
 
 

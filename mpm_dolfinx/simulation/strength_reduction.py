@@ -53,9 +53,9 @@ A trial that slides starts with an overload of 0.9 times the missing strength in
 By its end the overload has halved. With values of 1/8 and 1/2 the slope's factor changes by 1.1 and 0.5 %.
 """
 STRAINS = 4.0
-"""Strain in a trial of a marginal slide, divided by the trial's overload, or the elastic strain at yield if smaller.
+"""Strain in a trial of a marginal slide, divided by the smaller of its overload and the elastic strain at yield.
 
-Stresses of soil that begins to flow redistribute within strains of a few times that at yield.  In soft soil such large
+Stresses of soil that begins to flow redistribute within a few times the strain at yield.  In soft soil such large
 strains would change the shape of the body; a larger viscosity limits them.  If this number is halved or doubled, the
 factor of a slope changes by 0.5 %; with twice the number of steps, by less than 0.1 %.
 """
@@ -286,7 +286,7 @@ class _Weakened:
             raise GaveUp(f"factor_of_safety: {what}: {error}", error.result, error.history) from error
 
     def _overload(self, before: MaterialPoints, now: MaterialPoints) -> float:
-        """Return a step's viscous work, divided by the integral of the norm of deviatoric stress times that of strain.
+        """Return a step's viscous work, divided by the integral of |deviatoric stress| |deviatoric strain increment|.
 
         Points that moved to another process are excluded.
         """

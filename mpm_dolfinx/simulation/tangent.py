@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Tangent of both balances at the present state as sparse matrices, for modes and sensitivities."""
+"""Tangent of momentum and fluid at the present state as sparse matrices, for modes and sensitivities."""
 
 from __future__ import annotations
 

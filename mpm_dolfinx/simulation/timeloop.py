@@ -385,7 +385,7 @@ def _by_euler(simulation: Simulated, dt: float, failed: StepFailed) -> tuple[Sta
 
 
 def _has_left(failed: StepFailed, rule: StepSize, size: float, state: State) -> bool:
-    """Return whether points leave the grid in a step that is accurate: shorter steps cannot prevent this."""
+    """Return whether points leave the grid although the step is accurate, which shorter steps cannot prevent."""
     if not isinstance(failed, LeftGrid) or failed.report is None:
         return False
     return rule.refused(size, failed.report, measured(state.control, failed.report)) == 1

@@ -7,7 +7,7 @@ ordering, ms: blocks 110 and 60, scalar 430 and 150, MUMPS 260 and 155, UMFPACK 
 solve takes 4 ms (MUMPS 15, CHOLMOD 9). Copying the entries into blocks takes a tenth of the factorisation. On two
 processes MUMPS factorises in the same time, and solves in 25 ms. With few processes, one process therefore holds the
 factors of displacements, which many solves use. Another holds the factors of pressures, computed at the same time.
-When all of four processes shared both factorisations, the memory's bandwidth made them take 1.7 times as long.
+When each of four processes computed both itself, they took 1.7 times as long: processes share the memory's bandwidth.
 
 Large bodies need nested dissection. With 504000 unknowns in 2D, a repeated factorisation ordered by grid lines
 (`dissection`) takes 3.0 s, and the factors have 4.6e7 entries. With PETSc's nested dissection these values are 5.1 s
@@ -119,7 +119,7 @@ def _set_gathered(ksp: PETSc.KSP, A: PETSc.Mat, factors: NodalFactors | SingleFa
 
 
 def factorise(*preconditioners: PETSc.PC) -> None:
-    """Factorise all matrices at the same time if different processes hold their factors; else at the first solve."""
+    """Factorise all matrices at the same time if different processes hold their factors, else each when first used."""
     for pc in preconditioners:
         pc.setUp()
     for pc in preconditioners:
@@ -139,8 +139,8 @@ class Gathered:
     rank
         Process that holds the factors.
 
-    `setUp` gathers a matrix. The factors are computed on demand, or by `factorise`: after all matrices have been
-    gathered, each process then computes its own factors at the same time.
+    `setUp` gathers a matrix. The factors are computed on demand, or by the function `factorise`: it first
+    gathers all matrices, so that the processes compute their factors at the same time.
     """
 
     def __init__(self, x: PETSc.Vec, factors: NodalFactors | SingleFactors, rank: int):

@@ -6,9 +6,9 @@ spurious stretch. The step is halved while a law cannot be evaluated at its end,
 
 In yielding soil the step is full if the residual forces at its end do less than half of their initial work along it, or
 if the residual falls and they do at most all of this work. Otherwise bracketed secants look for the step length at
-which the work is zero. They end at less than half of the initial work (Matthies and Strang 1979). At nearly zero work,
-soil that unloads is elastic in the next tangent. The work of the fluid's residual is added, because forces do nearly no
-work if only the fluid is out of balance. Shorter steps with smaller residuals would lead to more short steps.
+which the work is zero. They end at less than half of the initial work (Matthies and Strang 1979): nearer to zero, soil
+may unload, and is then elastic in the next tangent. The work of the fluid's residual is added, because forces do nearly
+no work if only the fluid is out of balance. Shorter steps with smaller residuals would lead to more short steps.
 Soil that has lost its strength needs several secants: with one secant, a slumping bank takes twice the Newton steps.
 
 Flowing soil has almost no stiffness along its mechanisms, and negative stiffness with non-associated flow: full steps
@@ -33,7 +33,7 @@ import numpy as np
 EXPLODES, SHORTEST = 1e4, 1e-3
 """Largest growth of the residual in a step without yield, and smallest fraction of the full step.
 
-With 1e3 or 1e5 as largest growth, scenes take the same steps: it is below 1e3, or the residual is not finite.
+With 1e3 or 1e5 as largest growth, scenes take the same steps: the growth is below 1e3, or the residual is not finite.
 """
 WORK = 0.5
 """Largest ratio of the work at the end of a step to the work at its start (Matthies and Strang 1979)."""
@@ -75,7 +75,7 @@ class Search:
         """Return the next trial, or None if the search ends; work: last trial's work / initial work, or nan.
 
         growth: factor by which the residual grew. A full step that does not increase the residual ends the search if
-        |work| <= 1. A secant gives the next trial, or bisection if one of the bounds stays a second time.
+        |work| <= 1. A secant gives the next trial, or bisection if the same bound stays twice.
         """
         if not np.isfinite(work):
             end = self.step < 2 * SHORTEST

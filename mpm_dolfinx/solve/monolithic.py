@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Solver for both balances together, where a direct solver is too expensive: large bodies in 3D, larger ones in 2D.
+"""Solver for both balances together, where a direct solver is too expensive: large bodies, in 2D still larger ones.
 
     [ K  -B^T ] [du]   [R_u]
     [ B   C   ] [dp] = [R_p]
@@ -19,14 +19,13 @@ At nu = 0.499 the cycle is inaccurate, and GMRES takes more than 100 iterations 
 many iterations (see `plan`), or is predicted to, factors of K replace the cycle.  They are kept until a solve with them
 takes too many iterations.  With factors of an earlier tangent a solve takes about 10 iterations, with new factors 4 to
 6.  A step takes 6.2 s with kept factors, 8.5 s with new factors for each tangent.  Four steps of yielding soil with
-12^3 cells take 33 s and 41 s.  MUMPS factorises 3190 unknowns in 0.2 s, 8610 in 1.4 s (PETSc in 3.4 s).  Solves then
-take up to 19 iterations (22 at nu = 0.49 with contrasts of 1e3).
+12^3 cells take 33 s and 41 s.  MUMPS factorises 3190 unknowns in 0.2 s, 8610 in 1.4 s (PETSc in 3.4 s).  With factors,
+solves take up to 19 iterations (22 at nu = 0.49 with contrasts of 1e3).
 
-In 2D yielding soil would take 20 to 500 iterations (a footing on 41 cells, with any smoother). Shear bands are one cell
-wide, and coarse grids cannot represent them. With a viscosity of 0.05 GMRES takes 28 iterations, and 0.9 times as long
-as a direct solver on 41 cells, but 1.7 times on 81. If the volumetric stiffness of K is moved to the storage (p -> p +
-k B u), K is as well conditioned as at nu = 0.3, but GMRES takes 500 iterations: alternating pressures have almost no
-stiffness.
+In 2D yielding soil would take 20 to 500 iterations (footing, 41 cells, any smoother). Shear bands are one cell wide;
+coarse grids cannot represent them. With a viscosity of 0.05 GMRES takes 28 iterations, and 0.9 times as long as a
+direct solver on 41 cells, but 1.7 times as long on 81. If the volumetric stiffness of K is moved to the storage (p -> p
++ k B u), K is conditioned as at nu = 0.3, but GMRES takes 500 iterations: alternating pressures are almost not stiff.
 """
 
 from __future__ import annotations
@@ -48,7 +47,7 @@ from mpm_dolfinx.solve.solver_choice import SolverPlan
 LEAST = 1e-4
 """Smallest scale of the fluid residual, divided by the volume that the residual forces displace in a drained body.
 
-Sealed bodies exchange nearly no fluid. With a ratio of 5e5 between both scales, rounding left 2e-5 of a residual.
+Sealed bodies exchange nearly no fluid. With a ratio of 5e5 between the two scales, rounding left 2e-5 of a residual.
 """
 
 IDLE = object()

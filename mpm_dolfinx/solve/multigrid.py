@@ -35,8 +35,8 @@ OPTIONS = {
 FIRMLY = {"mg_levels_ksp_type": "chebyshev", "mg_levels_ksp_max_it": "3"}
 """Smoother for nearly incompressible bodies where a direct solver cannot replace multigrid.
 
-Test: cube of 14^3 cells, layers with stiffnesses 1 : 1000, nu = 0.49. Without a direct solver GMRES takes 126
-iterations, 112 with GAMG; with one sweep of smoothing it fails. With a direct solver both smoothers are equally fast.
+Test: cube of 14^3 cells, layers with stiffnesses 1 : 1000, nu = 0.49. GMRES takes 126 iterations, 112 with GAMG; with
+the smoother of `OPTIONS` it fails. If a direct solver then replaces multigrid, the two smoothers are equally fast.
 """
 MAYBE, NOT, IS = range(3)  # see `_shared`
 NONE = np.iinfo(np.int64).max

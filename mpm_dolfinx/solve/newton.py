@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Equations of a substep: balance of momentum and storage of fluid, coupled by u and p.
 
-Unconnected parts of the bodies balance independently. Each part has its own forces, fluid and lengths of Newton steps,
-which do not depend on the state and the stiffness of other parts.
+Unconnected parts of the bodies balance independently. The residuals of each part are divided by its forces and its
+exchanged fluid volume. A line search sets its step length, whatever the state and stiffness of other parts.
 
 A Newton step of the two problems reads
 
@@ -58,7 +58,7 @@ ERROR = 1 / 20
 """Assumed pressure error of a run, divided by e, the estimated error of a first-order step (`note_pressures`).
 
 For a mode with decay rate l, the stability function of sdirk2 gives an error of 0.081 dt |l| e in a step, at most 0.28
-e.  A pressure that follows a varying load has an error of at most 0.14 e.  With little decay in a step such errors add
+e.  A pressure that follows a varying load has an error of at most 0.14 e.  With little decay the errors of steps add
 up, to 0.081 e.  Measured against steps an eighth as long, errors are 0.05 to 0.08 e if loads rise or oscillate, or the
 pressure prescribed on a drained side oscillates.  They are 0.01 to 0.04 e with an oscillating source, 0.01 to 0.05 e
 late in a consolidation, 0.17 e in a first step from zero load, 0.26 e after a jump, and in a run at most 5 e / 20.
@@ -67,8 +67,8 @@ SUDDEN = np.sqrt(2)
 """If a pressure changes in the second substep by less than this multiple of its change in the first, sdirk2 overshoots.
 
 With z = -(decay rate) dt, the stability function (1 + (1 - 2 gamma) z) / (1 - gamma z)^2 changes its sign at z = -1 -
-sqrt(2). The changes there are -gamma z / (1 - gamma z) = sqrt(2) - 1 and 2 - sqrt(2). The ratio is (1 - gamma) / gamma
-if pressures follow loads.  Source: exact, the ratio of these changes.
+sqrt(2). At this z the two substeps change a pressure by -gamma z / (1 - gamma z) = sqrt(2) - 1 and 2 - sqrt(2). If
+pressures follow loads, the ratio is (1 - gamma) / gamma.  Source: exact, the ratio of these changes.
 """
 
 
@@ -168,7 +168,7 @@ def note_pressures(
     fixed-stress operator converts it into a pressure that is bounded for stiff modes, as in Hosea and Shampine (1996).
     Cells are weighted by their filling. The error of the step is assumed to be `ERROR` times this pressure.
 
-    seconds: factor, s, of the rates of the first substep; dt: length of the step, s; of_bodies: `Motion.of_bodies`, a
+    seconds: time weight, s, of the first substep's rates; dt: length of the step, s; of_bodies: `Motion.of_bodies`, a
     function of active owned cells (n,) and values (k, n) that returns the largest values (k, bodies) in each body.
     """
     if storage is None or not report.newton:
@@ -214,7 +214,7 @@ class Newton:
             self._vectors.append((storage.forms.p.x, active.cells))
 
     def newton(self, as_reset: AsReset, key: Hashable, serves: bool, ahead: Callable | None) -> Errors:
-        """Solve both balances by Newton's method; a tangent is kept while it converges, in linear laws many steps.
+        """Solve the balances by Newton's method; a tangent is kept while it converges, for linear laws over many steps.
 
         serves: whether the tangent of the previous substep may be reused; ahead: see `solve_substep`.
         """
@@ -277,7 +277,7 @@ class Newton:
     def _begin(self, ahead: Callable | None) -> tuple[Errors, list[NDArray[np.float64]] | None]:
         """Return the errors at the chosen start, and the present (u, p) if another start was chosen, else None.
 
-        `ahead` is chosen if the square of its residual is small; else the guess of least residual, in each part.
+        `ahead` is chosen if the square of its residual is small; else each part starts at its guess of least residual.
         """
         start = self._iterate()
         if ahead is not None:
@@ -331,9 +331,9 @@ class Newton:
     def _stable(self, found: Errors) -> Errors:
         """Return the errors; raise NotConverged at an unstable equilibrium: smaller steps find the path that leaves it.
 
-        The tangent of an unstable equilibrium has negative eigenvalues. Only dry bodies are checked, because water
-        delays buckling. A tangent that is kept for the whole step shows an instability only in the next step. Where
-        only soft springs resist a motion, an equilibrium within tolerance may seem unstable, so it is corrected once.
+        The tangent of an unstable equilibrium has negative eigenvalues. Only dry bodies with symmetric,
+        factorised tangents are checked: water delays buckling. A tangent kept for a step shows an instability only in
+        the next. If only soft springs resist a motion, a solution may seem unstable, and is therefore corrected once.
         """
         plan = self._solvers.plan
         if not self.report.newton or self._storage is not None or not plan.symmetric or plan.iterative:
@@ -397,8 +397,8 @@ class Newton:
         start (parts,): forces at the start of the step, N. Forces at other iterates are not part of the scale: after a
         diverging iterate every residual would seem small.
 
-        Residuals within round-off are returned as 0.  The history has their norms, with scales of at least the
-        round-off divided by the tolerance.
+        Residuals within round-off are returned as 0.  In the history their norms are divided by scales of at
+        least the round-off divided by the tolerance.
         """
         first = not self.report.history
         with _compat.Timer("residual"):
@@ -496,7 +496,7 @@ class Newton:
                 return errors
 
     def _tried(self, before: Errors | None) -> tuple[Errors | None, NotConverged | None]:
-        """Return the errors after a trial step and None; if a law fails, infinite errors or None, and the exception."""
+        """Return errors after a trial step, and None; if a law fails, infinite errors or None, and the exception."""
         try:
             return self._errors(before and before.start), None
         except NotConverged as failed:

@@ -31,7 +31,7 @@ class Numerics:
         Time integration: "sdirk2" (second order) or "backward-euler".
     renewal
         Whether to replace particle domains of yielded soil that are longer than a cell, see `stepping/renewal.py`. It
-        requires quadrature "domain", yielding soil, dry or saturated, in 2D, no `Contact`, in axisymmetry no inertia.
+        requires quadrature "domain", yielding dry or saturated soil in 2D, no `Contact`, and in axisymmetry no inertia.
     keep_volumes
         Whether yielded domains keep the volumes of their points, see `domains/kept_volumes.py`; only with "domain".
     petsc_options

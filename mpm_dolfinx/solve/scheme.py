@@ -67,5 +67,5 @@ class Scheme:
 
     @property
     def beta(self) -> float:
-        """Factor of beta, see `COUPLINGS`; 1 for beta = 1/K_w."""
+        """Factor f in the fixed-stress coefficient beta, see `COUPLINGS`; 1 in the scheme with beta = 1/K_w."""
         return COUPLINGS[self.coupling] or 1.0

@@ -31,8 +31,8 @@ class Thresholds:
         and a solve take, with 196000 unknowns: PETSc 2.6 and 0.02 s, MUMPS with OpenBLAS 0.7 and 0.09 s; with 51000
         unknowns: PETSc 0.25 and 0.004 s, MUMPS 0.12 and 0.02 s. A Newton step takes five to ten solves.
     gathering
-        Largest number of processes for which a single process holds the factors that many solves use. When all of four
-        processes shared the factorisations, the memory's bandwidth made these take 1.7 times as long.
+        Largest number of processes for which a single process holds the factors that many solves use. When each of
+        four processes computed all factors itself, this took 1.7 times as long: they share the memory's bandwidth.
     fallback_3d
         Largest number of unknown displacements in 3D for which a direct solver may replace multigrid. MUMPS takes 8 s
         and 0.2 GB for this number, with unsymmetric K 15 s and 0.4 GB.

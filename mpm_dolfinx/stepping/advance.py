@@ -52,9 +52,9 @@ TAKES_IN = 0.1
 
 The mean defect of an undrained part without sources is corrected at once, so that such a part keeps its volume. With
 rates of 0, 0.1, 0.2 and 0.4, twenty undrained cycles of a beam of 5 cells leave spurious stresses of 7.7, 3.8, 3.7 and
-3.6 %. From 0.2 on, pressures of a manufactured solution converge with an order below 1.75. The correction follows the
-motion, not the number of steps, so the order in time is unaffected. The mean defect of drained parts is not corrected:
-with a correction, a column under varying gravity has order 1.2 in the step.
+3.6 %. At 0.2 and above, pressures of a manufactured solution converge with an order below 1.75. The correction follows
+the motion, not the number of steps, so the order in time is unaffected. The mean defect of drained parts is not
+corrected: with a correction, a column under varying gravity has order 1.2 in the step.
 
 Halving this value changes the result of scene "beam" in tests/plateaus.py by 1.7e-03 (relative), doubling it by
 2.8e-03, and finer cells by 1.5e-02.
@@ -307,7 +307,7 @@ class Motion:
         Also return whether each point (n,) keeps its pieces, see `OnGrid.valid`, and the number of inverted domains.
 
         If Q1 cells would lock, F is scaled so that det F equals that of `deformed`. In yielded soil F is `deformed`:
-        the deformation there is permanent, and domains in kinks would give wrong values.
+        kinks of its motion are permanent, and the corners of domains in kinks would give a wrong F.
         """
         cut, stage = on_grid.cut, state.stage
         grid, folded = cut.grid, 0
@@ -378,9 +378,9 @@ class Motion:
     ) -> dict[str, NDArray[np.float64]]:
         """Return the volume defect of the points (n,) after a step, per reference volume, and the correction `due`.
 
-        The step adds to the defect the increase of the fluid content, due to volume and cell pressures, minus the net
-        inflow, divided by alpha.  Both are fluid masses divided by the density at zero pressure. Soil with a free
-        surface has no defect, because its content excludes drained water. Points in `keeps` (n,) have no correction.
+        The step adds (c - q) / alpha to the defect. The fluid content increases by c, due to volume and cell pressures;
+        q is the net inflow. Both are fluid masses divided by the density at zero pressure. Soil with a free surface
+        has no defect, because its content excludes drained water. Points in `keeps` (n,) have no correction.
         """
         before = state.points
         cut = on_grid.cut

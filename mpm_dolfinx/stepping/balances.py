@@ -136,7 +136,7 @@ def flight_of(start: Start) -> Flight | None:
 
 
 def leads(scene: Scene, loads: Sequence[Loads]) -> bool:
-    """Return whether Newton's method may start from extrapolated motion: if soil yields, or in quasi-static contact."""
+    """Return whether Newton's method may start from extrapolated motion: if laws yield, or in quasi-static contact."""
     momentum = scene.momentum
     return not momentum.elastic or (momentum.inertia is None and any([one.touches for one in loads]))
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""New distribution of the cells among processes at a reset of the grid, after bodies have moved, come or gone.
+"""New distribution of the cells among processes at a reset of the grid, after bodies have moved, arrived or left.
 
-The scene is compiled again on a grid with other owners; its forms need no new compilation.  The state is transferred as
+The scene is created again on a grid with other owners; its forms are not compiled again.  The state is transferred as
 by a checkpoint: points and pieces move to the owners of their cells, nodal data to the nodes of each process, and the
 conditions of the stage find their faces again.
 """

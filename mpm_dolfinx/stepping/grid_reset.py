@@ -128,7 +128,7 @@ class OnGrid(Keyed):
 
     @property
     def mixes(self) -> bool:
-        """Whether cells contain several soils with a pressure-dependent ratio of conductivities."""
+        """Whether any cell contains several soils with a pressure-dependent ratio of conductivities."""
         return self._mixed is not None and self._storage.fluxes.relative is not None
 
     @cached_property
@@ -262,8 +262,8 @@ class OnGrid(Keyed):
         The mean of the pieces' mass potentials in a cell is the cell's potential. The mean is weighted by `store` (m,),
         m^d/Pa, the storage of the pieces; in cells without storage by volume. t: time, s, of pressures on open sides.
 
-        With `water`, the sum of pore water in a cell is conserved. Then the reconstruction acts on differences from the
-        hydrostatic pressures `at_rest`, if there is gravity.
+        With `water`, the sum of pore water in a cell is conserved. With gravity the reconstruction then acts on
+        differences from the hydrostatic pressures `at_rest`.
         """
         pieces = self.data.pieces
         contents = self.contents

@@ -55,8 +55,8 @@ from mpm_dolfinx.stepping.step import set_up
 DEPTH, PATIENCE, LESS = 40, 16, 0.7
 """Anderson mixing of `DEPTH` iterations ends when `PATIENCE` successive residuals exceed `LESS` times the best one.
 
-Tests: a wet bank, elastic or frictional, and blocks on a rough base, one of them half supported. With 40 and 16, or 80
-and 24, iterations are equally many and leave relative forces of 4e-5 to 3e-9; with 40 and 8 they leave up to 6e-3.
+Tests: a wet bank, elastic or frictional, and blocks on a rough base, one of them half supported. Depth and patience
+of 40 and 16, or 80 and 24, take equally many iterations and leave relative forces of 4e-5 to 3e-9, but 40 and 8 6e-3.
 """
 REMARKABLE = 0.05
 """Largest change of stress by balancing without a warning, divided by the largest initial stress.
@@ -210,7 +210,7 @@ def _released(
 
 
 def _kept_at_rest(scene: Scene, state: State) -> State:
-    """Return the state on the grid of the next step, with the forces `State.held` that keep it at rest there.
+    """Return the state on the grid of the next step, with the forces `State.held` that keep its bodies at rest.
 
     Bodies are in equilibrium under the loads of the present stage.  A reset of the grid leaves a small imbalance.
     With contact there are no such forces, because contact removes penetrations that the last step has left.
@@ -382,8 +382,8 @@ def balanced(scene: Scene, state: State) -> State:
     For points with the strain of a displacement w, a step of the momentum balance gives a further displacement u(w).
     Points store only mean strains of their domains, so w + u(w) is not in equilibrium yet. The fixed-point iteration w
     <- w + u(w) follows, with Anderson mixing (Walker and Ni 2011). Mean strains cannot balance all nodes; nodal forces
-    `State.held` balance the remainder. Support forces are evaluated at the displacement w, `State.rest`, so sides keep
-    their seeded positions for any prescribed displacement at the start.
+    `State.held` balance the remainder. Support forces are evaluated at the displacement w, `State.rest`: sides then
+    stay where they were seeded, whatever displacement is prescribed at the start.
 
     Raises
     ------
@@ -440,7 +440,7 @@ def balanced(scene: Scene, state: State) -> State:
 def _report(scene: Scene, seeded: State, points: MaterialPoints, count: int, left: float, touches: bool) -> None:
     """Log the changes by balancing; raise ValueError for a large relative residual.
 
-    With contact (touches), which is detected only in the first step, a large residual causes a warning only.
+    touches: whether contact may act. It is detected only in the first step, so a large residual causes only a warning.
     """
     materials, comm = scene.materials, scene.grid.comm
     if left > REMARKABLE and not touches:
@@ -457,7 +457,7 @@ def _report(scene: Scene, seeded: State, points: MaterialPoints, count: int, lef
 
 
 def _rest(scene: Scene, cells: NDArray[np.int32], w: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return w, a local array of nodal displacements, m, with zeros outside these cells, which have supported sides."""
+    """Return w, a local array of nodal displacements, m, with zeros outside `cells`, the cells at supported sides."""
     return np.where(np.repeat(scene.momentum.active_nodes(cells), scene.grid.dim), w, 0.0)
 
 

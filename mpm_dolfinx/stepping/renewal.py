@@ -11,10 +11,10 @@ are filled anew:
 
 Remainders of old domains outside these cells become domains. Masses, volumes and the mass of the fluid are exact in
 each cell, as are mass-weighted sums of other point data, such as the logarithm of the elastic left Cauchy-Green tensor.
-These data are means over the overlap of old and new domains, shifted to the new centroids by fitted slopes, within the
+The other data are means over overlaps of old and new domains, shifted to the new centroids by fitted slopes, within the
 range of the old values. With inertia, the centre of mass, the momentum and the angular momentum of each cell are exact
-too. Cells with elastic soil, several bodies, several surface crossings, or domains on a side whose displacement a
-condition needs are unchanged.
+too. Cells are unchanged if they contain elastic soil, several bodies, several crossings of the surface, or domains
+on a side whose displacement a condition needs.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ class Renewal:
         return known & (self._materials.evolved(points) | (points.id >= self._starts[-1]))
 
     def _free(self, state: State) -> NDArray[np.bool_]:
-        """Return a mask (n,) of `flowed` points without probes, kept pieces, or faces whose displacement is needed."""
+        """Return a mask (n,) of `flowed` points without probes, kept pieces, or faces that conditions need."""
         free, stage = self.flowed(state.points), state.stage
         needed = [*(faces for _, faces, _ in stage.held), *(faces for one in stage.acting for faces in one.seeded)]
         if needed:
@@ -243,7 +243,7 @@ class Renewal:
         ratio = volume / volume0
 
         def kept(values: NDArray) -> NDArray:
-            """Return means with an exact mass-weighted sum: corrections stay within the values' range."""
+            """Return means, corrected within the range of the values so that their mass-weighted sum is exact."""
             means = mean(values).reshape(n, -1)
             for column, of in zip(means.T, values.reshape(len(values), means.shape[1]).T, strict=True):
                 missing = sum_by(groups, part * (mass * of)[source], count) - sum_by(group, volume0 * column, count)

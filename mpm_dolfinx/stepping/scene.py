@@ -207,7 +207,7 @@ class Scene:
     def rests_at(self, stage: Stage, t: float) -> None:
         """Set the fluid's unit weight, from which `Retentions` computes the pressure variation in unsaturated cells.
 
-        t, s: start of a step, the time of the gravity of `stage`.  If gravity varies, each step resets the grid.
+        t: time of the gravity of `stage`, s: the start of a step.  If gravity varies, each step resets the grid.
         """
         if self.materials.retentions is not None:
             gravity = stage.gravity_at(t) if self.materials.conducts else None

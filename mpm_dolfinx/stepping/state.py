@@ -72,7 +72,7 @@ class Stay:
     points
         The material points at the reset of the grid.
     keeps : (n,)
-        Whether each point keeps its pieces, because its connected part hardly moves; None if all points do.
+        Whether each point keeps its pieces, because its connected part hardly moves; None if all keep them.
     """
 
     points: MaterialPoints
@@ -161,7 +161,7 @@ class State:
         Motion in the last steps, an initial guess in elastic bodies; None in other scenes, and after bodies were added.
     held : (unknowns,), N
         Nodal forces on this process, with ghosts, that balance an initial stress where loads do not, or a body at rest
-        when inertia begins. None without such forces, after other new stages, and after a reset of the grid.
+        when inertia begins. None without such forces, in other stages, and after a reset of the grid.
     rest : (unknowns,), m
         Nodal displacement on this process, with ghosts, for which prescribed displacements and plates balance an
         initial stress. None after a stage that changes these conditions, and after a reset of the grid.

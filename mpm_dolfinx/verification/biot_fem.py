@@ -9,13 +9,13 @@ reference configuration of a box, from the state n at the start of a step:
                + int int kappa J F^-1 (F^-T grad pi - rho rho_w g) . grad q dV dt  =  0
 
 with tractions t (dead or pressures), the mass m of soil and fluid, kappa = k/(rho_w g), rho = exp((p + p_n)/(2 K_w)).
-`fluid_content` defines the content zeta and the mass potential pi.  Unsaturated soil has kappa k_r in place of kappa.
-Its content changes by S(p) times the change in saturated soil, plus the change of S, see `retention`.  Saturated pores
-have chi = S = k_r = 1.  If pressures are constant in the cells, the two-point flux is kappa J |F^-T N|^2 (p+ - p-)/h,
-with the distance h of the cells' centres, and with the mean of k_r between the pressures of both cells.  This flux is
-not consistent under shear.  In axisymmetry F contains the circumferential stretch, and integrals extend over the full
-circumference.  Materials, retention, user-defined terms and time integration have the same code as in the material
-point method.  The two methods differ only in discretisation.
+`fluid_content` defines the content zeta and the mass potential pi.  In unsaturated soil, kappa is multiplied by k_r.
+There rho [zeta - zeta_n] becomes S rho [zeta - zeta_n] + (S - S_n) J_n n_n exp(p_n/K_w), with saturation S(p), porosity
+n_n.  In saturated pores chi = S = k_r = 1.  If cells have constant pressures, the two-point flux is kappa J
+|F^-T N|^2 (p+ - p-)/h, with the distance h of the cells' centres, and with the mean of k_r between their pressures. It
+is not consistent under shear.  In axisymmetry F contains the circumferential stretch, and integrals extend over the
+full circumference.  Materials, retention, user-defined terms and time integration have the same code as in the material
+point method: the two methods differ only in discretisation.
 """
 
 from __future__ import annotations
@@ -106,7 +106,7 @@ class BiotFEM:
     cells : (d,)
         Number of cells along each axis, at least 1.
     material, fluid
-        Skeleton without state, and pore fluid.  Time steps may not converge for steep retention (n > 2.5, air entry).
+        Skeleton without state, and pore fluid.  Steps may not converge for steep retention (n > 2.5, or an air entry).
     walls
         Sides of the box, each with the displacement components that are zero there, such as {"left": "xy"}.
     conditions
@@ -357,7 +357,7 @@ class BiotFEM:
         return block(F) if self.grid.axisymmetric else F
 
     def _in_plane(self, T):
-        """Return the components of a tensor in the axes of the grid."""
+        """Return a tensor without its circumferential components: (2, 2) in axisymmetry, otherwise unchanged."""
         return ufl.as_matrix([[T[i, j] for j in (0, 1)] for i in (0, 1)]) if self.grid.axisymmetric else T
 
     def _begin(self, pressure: float | Callable, x: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -126,7 +126,7 @@ def cavity(
 
 
 def undrained(material: Skeleton, outer: float, radii: Sequence[float], rings: int = 2000) -> tuple[float, float]:
-    """Return the total radial stress at the outer radius minus that at the wall, and the effective one there, Pa.
+    """Return the total radial stress at the outer radius minus that at the wall, and the effective one at the wall, Pa.
 
     The radius of each element follows from constant volume, r^2 - a^2 = R^2 - 1.  radii: successive radii a of the
     cavity, in small steps.

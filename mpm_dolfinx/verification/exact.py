@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Exact solutions for comparison: consolidation, columns, beams and rods.  No dolfinx.
+"""Exact solutions for comparison: consolidation, columns, beams and rods.  The module needs no dolfinx.
 
 Stress is positive in tension, pore pressure in compression, as in the rest of the package.  The dimensionless time is
 T = c_v t / length².  The series of exponentials converges slowly for small T.  Below `SWITCH` a closed inverse of the
-Laplace transform is used, in which 1 replaces tanh X and coth X, X = sqrt(s).  Errors of both forms are of the order
-of erfc(1/sqrt(T)) < 2e-23 or less, so both are exact to round-off.
+Laplace transform is used, in which 1 replaces tanh X and coth X, X = sqrt(s).  Errors of both forms are
+at most of the order of erfc(1/sqrt(`SWITCH`)) < 2e-23, so both are exact to round-off.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ def terzaghi_pressure(z: ArrayLike, t: ArrayLike, height: float, cv: float, p0: 
     height, cv : m and m²/s, > 0; length, and coefficient of consolidation kappa / (S + alpha²/(K + 4G/3))
     p0 : Pa; pressure at t = 0+
 
-    Returns (...), Pa. Source: Terzaghi (1923); both series in Verruijt, Theory and Problems of Poroelasticity.
+    Returns (...), Pa. Source: Terzaghi (1923); series for all T: Verruijt, Theory and Problems of Poroelasticity.
     """
     _positive(height=height, cv=cv, t=t)
     zeta, T = np.broadcast_arrays(_within("z", z, height) / height, cv * np.asarray(t, dtype=float) / height**2)
