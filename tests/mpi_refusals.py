@@ -40,6 +40,15 @@ for words, simulation in CASES.items():
     assert words in message and len(set(said)) == 1, said
 
 
+try:
+    soil = mpm.Hencky(bulk=lambda X: 1e6 + 1e6 * (X[:, 1] - X[:, 1].mean()), shear=6e5)
+    mpm.Simulation(grid, [body], [soil], walls={"left": "xy"})
+    message = "accepted"
+except ValueError as error:
+    message = str(error)
+assert message.startswith("Hencky: bulk: values at positions depend on the other positions"), message
+
+
 def seen(simulation):
     if grid.comm.rank == grid.comm.size - 1:
         raise OSError("the disk is full")

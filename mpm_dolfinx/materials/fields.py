@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.errors import NotConverged
-from mpm_dolfinx.base.tolerances import TINY
+from mpm_dolfinx.base.tolerances import SAME, TINY
 from mpm_dolfinx.base.validation import line, numbers
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.forms.point_forms import FormPoints, PointData
@@ -597,12 +597,28 @@ def _evaluated(grid: Grid, m: Skeleton, X: NDArray[np.float64], ids: NDArray[np.
     X (n, d), m, and ids (n,): reference positions and ids of the points of this process.
     """
     names = _by_place(m)
-    out = everywhere(grid.comm, lambda: m.at(X) if len(X) or not names else m)
+
+    def at_points() -> Skeleton:
+        made = m.at(X) if len(X) or not names else m
+        if grid.comm.size > 1 and len(X) and names:
+            _check_local(made, m.at(X[::2]), names)
+        return made
+
+    out = everywhere(grid.comm, at_points)
     row = [(int(ids[0]), {name: getattr(out, name)[:1] for name in names})] if len(X) else []
     found = over_all(grid.comm, row) if names else []
     values = min(found, key=itemgetter(0))[1] if found else {}
     out = out if len(X) else replace(out, **values)
     return out, _expanded(out, values, 1)
+
+
+def _check_local(all_points: Skeleton, half: Skeleton, names: Sequence[str]) -> None:
+    """Raise ValueError if fields at every other point differ without the points between them."""
+    for name in names:
+        value, alone = getattr(all_points, name)[::2], getattr(half, name)
+        if np.abs(value - alone).max() > SAME * np.abs(value).max():
+            what = f"{type(all_points).__name__}: {name}: values at positions depend on the other positions"
+            raise ValueError(f"{what}, must be a function of each position alone on several processes")
 
 
 def _places(bodies: Sequence[Body], material: int, ids: NDArray[np.int64]) -> NDArray[np.float64]:

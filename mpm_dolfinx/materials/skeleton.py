@@ -25,7 +25,7 @@ from mpm_dolfinx.pores.retention import check_retention
 Field = float | Sequence[float] | Callable[[NDArray[np.float64]], ArrayLike]
 """A constant (number or vector), or a function of the reference positions X (n, d), m, that returns (n, ...).
 
-X are points of one process; values must not depend on the other positions, as a mean does.
+X are points of one process.  Several processes refuse values that depend on the other positions, as a mean does.
 """
 
 BY_SCENE = ("dt", "cell_size")
