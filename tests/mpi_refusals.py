@@ -73,7 +73,7 @@ simulation = mpm.Simulation(grid, mine, [mpm.Hencky(bulk=1e6, shear=6e5)], walls
 points = simulation.points
 left = np.where(points.id < len(mine[0]), 0.0, 0.4)[:, None] * [1, 0]
 moved = replace(points, corners=points.corners - left[:, None], x=points.x - left)
-before = simulation.state = replace(simulation.state, points=moved)
+simulation.state = replace(simulation.state, points=moved)  # the cells are distributed anew before the step
 try:
     with warnings.catch_warnings():
         warnings.simplefilter("error", mpm.ResultWarning)
@@ -82,4 +82,7 @@ try:
 except mpm.ResolutionWarning as error:
     message = str(error)
 said = grid.comm.allgather(message)
-assert "overlap" in message and len(set(said)) == 1 and simulation.state is before, said
+assert "overlap" in message and len(set(said)) == 1 and simulation.t == 0, said
+after, kept = simulation.state.points, grid.comm.allgather((moved.id, moved.corners))
+kept = dict(pair for ids, corners in kept for pair in zip(ids, corners, strict=True))
+assert all((kept[i] == corners).all() for i, corners in zip(after.id, after.corners, strict=True))
