@@ -77,7 +77,7 @@ def test_without_gravity_the_fluid_says_under_which_conductivities_are(name, war
     assert not warned()
     column(units)
     (message,) = warned()
-    assert "no liquid in SI units" in message and "give Fluid(gravity=...)" in message
+    assert "no liquid has these constants in SI units" in message and "give Fluid(gravity=...)" in message
 
 
 @pytest.mark.parametrize("grows", [True, False], ids=["grows", "as a function"])

@@ -365,7 +365,7 @@ def _check_conforming(body: MeshBody, name: str) -> None:
     if len(cover.face):
         x = own.corners[cover.face[0]].mean(axis=0)[: body.dim]
         what = f"{len(np.unique(cover.face))} faces touch others without common nodes, the first at {x}"
-        raise ValueError(f"{name}: {what}; hanging or duplicate nodes must be merged, or belong to two parts")
+        raise ValueError(f"{name}: {what}; must share nodes, or belong to two parts")
 
 
 def warn_small(grid: Grid, body: MeshBody, per_cell: int, name: str) -> MeshBody:

@@ -60,11 +60,11 @@ def warn_units(comm: MPI.Intracomm, fluid: Fluid, gravity: Gravity) -> None:
     if fluid.gravity is not None or gravity is not None:
         return
     if not DENSITIES[0] <= fluid.density <= DENSITIES[1] or fluid.bulk < SOFTEST:
-        what = "%s: no liquid in SI units, but without gravity its unit weight is density x %.4g m/s^2; in other units "
+        what = "%s: no liquid has these constants in SI units; conductivities are divided by density x %.4g m/s^2, "
         warn(
             comm,
             ConditionWarning,
-            f"{what}give Fluid(gravity=...), which converts conductivities to mobilities",
+            f"{what}because the scene has no gravity; in other units give Fluid(gravity=...)",
             line(fluid),
             STANDARD_GRAVITY,
         )
