@@ -3,15 +3,15 @@
 
 In each example, a column of 1 m between smooth walls stands on a floor (plane strain).  Each example adds one feature:
 a stored energy, fibres with a direction at each point, one of two conductivities that depend on the deformation, an
-elastic foundation, a source of fluid, a law with its own state variable, plastic flow, an implicit stress, or a return
-mapping in numpy.  The parameter names of a user function select its arguments.  `materials/skeleton.py` and
+elastic foundation, a source of fluid, a law with its own state variable (damage), plastic flow, an implicit stress, or
+a return mapping in numpy.  The parameter names of a user function select its arguments.  `materials/skeleton.py` and
 `materials/user_functions.py` of the package list them.
 
 The error is the largest difference from the exact solution, divided by the largest exact value.  With 20 cells it is
 8e-4 for the energy and 6e-4 for the fibres (these layers are stretched in a single step), 3e-3 for both conductivities,
-6e-4 for the foundation and 5e-4 for the source.  These errors decrease with the cell size.  The error of the damage is
-1e-5, because the penalty of the prescribed displacement lets the top move a little.  Plastic flow has an error of
-1e-11; the implicit stress and the return mapping have errors of 1e-15.
+6e-4 for the foundation and 5e-4 for the source.  These errors decrease with the cell size.  The error of the stress
+with damage is 1e-5, because the penalty of the prescribed displacement lets the top move a little.  Plastic flow has an
+error of 1e-11; the implicit stress and the return mapping have errors of 1e-15.
 """
 
 from __future__ import annotations

@@ -12,9 +12,9 @@ time.
 The references for q/E = 0.25 are results of Taylor-Hood elements, extrapolated in time, and in h from 20, 40 and 80
 cells. The extrapolated settlements differ from the settlements on 40 cells by 0.6 % at T = 0.01, and by 0.2 % at T =
 0.1.  Errors: `settlement` is the largest error of the displacement of the strip's middle from T = 0.1 on, and `at_once`
-its error at T = 0.01.  `edge` is the error at the strip's edge, where the load jumps, and `beside` is the error at the
-far corner.  All errors are relative to the displacement of the middle.  --reference also runs Taylor-Hood elements on
-the same cells. On one process.
+its error at T = 0.01.  `edge` and `beside` are the largest errors at two other places from T = 0.1 on: the strip's
+edge, where the load jumps, and the far end of the drained surface.  All errors are relative to the displacement of the
+middle.  --reference also runs Taylor-Hood elements on the same cells. On one process.
 """
 
 from __future__ import annotations

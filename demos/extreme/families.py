@@ -362,9 +362,10 @@ def units():
 
 @family(1e-4)
 def rain():
-    """Column under rain, k = 1e-12 to 1 m/s, alpha h = 1e-3 to 1e3: exact heads.
+    """Column under rain, k = 1e-12 to 1 m/s, alpha h = 1e-3 to 1e3: error against exact heads.
 
-    The rain increases from k / 20 to k / 2.  The soil is Gardner's, and stands on a water table.
+    The rain increases from k / 20 to k / 2.  The soil stands on a water table.  alpha is the constant of Gardner's
+    law, 1/m, and h the cell size, m.
     """
     for k in [*decades(-12, 0, 4), 0.1]:
         for steep in decades(-3, 3):
@@ -372,7 +373,7 @@ def rain():
 
 
 def rained(k: float, steep: float) -> Scene:
-    """Return the column under rain of k / 2, until the heads are steady; k: conductivity, m/s; steep: alpha h."""
+    """Return the column under rain of k / 2, until heads are steady; k: conductivity, m/s; steep: alpha h of `rain`."""
 
     def steady(share: float, alpha: float, z: np.ndarray) -> np.ndarray:
         return np.log(share + (1 - share) * np.exp(-alpha * z)) / alpha
@@ -388,9 +389,9 @@ def rained(k: float, steep: float) -> Scene:
 
 @family(1e-4)
 def evaporation():
-    """Drying column above a water table, k = 1e-12 to 1 m/s, alpha h = 1e-3 to 1e2: exact heads.
+    """Drying column above a water table, k = 1e-12 to 1 m/s, alpha h = 1e-3 to 1e2: error against exact heads.
 
-    The surface dries to a pressure head of -1.5 m at most.
+    The surface dries to a pressure head of -1.5 m at most.  `rain` defines alpha h.
     """
     for k in decades(-12, 0, 4):
         for steep in decades(-3, 2):
@@ -414,9 +415,9 @@ def dried(k: float, steep: float, driest: float = -1.5) -> Scene:
 
 @family(1e-4)
 def layered_rain():
-    """Two layers under rain, ratio of k 1e-3 to 1e3, alpha h = 1e-2 to 1e2: exact heads.
+    """Two layers under rain, ratio of k 1e-3 to 1e3, alpha h = 1e-2 to 1e2: error against exact heads.
 
-    The interface is off the grid lines.  One scene is in axisymmetry, and one in 3D.
+    `rain` defines alpha h.  The interface is off the grid lines.  One scene is in axisymmetry, and one in 3D.
     """
     for ratio in decades(-3, 3, 2):
         for steep in decades(-2, 2):
@@ -430,8 +431,8 @@ def layered_rain():
 def rained_layers(ratio: float, steep: float, other: float, grid: str = "plane") -> Scene:
     """Return a column of two layers.
 
-    steep: alpha h of the lower layer; ratio, other: k and alpha of the upper layer, divided by those of the lower
-    layer; grid: see `kind` of `exponential`.
+    steep: alpha h of the lower layer, see `rain`; ratio, other: k and alpha of the upper layer, divided by those of the
+    lower layer; grid: see `kind` of `exponential`.
     """
     k, alpha, edge = [1e-6, 1e-6 * ratio], [10 * steep, 10 * steep * other], 0.53
     rain = min(k) / 2

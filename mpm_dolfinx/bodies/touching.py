@@ -356,7 +356,7 @@ def _between_planes(a: NDArray, b: NDArray, normals: Iterable[NDArray]) -> NDArr
 
 
 def solids(body: Body) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return convex domains (m, 2^d, d), m, that fill a body, and their tolerances (m,), m; one domain for a box."""
+    """Return convex domains (m, 2^d, d), m, of a body, one for a box, and tolerances (m,), m, of gaps and overlaps."""
     low, high = body.bounds
     size, edge = high - low, body.spacing.min()
     if body.aligned and np.isclose(size.prod(), body.volume_of_boxes, rtol=SAME, atol=0):

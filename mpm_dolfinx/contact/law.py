@@ -51,7 +51,7 @@ SLIVER = 0.25  # fraction of a cell's face: penetrations of smaller contact area
 ROUNDS = 20  # largest number of augmentations
 BEGIN = 1.0, np.inf, 0.0, 0.0  # initial values of `ContactState.updates`
 SLOW, STIFFER = 0.6, 10.0
-"""k is multiplied by STIFFER if an augmentation leaves more than the fraction SLOW of the penetration."""
+"""The stiffness is multiplied by STIFFER if an augmentation leaves more than SLOW times the previous penetration."""
 RAMP = 10.0  # largest ratio of adhesion to normal pressure
 
 

@@ -320,7 +320,7 @@ class ContactProblem(Loads):
         return np.divide(off, slope, out=seeks, where=slope > 0)
 
     def _begins(self) -> NDArray[np.float64]:
-        """Return initial displacements (tools,), m, towards fixed bodies, at most until one point carries the load."""
+        """Return guessed tool displacements (tools,), m, with bodies at rest, at most until a point bears the load."""
         motion = np.zeros(len(self.now.law.contacts))
         still = np.zeros_like(self.pairs.x)
         h = self.grid.least
@@ -426,7 +426,7 @@ class ContactProblem(Loads):
     def rubbing(self, at: At, v: NDArray[np.float64]) -> tuple[float, float]:
         """See `Loads`.  Only tools do external work.  Elastic slip counts as dissipation, negative on unloading.
 
-        Dissipation by contact pressures is not computed, because velocities of substeps jump where a gap closes.
+        Work of contact pressures is not counted as dissipation, because velocities of substeps jump where a gap closes.
         """
         law = self.now.law
         found = self.found(at)

@@ -206,7 +206,7 @@ class Convex:
 
 
 def uniform(shape: Ball | Convex) -> Uniform:
-    """Return centroid and radius of gyration of a disc or polygon.  A polygon is divided into triangles at a corner."""
+    """Return centroid and radius of gyration of a disc, or of a polygon as a fan of triangles from one corner."""
     if isinstance(shape, Ball):
         return Uniform(np.array(shape.centre, dtype=float), shape.radius**2 / 2)
     hull = ConvexHull(np.asarray(shape.corners, dtype=float))

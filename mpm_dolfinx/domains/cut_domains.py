@@ -69,7 +69,7 @@ class Patches:
         if renewed is not None:
             around = np.where(renewed.old, around, 1.0)  # areas of renewed faces are already areas of rings
         self.area0 = self._share0 * around
-        """Reference areas (n,), m^(d-1)."""
+        """Reference areas (n,), m^(d-1); in axisymmetry of the rings, m^2."""
 
     @cached_property
     def X(self) -> NDArray[np.float64]:
@@ -90,7 +90,7 @@ class Patches:
         return lambda name: self.X if name == "X" else self.now(points) + self.base
 
     def area(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the current outward area vectors (n, d), m^(d-1)."""
+        """Return the current outward area vectors (n, d), m^(d-1); in axisymmetry of the rings, m^2."""
         share = self._share0 / self._whole0
         if self._grid.axisymmetric:
             share = share * self._grid.around(self.now(points))

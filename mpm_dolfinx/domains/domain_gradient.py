@@ -93,9 +93,9 @@ def cell_ratios(
 
     With mean dilatation, the ratio of a cell is the current volume of its domains, computed from the corners, divided
     by the reference volume.  This ratio does not depend on the path of deformation.  Differences between the volume
-    ratios of domains in a cell do no work.  If ratios were updated by increments only, no force would oppose a drift.
-    Without mean dilatation, pieces have the ratio of their point.  The same applies in cells with yielded soil, because
-    corner volumes are meaningless near plastic flow.
+    ratios of domains in a cell do no work.  If the ratio of a cell were updated by increments only, no force would
+    oppose a drift of the domains' volume from this ratio.  Without mean dilatation, pieces have the ratio of their
+    point.  The same applies in cells with yielded soil, because corner volumes are meaningless near plastic flow.
 
     cut, points: cut particle domains, and points at the start of the step; share (n,): weight, in [0, 1], of the ratio
     from corners in the geometric mean of this ratio and the ratio of the point; 0 without mean dilatation.  flows (n,):

@@ -29,9 +29,9 @@ from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.parallel.exchange import to_root
 
 SOFT = 0.1
-"""Weight of the motion d, needed because in regular lattices no motion changes alternating volumes to first order.
-Halving this value changes the result of scene "flow" in tests/plateaus.py by 2.5e-04 (relative), doubling it by
-1.4e-04, and finer cells by 9.2e-02."""
+"""Weight of the motion d.  It is needed because in regular lattices, to first order, no motion reduces errors e that
+alternate from domain to domain.  Halving this value changes the result of scene "flow" in tests/plateaus.py by 2.5e-04
+(relative), doubling it by 1.4e-04, and finer cells by 9.2e-02."""
 
 
 class Domains(NamedTuple):

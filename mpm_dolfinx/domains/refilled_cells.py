@@ -31,8 +31,8 @@ finer cells by 9.0e-02."""
 CRUMB = NEAR
 """Area of a part of a domain, divided by its cell's area, below which other parts receive its mass.  Source: `NEAR`."""
 SMALL = (0.5 / EDGES) ** 2
-"""Smallest part of a domain, in cell areas, that renewal leaves.  A cell with a smaller part is renewed too.  Source:
-definition, a square with half the length of an edge of the surface, which has `EDGES` edges in a cell."""
+"""Smallest part of an old domain that remains in a cell, divided by the cell area.  A cell with a smaller part is
+renewed too.  Source: definition, a square with half the length of a surface edge (`EDGES` edges in a cell)."""
 COVERED = 0.25
 """Largest difference between the area of the pieces in a renewed cell and its filled area, in cell areas.  Source:
 definition, the area of a new domain in a full cell, which is divided into four."""
@@ -59,7 +59,7 @@ class OuterFaces:
     point: NDArray[np.int64]  # material point (n,)
     face: NDArray[np.int64]  # index of the face in its domain (n,)
     key: NDArray[np.int64]  # key of the seeded face (n,), see `renewed_faces`
-    area: NDArray[np.float64]  # seeded area (n,), m^(d-1), in axisymmetry of the ring
+    area: NDArray[np.float64]  # seeded area (n,), m^(d-1), in axisymmetry of the ring, m^2
     ends: NDArray[np.float64]  # reference positions of the ends, the lower end first (n, 2, 2), m
 
 
@@ -69,7 +69,7 @@ class New(NamedTuple):
     corners: NDArray[np.float64]  # (n, 4, 2), m
     group: NDArray[np.int64]  # index of the group (n,); domains of a group receive values from the same pieces
     parent: NDArray[np.int64]  # key of the seeded face for each face, or -1 (n, 4)
-    area: NDArray[np.float64]  # seeded area of each face (n, 4), m^(d-1), in axisymmetry of the ring
+    area: NDArray[np.float64]  # seeded area of each face (n, 4), m^(d-1), in axisymmetry of the ring, m^2
     ends: NDArray[np.float64]  # reference positions of the ends of each face (n, 4, 2, 2), m
 
 

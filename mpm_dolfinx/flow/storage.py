@@ -13,7 +13,7 @@ that leaves a cell enters the neighbour.  The residual is the left side divided 
 neglects that r of a face differs from the r of storage.  A is the exact area of the body on the face, k the
 conductivity.  x+- are the centroids of the material in both cells, and d+- their distances from the face.  `layers`
 defines kappa and d of mixed cells.  Distances from centroids give an error of 0.2 % for any filling; half of the cell
-size as distance would give up to 12 %. `nonorthogonal` corrects faces between centroids that are offset along the face.
+size as distance would give up to 12 %. `nonorthogonal` corrects fluxes if the two centroids are offset along the face.
 The sum over all cells is the fluid balance of the bodies.  `fluid_content` defines the change of the content, and
 `time_integration` the integral over a substep.
 

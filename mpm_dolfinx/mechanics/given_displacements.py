@@ -214,7 +214,7 @@ class GivenDisplacements(Acting):
         return dict(zip(self._names, self._grid.comm.allreduce(sums), strict=True))
 
     def _warn(self, number: int, what: str, *values) -> None:
-        """Warn, once for each condition, of a fault of the condition with this index."""
+        """Warn of a fault `what` of the condition with index `number`, once for each condition and fault."""
         if (number, what) not in self._warned:
             warn(self._grid.comm, ConditionWarning, what, line(self._holds[number][0]), *values)
             self._warned.add((number, what))
@@ -357,7 +357,7 @@ class HoldLoads(Loads):
     def guess(self, parts: Parts, nodal: NDArray[np.float64]) -> NDArray[np.float64] | None:
         """Return an initial guess of u; None if the conditions rotate no connected part of the bodies.
 
-        A part that the conditions rotate gets the nearest rigid motion, other parts get the displacements `nodal`.
+        Parts that the conditions rotate get the rigid motion nearest to prescribed displacements; others get `nodal`.
         """
         grid = self.data.points.grid
         if grid.axisymmetric:

@@ -50,7 +50,7 @@ class Pieces:
     # the section of the product of both offsets from this midpoint, m^2; radius of the section's centroid, m
     hoop: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 0)))
     # (m, d, d) on request, else (m, 0): second moments about the centroid, divided by volume, m^2; in axisymmetry for
-    # pieces with symmetric sections
+    # pieces with sections symmetric about their centroids
     second: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 0)))
 
 
@@ -422,7 +422,7 @@ def spreads(corners: NDArray[np.float64], rings: bool) -> NDArray[np.float64]:
 
 
 def of_rings(spread: NDArray[np.float64], radius: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return second moments about the centroid divided by volume (n, 2, 2), m^2, of rings with symmetric sections.
+    """Return second moments about the centroid divided by volume (n, 2, 2), m^2, of rings; third moments are neglected.
 
     spread (n, 2, 2): second moments of the sections, divided by their areas, m^2; radius (n,): radius of the sections'
     centroids, m. The vector from a section's centroid to the ring's centroid is spread[:, 0] / radius.

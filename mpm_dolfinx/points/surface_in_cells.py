@@ -102,7 +102,7 @@ def resampled(
     Q: NDArray[np.float64],
     around: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Return the surface in each cell as vertices (n, EDGES + 1, 2) from P to Q (n, 2), evenly spaced between corners.
+    """Return the surface in n cells as vertices (n, EDGES + 1, 2) from P to Q (n, 2), at sharp bends or evenly spaced.
 
     A shift of vertices preserves the area between surface and chord, in axisymmetry the volume of the area's ring.
 
@@ -119,7 +119,7 @@ def resampled(
     joint = (x[:, 0] + np.roll(x[:, 1], 1, axis=0)) / 2  # there may be small gaps between segments
 
     def divide(low: int, high: int) -> None:
-        """Set a vertex between two others: at the sharpest corner, or in the middle of a nearly straight part."""
+        """Set a vertex between two others: at the sharpest bend, or in the middle of a nearly straight part."""
         middle = (low + high) // 2
         a, chord = out[:, low], out[:, high] - out[:, low]
         off = joint - a[of]

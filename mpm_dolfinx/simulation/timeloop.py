@@ -90,8 +90,8 @@ def run(
         that depends on velocity then raises ValueError: its error cannot be estimated. With inertia the error of the
         motion is limited too, relative to the largest motion since the start, see `motion_error`. In unsaturated soil
         the error of the water content is limited too, relative to its largest change in a step so far. The estimate is
-        a fraction of a first-order step's error, see `solve.newton.ERROR`. True errors were 0.7 to 5 times the
-        estimate; the largest ratio occurs directly after a jump of the load.
+        a fraction of a first-order step's error, see `solve.newton.ERROR`. The largest true error of a run was 0.7 to 5
+        times the largest estimate; the largest ratio occurs directly after a jump of the load.
     t_eval : (m,), s
         Output times, increasing, in (t, t_end]; t_end is always an output time. Steps end at output times.
     first_step, max_step

@@ -331,9 +331,9 @@ class Newton:
     def _stable(self, found: Errors) -> Errors:
         """Return the errors; raise NotConverged at an unstable equilibrium: smaller steps find the path that leaves it.
 
-        The tangent of an unstable equilibrium has negative eigenvalues. Only dry bodies with symmetric,
-        factorised tangents are checked: water delays buckling. A tangent kept for a step shows an instability only in
-        the next. If only soft springs resist a motion, a solution may seem unstable, and is therefore corrected once.
+        The tangent of an unstable equilibrium has negative eigenvalues. Only dry bodies with symmetric, factorised
+        tangents are checked: water delays buckling. A tangent kept for a step shows an instability only in the next
+        step. If only soft springs resist a motion, a stable solution may seem unstable; one more Newton step decides.
         """
         plan = self._solvers.plan
         if not self.report.newton or self._storage is not None or not plan.symmetric or plan.iterative:

@@ -341,8 +341,8 @@ def _changed(scene: Scene, points: MaterialPoints, fields: Mapping[str, ArrayLik
         if name in data and new.shape == data[name].shape[1:]:
             new = np.broadcast_to(new, data[name].shape)
         if new.shape != (data[name].shape if name in data else (len(points), *new.shape[1:])):
-            each = "one value for all, or " if name in data else f"one of {', '.join(data)}, or new data with "
-            raise ValueError(f"{what} of shape {new.shape}, must be {each}one for each of {len(points)} points")
+            each = "one value for all, or " if name in data else f"one of {', '.join(data)}, or new data: " * bool(data)
+            raise ValueError(f"{what} of shape {new.shape}, must be {each}one value for each of {len(points)} points")
         if name not in data and (close := get_close_matches(name, data)):
             warn(comm, ConditionWarning, "%s: new data that no law reads; is %r meant?", what, close[0])
         data[name] = new.copy()
