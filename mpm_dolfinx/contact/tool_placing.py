@@ -142,7 +142,7 @@ class Tools(Touching):
     def _posed(self, tool: Tool, start: float, t: float) -> Pose:
         """Return the pose of a tool at time t (s), the end of a substep.
 
-        With inertia, `in_step` corrects the prescribed pose after the first of two substeps, for a second-order velocity.
+        With inertia, `in_step` corrects a prescribed pose after the first of two substeps, for a second-order velocity.
         """
         pose = self._pose(tool, t)
         if self._end is None or not start < t < self._end or tool.free:
