@@ -27,6 +27,6 @@ walls = {"bottom": "xy", "left": "x", "right": "x"}
 s = mpm.Simulation(grid, bodies, [sand, gel], fluid=mpm.Fluid(), walls=walls, **acting)
 s.step(0.1)
 bytes_of, lengths = scaling.held(s, buffers=False)
-rows = grid.comm.gather((len(s.points), sum(seen), sum(bytes_of.values()), len(lengths & WHOLE)))
+rows = grid.comm.gather((len(s.points), max(seen, default=0), sum(bytes_of.values()), len(lengths & WHOLE)))
 if rows:
     np.savez(sys.argv[1], **dict(zip(("points", "asked", "held", "whole"), np.array(rows).T, strict=True)))
