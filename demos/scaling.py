@@ -54,6 +54,7 @@ from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 import mpm_dolfinx as mpm
+from mpm_dolfinx.base import _compat
 from mpm_dolfinx.forms import point_forms
 from mpm_dolfinx.parallel.exchange import traffic
 from mpm_dolfinx.simulation.summary import peak_memory
@@ -168,9 +169,7 @@ def held(root: object, buffers: bool = True) -> tuple[dict[str, int], set[int]]:
             objects.append(one.x.array)
             objects.append(one.function_space)
         elif isinstance(one, Mesh):
-            pairs = np.ndindex(*[one.topology.dim + 1] * 2)
-            links = [one.topology.connectivity(*pair) for pair in pairs]
-            out["mesh"] += one.geometry.x.nbytes + sum(4 * len(link.array) for link in links if link is not None)
+            out["mesh"] += one.geometry.x.nbytes + sum(link.nbytes for link in _compat.links(one))
         elif isinstance(one, FunctionType):  # its globals are of no scene
             objects += [one.__closure__, one.__defaults__]
         elif buffers or not isinstance(one, point_forms.Rows):

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
 from functools import cached_property
 from time import perf_counter
 
@@ -244,6 +245,15 @@ def _mesh_of(form: ufl.Form):
         return form.ufl_domain().ufl_cargo()
     spaces = [a.ufl_function_space() for a in (*form.arguments(), *form.coefficients())]
     return spaces[0].mesh
+
+
+def links(msh: mesh.Mesh) -> list[NDArray[np.int32]]:
+    """Return the arrays of all connectivities that a mesh has computed."""
+    found = []
+    for pair in np.ndindex(*[msh.topology.dim + 1] * 2):
+        with suppress(RuntimeError):  # from dolfinx 0.9 on, for others
+            found.append(msh.topology.connectivity(*pair))
+    return [one.array for one in found if one is not None]
 
 
 def _facet_cells(msh, facets, dim: int) -> NDArray[np.int32]:
