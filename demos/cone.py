@@ -89,8 +89,7 @@ def scene(
     """Return a simulation of the cone on the surface of the clay, and half of its outline (k, 2), m.
 
     cells: number of cells over the radius R, minus one half; depth: greatest depth of the cone, m; speed: velocity of
-    the cone, m/s, until the time `end`, s; follow:
-    whether grid lines follow the cone.
+    the cone, m/s, until the time `end`, s; follow: whether grid lines follow the cone.
     """
     h = R / (cells + 0.5)
     low, fine = -(np.ceil(depth / h) + 2 * cells + 0.5) * h, np.ceil(FINE / h) * h
@@ -233,8 +232,8 @@ def following(o: Namespace, clay: mpm.Skeleton, fixed: Push) -> dict[str, float]
     """Push the cone on grid lines that follow it; print and return its resistance and its cells, relative to others.
 
     load, last: relative difference of the mean of N over the second half of the way, and of the final N, from the run
-    on fixed lines.  cells, fixed: number of cells, divided by that of equal small cells in the same grid, and by that of
-    the grid with fixed lines.
+    on fixed lines.  cells: number of cells, divided by that of equal small cells in the same grid.  fixed: number of
+    cells, divided by that of the grid with fixed lines.
     """
     run, halfway = push(o.cells, o.depth * R, clay, follow=True), o.depth / 2
     mean, beside = (np.interp(WAY * o.depth, each.depth, each.N).mean() for each in (run, fixed))

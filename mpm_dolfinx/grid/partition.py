@@ -87,13 +87,13 @@ def boxes(load: NDArray[np.float64], processes: int) -> NDArray[np.int64]:
 
 
 def better(load: NDArray[np.float64], of: NDArray[np.int64]) -> NDArray[np.int64] | None:
-    """Return the boxes (ranks, 2, d) of a new bisection if it is more even than the boxes `of`, else None.
+    """Return the boxes (ranks, 2, d) of a new bisection if it is more even than the uneven boxes `of`, else None.
 
     A bisection with an imbalance above `UNEVEN` must reduce the imbalance by this factor.  Without this rule, each
     reset of the grid might distribute a few cells anew.
     """
-    before, new = imbalance(load, of), boxes(load, len(of))
-    return new if before > UNEVEN and imbalance(load, new) < max(UNEVEN, before / UNEVEN) else None
+    new = boxes(load, len(of))
+    return new if imbalance(load, new) < max(UNEVEN, imbalance(load, of) / UNEVEN) else None
 
 
 def imbalance(load: NDArray[np.float64], of: NDArray[np.int64]) -> float:

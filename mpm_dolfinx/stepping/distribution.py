@@ -38,7 +38,7 @@ def distribute(simulation: Distributed) -> None:
 
 
 def distribute_by(simulation: Distributed, boxes: NDArray[np.int64]) -> bool:
-    """Distribute the cells by boxes (ranks, 2, d), see `Cells`; return whether the scene allows it."""
+    """Distribute the cells by boxes (ranks, 2, d), see `Partition`; return whether the scene allows it."""
     new = simulation.scene.distributed(boxes)
     if new is not None:
         simulation.scene, simulation.state = new, new.adopted(simulation.state)

@@ -214,7 +214,7 @@ class Scene:
             self.materials.retentions.weight.value = 0.0 if gravity is None else self.fluid.density * gravity
 
     def distributed(self, boxes: NDArray[np.int64]) -> Scene | None:
-        """Return an equal scene on a grid distributed by boxes (ranks, 2, d), see `Cells`.
+        """Return an equal scene on a grid distributed by boxes (ranks, 2, d), see `Partition`.
 
         The result is None if a function of position, such as a random field, does not return the same values again, or
         if terms may be defined on the present mesh.
