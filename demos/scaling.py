@@ -39,6 +39,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
+from mmap import mmap
 from pathlib import Path
 from types import FunctionType, ModuleType
 
@@ -143,13 +144,15 @@ def measure(dim: int, points: float) -> dict:
 def held(root: object, buffers: bool = True) -> tuple[dict[str, int], set[int]]:
     """Return the bytes of all arrays that an object reaches on this process, by kind; and the lengths of their axes.
 
-    Shared memory counts once.
+    Shared memory counts once.  Arrays in files that are mapped into memory have the kind "files"; their axes are left
+    out.
 
     buffers: whether to count the buffers of integrands too, which have a fixed largest number of rows.
     """
     objects, seen = [root], set()
     arrays: dict[int, NDArray] = {}
-    out = dict.fromkeys(("arrays", "mesh", "matrices"), 0)
+    files: dict[int, NDArray] = {}
+    out = dict.fromkeys(("arrays", "files", "mesh", "matrices"), 0)
     while objects:
         one = objects.pop()
         if id(one) in seen or isinstance(one, (type, ModuleType)):
@@ -158,7 +161,8 @@ def held(root: object, buffers: bool = True) -> tuple[dict[str, int], set[int]]:
         if isinstance(one, np.ndarray):
             while isinstance(one.base, np.ndarray):
                 one = one.base
-            arrays[one.__array_interface__["data"][0]] = one
+            mapped = isinstance(getattr(one.base, "obj", None), mmap)
+            (files if mapped else arrays)[one.__array_interface__["data"][0]] = one
         elif isinstance(one, PETSc.Mat):
             if one.handle and "aij" in one.getType():  # others have no entries of their own
                 entries = int(one.getInfo(PETSc.Mat.InfoType.LOCAL)["nz_allocated"])
@@ -175,7 +179,8 @@ def held(root: object, buffers: bool = True) -> tuple[dict[str, int], set[int]]:
         elif buffers or not isinstance(one, point_forms.Rows):
             objects.extend(gc.get_referents(one))
     lengths = {length for array in arrays.values() for length in array.shape}
-    return out | {"arrays": sum(array.nbytes for array in arrays.values())}, lengths
+    sums = {kind: sum(array.nbytes for array in of.values()) for kind, of in (("arrays", arrays), ("files", files))}
+    return out | sums, lengths
 
 
 def in_own_process(dim: int, points: float, processes: int) -> dict:

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""Move two wet soils with fields of materials, on any number of processes; write the memory of all arrays."""
+"""Move two wet soils, boxes or meshes, with fields of materials, on any number of processes; write the memory of all arrays."""
 
 import sys
 
 import numpy as np
 import scaling
+from meshes import box_mesh
 
 import mpm_dolfinx as mpm
 
@@ -18,7 +19,13 @@ def stiffness(X):
 
 h = 2 * np.sqrt(2 / points)
 grid = mpm.Grid([0, 0], [2 + 4 * h, 1 + 4 * h], [round(2 / h) + 4, round(1 / h) + 4])
-bodies = [mpm.box(grid, [0, 0], [2, 0.3]), mpm.box(grid, [0, 0.3], [2, 1], material=1)]
+ends = [((0, 0), (2, 0.3)), ((0, 0.3), (2, 1))]
+if sys.argv[3:] == ["meshes"]:
+    counts = [[round(2 * (b - a) / h) for a, b in zip(*of, strict=True)] for of in ends]
+    meshes = [box_mesh("quad", count, *of) for count, of in zip(counts, ends, strict=True)]
+    bodies = [mpm.from_mesh(grid, mesh, material=i) for i, mesh in enumerate(meshes)]
+else:
+    bodies = [mpm.box(grid, *of, material=i) for i, of in enumerate(ends)]
 sand = mpm.DruckerPrager(bulk=stiffness, shear=2e6, friction=30, dilation=5, cohesion=1e4, conductivity=1e-4)
 gel = mpm.NeoHookean(bulk=2e6, shear=lambda X: 1e6 * (1 + X[:, 0]), conductivity=1e-5)
 WHOLE = {*map(len, bodies), grid.cells, grid.nodes}
@@ -27,6 +34,7 @@ walls = {"bottom": "xy", "left": "x", "right": "x"}
 s = mpm.Simulation(grid, bodies, [sand, gel], fluid=mpm.Fluid(), walls=walls, **acting)
 s.step(0.1)
 bytes_of, lengths = scaling.held(s, buffers=False)
-rows = grid.comm.gather((len(s.points), max(seen, default=0), sum(bytes_of.values()), len(lengths & WHOLE)))
-if rows:
-    np.savez(sys.argv[1], **dict(zip(("points", "asked", "held", "whole"), np.array(rows).T, strict=True)))
+files = bytes_of.pop("files")
+row = len(s.points), max(seen, default=0), sum(bytes_of.values()), len(lengths & WHOLE), files
+if rows := grid.comm.gather(row):
+    np.savez(sys.argv[1], **dict(zip(("points", "asked", "held", "whole", "files"), np.array(rows).T, strict=True)))

@@ -127,12 +127,14 @@ def test_a_second_scene_on_a_grid_is_as_even_as_alone(tmp_path):
     assert np.load(tmp_path / "out.npz")["imbalance"].max() < 1.3
 
 
-def test_no_process_holds_arrays_of_the_whole_scene(tmp_path):
+@pytest.mark.parametrize("of", ["boxes", "meshes"])
+def test_no_process_holds_arrays_of_the_whole_scene(of, tmp_path):
     """Of 1e4 points, many are at borders between processes, so that each of four holds more than a quarter: 0.309."""
     for processes in (1, 4):
-        mpirun(processes, "mpi_held.py", str(tmp_path / f"{processes}.npz"), "1e4")
+        mpirun(processes, "mpi_held.py", str(tmp_path / f"{processes}.npz"), "1e4", of)
     one, four = (dict(np.load(tmp_path / f"{processes}.npz")) for processes in (1, 4))
     assert one["whole"][0] > 0 and not four["whole"].any(), "lengths of bodies and of the grid"
     assert four["points"].sum() == one["points"][0] and (four["asked"] <= four["points"]).all()
     assert four["asked"].sum() == one["asked"][0] > 0
     assert (four["held"] < 0.33 * one["held"][0]).all()
+    assert not one["files"].any() and four["files"].any() == (of == "meshes"), "one copy of a mesh on a machine"

@@ -4,8 +4,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import redirect_stderr, redirect_stdout
+from functools import partial
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -22,9 +23,8 @@ from mpm_dolfinx.base.tolerances import NEAR
 from mpm_dolfinx.base.validation import instance, line, line_of, path
 from mpm_dolfinx.bodies import mesh_readers
 from mpm_dolfinx.bodies.mesh_cells import AS_LATTICE, KINDS, SECOND_ORDER, SIDES_OF, distinct, edges
-from mpm_dolfinx.bodies.meshes import Mesh, MeshBody, seeded, warn_small
+from mpm_dolfinx.bodies.meshes import Mesh, MeshBody, seeded
 from mpm_dolfinx.grid.grid import FACES, Grid
-from mpm_dolfinx.parallel.exchange import at_root
 from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
 
 TAGS = ("gmsh:physical", "medit:ref", "cell_tags", "MaterialIDs", "attribute", "material", "nastran:ref", "su2:tag")
@@ -81,18 +81,17 @@ def from_mesh(
     instance("body: grid", grid, Grid)
     name, names = "mesh", _numbers(names)
     if isinstance(mesh, (str, os.PathLike)):
-        name, file = f"mesh {os.fspath(mesh)}", path("mesh", mesh)
-        mesh = at_root(grid.comm, lambda: _file(file))
-    if isinstance(mesh, meshio.Mesh):
+        name, mesh = f"mesh {os.fspath(mesh)}", path("mesh", mesh)
+    if isinstance(mesh, (Path, meshio.Mesh)):
         if not (cell_tags is None or isinstance(cell_tags, str)) or facet_tags is not None:
             raise ValueError(
                 "mesh: cell_tags and facet_tags must be tags of a dolfinx mesh, or cell_tags the name of cell data"
             )
-        found = _of_meshio(grid, mesh, names, cell_tags, name)
+        found = partial(_of_meshio, grid, mesh, names, cell_tags, name)
     else:
         instance("mesh", mesh, dolfinx_mesh.Mesh)
         found = _of_dolfinx(grid, mesh, cell_tags, facet_tags, names)
-    return warn_small(grid, seeded(grid, found, part, per_cell, material, name), per_cell, name)
+    return seeded(grid, found, name, part=part, per_cell=per_cell, material=material)
 
 
 def _file(file: Path) -> meshio.Mesh:
@@ -108,8 +107,10 @@ def _file(file: Path) -> meshio.Mesh:
         raise ValueError(f"mesh {file}: {why}{allowed}") from None
 
 
-def _of_meshio(grid: Grid, mesh: meshio.Mesh, names: Mapping[str, int], tags: str | None, name: str) -> Mesh:
-    """Convert a meshio mesh.  `tags` is the name of the cell data with the tags of parts and sides."""
+def _of_meshio(grid: Grid, mesh: meshio.Mesh | Path, names: Mapping[str, int], tags: str | None, name: str) -> Mesh:
+    """Convert a meshio mesh, or a file.  `tags` is the name of the cell data with the tags of parts and sides."""
+    if isinstance(mesh, Path):
+        mesh = _file(mesh)
     mesh_readers.check_systems(mesh)
     dim = grid.dim
     x = _positions(grid.dim, mesh.points)
@@ -124,7 +125,7 @@ def _of_meshio(grid: Grid, mesh: meshio.Mesh, names: Mapping[str, int], tags: st
             curved, off = curved + len(rows), max(off, _edge_node_distance(x, rows, kind))
         blocks.append((kind, rows[:, : _vertices(dim, kind)]))
     if curved:
-        _warn_curved(grid, name, curved, off)
+        _warn_curved(name, curved, off)
     if tags is not None and tags not in mesh.cell_data:
         known = ", ".join(mesh.cell_data) or "none, for the cells have no data"
         raise ValueError(f"mesh: cell_tags = {line(tags)}, must be the name of cell data of the mesh: {known}")
@@ -193,10 +194,10 @@ def _edge_node_distance(x: NDArray[np.float64], rows: NDArray[np.int64], kind: s
     return float(np.max(nearest, initial=0.0))
 
 
-def _warn_curved(grid: Grid, name: str, count: int, off: float) -> None:
-    """Warn about second-order cells, which are reduced to their corners."""
+def _warn_curved(name: str, count: int, off: float) -> None:
+    """Warn on one process about second-order cells, which are reduced to their corners."""
     what = "%s: %d cells are of second order; only their corners are used, with straight edges; edge nodes lie "
-    warn(grid.comm, ResolutionWarning, what + "up to %.2g m off the midpoints", name, count, off)
+    warn(MPI.COMM_SELF, ResolutionWarning, what + "up to %.2g m off the midpoints", name, count, off)
 
 
 def _merged(
@@ -294,8 +295,11 @@ def _plane(dim: int, x: NDArray[np.float64], cells: Mapping[str, NDArray[np.int6
     return x[:, :dim]
 
 
-def _of_dolfinx(grid: Grid, mesh, cell_tags, facet_tags, names: Mapping[str, int]) -> Mesh:
-    """Gather a dolfinx mesh on every process.  Cells are sorted by position, so any partition gives the same result."""
+def _of_dolfinx(grid: Grid, mesh, cell_tags, facet_tags, names: Mapping[str, int]) -> Callable[[], Mesh]:
+    """Gather a dolfinx mesh on rank 0; return a function that converts it there.
+
+    Cells are sorted by position, so any partition of the mesh gives the same result.
+    """
     dim = grid.dim
     topology = mesh.topology
     kind = _compat.cell_kind(mesh)
@@ -311,18 +315,28 @@ def _of_dolfinx(grid: Grid, mesh, cell_tags, facet_tags, names: Mapping[str, int
     if dofs.shape[1] not in (vertices, orders):
         what = f"must have {vertices} or {orders}, for first or second order"
         raise ValueError(f"mesh: cells of {dofs.shape[1]} nodes, {what}")
-    if dofs.shape[1] != vertices:
+    curved, off = dofs.shape[1] != vertices, 0.0
+    if curved:
         off = _edge_node_distance(mesh.geometry.x, _as_meshio(dofs, kind), kind)
-        count, off = mesh.comm.allreduce(owned), mesh.comm.allreduce(off, op=MPI.MAX)
-        _warn_curved(grid, "mesh", count, off)
         dofs = dofs[:, :vertices]
     topology.create_connectivity(dim, dim - 1)
     facets = topology.connectivity(dim, dim - 1).array.reshape(-1, len(_facets(dim, kind)))[:owned]
     nodes = mesh.geometry.index_map().local_to_global(np.arange(len(mesh.geometry.x), dtype=np.int32))
-    rows = mesh.comm.allgather(
-        (nodes, mesh.geometry.x, nodes[dofs], _tag_of(cell_tags, np.arange(owned)), _tag_of(facet_tags, facets))
-    )
-    number, x, cells, tag, side = map(np.concatenate, zip(*rows, strict=True))
+    tags = _tag_of(cell_tags, np.arange(owned)), _tag_of(facet_tags, facets)
+    root = int(np.argmin(mesh.comm.allgather(grid.comm.rank)))  # the mesh may be on each process alone
+    rows = mesh.comm.gather((nodes, mesh.geometry.x, nodes[dofs], *tags, np.array([off])), root)
+    return partial(_of_rows, dim, kind, rows, curved, names)
+
+
+def _of_rows(dim: int, kind: str, rows: list[tuple], curved: bool, names: Mapping[str, int]) -> Mesh:
+    """Convert a dolfinx mesh.
+
+    rows: from each process, node indices and positions, nodes of cells, tags of cells and facets, and distance of edge
+    nodes from edge midpoints, m; curved: whether cells are of second order.
+    """
+    number, x, cells, tag, side, off = map(np.concatenate, zip(*rows, strict=True))
+    if curved:
+        _warn_curved("mesh", len(cells), off.max())
     vertices = np.empty((number.max(initial=-1) + 1, 3))
     vertices[number] = x
     vertices = _plane(dim, vertices, {kind: cells})

@@ -3,13 +3,18 @@
 
 `mesh_cells` divides cells into domains.  Domains that are too large for the grid are divided further, by their
 (tri)linear map.
+
+The first process reads and divides a mesh.  Each machine then has the domains once, in a file that its processes map
+into memory: a process loads the domains that it reads, such as those of its own points.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+
+from mpi4py import MPI
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +27,8 @@ from mpm_dolfinx.base.validation import whole
 from mpm_dolfinx.bodies.bodies import Body, check_inside
 from mpm_dolfinx.bodies.mesh_cells import KINDS, PARTS, Polytopes, distinct
 from mpm_dolfinx.bodies.touching import Faces, covers, face_vectors
-from mpm_dolfinx.grid.grid import FACES, Grid, corner_bits, rounding, sum_by
+from mpm_dolfinx.grid.grid import FACES, Grid, corner_bits, in_chunks, rounding, sum_by
+from mpm_dolfinx.parallel.machine_files import once_a_machine
 from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
 from mpm_dolfinx.points.cutting import centroids, simplex_volumes, vertices, volumes
 
@@ -32,7 +38,7 @@ SMALL = 0.2  # fraction of the desired domain size: smaller domains cause a warn
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """A mesh, the same on every process.  In quadrilaterals and hexahedra, the first axis of nodes varies fastest."""
+    """A mesh, on one process.  In quadrilaterals and hexahedra, the first axis of nodes varies fastest."""
 
     x: NDArray[np.float64]  # positions of nodes (nodes, d), m
     cells: Mapping[str, NDArray[np.int64]]  # cell type -> nodes (n, k)
@@ -55,11 +61,12 @@ class Mesh:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class MeshBody(Body):
-    """A body seeded from a mesh.  The boxes of its domains are bounding boxes."""
+    """A body seeded from a mesh.  The boxes of its domains are bounding boxes.  Its arrays may be read-only."""
 
     vertices: NDArray[np.float64]  # corners of the domains before all maps (n, 2^d, d), m
     surface: NDArray[np.bool_]  # whether a face lies on the surface of the body (n, d, 2)
     tagged: Mapping[str, NDArray[np.bool_]]  # name of a side -> whether a face belongs to the side (n, d, 2)
+    numbers: NDArray[np.int64]  # indices of the domains' corners (n, 2^d); shared corners have one index
 
     lattice = None
 
@@ -73,8 +80,13 @@ class MeshBody(Body):
 
     @cached_property
     def spacing(self) -> NDArray[np.float64]:
-        """Edge lengths (n, d), m, of the bounding boxes of domains."""
-        return self.vertices.max(axis=1) - self.vertices.min(axis=1)
+        """Smallest edge lengths (d,), m, of the bounding boxes of domains."""
+        return np.min([self.boxes(part).min(axis=0) for part in in_chunks(len(self))], axis=0)
+
+    def boxes(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
+        """Return the edge lengths (m, d), m, of the bounding boxes of the chosen domains, before the map."""
+        x = self.vertices[chosen]
+        return x.max(axis=1) - x.min(axis=1)
 
     def lower_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.float64]:
         """Return the lower corners (m, d), m, of the bounding boxes of the chosen domains."""
@@ -114,7 +126,7 @@ class MeshBody(Body):
 
     def across(self, axis: int) -> tuple[float, float]:
         """Return the body's extent along an axis divided by the mean edge length of domains, and this length, m."""
-        edge = float(self.spacing[:, axis].mean())
+        edge = float(np.concatenate([self.boxes(part)[:, axis] for part in in_chunks(len(self))]).mean())
         return float(np.ptp(self.vertices[:, :, axis])) / edge, edge
 
     def reference(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
@@ -123,19 +135,47 @@ class MeshBody(Body):
 
     def nodes(self, rows: slice | NDArray[np.int64]) -> NDArray[np.int64]:
         """Return node indices (m, 2^d) of the corners of domains.  Shared corners have one index."""
-        return self._nodes[rows]
-
-    @cached_property
-    def _nodes(self) -> NDArray[np.int64]:
-        x = self.vertices.reshape(-1, self.dim)
-        pairs = cKDTree(x).query_pairs(NEAR * self.spacing.min(), output_type="ndarray")
-        graph = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(x), len(x)))
-        return connected_components(graph, directed=False)[1].astype(np.int64).reshape(self.vertices.shape[:2])
+        return self.numbers[rows]
 
 
-def seeded(grid: Grid, mesh: Mesh, part: str | None, per_cell: int, material: int, name: str) -> MeshBody:
-    """Return the body of a part of a mesh, or of the whole mesh; see `from_mesh`."""
+def _numbered(vertices: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return the node indices (n, 2^d) of the corners of domains (n, 2^d, d), m."""
+    x = vertices.reshape(-1, vertices.shape[2])
+    pairs = cKDTree(x).query_pairs(NEAR * np.ptp(vertices, axis=1).min(), output_type="ndarray")
+    graph = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(x), len(x)))
+    return connected_components(graph, directed=False)[1].astype(np.int64).reshape(vertices.shape[:2])
+
+
+def seeded(
+    grid: Grid,
+    mesh: Callable[[], Mesh],
+    name: str,
+    *,
+    part: str | None = None,
+    per_cell: int,
+    material: int,
+    warns: bool = True,
+) -> MeshBody:
+    """Return the body of a part of a mesh, or of the whole mesh; see `from_mesh`.
+
+    mesh: function that returns the mesh on rank 0; warns: whether to warn about domains that are too small.
+    """
     per_cell, material = whole("body: per_cell", per_cell), whole("body: material", material, 0)
+
+    def arrays() -> dict[tuple[str, str], NDArray]:
+        body = _divided(grid, mesh(), part, per_cell, name)
+        if warns:
+            _warn_small(grid, body, per_cell, name)
+        tagged = {("tagged", side): rows for side, rows in body.tagged.items()}
+        return {(of, ""): getattr(body, of) for of in ("vertices", "numbers", "surface")} | tagged
+
+    found = once_a_machine(grid.comm, arrays)
+    tagged = {side: found.pop(key) for key in [*found] if (side := key[1])}
+    return MeshBody(**{of: array for (of, _), array in found.items()}, tagged=tagged, material=material)
+
+
+def _divided(grid: Grid, mesh: Mesh, part: str | None, per_cell: int, name: str) -> MeshBody:
+    """Return the body of a part of a mesh, or of the whole mesh, on one process."""
     cells = mesh.part(part)
     _check_repeated(mesh, cells, name)
     domains, keys, cell = map(np.concatenate, zip(*_domains(mesh, cells), strict=True))
@@ -161,9 +201,9 @@ def seeded(grid: Grid, mesh: Mesh, part: str | None, per_cell: int, material: in
     vertices, row, kept = _split(grid, domains, per_cell)
     surface, *tagged_rows = (rows[row].reshape(kept.shape) & kept for rows in (outer, *tagged.values()))
     named = {side: rows for side, rows in zip(tagged, tagged_rows, strict=True) if rows.any()}
-    body = MeshBody(vertices=vertices, surface=surface, tagged=named, material=material)
-    node = body.nodes(slice(None))  # domains have the same digits at a shared node, as those of boxes
+    node = _numbered(vertices)  # domains have the same digits at a shared node, as those of boxes
     vertices[...] = vertices.reshape(-1, grid.dim)[np.unique(node, return_index=True)[1]][node]
+    body = MeshBody(vertices=vertices, surface=surface, tagged=named, numbers=node)
     _check_conforming(body, name)
     return check_inside(grid, body, name)
 
@@ -368,13 +408,12 @@ def _check_conforming(body: MeshBody, name: str) -> None:
         raise ValueError(f"{name}: {what}; must share nodes, or belong to two parts")
 
 
-def warn_small(grid: Grid, body: MeshBody, per_cell: int, name: str) -> MeshBody:
-    """Warn about domains that are much smaller than the grid resolves; return the body."""
+def _warn_small(grid: Grid, body: MeshBody, per_cell: int, name: str) -> None:
+    """Warn on one process about domains that are much smaller than the grid resolves."""
     cell = grid.sizes_at(body.centre - grid.base).prod(axis=-1)
     size = (volumes(body.vertices) / cell) ** (1 / grid.dim) * per_cell
     small = np.flatnonzero(size < SMALL)
     if len(small):
         what = "%s: %d of %d domains are smaller than %.3g of the grid's resolution, the first at %s; "
         what += "they cost as much as large ones; a coarser mesh is sufficient"
-        warn(grid.comm, ResolutionWarning, what, name, len(small), len(body), SMALL, body.centre[small[0]])
-    return body
+        warn(MPI.COMM_SELF, ResolutionWarning, what, name, len(small), len(body), SMALL, body.centre[small[0]])

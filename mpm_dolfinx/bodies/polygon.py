@@ -15,9 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 from mpm_dolfinx.base.tolerances import ROUND_OFF
 from mpm_dolfinx.base.validation import instance, line, numbers, whole
 from mpm_dolfinx.bodies.mesh_cells import AS_LATTICE
-from mpm_dolfinx.bodies.meshes import Mesh, MeshBody, seeded, warn_small
+from mpm_dolfinx.bodies.meshes import Mesh, MeshBody, seeded
 from mpm_dolfinx.grid.grid import Grid
-from mpm_dolfinx.parallel.exchange import at_root
 
 
 def polygon(
@@ -77,9 +76,8 @@ def polygon(
     default = grid.least / whole("body: per_cell", per_cell)
     edge = float(numbers("polygon: size", default if size is None else size, test=lambda v: (v > 0) & np.isfinite(v)))
     _check_simple([corners for corners, _ in loops])
-    mesh = at_root(grid.comm, lambda: _filled(loops, edge))
-    body = seeded(grid, mesh, None, per_cell, material, "polygon")
-    return body if size is None else warn_small(grid, body, per_cell, "polygon")
+    how = {"per_cell": per_cell, "material": material, "warns": size is not None}
+    return seeded(grid, lambda: _filled(loops, edge), "polygon", **how)
 
 
 def _outline(name: str, corners: ArrayLike) -> NDArray[np.float64]:

@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: MIT
+"""Arrays with one copy on each machine, in a temporary file that all its processes map into memory.
+
+A process loads only the pages of the file that it reads, and the operating system may drop them again.  The file loses
+its name once all processes have opened it; its space becomes free with the last array.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable
+from contextlib import ExitStack
+from mmap import ACCESS_READ, mmap
+from tempfile import NamedTemporaryFile
+
+from mpi4py import MPI
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mpm_dolfinx.parallel.exchange import at_root, together
+
+ALIGNED = np.dtype(np.float64).itemsize
+
+
+def once_a_machine(comm: MPI.Intracomm, make: Callable[[], dict[Hashable, NDArray]]) -> dict[Hashable, NDArray]:
+    """Return on every process the arrays that `make` returns on rank 0; on several processes they are read-only.
+
+    If `make` raises, all processes raise its error.  No array may be empty.
+    """
+    made: dict[Hashable, NDArray] = {}
+
+    def form() -> dict[Hashable, tuple[tuple[int, ...], np.dtype]]:
+        made.update(make())
+        return {name: (array.shape, array.dtype) for name, array in made.items()}
+
+    forms = at_root(comm, form)
+    if comm.size == 1:
+        return made
+    machine = comm.Split_type(MPI.COMM_TYPE_SHARED, comm.rank)
+    leaders = comm.Split(MPI.UNDEFINED if machine.rank else 0, comm.rank)
+    with ExitStack() as files:
+        file, mapped = None, []
+
+        def write() -> None:
+            nonlocal file
+            file, failed = files.enter_context(NamedTemporaryFile(prefix="mpm_dolfinx_")), None
+            for name, (shape, dtype) in forms.items():
+                rows = np.ascontiguousarray(made.pop(name)) if comm.rank == 0 else np.empty(shape, dtype)
+                row = MPI.BYTE.Create_contiguous(rows[0].nbytes).Commit()  # the bytes may be too many for an int
+                leaders.Bcast([rows, len(rows), row])
+                row.Free()
+                try:
+                    file.write(rows.data)
+                    file.write(bytes(-rows.nbytes % ALIGNED))
+                    file.flush()
+                except OSError as error:  # such as a full disk; other machines still expect the next array
+                    failed = error
+            if failed is not None:
+                raise failed
+
+        def read() -> None:
+            with open(path, "rb") as opened:
+                mapped.append(mmap(opened.fileno(), 0, access=ACCESS_READ))
+
+        together(comm, write if machine.rank == 0 else lambda: None)
+        path = machine.bcast(file and file.name)
+        together(comm, read)
+    for one in (machine, leaders):
+        if one != MPI.COMM_NULL:
+            one.Free()
+    out, start = {}, 0
+    for name, (shape, dtype) in forms.items():
+        count = int(np.prod(shape))
+        out[name] = np.frombuffer(mapped[0], dtype, count, start).reshape(shape)
+        start += count * dtype.itemsize + -count * dtype.itemsize % ALIGNED
+    return out
