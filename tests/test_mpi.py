@@ -127,6 +127,11 @@ def test_a_second_scene_on_a_grid_is_as_even_as_alone(tmp_path):
     assert np.load(tmp_path / "out.npz")["imbalance"].max() < 1.3
 
 
+@pytest.mark.parametrize("processes", [2, 3])
+def test_several_processes_seed_or_refuse_the_same_meshes(processes, tmp_path):
+    mpirun(processes, "mpi_bodies.py", str(tmp_path))
+
+
 @pytest.mark.parametrize("of", ["boxes", "meshes"])
 def test_no_process_holds_arrays_of_the_whole_scene(of, tmp_path):
     """Of 1e4 points, many are at borders between processes, so that each of four holds more than a quarter: 0.309."""

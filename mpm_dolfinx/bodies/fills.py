@@ -184,7 +184,7 @@ def _between(K: csr_array, fixed: NDArray[np.bool_], u: NDArray[np.float64]) -> 
         rows = K[free]
         A = rows[:, free].tocsr()
         csr = (A.indptr.astype(PETSc.IntType), A.indices.astype(PETSc.IntType), A.data)
-        matrix = PETSc.Mat().createAIJ(A.shape, csr=csr, comm=MPI.COMM_SELF)  # every process holds all seeded bodies
+        matrix = PETSc.Mat().createAIJ(A.shape, csr=csr, comm=MPI.COMM_SELF)  # every process reads the whole fill
         solver = PETSc.KSP().create(MPI.COMM_SELF)
         solver.setErrorIfNotConverged(True)
         solver.setOperators(matrix)

@@ -50,7 +50,8 @@ def from_mesh(
     Sides have the names of the mesh's facets: gmsh's physical groups of lines in 2D and surfaces in 3D, Abaqus
     surfaces, or facet tags.  Bodies from several parts of a mesh share the faces between the parts.  Shared faces are
     no surface while both bodies are active.  Vertices of the mesh are reference positions.  The points form no lattice,
-    so the filter of short waves does not act.
+    so the filter of short waves does not act.  On several processes the first one reads the mesh, and each machine has
+    a copy of the domains in a temporary file.
 
     Parameters
     ----------
@@ -60,6 +61,7 @@ def from_mesh(
         A file that meshio reads, an Abaqus input file, a meshio mesh or a dolfinx mesh: triangles and quadrilaterals in
         2D; tetrahedra, hexahedra, wedges and pyramids in 3D.  Second-order cells are reduced to their corners, with a
         warning that gives the distance of edge nodes from edge midpoints.  2D cells must lie in a plane of equal z.
+        A dolfinx mesh may be distributed over the processes of the grid.
     part
         Group of cells, by default all cells: a physical group, an Abaqus part, instance or set, or a tag in data such
         as "MaterialIDs".
@@ -77,6 +79,8 @@ def from_mesh(
     ValueError
         A missing or unreadable file; another kind of mesh; an unknown part.  Cells that are flat, inverted, non-convex,
         repeated or overlapping; vertices outside the grid; hanging or duplicate nodes.
+    OSError
+        On several processes: a temporary file cannot be written.
     """
     instance("body: grid", grid, Grid)
     name, names = "mesh", _numbers(names)

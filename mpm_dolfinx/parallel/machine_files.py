@@ -39,20 +39,21 @@ def once_a_machine(comm: MPI.Intracomm, make: Callable[[], dict[Hashable, NDArra
     machine = comm.Split_type(MPI.COMM_TYPE_SHARED, comm.rank)
     leaders = comm.Split(MPI.UNDEFINED if machine.rank else 0, comm.rank)
     with ExitStack() as files:
-        file, mapped = None, []
+        written, mapped = [], []
+
+        def create() -> None:
+            written.append(files.enter_context(NamedTemporaryFile(prefix="mpm_dolfinx_")))
 
         def write() -> None:
-            nonlocal file
-            file, failed = files.enter_context(NamedTemporaryFile(prefix="mpm_dolfinx_")), None
+            failed = None
             for name, (shape, dtype) in forms.items():
                 rows = np.ascontiguousarray(made.pop(name)) if comm.rank == 0 else np.empty(shape, dtype)
                 row = MPI.BYTE.Create_contiguous(rows[0].nbytes).Commit()  # the bytes may be too many for an int
                 leaders.Bcast([rows, len(rows), row])
                 row.Free()
                 try:
-                    file.write(rows.data)
-                    file.write(bytes(-rows.nbytes % ALIGNED))
-                    file.flush()
+                    written[0].writelines((rows.data, bytes(-rows.nbytes % ALIGNED)))
+                    written[0].flush()
                 except OSError as error:  # such as a full disk; other machines still expect the next array
                     failed = error
             if failed is not None:
@@ -62,8 +63,9 @@ def once_a_machine(comm: MPI.Intracomm, make: Callable[[], dict[Hashable, NDArra
             with open(path, "rb") as opened:
                 mapped.append(mmap(opened.fileno(), 0, access=ACCESS_READ))
 
-        together(comm, write if machine.rank == 0 else lambda: None)
-        path = machine.bcast(file and file.name)
+        for action in (create, write):
+            together(comm, action if machine.rank == 0 else lambda: None)
+        path = machine.bcast([file.name for file in written])[0]
         together(comm, read)
     for one in (machine, leaders):
         if one != MPI.COMM_NULL:
