@@ -6,11 +6,12 @@ import tempfile
 import warnings
 from pathlib import Path
 
+from mpi4py import MPI
+
 import dolfinx.mesh
 import meshio
 import numpy as np
 from meshes import box_mesh
-from mpi4py import MPI
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.parallel import machine_files
