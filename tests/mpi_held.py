@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Move two wet soils, boxes or meshes, with fields of materials, on any number of processes; write the memory of all arrays."""
+"""Move two wet soils, boxes or meshes, with fields of materials, on any number of processes; write the memory held."""
 
 import sys
 
