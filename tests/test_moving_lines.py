@@ -163,6 +163,41 @@ def test_a_body_carried_through_lines_that_move_against_it_and_back_is_as_one_in
     assert (left[1] < 1.5 * left[0]).all(), left
 
 
+def on_swinging_lines(body, conditions, **more):
+    """Return wet soil of a box on graded lines that swing along x."""
+    given = mpm.graded([0, 0], [2, 2], [[[0.65, 0.88], [0.98, 1.24]]], 0.06, 1.3)
+    swing = lambda t: carried(given, np.array([0.4 * np.sin(20 * t), 0.0]))  # noqa: E731
+    grid, numerics = mpm.Grid(lines=given, follow=swing), mpm.Numerics(tolerance=1e-11)
+    acting = {"fluid": mpm.Fluid(), "conditions": [*conditions, mpm.Drained("top")], "numerics": numerics}
+    return mpm.Simulation(grid, [mpm.box(grid, *body)], [SOFT], **acting, **more)
+
+
+@pytest.mark.parametrize("inertia", [False, True])
+def test_tied_sides_hold_on_lines_that_swing_and_a_run_goes_on_with_the_same_bits(inertia, tmp_path):
+    ends, file = [], tmp_path / "kept"
+    for parts in (1, 2):
+        acting = [mpm.Displacement("bottom", (0, 0)), mpm.Tied("left", "right")]
+        more = {"inertia": inertia, "gravity": (2.0, -9.81), "walls": {}}
+        s, again = (on_swinging_lines(([0.3, 0.1], [1.7, 1]), acting, **more) for _ in range(2))
+        result = s.run(0.04, 0.01, progress=False, checkpoint=mpm.Checkpoint(file))
+        if parts == 2:
+            s, result = again, mpm.resume(again, file)
+        result = s.run(0.08, 0.01, progress=False, after=result)
+        assert result.balance < 1e-8 and np.abs(s.grid.lines[0] - s.grid.seeded[0]).max() > 0.3
+        if not inertia:  # both forces of the base bear one weight
+            across, up = s.reactions["displacement_bottom"]
+            assert across == pytest.approx(-2 / 9.81 * up, rel=1e-8)
+        ends.append(s.points)
+    assert (ends[0].corners == ends[1].corners).all() and (ends[0].pressure == ends[1].pressure).all()
+
+
+def test_soil_and_water_stay_at_rest_on_lines_that_swing():
+    start = {"initial_stress": mpm.K0(0.5), "pressure": mpm.hydrostatic(0.93), "gravity": (0, -9.81)}
+    s = on_swinging_lines(([0, 0], [2, 0.93]), [], walls={"left": "x", "right": "x", "bottom": "xy"}, **start)
+    result = s.run(0.08, 0.01, progress=False)
+    assert s.state.resets > 5 and result.balance < 1e-8 and np.abs(s.points.displacement).max() < 1e-12
+
+
 LINES = [[0, 1, 1.5, 2, 3], [0, 1, 1.5, 2, 3]]
 BALL = mpm.Tool(mpm.Ball((1.5, 1.5), 0.2), lambda t: (0, -t))
 
