@@ -47,6 +47,8 @@ are 6.05 for rough circles (Cox, Eason and Hopkins 1961), and 5.69 for smooth ci
 With non-associated flow the solution is not unique.  Shear bands are one cell wide and change their position between
 steps, more often on finer cells (Rudnicki and Rice 1975).  On fine grids many steps are therefore cut.  The option
 --viscosity adds a viscous stress, small compared with the cohesion, which makes the solution unique (Needleman 1988).
+With --explicit-friction, friction follows from the mean stress at the start of each step (Krabbenhoft et al. 2012).
+Flow is then associated within a step.  The error of the load is proportional to the step.
 """
 
 from __future__ import annotations
@@ -55,9 +57,11 @@ import time
 from dataclasses import dataclass, field, fields, replace
 from itertools import product
 from pathlib import Path
+from typing import ClassVar
 
 import common
 import numpy as np
+import ufl
 
 import mpm_dolfinx as mpm
 
@@ -73,6 +77,7 @@ SOIL = mpm.DruckerPrager(
     porosity=0.4,
     conductivity=1e-8,
 )
+OF_SOIL = {f.name: getattr(SOIL, f.name) for f in fields(SOIL)}
 WATER = mpm.Fluid()
 CV = SOIL.conductivity / WATER.unit_weight * SOIL.oedometric  # m²/s
 RATES = {"fast": 1000.0, "intermediate": 1.0, "slow": 1e-3}  # V
@@ -114,6 +119,41 @@ SURFACE = {  # limit loads divided by B c; Davis: reduced friction phi*, tan phi
 def embedded(depth):
     """Return the undrained limit load, divided by B c, of a base at the depth `depth` (divided by B)."""
     return SURFACE["undrained"] * (1 + 0.27 * np.sqrt(depth))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExplicitFriction(mpm.DruckerPrager):
+    """Drucker-Prager soil with the friction of the mean stress at the start of each step.
+
+    Within a step, the friction angle equals the dilation angle, so flow is associated.  The strength at zero mean
+    stress contains the rest of the friction.  Source: Krabbenhoft, Karim, Lyamin and Sloan (2012).  Further state
+    variables: `mean`, the mean Kirchhoff stress, Pa, and `strength`, that of the last step, Pa.
+    """
+
+    state: ClassVar = mpm.DruckerPrager.state | {"mean": 0.0, "strength": 0.0}
+
+    @property
+    def symmetric(self) -> bool:
+        return True
+
+    @staticmethod
+    def kirchhoff(F, bulk, shear, eta, xi, eta_flow, cohesion, plastic, hardened, mean, strength, dt):
+        """Return the Kirchhoff stress (3, 3), Pa, as UFL."""
+        now = ExplicitFriction.present(eta, xi, eta_flow, cohesion, mean, strength, dt)
+        return mpm.DruckerPrager.kirchhoff(F, bulk, shear, eta_flow, 1.0, eta_flow, now, 0.0, plastic, hardened)
+
+    @staticmethod
+    def update(F, bulk, shear, eta, xi, eta_flow, cohesion, plastic, hardened, mean, strength, dt):
+        """Return the state at the end of the step: UFL by name."""
+        now = ExplicitFriction.present(eta, xi, eta_flow, cohesion, mean, strength, dt)
+        law = F, bulk, shear, eta_flow, 1.0, eta_flow, now, 0.0, plastic, hardened
+        stress = ufl.tr(mpm.DruckerPrager.kirchhoff(*law)) / 3
+        return mpm.DruckerPrager.update(*law) | {"mean": stress, "strength": now}
+
+    @staticmethod
+    def present(eta, xi, eta_flow, cohesion, mean, strength, dt):
+        """Return the strength at zero mean stress, Pa; for dt = 0, that of the last step."""
+        return ufl.conditional(ufl.gt(dt, 0), ufl.max_value(xi * cohesion - (eta - eta_flow) * mean, 0), strength)
 
 
 @dataclass
@@ -279,7 +319,10 @@ def main(argv: list[str] | None = None) -> dict:
     methods = ("sdirk2", "backward-euler")
     parser.add_argument("--method", choices=methods, default=methods[0], help="with --steps: time integration")
     what = "with --steps: viscosity of the soil, divided by the cohesion and by the time of the push"
-    parser.add_argument("--viscosity", type=float, default=0.0, help=what)
+    how = parser.add_mutually_exclusive_group()
+    how.add_argument("--viscosity", type=float, default=0.0, help=what)
+    what = "with --steps: friction from the mean stress at the start of each step"
+    how.add_argument("--explicit-friction", action="store_true", help=what)
     parser.add_argument(
         "--graded", action="store_true", help="only the undrained limit load, in a large box of graded cells"
     )
@@ -295,8 +338,8 @@ def main(argv: list[str] | None = None) -> dict:
         parser.error(f"--steps {o.steps}: must be >= 1; --box {o.box:g}: must be in [1, 32]")
     if not 0 <= o.viscosity <= 1:
         parser.error(f"--viscosity {o.viscosity:g}: must be in [0, 1]")
-    if o.steps is None and (o.box, o.method, o.viscosity) != (BOX[0], methods[0], 0.0):
-        parser.error("--box, --method, --viscosity: must go with --steps")
+    if o.steps is None and (o.box, o.method, o.viscosity, o.explicit_friction) != (BOX[0], methods[0], 0.0, False):
+        parser.error("--box, --method, --viscosity, --explicit-friction: must go with --steps")
     if o.steps is None and not o.square:
         parser.refuse_processes(" without --steps or --square")
     with common.results(o) as out:
@@ -308,7 +351,7 @@ def main(argv: list[str] | None = None) -> dict:
             out |= of_many_sizes(o.cells, o.out)
             return out
         if o.steps is not None:
-            out |= effort(o.cells, o.depth, o.steps, o.box, o.method, o.viscosity)
+            out |= effort(o.cells, o.depth, o.steps, o.box, o.method, o.viscosity, o.explicit_friction)
             return out
         stiff = {(how, cells): limit_load(how, cells) for how in LIMITS_OF for cells in (o.cells, 2 * o.cells - 1)}
         out["errors"] = errors(stiff)
@@ -366,17 +409,19 @@ def viscous(viscosity: float, seconds: float) -> mpm.DruckerPrager:
     """
     if viscosity == 0:
         return SOIL
-    own = {f.name: getattr(SOIL, f.name) for f in fields(SOIL)} | {"residual": COHESION, "slip": WIDTH}  # no softening
+    own = OF_SOIL | {"residual": COHESION, "slip": WIDTH}  # no softening
     return mpm.SofteningDruckerPrager(**own, viscosity=viscosity * COHESION * seconds)
 
 
-def effort(cells: int, depth: float, steps: int, width: float, method: str, viscosity: float = 0.0) -> dict:
+def effort(
+    cells: int, depth: float, steps: int, width: float, method: str, viscosity: float = 0.0, explicit: bool = False
+) -> dict:
     """Push at the intermediate rate in equal steps; print and return load, numbers of steps, and processor time.
 
-    width: width of half the soil, divided by B.  viscosity: see `viscous`.
+    width: width of half the soil, divided by B.  viscosity: see `viscous`.  explicit: see `ExplicitFriction`.
     """
     began, rate = time.process_time(), RATES["intermediate"]
-    soil = viscous(viscosity, depth * WIDTH**2 / (CV * rate))
+    soil = ExplicitFriction(**OF_SOIL) if explicit else viscous(viscosity, depth * WIDTH**2 / (CV * rate))
     run = push(soil, cells, depth, rate, box=(width, BOX[1]), steps=steps, method=method)
     found = {"points": run.results[0].points, "asked": steps, "load": run.load[-1]}
     found |= {count: run.total(count) for count in ("steps", "cuts", "newton")} | {"cpu": time.process_time() - began}

@@ -117,6 +117,15 @@ def test_soil_with_a_small_viscosity_resists_in_proportion_to_it():
     assert loads[2] - loads[0] == pytest.approx(2 * (loads[1] - loads[0]), rel=0.1)
 
 
+def test_friction_at_the_start_of_a_step_changes_the_load_by_less_in_shorter_steps():
+    def load(steps, explicit):
+        return footing.effort(9, 0.15, steps, 2.0, "sdirk2", explicit=explicit)["load"]
+
+    long, short = (abs(load(steps, True) / load(steps, False) - 1) for steps in (4, 16))
+    print(f"change of the load by explicit friction: {long:.2%} in 4 steps, {short:.2%} in 16")
+    assert short < long / 2 < 0.01
+
+
 @pytest.mark.parametrize("roughness", ["rough", "smooth"])
 def test_circular_footings_on_graded_cells_tend_to_exact_loads_from_below(roughness):
     coarse, fine = (footing.bearing("circle", roughness, cells)["error"] for cells in (5, 9))
@@ -131,10 +140,10 @@ def test_a_square_footing_in_3d_tends_to_its_bounds_from_below_with_few_iteratio
 
 
 def test_options_that_would_change_nothing_without_steps_are_refused(capsys):
-    for option in ("--viscosity=0.1", "--box=4", "--method=backward-euler"):
+    for option in ("--viscosity=0.1", "--box=4", "--method=backward-euler", "--explicit-friction"):
         with pytest.raises(SystemExit):
             footing.main([option])
-        assert "--box, --method, --viscosity: must go with --steps" in capsys.readouterr().err
+        assert "--box, --method, --viscosity, --explicit-friction: must go with --steps" in capsys.readouterr().err
 
 
 @pytest.mark.slow
