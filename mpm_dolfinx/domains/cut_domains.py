@@ -137,6 +137,11 @@ class CutDomains(Keyed):
         self.hoop = exchange.send(self.pieces.hoop) if grid.axisymmetric else None
         """In axisymmetry: moments (m, 4) of the pieces in the plane, see `Pieces`."""
 
+    def take_faces(self) -> NDArray[np.float64]:
+        """Return the face areas (m, d, 2) of the pieces, see `Pieces`, on the owners of the cells; remove them here."""
+        faces, self.pieces.faces = self.pieces.faces, self.pieces.faces[:0].copy()
+        return self.pieces_to_cells(faces)
+
     def moved(self, points: MaterialPoints, part: NDArray[np.int64], count: int) -> NDArray[np.float64]:
         """Return for each connected part (count,) the largest motion of corners since the cut, in cell sizes.
 

@@ -288,6 +288,10 @@ class PointData(Keyed):
         nodal = u.take(self.places.nodal)
         return self._gradients(nodal, partial(self._of_nodal, nodal))
 
+    def clear(self) -> None:
+        """Delete the result that `gradients` has stored."""
+        self._gradients.clear()
+
     def increments(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return I + grad u (n, 9), with the circumferential stretch, for a Q1 vector with nodal values u."""
         out = np.zeros((len(self.cells), 3, 3))

@@ -6,7 +6,7 @@ The grid is reset at the start of the next step, see `grid_reset`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import cache, partial
 
@@ -130,7 +130,7 @@ class Motion:
             deformed = cache(partial(self._deformed, cut, data, nodal))
             if cut.domains:
                 followed = cut.followed(nodal, on_grid.active.contains)
-                points, keeps, folded = self._shaped(state, loads, on_grid, *followed, deformed)
+                points, keeps, folded = self._shaped(state, loads, on_grid, followed, deformed)
             else:
                 x, F = state.points.x + cut.displacement(nodal), deformed()
                 corners = parallelepipeds(x, F[:, :d, :d], self._sizes(state.points))
@@ -298,11 +298,10 @@ class Motion:
         state: State,
         loads: Sequence[Loads],
         on_grid: OnGrid,
-        moved: NDArray[np.float64],
-        bend: NDArray[np.float64],
+        followed: Iterable[NDArray[np.float64]],
         deformed: Callable[[], NDArray[np.float64]],
     ) -> tuple[MaterialPoints, NDArray[np.bool_], int]:
-        """Return the points with new F, and with corners moved by `moved` (n, 2^d, d), m, and the correction `bend`.
+        """Return the points with new F, and with corners moved by the two terms (n, 2^d, d), m, of `CutDomains.followed`.
 
         Also return whether each point (n,) keeps its pieces, see `OnGrid.valid`, and the number of inverted domains.
 
@@ -310,13 +309,14 @@ class Motion:
         kinks of its motion are permanent, and the corners of domains in kinks would give a wrong F.
         """
         cut, stage = on_grid.cut, state.stage
-        grid, folded = cut.grid, 0
+        (moved, bend), grid, folded = followed, cut.grid, 0
         own = self._own(stage, state.points)
         near = np.zeros(moved.shape[:2], dtype=bool)
         for one in loads:
             near |= one.near(state.points, state.points.corners + moved)
         free = own & ~near[:, :, None]
         corners = state.points.corners + moved + free * bend
+        del moved, bend  # memory is at its peak below
         for one in loads:
             corners = one.outside(corners, own)
         points = replace(state.points, corners=corners)

@@ -110,7 +110,7 @@ class OnGrid(Keyed):
                 weight=weight,
                 area=area,
                 x=x,
-                faces=cut.pieces_to_cells(cut.pieces.faces),
+                faces=cut.take_faces(),
                 fixed_stress=quadrature.fixed_stress(cut, points, of_fluid),
                 damping=quadrature.rows(cut, points, lambda m: m.pressure_damping()),
             )
