@@ -18,6 +18,15 @@ def memory() -> float:
     return pages * 4096 / 2**20
 
 
+def test_large_arrays_that_are_freed_leave_the_process():
+    """A library that PETSc loads had switched this off: a process kept the sum of what it ever held between arrays."""
+    before = memory()
+    large = np.ones(2**23)  # 64 MB
+    assert memory() - before > 60
+    del large
+    assert memory() - before < 1
+
+
 def test_memory_does_not_grow_with_the_number_of_steps():
     simulation, _ = beam()
     simulation.run(0.2, 0.02, progress=False)

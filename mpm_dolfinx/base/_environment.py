@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import logging
 import os
 import sys
@@ -52,4 +53,13 @@ def _check() -> None:
         raise ImportError(f"dolfinx {dolfinx.__version__} is not supported; mpm_dolfinx needs 0.5.2, 0.9, 0.10 or 0.11")
 
 
+def _return_memory() -> None:
+    """Let glibc return large freed arrays to the system; SuperLU_DIST, which PETSc loads, has prevented this."""
+    libc = ctypes.CDLL(None)
+    if hasattr(libc, "gnu_get_libc_version"):  # M_MMAP_MAX, and the largest thresholds that glibc itself sets
+        for option, value in ((-4, 2**16), (-3, 2**25), (-1, 2**26)):
+            libc.mallopt(option, value)
+
+
 _check()
+_return_memory()

@@ -50,14 +50,10 @@ class Patches:
     """
 
     def __init__(self, grid: Grid, faces: Surface, face, at, cell, x, xi, share, renewed: RenewedFaces | None = None):
-        self._faces = faces
-        self.face = face
-        self.at = at
-        self.xi = xi
-        self.cell = cell
-        self.x = x
-        self._grid = grid
-        self._renewed = renewed
+        self._faces, self.face = faces, face
+        self.at, self.cell = at, cell
+        self.x, self.xi = x, xi
+        self._grid, self._renewed = grid, renewed
         area0 = faces.area0[face]
         self._whole0, self._face = faces.whole0[face], faces.face[face]
         if renewed is not None:
@@ -116,8 +112,7 @@ class CutDomains(Keyed):
     """
 
     def __init__(self, grid: Grid, points: MaterialPoints, domains: bool, second: bool = False, faces: bool = True):
-        self.grid = grid
-        self.points = points
+        self.grid, self.points = grid, points
         self.domains = domains
         self._patches: dict[Surface, Patches] = {}
         self.pieces = cut(grid, points.corners, second, faces) if domains else whole_points(grid, points.x)
@@ -136,11 +131,6 @@ class CutDomains(Keyed):
         """If `second`: mean products (m, d, d), m^2, of all offsets in each piece from its centroid."""
         self.hoop = exchange.send(self.pieces.hoop) if grid.axisymmetric else None
         """In axisymmetry: moments (m, 4) of the pieces in the plane, see `Pieces`."""
-
-    def take_faces(self) -> NDArray[np.float64]:
-        """Return the face areas (m, d, 2) of the pieces, see `Pieces`, on the owners of the cells; remove them here."""
-        faces, self.pieces.faces = self.pieces.faces, self.pieces.faces[:0].copy()
-        return self.pieces_to_cells(faces)
 
     def moved(self, points: MaterialPoints, part: NDArray[np.int64], count: int) -> NDArray[np.float64]:
         """Return for each connected part (count,) the largest motion of corners since the cut, in cell sizes.
@@ -243,8 +233,7 @@ class CutDomains(Keyed):
     @cached_property
     def _followed(self) -> tuple[Exchange, NDArray[np.int32], NDArray[np.float64]]:
         """Exchange with owners of cells; cells and positions (m, d), m, of all corners (of points if not `domains`)."""
-        grid = self.grid
-        n = len(self.points)
+        grid, n = self.grid, len(self.points)
         d = self.grid.dim
         at = np.arange(n).repeat(2**d if self.domains else 1)
         x = self.points.corners.reshape(-1, d) if self.domains else self.points.x

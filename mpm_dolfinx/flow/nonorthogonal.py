@@ -60,11 +60,9 @@ class Gradients:
     def __init__(self, contents: CellContents, sides: OpenSides):
         self._grid = grid = contents.grid
         d = contents.grid.dim
-        centroid = contents.centroid
-        share = contents.open
+        centroid, share = contents.centroid, contents.open
         towards = np.repeat(np.arange(d), 2)
-        at = contents.slot(sides.cells)
-        tangential = _along(sides)
+        at, tangential = contents.slot(sides.cells), _along(sides)
         neighbours = grid.neighbours(contents.filled)
         cells = np.maximum(neighbours, 0)
         inside = (neighbours >= 0) & (share[contents.filled] > 0)
@@ -136,7 +134,8 @@ class Gradients:
         to_cells = p[self._neighbours] - own[:, None]
         to_sides = outer[self._faces[self._known]] - own[at]
         if weight is not None:
-            to_cells, to_sides = to_cells - self._separation @ weight, to_sides - self._sides.offset[self._faces[self._known]] @ weight
+            to_cells = to_cells - self._separation @ weight
+            to_sides = to_sides - self._sides.offset[self._faces[self._known]] @ weight
         to_cells = np.where(self._inside, to_cells, 0.0)
         out = np.einsum("nk,nki->ni", to_cells, of_cells)
         for axis in range(out.shape[1]):

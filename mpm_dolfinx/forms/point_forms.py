@@ -180,10 +180,8 @@ class Places(Keyed):
         mixed: NDArray[np.float64] | None = None,
         hoop: NDArray[np.float64] | None = None,
     ):
-        self.grid = grid
-        self.cells = cells
-        self.x = x
-        self.mixed = mixed
+        self.grid, self.cells = grid, cells
+        self.x, self.mixed = x, mixed
         self.offset = offset = x - grid.midpoints[cells]
         if grid.axisymmetric and hoop is None:
             hoop = np.column_stack([offset, offset.prod(axis=1), x[:, 0]])
@@ -256,10 +254,8 @@ class PointData(Keyed):
     """
 
     def __init__(self, points: FormPoints, places: Places, weight: NDArray[np.float64], fields: dict[str, NDArray]):
-        self.points = points
-        self.places = places
-        self.cells = places.cells
-        self.x = places.x
+        self.points, self.places = points, places
+        self.cells, self.x = places.cells, places.x
         self.volume, n = weight, len(places.cells)
         self.rows = {"offset": places.offset, "weight": (weight / points.grid.volumes(self.cells))[:, None]}
         if points.grid.dim == 3:
@@ -267,7 +263,7 @@ class PointData(Keyed):
         if points.grid.axisymmetric:
             self.rows["hoop"] = places.hoop
         self.rows |= {name: fields[name].reshape(n, size) for name, size in points.sizes.items()}
-        self._gradients: Latest[NDArray[np.float64]] = Latest()
+        self.stored: Latest[NDArray[np.float64]] = Latest()
 
     def part(self, points: FormPoints, places: Places, rows: NDArray[np.int64]) -> PointData:
         """Return the data of the points `rows`, for the fields of `points`, at the positions `places`."""
@@ -286,11 +282,7 @@ class PointData(Keyed):
     def gradients(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the gradients (n, d^2) of a Q1 vector with nodal values u, a local array; stores the last result."""
         nodal = u.take(self.places.nodal)
-        return self._gradients(nodal, partial(self._of_nodal, nodal))
-
-    def clear(self) -> None:
-        """Delete the result that `gradients` has stored."""
-        self._gradients.clear()
+        return self.stored(nodal, partial(self._of_nodal, nodal))
 
     def increments(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return I + grad u (n, 9), with the circumferential stretch, for a Q1 vector with nodal values u."""
@@ -305,9 +297,8 @@ class PointData(Keyed):
 
     def _of_nodal(self, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the gradients (n, d^2) from values at the nodes of the cells, see `Places.nodal`."""
-        places = self.places
-        grid = self.points.grid
-        d = self.points.grid.dim
+        places, grid = self.places, self.points.grid
+        d = grid.dim
         of_cells = grid.over_edges(grid.monomials @ nodal, places.filled)
         out = np.empty((len(self.cells), d, d))
         # one component at a time: numpy takes six times as long for rows of a few numbers

@@ -125,6 +125,8 @@ class Motion:
         """
         with _compat.Timer("move points"):
             cut, pieces = on_grid.cut, data.pieces
+            for one in (pieces, *data.parts):
+                one.stored.clear()  # memory is at its peak below
             grid, d = cut.grid, cut.grid.dim
             nodal = self._momentum.u.x.array.reshape(-1, d)
             deformed = cache(partial(self._deformed, cut, data, nodal))
@@ -269,8 +271,7 @@ class Motion:
 
         F is the mean of (increment of F) F_n over the pieces of the point, scaled so that det F is their mean det F.
         """
-        pieces = data.pieces
-        grid = cut.grid
+        pieces, grid = data.pieces, cut.grid
         n = len(cut.points)
         d = self._materials.stretches
         F = pieces["F"].reshape(-1, grid.stretches, grid.stretches)
@@ -301,7 +302,7 @@ class Motion:
         followed: Iterable[NDArray[np.float64]],
         deformed: Callable[[], NDArray[np.float64]],
     ) -> tuple[MaterialPoints, NDArray[np.bool_], int]:
-        """Return the points with new F, and with corners moved by the two terms (n, 2^d, d), m, of `CutDomains.followed`.
+        """Return the points with new F, and with corners moved by both terms (n, 2^d, d), m, of `CutDomains.followed`.
 
         Also return whether each point (n,) keeps its pieces, see `OnGrid.valid`, and the number of inverted domains.
 
@@ -309,14 +310,15 @@ class Motion:
         kinks of its motion are permanent, and the corners of domains in kinks would give a wrong F.
         """
         cut, stage = on_grid.cut, state.stage
-        (moved, bend), grid, folded = followed, cut.grid, 0
+        grid, folded = cut.grid, 0
+        moved, bend = followed
         own = self._own(stage, state.points)
         near = np.zeros(moved.shape[:2], dtype=bool)
         for one in loads:
             near |= one.near(state.points, state.points.corners + moved)
         free = own & ~near[:, :, None]
         corners = state.points.corners + moved + free * bend
-        del moved, bend  # memory is at its peak below
+        del moved, bend
         for one in loads:
             corners = one.outside(corners, own)
         points = replace(state.points, corners=corners)

@@ -69,10 +69,8 @@ class OnGrid(Keyed):
         cut: CutDomains,
         of_fluid: bool,
     ):
-        grid = cut.grid
-        points = cut.points
-        self.cut = cut
-        self._quadrature = quadrature
+        grid, points = cut.grid, cut.points
+        self.cut, self._quadrature = cut, quadrature
         self._storage, self._u = storage, momentum.u
         self._momentum = momentum
         self._places = quadrature.places(cut)
@@ -110,11 +108,12 @@ class OnGrid(Keyed):
                 weight=weight,
                 area=area,
                 x=x,
-                faces=cut.take_faces(),
+                faces=cut.pieces_to_cells(cut.pieces.faces),
                 fixed_stress=quadrature.fixed_stress(cut, points, of_fluid),
                 damping=quadrature.rows(cut, points, lambda m: m.pressure_damping()),
             )
             self.contents = CellContents(storage.fluxes, brought, own)
+            cut.pieces.faces = cut.pieces.faces[:0].copy()  # as large as F; not needed any more
             if quadrature.materials.retentions is not None:
                 lever = x - grid.midpoints[cut.cells] - self.contents.centroid[cut.cells]
                 self._places = replace(self._places, lever=lever)
@@ -182,10 +181,8 @@ class OnGrid(Keyed):
         The mass potentials pi (m,), Pa (`fluid_content`), preserve linear fields. A constant for each point, added to
         the pressures of its pieces, then preserves the water.
         """
-        materials = self._quadrature.materials
-        points = self.cut.points
-        bulk = self._storage.bulk
-        old = state.pieces
+        materials, points = self._quadrature.materials, self.cut.points
+        bulk, old = self._storage.bulk, state.pieces
         count, pieces = len(points), self.cut.pieces
         pores, store = materials.porosity(points), materials.storage(points)
         rows, scale = materials.retention_rows(points), materials.retention_scale(points)
@@ -265,12 +262,10 @@ class OnGrid(Keyed):
         With `water`, the sum of pore water in a cell is conserved. With gravity the reconstruction then acts on
         differences from the hydrostatic pressures `at_rest`.
         """
-        pieces = self.data.pieces
-        contents = self.contents
+        pieces, contents = self.data.pieces, self.contents
         bulk = self._storage.bulk if water is None else np.inf
         p_n = self._storage.p_n.x.array
-        cells = pieces.cells
-        offset = pieces.places.offset
+        cells, offset = pieces.cells, pieces.places.offset
         at = contents.slot(pieces.cells)
         store = self.cut.pieces_to_cells(store)
         weight = np.where(contents.total(store)[at] > 0, store, self.weight)
@@ -530,10 +525,8 @@ class Assembled(Keyed):
         loads: Sequence[Loads],
     ):
         self._system = system
-        self.momentum = system.momentum
-        self.storage = system.storage
-        self.symmetric = system.symmetric
-        self.plan = system.plan
+        self.momentum, self.storage = system.momentum, system.storage
+        self.symmetric, self.plan = system.symmetric, system.plan
         self.end_step = system.end_step
         self._on_grid, self._stage = on_grid, stage
         self._nodal, self._varies = momentum.nodal, storage is not None and storage.conductivity is not None

@@ -68,7 +68,6 @@ def step(scene: Scene, state: State, dt: float, how: tuple = ()) -> tuple[State,
     note_pressures(report, start.matrices.solvers, both.storage, acting.substep.before * dt, dt, rates, bodies)
     report.moves = start.moves(flights[1:], acting.substep)
     start.matrices.end_step()
-    start.data.end_step()
     seconds = dt * np.array([acting.substep.before, acting.substep.own])
     at, outcome = both.momentum.at, both.outcome(state, passed, seconds)
     end = state.t + dt, [one.ended(at) for one in acting.loads], both.net_inflow(rates[-1]), report
