@@ -251,7 +251,7 @@ def material_points(
     return MaterialPoints(
         id=ids,
         corners=corners,
-        F=np.tile(np.eye(grid.stretches), (n, 1, 1)),
+        F=np.broadcast_to(np.eye(grid.stretches), (n, grid.stretches, grid.stretches)),
         volume0=domain_volumes(corners, True) if grid.axisymmetric else size.prod(axis=1),
         material=material,
         pressure=pressures,

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpm_dolfinx.domains.cut_domains import CutDomains
-from mpm_dolfinx.grid.grid import FACE_SIGNS, FACES, TURN, sum_by
+from mpm_dolfinx.grid.grid import FACE_SIGNS, FACES, TURN, in_chunks, sum_by
 from mpm_dolfinx.points.cutting import cross, domain_volumes, volumes
 from mpm_dolfinx.points.material_points import MaterialPoints, cofactor, determinant
 
@@ -34,8 +34,11 @@ def gradient(
         now, then = (domain_volumes(y, True) / volumes(y) for y in (corners, reference))
         out[:, 2, 2] = now / then
         return out
-    F, then = _of_hexahedra(corners, reference)
-    return F * np.cbrt(volumes(corners) / then / determinant(F))[:, None, None]
+    out = np.empty((len(corners), 3, 3))
+    for part in in_chunks(len(corners)):
+        F, then = _of_hexahedra(corners[part], reference[part])
+        out[part] = F * np.cbrt(volumes(corners[part]) / then / determinant(F))[:, None, None]
+    return out
 
 
 def _of_hexahedra(

@@ -118,7 +118,7 @@ class DrainedSides(Feeding):
         cell, x, values = grid.gathered(rows, 5 + grid.dim)
         number = values[:, 0].astype(np.int64)
         pressure, flux, one_way, driest = values[:, 1:5].T
-        area = values[:, 5:]
+        area = values[:, 5:].copy()  # a view would keep all columns
         drains = np.isfinite(pressure)
         size, offset = np.linalg.norm(area, axis=1), x - grid.midpoints[cell] - wet.contents.centroid[cell]
         least = wet.contents.fill[wet.contents.slot(cell)] * grid.sizes(cell).min(axis=-1) / THICK / (grid.dim + 1)

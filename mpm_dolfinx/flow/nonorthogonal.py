@@ -63,7 +63,7 @@ class Gradients:
         centroid = contents.centroid
         share = contents.open
         towards = np.repeat(np.arange(d), 2)
-        at, normal = contents.slot(sides.cells), sides.normal
+        at = contents.slot(sides.cells)
         tangential = _along(sides)
         neighbours = grid.neighbours(contents.filled)
         cells = np.maximum(neighbours, 0)
@@ -89,9 +89,7 @@ class Gradients:
         place[rows] = np.arange(len(rows))
         self._faces = np.flatnonzero(off[at])
         self._at = place[at[self._faces]]
-        self._offset = sides.offset[self._faces]
         self._tangential = tangential[self._faces]
-        self._normal = normal[self._faces]
         self._known = np.flatnonzero(((sides.shape > 0) & ~sides.seeps)[self._faces])
         self._contents, self._sides = contents, sides
 
@@ -111,11 +109,11 @@ class Gradients:
         at, sealed = self._at[known], self._sealed(self._contents, self._sides)[self.rows]
         size = np.linalg.norm(self._sides.area, axis=1)[self._faces[known]]
         weight = SIDES * size / sum_by(at, size, len(self.rows))[at]
-        offset = self._offset[known]
+        offset = self._sides.offset[self._faces[known]]
         near = np.broadcast_to((NEAREST * self._grid.sizes(self._own).min(axis=-1)) ** 2, len(self._own))
         squared = np.maximum((self._separation**2).sum(axis=2), near[:, None])
         to_cells = self._inside[:, :, None] * self._separation / squared[:, :, None]
-        distance = np.einsum("md,md->m", offset, self._normal[known])
+        distance = np.einsum("md,md->m", offset, self._sides.normal[self._faces[known]])
         to_sides = (weight / np.maximum(distance**2, near[at]))[:, None] * offset
         size = np.linalg.norm(sealed, axis=1, keepdims=True)
         closed = np.divide(sealed, np.sqrt(np.maximum(size, size**2)), out=np.zeros_like(sealed), where=size > 0)
@@ -138,7 +136,8 @@ class Gradients:
         to_cells = p[self._neighbours] - own[:, None]
         to_sides = outer[self._faces[self._known]] - own[at]
         if weight is not None:
-            to_cells, to_sides = to_cells - self._separation @ weight, to_sides - self._offset[self._known] @ weight
+            to_cells = to_cells - self._separation @ weight
+            to_sides = to_sides - self._sides.offset[self._faces[self._known]] @ weight
         to_cells = np.where(self._inside, to_cells, 0.0)
         out = np.einsum("nk,nki->ni", to_cells, of_cells)
         for axis in range(out.shape[1]):

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.tolerances import NEAR
-from mpm_dolfinx.grid.grid import ABOUT_MIDDLE, FACE_SIGNS, FACES, TURN, Grid, corner_bits, sum_by
+from mpm_dolfinx.grid.grid import ABOUT_MIDDLE, FACE_SIGNS, FACES, TURN, Grid, corner_bits, in_chunks, sum_by
 
 SLIVER = NEAR**2
 """Smallest volume fraction of a piece. Pieces thinner than `Grid.snap` have an open face. Source: epsilon."""
@@ -98,14 +98,17 @@ def volumes(corners: NDArray[np.float64]) -> NDArray[np.float64]:
 
     In 3D each face contributes a third of the product of its middle and its area vector.
     """
-    y = np.ascontiguousarray((corners - corners[:, :1]).transpose(1, 2, 0))
-    if len(y) == 4:
-        (ax, ay), (bx, by) = y[3] - y[0], y[2] - y[1]
-        return (ax * by - ay * bx) / 2
-    total = 0.0
-    for (p, q, r, s), sign in zip(y[FACES[3]], FACE_SIGNS, strict=True):
-        total = total + sign * ((p + q + r + s) * cross(s - p, r - q)).sum(axis=0)
-    return total / 24
+    out = np.zeros(len(corners))
+    for part in in_chunks(len(corners)):
+        y = np.ascontiguousarray((corners[part] - corners[part, :1]).transpose(1, 2, 0))
+        if len(y) == 4:
+            (ax, ay), (bx, by) = y[3] - y[0], y[2] - y[1]
+            out[part] = (ax * by - ay * bx) / 2
+            continue
+        for (p, q, r, s), sign in zip(y[FACES[3]], FACE_SIGNS, strict=True):
+            out[part] += sign * ((p + q + r + s) * cross(s - p, r - q)).sum(axis=0)
+        out[part] /= 24
+    return out
 
 
 def cross(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:

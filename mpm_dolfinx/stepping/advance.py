@@ -6,7 +6,7 @@ The grid is reset at the start of the next step, see `grid_reset`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import cache, partial
 
@@ -125,12 +125,14 @@ class Motion:
         """
         with _compat.Timer("move points"):
             cut, pieces = on_grid.cut, data.pieces
+            for one in (pieces, *data.parts):
+                one.stored.clear()  # memory is at its peak below
             grid, d = cut.grid, cut.grid.dim
             nodal = self._momentum.u.x.array.reshape(-1, d)
             deformed = cache(partial(self._deformed, cut, data, nodal))
             if cut.domains:
                 followed = cut.followed(nodal, on_grid.active.contains)
-                points, keeps, folded = self._shaped(state, loads, on_grid, *followed, deformed)
+                points, keeps, folded = self._shaped(state, loads, on_grid, followed, deformed)
             else:
                 x, F = state.points.x + cut.displacement(nodal), deformed()
                 corners = parallelepipeds(x, F[:, :d, :d], self._sizes(state.points))
@@ -298,11 +300,10 @@ class Motion:
         state: State,
         loads: Sequence[Loads],
         on_grid: OnGrid,
-        moved: NDArray[np.float64],
-        bend: NDArray[np.float64],
+        followed: Iterable[NDArray[np.float64]],
         deformed: Callable[[], NDArray[np.float64]],
     ) -> tuple[MaterialPoints, NDArray[np.bool_], int]:
-        """Return the points with new F, and with corners moved by `moved` (n, 2^d, d), m, and the correction `bend`.
+        """Return the points with new F, and with corners moved by both terms (n, 2^d, d), m, of `CutDomains.followed`.
 
         Also return whether each point (n,) keeps its pieces, see `OnGrid.valid`, and the number of inverted domains.
 
@@ -311,12 +312,14 @@ class Motion:
         """
         cut, stage = on_grid.cut, state.stage
         grid, folded = cut.grid, 0
+        moved, bend = followed
         own = self._own(stage, state.points)
         near = np.zeros(moved.shape[:2], dtype=bool)
         for one in loads:
             near |= one.near(state.points, state.points.corners + moved)
         free = own & ~near[:, :, None]
         corners = state.points.corners + moved + free * bend
+        del moved, bend
         for one in loads:
             corners = one.outside(corners, own)
         points = replace(state.points, corners=corners)

@@ -115,6 +115,7 @@ class OnGrid(Keyed):
                 damping=quadrature.rows(cut, points, lambda m: m.pressure_damping()),
             )
             self.contents = CellContents(storage.fluxes, brought, own)
+            cut.pieces.faces = cut.pieces.faces[:0].copy()  # as large as F; not needed any more
             if quadrature.materials.retentions is not None:
                 lever = x - grid.midpoints[cut.cells] - self.contents.centroid[cut.cells]
                 self._places = replace(self._places, lever=lever)
