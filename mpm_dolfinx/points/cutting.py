@@ -98,13 +98,13 @@ def volumes(corners: NDArray[np.float64]) -> NDArray[np.float64]:
 
     In 3D each face contributes a third of the product of its middle and its area vector.
     """
+    if corners.shape[1] == 4:
+        y = np.ascontiguousarray((corners - corners[:, :1]).transpose(1, 2, 0))
+        (ax, ay), (bx, by) = y[3] - y[0], y[2] - y[1]
+        return (ax * by - ay * bx) / 2
     out = np.zeros(len(corners))
     for part in in_chunks(len(corners)):
         y = np.ascontiguousarray((corners[part] - corners[part, :1]).transpose(1, 2, 0))
-        if len(y) == 4:
-            (ax, ay), (bx, by) = y[3] - y[0], y[2] - y[1]
-            out[part] = (ax * by - ay * bx) / 2
-            continue
         for (p, q, r, s), sign in zip(y[FACES[3]], FACE_SIGNS, strict=True):
             out[part] += sign * ((p + q + r + s) * cross(s - p, r - q)).sum(axis=0)
         out[part] /= 24
