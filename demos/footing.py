@@ -394,7 +394,7 @@ def draw_cells(ax, frame: Frame) -> None:
 
     corners, p = frame.corners[:, [0, 1, 3, 2]], frame.pressure / COHESION
     quads = PolyCollection(corners, array=p, cmap="viridis", clim=(0, np.quantile(p, 0.99)))
-    quads.set(edgecolors="black", linewidth=0.1)
+    quads.set(edgecolors="face", linewidth=0.3, snap=False)  # black lines alternate with the pixels
     ax.add_collection(quads)
     ax.autoscale()
     block(ax, frame)
