@@ -73,11 +73,11 @@ def sheet(strengths, stage):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("cells", "volumes"), [(6, 2e-4), (12, 1e-4)])
-def test_clay_runs_out_over_thirty_heights(cells, volumes):
+@pytest.mark.parametrize(("cells", "most", "volumes"), [(6, 1.005, 2e-4), (12, 1.008, 1e-4)])
+def test_clay_runs_out_over_thirty_heights(cells, most, volumes):
     """A column on a smooth base that loses all but a thousandth of its strength; long sheets stretch uniformly.
 
-    Renewed domains overlap by less than 0.8 % of a cell: the correction of volumes moves their corners off edges.
+    With 6 cells this test fails: cells are filled to 100.6 %, see *Limits*.
     """
     given = {"stages": 11, "strong": 2 * STRONG, "weak": 2e-3 * STRONG, "stage": 3.15}
     fill, volume, front = collapsed(cells, steps=40, renewal=True, wide=34, base="y", **given)
@@ -86,7 +86,7 @@ def test_clay_runs_out_over_thirty_heights(cells, volumes):
         f"{cells} cells: {100 * fill.max():.2f} %, volume {np.abs(volume - 1).max():.1e}, front {front[-1]:.3f} m, "
         f"sheet {exact:.3f} m"
     )
-    assert fill.max() < 1.008
+    assert fill.max() < most
     assert volume == pytest.approx(1, abs=volumes)
     assert front[-1] > 30
     assert front[-1] == pytest.approx(exact, rel=2e-3)
