@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from mpm_dolfinx.base.tolerances import SAME
-from mpm_dolfinx.grid.grid import ABOUT_MIDDLE, FACE_SIGNS, FACES, corner_bits
+from mpm_dolfinx.grid.grid import ABOUT_MIDDLE, FACE_SIGNS, FACES, corner_bits, cross_in_plane
 
 
 def overburden(
@@ -84,7 +84,7 @@ def _hits(corners: NDArray, at: NDArray) -> Iterator[tuple[NDArray, NDArray, NDA
         for corner in ABOUT_MIDDLE:
             part = x[:, corner]
             off = part[:, :, :2] - at[:, None]
-            area = np.cross(off[:, [1, 2, 0]], off[:, [2, 0, 1]])  # opposite to each corner
+            area = cross_in_plane(off[:, [1, 2, 0]], off[:, [2, 0, 1]])  # opposite to each corner
             on = np.flatnonzero((area > 0).all(axis=1) | (area < 0).all(axis=1))
             area = area[on]
             whole = area.sum(axis=1)

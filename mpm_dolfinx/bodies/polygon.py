@@ -16,7 +16,7 @@ from mpm_dolfinx.base.tolerances import ROUND_OFF
 from mpm_dolfinx.base.validation import instance, line, numbers, whole
 from mpm_dolfinx.bodies.mesh_cells import AS_LATTICE
 from mpm_dolfinx.bodies.meshes import Mesh, MeshBody, seeded
-from mpm_dolfinx.grid.grid import Grid
+from mpm_dolfinx.grid.grid import Grid, cross_in_plane
 
 
 def polygon(
@@ -116,19 +116,14 @@ def _check_simple(outlines: Sequence[NDArray[np.float64]]) -> None:
 
 def _areas(a: NDArray[np.float64], b: NDArray[np.float64], c: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the signed areas (n,) of the parallelograms (b - a, c - a); positive if c is to the left of edge ab."""
-    return _cross(b - a, c - a)
-
-
-def _cross(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the scalar cross products (n,) of vectors (n, 2)."""
-    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+    return cross_in_plane(b - a, c - a)
 
 
 def _inside(x: NDArray[np.float64], outline: NDArray[np.float64]) -> bool:
     """Return whether a position x (2,) is inside a polygon, that is, a ray from x crosses an odd number of edges."""
     a, b = outline - x, np.roll(outline, -1, axis=0) - x
     crosses = (a[:, 1] > 0) != (b[:, 1] > 0)
-    return bool((crosses & ((_cross(a, b) > 0) == (b[:, 1] > a[:, 1]))).sum() % 2)
+    return bool((crosses & ((cross_in_plane(a, b) > 0) == (b[:, 1] > a[:, 1]))).sum() % 2)
 
 
 @contextmanager

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from mpm_dolfinx.base.tolerances import NEAR, ROUND_OFF, SAME, TINY
 from mpm_dolfinx.bodies.bodies import Body
-from mpm_dolfinx.grid.grid import FACE_SIGNS, FACES, Grid, corner_bits, rounding, sum_by
+from mpm_dolfinx.grid.grid import FACE_SIGNS, FACES, Grid, corner_bits, cross_in_plane, rounding, sum_by
 from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
 from mpm_dolfinx.points.cutting import cut_at, kuhn_simplices
 
@@ -201,10 +201,10 @@ def uncovered_triangles(
         free, whose = [s[:, :, ~has]], [owner[~has]]
         s, owner = s[:, :, has], owner[has]
         quad = cover.plane[of[np.minimum(first + k, len(of) - 1)]][:, [0, 1, 3, 2]]  # corners around the face
-        orientation = np.sign(_cross(quad[:, 2] - quad[:, 0], quad[:, 3] - quad[:, 1]))
+        orientation = np.sign(cross_in_plane(quad[:, 2] - quad[:, 0], quad[:, 3] - quad[:, 1]))
         for a in range(4):
             p, q = quad[owner, a].T, quad[owner, (a + 1) % 4].T
-            inside = orientation[owner] * _cross((q - p).T, (s - p).transpose(0, 2, 1))
+            inside = orientation[owner] * cross_in_plane((q - p).T, (s - p).transpose(0, 2, 1))
             s3 = np.concatenate([s, inside[:, None]], axis=1)
             out, out_owner, s3, owner = split(s3, owner, 2, 0.0)
             free.append(out[:, :2])
@@ -242,14 +242,9 @@ def _triangles(quads: NDArray, owner: NDArray) -> tuple[NDArray[np.float64], NDA
     return np.concatenate(both, axis=2).astype(float), np.tile(owner, 2)
 
 
-def _cross(a: NDArray, b: NDArray) -> NDArray[np.float64]:
-    """Return the scalar cross products (...) of vectors (..., 2)."""
-    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
-
-
 def _areas(s: NDArray) -> NDArray[np.float64]:
     """Return the areas (n,) of triangles (3, 2, n)."""
-    return 0.5 * np.abs(_cross(*(s[1:] - s[0]).swapaxes(1, 2)))
+    return 0.5 * np.abs(cross_in_plane(*(s[1:] - s[0]).swapaxes(1, 2)))
 
 
 def split(s: NDArray, owner: NDArray, axis: int, plane) -> tuple[NDArray, NDArray, NDArray, NDArray]:

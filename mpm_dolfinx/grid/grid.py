@@ -45,6 +45,11 @@ ORDER = "the order is Grid(lower, upper, cells)"
 MANY = "grid: h is undefined for unequal cells, must be replaced by sizes"
 
 
+def cross_in_plane(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the scalar cross products (...) of vectors (..., 2)."""
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+
+
 def corner_bits(dim: int) -> NDArray[np.int64]:
     """Return at which end of each axis each corner of a box lies (2^d, d): 0 lower, 1 upper."""
     return (np.arange(2**dim)[:, None] >> np.arange(dim)) & 1

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.tolerances import NEAR, TINY
-from mpm_dolfinx.grid.grid import sum_by
+from mpm_dolfinx.grid.grid import cross_in_plane, sum_by
 from mpm_dolfinx.points.polygons import NONE, Polygons
 
 EDGES = 4
@@ -63,7 +63,7 @@ class Region:
         self.area = ring.area
         self._middle = ring.centroid
         a, b = x - self._middle[:, None], ring.after - self._middle[:, None]
-        angles = np.where(np.arange(most) < self._size[:, None], _cross(a, b), 1.0)
+        angles = np.where(np.arange(most) < self._size[:, None], cross_in_plane(a, b), 1.0)
         self.simple = (angles.min(axis=1) > 0) & (self.area > NEAR)
 
     def area_of(self, count: int) -> NDArray[np.float64]:
@@ -123,7 +123,7 @@ def resampled(
         middle = (low + high) // 2
         a, chord = out[:, low], out[:, high] - out[:, low]
         off = joint - a[of]
-        far = np.abs(_cross(chord[of], off))
+        far = np.abs(cross_in_plane(chord[of], off))
         far /= np.maximum(np.linalg.norm(chord, axis=1), TINY)[of]
         within = (arc[:-1] > at[of, low]) & (arc[:-1] < at[of, high])
         far = np.where(within, far, 0.0)
@@ -151,7 +151,7 @@ def resampled(
 
     def ring(a: NDArray, b: NDArray, of: NDArray) -> NDArray:
         """Return twice the areas of triangles (P, P + a, P + b) in cells `of`, in axisymmetry of their rings."""
-        return _cross(a, b) * (inner[of] + wider[of] * (P[of, 0] + (a[:, 0] + b[:, 0]) / 3))
+        return cross_in_plane(a, b) * (inner[of] + wider[of] * (P[of, 0] + (a[:, 0] + b[:, 0]) / 3))
 
     bulge = sum_by(of, ring(a, b, of), len(P)) + sum_by(of[1:], ring(b[:-1], b[:-1] + gap, of[1:]), len(P))
     y = out - P[:, None]
@@ -163,11 +163,6 @@ def resampled(
     shift = (bulge - has) / (size * (inner[:, None] + wider[:, None] * out[:, 1:-1, 0])).sum(axis=1)
     out[:, 1:-1] += shift[:, None, None] * normal / size[:, :, None]
     return np.clip(out, 0.0, 1.0)
-
-
-def _cross(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the cross products (...) of vectors (..., 2)."""
-    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
 
 
 def _around(x: NDArray[np.float64]) -> NDArray[np.float64]:
