@@ -246,7 +246,7 @@ class StorageSystem:
         """Whether the matrix of the pressure unknowns is symmetric."""
         d = forms.grid.dim
         fluxes = forms.fluxes
-        self.unknowns = own = Unknowns(forms.p, cells.astype(np.int64), forms.grid.midpoints)
+        self.unknowns = own = Unknowns(forms.p, cells.astype(np.int64), forms.grid.midpoints, forms.grid.near_others[1])
         self.of_parts = OfParts(forms.grid.comm, parts.cells[own.owned], parts.count)
         """Connected part of the bodies to which each unknown belongs."""
         self.T, self.D, self.L = (matrix(own, own, 2 * d + 1) for _ in range(3))

@@ -23,10 +23,17 @@ class Unknowns:
 
     function: any function of the space, with ghosts.  dofs: unrolled local degrees of freedom that are
     unknowns, ghosts included; x (entities, d), m: positions of the nodes or cells of this process.  If x is None,
-    the space computes all positions at each request.
+    the space computes all positions at each request.  near (entities,): whether equations of nodes or cells may have
+    unknowns of other processes.
     """
 
-    def __init__(self, function: fem.Function, dofs: NDArray[np.int64], x: NDArray[np.float64] | None = None):
+    def __init__(
+        self,
+        function: fem.Function,
+        dofs: NDArray[np.int64],
+        x: NDArray[np.float64] | None = None,
+        near: NDArray[np.bool_] | None = None,
+    ):
         self._x = x
         self._space = space = function.function_space
         self.comm = space.mesh.comm
@@ -36,6 +43,8 @@ class Unknowns:
         self.owned = dofs[dofs < owned]
         """Unrolled local degree of freedom of each entry of a vector."""
         self.size = len(self.owned)
+        self.near = True if near is None else near[self.owned // dofmap.bs]
+        """Whether the row of each unknown may have entries in columns of other processes."""
         start = 0
         if self.comm.size > 1:
             start = self.comm.exscan(self.size) or 0
@@ -97,7 +106,7 @@ def matrix(rows: Unknowns, columns: Unknowns, row_length: int | NDArray[np.int64
     A.setSizes(((rows.size, None), (columns.size, None)))
     A.setType(PETSc.Mat.Type.AIJ)
     length = np.zeros(rows.size, dtype=PETSc.IntType) + np.asarray(row_length, dtype=PETSc.IntType)
-    elsewhere = np.minimum(length, columns.global_size) if rows.comm.size > 1 else 0
+    elsewhere = np.where(rows.near, np.minimum(length, columns.global_size), 0) if rows.comm.size > 1 else 0
     A.setPreallocationNNZ((np.minimum(length, columns.size), elsewhere))
     A.setOption(PETSc.Mat.Option.NEW_NONZERO_ALLOCATION_ERR, False)
     A.setLGMap(rows.map, columns.map)

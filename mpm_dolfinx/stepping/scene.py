@@ -224,6 +224,8 @@ class Scene:
         out = self._on(self.grid.distributed(boxes))
         if not self.grid.comm.allreduce(out.materials.checksums == self.materials.checksums, op=MPI.LAND):
             return None
+        if not self.grid.comm.allreduce(len(self.materials.seeded)):
+            out.materials.seeds_no_more()
         out.former = self.former | {self.materials}
         out.scheme, out._warned = self.scheme, self._warned
         left = [getattr(look, "func", look) for look in self._looks]

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from mpm_dolfinx.conditions.acting import Outcome
 from mpm_dolfinx.domains.pressure_transport import PiecePressures
 from mpm_dolfinx.grid.grid import Grid
-from mpm_dolfinx.parallel.exchange import Exchange
+from mpm_dolfinx.parallel.exchange import Exchange, over_all
 from mpm_dolfinx.points.material_points import MaterialPoints, PlacedPoints
 from mpm_dolfinx.stepping.result import Result
 from mpm_dolfinx.stepping.stage import Stage
@@ -236,4 +236,6 @@ class State:
         if grid.comm.size == 1:
             return self
         placed = self.as_cut
-        return self.migrated(grid.owner(grid.number(grid.index_from_base(placed.x)) + grid.copy(placed.id)), grid.comm)
+        owner = grid.owner(grid.number(grid.index_from_base(placed.x)) + grid.copy(placed.id))
+        moves = over_all(grid.comm, int((owner != grid.comm.rank).any()))
+        return self.migrated(owner, grid.comm) if moves else self
