@@ -135,13 +135,14 @@ class CutDomains(Keyed):
         """In 3D: mean products of the offsets in each piece from its centroid, see `Pieces`."""
         self.hoop = exchange.send(pieces.hoop) if grid.axisymmetric else None
         """In axisymmetry: moments (m, 4) of the pieces in the plane, see `Pieces`."""
-        self._faces = [exchange.send(pieces.faces)] if faces else []
+        self._faces = exchange.send(pieces.faces) if faces else None
         self.pieces = replace(pieces, faces=pieces.faces[:0].copy(), mixed=pieces.mixed[:0].copy())
         """Pieces of this process's points, without areas and mean products, which only integrals over cells need."""
 
     def faces(self) -> NDArray[np.float64]:
         """Return the areas (m, d, 2), m^(d-1), of the pieces on faces of their cells, once: they are as large as F."""
-        return self._faces.pop()
+        faces, self._faces = self._faces, None
+        return faces
 
     def moved(self, points: MaterialPoints, part: NDArray[np.int64], count: int) -> NDArray[np.float64]:
         """Return for each connected part (count,) the largest motion of corners since the cut, in cell sizes.
@@ -250,10 +251,8 @@ class CutDomains(Keyed):
     @cached_property
     def _followed(self) -> tuple[Exchange, NDArray[np.int32]]:
         """Exchange of `_tracked` positions with the owners of their cells; and these cells (m,)."""
-        grid, x = self.grid, self._tracked
-        at = np.arange(len(self.points)).repeat(len(x) // max(1, len(self.points)))
-        # rounding must not assign a corner on a grid line to a cell outside the domain
-        cell = self._filled_cell(at, x + NEAR * (self.points.x[at] - x))
+        grid, at = self.grid, np.arange(len(self.points))
+        cell = self.cells_at(at.repeat(2**grid.dim) if self.domains else at, self._tracked)
         exchange = Exchange(grid.comm, grid.owner(cell))
         return exchange, grid.locals[exchange.send(cell)]
 
@@ -268,6 +267,7 @@ class CutDomains(Keyed):
 
     def cells_at(self, at: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:
         """Return the lexicographic index (m,) of the cell of each x (m, d), m, in or on the domain of point `at`."""
+        # rounding must not assign a corner on a grid line to a cell outside the domain
         return self._filled_cell(at, x + NEAR * (self.points.x[at] - x))
 
     def _filled_cell(self, at: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:

@@ -290,7 +290,7 @@ class PointData(Keyed):
 
     def forget(self) -> None:
         """Delete the result that `gradients` stores."""
-        self._stored.clear()
+        self._stored = Latest()
 
     def increments(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return I + grad u (n, 9), with the circumferential stretch, for a Q1 vector with nodal values u."""

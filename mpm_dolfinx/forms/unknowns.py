@@ -22,19 +22,13 @@ class Unknowns:
     """Numbering of a subset of the degrees of freedom of a function's space.
 
     function: any function of the space, with ghosts.  dofs: unrolled local degrees of freedom that are
-    unknowns, ghosts included; x (entities, d), m: positions of the nodes or cells of this process.  If x is None,
-    the space computes all positions at each request.  near (entities,): whether equations of nodes or cells may have
-    unknowns of other processes.
+    unknowns, ghosts included; at: positions (entities, d), m, of the nodes or cells of this process, and whether their
+    rows of matrices may have entries in columns of other processes.  If it is None, the space computes all positions at
+    each request, and all rows may have such entries.
     """
 
-    def __init__(
-        self,
-        function: fem.Function,
-        dofs: NDArray[np.int64],
-        x: NDArray[np.float64] | None = None,
-        near: NDArray[np.bool_] | None = None,
-    ):
-        self._x = x
+    def __init__(self, function: fem.Function, dofs: NDArray[np.int64], at: tuple[NDArray, NDArray] | None = None):
+        self._x, near = at or (None, None)
         self._space = space = function.function_space
         self.comm = space.mesh.comm
         dofmap = space.dofmap
@@ -44,7 +38,6 @@ class Unknowns:
         """Unrolled local degree of freedom of each entry of a vector."""
         self.size = len(self.owned)
         self.near = True if near is None else near[self.owned // dofmap.bs]
-        """Whether the row of each unknown may have entries in columns of other processes."""
         start = 0
         if self.comm.size > 1:
             start = self.comm.exscan(self.size) or 0

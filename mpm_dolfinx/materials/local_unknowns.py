@@ -31,7 +31,7 @@ from mpm_dolfinx.base.validation import asked, instance, line
 from mpm_dolfinx.forms.point_forms import FormPoints, PointData, PointExpression
 from mpm_dolfinx.materials.skeleton import BY_SCENE, Skeleton
 from mpm_dolfinx.materials.user_functions import call, named
-from mpm_dolfinx.parallel.exchange import first
+from mpm_dolfinx.parallel.exchange import everywhere, first
 
 MOST, HALVINGS = 60, 25  # largest numbers of Newton iterations, and of step halvings in all iterations together
 
@@ -251,14 +251,7 @@ class _Equations:
 
     def _concatenated(self, make: Callable[[], list[NDArray[np.float64]]]) -> NDArray[np.float64]:
         """Return arrays concatenated along axis 1; a ValueError on one process is raised on all processes."""
-        arrays, reason = [], ""
-        try:
-            arrays = make()
-        except ValueError as error:
-            reason = str(error)
-        if message := first(self._grid.comm, reason):
-            raise ValueError(message)
-        return np.concatenate(arrays, axis=1)
+        return np.concatenate(everywhere(self._grid.comm, make), axis=1)
 
     @property
     def _title(self) -> str:

@@ -62,11 +62,6 @@ class QuadratureData:
     rows: tuple[NDArray[np.int64] | slice, ...]  # indices in `pieces` of each part's integration points
     of_points: PointData  # like `pieces`, but volumes and F are not scaled for F-bar; for user-defined terms
 
-    def forget(self) -> None:
-        """Delete the gradients that the points store for repeated use at one displacement."""
-        for one in (self.pieces, *self.parts):
-            one.forget()
-
     def increments(self, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return I + grad u (m, d, d) at the positions where laws use it, of displacements `nodal` (nodes, d), m."""
         n, d = self.pieces.x.shape

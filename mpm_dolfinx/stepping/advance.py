@@ -125,7 +125,8 @@ class Motion:
         """
         with _compat.Timer("move points"):
             cut, pieces = on_grid.cut, data.pieces
-            data.forget()  # memory is at its peak below
+            for one in (pieces, *data.parts):
+                one.forget()  # memory is at its peak below
             grid, d = cut.grid, cut.grid.dim
             nodal = self._momentum.u.x.array.reshape(-1, d)
             deformed = cache(partial(self._deformed, cut, data, nodal))

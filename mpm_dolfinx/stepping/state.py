@@ -81,13 +81,6 @@ class Stay:
     def __post_init__(self):
         _freeze(vars(self))
 
-    def migrated(self, exchange: Exchange) -> Stay:
-        """Return the same data after an exchange of points between processes."""
-        keeps = self.keeps
-        if keeps is not None:
-            keeps = exchange.send(keeps)[np.argsort(exchange.send(self.points.id))]
-        return Stay(self.points.migrated(exchange), keeps)
-
 
 @dataclass(frozen=True, eq=False)
 class Trend:
@@ -226,9 +219,12 @@ class State:
         pieces = self.pieces
         if pieces is not None:
             pieces = pieces.migrated(Exchange(comm, destination[np.searchsorted(self.points.id, pieces.id)]))
-        stay, trend = self.stay and self.stay.migrated(exchange), self.trend
-        if trend is not None:
-            trend = Trend(trend.lengths, exchange.send(trend.rates)[np.argsort(exchange.send(self.points.id))])
+        stay, trend = self.stay, self.trend
+        order = np.argsort(exchange.send(self.points.id))
+        if stay is not None:
+            keeps = None if stay.keeps is None else exchange.send(stay.keeps)[order]
+            stay = Stay(stay.points.migrated(exchange), keeps)
+        trend = trend and Trend(trend.lengths, exchange.send(trend.rates)[order])
         return replace(self, points=self.points.migrated(exchange), pieces=pieces, stay=stay, trend=trend)
 
     def at_owners(self, grid: Grid) -> State:
