@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
 from functools import cached_property
 from math import prod
 
@@ -136,7 +135,8 @@ class CutDomains(Keyed):
         self.hoop = exchange.send(pieces.hoop) if grid.axisymmetric else None
         """In axisymmetry: moments (m, 4) of the pieces in the plane, see `Pieces`."""
         self._faces = exchange.send(pieces.faces) if faces else None
-        self.pieces = replace(pieces, faces=pieces.faces[:0].copy(), mixed=pieces.mixed[:0].copy())
+        pieces.faces, pieces.mixed = pieces.faces[:0].copy(), pieces.mixed[:0].copy()
+        self.pieces = pieces
         """Pieces of this process's points, without areas and mean products, which only integrals over cells need."""
 
     def faces(self) -> NDArray[np.float64]:

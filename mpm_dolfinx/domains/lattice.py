@@ -113,12 +113,12 @@ class Lattice:
             return np.zeros_like(d)
         values = np.concatenate([d, crossed[:, :, None]], axis=2).reshape(-1, self._dim + 1)
         where = comm, tuple(np.add(self._count, 1)), self.nodes(ids).ravel()
-        field, layers, back = _at_sites(*where, values, self._tolerance)
+        field, layers, to_rows = _at_sites(*where, values, self._tolerance)
         del values  # as large as the corners
         thirds = self._thirds and [self._thirds[0][:, layers], *self._thirds[1:]]
         change = _filtered(field[..., :-1], field[..., -1:], thirds) - field[..., :-1]
         change[np.isnan(change)] = 0.0
-        change = back(change.reshape(-1, self._dim)).reshape(d.shape)
+        change = to_rows(change.reshape(-1, self._dim)).reshape(d.shape)
         change[self.held_of(ids)[1]] = 0.0
         return change
 

@@ -169,7 +169,7 @@ class OpenSides:
         cosine = normal[:, :, None] * [-1, 1]
         row, axis, end = (cosine > ALONG).nonzero()
         share = area[row] * cosine[row, axis, end]
-        slots = np.ravel_multi_index((at[row], axis, end), out.shape[:3])
+        slots = (at[row] * out.shape[1] + axis) * 2 + end
 
         def total(values: NDArray[np.float64]) -> NDArray[np.float64]:
             """Return the sum of the values at each cell, axis and end."""
