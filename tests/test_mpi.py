@@ -147,5 +147,6 @@ def test_no_process_holds_arrays_of_the_whole_scene(points, of, bound, tmp_path)
     assert one["whole"][0] > 0 and not four["whole"].any(), "lengths of bodies and of the grid"
     assert four["points"].sum() == one["points"][0] and (four["asked"] <= four["points"]).all()
     assert four["asked"].sum() == one["asked"][0] > 0
+    print(f"shares: {four['held'] / one['held'][0]}")
     assert (four["held"] < bound * one["held"][0]).all()
     assert not one["files"].any() and four["files"].any() == (of == "meshes"), "one copy of a mesh on a machine"
