@@ -132,14 +132,21 @@ def test_several_processes_seed_or_refuse_the_same_meshes(processes, tmp_path):
     mpirun(processes, "mpi_bodies.py", str(tmp_path))
 
 
-@pytest.mark.parametrize("of", ["boxes", "meshes"])
-def test_no_process_holds_arrays_of_the_whole_scene(of, tmp_path):
-    """Of 1e4 points, many are at borders between processes, so that each of four holds more than a quarter: 0.309."""
+MANY_POINTS = pytest.param("3e5", "boxes", 0.3, marks=pytest.mark.slow)
+
+
+@pytest.mark.parametrize("points, of, bound", [("1e4", "boxes", 0.28), ("1e4", "meshes", 0.28), MANY_POINTS])
+def test_no_process_holds_arrays_of_the_whole_scene(points, of, bound, tmp_path):
+    """The excess over a quarter is due to borders between processes, and to more points on one process than another.
+
+    The largest shares are 0.266 of 1e4 points, and 0.265 of 3e5 points.
+    """
     for processes in (1, 4):
-        mpirun(processes, "mpi_held.py", str(tmp_path / f"{processes}.npz"), "1e4", of)
+        mpirun(processes, "mpi_held.py", str(tmp_path / f"{processes}.npz"), points, of)
     one, four = (dict(np.load(tmp_path / f"{processes}.npz")) for processes in (1, 4))
     assert one["whole"][0] > 0 and not four["whole"].any(), "lengths of bodies and of the grid"
     assert four["points"].sum() == one["points"][0] and (four["asked"] <= four["points"]).all()
     assert four["asked"].sum() == one["asked"][0] > 0
-    assert (four["held"] < 0.33 * one["held"][0]).all()
+    print(f"shares: {four['held'] / one['held'][0]}")
+    assert (four["held"] < bound * one["held"][0]).all()
     assert not one["files"].any() and four["files"].any() == (of == "meshes"), "one copy of a mesh on a machine"

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.base.validation import asked, at_places, instance, numbers
 from mpm_dolfinx.grid.grid import FACES, SIDES, Grid, corner_bits, in_chunks
-from mpm_dolfinx.parallel.exchange import first
+from mpm_dolfinx.parallel.exchange import everywhere
 from mpm_dolfinx.points.cutting import centroids, domain_volumes, volumes
 from mpm_dolfinx.points.material_points import MaterialPoints
 
@@ -240,21 +240,13 @@ def material_points(
     material = np.repeat(np.array([body.material for body in bodies], dtype=np.int32), list(map(len, rows)))
     x = centroids(corners)
     n = len(ids)
-    pressures = np.empty(0)
-    refused = ""
-    try:
-        pressures = pressure_at(pressure, x + grid.base)
-    except ValueError as error:
-        refused = str(error)
-    if refused := first(grid.comm, refused):
-        raise ValueError(refused)
     return MaterialPoints(
         id=ids,
         corners=corners,
         F=np.broadcast_to(np.eye(grid.stretches), (n, grid.stretches, grid.stretches)),
         volume0=domain_volumes(corners, True) if grid.axisymmetric else size.prod(axis=1),
         material=material,
-        pressure=pressures,
+        pressure=everywhere(grid.comm, lambda: pressure_at(pressure, x + grid.base)),
         x=x,
         origin=corners,
         reference=corners,

@@ -120,22 +120,29 @@ class CutDomains(Keyed):
         self.points = points
         self.domains = domains
         self._patches: dict[Surface, Patches] = {}
-        self.pieces = cut(grid, points.corners, second, faces) if domains else whole_points(grid, points.x)
+        pieces = cut(grid, points.corners, second, faces) if domains else whole_points(grid, points.x)
         if grid.copies > 1:
-            self.pieces.cell += grid.copy(points.id)[self.pieces.point]
-        exchange = Exchange(grid.comm, grid.owner(self.pieces.cell))
+            pieces.cell += grid.copy(points.id)[pieces.point]
+        exchange = Exchange(grid.comm, grid.owner(pieces.cell))
         self.pieces_to_cells = exchange.send
         """Function that sends values of the pieces to the owners of their cells."""
         self.to_pieces = exchange.back
         """Function that sends values of the pieces from the owners of their cells to the processes of the points."""
-        self.cells, self.x = grid.locals[exchange.send(self.pieces.cell)], exchange.send(self.pieces.x)
+        self.cells, self.x = grid.locals[exchange.send(pieces.cell)], exchange.send(pieces.x)
         """Owned cells (m,) of the pieces, and centroids (m, d), m, of the pieces."""
-        self.mixed = exchange.send(self.pieces.mixed) if grid.dim == 3 and domains else None
+        self.mixed = exchange.send(pieces.mixed) if grid.dim == 3 and domains else None
         """In 3D: mean products of the offsets in each piece from its centroid, see `Pieces`."""
-        self.second = exchange.send(self.pieces.second) if second else None
-        """If `second`: mean products (m, d, d), m^2, of all offsets in each piece from its centroid."""
-        self.hoop = exchange.send(self.pieces.hoop) if grid.axisymmetric else None
+        self.hoop = exchange.send(pieces.hoop) if grid.axisymmetric else None
         """In axisymmetry: moments (m, 4) of the pieces in the plane, see `Pieces`."""
+        self._faces = exchange.send(pieces.faces) if faces else None
+        pieces.faces, pieces.mixed = pieces.faces[:0].copy(), pieces.mixed[:0].copy()
+        self.pieces = pieces
+        """Pieces of this process's points, without areas and mean products, which only integrals over cells need."""
+
+    def faces(self) -> NDArray[np.float64]:
+        """Return the areas (m, d, 2), m^(d-1), of the pieces on faces of their cells, once: they are as large as F."""
+        faces, self._faces = self._faces, None
+        return faces
 
     def moved(self, points: MaterialPoints, part: NDArray[np.int64], count: int) -> NDArray[np.float64]:
         """Return for each connected part (count,) the largest motion of corners since the cut, in cell sizes.
@@ -224,29 +231,30 @@ class CutDomains(Keyed):
 
     def displacement(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return values (n, d) of a Q1 field u (nodes, d) at the material points; only for a cut without `domains`."""
-        exchange, cells, x = self._followed
-        return exchange.back(self.grid.at(cells, x, u))
+        exchange, cells = self._followed
+        return exchange.back(self.grid.at(cells, exchange.send(self._tracked), u))
 
     def followed(self, u: NDArray[np.float64], filled: NDArray[np.bool_]) -> Iterator[NDArray[np.float64]]:
         """Yield the Q1 field u (nodes, d), m, at the corners (n, 2^d, d), then its quadratic correction there, m.
 
         `filled` (cells,) tells which local cells contain material.
         """
-        exchange, cells, x = self._followed
-        return (exchange.back(v).reshape(self.points.corners.shape) for v in followed(self.grid, cells, x, u, filled))
+        exchange, cells = self._followed
+        moved = followed(self.grid, cells, exchange.send(self._tracked), u, filled)
+        return (exchange.back(v).reshape(self.points.corners.shape) for v in moved)
+
+    @property
+    def _tracked(self) -> NDArray[np.float64]:
+        """Positions (n, d), m, of all corners, or of the points if not `domains`."""
+        return self.points.corners.reshape(-1, self.grid.dim) if self.domains else self.points.x
 
     @cached_property
-    def _followed(self) -> tuple[Exchange, NDArray[np.int32], NDArray[np.float64]]:
-        """Exchange with owners of cells; cells and positions (m, d), m, of all corners (of points if not `domains`)."""
-        grid = self.grid
-        n = len(self.points)
-        d = self.grid.dim
-        at = np.arange(n).repeat(2**d if self.domains else 1)
-        x = self.points.corners.reshape(-1, d) if self.domains else self.points.x
-        # rounding must not assign a corner on a grid line to a cell outside the domain
-        cell = self._filled_cell(at, x + NEAR * (self.points.x[at] - x))
+    def _followed(self) -> tuple[Exchange, NDArray[np.int32]]:
+        """Exchange of `_tracked` positions with the owners of their cells; and these cells (m,)."""
+        grid, at = self.grid, np.arange(len(self.points))
+        cell = self.cells_at(at.repeat(2**grid.dim) if self.domains else at, self._tracked)
         exchange = Exchange(grid.comm, grid.owner(cell))
-        return exchange, grid.locals[exchange.send(cell)], exchange.send(x)
+        return exchange, grid.locals[exchange.send(cell)]
 
     def total_displacement(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return total displacements (m, d), m, of the pieces' centroids, computed from the corners of the domains."""
@@ -259,6 +267,7 @@ class CutDomains(Keyed):
 
     def cells_at(self, at: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:
         """Return the lexicographic index (m,) of the cell of each x (m, d), m, in or on the domain of point `at`."""
+        # rounding must not assign a corner on a grid line to a cell outside the domain
         return self._filled_cell(at, x + NEAR * (self.points.x[at] - x))
 
     def _filled_cell(self, at: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:

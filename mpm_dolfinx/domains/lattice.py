@@ -19,7 +19,7 @@ a wall, a prescribed displacement, a plate or another body.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 from mpi4py import MPI
 
@@ -111,30 +111,32 @@ class Lattice:
         """
         if self._count is None:
             return np.zeros_like(d)
-        number = self.nodes(ids)
         values = np.concatenate([d, crossed[:, :, None]], axis=2).reshape(-1, self._dim + 1)
-        shape = tuple(np.add(self._count, 1))
-        change = _change(comm, shape, number.ravel(), values, self._tolerance, self._thirds).reshape(d.shape)
+        where = comm, tuple(np.add(self._count, 1)), self.nodes(ids).ravel()
+        field, layers, to_rows = _at_sites(*where, values, self._tolerance)
+        del values  # as large as the corners
+        thirds = self._thirds and [self._thirds[0][:, layers], *self._thirds[1:]]
+        change = _filtered(field[..., :-1], field[..., -1:], thirds) - field[..., :-1]
+        change[np.isnan(change)] = 0.0
+        change = to_rows(change.reshape(-1, self._dim)).reshape(d.shape)
         change[self.held_of(ids)[1]] = 0.0
         return change
 
 
-def _change(
+def _at_sites(
     comm: MPI.Intracomm,
     shape: tuple[int, ...],
     number: NDArray[np.int64],
     values: NDArray[np.float64],
     tolerance: NDArray[np.float64],
-    thirds: Sequence[NDArray[np.float64]] | None = None,
-) -> NDArray[np.float64]:
-    """Return the change (m, k) by which the filter corrects values on a lattice.
+) -> tuple[NDArray[np.float64], slice, Callable[[NDArray[np.float64]], NDArray[np.float64]]]:
+    """Return values at the sites of a lattice (..., k), which is distributed over the processes in slabs of layers.
 
-    The lattice is distributed over the processes in slabs along its first axis.
+    Also return the first layers of third differences in this slab, and a function from values at all its sites to rows.
 
     shape: number of lattice sites along each axis; number (m,): lexicographic index of the site of each row of values;
-    values (m, k + 1): k values, and the number of crossed cells; tolerance (k + 1,): largest difference between rows of
-    a site; if it is exceeded, the domains have separated, and the site is left out.  thirds (4, n - 3) along each axis:
-    weights of third differences of n corners, for domains of different widths, see `_divided`.
+    values (m, k); tolerance (k,): largest difference between rows of a site; if it is exceeded, the domains have
+    separated, and the site is nan.
     """
     across, starts = int(np.prod(shape[1:])), np.arange(comm.size + 1) * shape[0] // comm.size
     layer = number // across
@@ -157,12 +159,8 @@ def _change(
             sites = at[part]
             differs = np.abs(field.take(sites, axis=0) - d[part]) > tolerance
             field[sites[np.logical_or.reduce(differs.T)]] = np.nan
-    field = field.reshape(-1, *shape[1:], values.shape[1])
-    if thirds is not None:  # the part of this slab
-        thirds = [thirds[0][:, first : max(first, last - MARGIN)], *thirds[1:]]
-    change = _filtered(field[..., :-1], field[..., -1:], thirds) - field[..., :-1]
-    change[np.isnan(change)] = 0.0
-    return exchange.back(change.reshape(-1, values.shape[1] - 1).take(rows[0][0], axis=0))
+    field, home = field.reshape(-1, *shape[1:], values.shape[1]), rows[0][0]
+    return field, slice(first, max(first, last - MARGIN)), lambda change: exchange.back(change.take(home, axis=0))
 
 
 def _filtered(

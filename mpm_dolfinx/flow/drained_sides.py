@@ -130,7 +130,7 @@ class DrainedSides(Feeding):
         shape, pressure = (np.where(drains, values, 0.0) for values in (shape, pressure))
         rains = np.isfinite(driest)
         given, rain = np.where(rains, 0.0, flux * size), np.where(rains, flux * size, np.nan)
-        return OpenSides(number, cell, shape, pressure, given, one_way > 0, area, offset, rain, driest)
+        return OpenSides(number, cell, shape, pressure, given, one_way > 0, area, offset, rain, driest.copy())
 
 
 @dataclass(frozen=True)

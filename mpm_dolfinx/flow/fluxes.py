@@ -167,18 +167,18 @@ class OpenSides:
         distance = distance[drained]
         area, jump = self.shape[drained] * distance, self.pressure[drained] - p[at]
         cosine = normal[:, :, None] * [-1, 1]
-        share = np.where(cosine > ALONG, area[:, None, None] * cosine, 0.0)
-        ends = 2 * out.shape[1]
-        slots = (ends * at[:, None] + np.arange(ends)).ravel()
+        row, axis, end = (cosine > ALONG).nonzero()
+        share = area[row] * cosine[row, axis, end]
+        slots = (at[row] * out.shape[1] + axis) * 2 + end
 
         def total(values: NDArray[np.float64]) -> NDArray[np.float64]:
             """Return the sum of the values at each cell, axis and end."""
-            return sum_by(slots, values.ravel(), ends * len(p)).reshape(out.shape[:3])
+            return sum_by(slots, values, out[..., 0].size).reshape(out.shape[:3])
 
         whole = total(share)
         # the pressure is constant along the side, so the pressure gradient is normal to the side
-        for k, values in enumerate((jump[:, None], (jump / distance)[:, None] * normal)):
-            np.divide(total(share * values[:, :, None]), whole, out=out[..., k], where=whole > 0)
+        for k, values in enumerate((jump[row], (jump / distance)[row] * normal[row, axis])):
+            np.divide(total(share * values), whole, out=out[..., k], where=whole > 0)
         return out
 
 

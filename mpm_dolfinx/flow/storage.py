@@ -244,9 +244,9 @@ class StorageSystem:
         self._forms = forms
         self.symmetric = not forms.retains
         """Whether the matrix of the pressure unknowns is symmetric."""
-        d = forms.grid.dim
+        grid, d = forms.grid, forms.grid.dim
         fluxes = forms.fluxes
-        self.unknowns = own = Unknowns(forms.p, cells.astype(np.int64), forms.grid.midpoints)
+        self.unknowns = own = Unknowns(forms.p, cells.astype(np.int64), (grid.midpoints, grid.near_others[1]))
         self.of_parts = OfParts(forms.grid.comm, parts.cells[own.owned], parts.count)
         """Connected part of the bodies to which each unknown belongs."""
         self.T, self.D, self.L = (matrix(own, own, 2 * d + 1) for _ in range(3))
@@ -260,7 +260,7 @@ class StorageSystem:
         _add_diagonal(self.L, np.zeros(own.size))  # has entries even for a cell without faces
         pattern = self.L
         if forms.softens:
-            grid, zeros = forms.grid, np.zeros((forms.grid.num_local, d, 2))
+            zeros = np.zeros((grid.num_local, d, 2))
             pattern = second_differences(own, grid, zeros[: own.size, :, 0], zeros[:, :, 0], zeros)
             pattern.axpy(1.0, self.L, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
         self.C, self.P = pattern.duplicate(), pattern.duplicate()

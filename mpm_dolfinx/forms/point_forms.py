@@ -267,7 +267,7 @@ class PointData(Keyed):
         if points.grid.axisymmetric:
             self.rows["hoop"] = places.hoop
         self.rows |= {name: fields[name].reshape(n, size) for name, size in points.sizes.items()}
-        self.stored: Latest[NDArray[np.float64]] = Latest()
+        self._stored: Latest[NDArray[np.float64]] = Latest()
 
     def part(self, points: FormPoints, places: Places, rows: NDArray[np.int64]) -> PointData:
         """Return the data of the points `rows`, for the fields of `points`, at the positions `places`."""
@@ -286,7 +286,11 @@ class PointData(Keyed):
     def gradients(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the gradients (n, d^2) of a Q1 vector with nodal values u, a local array; stores the last result."""
         nodal = u.take(self.places.nodal)
-        return self.stored(nodal, partial(self._of_nodal, nodal))
+        return self._stored(nodal, partial(self._of_nodal, nodal))
+
+    def forget(self) -> None:
+        """Delete the result that `gradients` stores."""
+        self._stored = Latest()
 
     def increments(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return I + grad u (n, 9), with the circumferential stretch, for a Q1 vector with nodal values u."""

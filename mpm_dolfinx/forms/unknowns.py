@@ -22,12 +22,13 @@ class Unknowns:
     """Numbering of a subset of the degrees of freedom of a function's space.
 
     function: any function of the space, with ghosts.  dofs: unrolled local degrees of freedom that are
-    unknowns, ghosts included; x (entities, d), m: positions of the nodes or cells of this process.  If x is None,
-    the space computes all positions at each request.
+    unknowns, ghosts included; at: positions (entities, d), m, of the nodes or cells of this process, and whether their
+    rows of matrices may have entries in columns of other processes.  If it is None, the space computes all positions at
+    each request, and all rows may have such entries.
     """
 
-    def __init__(self, function: fem.Function, dofs: NDArray[np.int64], x: NDArray[np.float64] | None = None):
-        self._x = x
+    def __init__(self, function: fem.Function, dofs: NDArray[np.int64], at: tuple[NDArray, NDArray] | None = None):
+        self._x, near = at or (None, None)
         self._space = space = function.function_space
         self.comm = space.mesh.comm
         dofmap = space.dofmap
@@ -36,6 +37,7 @@ class Unknowns:
         self.owned = dofs[dofs < owned]
         """Unrolled local degree of freedom of each entry of a vector."""
         self.size = len(self.owned)
+        self.near = True if near is None else near[self.owned // dofmap.bs]
         start = 0
         if self.comm.size > 1:
             start = self.comm.exscan(self.size) or 0
@@ -97,7 +99,7 @@ def matrix(rows: Unknowns, columns: Unknowns, row_length: int | NDArray[np.int64
     A.setSizes(((rows.size, None), (columns.size, None)))
     A.setType(PETSc.Mat.Type.AIJ)
     length = np.zeros(rows.size, dtype=PETSc.IntType) + np.asarray(row_length, dtype=PETSc.IntType)
-    elsewhere = np.minimum(length, columns.global_size) if rows.comm.size > 1 else 0
+    elsewhere = np.where(rows.near, np.minimum(length, columns.global_size), 0) if rows.comm.size > 1 else 0
     A.setPreallocationNNZ((np.minimum(length, columns.size), elsewhere))
     A.setOption(PETSc.Mat.Option.NEW_NONZERO_ALLOCATION_ERR, False)
     A.setLGMap(rows.map, columns.map)

@@ -211,7 +211,7 @@ class Cells:
         self.mesh = mesh
         self.partition = partition
         d = grid.dim
-        nodes = _compat.function_space(mesh, "Lagrange", 1)
+        self._nodes = nodes = _compat.function_space(mesh, "Lagrange", 1)
         self.num_owned, self.num_local = _compat.num_cells(mesh)
         self.cell_nodes = _compat.cell_dofs(nodes)
         node_x = nodes.tabulate_dof_coordinates()[:, :d]
@@ -248,6 +248,19 @@ class Cells:
         """Function spaces by value shape, each created once.  All functions of a shape share memory."""
         self.memory = cache(lambda shape, space=self.cellwise: fem.Function(space(shape)))
         self.move(grid)
+
+    @cached_property
+    def near_others(self) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """Masks of local nodes at most two cells from nodes of several processes, and of local cells at such nodes."""
+        holders = fem.Function(self._nodes)
+        holders.x.array[:] = 1.0
+        _compat.scatter_reverse_add(holders)
+        holders.x.scatter_forward()
+        near = holders.x.array > 1
+        cells = near[self.cell_nodes].any(axis=1)
+        for _ in range(2):
+            near[self.cell_nodes[near[self.cell_nodes].any(axis=1)]] = True
+        return near, cells
 
     @cached_property
     def edges(self) -> fem.Function:
@@ -522,6 +535,7 @@ class Grid:
         return np.minimum(np.maximum(self.lines[axis].searchsorted(x, side="right") - 1, 0), self.shape[axis] - 1)
 
     mesh = of_cells("mesh")
+    near_others = of_cells("near_others")
     partition = of_cells("partition")
     locals = of_cells("locals")
     num_owned = of_cells("num_owned")

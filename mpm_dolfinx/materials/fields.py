@@ -166,6 +166,10 @@ class SceneMaterials:
             for law in self.laws
         ]
 
+    def seeds_no_more(self) -> None:
+        """Delete the seeded points after all bodies are in the state; names and shapes of their data remain."""
+        self.seeded = self.seeded.of(np.empty(0, dtype=np.int64))
+
     def check_cells(self) -> None:
         """Raise ValueError if cells are too large for a softening law; called when the cells are made or have moved."""
         size = mean_size(self.grid)

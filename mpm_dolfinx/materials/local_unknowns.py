@@ -31,7 +31,7 @@ from mpm_dolfinx.base.validation import asked, instance, line
 from mpm_dolfinx.forms.point_forms import FormPoints, PointData, PointExpression
 from mpm_dolfinx.materials.skeleton import BY_SCENE, Skeleton
 from mpm_dolfinx.materials.user_functions import call, named
-from mpm_dolfinx.parallel.exchange import first
+from mpm_dolfinx.parallel.exchange import everywhere, first
 
 MOST, HALVINGS = 60, 25  # largest numbers of Newton iterations, and of step halvings in all iterations together
 
@@ -241,24 +241,14 @@ class _Equations:
             return [found[of][0].reshape(n, _size(shape)) for of, shape in self._unknowns.items()]
 
         def derive() -> Derived:
-            slopes = self._concatenated(lambda: [self._slopes_of(of, found[of][1], n) for of in self._unknowns])
+            each = everywhere(self._grid.comm, lambda: [self._slopes_of(of, found[of][1], n) for of in self._unknowns])
+            slopes = np.concatenate(each, axis=1)
             self._refuse(data, np.flatnonzero(~np.isfinite(slopes).all(axis=(1, 2))), ".solution: is not finite")
             return Derived(slopes.reshape(n, self.count * k))
 
-        y = self._concatenated(solution)
+        y = np.concatenate(everywhere(self._grid.comm, solution), axis=1)
         self._refuse(data, np.flatnonzero(~np.isfinite(y).all(axis=1)), ".solution: is not finite")
         return Solved(data.key, y, trial, derive)
-
-    def _concatenated(self, make: Callable[[], list[NDArray[np.float64]]]) -> NDArray[np.float64]:
-        """Return arrays concatenated along axis 1; a ValueError on one process is raised on all processes."""
-        arrays, reason = [], ""
-        try:
-            arrays = make()
-        except ValueError as error:
-            reason = str(error)
-        if message := first(self._grid.comm, reason):
-            raise ValueError(message)
-        return np.concatenate(arrays, axis=1)
 
     @property
     def _title(self) -> str:

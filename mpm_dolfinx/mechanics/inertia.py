@@ -236,7 +236,7 @@ class InertiaForms:
         grid = self.grid
         rows = cut.pieces_to_cells(cut.pieces.fraction * mass[cut.pieces.point])
         places = Places(grid, cut.cells, cut.x, cut.mixed, cut.hoop)
-        pieces = PointData(self.pieces, places, rows, {"spread": cut.second})
+        pieces = PointData(self.pieces, places, rows, {"spread": cut.pieces_to_cells(cut.pieces.second)})
         content = sum_by(cut.cells, rows, grid.num_local)
         volume = fill * grid.volumes(np.arange(grid.num_local))
         self.density.x.array[:] = np.divide(content, volume, out=np.zeros_like(content), where=volume > 0)

@@ -305,7 +305,8 @@ class MomentumSystem:
         parts: Parts,
     ):
         self._forms, d = forms, forms.grid.dim
-        self.unknowns = Unknowns(forms.u, dofs, forms.grid.node_x)
+        at_nodes = forms.grid.node_x, forms.grid.near_others[0]
+        self.unknowns = Unknowns(forms.u, dofs, at_nodes)
         self.locks = forms.dilatation is not None
         """Whether some law uses F-bar, because the soil yields or is nearly incompressible."""
         active = forms.active.now.dofs
@@ -323,7 +324,7 @@ class MomentumSystem:
         self.K = matrix(self.unknowns, self.unknowns, 3**d * d)
         self.residual, self.step = self.unknowns.vector(), self.unknowns.vector()
         held = active[~among(active, dofs)]
-        self.held = Unknowns(forms.u, held, forms.grid.node_x)
+        self.held = Unknowns(forms.u, held, at_nodes)
         """Degrees of freedom that walls of the grid fix."""
         self.held_residual = self.held.vector()
         self.penalty, self.held_penalty = (self._penalty_matrix(of, facets, stiff) for of in (self.unknowns, self.held))

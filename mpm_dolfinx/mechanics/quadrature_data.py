@@ -105,12 +105,14 @@ class QuadraturePoints:
         Whether mobilities change with the deformation.
     layered
         Whether the conductivity differs between points.
+    materials
+        The materials of the scene.
     """
 
     def __init__(self, scene: SceneMaterials, bodies: Sequence[Body], weighs: bool, extended: bool):
         self._grid, self._fluid = grid, fluid = scene.grid, scene.fluid
         self._linear = LinearGradients(grid.comm, bodies) if scene.some_elastic else None
-        self._scene = scene
+        self.materials = scene
         self._weighs = weighs
         self._extended = extended
         self.varies = bool(fluid and scene.conductivity_laws)
@@ -141,16 +143,16 @@ class QuadraturePoints:
         pieces, parts = Places(self._grid, cut.cells, cut.x, cut.mixed, cut.hoop), []
         law_places = self._law_places(cut, pieces)
         if len(self.laws) > 1 or law_places is not pieces:
-            part = cut.to_cells(self._scene.part_of(cut.points))
+            part = cut.to_cells(self.materials.part_of(cut.points))
             rows = [(part == number).nonzero()[0] for number in range(len(self.laws))]
             parts = [(own, law_places.part(own)) for own in rows]
         return PiecePlaces(pieces, tuple(parts))
 
     def _law_places(self, cut: CutDomains, pieces: Places) -> Places:
         """Return the positions at which laws use the gradient; they are shifted in flowing, dilatant soil (`SHARE`)."""
-        if not self._scene.dilates or self._grid.axisymmetric:
+        if not self.materials.dilates or self._grid.axisymmetric:
             return pieces
-        flows = cut.to_cells(self._scene.dilating(cut.points))
+        flows = cut.to_cells(self.materials.dilating(cut.points))
         size, volume = self._grid.num_local, (cut.points.volume0 * cut.points.J)[cut.pieces.point]
         weight = cut.pieces_to_cells(cut.pieces.fraction * volume)
         whole = sum_by(cut.cells, weight, size)
@@ -169,15 +171,15 @@ class QuadraturePoints:
         even = {name: values for name, values in self._changing(points).items() if name not in within}
         fields = {**self._constant(cut, points), **{name: cut.to_cells(values) for name, values in even.items()}}
         fields |= {name: cut.pieces_to_cells(values) for name, values in within.items()} | self._own(cut, points)
-        if self._scene.retentions:
+        if self.materials.retentions:
             fields["lever"] = np.zeros_like(cut.x) if places.lever is None else places.lever
         weight = cut.pieces_to_cells(cut.pieces.fraction * (points.volume0 * points.J)[cut.pieces.point])
         apart = self._extended and self._locks
         of_points = PointData(self.pieces, places.pieces, weight, fields) if apart else None
         if self._locks and cut.domains:
-            share = self._scene.table(points, lambda m: corner_share(m, bool(self._fluid)))
-            share = self._scene.locking(points) * share
-            factor = cell_ratios(cut, points, share, self._scene.evolved(points)) / cut.to_cells(points.J)
+            share = self.materials.table(points, lambda m: corner_share(m, bool(self._fluid)))
+            share = self.materials.locking(points) * share
+            factor = cell_ratios(cut, points, share, self.materials.evolved(points)) / cut.to_cells(points.J)
             weight, fields["F"] = factor * weight, factor[:, None, None] ** (1 / cut.grid.stretches) * fields["F"]
             if ACROSS in fields:
                 fields[ACROSS] = np.cbrt(factor) * fields[ACROSS]
@@ -193,42 +195,42 @@ class QuadraturePoints:
 
     def _constant(self, cut: CutDomains, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
         """Return the material constants at the integration points."""
-        values = tuple(points.data[name] for name in self._scene.field_names)
+        values = tuple(points.data[name] for name in self.materials.field_names)
 
         def make() -> dict[str, NDArray[np.float64]]:
-            fields = self._scene.parameters(points)
+            fields = self.materials.parameters(points)
             if self._fluid:
-                fields["biot"] = self._scene.table(points, lambda m: m.biot)
-                fields["storage_at_one"] = self._scene.storage_at_one(points)
-                if self._scene.drains:
-                    fields["drainage"] = self._scene.drainage(points)
-                if self._scene.retentions:
-                    fields["retention"] = self._scene.retention_rows(points)
+                fields["biot"] = self.materials.table(points, lambda m: m.biot)
+                fields["storage_at_one"] = self.materials.storage_at_one(points)
+                if self.materials.drains:
+                    fields["drainage"] = self.materials.drainage(points)
+                if self.materials.retentions:
+                    fields["retention"] = self.materials.retention_rows(points)
             if self.varies:
-                fields["conductivity"] = self._scene.table(points, lambda m: m.conductivity)
-                fields["porosity0"] = self._scene.table(points, lambda m: m.porosity)
+                fields["conductivity"] = self.materials.table(points, lambda m: m.conductivity)
+                fields["porosity0"] = self.materials.table(points, lambda m: m.porosity)
             return {name: cut.to_cells(rows) for name, rows in fields.items()}
 
         return self._constants((cut.key, values), make, self._grid.comm)
 
     def _changing(self, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
         """Return the data of material points that change from step to step."""
-        fields = {"F": points.F, **self._scene.state(points)}
-        fields |= {ACROSS: points.data[ACROSS]} if self._scene.across else {}
+        fields = {"F": points.F, **self.materials.state(points)}
+        fields |= {ACROSS: points.data[ACROSS]} if self.materials.across else {}
         if self._extended:  # fields of laws are in `_constant`; in `data` each is valid only at points of its own law
-            fields |= {name: rows for name, rows in points.data.items() if name not in self._scene.shapes}
+            fields |= {name: rows for name, rows in points.data.items() if name not in self.materials.shapes}
         if self._fluid:
-            fields["storage"] = self._scene.storage(points)
-        if self._fluid and self._scene.retentions:
-            fields["pores"] = self._scene.porosity(points)
+            fields["storage"] = self.materials.storage(points)
+        if self._fluid and self.materials.retentions:
+            fields["pores"] = self.materials.porosity(points)
         if self._weighs:
-            fields["density"] = self._scene.density(points)
+            fields["density"] = self.materials.density(points)
         return fields
 
     def _gradients(self, cut: CutDomains, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
         """Return F at the pieces of this process's points, and the out-of-plane stretch if laws use it."""
-        of_materials = self._scene.elastic(points), self._scene.soil_rows(points)
-        if not self._scene.across:
+        of_materials = self.materials.elastic(points), self.materials.soil_rows(points)
+        if not self.materials.across:
             return {"F": self._linear.at_pieces(cut, points.F, *of_materials)}
         F = self._linear.at_pieces(cut, in_space(points.F, points.data[ACROSS]), *of_materials)
         return dict(zip(("F", ACROSS), in_plane(F), strict=True))
@@ -244,7 +246,7 @@ class QuadraturePoints:
 
     def rows(self, cut: CutDomains, points: MaterialPoints, value: Callable[[Skeleton], float]) -> NDArray[np.float64]:
         """Return a material constant at the integration points (m,)."""
-        return cut.to_cells(self._scene.table(points, value))
+        return cut.to_cells(self.materials.table(points, value))
 
     def mobility(
         self, cut: CutDomains, law: ConductivityAtPieces | None, data: PointData, begins: bool
@@ -254,18 +256,13 @@ class QuadraturePoints:
             return self.rows(cut, cut.points, lambda m: m.conductivity) / self._fluid.unit_weight
         return law.evaluate(data, cut.to_cells(cut.points.material), begins) / self._fluid.unit_weight
 
-    @property
-    def materials(self) -> SceneMaterials:
-        """The materials of the scene."""
-        return self._scene
-
     def masses(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return the masses (n,), kg, of the material points, pore fluid included."""
-        return self._scene.present_density(points) * points.volume0 * points.J
+        return self.materials.present_density(points) * points.volume0 * points.J
 
     def conducting(self, cut: CutDomains) -> NDArray[np.float64]:
         """Return two numbers (m, 2) of each integration point: both are equal at points with equal conductivity."""
-        return cut.to_cells(self._scene.conducting(cut.points))
+        return cut.to_cells(self.materials.conducting(cut.points))
 
     def fixed_stress(self, cut: CutDomains, points: MaterialPoints, of_fluid: bool) -> NDArray[np.float64]:
         """Return beta (m,), 1/Pa, at the integration points, for the fixed-stress operator C + f beta V (f: `Scheme`).
@@ -274,5 +271,5 @@ class QuadraturePoints:
         """
         if of_fluid:
             return np.full(len(cut.cells), 1 / self._fluid.bulk)
-        beta = self._scene.table(points, lambda m: m.biot**2 / m.drained_modulus(self._grid.stretches)) * points.J
+        beta = self.materials.table(points, lambda m: m.biot**2 / m.drained_modulus(self._grid.stretches)) * points.J
         return cut.to_cells(beta)

@@ -188,15 +188,15 @@ class MaterialPoints:
         """Displacement (n, d), m, of the centroids since the start, or since a stage set it to zero."""
         return self.x - centroids(self.origin)
 
-    def map(self, function: Callable[[NDArray], NDArray]) -> MaterialPoints:
+    def map(self, function: Callable[[NDArray], NDArray], shared: bool = True) -> MaterialPoints:
         """Return points with a function applied to each array: a selection, a copy, or a transfer of its entries.
 
-        Fields that share an array share the new array too.
+        shared: whether fields that share an array share the new array too.
         """
         cache: dict[int, NDArray] = {}
 
         def once(values: NDArray) -> NDArray:
-            if id(values) not in cache:
+            if not shared or id(values) not in cache:
                 cache[id(values)] = function(values)
             return cache[id(values)]
 
@@ -234,14 +234,9 @@ class MaterialPoints:
         arrays = self.arrays
         one = tuple([values is other for other in arrays].index(True) for values in arrays)
         equal = len(set(exchange.comm.allgather(one))) == 1  # else numbers of transfers would differ between processes
-        received = (self if equal else self._copied()).map(exchange.send)
+        received = self.map(exchange.send, equal)
         order = received.id.argsort()
         return received.map(lambda rows: rows[order])
-
-    def _copied(self) -> MaterialPoints:
-        """Return the points with a separate array for each field."""
-        arrays = {f.name: getattr(self, f.name).copy() for f in fields(self) if f.name != "data"}
-        return type(self)(**arrays, data={name: values.copy() for name, values in self.data.items()})
 
     def find(self, ids: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return the indices of entries of `ids` that are points of this process, and the indices of these points."""

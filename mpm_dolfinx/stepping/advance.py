@@ -126,7 +126,7 @@ class Motion:
         with _compat.Timer("move points"):
             cut, pieces = on_grid.cut, data.pieces
             for one in (pieces, *data.parts):
-                one.stored.clear()  # memory is at its peak below
+                one.forget()  # memory is at its peak below
             grid, d = cut.grid, cut.grid.dim
             nodal = self._momentum.u.x.array.reshape(-1, d)
             deformed = cache(partial(self._deformed, cut, data, nodal))

@@ -26,15 +26,20 @@ class Distributed(Protocol):
 
 
 def distribute(simulation: Distributed) -> None:
-    """Distribute the cells anew before a step that resets the grid, if uneven numbers of points become more even."""
+    """Distribute the cells anew before a step that resets the grid, if uneven numbers of points become more even.
+
+    Else points move to the owners of their cells; lines that follow move later, and the points with them.
+    """
     grid = simulation.scene.grid
-    if grid.comm.size == 1 or (state := simulation.state).stays or simulation.scene.extended:
+    if grid.comm.size == 1 or (state := simulation.state).stays:
         return
     if state.lines is not None:
         grid.move([state.lines[letter] for letter in sorted(state.lines)])
-    boxes = grid.better(state.as_cut.x)
+    boxes = None if simulation.scene.extended else grid.better(state.as_cut.x)
     if boxes is not None and distribute_by(simulation, boxes):
         log(grid.comm, "t = %g s: cells distributed anew among %d processes", state.t, grid.comm.size)
+    elif grid.follow is None:
+        simulation.state = state.at_owners(grid)  # the step would keep a second state, with points where they were
 
 
 def distribute_by(simulation: Distributed, boxes: NDArray[np.int64]) -> bool:

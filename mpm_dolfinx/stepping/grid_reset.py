@@ -110,12 +110,11 @@ class OnGrid(Keyed):
                 weight=weight,
                 area=area,
                 x=x,
-                faces=cut.pieces_to_cells(cut.pieces.faces),
+                faces=cut.faces(),
                 fixed_stress=quadrature.fixed_stress(cut, points, of_fluid),
                 damping=quadrature.rows(cut, points, lambda m: m.pressure_damping()),
             )
             self.contents = CellContents(storage.fluxes, brought, own)
-            cut.pieces.faces = cut.pieces.faces[:0].copy()  # as large as F; not needed any more
             if quadrature.materials.retentions is not None:
                 lever = x - grid.midpoints[cut.cells] - self.contents.centroid[cut.cells]
                 self._places = replace(self._places, lever=lever)

@@ -83,6 +83,8 @@ def first_state(scene: Scene, conditions: Mapping[str, Any], later: Sequence[int
     points = scene.seeded(present)
     points = scene.initial.of(scene.materials, points, present, first.gravity_at(0.0) if scene.initial.given else None)
     pieces = None
+    if all(present):
+        scene.materials.seeds_no_more()
     scene.rests_at(first, 0.0)
     if scene.fluid:
         placed = callable(scene.initial.pressure) or scene.materials.retentions is not None

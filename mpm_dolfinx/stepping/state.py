@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from mpm_dolfinx.conditions.acting import Outcome
 from mpm_dolfinx.domains.pressure_transport import PiecePressures
 from mpm_dolfinx.grid.grid import Grid
-from mpm_dolfinx.parallel.exchange import Exchange
+from mpm_dolfinx.parallel.exchange import Exchange, over_all
 from mpm_dolfinx.points.material_points import MaterialPoints, PlacedPoints
 from mpm_dolfinx.stepping.result import Result
 from mpm_dolfinx.stepping.stage import Stage
@@ -80,13 +80,6 @@ class Stay:
 
     def __post_init__(self):
         _freeze(vars(self))
-
-    def migrated(self, exchange: Exchange) -> Stay:
-        """Return the same data after an exchange of points between processes."""
-        keeps = self.keeps
-        if keeps is not None:
-            keeps = exchange.send(keeps)[np.argsort(exchange.send(self.points.id))]
-        return Stay(self.points.migrated(exchange), keeps)
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,9 +219,12 @@ class State:
         pieces = self.pieces
         if pieces is not None:
             pieces = pieces.migrated(Exchange(comm, destination[np.searchsorted(self.points.id, pieces.id)]))
-        stay, trend = self.stay and self.stay.migrated(exchange), self.trend
-        if trend is not None:
-            trend = Trend(trend.lengths, exchange.send(trend.rates)[np.argsort(exchange.send(self.points.id))])
+        stay, trend = self.stay, self.trend
+        order = np.argsort(exchange.send(self.points.id))
+        if stay is not None:
+            keeps = None if stay.keeps is None else exchange.send(stay.keeps)[order]
+            stay = Stay(stay.points.migrated(exchange), keeps)
+        trend = trend and Trend(trend.lengths, exchange.send(trend.rates)[order])
         return replace(self, points=self.points.migrated(exchange), pieces=pieces, stay=stay, trend=trend)
 
     def at_owners(self, grid: Grid) -> State:
@@ -236,4 +232,6 @@ class State:
         if grid.comm.size == 1:
             return self
         placed = self.as_cut
-        return self.migrated(grid.owner(grid.number(grid.index_from_base(placed.x)) + grid.copy(placed.id)), grid.comm)
+        owner = grid.owner(grid.number(grid.index_from_base(placed.x)) + grid.copy(placed.id))
+        moves = over_all(grid.comm, int((owner != grid.comm.rank).any()))
+        return self.migrated(owner, grid.comm) if moves else self
