@@ -277,11 +277,11 @@ def test_a_checkpoint_that_cannot_be_finished_leaves_the_one_before(checkpoint, 
     simulation, _ = beam(h=0.06)
     after = mpm.resume(simulation, file)
 
-    def full(f, **arrays):
+    def full(f, array, **options):
         f.write(before[:1000])
         raise OSError("No space left on device")
 
-    monkeypatch.setattr(np, "savez", full)
+    monkeypatch.setattr(np.lib.format, "write_array", full)
     with pytest.raises(OSError, match="No space left"):
         simulation.run(0.04, 0.02, after=after, checkpoint=mpm.Checkpoint(file))
     assert file.read_bytes() == before and (tmp_path / "run.ckpt.part").exists()

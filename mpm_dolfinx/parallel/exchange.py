@@ -137,16 +137,15 @@ def everywhere(comm: MPI.Intracomm, ask: Callable[[], T]) -> T:
 
 
 def together(comm: MPI.Intracomm, action: Callable[[], T]) -> T:
-    """Return the result of an action on this process; if it raises on any, all raise an error: their own, or the first.
-    """
+    """Return the result of an action on this process; if it raises on any process, all raise the first error."""
     value = error = None
     try:
         value = action()
     except Exception as raised:
         error = raised
-    for one in [error, *comm.allgather(error)]:
+    for rank, one in enumerate(comm.allgather(error)):
         if one is not None:
-            raise one
+            raise error if rank == comm.rank else one
     return value
 
 
