@@ -79,7 +79,7 @@ def check(simulation, file):
     comm = simulation.grid.comm
     kept, part = file.read_bytes(), file.with_name("altered")
     comm.barrier()
-    for name, alter in {**ALTERED, **PIECES}.items():
+    for alter in {**ALTERED, **PIECES}.values():
         if not comm.rank:
             arrays = dict(np.load(file))
             alter(arrays)

@@ -58,7 +58,8 @@ class Checkpoint:
     Parameters
     ----------
     file
-        The file to be written, for `resume`.  A new file replaces the old one when it is complete.
+        The file to be written, for `resume`, in a folder of all processes.  A new file replaces the old one when it is
+        complete.
     every
         Number of output intervals between two checkpoints, >= 1.
     seconds
@@ -184,9 +185,7 @@ def _arrays(state: State) -> dict[str, NDArray]:
     return _named("", named)
 
 
-def _state(
-    file: Path, arrays: dict[str, NDArray], note: dict[str, Any], simulation: Simulation, count: int
-) -> State:
+def _state(file: Path, arrays: dict[str, NDArray], note: dict[str, Any], simulation: Simulation, count: int) -> State:
     """Return a state with this process's share of the points in a file, which has `count` points.
 
     Nodal fields of the state are pairs of nodes and values.  Raise ValueError if the file does not fit the simulation.

@@ -110,11 +110,11 @@ def evenly(comm: MPI.Intracomm, numbers: NDArray[np.int64]) -> NDArray[np.int32]
 
     The ranks get equal shares of all numbers: the smallest numbers go to rank 0, and so on.
     """
-    wanted = over_all(comm, len(numbers)) * np.arange(1, comm.size) // comm.size
-    low, high = np.zeros_like(wanted), np.full_like(wanted, over_all(comm, int(numbers.max(initial=0)), MPI.MAX) + 1)
-    while (low < high).any():  # bisection for the numbers that `wanted` numbers lie below
+    below = over_all(comm, len(numbers)) * np.arange(1, comm.size) // comm.size
+    low, high = np.zeros_like(below), np.full_like(below, over_all(comm, int(numbers.max(initial=0)), MPI.MAX) + 1)
+    while (low < high).any():  # bisection for the smallest numbers of the ranks from 1
         middle = (low + high) // 2
-        enough = over_all(comm, numbers.searchsorted(middle)) >= wanted
+        enough = over_all(comm, numbers.searchsorted(middle)) >= below
         low, high = np.where(enough, low, middle + 1), np.where(enough, middle, high)
     return low.searchsorted(numbers, side="right").astype(np.int32)
 

@@ -55,7 +55,8 @@ def write(comm: MPI.Intracomm, file: Path, arrays: Mapping[str, NDArray], rows: 
     for (name, of), length in zip(rows.items(), total.tolist(), strict=True):
         info, head = ZipInfo(f"{name}.npy"), _head(of.dtype, (length, *of.shape[1:]))
         size = length * _row_bytes(of.dtype, of.shape)
-        info.CRC, info.file_size, info.compress_size = 0, len(head) + size, len(head) + size
+        info.CRC = 0  # unknown so far
+        info.file_size = info.compress_size = len(head) + size
         info.header_offset = end
         start = end + len(info.FileHeader(zip64=True)) + len(head)
         placed.append((info, head, start))
