@@ -1,20 +1,36 @@
 # SPDX-License-Identifier: MIT
-"""Move two wet soils, boxes or meshes, with fields of materials, on any number of processes; write the memory held."""
+"""Move two wet soils, boxes or meshes, with fields of materials, on any number of processes; write the memory held.
+
+Also write a checkpoint, read the one that a single process has written in the same folder, and weigh both.
+"""
 
 import sys
+import tracemalloc
+from pathlib import Path
 
 import numpy as np
 import scaling
 from meshes import box_mesh
 
 import mpm_dolfinx as mpm
+from mpm_dolfinx.io.checkpoint import save
 
+file = Path(sys.argv[1])
 points, seen = float(sys.argv[2]), []
 
 
 def stiffness(X):
     seen.append(len(X))
     return 4e6 * (2 - X[:, 1])
+
+
+def peak(action):
+    """Return the largest memory that Python and numpy take during an action on this process, bytes."""
+    tracemalloc.start()
+    action()
+    found = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    return found
 
 
 h = 2 * np.sqrt(2 / points)
@@ -32,9 +48,12 @@ WHOLE = {*map(len, bodies), grid.cells, grid.nodes}
 acting = {"conditions": [mpm.Traction("top", lambda t: (1e3 * t, -1e4 * t)), mpm.Drained("top")]}
 walls = {"bottom": "xy", "left": "x", "right": "x"}
 s = mpm.Simulation(grid, bodies, [sand, gel], fluid=mpm.Fluid(), walls=walls, **acting)
-s.step(0.1)
+s.run(0.1, 0.1, progress=False)
 bytes_of, lengths = scaling.held(s, buffers=False)
 files = bytes_of.pop("files")
-row = len(s.points), max(seen, default=0), sum(bytes_of.values()), len(lengths & WHOLE), files
+row = [len(s.points), max(seen, default=0), sum(bytes_of.values()), len(lengths & WHOLE), files]
+row.append(peak(lambda: save(s, file.with_suffix(".checkpoint"))))
+row.append(peak(lambda: mpm.resume(s, file.with_name("1.checkpoint"))))
+names = ("points", "asked", "held", "whole", "files", "written", "read")
 if rows := grid.comm.gather(row):
-    np.savez(sys.argv[1], **dict(zip(("points", "asked", "held", "whole", "files"), np.array(rows).T, strict=True)))
+    np.savez(file, **dict(zip(names, np.array(rows).T, strict=True)))

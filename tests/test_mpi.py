@@ -150,3 +150,5 @@ def test_no_process_holds_arrays_of_the_whole_scene(points, of, bound, tmp_path)
     print(f"shares: {four['held'] / one['held'][0]}")
     assert (four["held"] < bound * one["held"][0]).all()
     assert not one["files"].any() and four["files"].any() == (of == "meshes"), "one copy of a mesh on a machine"
+    size = (tmp_path / "1.checkpoint").stat().st_size
+    assert (four["written"] < 2 * size / 4).all() and (four["read"] < 3 * size / 4).all(), "shares of a checkpoint"

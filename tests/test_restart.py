@@ -204,6 +204,17 @@ def test_two_processes_write_the_files_of_one(parallel):
     assert [len(files) for _, files in grids] == [2, 2, 2] and readable(folder / "two.out")
 
 
+QUICK = "dug carried few parts"
+SLOW = "renewed following sinking rained"
+
+
+@pytest.mark.parametrize("scenes", [QUICK, pytest.param(SLOW, marks=pytest.mark.slow)])
+def test_any_number_of_processes_reads_a_checkpoint_and_writes_the_same_bits(scenes, tmp_path):
+    """All processes refuse alike a damaged one, and write none if the disk of one process is full."""
+    for processes, task in ((3, "write"), (2, "read"), (1, "write"), (4, "read")):
+        mpirun(processes, "mpi_checkpoints.py", str(tmp_path), task, *scenes.split())
+
+
 @pytest.fixture(scope="module")
 def checkpoint(tmp_path_factory):
     file = tmp_path_factory.mktemp("checkpoint") / "run.ckpt"
@@ -277,11 +288,11 @@ def test_a_checkpoint_that_cannot_be_finished_leaves_the_one_before(checkpoint, 
     simulation, _ = beam(h=0.06)
     after = mpm.resume(simulation, file)
 
-    def full(f, **arrays):
+    def full(f, array, **options):
         f.write(before[:1000])
         raise OSError("No space left on device")
 
-    monkeypatch.setattr(np, "savez", full)
+    monkeypatch.setattr(np.lib.format, "write_array", full)
     with pytest.raises(OSError, match="No space left"):
         simulation.run(0.04, 0.02, after=after, checkpoint=mpm.Checkpoint(file))
     assert file.read_bytes() == before and (tmp_path / "run.ckpt.part").exists()

@@ -85,7 +85,7 @@ class MixedCells:
         middle = self._middle
         self._bounds = np.minimum(ROUND_OFF - 0.5 - middle, 0.0), np.maximum(0.5 - ROUND_OFF - middle, 0.0)
         count, first = count[self._at], first[self._at]
-        ends = 1 + np.flatnonzero(np.diff(np.cumsum(count) // PAIRS, append=-1))
+        ends = (1 + np.flatnonzero(np.diff(np.cumsum(count) // PAIRS, append=-1))).tolist() or [0]
         crossings = [self._crossed(slice(a, b), first, count, low, high) for a, b in pairwise([0, *ends])]
         size, share = np.maximum(high - low, NEAR), volume / contents.grid.sizes(cells).prod(axis=-1)
         self._lines = []

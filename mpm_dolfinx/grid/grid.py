@@ -718,13 +718,20 @@ class Grid:
         return np.ravel_multi_index(tuple(index), tuple(self.shape + 1)) + copy * self.nodes
 
     def from_other(self, other: Grid, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return nodal values (unknowns,) from an equal grid with other owners; rank i % P of P passes on node i."""
+        """Return nodal values (unknowns,) from an equal grid with other owners."""
         rows = nodal.reshape(-1, self.dim)
         some = rows.any(axis=1)
-        old, new = other.node_numbers()[some], self.node_numbers()
-        store, fetch = (Exchange(self.comm, (node % self.comm.size).astype(np.int32)) for node in (old, new))
-        node, first = np.unique(store.send(old), return_index=True)
-        return fetch.back(values_at(fetch.send(new), node, store.send(rows[some])[first])).ravel()
+        return self.from_rows(other.node_numbers()[some], rows[some])
+
+    def from_rows(self, nodes: NDArray[np.int64], rows: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return nodal values (unknowns,) from rows (n, d) of nodes (n,) on any processes; others are zero.
+
+        nodes: lexicographic indices, see `node_numbers`.  Rank i % P of P passes on node i.
+        """
+        new = self.node_numbers()
+        store, fetch = (Exchange(self.comm, (node % self.comm.size).astype(np.int32)) for node in (nodes, new))
+        node, first = np.unique(store.send(nodes), return_index=True)
+        return fetch.back(values_at(fetch.send(new), node, store.send(rows)[first])).ravel()
 
     def cell_places(self, cells: NDArray[np.integer]) -> NDArray[np.int64]:
         """Return for local cells (n,) the indices along the axes and, in column d, the index of the copy."""

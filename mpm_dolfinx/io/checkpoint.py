@@ -2,6 +2,7 @@
 """Checkpoints: files from which an interrupted run is resumed, on any number of processes.
 
 A checkpoint is a numpy archive of the state between two steps (`State`), with a description that identifies the scene.
+Points are ordered by id, whatever processes write them.  Each process writes and reads an equal share of the points.
 """
 
 from __future__ import annotations
@@ -9,10 +10,15 @@ from __future__ import annotations
 import json
 import os
 import time
-from collections.abc import Mapping
+from bisect import bisect_left
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
+
+from mpi4py import MPI
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,11 +28,12 @@ from mpm_dolfinx.base.validation import instance, line, numbers, on_disk, path, 
 from mpm_dolfinx.conditions.acting import MOTIONS, Outcome
 from mpm_dolfinx.domains.pressure_transport import PiecePressures
 from mpm_dolfinx.domains.renewed_faces import PARENT, with_faces
-from mpm_dolfinx.grid.grid import Grid, values_at
-from mpm_dolfinx.io.writer import WRITABLE, replacing
-from mpm_dolfinx.parallel.exchange import at_root
+from mpm_dolfinx.grid.grid import Grid
+from mpm_dolfinx.io.writer import WRITABLE
+from mpm_dolfinx.parallel.exchange import Exchange, at_root, evenly, together
 from mpm_dolfinx.parallel.messages import log
-from mpm_dolfinx.points.material_points import MaterialPoints
+from mpm_dolfinx.parallel.shared_archives import Member, members, read, some_rows, write
+from mpm_dolfinx.points.material_points import MaterialPoints, body_of
 from mpm_dolfinx.simulation.simulation import Simulation
 from mpm_dolfinx.stepping.distribution import distribute_by
 from mpm_dolfinx.stepping.result import Result
@@ -35,6 +42,10 @@ from mpm_dolfinx.stepping.state import NODAL, State, Stay, StepControl, Trend
 FORMAT, VERSION = "mpm_dolfinx checkpoint", 15  # Source: the format of the files
 FOREIGN = "not a checkpoint of mpm_dolfinx, must be one"
 ZIP = b"PK\3\4"  # first bytes of a numpy archive
+POINTS, PIECES = "points/id", "pieces/id"
+# arrays by rows, by the beginning of their names: the array that numbers the rows
+NUMBERED = {"points/": POINTS, "stay/": POINTS, "trend/rates": POINTS, "pieces/": PIECES}
+NUMBERED |= {f"{name}/": f"{name}/node" for name in NODAL}
 LEAVE = ("pressure", "slope", "bounds")  # fields of pieces that are not stored if all points keep their pieces
 # metadata of a checkpoint, with their types
 NOTE = {"t": float, "resets": int, "begins": bool, "scene": dict, "result": dict, "control": dict, "partition": list}
@@ -47,7 +58,8 @@ class Checkpoint:
     Parameters
     ----------
     file
-        The file to be written, for `resume`.  A new file replaces the old one when it is complete.
+        The file to be written, for `resume`, in a folder of all processes.  A new file replaces the old one when it is
+        complete.
     every
         Number of output intervals between two checkpoints, >= 1.
     seconds
@@ -88,23 +100,16 @@ def save(simulation: Simulation, file: Path) -> None:
     comm = simulation.grid.comm
     start = time.perf_counter()
     state = simulation.state
-    whole_state = state.migrated(np.zeros(len(state.points), dtype=np.int32), comm)
-    nodal = {}
+    arrays = _arrays(state.migrated(evenly(comm, state.points.id), comm))
     for name in NODAL:
-        nodal |= _nodal_of_all(simulation.grid, name, getattr(state, name))
+        arrays |= _nodal_rows(simulation, name, getattr(state, name))
+    rows = {name: arrays.pop(name) for name in list(arrays) if _numbered(name)}
     note = {"version": VERSION, "t": state.t, "resets": state.resets, "begins": state.begins}
     note |= {"scene": describe(simulation), "result": _scalars(state.result), "control": vars(state.control)}
     note["partition"] = simulation.grid.partition.boxes.tolist()
-
-    def write() -> int:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        arrays = {"format": np.array(FORMAT), "note": np.array(json.dumps(note)), **_arrays(whole_state), **nodal}
-        with replacing(file) as part, open(part, "wb") as f:
-            np.savez(f, **arrays)
-        return file.stat().st_size
-
+    arrays = {"format": np.array(FORMAT), "note": np.array(json.dumps(note)), **arrays}
     with on_disk(f"{file}: checkpoint at t = {state.t:g} s", WRITABLE):
-        size = at_root(comm, write)
+        size = write(comm, file, arrays, rows)
     seconds = time.perf_counter() - start
     log(comm, "t = %g s: checkpoint %s written: %.3g MB, %.2g s", state.t, file, size / 1e6, seconds)
 
@@ -132,20 +137,21 @@ def resume(simulation: Simulation, file: str | os.PathLike) -> Result:
     instance("resume: simulation", simulation, Simulation)
     file, comm = path("checkpoint: file", file), simulation.grid.comm
 
-    def read() -> tuple[State, NDArray[np.int64]]:
-        with on_disk("resume", "a checkpoint that can be read"):
-            arrays, note = _read(file)
+    def index() -> tuple[dict[str, NDArray], dict[str, Member], dict[str, Any], NDArray[np.int64]]:
+        arrays, rows, note = _read(file)
         _check_scene(file, note["scene"], describe(simulation))
-        found.append(_state(file, arrays, note, simulation))
-        return _without_rows(found[0]), _partition(file, note["partition"], simulation.grid)
+        return arrays, rows, note, _partition(file, note["partition"], simulation.grid)
 
-    found: list[State] = []  # rank 0 reads all points and pieces, and sends them to their owners
-    bare, boxes = at_root(comm, read)
-    state = found[0] if found else bare
+    with on_disk("resume", "a checkpoint that can be read"):
+        arrays, rows, note, boxes = at_root(comm, index)
+        with _complete(file):
+            arrays |= read(comm, file, rows, together(comm, lambda: _ranges(comm, file, rows)))
+    count = rows[POINTS].shape[0]
+    state = together(comm, lambda: _state(file, arrays, note, simulation, count))
     # on as many processes, the same distribution gives the same bits
     if len(boxes) == comm.size > 1 and (boxes != simulation.grid.partition.boxes).any():
         distribute_by(simulation, boxes)
-    nodal = {name: _nodal_here(simulation.grid, getattr(state, name)) for name in NODAL}
+    nodal = {name: simulation.grid.from_rows(*of) for name in NODAL if (of := getattr(state, name)) is not None}
     if state.lines is not None:
         simulation.grid.move([state.lines[letter] for letter in sorted(state.lines)])
     simulation.state = replace(state, stage=simulation.state.stage, **nodal).at_owners(simulation.grid)
@@ -179,21 +185,26 @@ def _arrays(state: State) -> dict[str, NDArray]:
     return _named("", named)
 
 
-def _state(file: Path, arrays: dict[str, NDArray], note: dict[str, Any], simulation: Simulation) -> State:
-    """Return the complete state in a file; raise ValueError if it does not fit the simulation."""
+def _state(file: Path, arrays: dict[str, NDArray], note: dict[str, Any], simulation: Simulation, count: int) -> State:
+    """Return a state with this process's share of the points in a file, which has `count` points.
+
+    Nodal fields of the state are pairs of nodes and values.  Raise ValueError if the file does not fit the simulation.
+    """
     now, dim = simulation.state, simulation.grid.dim
-    wet, damaged = simulation.scene.fluid is not None, f"{file}: is cut short or damaged"
-    ids, total = simulation.scene.ids(now.stage.present), sum(map(len, simulation.bodies))
-    try:
-        points = _points(_part(arrays, "points/"), now.points, ids, total)
+    wet = simulation.scene.fluid is not None
+    with _complete(file):
+        points = _points(_part(arrays, "points/"), now.points)
+        _check_ids(points, simulation, count)
         stay = None
         pieces = None
         of_stay = _part(arrays, "stay/")
         if of_stay:
             in_cut = of_stay.pop("keeps", None)
-            stay = Stay(_points(_part(of_stay, "points/"), now.points, ids, total), in_cut)
+            stay = Stay(_points(_part(of_stay, "points/"), now.points), in_cut)
             if in_cut is not None and (in_cut.dtype != bool or in_cut.shape != points.id.shape):
                 raise ValueError(f"stay/keeps: {in_cut.dtype} of shape {in_cut.shape}")
+            if not np.array_equal(stay.points.id, points.id):
+                raise ValueError("stay/points/id: points differ from the points of the bodies")
         if wet:
             own = _part(arrays, "pieces/")
             _check_pieces(own, points.id, dim)
@@ -213,10 +224,7 @@ def _state(file: Path, arrays: dict[str, NDArray], note: dict[str, Any], simulat
         outcomes = _outcomes(_part(histories, "outcome/"), len(times))
         result, control = Result(Rows.of_columns(histories, outcomes), **note["result"]), StepControl(**note["control"])
         outcome = _nested(_part(arrays, "outcome/"))
-        nodal = [_part(arrays, f"{name}/") or None for name in NODAL]
-        for name, given in zip(NODAL, nodal, strict=True):
-            if given is not None:
-                _check_nodal(name, given, simulation.grid)
+        nodal = [_nodal(name, _part(arrays, f"{name}/"), simulation.grid) for name in NODAL]
         if arrays or not all(np.isfinite([note["t"], *times])):
             raise ValueError(f"has {', '.join(arrays) or 'times that are not finite'}")
         return State(
@@ -234,8 +242,6 @@ def _state(file: Path, arrays: dict[str, NDArray], note: dict[str, Any], simulat
             control=control,
             **dict(zip(NODAL, nodal, strict=True)),
         )
-    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
-        raise ValueError(f"{damaged} ({line(error)}), must be a whole checkpoint") from error
 
 
 def _outcomes(arrays: dict[str, NDArray], count: int) -> list[dict[str, dict[str, NDArray]]]:
@@ -281,54 +287,53 @@ def _nested(arrays: dict[str, NDArray]) -> dict[str, Any]:
     return out
 
 
-def _points(arrays: dict[str, NDArray], like: MaterialPoints, ids: NDArray[np.int64], total: int) -> MaterialPoints:
-    """Return the material points with the given ids from the stored arrays.
-
-    Raise ValueError if names or shapes do not match `like`, or ids do not match `ids`.  Renewed points replace some
-    seeded points; their ids are at least `total`, the number of seeded points.
-    """
+def _points(arrays: dict[str, NDArray], like: MaterialPoints) -> MaterialPoints:
+    """Return material points from the stored arrays; raise ValueError if names or shapes do not match `like`."""
     data = _part(arrays, "data/")
-    if PARENT in data:
-        like = with_faces(like)
-        ids = np.concatenate([ids[np.isin(ids, arrays["id"])], arrays["id"][arrays["id"] >= total]])
+    like = with_faces(like) if PARENT in data else like
     points = MaterialPoints(**arrays, data=data)
     kinds = {**vars(like), **like.data}
     for name, rows in {**arrays, **data}.items():
         kind = kinds[name]
-        if rows.dtype != kind.dtype or rows.shape != (len(ids), *kind.shape[1:]) or not np.isfinite(rows).all():
+        if rows.dtype != kind.dtype or rows.shape != (len(points), *kind.shape[1:]) or not np.isfinite(rows).all():
             raise ValueError(f"points/{name}: {rows.dtype} of shape {rows.shape}, or not finite")
-    if set(data) != set(like.data) or not np.array_equal(points.id, ids):
-        raise ValueError("points/id: points differ from the points of the bodies")
+    if set(data) != set(like.data):
+        raise ValueError(f"points/data: {', '.join(data)}")
     return points
+
+
+def _check_ids(points: MaterialPoints, simulation: Simulation, count: int) -> None:
+    """Raise ValueError if points of a file with `count` points in all do not belong to the present bodies.
+
+    Renewed points replace some seeded points; their ids are at least the number of seeded points.
+    """
+    lengths, present = np.array([len(body) for body in simulation.bodies]), np.asarray(simulation.state.stage.present)
+    starts = np.concatenate([[0], lengths.cumsum()])
+    whole = count == lengths[present].sum() and (points.id < starts[-1]).all()
+    if (points.id < 0).any() or not present[body_of(points.id, starts)].all() or not (whole or PARENT in points.data):
+        raise ValueError("points/id: points differ from the points of the bodies")
 
 
 def _partition(file: Path, given: list, grid: Grid) -> NDArray[np.int64]:
     """Return the boxes (ranks, 2, d) of the processes that have written a file; raise ValueError for others."""
-    try:
+    with _complete(file):
         boxes = np.array(given, dtype=np.int64).reshape(-1, 2, grid.dim)
         grid.check_boxes(boxes)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise ValueError(f"{file}: is cut short or damaged ({line(error)}), must be a whole checkpoint") from error
     return boxes
 
 
-def _nodal_of_all(grid: Grid, name: str, nodal: NDArray[np.float64] | None) -> dict[str, NDArray]:
-    """Return, on rank 0, indices and values of nodes with non-zero values; an empty dictionary if `nodal` is None."""
+def _nodal_rows(simulation: Simulation, name: str, nodal: NDArray[np.float64] | None) -> dict[str, NDArray]:
+    """Return this process's share of all nodes with non-zero values; an empty dictionary if `nodal` is None."""
     if nodal is None:
         return {}
-    nodal = nodal.reshape(-1, grid.dim)
-    some = nodal.any(axis=1)
-    parts = grid.comm.gather((grid.node_numbers()[some], nodal[some])) or [(np.empty(0, np.int64), nodal[:0])]
-    node, rows = (np.concatenate(values) for values in zip(*parts, strict=True))
-    node, first = np.unique(node, return_index=True)
-    return {f"{name}/node": node, f"{name}/values": rows[first]}
-
-
-def _nodal_here(grid: Grid, given: dict[str, NDArray] | None) -> NDArray[np.float64] | None:
-    """Return the nodal values on this process, from the stored nodes with non-zero values; None if `given` is None."""
-    if given is None:
-        return None
-    return values_at(grid.node_numbers(), given["node"], given["values"]).ravel()
+    grid, owned = simulation.grid, simulation.scene.momentum.u.function_space.dofmap.index_map.size_local
+    values, node = nodal.reshape(-1, grid.dim)[:owned], grid.node_numbers()[:owned]
+    order = node.argsort()
+    order = order[values[order].any(axis=1)]
+    exchange = Exchange(grid.comm, evenly(grid.comm, node[order]))
+    node, values = exchange.send(node[order]), exchange.send(values[order])
+    order = node.argsort()
+    return {f"{name}/node": node[order], f"{name}/values": values[order]}
 
 
 def _check_lines(arrays: dict[str, NDArray], grid: Grid) -> None:
@@ -342,15 +347,17 @@ def _check_lines(arrays: dict[str, NDArray], grid: Grid) -> None:
             raise ValueError("lines: not ascending between the sides of the grid")
 
 
-def _check_nodal(name: str, arrays: dict[str, NDArray], grid: Grid) -> None:
-    """Raise ValueError for arrays that are no nodal values on the grid."""
+def _nodal(name: str, arrays: dict[str, NDArray], grid: Grid) -> tuple[NDArray, NDArray] | None:
+    """Return nodes and their values from stored arrays, None without arrays; raise ValueError for invalid ones."""
+    if not arrays:
+        return None
     node, values = arrays.pop("node"), arrays.pop("values")
     right = node.dtype == np.int64 and values.dtype == np.float64 and values.shape == (len(node), grid.dim)
-    if arrays or not right or not np.isfinite(values).all() or (np.diff(node) <= 0).any():
+    if arrays or not right or not np.isfinite(values).all():
         raise ValueError(f"{name}: not nodal values on the grid, or not finite")
     if len(node) and not 0 <= node[0] <= node[-1] < grid.copies * grid.nodes:
         raise ValueError(f"{name}: node indices out of range of the grid")
-    arrays |= {"node": node, "values": values}
+    return node, values
 
 
 def _check_trend(trend: Trend, points: MaterialPoints, wet: bool) -> None:
@@ -369,19 +376,8 @@ def _check_pieces(arrays: dict[str, NDArray], ids: NDArray[np.int64], dim: int) 
         kind = np.int64 if name in ("id", "cell") else np.float64
         if rows.dtype != kind or rows.shape != (count, *shapes.get(name, ())) or not np.isfinite(rows).all():
             raise ValueError(f"pieces/{name}: {rows.dtype} of shape {rows.shape}, or not finite")
-    if not np.array_equal(np.unique(arrays["id"]), ids) or (np.diff(arrays["id"]) < 0).any():
+    if not np.array_equal(np.unique(arrays["id"]), ids):
         raise ValueError("pieces/id: points differ from the points of the bodies")
-
-
-def _without_rows(state: State) -> State:
-    """Return a state without its points and pieces."""
-    none = np.empty(0, np.int64)
-    points = state.points.of(none)
-    stay = state.stay
-    if stay is not None:
-        stay = Stay(stay.points.of(none), None if stay.keeps is None else stay.keeps[:0])
-    trend = state.trend and replace(state.trend, rates=state.trend.rates[:0])
-    return replace(state, points=points, pieces=state.pieces and state.pieces.of(none), stay=stay, trend=trend)
 
 
 def _named(prefix: str, values: dict) -> dict[str, NDArray]:
@@ -397,14 +393,58 @@ def _part(arrays: dict[str, NDArray], prefix: str) -> dict[str, NDArray]:
     return {name.removeprefix(prefix): arrays.pop(name) for name in list(arrays) if name.startswith(prefix)}
 
 
-def _read(file: Path) -> tuple[dict[str, NDArray], dict[str, Any]]:
-    """Return the arrays and the metadata of a checkpoint file."""
+@contextmanager
+def _complete(file: Path) -> Iterator[None]:
+    """Context manager for reading a checkpoint: errors become a ValueError with the text that the file is damaged."""
+    try:
+        yield
+    except (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError, BadZipFile) as error:
+        raise ValueError(f"{file}: is cut short or damaged ({line(error)}), must be a whole checkpoint") from error
+
+
+def _numbered(name: str) -> str | None:
+    """Return the name of the array that numbers the rows of an array; None for arrays that are not by rows."""
+    return next((numbers for start, numbers in NUMBERED.items() if name.startswith(start)), None)
+
+
+def _ranges(comm: MPI.Intracomm, file: Path, of: dict[str, Member]) -> dict[str, tuple[int, int]]:
+    """Return first row and last row plus one, on this process, of arrays by rows; pieces are with their points.
+
+    Raise ValueError if arrays with the same numbers differ in length, or if numbers do not ascend.
+    """
+    out = {}
+    for name in dict.fromkeys(map(_numbered, of)):
+        first, last = (of[name].shape[0] * (comm.rank + k) // comm.size for k in (0, 1))
+        if name == PIECES:
+            first, last = (_before(file, of, row) for row in out[POINTS])
+        numbers = some_rows(file, of[name], first, min(last + 1, of[name].shape[0]))
+        if (np.diff(numbers) < (name != PIECES)).any():
+            raise ValueError(f"{name}: does not ascend")
+        out[name] = first, last
+    for name, member in of.items():
+        if member.shape[0] != of[_numbered(name)].shape[0]:
+            raise ValueError(f"{name}: array of shape {member.shape}")
+    return {name: out[_numbered(name)] for name in of}
+
+
+def _before(file: Path, of: dict[str, Member], row: int) -> int:
+    """Return the number of pieces of the points before row `row`."""
+    points, pieces = of[POINTS], of[PIECES]
+    if row == points.shape[0]:
+        return pieces.shape[0]
+    ids = some_rows(file, points, row, row + 1)
+    return bisect_left(range(pieces.shape[0]), ids[0], key=lambda k: some_rows(file, pieces, k, k + 1)[0])
+
+
+def _read(file: Path) -> tuple[dict[str, NDArray], dict[str, Member], dict[str, Any]]:
+    """Return the arrays of a checkpoint file that are not by rows, all others as members, and the metadata."""
     with open(file, "rb") as f:
         begin = f.read(4)
     what = "is cut short or damaged, must be a whole checkpoint" if begin == ZIP else FOREIGN
     try:
         with np.load(file, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
+            arrays = {name: archive[name] for name in archive.files if not _numbered(name)}
+            rows = [name for name in archive.files if _numbered(name)]
     except Exception as error:  # damaged bytes raise many types of errors in numpy and zipfile
         raise ValueError(f"{file}: {what}") from error
     if str(arrays.pop("format", None)) != FORMAT or "note" not in arrays:
@@ -418,7 +458,8 @@ def _read(file: Path) -> tuple[dict[str, NDArray], dict[str, Any]]:
         raise ValueError(f"{file}: checkpoint of version {version}, must be {VERSION} for this mpm_dolfinx")
     if kinds != NOTE:
         raise ValueError(f"{file}: {what}")
-    return arrays, note
+    with _complete(file):
+        return arrays, members(file, rows), note
 
 
 def describe(simulation: Simulation) -> dict[str, Any]:

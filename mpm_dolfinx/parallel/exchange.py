@@ -105,6 +105,20 @@ def to_root(comm: MPI.Intracomm, rows: int) -> Exchange:
     return Exchange(comm, np.zeros(rows, dtype=np.int32))
 
 
+def evenly(comm: MPI.Intracomm, numbers: NDArray[np.int64]) -> NDArray[np.int32]:
+    """Return ranks (n,) for ascending numbers (n,) >= 0, which differ on all processes, so that all lie in order.
+
+    The ranks get equal shares of all numbers: the smallest numbers go to rank 0, and so on.
+    """
+    below = over_all(comm, len(numbers)) * np.arange(1, comm.size) // comm.size
+    low, high = np.zeros_like(below), np.full_like(below, over_all(comm, int(numbers.max(initial=0)), MPI.MAX) + 1)
+    while (low < high).any():  # bisection for the smallest numbers of the ranks from 1
+        middle = (low + high) // 2
+        enough = over_all(comm, numbers.searchsorted(middle)) >= below
+        low, high = np.where(enough, low, middle + 1), np.where(enough, middle, high)
+    return low.searchsorted(numbers, side="right").astype(np.int32)
+
+
 def first(comm: MPI.Intracomm, message: str) -> str:
     """Return the first non-empty message of all processes, so that all can raise the same error."""
     return next(filter(None, comm.allgather(message)), "") if comm.size > 1 else message
@@ -122,16 +136,17 @@ def everywhere(comm: MPI.Intracomm, ask: Callable[[], T]) -> T:
     return value
 
 
-def together(comm: MPI.Intracomm, action: Callable[[], object]) -> None:
-    """Perform an action on every process; if it raises on any process, all raise an error: their own, or the first."""
-    error = None
+def together(comm: MPI.Intracomm, action: Callable[[], T]) -> T:
+    """Return the result of an action on this process; if it raises on any process, all raise the first error."""
+    value = error = None
     try:
-        action()
+        value = action()
     except Exception as raised:
         error = raised
-    for one in [error, *comm.allgather(error)]:
+    for rank, one in enumerate(comm.allgather(error)):
         if one is not None:
-            raise one
+            raise error if rank == comm.rank else one
+    return value
 
 
 def at_root(comm: MPI.Intracomm, action: Callable[[], T]) -> T:

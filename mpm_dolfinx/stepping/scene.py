@@ -327,10 +327,6 @@ class Scene:
         """Return the points of the chosen bodies on this process, as seeded."""
         return self.materials.seeded.of_bodies(chosen, np.cumsum([0, *map(len, self.bodies)]))
 
-    def ids(self, chosen: Sequence[bool]) -> NDArray[np.int64]:
-        """Return the ids of all points of the chosen bodies."""
-        return np.flatnonzero(np.repeat(chosen, [len(body) for body in self.bodies]))
-
     @cached_property
     def description(self) -> dict[str, Any]:
         """Constants that define the scene, by name; they identify a checkpoint."""
