@@ -339,9 +339,7 @@ def over_equal(name, errors, *, bound=1.3):
     assert 0 < largest <= bound and 0 < mean <= bound, errors
 
 
-@pytest.mark.parametrize(
-    "low, largest, until, part", [(0.7, np.inf, 0.01, 0.55), (0.4, 2.0, 0.1, 0.85)]
-)
+@pytest.mark.parametrize("low, largest, until, part", [(0.7, np.inf, 0.01, 0.55), (0.4, 2.0, 0.1, 0.85)])
 def test_a_boundary_layer_needs_fine_cells_where_it_is(low, largest, until, part):
     """Terzaghi's column, fine above `low`: fewer cells have the same error while the layer is there.
 
