@@ -46,16 +46,17 @@ def disc(x: np.ndarray) -> np.ndarray:
     return RADIUS * a * np.sqrt(1 - a[:, ::-1] ** 2 / 2)
 
 
-def scene(cells: int, axisymmetric: bool = False) -> mpm.Simulation:
-    """Return the octant, or the quarter disc, with `cells` cells over the radius."""
+def scene(cells: int, axisymmetric: bool = False, grid: mpm.Grid | None = None) -> mpm.Simulation:
+    """Return the octant, or the quarter disc, with `cells` cells over the radius, or on another grid."""
     h = RADIUS / cells
     if axisymmetric:
-        grid, sides = mpm.Grid([0] * 2, [RADIUS + h] * 2, [cells + 1] * 2, axisymmetric=True), ("right", "top")
+        grid = grid or mpm.Grid([0] * 2, [RADIUS + h] * 2, [cells + 1] * 2, axisymmetric=True)
+        sides = "right", "top"
         quarter = mpm.mapped(grid, mpm.box(grid, [0, 0], [SQUARE] * 2), disc)
         pressed, drained = [mpm.Traction(s, -LOAD) for s in sides], [mpm.Drained(s) for s in sides]
         acting = {"walls": {"bottom": "y"}, "conditions": [*pressed, *drained]}
         return mpm.Simulation(grid, [quarter], [SAND], fluid=WATER, **acting)
-    grid = mpm.Grid([0] * 3, [RADIUS + h] * 3, [cells + 1] * 3)
+    grid = grid or mpm.Grid([0] * 3, [RADIUS + h] * 3, [cells + 1] * 3)
     octant = mpm.mapped(grid, mpm.box(grid, [0] * 3, [CUBE] * 3), ball)
     walls = {"left": "x", "front": "y", "bottom": "z"}
     pressed, drained = [mpm.Traction(s, -LOAD) for s in OUTER], [mpm.Drained(s) for s in OUTER]
@@ -72,9 +73,11 @@ class Outcome:
     cells: int
 
 
-def run(cells: int = 20, steps: int = 100, axisymmetric: bool = False) -> tuple[dict[str, float], Outcome]:
+def run(
+    cells: int = 20, steps: int = 100, axisymmetric: bool = False, grid: mpm.Grid | None = None
+) -> tuple[dict[str, float], Outcome]:
     """Run to the reduced time `END` in equal steps; return the errors that the module's docstring defines."""
-    simulation, history = scene(cells, axisymmetric), []
+    simulation, history = scene(cells, axisymmetric, grid), []
 
     def observe(s: mpm.Simulation) -> None:
         nearest = np.square(s.points.x).sum(axis=1)

@@ -144,6 +144,20 @@ def left_after_a_way_and_back(grid):
     return np.array([np.linalg.norm(s.effective_stress(), axis=(1, 2)).mean(), np.abs(s.points.pressure).max()])
 
 
+def imbalance(s, before, soil, gravity):
+    """Return the resultant of all forces on wet soil after a step, over the largest force.
+
+    The weight counts the fluid as the balance of momentum does: without the step's change of the volume defect, and
+    without the correction of the defect.  `before` are the points at the start of the step.
+    """
+    p, n = s.points, soil.porosity
+    fluid = p.volume0 @ (p.J - 1 + n - p.data["owed"]) + before.volume0 @ (before.data["owed"] - before.data["due"])
+    mass = soil.grain_density * (1 - n) * p.volume0.sum() + s.scene.fluid.density * fluid
+    tools = (force[: s.grid.dim] for force in s.tool_forces.values())
+    forces = np.array([*s.wall_reactions.values(), *s.reactions.values(), *tools, mass * np.array(gravity)])
+    return np.abs(forces.sum(axis=0)).max() / np.abs(forces).max()
+
+
 def gathered(simulation):
     """Return positions, pressures, stresses and F of all points by number, and their counts a process; {} but on 0."""
     points = simulation.points

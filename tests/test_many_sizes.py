@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: MIT
 """Cells of many sizes, between random lines: they share the properties of equal cells, and their limit is these."""
 
+import cryer
 import footing
 import manufactured as made
 import numpy as np
+import poroelastic_beam
 import pytest
 import terzaghi
 from helpers import SOFT, left_after_a_way_and_back, rates, refused_in_one_line, thresholds
@@ -11,6 +13,7 @@ from helpers import SOFT, left_after_a_way_and_back, rates, refused_in_one_line,
 import mpm_dolfinx as mpm
 from mpm_dolfinx.grid.grid import SIDES
 from mpm_dolfinx.points.cutting import centroids, corner_bits, cut
+from mpm_dolfinx.verification.biot_fem import BiotFEM
 from mpm_dolfinx.verification.exact import terzaghi_pressure
 
 KINDS = [(2, False), (2, True), (3, False)]
@@ -329,26 +332,70 @@ def test_displacement_and_pressure_are_of_second_order_on_smoothly_graded_lines(
     assert rates(found).min() > 1.9, found
 
 
-def test_a_boundary_layer_needs_fine_cells_where_it_is():
-    """Terzaghi's column at T = 0.005 and 0.01, fine near its top: a third of the cells, the same error."""
-    errors, cells = [], 50
+def over_equal(name, errors, *, bound=1.3):
+    """Print and check the largest and the root mean square error of a history on graded lines over equal cells."""
+    largest, mean = (np.divide(*(of(e) for e in errors[::-1])) for of in (np.max, lambda e: np.sqrt(np.mean(e**2))))
+    print(f"{name}: error on graded lines over that of equal cells: largest {largest:.2f}, mean {mean:.2f}")
+    assert 0 < largest <= bound and 0 < mean <= bound, errors
+
+
+@pytest.mark.parametrize("low, largest, until, part", [(0.7, np.inf, 0.01, 0.55), (0.4, 2.0, 0.1, 0.85)])
+def test_a_boundary_layer_needs_fine_cells_where_it_is(low, largest, until, part):
+    """Terzaghi's column, fine above `low`: fewer cells have the same error while the layer is there.
+
+    From T = 0.1 on the pressure varies in the whole column; then cells may be larger only in its lower part.
+    """
+    errors, cells, times = [], 50, np.array([0.005, 0.01, 0.1])
     h, load = 1 / cells, 1e-5 * terzaghi.SOIL.oedometric
-    lines = mpm.graded([0, 0], [h, 1], [[[0, 0.7], [h, 1]]], h, 1.2)
+    lines = mpm.graded([0, 0], [h, 1], [[[0, low], [h, 1]]], h, 1.2, largest * h)
     for grid in (mpm.Grid([0, 0], [h, 1], [1, cells]), mpm.Grid(lines=lines)):
         acting = [mpm.Traction("top", (0, -load)), mpm.Drained("top")]
         walls = {"left": "x", "right": "x", "bottom": "y"}
         body, more = mpm.box(grid, [0, 0], [h, 1]), {"fluid": terzaghi.WATER, "walls": walls}
         s = mpm.Simulation(grid, [body], [terzaghi.SOIL], conditions=acting, **more)
         of = []
-        for T, dt in ((0.005, 2.5e-4), (0.01, 2.5e-4), (0.1, 2.25e-3)):
+        for T in times:
+            dt = 2.5e-4 if T <= 0.01 else 1e-3
             s.run(T / terzaghi.CV, dt / terzaghi.CV, progress=False)
             at = s.cells()
             of.append(np.abs(at.pressure / load - terzaghi_pressure(1 - at.x[:, 1], T, 1.0, 1.0)).max())
-        errors.append(of)
-    equal, graded = errors
-    print("errors at T = 0.005, 0.01, 0.1 over those of equal cells:", np.divide(graded, equal))
-    assert (np.array(graded[:2]) < 1.3 * np.array(equal[:2])).all(), errors
-    assert len(lines[1]) < 0.55 * cells
+        errors.append(np.array(of))
+    ratios = errors[1] / errors[0]
+    print(f"Terzaghi, errors at T = {times} over those of equal cells:", ratios)
+    assert (ratios[times <= until] < 1.3).all(), errors
+    assert len(lines[1]) - 1 < part * cells
+
+
+def test_a_beam_bends_and_drains_on_graded_lines_as_on_equal_ones():
+    """Lines are fine at the clamp; errors of the whole history, against finite elements with equal steps."""
+    o = poroelastic_beam.arguments(["--h", "0.03", "--dt", "0.06"])
+    (equal, bottom), errors, active = poroelastic_beam.scene(o), [], []
+    h, top = equal.grid.h, bottom + poroelastic_beam.HEIGHT
+    lines = mpm.graded(equal.grid.lower, equal.grid.upper, [[[0, bottom], [0.3, top + h[1] / 2]]], h, 1.2)
+    grid = mpm.Grid(lines=lines)
+    beam = mpm.box(grid, [0, bottom], [poroelastic_beam.LENGTH, top])
+    graded = mpm.Simulation(grid, [beam], [poroelastic_beam.material(o)], **poroelastic_beam.physics(o))
+    size = [poroelastic_beam.LENGTH, poroelastic_beam.HEIGHT]
+    fem = BiotFEM([0, 0], size, (40, 12), poroelastic_beam.material(o), **poroelastic_beam.physics(o))
+    exact = np.array(fem.run(o.t_end, o.dt, probes=[[1.0, 0.15]]).displacement)[1:, 0, 1]
+    for s in (equal, graded):
+        result = s.run(o.t_end, o.dt, probes=mpm.probes(s.bodies, [[1.0, bottom + 0.15]]), progress=False)
+        errors.append(np.abs(np.array(result.displacement)[1:, 0, 1] / exact - 1))
+        active.append(s.scene.last[0].active_cells)
+    over_equal("beam", errors)
+    assert active[1] < 0.6 * active[0], active
+
+
+def test_a_sphere_consolidates_on_graded_lines_as_on_equal_ones():
+    """Cryer's sphere in axisymmetry, fine at its centre and at its surface: in the whole history of the pressure."""
+    n, errors, active = 20, [], []
+    upper, fine = [1 + 1 / n] * 2, [[[0, 0], [0.25, 0.25]], [[0.75, 0.75], [1 + 1 / n] * 2]]
+    for grid in (None, mpm.Grid(lines=mpm.graded([0, 0], upper, fine, 1 / n, 1.2), axisymmetric=True)):
+        _, out = cryer.run(n, 48, True, grid)
+        errors.append(np.abs(out.pressure - cryer.exact(out.T)))
+        active.append(out.cells)
+    over_equal("sphere", errors)
+    assert active[1] < 0.85 * active[0], active
 
 
 # ---- what else ----------------------------------------------------------------------------------------

@@ -3,9 +3,11 @@
 
 from functools import partial
 
+import mpi_following_3d as in_3d
 import numpy as np
 import pytest
-from helpers import SOFT, left_after_a_way_and_back, refused_in_one_line
+from helpers import SOFT, imbalance, left_after_a_way_and_back, refused_in_one_line
+from meshes import box_mesh
 from mpi_following import pushed
 from test_many_sizes import EXACT, KINDS, at_random
 
@@ -163,13 +165,14 @@ def test_a_body_carried_through_lines_that_move_against_it_and_back_is_as_one_in
     assert (left[1] < 1.5 * left[0]).all(), left
 
 
-def on_swinging_lines(body, conditions, **more):
-    """Return wet soil of a box on graded lines that swing along x."""
-    given = mpm.graded([0, 0], [2, 2], [[[0.65, 0.88], [0.98, 1.24]]], 0.06, 1.3)
+def on_swinging_lines(body, conditions, size=0.06, **more):
+    """Return wet soil of a box, or a mesh, on graded lines that swing along x."""
+    given = mpm.graded([0, 0], [2, 2], [[[0.65, 0.88], [0.98, 1.24]]], size, 1.3)
     swing = lambda t: carried(given, np.array([0.4 * np.sin(20 * t), 0.0]))  # noqa: E731
     grid, numerics = mpm.Grid(lines=given, follow=swing), mpm.Numerics(tolerance=1e-11)
     acting = {"fluid": mpm.Fluid(), "conditions": [*conditions, mpm.Drained("top")], "numerics": numerics}
-    return mpm.Simulation(grid, [mpm.box(grid, *body)], [SOFT], **acting, **more)
+    body = mpm.box(grid, *body) if isinstance(body, tuple) else mpm.from_mesh(grid, body)
+    return mpm.Simulation(grid, [body], [SOFT], **acting, **more)
 
 
 @pytest.mark.parametrize("inertia", [False, True])
@@ -198,6 +201,45 @@ def test_soil_and_water_stay_at_rest_on_lines_that_swing():
     assert s.state.resets > 5 and result.balance < 1e-8 and np.abs(s.points.displacement).max() < 1e-12
 
 
+DISC = mpm.Tool(mpm.Ball((0.8, 1.1), 0.1), lambda t: (0.4 * t, -0.2 * t), friction=0.2)
+OTHER = mpm.Tool(mpm.Ball((1.4, 1.2), 0.2), load=lambda t: 1e5 * t, direction=(0, -1))
+BLOCK = ([0, 0], [2, 1])
+
+
+@pytest.mark.parametrize(
+    "body, tools, size",
+    [(BLOCK, [], (0.3, 0.006)), (box_mesh("triangle", (10, 5), *BLOCK), [DISC], 0.06), (BLOCK, [DISC, OTHER], 0.06)],
+    ids=["flat cells", "mesh", "two tools"],
+)
+def test_forces_and_fluid_are_in_balance_on_lines_that_swing(body, tools, size):
+    """Flat cells are fifty times as wide as high."""
+    gravity, walls = (2.0, -9.81), {"left": "x", "right": "x", "bottom": "xy"}
+    s = on_swinging_lines(body, tools, size, gravity=gravity, walls=walls)
+    for _ in range(4):
+        before, report = s.points, s.step(0.01)
+        off = imbalance(s, before, SOFT, gravity)
+        print(f"resultant {off:.1e}, fluid {report.balance:.1e}")
+        assert off < 1e-9 and report.balance < 1e-9
+    assert np.abs(s.grid.lines[0] - s.grid.seeded[0]).max() > 0.1
+
+
+@pytest.mark.parametrize("follows", [True, False], ids=["ball", "function"])
+def test_lines_follow_in_3d_with_all_balances_and_a_run_goes_on_with_the_same_bits(follows, tmp_path):
+    ends, file = [], tmp_path / "kept"
+    for parts in (1, 2):
+        s, again = (in_3d.pushed(follows) for _ in range(2))
+        result = s.run(0.05, 0.05, progress=False, checkpoint=mpm.Checkpoint(file))
+        if parts == 2:
+            s, result = again, mpm.resume(again, file)
+        result = s.run(0.1, 0.05, progress=False, after=result)
+        ends.append(s.points)
+        before, report = s.points, s.step(0.025)
+        assert np.abs(s.grid.lines[0] - s.grid.seeded[0]).max() > 0.14
+        assert max(result.balance, report.balance) < 1e-9
+        assert imbalance(s, before, in_3d.SOIL, (0, 0, -9.81)) < 1e-8
+    assert (ends[0].corners == ends[1].corners).all() and (ends[0].pressure == ends[1].pressure).all()
+
+
 LINES = [[0, 1, 1.5, 2, 3], [0, 1, 1.5, 2, 3]]
 BALL = mpm.Tool(mpm.Ball((1.5, 1.5), 0.2), lambda t: (0, -t))
 
@@ -220,7 +262,9 @@ def step(follow, lines=LINES, there=True):
         (lambda: mpm.Grid(lines=[[0, 1, 2], [0, 1, 2]], follow=BALL), "grid: follow", "equal"),
         (lambda: step(lambda t: [LINES[0][:4], LINES[1]]), "grid: follow at t = 1 s", "4 and 5"),
         (lambda: step(lambda t: [[0, 1, 1.5, 2, 4], LINES[1]]), "grid: follow at t = 1 s", "4"),
-        (lambda: step(lambda t: [[0, 2, 1, 2.5, 3], LINES[1]]), "lines along x", "[0, 2, 1, 2.5, 3]"),
+        (lambda: step(lambda t: [[0, 2, 1, 2.5, 3], LINES[1]]), "grid: follow at t = 1 s", "[0, 2, 1, 2.5, 3]"),
+        (lambda: step(lambda t: [[0, np.nan, 1, 2, 3], LINES[1]]), "grid: follow at t = 1 s: lines along x", "nan"),
+        (lambda: step(lambda t: None), "grid: follow at t = 1 s: lines", "None"),
         (lambda: step(lambda t: 1 / 0), "grid: follow at t = 1 s", "ZeroDivisionError"),
         (lambda: step(BALL), "grid: follow", "0 m between"),
         (lambda: step(BALL, there=False), "grid: follow", "not in the first stage"),

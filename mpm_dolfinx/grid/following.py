@@ -45,7 +45,7 @@ def lines_at(
     """
     what, count = f"grid: follow at t = {t:g} s", [len(of) for of in given]
     allowed = f"{' and '.join(map(str, count))} coordinates along the axes"
-    out = checked(asked(what, allowed, called, follow, {"t": t, "x": x}))
+    out = checked(asked(what, allowed, called, follow, {"t": t, "x": x}), what)
     if [len(of) for of in out] != count:
         raise ValueError(f"{what}: {' and '.join(str(len(of)) for of in out)} lines, must be {allowed}")
     for letter, new, old in zip("xyz", out, given, strict=False):

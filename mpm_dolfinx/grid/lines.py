@@ -21,19 +21,19 @@ def rounding(x: NDArray[np.float64]) -> float:
     return 8 * EPSILON * float(np.abs(x).max(initial=0.0))
 
 
-def checked(lines: Sequence[ArrayLike]) -> list[NDArray[np.float64]]:
+def checked(lines: Sequence[ArrayLike], what: str = "grid") -> list[NDArray[np.float64]]:
     """Return the grid lines (n,), m, along each of two or three axes; raise ValueError if they are invalid."""
     if not isinstance(lines, Sequence | np.ndarray) or len(lines) not in (2, 3):
-        raise ValueError(f"grid: lines = {line(lines)}, must be 2 or 3 lists of coordinates, one for each axis")
+        raise ValueError(f"{what}: lines = {line(lines)}, must be 2 or 3 lists of coordinates, one for each axis")
     out = []
     for letter, places in zip("xyz", lines, strict=False):
         allowed = "at least 2 finite coordinates, each > the one before"
-        x = numbers(f"grid: lines along {letter}", places, None, allowed=allowed)
+        x = numbers(f"{what}: lines along {letter}", places, None, allowed=allowed)
         if x.ndim != 1 or len(x) < 2 or not (np.diff(x) > 0).all():
-            raise ValueError(f"grid: lines along {letter} = {line(places)}, must be {allowed}")
+            raise ValueError(f"{what}: lines along {letter} = {line(places)}, must be {allowed}")
         if np.diff(x).min() <= rounding(x) / SAME:
-            what = f"smallest spacing {np.diff(x).min():.3g} m"
-            raise ValueError(f"grid: lines along {letter}: {what}, must be > {rounding(x) / SAME:.3g} m for rounding")
+            least = f"smallest spacing {np.diff(x).min():.3g} m, must be > {rounding(x) / SAME:.3g} m for rounding"
+            raise ValueError(f"{what}: lines along {letter}: {least}")
         out.append(x)
     return out
 
