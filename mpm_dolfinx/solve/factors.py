@@ -201,7 +201,7 @@ class SingleFactors:
 
     def factorise(self) -> None:
         """Factorise the matrix if it has changed."""
-        self._solver.value[0].setUp()
+        self._solver.value[0].pc.setUp()  # PETSc's KSPSetUp does nothing when only entries have changed
 
     def _of(self, rows: NDArray[np.int32], columns: NDArray[np.int32]) -> tuple[PETSc.KSP, PETSc.Vec, PETSc.Vec]:
         """Return a solver for matrices with this sparsity pattern, and vectors for solution and right-hand side."""
@@ -330,7 +330,7 @@ class BlockFactors:
 
     def factorise(self) -> None:
         """Factorise the matrix if it has changed."""
-        self._solver.setUp()
+        self._solver.pc.setUp()
 
     def solve(self, b: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the solution for the right-hand side b, for all unknowns."""
