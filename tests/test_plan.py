@@ -20,7 +20,7 @@ from mpm_dolfinx.solve.solver_choice import plan
         ((1e6, 2, {"yields": True}), "Schur complement: displacements by factors in blocks, pressures by factors, CG"),
         ((1e6, 2, {"yields": True, "symmetric": False}), "pressures by factors by MUMPS, FGMRES"),
         ((9e4, 2, {"yields": True, "processes": 8}), "displacements by factors in blocks, pressures by factors, CG"),
-        ((1e5, 2, {"yields": True, "processes": 2}), "displacements by factors by MUMPS, pressures by factors by MUMPS"),
+        ((1e5, 2, {"yields": True, "processes": 2}), "displacements by factors by MUMPS, pressures by factors by M"),
         ((1e5, 2, {"wet": False, "processes": 2}), "momentum alone: displacements by factors"),
         ((100, 2, {"coupling": "fixed-stress"}), "in turn: displacements by factors in blocks, pressures by factors"),
         ((1e6, 3, {"locks": True}), "GMRES"),
