@@ -2,8 +2,8 @@
 """Thresholds between linear solvers: run times of both solvers below and above each threshold.
 
 Each row is a scene with a given number of displacement unknowns.  The threshold is changed so that each of the two
-solvers is used.  Times are processor times of two steps, the shortest of --repeat runs.  The table of thresholds is in
-`mpm_dolfinx/solve/solver_choice.py`.
+solvers is used.  Times are processor times of two steps, the shortest of --repeat runs.  On several processes this is
+the largest time of a process, including waiting.  The table of thresholds is in `mpm_dolfinx/solve/solver_choice.py`.
 """
 
 from __future__ import annotations
@@ -59,21 +59,22 @@ def took(make: Callable[[int], mpm.Simulation], n: int, name: str, least: int) -
         began = time.process_time()
         for _ in range(STEPS):
             s.step(1.0)
-        matrices = s.scene.last[1]
-        return time.process_time() - began, matrices.momentum.unknowns.global_size, matrices.plan
+        matrices, seconds = s.scene.last[1], time.process_time() - began
+        return max(s.grid.comm.allgather(seconds)), matrices.momentum.unknowns.global_size, matrices.plan
     finally:
         plan.THRESHOLDS = usual
 
 
 def main(argv: list[str] | None = None) -> dict:
     """Print the table and return its times by threshold and unknowns."""
-    parser = common.Parser(__doc__, __file__)
+    parser = common.Parser(__doc__, __file__, processes=True)
     parser.add_argument("--repeat", type=int, default=2, help="turns of a pair")
     parser.add_argument("--quick", action="store_true", help="small blocks, one turn")
     o = parser.parse_args(argv)
     lines = [common.markdown([["threshold", "unknowns", "below it (s)", "above it (s)", "plan below", "plan above"]])]
     with common.results(o) as out:
-        print(lines[0], flush=True)
+        if common.first():
+            print(lines[0], flush=True)
         for name, (make, sizes, small) in CASES.items():
             for n in small if o.quick else sizes:
                 pairs = [[took(make, n, name, least) for least in (HUGE, 0)] for _ in range(1 if o.quick else o.repeat)]
@@ -82,9 +83,11 @@ def main(argv: list[str] | None = None) -> dict:
                 out[f"{name}_{n}"] = [unknowns, below, above]
                 usual = getattr(plan.THRESHOLDS, name)
                 lines.append(f"| {name} {usual} | {unknowns} | {below:.3f} | {above:.3f} | {one} | {other} |")
-                print(lines[-1], flush=True)
-        o.out.mkdir(parents=True, exist_ok=True)
-        (o.out / "calibration.md").write_text("\n".join(lines) + "\n")
+                if common.first():
+                    print(lines[-1], flush=True)
+        if common.first():
+            o.out.mkdir(parents=True, exist_ok=True)
+            (o.out / "calibration.md").write_text("\n".join(lines) + "\n")
         out["converged"] = True
     return out
 

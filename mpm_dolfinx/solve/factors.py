@@ -5,9 +5,12 @@ PETSc's own factors of displacement matrices, with a block for each node, take a
 Times of the first factorisation, and of the next with the same pattern, with 44000 unknowns in 2D and minimum degree
 ordering, ms: blocks 110 and 60, scalar 430 and 150, MUMPS 260 and 155, UMFPACK 290 and 265, CHOLMOD 285 and 290. A
 solve takes 4 ms (MUMPS 15, CHOLMOD 9). Copying the entries into blocks takes a tenth of the factorisation. On two
-processes MUMPS factorises in the same time, and solves in 25 ms. With few processes, one process therefore holds the
+processes MUMPS factorises in the same time, and solves in 25 ms. On several processes, one of them therefore holds the
 factors of displacements, which many solves use. Another holds the factors of pressures, computed at the same time.
 When each of four processes computed both itself, they took 1.7 times as long: processes share the memory's bandwidth.
+In large scenes processes share factors by MUMPS (`Thresholds.mumps`). SuperLU_DIST is slower there: with 100100
+unknowns it takes 841 and 56 ms for factors of K and a solve (MUMPS 476 and 57); with 25500 unknowns 125 and 9 ms.
+MUMPS factorises K and the storage together in 385 ms there, four times as long as K alone.
 
 Large bodies need nested dissection. With 504000 unknowns in 2D, a repeated factorisation ordered by grid lines
 (`dissection`) takes 3.0 s, and the factors have 4.6e7 entries. With PETSc's nested dissection these values are 5.1 s
@@ -201,7 +204,7 @@ class SingleFactors:
 
     def factorise(self) -> None:
         """Factorise the matrix if it has changed."""
-        self._solver.value[0].setUp()
+        self._solver.value[0].pc.setUp()  # PETSc's KSPSetUp does nothing when only entries have changed
 
     def _of(self, rows: NDArray[np.int32], columns: NDArray[np.int32]) -> tuple[PETSc.KSP, PETSc.Vec, PETSc.Vec]:
         """Return a solver for matrices with this sparsity pattern, and vectors for solution and right-hand side."""
@@ -330,7 +333,7 @@ class BlockFactors:
 
     def factorise(self) -> None:
         """Factorise the matrix if it has changed."""
-        self._solver.setUp()
+        self._solver.pc.setUp()
 
     def solve(self, b: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the solution for the right-hand side b, for all unknowns."""

@@ -42,7 +42,7 @@ from mpm_dolfinx.base import _compat
 from mpm_dolfinx.flow.storage import FluxSlope, StorageSystem
 from mpm_dolfinx.mechanics.momentum import MomentumSystem
 from mpm_dolfinx.solve.factors import MOST, direct_solver, displacement_solver, factorise, solved
-from mpm_dolfinx.solve.solver_choice import SolverPlan
+from mpm_dolfinx.solve.solver_choice import MUMPS, SolverPlan
 
 LEAST = 1e-4
 """Smallest scale of the fluid residual, divided by the volume that the residual forces displace in a drained body.
@@ -217,7 +217,7 @@ class BlockSolver:
         K, unknowns = self._momentum.K, self._momentum.unknowns
         solvers = [displacement_solver(K, "factors", unknowns, self._plan.fallback, self._plan.symmetric)]
         if unknowns.dim == 2:
-            solvers.append(direct_solver(self._storage.P, "storage_factors", gathered=self._plan.gathered))
+            solvers.append(direct_solver(self._storage.P, "storage_factors", gathered=self._plan.fallback != MUMPS))
         found = [ksp.pc for ksp in solvers]
         factorise(*found)
         for pc in found:

@@ -125,10 +125,8 @@ class LinearSolvers:
             self._schur = PETSc.Mat().createPython((n, n), self._context, storage.unknowns.comm)
             self._schur.setUp()
             mumps = how.pressures == MUMPS
-            gathered = how.gathered and not mumps
-            self._solve_s = direct_solver(
-                storage.P, "storage", storage.symmetric, gathered=gathered, package="mumps" if mumps else None
-            )
+            package = "mumps" if mumps else None
+            self._solve_s = direct_solver(storage.P, "storage", storage.symmetric, gathered=not mumps, package=package)
             self._set_krylov(how.krylov)
             self._solve_s.setFromOptions()
             self._krylov = self._solve_s.getType()

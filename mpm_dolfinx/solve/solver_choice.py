@@ -27,12 +27,12 @@ class Thresholds:
         The same limit in wet 2D scenes without yield. In a step of the beam, direct solver and multigrid take, s: 0.06
         and 0.05 (10400 unknowns), 0.19 and 0.14 (25500), 0.53 and 0.32 (51000), 2.3 and 1.0 (151000).
     mumps
-        Number of unknown displacements of wet unsymmetric problems from which MUMPS is used, on all processes. Factors
-        and a solve take, with 196000 unknowns: PETSc 2.6 and 0.02 s, MUMPS with OpenBLAS 0.7 and 0.09 s; with 51000
-        unknowns: PETSc 0.25 and 0.004 s, MUMPS 0.12 and 0.02 s. A Newton step takes five to ten solves.
-    gathering
-        Largest number of processes for which a single process holds the factors that many solves use. When each of
-        four processes computed all factors itself, this took 1.7 times as long: they share the memory's bandwidth.
+        Number of unknown displacements from which MUMPS computes the factors in wet scenes: of a K that is not
+        symmetric, and on several processes of all matrices. Processes then share the factors. Below this number one
+        process holds those of K, with 1.5e7 entries (0.12 GB) at the limit. Factors of K and a solve take on two
+        processes, ms: PETSc's on one of them 20 and 0.5, MUMPS 16 and 3.8 (5700 unknowns); 174 and 3.5, 98 and 15
+        (25500); 708 and 11, 306 and 37 (61400); 1481 and 18, 476 and 57 (100100). Without pressures, sharing thus
+        pays if a tangent serves less than 1, 7, 16 and 26 solves. A Newton step of a footing takes 15.
     fallback_3d
         Largest number of unknown displacements in 3D for which a direct solver may replace multigrid. MUMPS takes 8 s
         and 0.2 GB for this number, with unsymmetric K 15 s and 0.4 GB.
@@ -46,7 +46,6 @@ class Thresholds:
     multigrid_3d: int = 1500
     multigrid_2d: int = 30000
     mumps: int = 100000
-    gathering: int = 4
     fallback_3d: int = 20000
     many: int = 29
     coarsest: int = 1000
@@ -85,8 +84,6 @@ class SolverPlan:
         Direct solver that replaces the multigrid cycle on K after many iterations; "" if there is none.
     firmly
         Whether multigrid uses a stronger smoother: for nearly incompressible bodies without a fallback.
-    gathered
-        Whether one process holds the factors.
     symmetric
         Whether K is symmetric.
     many, coarsest
@@ -103,7 +100,6 @@ class SolverPlan:
     krylov: str
     fallback: str
     firmly: bool
-    gathered: bool
     symmetric: bool
     many: int
     coarsest: int
@@ -173,8 +169,8 @@ def plan(
         multigrid = unknowns >= limits.multigrid_3d
     else:
         multigrid = at_once and not yields and unknowns >= limits.multigrid_2d
-    gathered, mumps = processes <= limits.gathering, not symmetric and unknowns >= limits.mumps
-    direct = MUMPS if wet and (mumps or not gathered) else NODAL if wet else FACTORS
+    mumps = wet and unknowns >= limits.mumps and (processes > 1 or not symmetric)
+    direct = MUMPS if mumps else NODAL if wet else FACTORS
     fallback = ""
     if multigrid and at_once and (dim == 2 or unknowns <= limits.fallback_3d):
         fallback = MUMPS if dim == 3 else direct
@@ -193,7 +189,6 @@ def plan(
         krylov=krylov,
         fallback=fallback,
         firmly=multigrid and locks and not fallback,
-        gathered=gathered,
         symmetric=symmetric,
         many=limits.many,
         coarsest=limits.coarsest,
