@@ -24,7 +24,7 @@ def pushed(follows=True):
     grid = mpm.Grid(lines=LINES, follow=ball if follows else leading)
     walls = {"left": "x", "right": "x", "front": "y", "back": "y", "bottom": "xyz"}
     acting = {"conditions": [ball, mpm.Drained("top")], "fluid": mpm.Fluid(), "gravity": (0, 0, -9.81)}
-    block, tight = mpm.box(grid, [0, 0, 0], [2.1, 0.9, 0.6], per_cell=1), mpm.Numerics(tolerance=1e-11)
+    block, tight = mpm.box(grid, [0, 0, 0], [2.1, 0.9, 0.6]), mpm.Numerics(tolerance=1e-11)
     return mpm.Simulation(grid, [block], [SOIL], walls=walls, numerics=tight, **acting)
 
 

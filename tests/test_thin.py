@@ -3,6 +3,7 @@
 
 import re
 
+import numpy as np
 import pytest
 from extreme.scenes import WATER, Beam, soil
 from test_bad_input import GRID, scene
@@ -53,6 +54,23 @@ def test_a_wet_body_with_one_point_a_cell_is_named_with_what_it_loses(warned):
         lost = result.displacement[-1][0, 1] / beam.elements()[1] - 1
         assert lost == pytest.approx(LOST_WET / n**2, rel=1 / 3)
         assert f"with pore fluid it bends about {LOST_WET / n**2:.0%} too much and creeps" in warned()[0]
+
+
+@pytest.mark.parametrize(
+    ("lower", "per_cell", "refused"), [((0, 0, 0), 1, True), ((0, 0, 0.03), 1, True), ((0, 0.03, 0.03), 1, False)]
+)
+def test_domains_that_meet_on_grid_lines_only_are_refused_in_3d(lower, per_cell, refused):
+    """Newton's method found no descent in dry soil; wet soil alternated from cell to cell by any amount."""
+    grid = mpm.Grid([0, 0, 0], [1, 1, 1], [10, 10, 10])
+    body, walls = mpm.box(grid, lower, np.add(lower, [0.6, 0.6, 0.5]), per_cell=per_cell), {"bottom": "xyz"}
+    conditions = [mpm.Traction("top", (0, 0, -1e3))]
+    if refused:
+        with pytest.raises(ValueError, match=r"body 0: one domain over each cell along x and y, .* per_cell >= 2$"):
+            mpm.Simulation(grid, [body], [RUBBER], walls=walls, conditions=conditions)
+        return
+    s = mpm.Simulation(grid, [body], [RUBBER], walls={"bottom": "xyz", "left": "xyz"}, conditions=conditions)
+    s.step(1.0)
+    assert np.abs(s.points.x - s.points.reference.mean(axis=1)).max() < 1e-3
 
 
 @pytest.mark.parametrize("walls", [{"left": "x", "right": "x", "bottom": "y"}])

@@ -12,11 +12,11 @@ from mpi4py import MPI
 import numpy as np
 from numpy.typing import NDArray
 
-from mpm_dolfinx.base.tolerances import SAME
+from mpm_dolfinx.base.tolerances import NEAR, SAME
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.bodies.touching import Faces, covered, covers
 from mpm_dolfinx.domains.cut_domains import CutDomains
-from mpm_dolfinx.grid.grid import SIDES, Grid, sum_by
+from mpm_dolfinx.grid.grid import SIDES, Grid, in_chunks, sum_by
 from mpm_dolfinx.materials.fields import SceneMaterials
 from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
@@ -155,6 +155,28 @@ def warn_thin(grid: Grid, bodies: Sequence[Body], walls: Mapping[str, str], wet:
                     consequence = f"with pore fluid it bends about {LOST_WET / n**2:.0%} too much and creeps"
                 what = "body %d: %.3g point%s over its thickness along %s, in cells of %.3g m: %s; take per_cell >= 2"
                 warn(grid.comm, ResolutionWarning, what, i, n, "s" if n > 1 else "", letter, h, consequence)
+
+
+def check_stiff(grid: Grid, bodies: Sequence[Body]) -> None:
+    """Raise ValueError for boxes in 3D whose domains meet on grid lines only, along two axes.
+
+    Displacements that alternate from node to node along both axes then have no mean gradient in any piece, and thus no
+    stiffness, however they vary along the third axis.  In 2D a single such field remains for each component; walls
+    prevent it.
+    """
+    for i, body in enumerate(bodies):
+        if grid.dim < 3 or not body.aligned:
+            continue
+        low, between = body.bounds[0], np.zeros(grid.dim, dtype=bool)
+        for part in in_chunks(len(body)):
+            lower = body.lower_of(part)
+            at = grid.in_cells(lower - grid.base)
+            between |= ((np.abs(at - at.round()) > NEAR) & (lower > low + NEAR * grid.finest)).any(axis=0)
+            if between.sum() > 1:
+                break
+        else:
+            what = "one domain over each cell along {} and {}, must be more: some displacements would have no stiffness"
+            raise ValueError(f"body {i}: {what.format(*np.array(list('xyz'))[~between][:2])}; take per_cell >= 2")
 
 
 def _edge(grid: Grid, body: Body, axis: int) -> float:

@@ -18,7 +18,7 @@ from mpm_dolfinx.conditions.names import ByName
 from mpm_dolfinx.conditions.unit_weights import under
 from mpm_dolfinx.conditions.walls import with_axis
 from mpm_dolfinx.contact.groups import grouped
-from mpm_dolfinx.diagnostics.resolution import warn_thin
+from mpm_dolfinx.diagnostics.resolution import check_stiff, warn_thin
 from mpm_dolfinx.diagnostics.scene_parts import check_axisymmetry, check_options, check_parts
 from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.materials.initial_stress import InitialStress, by_body
@@ -118,6 +118,7 @@ class Simulation:
         check_options(bodies, fluid, pressure, terms, sources, quadrature)
         grid = grouped(grid, bodies, checked(conditions), quadrature, {"terms": terms, "sources": sources})
         grid = grid.shared(points_in_cells(grid, bodies), keep=bool(len(terms) + len(sources)))
+        check_stiff(grid, bodies)
         warn_thin(grid, bodies, with_axis(grid, walls), fluid is not None)
         check_axisymmetry(grid, bodies, quadrature)
         velocity = checked_velocity(grid, quadrature, inertia, velocity)
