@@ -2,10 +2,12 @@
 """A slender body needs several points over its thickness; with too few, a warning names it and the error."""
 
 import re
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
 from extreme.scenes import WATER, Beam, soil
+from meshes import box_mesh
 from test_bad_input import GRID, scene
 
 import mpm_dolfinx as mpm
@@ -65,12 +67,20 @@ def test_domains_that_meet_on_grid_lines_only_are_refused_in_3d(lower, per_cell,
     body, walls = mpm.box(grid, lower, np.add(lower, [0.6, 0.6, 0.5]), per_cell=per_cell), {"bottom": "xyz"}
     conditions = [mpm.Traction("top", (0, 0, -1e3))]
     if refused:
-        with pytest.raises(ValueError, match=r"body 0: one domain over each cell along x and y, .* per_cell >= 2$"):
+        with pytest.raises(ValueError, match=r"body 0: one domain in each cell, in line with cells along x and y, .* >= 2$"):
             mpm.Simulation(grid, [body], [RUBBER], walls=walls, conditions=conditions)
         return
     s = mpm.Simulation(grid, [body], [RUBBER], walls={"bottom": "xyz", "left": "xyz"}, conditions=conditions)
     s.step(1.0)
     assert np.abs(s.points.x - s.points.reference.mean(axis=1)).max() < 1e-3
+
+
+@pytest.mark.parametrize(("kind", "refused"), [("hexahedron", True), ("tetra", False)])
+def test_meshes_with_one_domain_in_each_cell_are_refused_in_3d(kind, refused):
+    grid = mpm.Grid([0, 0, 0], [0.4, 0.4, 0.4], [4, 4, 4])
+    body = mpm.from_mesh(grid, box_mesh(kind, [3, 3, 3], [0, 0, 0], [0.3, 0.3, 0.3]), per_cell=1)
+    with pytest.raises(ValueError, match="body 0: one domain in each cell") if refused else nullcontext():
+        mpm.Simulation(grid, [body], [RUBBER], walls={"bottom": "xyz"})
 
 
 @pytest.mark.parametrize("walls", [{"left": "x", "right": "x", "bottom": "y"}])

@@ -158,25 +158,30 @@ def warn_thin(grid: Grid, bodies: Sequence[Body], walls: Mapping[str, str], wet:
 
 
 def check_stiff(grid: Grid, bodies: Sequence[Body]) -> None:
-    """Raise ValueError for boxes in 3D whose domains meet on grid lines only, along two axes.
+    """Raise ValueError for bodies in 3D with one domain in each cell, which ends at grid lines along two axes.
 
     Displacements that alternate from node to node along both axes then have no mean gradient in any piece, and thus no
     stiffness, however they vary along the third axis.  In 2D a single such field remains for each component; walls
     prevent it.
     """
-    for i, body in enumerate(bodies):
-        if grid.dim < 3 or not body.aligned:
-            continue
-        low, between = body.bounds[0], np.zeros(grid.dim, dtype=bool)
+    for i, body in enumerate(bodies if grid.dim == 3 else ()):
+        low, between = np.array([[np.inf], [-np.inf]]) * np.ones(grid.dim)  # of domains; the highest end inside a cell
+        cells = []
         for part in in_chunks(len(body)):
-            lower = body.lower_of(part)
-            at = grid.in_cells(lower - grid.base)
-            between |= ((np.abs(at - at.round()) > NEAR) & (lower > low + NEAR * grid.finest)).any(axis=0)
-            if between.sum() > 1:
+            x = body.corners(part) - grid.base
+            lower = grid.in_cells(x.min(axis=1))
+            cells.append(grid.number(grid.index_from_base(x.mean(axis=1))))
+            low = np.minimum(low, lower.min(axis=0))
+            inside = np.where(np.abs(lower - lower.round()) > NEAR, lower, -np.inf)
+            between = np.maximum(between, inside.max(axis=0))
+            if (between > low + NEAR).sum() > 1:
                 break
         else:
-            what = "one domain over each cell along {} and {}, must be more: some displacements would have no stiffness"
-            raise ValueError(f"body {i}: {what.format(*np.array(list('xyz'))[~between][:2])}; take per_cell >= 2")
+            if len(np.unique(np.concatenate(cells))) == len(body):
+                axes = np.array(list("xyz"))[between <= low + NEAR]
+                what = "one domain in each cell, in line with cells along %s and %s, must be more: some displacements "
+                what += "would have no stiffness; take per_cell >= 2"
+                raise ValueError(f"body {i}: " + what % tuple(axes[:2]))
 
 
 def _edge(grid: Grid, body: Body, axis: int) -> float:
