@@ -82,6 +82,9 @@ CHANGES = {
     ("Writer", "closed"): "whether it is closed",
     ("Table", "columns"): "of a file that begins with its first row",
     ("Checkpoint", "_written"): "the time of the last file",
+    ("CutDomains", "_faces"): "the areas of pieces on faces, freed at their only use",
+    ("PointData", "_stored"): "the last gradients, freed at the end of a step",
+    ("SceneMaterials", "seeded"): "the points as seeded, freed once all bodies are in the state",
 }
 """All that objects change after they are made, and why it is no part of the state; what else changes is hidden."""
 

@@ -91,7 +91,7 @@ class Scene:
         initial: Mapping[int, Any],
         velocity: ArrayLike | Callable | None = None,
     ):
-        self.grid, self.fluid = grid, fluid
+        self.grid = grid
         given = {"numerics": numerics, "weighs": weighs, "pressure": pressure, "extensions": extensions}
         given |= {"initial": initial, "velocity": velocity}
         self._on = partial(Scene, bodies=bodies, materials=materials, fluid=fluid, **given)
@@ -99,8 +99,7 @@ class Scene:
         """Materials of this scene on grids with other distributions among processes."""
         self.bodies = tuple(bodies)
         self.numerics, scheme = numerics, numerics.scheme
-        self.extensions = terms, sources = extensions
-        """User-defined terms and sources."""
+        terms, sources = extensions
         pressure = weighed(pressure, fluid)
         self.initial = InitialStresses(self.bodies, initial, pressure)
         seeded = material_points(grid, bodies, pressure)
@@ -130,8 +129,7 @@ class Scene:
             self.storage = StorageForms(pieces, self.momentum.u, p, self.momentum.active, *of_fluid)
         keeps_volumes = numerics.keep_volumes and numerics.quadrature == "domain" and scene.evolves
         self.motion = Motion(scene, bodies, self.momentum, self.storage, keeps_volumes)
-        # subjects of earlier warnings, and checks that remain to be made; they affect only the log
-        self._warned: set[str] = set()
+        # checks that remain to be made; they affect only the log
         self._looks = (warn_overfilled, *[partial(warn_smeared, materials=scene)] * scene.uneven)
         self._assembled: Latest[Assembled] = Latest()
         self._on_grid: Latest[OnGrid] = Latest(self._assembled)
@@ -143,6 +141,16 @@ class Scene:
     def flows(self) -> bool:
         """Whether fluid flows, or sources add it."""
         return self.storage is not None and (self.materials.conducts or bool(self.storage.feeding))
+
+    @cached_property
+    def fluid(self) -> Fluid | None:
+        """Pore fluid."""
+        return self.materials.fluid
+
+    @property
+    def extensions(self) -> tuple[Sequence[Callable], Sequence[Callable]]:
+        """User-defined terms and sources."""
+        return self._on.keywords["extensions"]
 
     @property
     def extended(self) -> bool:
@@ -180,6 +188,11 @@ class Scene:
         if u is not None:
             self.momentum.u.x.array[:] = u
         return MomentumProblem(self.momentum, system, data, loads, self.scheme.tolerance, **options)
+
+    @cached_property
+    def _warned(self) -> set[str]:
+        """Subjects of earlier warnings; they affect only the log."""
+        return set()
 
     def look_at(self, gravity: Sequence[NDArray[np.float64] | None]) -> None:
         """Warn, once, if the gravity of a step differs from the gravity that defines the conductivities."""
