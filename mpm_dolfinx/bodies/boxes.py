@@ -94,6 +94,11 @@ class LatticeBody(Body):
         low, high = self._ends
         return self._at(low), self._at(high + 1)
 
+    def neighbour(self, rows: NDArray[np.int64], step: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the domains (m,) of the body at lattice steps (m, d) from domains `rows` (m,)."""
+        number = np.ravel_multi_index(tuple((self._index(rows) + step).T), self.count)
+        return number if self.filled is None else np.searchsorted(self.filled, number)
+
     @property
     def lattice(self) -> tuple[int, ...]:
         """Number of lattice boxes along each axis within the bounding box of the body; some may not be filled."""

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
+from itertools import product
 
 from mpi4py import MPI
 
@@ -27,35 +28,33 @@ from mpm_dolfinx.base.caching import Latest
 from mpm_dolfinx.base.tolerances import NEAR
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.domains.cut_domains import CutDomains
+from mpm_dolfinx.domains.divided_domains import ROOT, Identifiers, is_part, roots
 from mpm_dolfinx.grid.grid import FACES, sum_by
-from mpm_dolfinx.parallel.exchange import Exchange
-from mpm_dolfinx.points.material_points import body_of, cofactor, determinant
+from mpm_dolfinx.parallel.exchange import Exchange, over_all
+from mpm_dolfinx.points.material_points import MaterialPoints, body_of, cofactor, determinant
 
 
 class Neighbours:
     """Neighbours of domains across shared faces, including neighbours on other processes.
 
-    comm: communicator of the processes; bodies: all bodies of the scene; ids (n,): identifiers of the material points
-    of this process; chosen (n,): whether to find the neighbours of each point.
+    comm: communicator of the processes; bodies: all bodies of the scene; points: material points of this process;
+    chosen (n,): whether to find the neighbours of each point.
     """
 
-    def __init__(self, comm: MPI.Intracomm, bodies: Sequence[Body], ids: NDArray[np.int64], chosen: NDArray[np.bool_]):
-        starts = np.cumsum([0, *map(len, bodies)])
-        self.rows = rows = (chosen & (ids < starts[-1])).nonzero()[0]
-        """Indices (k,) of the points whose neighbours are sought."""
+    def __init__(
+        self, comm: MPI.Intracomm, bodies: Sequence[Body], points: MaterialPoints, chosen: NDArray[np.bool_]
+    ):
         dim = bodies[0].dim
-        of, key = body_of(ids[rows], starts), np.zeros((len(rows), 2 * dim), dtype=np.int64)
-        for i, body in enumerate(bodies):
-            chosen_rows = (of == i).nonzero()[0]
-            corners = (2**dim * starts[i] + body.nodes(ids[rows[chosen_rows]] - starts[i]))[:, FACES[dim]]
-            # the key of a face is the same in both domains: lowest corner index, and index of the opposite corner
-            first = corners.argmin(axis=2)[:, :, None]
-            ends = (np.take_along_axis(corners, at, axis=2)[:, :, 0] for at in (first, corners.shape[2] - 1 - first))
-            key[chosen_rows] = np.ravel_multi_index(tuple(ends), (2**dim * starts[-1],) * 2)
-        key = key.ravel()
+        seeded = points.id < sum(map(len, bodies))
+        self.rows = rows = (chosen & (seeded | is_part(points))).nonzero()[0]
+        """Indices (k,) of the points whose neighbours are sought."""
+        key = _seeded_faces(bodies, points.id[rows], seeded[rows])
+        if ROOT in points.data:
+            key = _faces_of_parts(comm, bodies, points.map(lambda values: values[rows]), key)
+        key = key.reshape(2 * dim * len(rows), key.shape[2])
         partner = _pairs(key)
         self._unpaired = (partner < 0).nonzero()[0]
-        self._exchange = Exchange(comm, (key[self._unpaired] % comm.size).astype(np.int32))
+        self._exchange = Exchange(comm, (np.add.reduce(key[self._unpaired], axis=1) % comm.size).astype(np.int32))
         self._partners = _pairs(self._exchange.send(key[self._unpaired]))
         found = self._exchange.back(self._partners >= 0)
         partner[self._unpaired[found]] = len(key) + found.nonzero()[0]
@@ -97,16 +96,58 @@ class LinearGradients:
         self, cut: CutDomains, F: NDArray[np.float64], elastic: NDArray[np.bool_], soils: NDArray[np.float64]
     ) -> NDArray[np.float64]:
         """Return `linear_gradients`, which vary only in domains of `elastic` points (n,); all processes call it."""
-        key = cut.points.id, elastic
-        return linear_gradients(
-            self._neighbours(key, partial(Neighbours, self._comm, self._bodies, *key), self._comm), cut, F, soils
-        )
+        make = partial(Neighbours, self._comm, self._bodies, cut.points, elastic)
+        return linear_gradients(self._neighbours((cut.points.id, elastic), make, self._comm), cut, F, soils)
+
+
+def _seeded_faces(bodies: Sequence[Body], ids: NDArray[np.int64], seeded: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Return a key (k, 2d, 1) for each face of the seeded domains `ids` (k,), equal in both domains at the face."""
+    dim, starts = bodies[0].dim, np.cumsum([0, *map(len, bodies)])
+    of, key = np.where(seeded, body_of(ids, starts), -1), np.zeros((len(ids), 2 * dim), dtype=np.int64)
+    for i, body in enumerate(bodies):
+        chosen = (of == i).nonzero()[0]
+        corners = (2**dim * starts[i] + body.nodes(ids[chosen] - starts[i]))[:, FACES[dim]]
+        # the key of a face: lowest corner index, and index of the opposite corner
+        first = corners.argmin(axis=2)[:, :, None]
+        ends = (np.take_along_axis(corners, at, axis=2)[:, :, 0] for at in (first, corners.shape[2] - 1 - first))
+        key[chosen] = np.ravel_multi_index(tuple(ends), (2**dim * starts[-1],) * 2)
+    return key[:, :, None]
+
+
+def _faces_of_parts(
+    comm: MPI.Intracomm, bodies: Sequence[Body], points: MaterialPoints, seeded: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """Return a key (n, 2d, 2) for each face of parts of domains, and of whole domains on lattices; else `seeded`.
+
+    The key of a face on a lattice: its lower corner, its normal and its size, in units of the smallest part of all.
+    Parts of other domains have neighbours only in the same domain.
+    """
+    dim, part = bodies[0].dim, is_part(points)
+    root, ends = roots(points)
+    places, size = Identifiers(bodies).places(root), np.ptp(ends, axis=2)
+    extremes = (np.min, MPI.MIN), (np.max, MPI.MAX)
+    least, most = (over_all(comm, float(of(size, initial=1.0)), op) for of, op in extremes)
+    levels = int(np.log2(most / least)) + 1
+    level = np.rint(np.log2(size / least)).astype(np.int64)
+    on_lattice = places[:, 0] >= 0
+    lower, upper = (np.rint((places[:, 1:] + ends[..., k]) / least).astype(np.int64) for k in (0, 1))
+    # the second number of a key: the body on whose lattice the face lies, or the seeded domain
+    shape = (*(upper.max(axis=0, initial=0) + 1), *(levels,) * dim, dim)
+    shape = tuple(over_all(comm, np.array(shape), MPI.MAX))
+    out = np.concatenate([seeded, np.full(seeded.shape, len(bodies))], axis=2)
+    for axis, (end, corner) in product(range(dim), enumerate((lower, upper))):
+        at, across = lower.copy(), level.copy()
+        at[:, axis], across[:, axis] = corner[:, axis], 0
+        number = np.ravel_multi_index((*at.T, *across.T, np.full(len(at), axis)), shape)
+        key = np.stack([number, places[:, 0]], axis=1)
+        out[:, 2 * axis + end] = np.where((part | on_lattice)[:, None], key, out[:, 2 * axis + end])
+    return out
 
 
 def _pairs(key: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return for each entry the index (n,) of the other entry with the same key, or -1."""
-    order, out = key.argsort(kind="stable"), np.full(len(key), -1)
-    same = (key[order[1:]] == key[order[:-1]]).nonzero()[0]
+    """Return for each row of keys (n, k) the index (n,) of the other equal row, or -1."""
+    order, out = np.lexsort(key.T), np.full(len(key), -1)
+    same = np.logical_and.reduce(key[order[1:]] == key[order[:-1]], axis=1).nonzero()[0]
     out[order[same]], out[order[same + 1]] = order[same + 1], order[same]
     return out
 

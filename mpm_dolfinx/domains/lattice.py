@@ -32,7 +32,8 @@ from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.bodies.boxes import RowsBody
 from mpm_dolfinx.bodies.faces import Surface
 from mpm_dolfinx.bodies.touching import Faces, covers
-from mpm_dolfinx.grid.grid import FACES, Grid, among, in_chunks
+from mpm_dolfinx.domains.divided_domains import is_part, roots
+from mpm_dolfinx.grid.grid import FACES, Grid, among, corner_bits, in_chunks
 from mpm_dolfinx.parallel.exchange import Exchange
 from mpm_dolfinx.points.material_points import MaterialPoints
 
@@ -102,23 +103,44 @@ class Lattice:
         """Return the indices (m, 2^d) of the corners of domains in the body."""
         return self._numbers(ids, lambda: self._body.nodes(ids - self._start))
 
+    def corners_of_parts(self, points: MaterialPoints) -> NDArray[np.int64]:
+        """Return the indices (m,) of the body's corners that are corners of parts of domains, see `divided_domains`."""
+        own = is_part(points).nonzero()[0]
+        root, part = (of[own] for of in roots(points))
+        own = ((root >= self._start) & (root < self._stop)).nonzero()[0]
+        if not len(own) or self._count is None:
+            return own[:0]
+        shape = tuple(np.add(self._count, 1))
+        first = np.stack(np.unravel_index(self._body.nodes(root[own] - self._start)[:, 0], shape), axis=1)
+        bits = corner_bits(self._dim)
+        corners = first[:, None] + np.where(bits, part[own, None, :, 1], part[own, None, :, 0])
+        corners = corners[(corners == np.rint(corners)).all(axis=2)].astype(np.int64)
+        return np.ravel_multi_index(tuple(corners.T), shape)
+
     def corners_change(
-        self, comm: MPI.Intracomm, ids: NDArray[np.int64], d: NDArray[np.float64], crossed: NDArray[np.float64]
+        self,
+        comm: MPI.Intracomm,
+        ids: NDArray[np.int64],
+        d: NDArray[np.float64],
+        crossed: NDArray[np.float64],
+        parts: NDArray[np.int64],
     ) -> NDArray[np.float64]:
         """Return the change (n, 2^d, d), m, by which the filter corrects displacements of domain corners.
 
-        `d` (n, 2^d, d), m, are the displacements; `crossed` (n, 2^d) the numbers of cells crossed since the grid reset.
+        `d` (n, 2^d, d), m, are the displacements; `crossed` (n, 2^d) the numbers of cells crossed since the grid reset;
+        `parts` (m,) the indices of corners of parts of domains: these corners are not filtered.
         """
         if self._count is None:
             return np.zeros_like(d)
         values = np.concatenate([d, crossed[:, :, None]], axis=2).reshape(-1, self._dim + 1)
-        where = comm, tuple(np.add(self._count, 1)), self.nodes(ids).ravel()
+        values = np.concatenate([values, np.full((len(parts), self._dim + 1), np.inf)])  # differs from any other value
+        where = comm, tuple(np.add(self._count, 1)), np.concatenate([self.nodes(ids).ravel(), parts])
         field, layers, to_rows = _at_sites(*where, values, self._tolerance)
         del values  # as large as the corners
         thirds = self._thirds and [self._thirds[0][:, layers], *self._thirds[1:]]
         change = _filtered(field[..., :-1], field[..., -1:], thirds) - field[..., :-1]
         change[np.isnan(change)] = 0.0
-        change = to_rows(change.reshape(-1, self._dim)).reshape(d.shape)
+        change = to_rows(change.reshape(-1, self._dim))[: d[..., 0].size].reshape(d.shape)
         change[self.held_of(ids)[1]] = 0.0
         return change
 
@@ -159,6 +181,7 @@ def _at_sites(
             sites = at[part]
             differs = np.abs(field.take(sites, axis=0) - d[part]) > tolerance
             field[sites[np.logical_or.reduce(differs.T)]] = np.nan
+    field[np.isinf(field)] = np.nan
     field, home = field.reshape(-1, *shape[1:], values.shape[1]), rows[0][0]
     return field, slice(first, max(first, last - MARGIN)), lambda change: exchange.back(change.take(home, axis=0))
 
@@ -252,8 +275,8 @@ def filtered(
     out, cells = np.zeros(points.corners.shape), crossed(grid, points, then, free)
     for lattice in lattices:
         rows = lattice.rows(points)
-        moved = points.corners[rows] - points.reference[rows]
-        out[rows] = lattice.corners_change(grid.comm, points.id[rows], moved, cells[rows])
+        moved, parts = points.corners[rows] - points.reference[rows], lattice.corners_of_parts(points)
+        out[rows] = lattice.corners_change(grid.comm, points.id[rows], moved, cells[rows], parts)
     return out
 
 

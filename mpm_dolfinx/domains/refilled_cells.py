@@ -94,7 +94,7 @@ class RefilledCells:
 
     body (n,): index of each point's body; flowed (n,): whether points may be renewed; needs (n,): whether their domains
     need renewal; faces: surface of the bodies; signs: keys of these faces, and the index of the set of
-    conditions on each face, see `Renewal._signatures`; second: whether to compute second moments of the pieces.
+    conditions on each face, see `SeededFaces.signatures`; second: whether to compute second moments of the pieces.
     """
 
     def __init__(

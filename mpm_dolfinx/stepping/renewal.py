@@ -32,16 +32,17 @@ from mpm_dolfinx.base.caching import Latest
 from mpm_dolfinx.base.errors import NotConverged
 from mpm_dolfinx.base.fluid_content import pressure_of
 from mpm_dolfinx.bodies.bodies import Body
-from mpm_dolfinx.bodies.faces import Surface
+from mpm_dolfinx.domains.divided_domains import PART, ROOT, is_part
 from mpm_dolfinx.domains.pressure_transport import PiecePressures, at_start, transport
-from mpm_dolfinx.domains.refilled_cells import New, OuterFaces, RefilledCells, misshapen, ring_lengths
-from mpm_dolfinx.domains.renewed_faces import AREA, ENDS, PARENT, keys, with_faces
+from mpm_dolfinx.domains.refilled_cells import New, RefilledCells, misshapen
+from mpm_dolfinx.domains.renewed_faces import AREA, ENDS, PARENT, with_faces
 from mpm_dolfinx.dynamics.renewed_velocities import MOTION, centred, velocities
-from mpm_dolfinx.grid.grid import FACES, sum_by
+from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.materials.fields import SceneMaterials
 from mpm_dolfinx.parallel.exchange import first, over_all
 from mpm_dolfinx.points.cutting import centroids, domain_volumes
 from mpm_dolfinx.points.material_points import ACROSS, MaterialPoints, body_of, in_space, unstretched
+from mpm_dolfinx.stepping.seeded_faces import SeededFaces
 from mpm_dolfinx.stepping.state import State, Stay
 
 LONGEST = 1.0
@@ -59,31 +60,8 @@ class Renewal:
         self._bodies = bodies
         self._starts = np.cumsum([0, *map(len, bodies)])
         self._materials = materials
+        self._faces = SeededFaces(materials.grid, bodies)
         self._signs: Latest[tuple[NDArray, NDArray]] = Latest()
-
-    @cached_property
-    def _outer(self) -> OuterFaces:
-        """All outer faces of the bodies as seeded, ordered by key."""
-        found = []
-        for start, body in zip(self._starts, self._bodies, strict=False):
-            row, face = body.outer()
-            at = FACES[2][face]
-            X, x = (np.take_along_axis(of(row), at[:, :, None], axis=1) for of in (body.reference, body.corners))
-            size = np.linalg.norm(x[:, 1] - x[:, 0], axis=1) * ring_lengths(self._grid, x.mean(axis=1))
-            found.append((start + row, face, keys(start + row, face), size, X))
-        columns = [np.concatenate(column) for column in zip(*found, strict=True)]
-        order = np.argsort(columns[2])
-        return OuterFaces(*(column[order] for column in columns))
-
-    def _faces(self, points: MaterialPoints) -> OuterFaces:
-        """Return the outer faces of the points."""
-        seeded = self._outer
-        known, at = points.find(seeded.point)
-        columns = [(at, *(v[known] for v in (seeded.face, seeded.key, seeded.area, seeded.ends)))]
-        if PARENT in points.data:
-            at, face = np.nonzero(points.data[PARENT] >= 0)
-            columns.append((at, face, *(points.data[name][at, face] for name in (PARENT, AREA, ENDS))))
-        return OuterFaces(*map(np.concatenate, zip(*columns, strict=True)))
 
     def long(self, points: MaterialPoints) -> NDArray[np.bool_]:
         """Return a mask (n,) of domains that are longer than `LONGEST` cells, or partly inverted."""
@@ -94,15 +72,11 @@ class Renewal:
         if "plastic" not in points.data:
             return np.zeros(len(points), dtype=bool)
         known = np.array(["plastic" in law.state for law in self._materials.laws])[self._materials.law_of(points)]
-        return known & (self._materials.evolved(points) | (points.id >= self._starts[-1]))
+        return known & (self._materials.evolved(points) | (points.id >= self._starts[-1]) & ~is_part(points))
 
     def _free(self, state: State) -> NDArray[np.bool_]:
         """Return a mask (n,) of `flowed` points without probes, kept pieces, or faces that conditions need."""
-        free, stage = self.flowed(state.points), state.stage
-        needed = [*(faces for _, faces, _ in stage.held), *(faces for one in stage.acting for faces in one.seeded)]
-        if needed:
-            faces = self._faces(state.points)
-            free[faces.point[np.isin(faces.key, np.concatenate([keys(one.id, one.face) for one in needed]))]] = False
+        free = self.flowed(state.points) & ~self._faces.needed(state.stage, state.points)
         if state.watched is not None:
             free &= ~np.isin(state.points.id, state.watched)
         return free if state.stay is None else free & ~state.stay.keeps
@@ -135,10 +109,10 @@ class Renewal:
 
     def _renewed(self, state: State) -> tuple[State, int]:
         stage, points = state.stage, state.points
-        signs = self._signs((stage,), lambda: self._signatures(stage.faces), MPI.COMM_SELF)
+        signs = self._signs((stage,), lambda: self._faces.signatures(stage.faces), MPI.COMM_SELF)
         needs, body = self.long(points), body_of(points.id, self._starts)
         moves = MOTION[0] in points.data
-        work = RefilledCells(self._grid, points, body, self._free(state), needs, self._faces(points), signs, moves)
+        work = RefilledCells(self._grid, points, body, self._free(state), needs, self._faces.of(points), signs, moves)
         if not work.chosen.any():
             return state, 0
         new = [work.full(), work.partial(), work.remainders[0]]
@@ -189,20 +163,6 @@ class Renewal:
         even = over(brings, volume) / over(share, volume)
         stored = sum_by(group, materials.storage(made) * made.volume0 * made.J, count)
         return pressure_of(np.divide(over(brings, store), stored, out=even, where=stored > 0), bulk)[group]
-
-    def _signatures(self, surfaces: Sequence[Surface]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return keys of outer faces, and the index of each face's set of conditions; -1 for faces that must stay."""
-        key = self._outer.key
-        kind = np.zeros((len(key), len(surfaces)), dtype=np.int8)
-        barred = np.zeros(len(key), dtype=bool)
-        for k, faces in enumerate(surfaces):
-            at = np.minimum(np.searchsorted(key, keys(faces.id, faces.face)), len(key) - 1)
-            ok = key[at] == keys(faces.id, faces.face)
-            whole = np.ptp(faces.xi, axis=1).max(axis=1) >= 2
-            kind[at[ok & whole], k] = 1
-            barred[at[ok & ~whole]] = True
-        number = np.unique(kind, axis=0, return_inverse=True)[1].ravel() if len(surfaces) else np.zeros(len(key), int)
-        return key, np.where(barred, -1, number)
 
     def _filled(
         self, points: MaterialPoints, work: RefilledCells, new: Sequence[New], touched: Sequence[str]
@@ -274,13 +234,15 @@ class Renewal:
                 data[name] = work.on_faces(values, corners, parent, group, points)
             elif name == ACROSS:
                 data[name] = across
-            elif name not in (PARENT, AREA, ENDS, *MOTION, "plastic"):
+            elif name == ROOT:
+                data |= {ROOT: np.full(n, -1), PART: np.zeros((n, d, 2))}
+            elif name not in (PARENT, AREA, ENDS, PART, *MOTION, "plastic"):
                 data[name] = kept(values)
         data |= {PARENT: parent, AREA: area, ENDS: ends}
-        used = points.id[points.id >= self._starts[-1]]
-        number = (used.max(initial=self._starts[-1] - 1) - self._starts[-1]) // len(self._bodies) + 1
+        number = (points.id - self._starts[-1]) // len(self._bodies)
+        number = number[(number >= 0) & (number % 2 == 0)].max(initial=-2) + 2  # parts have odd numbers
         return MaterialPoints(
-            id=self._starts[-1] + body + len(self._bodies) * (number + np.arange(n)),
+            id=self._starts[-1] + body + len(self._bodies) * (number + 2 * np.arange(n)),
             corners=corners,
             F=F,
             volume0=volume0,

@@ -41,6 +41,7 @@ from mpm_dolfinx.points.cutting import volumes
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.solve.numerics import Numerics
 from mpm_dolfinx.stepping.advance import Motion
+from mpm_dolfinx.stepping.division import Division
 from mpm_dolfinx.stepping.grid_reset import Assembled, OnGrid, System, assembled
 from mpm_dolfinx.stepping.moving_lines import followed_tool, with_lines
 from mpm_dolfinx.stepping.renewal import Renewal
@@ -135,7 +136,7 @@ class Scene:
         self._on_grid: Latest[OnGrid] = Latest(self._assembled)
         self._systems: Latest[System] = Latest()
         self._renewed: Latest[tuple[dict[str, Any], int]] = Latest()
-        _ = self._renewal  # raises ValueError for scenes that do not support renewal
+        _ = self._replacing  # raises ValueError for scenes that do not support renewal
 
     @property
     def flows(self) -> bool:
@@ -282,23 +283,32 @@ class Scene:
         return state
 
     @cached_property
-    def _renewal(self) -> Renewal | None:
-        """Renewal of particle domains; None if it is off."""
+    def _replacing(self) -> Sequence[Callable[[State], tuple[State, int]]]:
+        """Functions that replace particle domains at a reset of the grid: by division and merging, and by renewal."""
         grid = self.grid
         if not self.numerics.renewal:
-            return None
+            return ()
         has = {
-            "is in 3D": grid.dim == 3,
-            "has inertia in axisymmetry": grid.axisymmetric and self.momentum.inertia is not None,
             "has groups in contact": grid.copies > 1,
             "has pores that drain": self.materials.drains or self.materials.retentions is not None,
             "has quadrature 'point'": self.numerics.quadrature != "domain",
+        }
+        moves = self.momentum.inertia is not None
+        of_yield = has | {
+            "is in 3D": grid.dim == 3,
+            "has inertia in axisymmetry": grid.axisymmetric and moves,
             "has no soil that yields": "plastic" not in self.materials.state_names,
         }
-        if found := [what for what, so in has.items() if so]:
-            what = f"Numerics(renewal=True): the scene {' and '.join(found)}"
-            raise ValueError(f"{what}, must be of soil that yields, dry or saturated, in 2D")
-        return Renewal(self.bodies, self.materials)
+        of_lines = has | {"has inertia": moves, "has grid lines that stay": grid.follow is None}
+        found = [[what for what, so in of.items() if so] for of in (of_yield, of_lines)]
+        if all(found):
+            allowed = "of soil that yields, dry or saturated, in 2D"
+            if grid.follow is not None:
+                found, allowed = found[1:], "dry or saturated, without inertia, on a grid whose lines move"
+            raise ValueError(f"Numerics(renewal=True): the scene {' and '.join(found[0])}, must be {allowed}")
+        renewal, division = Renewal(self.bodies, self.materials), Division(self.bodies, self.materials)
+        both = (division.divided, not found[1]), (renewal.renewed, not found[0])
+        return [one for one, possible in both if possible]
 
     def for_reset(self, state: State, renew: bool) -> tuple[State, int]:
         """Return a state for a reset of the grid, with points at their owners, and the number of renewed domains.
@@ -307,16 +317,19 @@ class Scene:
         """
         if state.stays:
             return state, 0
-        if self._renewal is None or not renew:
+        if not self._replacing or not renew:
             return state.at_owners(self.grid), 0
 
         def make() -> tuple[dict[str, Any], int]:
             with _compat.Timer("renew domains"):
-                new, count = self._renewal.renewed(state)
-            return {name: getattr(new, name) for name in ("points", "pieces", "stay") if count}, count
+                new, count = state, 0
+                for replacing in self._replacing:
+                    new, number = replacing(new)
+                    count += number
+            return {name: getattr(new, name) for name in ("points", "pieces", "stay", "trend") if count}, count
 
         pieces, stay = state.pieces, state.stay
-        key = (*state.points.arrays, state.stage, state.watched, stay and stay.keeps)
+        key = (*state.points.arrays, *self.grid.lines, state.stage, state.watched, stay and stay.keeps)
         key = key if pieces is None else (*key, *pieces.arrays.values())
         new, count = self._renewed(key, make, self.grid.comm)
         return replace(state, **new).at_owners(self.grid), count
