@@ -99,7 +99,7 @@ def restless(cells: int, **options) -> mpm.Simulation:
     return simulation
 
 
-def of_many_sizes(cells: int, moves: bool) -> mpm.Simulation:
+def of_many_sizes(cells: int, moves: bool, **options) -> mpm.Simulation:
     """Return the block with the grid reset in each step, in cells of two sizes; moves: whether grid lines oscillate."""
 
     def lines(t: float) -> list[np.ndarray]:
@@ -108,7 +108,7 @@ def of_many_sizes(cells: int, moves: bool) -> mpm.Simulation:
             x[1:-1:2] += (0.1 + 0.01 * np.sin(t)) / cells
         return even
 
-    return restless(cells, grid=mpm.Grid(lines=lines(0.0), follow=lines if moves else None))
+    return restless(cells, grid=mpm.Grid(lines=lines(0.0), follow=lines if moves else None), **options)
 
 
 def refactorised(cells: int) -> mpm.Simulation:
@@ -277,6 +277,10 @@ PAIRS: dict[str, tuple[Make, Make]] = {
     "files written in each step": (block, block),
     "grid reset in each step": (block, restless),
     "grid lines that move": (partial(of_many_sizes, moves=False), partial(of_many_sizes, moves=True)),
+    "division that divides nothing": (
+        partial(of_many_sizes, moves=True),
+        partial(of_many_sizes, moves=True, numerics=mpm.Numerics(renewal=True)),
+    ),
     "body from a mesh": (block, lambda n: block(n, from_mesh=True)),
     "axisymmetry": (
         lambda n: restless(n, material=soil(conductivity=1e-4), **WATER),

@@ -86,7 +86,7 @@ def test_masses_volumes_region_and_surface_stay(monkeypatch, hole, uneven, given
     before, after = (domain_volumes(points.corners, s.grid.axisymmetric).sum() for points in (old, new))
     assert after == pytest.approx(before, rel=1e-4)
     own = renewal.Renewal(s.bodies, s.scene.materials)
-    before, after = (own._faces(points) for points in (old, new))
+    before, after = (own._faces.of(points) for points in (old, new))
     total = [faces.area.sum() for faces in (before, after)]
     assert total[1] == pytest.approx(total[0], rel=1e-6 if uneven else 1e-12)  # near corners merge
     for faces, points in ((before, old), (after, new)):

@@ -25,6 +25,8 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 ROOT = "seeded domain"
 PART = "part of the seeded domain"
 """Names of point data: id of the seeded domain with the lower corner of a part, or -1; ends (n, d, 2) of the part."""
+PLACES = "corners", "reference", "origin"
+"""Names of the arrays of points that contain corners of domains."""
 
 
 def with_parts(points: MaterialPoints) -> MaterialPoints:
@@ -97,15 +99,34 @@ class Identifiers:
         return out, lower - step
 
     def places(self, root: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the body and lattice index (n, 1 + d) of seeded domains; of domains without lattice -1 - id."""
+        """Return the body and lattice index (n, 1 + d) of seeded domains; -1 - id for domains that are not boxes."""
         out = np.zeros((len(root), 1 + self._dim), dtype=np.int64)
         body = self.starts.searchsorted(root, side="right") - 1
         for i in np.unique(body):
             at, one = body == i, self._bodies[i]
-            out[at, 0] = i if one.lattice else -1 - root[at]
-            if one.lattice:
+            regular = one.lattice and one.aligned
+            out[at, 0] = i if regular else -1 - root[at]
+            if regular:
                 lower = one.nodes(root[at] - self.starts[i])[:, 0]
                 out[at, 1:] = np.stack(np.unravel_index(lower, tuple(np.add(one.lattice, 1))), axis=1)
+        return out
+
+
+    def middle(self, root: NDArray[np.int64], part: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
+        """Return the local coordinates (n,), in (0, 1), of the middles of intervals along an axis.
+
+        Rows of boxes on a lattice may have different widths, so the middle of a merged domain may not be at 1/2.
+        """
+        out, size = np.full(len(root), 0.5), np.rint(np.ptp(part, axis=2)[:, axis]).astype(np.int64)
+        body = self.starts.searchsorted(root, side="right") - 1
+        for i in np.unique(body[size > 1]):
+            at = ((body == i) & (size > 1)).nonzero()[0]
+            row, one, step = root[at] - self.starts[i], self._bodies[i], np.zeros((len(at), self._dim), dtype=np.int64)
+            step[:, axis] = size[at] // 2
+            first, half = (one.lower_of(rows)[:, axis] for rows in (row, one.neighbour(row, step)))
+            step[:, axis] = size[at] - 1
+            last = one.neighbour(row, step)
+            out[at] = (half - first) / ((one.lower_of(last) + one.boxes(last))[:, axis] - first)
         return out
 
 
@@ -114,11 +135,12 @@ def whole(part: NDArray[np.float64]) -> NDArray[np.bool_]:
     return (part == [0.0, 1.0]).all(axis=(1, 2))
 
 
-def halves(corners: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
-    """Return the corners (2, n, 2^d, d) of both halves of domains (n, 2^d, d) that are bisected along a local axis."""
+def halves(corners: NDArray[np.float64], axis: int, middle: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the corners (2, n, 2^d, d) of both parts of domains (n, 2^d, d), divided at `middle` (n,) along an axis."""
     low, high = FACES[corners.shape[2]][2 * axis : 2 * axis + 2]
+    t = middle[:, None, None]
     out = np.stack([corners, corners])
-    out[0, :, high] = out[1, :, low] = ((corners[:, low] + corners[:, high]) / 2).swapaxes(0, 1)
+    out[0][:, high] = out[1][:, low] = (1 - t) * corners[:, low] + t * corners[:, high]
     return out
 
 
@@ -137,30 +159,17 @@ def halved(points: MaterialPoints, axis: int, identifiers: Identifiers, axisymme
 
     Volumes at rest and in the deformed state add up to those of the point.
     """
-    corners, reference, origin = (
-        halves(of, axis).reshape(-1, *of.shape[1:]) for of in (points.corners, points.reference, points.origin)
-    )
     root, part = roots(points)
+    at, n = identifiers.middle(root, part, axis), len(points)
+    places = {name: halves(getattr(points, name), axis, at).reshape(-1, *points.corners.shape[1:]) for name in PLACES}
     ends = np.concatenate([part, part])
-    middle, n = part[:, axis].mean(axis=1), len(points)
-    ends[:n, axis, 1] = ends[n:, axis, 0] = middle
+    ends[:n, axis, 1] = ends[n:, axis, 0] = part[:, axis].mean(axis=1)
     root, lower = identifiers.at(np.concatenate([root, root]), ends[..., 0])
     ends = np.stack([lower, lower + np.ptp(ends, axis=2)], axis=2)
     both = points.map(lambda values: np.concatenate([values, values]))
-    size = np.abs(domain_volumes(reference, axisymmetric))
-    share = size / np.tile(size[:n] + size[n:], 2)
-    F = gradient(corners, reference, axisymmetric) @ beyond_corners(both, axisymmetric)
-    return replace(
-        both,
-        id=identifiers.of(root, ends),
-        corners=corners,
-        reference=reference,
-        origin=origin,
-        x=centroids(corners),
-        volume0=both.volume0 * share,
-        F=F,
-        data={**both.data, **_named(root, ends)},
-    )
+    size = np.abs(domain_volumes(places["reference"], axisymmetric))
+    both = replace(both, volume0=both.volume0 * size / np.tile(size[:n] + size[n:], 2))
+    return _placed(both, places, identifiers.of(root, ends), (root, ends), beyond_corners(both, axisymmetric))
 
 
 def joined(
@@ -170,39 +179,35 @@ def joined(
 
     F is the ratio of corners and reference corners.  Data are means, weighted by the volumes at rest.
     """
-    corners, reference, origin = (
-        merged(getattr(lower, name), getattr(upper, name), axis) for name in ("corners", "reference", "origin")
-    )
-    (root, part), size = roots(lower), np.ptp(roots(upper)[1], axis=2)[:, axis]
+    places = {name: merged(getattr(lower, name), getattr(upper, name), axis) for name in PLACES}
+    root, part = roots(lower)
     part = part.copy()
-    part[:, axis, 1] += size
+    part[:, axis, 1] += np.ptp(roots(upper)[1][:, axis], axis=1)
     volume0 = lower.volume0 + upper.volume0
-    weight = lower.volume0 / volume0
 
     def mean(a: NDArray, b: NDArray) -> NDArray:
-        share = weight.reshape(-1, *[1] * (a.ndim - 1))
+        share = (lower.volume0 / volume0).reshape(-1, *[1] * (a.ndim - 1))
         return (share * a + (1 - share) * b).astype(a.dtype)
 
     beyond = mean(*(beyond_corners(of, axisymmetric) for of in (lower, upper)))
     data = {name: mean(values, upper.data[name]) for name, values in lower.data.items()}
-    return replace(
-        lower,
-        id=identifiers.of(root, part),
-        corners=corners,
-        reference=reference,
-        origin=origin,
-        x=centroids(corners),
-        volume0=volume0,
-        F=gradient(corners, reference, axisymmetric) @ beyond,
-        pressure=mean(lower.pressure, upper.pressure),
-        data={**data, **_named(root, part)},
-    )
+    both = replace(lower, volume0=volume0, pressure=mean(lower.pressure, upper.pressure), data=data)
+    return _placed(both, places, identifiers.of(root, part), (root, part), beyond)
 
 
-def _named(root: NDArray[np.int64], part: NDArray[np.float64]) -> dict[str, NDArray]:
-    """Return `ROOT` and `PART` as data of points; whole domains have none."""
+def _placed(
+    points: MaterialPoints,
+    places: dict[str, NDArray[np.float64]],
+    id: NDArray[np.int64],
+    of: tuple[NDArray[np.int64], NDArray[np.float64]],
+    beyond: NDArray[np.float64],
+) -> MaterialPoints:
+    """Return points at other places, with `ROOT` and `PART` in `of`, and F from their corners and `beyond_corners`."""
+    root, part = of
     is_whole = whole(part)
-    return {ROOT: np.where(is_whole, -1, root), PART: np.where(is_whole[:, None, None], 0.0, part)}
+    data = {ROOT: np.where(is_whole, -1, root), PART: np.where(is_whole[:, None, None], 0.0, part)}
+    F = gradient(places["corners"], places["reference"], beyond.shape[1] > part.shape[1]) @ beyond
+    return replace(points, id=id, **places, x=centroids(places["corners"]), F=F, data={**points.data, **data})
 
 
 def halved_faces(
@@ -216,7 +221,7 @@ def halved_faces(
     faces: the same data (n, ...) of the points; reference (2n, 4, 2), m: reference corners of the halves.
     """
     parent, area, ends = (np.concatenate([of, of]) for of in faces)
-    n, along = len(faces[0]), [2 * (1 - axis), 2 * (1 - axis) + 1]
+    n, along = len(faces[0]), np.array([0, 1]) + 2 * (1 - axis)
     inner = (np.arange(2 * n) < n).astype(int) + 2 * axis  # the face between both halves
     parent[np.arange(2 * n), inner] = -1
     middle = faces[2][:, along].mean(axis=2)
@@ -234,10 +239,10 @@ def halved_faces(
 
 def joined_faces(lower: Sequence[NDArray], upper: Sequence[NDArray], axis: int) -> dict[str, NDArray]:
     """Return `PARENT`, `AREA` and `ENDS` of merged points (n, ...) in 2D, from those of their halves."""
-    (parent, area, ends), end = (of.copy() for of in lower), 2 * axis + 1
-    for of, values in zip((parent, area, ends), upper, strict=True):
+    along, end = np.array([0, 1]) + 2 * (1 - axis), 2 * axis + 1
+    out = dict(zip((PARENT, AREA, ENDS), (of.copy() for of in lower), strict=True))
+    for of, values in zip(out.values(), upper, strict=True):
         of[:, end] = values[:, end]
-    for face in (2 * (1 - axis), 2 * (1 - axis) + 1):
-        area[:, face] += upper[1][:, face]
-        ends[:, face, 1] = upper[2][:, face, 1]
-    return {PARENT: parent, AREA: area, ENDS: ends}
+    out[AREA][:, along] += upper[1][:, along]
+    out[ENDS][:, along, 1] = upper[2][:, along, 1]
+    return out

@@ -133,7 +133,7 @@ class Lattice:
         if self._count is None:
             return np.zeros_like(d)
         values = np.concatenate([d, crossed[:, :, None]], axis=2).reshape(-1, self._dim + 1)
-        values = np.concatenate([values, np.full((len(parts), self._dim + 1), np.inf)])  # differs from any other value
+        values = np.concatenate([values, np.full((len(parts), self._dim + 1), np.nan)])
         where = comm, tuple(np.add(self._count, 1)), np.concatenate([self.nodes(ids).ravel(), parts])
         field, layers, to_rows = _at_sites(*where, values, self._tolerance)
         del values  # as large as the corners
@@ -181,7 +181,7 @@ def _at_sites(
             sites = at[part]
             differs = np.abs(field.take(sites, axis=0) - d[part]) > tolerance
             field[sites[np.logical_or.reduce(differs.T)]] = np.nan
-    field[np.isinf(field)] = np.nan
+        field[at[np.isnan(d[:, 0])]] = np.nan
     field, home = field.reshape(-1, *shape[1:], values.shape[1]), rows[0][0]
     return field, slice(first, max(first, last - MARGIN)), lambda change: exchange.back(change.take(home, axis=0))
 

@@ -27,6 +27,7 @@ from mpm_dolfinx.base.histories import COLUMNS, Rows
 from mpm_dolfinx.base.validation import instance, line, numbers, on_disk, path, whole
 from mpm_dolfinx.conditions.acting import MOTIONS, Outcome
 from mpm_dolfinx.domains.pressure_transport import PiecePressures
+from mpm_dolfinx.domains.divided_domains import ROOT, with_parts
 from mpm_dolfinx.domains.renewed_faces import PARENT, with_faces
 from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.io.writer import WRITABLE
@@ -291,6 +292,7 @@ def _points(arrays: dict[str, NDArray], like: MaterialPoints) -> MaterialPoints:
     """Return material points from the stored arrays; raise ValueError if names or shapes do not match `like`."""
     data = _part(arrays, "data/")
     like = with_faces(like) if PARENT in data else like
+    like = with_parts(like) if ROOT in data else like
     points = MaterialPoints(**arrays, data=data)
     kinds = {**vars(like), **like.data}
     for name, rows in {**arrays, **data}.items():
@@ -305,12 +307,12 @@ def _points(arrays: dict[str, NDArray], like: MaterialPoints) -> MaterialPoints:
 def _check_ids(points: MaterialPoints, simulation: Simulation, count: int) -> None:
     """Raise ValueError if points of a file with `count` points in all do not belong to the present bodies.
 
-    Renewed points replace some seeded points; their ids are at least the number of seeded points.
+    Renewed and divided points replace seeded points; their ids are at least the number of seeded points.
     """
     lengths, present = np.array([len(body) for body in simulation.bodies]), np.asarray(simulation.state.stage.present)
     starts = np.concatenate([[0], lengths.cumsum()])
     whole = count == lengths[present].sum() and (points.id < starts[-1]).all()
-    if (points.id < 0).any() or not present[body_of(points.id, starts)].all() or not (whole or PARENT in points.data):
+    if (points.id < 0).any() or not present[body_of(points.id, starts)].all() or not (whole or {PARENT, ROOT} & set(points.data)):
         raise ValueError("points/id: points differ from the points of the bodies")
 
 

@@ -32,6 +32,8 @@ class Numerics:
     renewal
         Whether to replace particle domains of yielded soil that are longer than a cell, see `stepping/renewal.py`. It
         requires quadrature "domain", yielding dry or saturated soil in 2D, no `Contact`, and in axisymmetry no inertia.
+        On a grid with `follow`, also whether to divide and merge elastic domains, see `stepping/division.py`. This
+        requires quadrature "domain", dry or saturated soil, no `Contact` and no inertia.
     keep_volumes
         Whether yielded domains keep the volumes of their points, see `domains/kept_volumes.py`; only with "domain".
     petsc_options

@@ -33,13 +33,12 @@ from mpm_dolfinx.domains.divided_domains import (
     with_parts,
 )
 from mpm_dolfinx.domains.pressure_transport import PiecePressures, transport
-from mpm_dolfinx.domains.renewed_faces import AREA, ENDS, PARENT, with_faces
+from mpm_dolfinx.domains.renewed_faces import AREA, ENDS, PARENT, SeededFaces, with_faces
 from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.materials.fields import SceneMaterials
 from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.cutting import Pieces, edges
 from mpm_dolfinx.points.material_points import MaterialPoints
-from mpm_dolfinx.stepping.seeded_faces import SeededFaces
 from mpm_dolfinx.stepping.state import State
 
 
@@ -75,7 +74,7 @@ class Division:
         """Return the edge lengths (n, d) of the domains in cells: now, and of their seeded domains at seeding."""
         grid, root = self._grid, roots(points)[0]
         now = np.linalg.norm(edges(grid.in_cells(points.corners)), axis=1)
-        seeded = np.empty(now.shape)
+        seeded = np.full(now.shape, np.nan)  # renewed domains have no seeded size
         starts = self._identifiers.starts
         body = starts.searchsorted(root, side="right") - 1
         for i in np.unique(body[root < starts[-1]]):
@@ -95,7 +94,7 @@ class Division:
             key, number = self._faces.signatures(state.stage.faces)
             faces = self._faces.of(points)
             free[faces.point[number[np.searchsorted(key, faces.key)] < 0]] = False
-            return free & ~self._faces.needed(state.stage, points)
+            return free & ~self._faces.needed(state.stage.lasting, points)
         return free & ~self._outside(points)
 
     def _outside(self, points: MaterialPoints) -> NDArray[np.bool_]:
@@ -117,10 +116,10 @@ class Division:
     def _on_faces(self, points: MaterialPoints) -> tuple[NDArray, NDArray, NDArray]:
         """Return `PARENT`, `AREA` and `ENDS` (n, 4, ...) of all points, including seeded domains."""
         faces, n = self._faces.of(points), len(points)
-        parent, area, ends = np.full((n, 4), -1), np.zeros((n, 4)), np.zeros((n, 4, 2, 2))
-        at = faces.point, faces.face
-        parent[at], area[at], ends[at] = faces.key, faces.area, faces.ends
-        return parent, area, ends
+        out = np.full((n, 4), -1), np.zeros((n, 4)), np.zeros((n, 4, 2, 2))
+        for rows, of in zip(out, (faces.key, faces.area, faces.ends), strict=True):
+            rows[faces.point, faces.face] = of
+        return out
 
     # ---- division -------------------------------------------------------------------------------
 

@@ -35,14 +35,13 @@ from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.domains.divided_domains import PART, ROOT, is_part
 from mpm_dolfinx.domains.pressure_transport import PiecePressures, at_start, transport
 from mpm_dolfinx.domains.refilled_cells import New, RefilledCells, misshapen
-from mpm_dolfinx.domains.renewed_faces import AREA, ENDS, PARENT, with_faces
+from mpm_dolfinx.domains.renewed_faces import AREA, ENDS, PARENT, SeededFaces, with_faces
 from mpm_dolfinx.dynamics.renewed_velocities import MOTION, centred, velocities
 from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.materials.fields import SceneMaterials
 from mpm_dolfinx.parallel.exchange import first, over_all
 from mpm_dolfinx.points.cutting import centroids, domain_volumes
 from mpm_dolfinx.points.material_points import ACROSS, MaterialPoints, body_of, in_space, unstretched
-from mpm_dolfinx.stepping.seeded_faces import SeededFaces
 from mpm_dolfinx.stepping.state import State, Stay
 
 LONGEST = 1.0
@@ -76,7 +75,7 @@ class Renewal:
 
     def _free(self, state: State) -> NDArray[np.bool_]:
         """Return a mask (n,) of `flowed` points without probes, kept pieces, or faces that conditions need."""
-        free = self.flowed(state.points) & ~self._faces.needed(state.stage, state.points)
+        free = self.flowed(state.points) & ~self._faces.needed(state.stage.lasting, state.points)
         if state.watched is not None:
             free &= ~np.isin(state.points.id, state.watched)
         return free if state.stay is None else free & ~state.stay.keeps

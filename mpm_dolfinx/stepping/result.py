@@ -38,9 +38,9 @@ class Result:
     rederived
         Number of inverted domains that were re-initialised from F.
     renewed
-        Number of renewed domains of yielded soil.
+        Number of particle domains replaced by renewal, division or merging.
     renewals
-        Number of resets of the grid with renewal.
+        Number of resets of the grid with such replacements.
     balance
         Largest relative error of the fluid mass balance so far.
     residual

@@ -140,6 +140,11 @@ class Stage:
         return {name for name, one in shared if one is before.given[name] or getattr(one, "name", None) == name}
 
     @property
+    def lasting(self) -> list[Surface]:
+        """Faces whose displacement from the seeded position conditions need; their domains must not be replaced."""
+        return [*(faces for _, faces, _ in self.held), *(faces for one in self.acting for faces in one.seeded)]
+
+    @property
     def quantities(self) -> tuple[str, ...]:
         """Quantities that conditions of the package may return."""
         return QUANTITIES + OF_RAIN + MOTIONS

@@ -1,0 +1,39 @@
+# SPDX-License-Identifier: MIT
+"""Press wet soil by a disc and a load while the finest cells travel, on any number of processes; write the state."""
+
+import sys
+
+import numpy as np
+from helpers import gathered
+
+import mpm_dolfinx as mpm
+
+SOIL = mpm.Hencky(2e6, 1e6, porosity=0.4, conductivity=1e-6)
+GRAVITY = (2.0, -9.81)
+
+
+def fine_about(low, high, count, middle, width=0.15, times=6):
+    """Return lines from low to high; cells at `middle` are `times` + 1 times finer than far from it."""
+    x = np.linspace(low, high, 1601)
+    density = 1 + times * np.exp(-(((x - middle) / width) ** 2))
+    share = np.append(0.0, np.cumsum((density[1:] + density[:-1]) / 2))
+    return np.interp(np.linspace(0, 1, count + 1), share / share[-1], x)
+
+
+def pressed(renewal=True, loaded=True):
+    """Return a block under a rough disc that sinks, and under a load, in cells that travel to the right and back."""
+    lines = lambda t: [fine_about(0, 2, 18, 0.4 + 1.2 * np.sin(2 * t) ** 2), fine_about(0, 1.2, 9, 0.9, 0.2, 2)]  # noqa: E731
+    grid = mpm.Grid(lines=lines(0), follow=lines)
+    disc = mpm.Tool(mpm.Ball((1.0, 1.25), 0.25), lambda t: (0.001 * t, -0.002 * t), friction=0.3)
+    load = mpm.Pressure("top", lambda t, X: 1e4 * t * (X[:, 0] < 0.5), region=([0, 0], [0.7, 2]))
+    walls = {"left": "x", "right": "x", "bottom": "xy"}
+    acting = {"conditions": [disc, mpm.Drained("top"), *[load] * loaded], "fluid": mpm.Fluid(), "gravity": GRAVITY}
+    numerics = mpm.Numerics(renewal=renewal, tolerance=1e-11)
+    return mpm.Simulation(grid, [mpm.box(grid, [0, 0], [2, 1])], [SOIL], walls=walls, numerics=numerics, **acting)
+
+
+if __name__ == "__main__":
+    simulation = pressed()
+    result = simulation.run(2.0, 0.25, progress=False)
+    if state := gathered(simulation):
+        np.savez(sys.argv[1], **state, balance=result.balance, renewed=result.renewed)

@@ -1,0 +1,173 @@
+# SPDX-License-Identifier: MIT
+"""Elastic domains are divided where grid lines make cells finer, and merge again where cells become coarser."""
+
+from functools import partial
+
+import numpy as np
+import pytest
+from helpers import SOFT, imbalance, refused_in_one_line
+from meshes import box_mesh
+from mpi_division import GRAVITY, SOIL, fine_about, pressed
+from test_many_sizes import EXACT, KINDS
+
+import mpm_dolfinx as mpm
+from mpm_dolfinx.grid.grid import SIDES
+
+RENEWAL = mpm.Numerics(renewal=True)
+
+
+def travelling(dim, high, count, way, axisymmetric=False):
+    """Return a grid whose finest cells travel along the first axis from .2 of its length, as far as way(t)."""
+    others = [np.linspace(0, high, count // 2 + 1)] * (dim - 1)
+    lines = lambda t: [fine_about(0, high, count, high * (0.2 + way(t))), *others]  # noqa: E731
+    return mpm.Grid(lines=lines(0), follow=lines, axisymmetric=axisymmetric)
+
+
+def there_and_back(t):
+    """Return .6 after 3 s, and 0 from 6 s on."""
+    return 0.2 * max(0, 3 - abs(t - 3))
+
+
+@pytest.mark.parametrize("dim, axisymmetric", KINDS)
+def test_even_stresses_are_exact_and_seeded_domains_come_back(dim, axisymmetric):
+    grid = travelling(dim, 1.3, 8 if dim == 3 else 16, there_and_back, axisymmetric)
+    body = mpm.box(grid, [0] * dim, [1.3, 1.01, 0.97][:dim])
+    walls = {"left": "x", "bottom": "y"} if dim == 2 else {"left": "x", "front": "y", "bottom": "z"}
+    loads = [mpm.Pressure(side, lambda t: 2e5 * t) for side in ["right", "top", "back"][:dim]]
+    numerics = mpm.Numerics(renewal=True, tolerance=EXACT.tolerance)
+    s = mpm.Simulation(grid, [body], [mpm.NeoHookean(2e6, 1e6)], walls=walls, conditions=loads, numerics=numerics)
+    seeded, counts = s.points, []
+    for _ in range(6 if dim == 3 else 8):
+        result = s.run(s.t + 1.0, 1.0, progress=False)
+        counts.append(len(s.points))
+        stress, points = s.effective_stress(), s.points
+        assert np.abs(stress - stress.mean(axis=0)).max() < 1e-10 * np.abs(stress).max()
+        assert points.volume0.sum() == pytest.approx(seeded.volume0.sum(), rel=1e-13)
+    print(counts, result.renewed)
+    assert any(count != len(seeded) for count in counts)
+    again = np.isin(seeded.id, s.points.id)
+    at, of = s.points.find(seeded.id[again])
+    assert again.mean() > 0.1 and np.abs(s.points.reference[of] - seeded.reference[again][at]).max() < 1e-15
+
+
+@pytest.mark.parametrize("dim, axisymmetric", KINDS)
+def test_sealed_soil_keeps_its_water(dim, axisymmetric):
+    """Under pressures that vary from point to point, with a compressible fluid."""
+    grid = travelling(dim, 1.3, 8 if dim == 3 else 16, there_and_back, axisymmetric)
+    walls = dict.fromkeys(SIDES[dim], "xyz"[:dim])
+    acting = {"pressure": lambda x: 1e5 * np.sin(3 * x[:, 0]) * x[:, 1], "fluid": mpm.Fluid(bulk=1e6), "walls": walls}
+    body = mpm.box(grid, [0] * dim, [1.3] * dim)
+    s = mpm.Simulation(grid, [body], [mpm.Hencky(1e6, 4e5, porosity=0.4)], **acting, numerics=RENEWAL)
+    held, count = [], 0
+    for _ in range(6):
+        count += s.step(1.0).renewed
+        held.append(s.cells().water.sum())
+    assert count > 500 and np.ptp(held) < 1e-12 * held[0]
+
+
+@pytest.mark.parametrize("dim, axisymmetric", KINDS)
+def test_linear_pressures_are_exact(dim, axisymmetric):
+    """In steady flow with gravity, through a rigid block that ends within cells."""
+    grid, g = travelling(dim, 1.3, 8 if dim == 3 else 16, lambda t: there_and_back(t / 1e3), axisymmetric), [0.0] * dim
+    g[-1] = -9.81
+    slope = np.array([0.0 if axisymmetric else 3e3, -2e3, 1e3])[:dim]
+    rock = mpm.Hencky(bulk=1e15, shear=1e15, porosity=0.4, conductivity=1e-4)
+    names = ["bottom", "top"] if axisymmetric else list(SIDES[dim])
+    drained = [mpm.Drained(name, lambda x: 1e4 + x @ slope) for name in names]
+    hold = dict.fromkeys(("left", "bottom", "front")[: dim if dim == 3 else 2], "xyz"[:dim])
+    options = {"walls": hold, "fluid": mpm.Fluid(bulk=np.inf), "gravity": g, "conditions": drained}
+    numerics = mpm.Numerics(renewal=True, tolerance=EXACT.tolerance)
+    s = mpm.Simulation(grid, [mpm.box(grid, [0] * dim, [1.25] * dim)], [rock], **options, numerics=numerics)
+    result = s.run(7e3, 1e3, progress=False)
+    cells = s.cells()
+    assert result.renewed > 20 and result.balance < 1e-8
+    assert np.abs(cells.pressure - 1e4 - cells.x @ slope).max() < 1e-10 * 2e4
+
+
+LAYER = mpm.Hencky(2e6, 1e6, porosity=0.4, conductivity=1e-7)
+CENTRE = partial(np.interp, xp=[0, 1], fp=[0.6, 3.4])
+
+
+def under_a_load_that_travels(numerics, fixed=False, fluid=None):
+    """Return a layer under a pressure that travels, in cells that are fine under it; or fine everywhere."""
+    y, follow = fine_about(0, 1.25, 14, 1.0, 0.25, 3), lambda t: [fine_about(0, 4, 40, CENTRE(t + 1 / 8), 0.3), y]
+    lines = [np.linspace(0, 4, 161), y] if fixed else follow(0)
+    grid = mpm.Grid(lines=lines, **({} if fixed else {"follow": follow}))
+    load = mpm.Pressure("top", lambda t, X: 4e5 * np.exp(-(((X[:, 0] - CENTRE(t)) / 0.1) ** 4)))
+    walls = {"left": "x", "right": "x", "bottom": "xy"}
+    body = mpm.box(grid, [0, 0], [4, 1])
+    return mpm.Simulation(grid, [body], [LAYER], walls=walls, conditions=[load], numerics=numerics, fluid=fluid)
+
+
+@pytest.mark.parametrize("fluid", [None, mpm.Fluid(bulk=1e8)], ids=["dry", "wet"])
+def test_division_carries_the_accuracy_of_fine_cells_along(fluid):
+    """Means of displacement, stress and pressure under the load, against cells that are fine everywhere."""
+    errors, means = [], []
+    for fixed, numerics in ((True, mpm.Numerics()), (False, mpm.Numerics()), (False, RENEWAL)):
+        s, found = under_a_load_that_travels(numerics, fixed, fluid), []
+        for k in range(8):
+            s.run((k + 1) / 8, 1 / 8, progress=False)
+            p, X = s.points, s.points.origin.mean(axis=1)
+            weight = p.volume0 * ((np.abs(X[:, 0] - CENTRE(s.t)) < 0.08) & (X[:, 1] > 0.75))
+            found.append(weight @ np.stack([p.displacement[:, 1], s.effective_stress()[:, 1, 1], p.pressure]).T)
+            found[-1] /= weight.sum()
+        means.append(np.array(found))
+        errors.append(np.linalg.norm(means[-1] - means[0], axis=0) / (np.linalg.norm(means[0], axis=0) + 1e-9))
+        print(errors[-1], len(p))
+    assert (errors[2] < 0.04).all() and (errors[2][:2] < 0.4 * errors[1][:2]).all()
+
+
+def test_forces_and_fluid_are_in_balance():
+    """In each step, below a rough disc that turns and sinks into the soil."""
+    s, replaced = pressed(loaded=False), 0
+    for _ in range(8):
+        report = s.step(0.25)
+        replaced += report.renewed
+        assert report.balance < 1e-10 and imbalance(s, s.scene.last[0].cut.points, SOIL, GRAVITY) < 1e-9
+    assert replaced > 1000 and s.tool_forces["tool"][1] < -1e3
+
+
+def test_a_run_goes_on_with_the_same_bits(tmp_path):
+    ends, file = [], tmp_path / "kept"
+    for parts in (1, 2):
+        s, again = pressed(), pressed()
+        result = s.run(1.0, 0.25, progress=False, checkpoint=mpm.Checkpoint(file))
+        if parts == 2:
+            s, result = again, mpm.resume(again, file)
+        assert s.run(2.0, 0.25, progress=False, after=result).renewed > 1000
+        ends.append(s.points)
+    assert all((one == other).all() for one, other in zip(*(points.arrays for points in ends), strict=True))
+
+
+def test_domains_of_a_mesh_are_divided_and_merge_again():
+    """Down to seeded domains only: those of a mesh have no lattice."""
+    grid = travelling(2, 1.3, 16, there_and_back)
+    body = mpm.from_mesh(grid, box_mesh("triangle", (4, 3), [0, 0], [1.3, 1.0]))
+    load, walls = mpm.Pressure("top", lambda t: 1e5 * t), {"left": "x", "right": "x", "bottom": "y"}
+    s = mpm.Simulation(grid, [body], [mpm.NeoHookean(2e6, 1e6)], walls=walls, conditions=[load], numerics=RENEWAL)
+    counts = []
+    for _ in range(7):
+        s.step(1.0)
+        counts.append(len(s.points))
+        stress = s.effective_stress()
+        assert np.abs(stress - stress.mean(axis=0)).max() < 1e-7 * np.abs(stress).max()
+    print(counts)
+    assert min(counts) >= counts[0] == len(body) < max(counts)
+
+
+def refused(grid, **more):
+    """Make a scene with renewal on a grid."""
+    options = {"numerics": RENEWAL, **more}
+    mpm.Simulation(grid, [mpm.box(grid, [0, 0], [1, 1])], [SOFT], walls={"bottom": "xy"}, **options)
+
+
+@pytest.mark.parametrize(
+    "make, value",
+    [
+        (lambda: refused(mpm.Grid([0, 0], [1, 1], [4, 4])), "no soil that yields"),
+        (lambda: refused(travelling(2, 1.0, 8, np.sin), inertia=True), "inertia"),
+        (lambda: refused(travelling(2, 1.0, 8, np.sin), numerics=mpm.Numerics("point", renewal=True)), "point"),
+    ],
+)
+def test_scenes_that_cannot_be_divided_are_refused_in_one_line(make, value):
+    refused_in_one_line(make, "Numerics(renewal=True)", value, None, 300)
