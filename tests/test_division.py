@@ -8,6 +8,7 @@ import pytest
 from helpers import SOFT, imbalance, refused_in_one_line
 from meshes import box_mesh
 from mpi_division import GRAVITY, SOIL, fine_about, pressed
+from scipy.spatial import cKDTree
 from test_many_sizes import EXACT, KINDS
 
 import mpm_dolfinx as mpm
@@ -153,6 +154,39 @@ def test_domains_of_a_mesh_are_divided_and_merge_again():
         assert np.abs(stress - stress.mean(axis=0)).max() < 1e-7 * np.abs(stress).max()
     print(counts)
     assert min(counts) >= counts[0] == len(body) < max(counts)
+
+
+def in_a_frame(frame):
+    """Return a block with odd numbers of rows, as it is, mirrored, or with its axes exchanged, and its true positions."""
+    to = {"mirrored": lambda x: x * [-1, 1] + [1.7, 0], "exchanged": lambda x: x[:, ::-1]}.get(frame, lambda x: x)
+
+    def lines(t):
+        a = fine_about(0, 1.7, 17, 0.4 + 0.9 * np.sin(2 * t) ** 2)
+        b = fine_about(0, 1.3, 10, 0.5 + 0.4 * np.sin(3 * t) ** 2, 0.2, 3)
+        return [b, a] if frame == "exchanged" else [1.7 - a[::-1] if frame == "mirrored" else a, b]
+
+    top, left, bottom = {"mirrored": ("top", "right", "bottom"), "exchanged": ("right", "bottom", "left")}.get(
+        frame, ("top", "left", "bottom")
+    )
+    walls = {left: "y", bottom: "xy"} if frame == "exchanged" else {left: "x", bottom: "xy"}
+    load = mpm.Pressure(top, lambda t, X: 3e4 * t * np.exp(-(((to(X)[:, 0] - 0.6) / 0.2) ** 2)))
+    gravity = to(np.array([[2.0, -9.81]]))[0] - to(np.zeros((1, 2)))[0]
+    grid, ends = mpm.Grid(lines=lines(0), follow=lines), to(np.array([[0.0, 0.0], [1.45, 0.95]]))
+    body = mpm.box(grid, ends.min(axis=0), ends.max(axis=0))
+    acting = {"conditions": [load, mpm.Drained(top)], "walls": walls, "gravity": gravity, "fluid": mpm.Fluid()}
+    return mpm.Simulation(grid, [body], [SOIL], numerics=mpm.Numerics(renewal=True, tolerance=1e-12), **acting), to
+
+
+@pytest.mark.parametrize("frame", ["mirrored", "exchanged"])
+def test_the_frame_changes_nothing(frame):
+    (one, _), (other, to) = in_a_frame(""), in_a_frame(frame)
+    assert all(count % 2 for count in one.bodies[0].lattice)
+    for _ in range(5):
+        counts = [s.step(0.25).renewed for s in (one, other)]
+        assert counts[0] == counts[1]
+    far, at = cKDTree(one.points.x).query(to(other.points.x))
+    assert len(one.points) == len(other.points) and far.max() < 1e-11
+    assert other.points.pressure == pytest.approx(one.points.pressure[at], abs=1e-8 * one.points.pressure.max())
 
 
 def refused(grid, **more):

@@ -112,6 +112,19 @@ class Identifiers:
         return out
 
 
+    def from_middle(self, places: NDArray[np.int64], axis: int) -> NDArray[np.float64]:
+        """Return the index (n,) of rows of the lattice along an axis, from the middle of the body.
+
+        Pairs of rows are then the same in a mirrored scene. The middle one of an odd number of rows has no pair: nan, as
+        domains without lattice.
+        """
+        out = np.full(len(places), np.nan)
+        for i in np.unique(places[places[:, 0] >= 0, 0]):
+            at, count = places[:, 0] == i, self._bodies[i].lattice[axis]
+            twice = 2 * places[at, 1 + axis] + 1 - count
+            out[at] = np.where(twice > 0, np.ceil(twice / 2) - 1, np.where(twice < 0, np.floor(twice / 2), np.nan))
+        return out
+
     def middle(self, root: NDArray[np.int64], part: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
         """Return the local coordinates (n,), in (0, 1), of the middles of intervals along an axis.
 

@@ -198,14 +198,17 @@ class Division:
     def _intervals(self, points: MaterialPoints, axis: int) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """Return a row (n, k) for each part that is equal for two halves, and which points are upper halves (n,).
 
-        Halves that have no other half, because a domain is not on a lattice, have unique rows.
+        Domains that have no other half have rows with nan.
         """
         root, part = roots(points)
         place, size = self._identifiers.places(root), np.ptp(part, axis=2)
-        lower = (place[:, 1:] + part[..., 0]) / size
+        lower = place[:, 1:] + part[..., 0]
+        outside = size[:, axis] >= 1
+        lower[outside, axis] = self._identifiers.from_middle(place[outside], axis)
+        lower /= size
         pair = np.floor(lower[:, axis] / 2)
         upper = lower[:, axis] != 2 * pair
-        lower[:, axis] = np.where((place[:, 0] < 0) & (size[:, axis] >= 1), -1 - upper, pair)
+        lower[:, axis] = pair
         return np.concatenate([place[:, :1], lower, size], axis=1), upper
 
     def _joined(self, state: State, axis: int) -> tuple[State, int]:
