@@ -17,6 +17,7 @@ from test_many_sizes import at_random
 from test_mpi import mpirun
 
 import mpm_dolfinx as mpm
+from mpm_dolfinx.domains.renewed_faces import SeededFaces
 from mpm_dolfinx.mechanics.inertia import velocity_gradients
 from mpm_dolfinx.points.cutting import cut, domain_volumes, volumes
 from mpm_dolfinx.points.polygons import Polygons
@@ -54,14 +55,14 @@ def yielded(s, strain, hardened=0.0):
 def renewed(s, points, monkeypatch, longest=1e-3):
     """Return the points with domains renewed that are longer than so many cells, and how many were."""
     monkeypatch.setattr(renewal, "LONGEST", longest)
-    own = renewal.Renewal(s.bodies, s.scene.materials)
+    own = renewal.Renewal(SeededFaces(s.grid, s.bodies), s.scene.materials)
     state, count = own.renewed(replace(s.state, points=points))
     return state.points, count
 
 
 def strain_of(s, points):
     """Return the elastic strains (n, 3, 3)."""
-    own = renewal.Renewal(s.bodies, s.scene.materials)
+    own = renewal.Renewal(SeededFaces(s.grid, s.bodies), s.scene.materials)
     return renewal._of_tensors(np.log, own._elastic(points, np.arange(len(points)))) / 2
 
 
@@ -85,7 +86,7 @@ def test_masses_volumes_region_and_surface_stay(monkeypatch, hole, uneven, given
     assert volumes(new.corners).min() > 0
     before, after = (domain_volumes(points.corners, s.grid.axisymmetric).sum() for points in (old, new))
     assert after == pytest.approx(before, rel=1e-4)
-    own = renewal.Renewal(s.bodies, s.scene.materials)
+    own = renewal.Renewal(SeededFaces(s.grid, s.bodies), s.scene.materials)
     before, after = (own._faces.of(points) for points in (old, new))
     total = [faces.area.sum() for faces in (before, after)]
     assert total[1] == pytest.approx(total[0], rel=1e-6 if uneven else 1e-12)  # near corners merge

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Parts of seeded domains, after division and merging: intervals of seeded domains, identifiers, corners and faces.
 
-A part is the image of a box [a, b] under the bilinear or trilinear map of its domain, in the reference configuration and
-in the deformed one. Coordinates count seeded domains: a whole domain is the interval [0, 1] along each axis. Intervals
-are dyadic: a division bisects an interval, and two parts merge if they are the halves of one interval. On the lattice
-of a box, whole domains merge as well, to [0, 2], [0, 4], and so on.
+A part is the image of a box [a, b] under the bilinear or trilinear map of its domain, in the reference configuration
+and in the deformed one. Coordinates count seeded domains: a whole domain is the interval [0, 1] along each axis.
+Intervals are dyadic: a division bisects an interval, and two parts merge if they are the halves of one interval. On the
+lattice of a box, whole domains merge as well, to [0, 2], [0, 4], and so on.
 """
 
 from __future__ import annotations
@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.domains.domain_gradient import gradient
-from mpm_dolfinx.domains.renewed_faces import AREA, ENDS, PARENT
-from mpm_dolfinx.grid.grid import FACES, corner_bits
-from mpm_dolfinx.points.cutting import centroids, domain_volumes
+from mpm_dolfinx.grid.grid import FACES, Grid, corner_bits, sum_by
+from mpm_dolfinx.points.cutting import centroids, domain_volumes, edges
 from mpm_dolfinx.points.material_points import MaterialPoints
 
 ROOT = "seeded domain"
@@ -112,11 +111,24 @@ class Identifiers:
         return out
 
 
+    def sizes(self, grid: Grid, points: MaterialPoints) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the edge lengths (n, d) of domains in cells: now, and of their seeded domains at seeding."""
+        root = roots(points)[0]
+        now = np.linalg.norm(edges(grid.in_cells(points.corners)), axis=1)
+        seeded = np.full(now.shape, np.nan)  # of renewed domains
+        body = self.starts.searchsorted(root, side="right") - 1
+        for i in np.unique(body[root < self.starts[-1]]):
+            at = body == i
+            x = self._bodies[i].corners(root[at] - self.starts[i]) - grid.base
+            place = [np.interp(x[..., a], lines, np.arange(len(lines))) for a, lines in enumerate(grid.seeded)]
+            seeded[at] = np.linalg.norm(edges(np.stack(place, axis=-1)), axis=1)
+        return now, seeded
+
     def from_middle(self, places: NDArray[np.int64], axis: int) -> NDArray[np.float64]:
         """Return the index (n,) of rows of the lattice along an axis, from the middle of the body.
 
-        Pairs of rows are then the same in a mirrored scene. The middle one of an odd number of rows has no pair: nan, as
-        domains without lattice.
+        Pairs of rows are then the same in a mirrored scene. The result is nan without a pair: in the middle of an odd
+        number of rows, and for domains that are not on a lattice.
         """
         out = np.full(len(places), np.nan)
         for i in np.unique(places[places[:, 0] >= 0, 0]):
@@ -134,7 +146,8 @@ class Identifiers:
         body = self.starts.searchsorted(root, side="right") - 1
         for i in np.unique(body[size > 1]):
             at = ((body == i) & (size > 1)).nonzero()[0]
-            row, one, step = root[at] - self.starts[i], self._bodies[i], np.zeros((len(at), self._dim), dtype=np.int64)
+            row, one = root[at] - self.starts[i], self._bodies[i]
+            step = np.zeros((len(at), self._dim), dtype=np.int64)
             step[:, axis] = size[at] // 2
             first, half = (one.lower_of(rows)[:, axis] for rows in (row, one.neighbour(row, step)))
             step[:, axis] = size[at] - 1
@@ -149,7 +162,7 @@ def whole(part: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 
 def halves(corners: NDArray[np.float64], axis: int, middle: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the corners (2, n, 2^d, d) of both parts of domains (n, 2^d, d), divided at `middle` (n,) along an axis."""
+    """Return the corners (2, n, 2^d, d) of both parts of domains (n, 2^d, d), divided at `middle` (n,) of an axis."""
     low, high = FACES[corners.shape[2]][2 * axis : 2 * axis + 2]
     t = middle[:, None, None]
     out = np.stack([corners, corners])
@@ -223,39 +236,13 @@ def _placed(
     return replace(points, id=id, **places, x=centroids(places["corners"]), F=F, data={**points.data, **data})
 
 
-def halved_faces(
-    faces: tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]],
-    reference: NDArray[np.float64],
-    axis: int,
-    axisymmetric: bool,
-) -> dict[str, NDArray]:
-    """Return `PARENT`, `AREA` and `ENDS` of both halves (2n, ...) of points in 2D.
+def with_defect(new: MaterialPoints, old: MaterialPoints, into: NDArray[np.int64]) -> MaterialPoints:
+    """Return new points with a volume defect such that soil and fluid fill the same volume as those of the old points.
 
-    faces: the same data (n, ...) of the points; reference (2n, 4, 2), m: reference corners of the halves.
+    into: old point of each new point, or new point of each old point, if there are fewer.
     """
-    parent, area, ends = (np.concatenate([of, of]) for of in faces)
-    n, along = len(faces[0]), np.array([0, 1]) + 2 * (1 - axis)
-    inner = (np.arange(2 * n) < n).astype(int) + 2 * axis  # the face between both halves
-    parent[np.arange(2 * n), inner] = -1
-    middle = faces[2][:, along].mean(axis=2)
-    ends[:n, along, 1] = ends[n:, along, 0] = middle
-    share = np.full((2 * n, 2), 0.5)
-    if axisymmetric:
-        at = FACES[2][along]
-        radius = reference[:, at, 0].mean(axis=2)
-        total = np.tile(radius[:n] + radius[n:], (2, 1))
-        share = np.divide(radius, total, out=share, where=total > 0)
-    area[:, along] *= share
-    none = parent < 0
-    return {PARENT: parent, AREA: np.where(none, 0.0, area), ENDS: np.where(none[..., None, None], 0.0, ends)}
-
-
-def joined_faces(lower: Sequence[NDArray], upper: Sequence[NDArray], axis: int) -> dict[str, NDArray]:
-    """Return `PARENT`, `AREA` and `ENDS` of merged points (n, ...) in 2D, from those of their halves."""
-    along, end = np.array([0, 1]) + 2 * (1 - axis), 2 * axis + 1
-    out = dict(zip((PARENT, AREA, ENDS), (of.copy() for of in lower), strict=True))
-    for of, values in zip(out.values(), upper, strict=True):
-        of[:, end] = values[:, end]
-    out[AREA][:, along] += upper[1][:, along]
-    out[ENDS][:, along, 1] = upper[2][:, along, 1]
-    return out
+    if "owed" not in new.data:
+        return new
+    fewer, more = sorted((old, new), key=len)
+    excess = sum_by(into, more.volume0 * more.J, len(fewer)) / fewer.volume0 - fewer.J
+    return replace(new, data={**new.data, "owed": new.data["owed"] + (excess[into] if more is new else -excess)})

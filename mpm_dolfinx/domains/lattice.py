@@ -133,8 +133,10 @@ class Lattice:
         if self._count is None:
             return np.zeros_like(d)
         values = np.concatenate([d, crossed[:, :, None]], axis=2).reshape(-1, self._dim + 1)
-        values = np.concatenate([values, np.full((len(parts), self._dim + 1), np.nan)])
-        where = comm, tuple(np.add(self._count, 1)), np.concatenate([self.nodes(ids).ravel(), parts])
+        number = self.nodes(ids).ravel()
+        if len(parts):
+            number, values = np.append(number, parts), np.pad(values, ((0, len(parts)), (0, 0)), constant_values=np.nan)
+        where = comm, tuple(np.add(self._count, 1)), number
         field, layers, to_rows = _at_sites(*where, values, self._tolerance)
         del values  # as large as the corners
         thirds = self._thirds and [self._thirds[0][:, layers], *self._thirds[1:]]

@@ -26,7 +26,7 @@ import numpy as np
 from dolfinx import fem
 from numpy.typing import NDArray
 
-from mpm_dolfinx.base.fluid_content import mass_potential
+from mpm_dolfinx.base.fluid_content import mass_potential, pressure_of
 from mpm_dolfinx.grid.grid import Grid, sum_by
 from mpm_dolfinx.parallel.exchange import Exchange
 from mpm_dolfinx.points.cutting import Pieces
@@ -255,3 +255,83 @@ def _limited(correction, pressure, old: PiecePressures, owner, new: Pieces) -> N
     margin = np.where(correction > 0, high[new.point] - pressure, low[new.point] - pressure)
     share = np.divide(margin, correction, out=np.ones(len(correction)), where=correction != 0)
     return np.minimum.reduceat(np.minimum(np.maximum(share, 0.0), 1.0), new_first)[new.point]
+
+
+def halved_pieces(
+    pieces: PiecePressures,
+    points: tuple[MaterialPoints, MaterialPoints],
+    into: NDArray[np.int64],
+    storage: tuple[NDArray[np.float64], NDArray[np.float64]],
+    bulk: float,
+) -> PiecePressures:
+    """Return one piece for each new point.  Its pressure follows from the mean slope in its old point.
+
+    pieces: pieces of the old points; points: old and new points; into (m,): old point of each new point; storage:
+    storage coefficients of old and new points (n,), (m,), 1/Pa; bulk: K_w, Pa.
+    """
+    (old, new), n = points, len(points[0])
+    order = np.argsort(into, kind="stable")
+    size = new.volume0 * new.J
+    fraction = size / sum_by(into, size, n)[into]
+    cell = 1 + pieces.cell.max(initial=-1) + np.arange(len(new)) // n
+    parts = Pieces(into[order], cell[order], fraction[order], new.x[order], np.empty((len(new), 0, 2)))
+    given, of = pieces.potentials(bulk), old.id.searchsorted(pieces.id)
+    potential = np.empty(len(new))
+    potential[order] = transport(given, old, parts)
+    store = storage[1] * size
+    held = storage[0] * old.volume0 * old.J * sum_by(of, pieces.fraction * given.pressure, n)
+    pressure = pressure_of(potential + _missing(held, store, potential, into)[into], bulk)
+    slope, bounds = sum_by(of, pieces.fraction * pieces.slope.T, n).T, _outermost(pieces.bounds, of, n)
+    cell, fraction = np.full(len(new), -1), np.ones(len(new))
+    return PiecePressures(new.id, cell, fraction, pressure, new.x, slope[into], bounds[into])
+
+
+def joined_pieces(
+    pieces: PiecePressures,
+    points: tuple[MaterialPoints, MaterialPoints],
+    into: NDArray[np.int64],
+    storage: tuple[NDArray[np.float64], NDArray[np.float64]],
+    bulk: float,
+) -> PiecePressures:
+    """Return the pieces of merged points: pieces of their old points in one cell become one piece.
+
+    into (n,): new point of each old point; other parameters: see `halved_pieces`.
+    """
+    old, new = points
+    order = np.argsort(old.id)
+    of = order[np.searchsorted(old.id[order], pieces.id)]
+    given, size = pieces.potentials(bulk), old.volume0 * old.J
+    store = pieces.fraction * (storage[0] * size)[of]
+    fraction = pieces.fraction * (size / sum_by(into, size, len(new))[into])[of]
+    key = into[of] * (2 + pieces.cell.max(initial=-1)) + 1 + pieces.cell
+    _, at, piece = np.unique(key, return_index=True, return_inverse=True)
+    piece, m = piece.ravel(), len(at)
+
+    def mean(values: NDArray, weight: NDArray) -> NDArray:
+        total = sum_by(piece, weight, m)
+        return np.divide(sum_by(piece, weight * values, m), total, out=np.zeros(m), where=total > 0)
+
+    potential = mean(given.pressure, np.where(sum_by(piece, store, m)[piece] > 0, store, fraction))
+    point, share = into[of][at], sum_by(piece, fraction, m)
+    held = sum_by(into[of], store * given.pressure, len(new))
+    potential += _missing(held, share * (storage[1] * new.volume0 * new.J)[point], potential, point)[point]
+    x, slope = (np.stack([mean(c, fraction) for c in rows.T], axis=1) for rows in (pieces.x, pieces.slope))
+    pressure = pressure_of(potential, bulk)
+    bounds = _outermost(pieces.bounds, piece, m)
+    return PiecePressures(new.id[point], pieces.cell[at], share, pressure, x, slope, bounds)
+
+
+def _missing(
+    held: NDArray[np.float64], store: NDArray[np.float64], potential: NDArray[np.float64], of: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """Return the change (n,), Pa, of potentials (m,), so that rows `of` with storage (m,) contain the fluid `held`."""
+    (total, now), n = sum_by(of, np.array([store, store * potential]), len(held)), len(held)
+    return np.divide(held - now, total, out=np.zeros(n), where=total > 0)
+
+
+def _outermost(bounds: NDArray[np.float64], of: NDArray[np.int64], n: int) -> NDArray[np.float64]:
+    """Return the smallest and largest bounds (n, 2), Pa, of rows of bounds (m, 2) with indices `of` (m,)."""
+    out = np.stack([np.full(n, np.inf), np.full(n, -np.inf)], axis=1)
+    np.minimum.at(out[:, 0], of, bounds[:, 0])
+    np.maximum.at(out[:, 1], of, bounds[:, 1])
+    return out

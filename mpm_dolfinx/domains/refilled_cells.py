@@ -262,7 +262,7 @@ class RefilledCells:
         y = (bits[:, None] + bits[None]) / 2  # (4 domains, 4 corners, 2)
         of = np.repeat(cells, 4)
         local = np.tile(y, (len(cells), 1, 1))
-        return self._partial(of, local, *_no_faces(len(of)))
+        return self._partial(of, local, *no_faces(len(of)))
 
     def partial(self) -> New:
         """Return the new domains of cells that the surface crosses."""
@@ -272,7 +272,7 @@ class RefilledCells:
         whole = sum_by(parts.cell, self._seeded(parts.row, parts.t), self.cells)
         rows, local, surface = self.region.quadrilaterals(self.chosen)
         cells = self.region.cells[rows]
-        parent, area, ends = _no_faces(len(cells))
+        parent, area, ends = no_faces(len(cells))
         at, face = np.nonzero(surface)
         lower, upper = (local[at, FACES[2][face, k]] for k in (0, 1))
         key, X = self._nearest(parts, order, cells[at], lower, upper)
@@ -399,7 +399,7 @@ class RefilledCells:
         left, number = np.unique(piece, return_inverse=True)
         corners = np.empty_like(quads)
         corners[:, RING] = quads
-        parent, area, ends = _no_faces(len(quads))
+        parent, area, ends = no_faces(len(quads))
         for k in range(4):
             at = np.flatnonzero(edge[:, k] != NONE)
             row, face = index[pieces.point[piece[at]], edge[at, k]], SIDE[k]
@@ -496,7 +496,7 @@ class RefilledCells:
         return out.reshape(len(corners), *values.shape[1:])
 
 
-def _no_faces(n: int) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+def no_faces(n: int) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
     """Return keys, seeded areas and ends of faces for n domains without faces on the surface."""
     return np.full((n, 4), NONE), np.zeros((n, 4)), np.zeros((n, 4, 2, 2))
 

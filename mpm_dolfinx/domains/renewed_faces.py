@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from mpm_dolfinx.base.tolerances import SAME
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.bodies.faces import Surface
-from mpm_dolfinx.domains.refilled_cells import OuterFaces, ring_lengths
+from mpm_dolfinx.domains.refilled_cells import OuterFaces, no_faces, ring_lengths
 from mpm_dolfinx.grid.grid import FACES, Grid
 from mpm_dolfinx.points.material_points import MaterialPoints
 
@@ -21,6 +21,10 @@ PARENT = "renewed faces"
 AREA = "renewed areas"
 ENDS = "renewed ends"
 """Names of data of a point's faces: seeded face's key, or -1 (PARENT); seeded area, m^(d-1); reference ends, m."""
+
+
+NONE = -1, 0.0, 0.0
+"""Values of these data without a seeded face."""
 
 
 def keys(point: NDArray[np.int64], face: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -33,8 +37,7 @@ def with_faces(points: MaterialPoints) -> MaterialPoints:
     if PARENT in points.data:
         return points
     n = len(points)
-    none = {PARENT: np.full((n, 4), -1), AREA: np.zeros((n, 4)), ENDS: np.zeros((n, 4, 2, 2))}
-    return replace(points, data={**points.data, **none})
+    return replace(points, data={**points.data, **dict(zip((PARENT, AREA, ENDS), no_faces(n), strict=True))})
 
 
 class SeededFaces:
@@ -44,14 +47,15 @@ class SeededFaces:
     """
 
     def __init__(self, grid: Grid, bodies: Sequence[Body]):
-        self._grid, self._bodies = grid, bodies
+        self.bodies = bodies
+        self._grid = grid
 
     @cached_property
     def seeded(self) -> OuterFaces:
         """All outer faces of the bodies as seeded, ordered by key."""
         found = []
-        starts = np.cumsum([0, *map(len, self._bodies)])
-        for start, body in zip(starts, self._bodies, strict=False):
+        starts = np.cumsum([0, *map(len, self.bodies)])
+        for start, body in zip(starts, self.bodies, strict=False):
             row, face = body.outer()
             at = FACES[2][face]
             X, x = (np.take_along_axis(of(row), at[:, :, None], axis=1) for of in (body.reference, body.corners))
@@ -70,6 +74,13 @@ class SeededFaces:
             at, face = np.nonzero(points.data[PARENT] >= 0)
             columns.append((at, face, *(points.data[name][at, face] for name in (PARENT, AREA, ENDS))))
         return OuterFaces(*map(np.concatenate, zip(*columns, strict=True)))
+
+    def data_of(self, points: MaterialPoints) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+        """Return `PARENT`, `AREA` and `ENDS` (n, 4, ...) of all points, including seeded domains."""
+        faces, out = self.of(points), no_faces(len(points))
+        for rows, of in zip(out, (faces.key, faces.area, faces.ends), strict=True):
+            rows[faces.point, faces.face] = of
+        return out
 
     def needed(self, surfaces: Sequence[Surface], points: MaterialPoints) -> NDArray[np.bool_]:
         """Return a mask (n,) of points with faces on any of the surfaces."""
@@ -92,6 +103,51 @@ class SeededFaces:
             barred[at[ok & ~whole]] = True
         number = np.unique(kind, axis=0, return_inverse=True)[1].ravel() if len(surfaces) else np.zeros(len(key), int)
         return key, np.where(barred, -1, number)
+
+
+def halved_faces(
+    faces: tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]],
+    reference: NDArray[np.float64],
+    axis: int,
+    axisymmetric: bool,
+) -> dict[str, NDArray]:
+    """Return `PARENT`, `AREA` and `ENDS` of both halves (2n, ...) of points in 2D.
+
+    faces: the same data (n, ...) of the points; reference (2n, 4, 2), m: reference corners of the halves.
+    """
+    parent, area, ends = (np.concatenate([of, of]) for of in faces)
+    n, along = len(faces[0]), np.array([0, 1]) + 2 * (1 - axis)
+    inner = (np.arange(2 * n) < n).astype(int) + 2 * axis  # the face between both halves
+    parent[np.arange(2 * n), inner] = -1
+    middle = faces[2][:, along].mean(axis=2)
+    ends[:n, along, 1] = ends[n:, along, 0] = middle
+    share = np.full((2 * n, 2), 0.5)
+    if axisymmetric:
+        at = FACES[2][along]
+        radius = reference[:, at, 0].mean(axis=2)
+        total = np.tile(radius[:n] + radius[n:], (2, 1))
+        share = np.divide(radius, total, out=share, where=total > 0)
+    area[:, along] *= share
+    none = parent < 0
+    return {PARENT: parent, AREA: np.where(none, 0.0, area), ENDS: np.where(none[..., None, None], 0.0, ends)}
+
+
+def joined_faces(
+    lower: Sequence[NDArray], upper: Sequence[NDArray], axis: int, seeded: NDArray[np.bool_]
+) -> dict[str, NDArray]:
+    """Return `PARENT`, `AREA` and `ENDS` of merged points (n, ...) in 2D, from those of their halves.
+
+    seeded (n,): which points are seeded domains again, without these data.
+    """
+    along, end = np.array([0, 1]) + 2 * (1 - axis), 2 * axis + 1
+    out = dict(zip((PARENT, AREA, ENDS), (of.copy() for of in lower), strict=True))
+    for of, values in zip(out.values(), upper, strict=True):
+        of[:, end] = values[:, end]
+    out[AREA][:, along] += upper[1][:, along]
+    out[ENDS][:, along, 1] = upper[2][:, along, 1]
+    for values, none in zip(out.values(), NONE, strict=True):
+        values[seeded] = none
+    return out
 
 
 @dataclass(frozen=True)

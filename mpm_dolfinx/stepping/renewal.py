@@ -21,7 +21,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import cached_property
 
 from mpi4py import MPI
 
@@ -31,7 +30,6 @@ from numpy.typing import NDArray
 from mpm_dolfinx.base.caching import Latest
 from mpm_dolfinx.base.errors import NotConverged
 from mpm_dolfinx.base.fluid_content import pressure_of
-from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.domains.divided_domains import PART, ROOT, is_part
 from mpm_dolfinx.domains.pressure_transport import PiecePressures, at_start, transport
 from mpm_dolfinx.domains.refilled_cells import New, RefilledCells, misshapen
@@ -51,15 +49,15 @@ LONGEST = 1.0
 class Renewal:
     """Renewal of the particle domains in a scene.
 
-    bodies, materials: bodies and materials of the scene.
+    faces, materials: faces of the bodies, and materials of the scene.
     """
 
-    def __init__(self, bodies: Sequence[Body], materials: SceneMaterials):
+    def __init__(self, faces: SeededFaces, materials: SceneMaterials):
         self._grid = materials.grid
-        self._bodies = bodies
-        self._starts = np.cumsum([0, *map(len, bodies)])
+        self._bodies = faces.bodies
+        self._starts = np.cumsum([0, *map(len, faces.bodies)])
         self._materials = materials
-        self._faces = SeededFaces(materials.grid, bodies)
+        self._faces = faces
         self._signs: Latest[tuple[NDArray, NDArray]] = Latest()
 
     def long(self, points: MaterialPoints) -> NDArray[np.bool_]:
