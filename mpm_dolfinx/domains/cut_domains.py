@@ -16,7 +16,7 @@ from mpm_dolfinx.base.caching import Keyed
 from mpm_dolfinx.base.tolerances import NEAR
 from mpm_dolfinx.bodies.faces import Surface, face_vectors, interpolate, on_face
 from mpm_dolfinx.domains.bending import followed
-from mpm_dolfinx.domains.renewed_faces import PARENT, RenewedFaces, renewed_faces
+from mpm_dolfinx.domains.renewed_faces import PARENT, RenewedFaces, on_parts, renewed_faces
 from mpm_dolfinx.grid.grid import TURN, Grid, sum_by
 from mpm_dolfinx.parallel.exchange import Exchange, over_all
 from mpm_dolfinx.points.cutting import Pieces, cut, cut_faces
@@ -37,10 +37,10 @@ class Patches:
     ----------
     grid
         Background grid.
-    faces
-        Faces on the surface of the bodies.
+    faces, row : (n,)
+        Faces on the surface of the bodies and on parts of their domains, and index of each point's face among these.
     face, at : (n,)
-        Index of the face in `faces`, and index of the material point.
+        Index of the face, and index of the material point.
     cell : (n,)
         Lexicographic index of the cell.
     x, xi : (n, d)
@@ -49,8 +49,11 @@ class Patches:
         Fraction of the face that the point represents.
     """
 
-    def __init__(self, grid: Grid, faces: Surface, face, at, cell, x, xi, share, renewed: RenewedFaces | None = None):
+    def __init__(
+        self, grid: Grid, faces: Surface, face, row, at, cell, x, xi, share, renewed: RenewedFaces | None = None
+    ):
         self._faces = faces
+        self._row = row
         self.face = face
         self.at = at
         self.xi = xi
@@ -58,14 +61,14 @@ class Patches:
         self.x = x
         self._grid = grid
         self._renewed = renewed
-        area0 = faces.area0[face]
-        self._whole0, self._face = faces.whole0[face], faces.face[face]
+        area0 = faces.area0[row]
+        self._whole0, self._face = faces.whole0[row], faces.face[row]
         if renewed is not None:
             area0, self._whole0, self._face = renewed.in_place_of(area0, self._whole0, self._face)
         self._share0 = share * area0
         self.base = grid.base
         """Origin of positions (d,), m, see `Grid`."""
-        around = grid.around(interpolate(faces.domain[face], xi)) if grid.axisymmetric else 1.0
+        around = grid.around(interpolate(faces.domain[row], xi)) if grid.axisymmetric else 1.0
         if renewed is not None:
             around = np.where(renewed.old, around, 1.0)  # areas of renewed faces are already areas of rings
         self.area0 = self._share0 * around
@@ -74,7 +77,7 @@ class Patches:
     @cached_property
     def X(self) -> NDArray[np.float64]:
         """Reference positions (n, d), m."""
-        X = self._faces.reference(self.face, self.xi)
+        X = self._faces.reference(self._row, self.xi)
         return X if self._renewed is None else self._renewed.reference(X, self.xi)
 
     def origin(self, points: MaterialPoints) -> NDArray[np.float64]:
@@ -200,7 +203,8 @@ class CutDomains(Keyed):
             self._patches.update(zip(new, self._cut_surfaces(new), strict=True))
         return [self._patches[faces] for faces in several]
 
-    def _cut_surfaces(self, several: Sequence[Surface]) -> list[Patches]:
+    def _cut_surfaces(self, given: Sequence[Surface]) -> list[Patches]:
+        several, origin = zip(*(on_parts(faces, self.points) for faces in given), strict=True)
         columns = ((faces.id, faces.face, faces.xi, faces.skew, np.arange(len(faces))) for faces in several)
         ids, number, xi, skew, row = map(np.concatenate, zip(*columns, strict=True))
         here, at = self.points.find(ids)
@@ -226,7 +230,7 @@ class CutDomains(Keyed):
         for k, faces in enumerate(several):
             own = (surface == k).nonzero()[0]
             anew = renewed and renewed.of(face[own] - (len(here) - len(renewed.row)))
-            out.append(Patches(self.grid, faces, *[v[own] for v in rows], anew))
+            out.append(Patches(self.grid, faces, origin[k][rows[0][own]], *[v[own] for v in rows], anew))
         return out
 
     def displacement(self, u: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -17,51 +17,28 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.domains.domain_gradient import gradient
+from mpm_dolfinx.domains.renewed_faces import PART, ROOT, roots
 from mpm_dolfinx.grid.grid import FACES, Grid, corner_bits, sum_by
 from mpm_dolfinx.points.cutting import centroids, domain_volumes, edges
 from mpm_dolfinx.points.material_points import MaterialPoints
 
-ROOT = "seeded domain"
-PART = "part of the seeded domain"
-"""Names of point data: id of the seeded domain with the lower corner of a part, or -1; ends (n, d, 2) of the part."""
 PLACES = "corners", "reference", "origin"
 """Names of the arrays of points that contain corners of domains."""
 
 
-def with_parts(points: MaterialPoints) -> MaterialPoints:
-    """Return the points with the data of parts.  Points that lack these data are whole domains, or were renewed."""
-    if ROOT in points.data:
-        return points
-    n, d = points.x.shape
-    return replace(points, data={**points.data, ROOT: np.full(n, -1), PART: np.zeros((n, d, 2))})
+class SeededDomains:
+    """Seeded domains of the bodies, and identifiers of their parts, which follow from domain and interval.
 
-
-def is_part(points: MaterialPoints) -> NDArray[np.bool_]:
-    """Return which points (n,) are parts of seeded domains, or merged seeded domains."""
-    return points.data[ROOT] >= 0 if ROOT in points.data else np.zeros(len(points), dtype=bool)
-
-
-def roots(points: MaterialPoints) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return `ROOT` (n,) and `PART` (n, d, 2) of all points; a whole domain is [0, 1] of its own."""
-    part, (n, d) = is_part(points), points.x.shape
-    if not part.any():
-        return points.id, np.broadcast_to([0.0, 1.0], (n, d, 2))
-    return np.where(part, points.data[ROOT], points.id), np.where(part[:, None, None], points.data[PART], [0.0, 1.0])
-
-
-class Identifiers:
-    """Identifiers of the parts of seeded domains, which follow from domain and interval.
-
-    They are `points.body_of` numbers with an odd index in the body; renewed points have even indices.
+    Identifiers are `points.body_of` numbers with an odd index in the body; renewed points have even indices.
 
     bodies: all bodies of the scene.
     """
 
     def __init__(self, bodies: Sequence[Body]):
         self.starts = np.cumsum([0, *map(len, bodies)])
-        self._bodies = bodies
+        self.bodies = bodies
         self._dim = bodies[0].dim
-        most = np.iinfo(np.int64).max // 4
+        most = np.iinfo(np.int64).max // 16  # for `renewed_faces.keys`, too
         self._codes = int((most // (len(bodies) * int(self.starts[-1] + 1))) ** (1 / self._dim))
 
     def known(self, part: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -75,7 +52,7 @@ class Identifiers:
             code = code * self._codes + column
         body = self.starts.searchsorted(root, side="right") - 1
         number = 2 * (root * self._codes**self._dim + code) + 1
-        return np.where(whole(part), root, self.starts[-1] + body + len(self._bodies) * number)
+        return np.where(whole(part), root, self.starts[-1] + body + len(self.bodies) * number)
 
     @staticmethod
     def _code(part: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -94,7 +71,7 @@ class Identifiers:
         body = self.starts.searchsorted(root[moved], side="right") - 1
         for i in np.unique(body):
             at = moved[body == i]
-            out[at] = self.starts[i] + self._bodies[i].neighbour(root[at] - self.starts[i], step[at])
+            out[at] = self.starts[i] + self.bodies[i].neighbour(root[at] - self.starts[i], step[at])
         return out, lower - step
 
     def places(self, root: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -102,7 +79,7 @@ class Identifiers:
         out = np.zeros((len(root), 1 + self._dim), dtype=np.int64)
         body = self.starts.searchsorted(root, side="right") - 1
         for i in np.unique(body):
-            at, one = body == i, self._bodies[i]
+            at, one = body == i, self.bodies[i]
             regular = one.lattice and one.aligned
             out[at, 0] = i if regular else -1 - root[at]
             if regular:
@@ -119,7 +96,7 @@ class Identifiers:
         body = self.starts.searchsorted(root, side="right") - 1
         for i in np.unique(body[root < self.starts[-1]]):
             at = body == i
-            x = self._bodies[i].corners(root[at] - self.starts[i]) - grid.base
+            x = self.bodies[i].corners(root[at] - self.starts[i]) - grid.base
             place = [np.interp(x[..., a], lines, np.arange(len(lines))) for a, lines in enumerate(grid.seeded)]
             seeded[at] = np.linalg.norm(edges(np.stack(place, axis=-1)), axis=1)
         return now, seeded
@@ -132,7 +109,7 @@ class Identifiers:
         """
         out = np.full(len(places), np.nan)
         for i in np.unique(places[places[:, 0] >= 0, 0]):
-            at, count = places[:, 0] == i, self._bodies[i].lattice[axis]
+            at, count = places[:, 0] == i, self.bodies[i].lattice[axis]
             twice = 2 * places[at, 1 + axis] + 1 - count
             out[at] = np.where(twice > 0, np.ceil(twice / 2) - 1, np.where(twice < 0, np.floor(twice / 2), np.nan))
         return out
@@ -146,7 +123,7 @@ class Identifiers:
         body = self.starts.searchsorted(root, side="right") - 1
         for i in np.unique(body[size > 1]):
             at = ((body == i) & (size > 1)).nonzero()[0]
-            row, one = root[at] - self.starts[i], self._bodies[i]
+            row, one = root[at] - self.starts[i], self.bodies[i]
             step = np.zeros((len(at), self._dim), dtype=np.int64)
             step[:, axis] = size[at] // 2
             first, half = (one.lower_of(rows)[:, axis] for rows in (row, one.neighbour(row, step)))
@@ -180,26 +157,26 @@ def beyond_corners(points: MaterialPoints, axisymmetric: bool) -> NDArray[np.flo
     return np.linalg.inv(gradient(points.corners, points.reference, axisymmetric)) @ points.F
 
 
-def halved(points: MaterialPoints, axis: int, identifiers: Identifiers, axisymmetric: bool) -> MaterialPoints:
+def halved(points: MaterialPoints, axis: int, domains: SeededDomains, axisymmetric: bool) -> MaterialPoints:
     """Return both halves (2n,) of each point, the lower half of all points first.
 
     Volumes at rest and in the deformed state add up to those of the point.
     """
     root, part = roots(points)
-    at, n = identifiers.middle(root, part, axis), len(points)
+    at, n = domains.middle(root, part, axis), len(points)
     places = {name: halves(getattr(points, name), axis, at).reshape(-1, *points.corners.shape[1:]) for name in PLACES}
     ends = np.concatenate([part, part])
     ends[:n, axis, 1] = ends[n:, axis, 0] = part[:, axis].mean(axis=1)
-    root, lower = identifiers.at(np.concatenate([root, root]), ends[..., 0])
+    root, lower = domains.at(np.concatenate([root, root]), ends[..., 0])
     ends = np.stack([lower, lower + np.ptp(ends, axis=2)], axis=2)
     both = points.map(lambda values: np.concatenate([values, values]))
     size = np.abs(domain_volumes(places["reference"], axisymmetric))
     both = replace(both, volume0=both.volume0 * size / np.tile(size[:n] + size[n:], 2))
-    return _placed(both, places, identifiers.of(root, ends), (root, ends), beyond_corners(both, axisymmetric))
+    return _placed(both, places, domains.of(root, ends), (root, ends), beyond_corners(both, axisymmetric))
 
 
 def joined(
-    lower: MaterialPoints, upper: MaterialPoints, axis: int, identifiers: Identifiers, axisymmetric: bool
+    lower: MaterialPoints, upper: MaterialPoints, axis: int, domains: SeededDomains, axisymmetric: bool
 ) -> MaterialPoints:
     """Return the points (n,) merged from their halves.
 
@@ -218,7 +195,7 @@ def joined(
     beyond = mean(*(beyond_corners(of, axisymmetric) for of in (lower, upper)))
     data = {name: mean(values, upper.data[name]) for name, values in lower.data.items()}
     both = replace(lower, volume0=volume0, pressure=mean(lower.pressure, upper.pressure), data=data)
-    return _placed(both, places, identifiers.of(root, part), (root, part), beyond)
+    return _placed(both, places, domains.of(root, part), (root, part), beyond)
 
 
 def _placed(

@@ -28,7 +28,8 @@ from mpm_dolfinx.base.caching import Latest
 from mpm_dolfinx.base.tolerances import NEAR
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.domains.cut_domains import CutDomains
-from mpm_dolfinx.domains.divided_domains import ROOT, Identifiers, is_part, roots
+from mpm_dolfinx.domains.divided_domains import SeededDomains
+from mpm_dolfinx.domains.renewed_faces import ROOT, is_part, roots
 from mpm_dolfinx.grid.grid import FACES, sum_by
 from mpm_dolfinx.parallel.exchange import Exchange, over_all
 from mpm_dolfinx.points.material_points import MaterialPoints, body_of, cofactor, determinant
@@ -124,7 +125,7 @@ def _faces_of_parts(
     """
     dim, part = bodies[0].dim, is_part(points)
     root, ends = roots(points)
-    places, size = Identifiers(bodies).places(root), np.ptp(ends, axis=2)
+    places, size = SeededDomains(bodies).places(root), np.ptp(ends, axis=2)
     extremes = (np.min, MPI.MIN), (np.max, MPI.MAX)
     least, most = (over_all(comm, float(of(size, initial=1.0)), op) for of, op in extremes)
     levels = int(np.log2(most / least)) + 1

@@ -32,7 +32,7 @@ from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.bodies.boxes import RowsBody
 from mpm_dolfinx.bodies.faces import Surface
 from mpm_dolfinx.bodies.touching import Faces, covers
-from mpm_dolfinx.domains.divided_domains import is_part, roots
+from mpm_dolfinx.domains.renewed_faces import is_part, roots
 from mpm_dolfinx.grid.grid import FACES, Grid, among, corner_bits, in_chunks
 from mpm_dolfinx.parallel.exchange import Exchange
 from mpm_dolfinx.points.material_points import MaterialPoints

@@ -319,7 +319,7 @@ class RefilledCells:
         if self.grid.axisymmetric:
             corners, face = self.points.corners[self.faces.point[row]], self.faces.face[row]
             r0, r1 = (corners[np.arange(len(row)), end[face], 0] for end in (START, END))
-            share = share * _ring_share(r0, r1, t.mean(axis=1))
+            share = share * ring_share(r0, r1, t.mean(axis=1))
         return self.faces.area[row] * share
 
     def _seeded_at(self, row: NDArray[np.int64], t: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -413,7 +413,7 @@ class RefilledCells:
             parent[at, face] = faces.key[row]
             part = np.abs(t[1] - t[0])
             if self.grid.axisymmetric:
-                part = part * _ring_share(low[:, 0], high[:, 0], (t[0] + t[1]) / 2)
+                part = part * ring_share(low[:, 0], high[:, 0], (t[0] + t[1]) / 2)
             area[at, face] = faces.area[row] * part
             X0, X1 = faces.ends[row].transpose(1, 0, 2)
             ends[at, face] = np.stack([X0 + s[:, None] * (X1 - X0) for s in t], axis=1)
@@ -501,7 +501,7 @@ def no_faces(n: int) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np
     return np.full((n, 4), NONE), np.zeros((n, 4)), np.zeros((n, 4, 2, 2))
 
 
-def _ring_share(r0: NDArray[np.float64], r1: NDArray[np.float64], t: NDArray[np.float64]) -> NDArray[np.float64]:
+def ring_share(r0: NDArray[np.float64], r1: NDArray[np.float64], t: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return radii (n,) at coordinates t (n,) on faces from radius r0 to r1 (n,), m, relative to the mean radius."""
     mean = (r0 + r1) / 2
     return np.divide(r0 + t * (r1 - r0), mean, out=np.ones(len(t)), where=mean > 0)

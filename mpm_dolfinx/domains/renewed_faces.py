@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx.base.tolerances import SAME
 from mpm_dolfinx.bodies.bodies import Body
-from mpm_dolfinx.bodies.faces import Surface
-from mpm_dolfinx.domains.refilled_cells import OuterFaces, no_faces, ring_lengths
-from mpm_dolfinx.grid.grid import FACES, Grid
+from mpm_dolfinx.bodies.faces import Surface, interpolate
+from mpm_dolfinx.domains.refilled_cells import OuterFaces, no_faces, ring_lengths, ring_share
+from mpm_dolfinx.grid.grid import FACES, Grid, corner_bits, ranges
 from mpm_dolfinx.points.material_points import MaterialPoints
 
 PARENT = "renewed faces"
@@ -23,8 +23,9 @@ ENDS = "renewed ends"
 """Names of data of a point's faces: seeded face's key, or -1 (PARENT); seeded area, m^(d-1); reference ends, m."""
 
 
-NONE = -1, 0.0, 0.0
-"""Values of these data without a seeded face."""
+ROOT = "seeded domain"
+PART = "part of the seeded domain"
+"""Names of point data: id of the seeded domain with the lower corner of a part, or -1; ends (n, d, 2) of the part."""
 
 
 def keys(point: NDArray[np.int64], face: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -38,6 +39,74 @@ def with_faces(points: MaterialPoints) -> MaterialPoints:
         return points
     n = len(points)
     return replace(points, data={**points.data, **dict(zip((PARENT, AREA, ENDS), no_faces(n), strict=True))})
+
+
+def with_parts(points: MaterialPoints) -> MaterialPoints:
+    """Return the points with the data of parts.  Points that lack these data are whole domains, or were renewed."""
+    if ROOT in points.data:
+        return points
+    n, d = points.x.shape
+    return replace(points, data={**points.data, ROOT: np.full(n, -1), PART: np.zeros((n, d, 2))})
+
+
+def is_part(points: MaterialPoints) -> NDArray[np.bool_]:
+    """Return which points (n,) are parts of seeded domains, or merged seeded domains."""
+    return points.data[ROOT] >= 0 if ROOT in points.data else np.zeros(len(points), dtype=bool)
+
+
+def roots(points: MaterialPoints) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return `ROOT` (n,) and `PART` (n, d, 2) of all points; a whole domain is [0, 1] of its own."""
+    part, (n, d) = is_part(points), points.x.shape
+    if not part.any():
+        return points.id, np.broadcast_to([0.0, 1.0], (n, d, 2))
+    return np.where(part, points.data[ROOT], points.id), np.where(part[:, None, None], points.data[PART], [0.0, 1.0])
+
+
+def faces_of_parts(
+    points: MaterialPoints, id: NDArray[np.int64], face: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return which parts of domains lie on faces of seeded domains.
+
+    id, face (m,): seeded domains and indices of their faces.
+
+    Returns
+    -------
+    Index of the face (n,), index of the point (n,), and lower and upper ends (n, d) of the part in its seeded domain.
+    """
+    at = is_part(points).nonzero()[0]
+    root, part = (of[at] for of in roots(points))
+    order = root.argsort(kind="stable")
+    first, stop = (np.searchsorted(root[order], id, side=side) for side in ("left", "right"))
+    row, found = ranges(first, stop - first)
+    at, part = (of[order[found]] for of in (at, part))
+    axis, end = np.divmod(face[row], 2)
+    on = (part[np.arange(len(row)), axis, end] == end) & (part <= 1).all(axis=(1, 2))
+    return row[on], at[on], part[on, :, 0], part[on, :, 1]
+
+
+def on_parts(faces: Surface, points: MaterialPoints) -> tuple[Surface, NDArray[np.int64]]:
+    """Return a surface together with its faces on parts of domains, and for each row the index of the given face.
+
+    Polygons of the surface on seeded domains are clipped to the parts; they must be rectangles in local coordinates.
+    """
+    own = np.arange(len(faces))
+    if not is_part(points).any():
+        return faces, own
+    row, at, low, high = faces_of_parts(points, faces.id, faces.face)
+    low, high = 2 * low - 1, 2 * high - 1
+    clipped = np.clip(faces.xi[row], low[:, None], high[:, None])
+    some = (np.ptp(clipped, axis=1) > 0).sum(axis=1) == clipped.shape[2] - 1
+    if not some.any():
+        return faces, own
+    row, at, low, high = (values[some] for values in (row, at, low, high))
+    size = (high - low)[:, None]
+    corners, d = low[:, None] + corner_bits(low.shape[1]) * size, low.shape[1]
+    of = {"id": points.id[at], "face": faces.face[row], "xi": 2 * (clipped[some] - low[:, None]) / size - 1}
+    for name in ("domain", "before"):
+        rows = getattr(faces, name)[row].repeat(2**d, axis=0)
+        of[name] = interpolate(rows, corners.reshape(-1, d)).reshape(corners.shape)
+    both = {name: np.concatenate([getattr(faces, name), values]) for name, values in of.items()}
+    return Surface(**both, region=faces.region), np.append(own, row)
 
 
 class SeededFaces:
@@ -73,14 +142,15 @@ class SeededFaces:
         if PARENT in points.data:
             at, face = np.nonzero(points.data[PARENT] >= 0)
             columns.append((at, face, *(points.data[name][at, face] for name in (PARENT, AREA, ENDS))))
+        if is_part(points).any():
+            row, at, low, high = faces_of_parts(points, seeded.point, seeded.face)
+            along = 1 - seeded.face[row] // 2
+            low, high = (t[np.arange(len(row)), along, None] for t in (low, high))
+            (first, last), middle = seeded.ends[row].swapaxes(0, 1), (low + high)[:, 0] / 2
+            share = (high - low)[:, 0] * (ring_share(*seeded.ends[row, :, 0].T, middle) if self._grid.axisymmetric else 1.0)
+            ends = np.stack([first + low * (last - first), first + high * (last - first)], axis=1)
+            columns.append((at, seeded.face[row], seeded.key[row], seeded.area[row] * share, ends))
         return OuterFaces(*map(np.concatenate, zip(*columns, strict=True)))
-
-    def data_of(self, points: MaterialPoints) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-        """Return `PARENT`, `AREA` and `ENDS` (n, 4, ...) of all points, including seeded domains."""
-        faces, out = self.of(points), no_faces(len(points))
-        for rows, of in zip(out, (faces.key, faces.area, faces.ends), strict=True):
-            rows[faces.point, faces.face] = of
-        return out
 
     def needed(self, surfaces: Sequence[Surface], points: MaterialPoints) -> NDArray[np.bool_]:
         """Return a mask (n,) of points with faces on any of the surfaces."""
@@ -103,51 +173,6 @@ class SeededFaces:
             barred[at[ok & ~whole]] = True
         number = np.unique(kind, axis=0, return_inverse=True)[1].ravel() if len(surfaces) else np.zeros(len(key), int)
         return key, np.where(barred, -1, number)
-
-
-def halved_faces(
-    faces: tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]],
-    reference: NDArray[np.float64],
-    axis: int,
-    axisymmetric: bool,
-) -> dict[str, NDArray]:
-    """Return `PARENT`, `AREA` and `ENDS` of both halves (2n, ...) of points in 2D.
-
-    faces: the same data (n, ...) of the points; reference (2n, 4, 2), m: reference corners of the halves.
-    """
-    parent, area, ends = (np.concatenate([of, of]) for of in faces)
-    n, along = len(faces[0]), np.array([0, 1]) + 2 * (1 - axis)
-    inner = (np.arange(2 * n) < n).astype(int) + 2 * axis  # the face between both halves
-    parent[np.arange(2 * n), inner] = -1
-    middle = faces[2][:, along].mean(axis=2)
-    ends[:n, along, 1] = ends[n:, along, 0] = middle
-    share = np.full((2 * n, 2), 0.5)
-    if axisymmetric:
-        at = FACES[2][along]
-        radius = reference[:, at, 0].mean(axis=2)
-        total = np.tile(radius[:n] + radius[n:], (2, 1))
-        share = np.divide(radius, total, out=share, where=total > 0)
-    area[:, along] *= share
-    none = parent < 0
-    return {PARENT: parent, AREA: np.where(none, 0.0, area), ENDS: np.where(none[..., None, None], 0.0, ends)}
-
-
-def joined_faces(
-    lower: Sequence[NDArray], upper: Sequence[NDArray], axis: int, seeded: NDArray[np.bool_]
-) -> dict[str, NDArray]:
-    """Return `PARENT`, `AREA` and `ENDS` of merged points (n, ...) in 2D, from those of their halves.
-
-    seeded (n,): which points are seeded domains again, without these data.
-    """
-    along, end = np.array([0, 1]) + 2 * (1 - axis), 2 * axis + 1
-    out = dict(zip((PARENT, AREA, ENDS), (of.copy() for of in lower), strict=True))
-    for of, values in zip(out.values(), upper, strict=True):
-        of[:, end] = values[:, end]
-    out[AREA][:, along] += upper[1][:, along]
-    out[ENDS][:, along, 1] = upper[2][:, along, 1]
-    for values, none in zip(out.values(), NONE, strict=True):
-        values[seeded] = none
-    return out
 
 
 @dataclass(frozen=True)

@@ -27,8 +27,7 @@ from mpm_dolfinx.base.histories import COLUMNS, Rows
 from mpm_dolfinx.base.validation import instance, line, numbers, on_disk, path, whole
 from mpm_dolfinx.conditions.acting import MOTIONS, Outcome
 from mpm_dolfinx.domains.pressure_transport import PiecePressures
-from mpm_dolfinx.domains.divided_domains import ROOT, with_parts
-from mpm_dolfinx.domains.renewed_faces import PARENT, with_faces
+from mpm_dolfinx.domains.renewed_faces import PARENT, ROOT, with_faces, with_parts
 from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.io.writer import WRITABLE
 from mpm_dolfinx.parallel.exchange import Exchange, at_root, evenly, together

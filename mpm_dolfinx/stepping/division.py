@@ -3,8 +3,7 @@
 
 A domain is bisected along a local axis if both halves then count as many cells as the domain did at seeding. Two halves
 merge if the merged domain counts as many cells as at seeding. Whole domains on a lattice inside a body merge
-too. Domains that yield, have probes, or are on sides whose displacement a condition needs, remain. In 3D this also
-applies to domains at the surface of a body.
+too. Domains that yield, have probes, or are on sides whose displacement a condition needs, remain.
 
 Corners of elastic domains determine F, so a division adds no error: both halves share the mapping of the domain. After
 merging, F follows from the outer corners. Mass, fluid, and the volume that the fluid has to fill are exact. The number
@@ -15,14 +14,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.tolerances import SAME
-from mpm_dolfinx.domains.divided_domains import Identifiers, halved, is_part, joined, roots, with_defect, with_parts
+from mpm_dolfinx.domains.divided_domains import SeededDomains, halved, joined, with_defect
 from mpm_dolfinx.domains.pressure_transport import halved_pieces, joined_pieces
-from mpm_dolfinx.domains.renewed_faces import PARENT, SeededFaces, halved_faces, joined_faces, with_faces
+from mpm_dolfinx.domains.renewed_faces import faces_of_parts, is_part, roots, with_parts
 from mpm_dolfinx.materials.fields import SceneMaterials
 from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.material_points import MaterialPoints
@@ -32,14 +32,13 @@ from mpm_dolfinx.stepping.state import State
 class Division:
     """Division and merging of the particle domains in a scene.
 
-    faces, materials: faces of the bodies, and materials of the scene.
+    domains, materials: domains of the bodies, and materials of the scene.
     """
 
-    def __init__(self, faces: SeededFaces, materials: SceneMaterials):
+    def __init__(self, domains: SeededDomains, materials: SceneMaterials):
         self._grid = materials.grid
         self._materials = materials
-        self._faces = faces
-        self._identifiers = Identifiers(faces.bodies)
+        self._domains = domains
 
     def divided(self, state: State) -> tuple[State, int]:
         """Return the state with divided and merged domains, and their number; all processes must call it."""
@@ -58,27 +57,26 @@ class Division:
 
     def _free(self, state: State) -> NDArray[np.bool_]:
         """Return a mask (n,) of elastic points that may be divided or merged."""
-        points, starts = state.points, self._identifiers.starts
-        free = ~self._materials.evolved(points) & (is_part(points) | (points.id < starts[-1]))
+        points, stage = state.points, state.stage
+        free = ~self._materials.evolved(points) & (is_part(points) | (points.id < self._domains.starts[-1]))
         if state.watched is not None:
             free &= ~np.isin(points.id, state.watched)
-        if self._grid.dim == 2:
-            key, number = self._faces.signatures(state.stage.faces)
-            faces = self._faces.of(points)
-            free[faces.point[number[np.searchsorted(key, faces.key)] < 0]] = False
-            return free & ~self._faces.needed(state.stage.lasting, points)
-        return free & ~self._outside(points)
+        triangles = [faces.id[(faces.xi[:, -1] == faces.xi[:, -2]).all(axis=1)] for faces in stage.faces]
+        fixed = np.concatenate([*(faces.id for faces in stage.lasting), *triangles, np.empty(0, dtype=np.int64)])
+        return free & ~np.isin(roots(points)[0], fixed)
+
+    @cached_property
+    def _outer(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Seeded domains and face indices of the surface of all bodies."""
+        found = [body.outer() for body in self._domains.bodies]
+        ids = [start + row for start, (row, _) in zip(self._domains.starts, found, strict=False)]
+        return np.concatenate(ids), np.concatenate([face for _, face in found])
 
     def _outside(self, points: MaterialPoints) -> NDArray[np.bool_]:
         """Return a mask (n,) of points with a face on the surface of their body as seeded."""
-        out, starts = np.zeros(len(points), dtype=bool), self._identifiers.starts
-        if self._grid.dim == 2:
-            out[self._faces.of(points).point] = True
-            return out
-        body = starts.searchsorted(points.id, side="right") - 1
-        for i in np.unique(body[points.id < starts[-1]]):
-            at = body == i
-            out[at] = self._faces.bodies[i].sides_of(points.id[at] - starts[i]).any(axis=(1, 2))
+        ids, faces = self._outer
+        out = np.isin(points.id, ids)
+        out[faces_of_parts(points, ids, faces)[1]] = True
         return out
 
     def _replaced(
@@ -97,41 +95,33 @@ class Division:
         points = state.points.of(ids, kept=False).joined(new)
         return replace(state, points=points, pieces=pieces), over_all(self._grid.comm, len(ids))
 
-    def _with_data(self, state: State) -> State:
-        """Return the state with the data of parts and of faces at its points."""
-        points = with_parts(state.points)
-        return replace(state, points=with_faces(points) if self._grid.dim == 2 else points, trend=None)
-
     # ---- division -------------------------------------------------------------------------------
 
     def _halved(self, state: State, axis: int) -> tuple[State, int]:
-        now, seeded = self._identifiers.sizes(self._grid, state.points)
+        now, seeded = self._domains.sizes(self._grid, state.points)
         wants = now[:, axis] >= 2 * seeded[:, axis] * (1 - SAME)
         if over_all(self._grid.comm, int(wants.any())):
             wants &= self._free(state)
             part = roots(state.points)[1].copy()
             part[:, axis, 1] = part[:, axis].mean(axis=1)
-            wants &= self._identifiers.known(part)
+            wants &= self._domains.known(part)
         if not over_all(self._grid.comm, int(wants.any())):
             return state, 0
-        state = self._with_data(state)
-        ids = state.points.id[wants]
-        old = state.points.of(ids)
-        new = halved(old, axis, self._identifiers, self._grid.axisymmetric)
-        if self._grid.dim == 2:
-            on = halved_faces(self._faces.data_of(old), new.reference, axis, self._grid.axisymmetric)
-            off = ~(on[PARENT] >= 0).any(axis=1)
-            kept = {name: new.data[name].copy() for name in state.stage.kept(0) if name in new.data}
-            for rows in kept.values():  # histories of conditions on faces
-                rows[off] = 0.0
-            new = replace(new, data={**new.data, **on, **kept})
+        state = replace(state, points=with_parts(state.points), trend=None)
+        old = state.points.map(lambda rows: rows[wants])
+        new = halved(old, axis, self._domains, self._grid.axisymmetric)
+        inside = ~self._outside(new)
+        kept = {name: new.data[name].copy() for name in state.stage.kept(0) if name in new.data}
+        for rows in kept.values():  # histories of conditions on the surface
+            rows[inside] = 0.0
+        new = replace(new, data={**new.data, **kept})
         return self._replaced(state, old, new, np.tile(np.arange(len(old)), 2), halved_pieces)
 
     # ---- merging --------------------------------------------------------------------------------
 
     def _merging(self, state: State, axis: int) -> NDArray[np.bool_]:
         """Return a mask (n,) of points whose domains are to be merged along a local axis, if there is another half."""
-        now, seeded = self._identifiers.sizes(self._grid, state.points)
+        now, seeded = self._domains.sizes(self._grid, state.points)
         wants = 2 * now[:, axis] <= seeded[:, axis] * (1 + SAME)
         if over_all(self._grid.comm, int(wants.any())):
             wants &= self._free(state)
@@ -145,10 +135,10 @@ class Division:
         Domains that have no other half have rows with nan.
         """
         root, part = roots(points)
-        place, size = self._identifiers.places(root), np.ptp(part, axis=2)
+        place, size = self._domains.places(root), np.ptp(part, axis=2)
         lower = place[:, 1:] + part[..., 0]
         outside = size[:, axis] >= 1
-        lower[outside, axis] = self._identifiers.from_middle(place[outside], axis)
+        lower[outside, axis] = self._domains.from_middle(place[outside], axis)
         lower /= size
         pair = np.floor(lower[:, axis] / 2)
         upper = lower[:, axis] != 2 * pair
@@ -175,26 +165,15 @@ class Division:
         first, other = at[first[pair]], at[other[pair]]
         if not over_all(comm, len(first)):
             return state, 0
-        state = self._with_data(state)
+        state = replace(state, points=with_parts(state.points), trend=None)
         points = state.points
         halves = [points.map(lambda rows, at=at: rows[at]) for at in (first, other)]
-        new = joined(*halves, axis, self._identifiers, self._grid.axisymmetric)
-        if self._grid.dim == 2:
-            new = replace(new, data={**new.data, **self._joined_data(state, halves, new, axis)})
+        new = joined(*halves, axis, self._domains, self._grid.axisymmetric)
+        lower, upper = map(self._outside, halves)
+        kept = {name: new.data[name].copy() for name in state.stage.kept(0) if name in new.data}
+        for name, rows in kept.items():  # histories of conditions on the surface
+            for half, only in zip(halves, (lower & ~upper, upper & ~lower), strict=True):
+                rows[only] = half.data[name][only]
+        new = replace(new, data={**new.data, **kept})
         old = points.map(lambda rows: rows[np.concatenate([first, other])])
         return self._replaced(state, old, new, np.tile(np.arange(len(new)), 2), joined_pieces)
-
-    def _joined_data(
-        self, state: State, halves: Sequence[MaterialPoints], new: MaterialPoints, axis: int
-    ) -> dict[str, NDArray]:
-        """Return faces, and histories of conditions on faces, of merged points in 2D."""
-        on = [self._faces.data_of(of) for of in halves]
-        out = joined_faces(*on, axis, ~is_part(new))
-        lower, upper = ((parent >= 0).any(axis=1) for parent, _, _ in on)
-        for name in state.stage.kept(0):
-            if name in new.data:
-                rows = new.data[name].copy()
-                rows[lower & ~upper] = halves[0].data[name][lower & ~upper]
-                rows[upper & ~lower] = halves[1].data[name][upper & ~lower]
-                out[name] = rows
-        return out

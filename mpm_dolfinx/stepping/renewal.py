@@ -30,10 +30,9 @@ from numpy.typing import NDArray
 from mpm_dolfinx.base.caching import Latest
 from mpm_dolfinx.base.errors import NotConverged
 from mpm_dolfinx.base.fluid_content import pressure_of
-from mpm_dolfinx.domains.divided_domains import PART, ROOT, is_part
 from mpm_dolfinx.domains.pressure_transport import PiecePressures, at_start, transport
 from mpm_dolfinx.domains.refilled_cells import New, RefilledCells, misshapen
-from mpm_dolfinx.domains.renewed_faces import AREA, ENDS, PARENT, SeededFaces, with_faces
+from mpm_dolfinx.domains.renewed_faces import AREA, ENDS, PARENT, PART, ROOT, SeededFaces, is_part, with_faces
 from mpm_dolfinx.dynamics.renewed_velocities import MOTION, centred, velocities
 from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.materials.fields import SceneMaterials
