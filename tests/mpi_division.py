@@ -22,7 +22,8 @@ def fine_about(low, high, count, middle, width=0.15, times=6):
 
 def pressed(renewal=True, loaded=True):
     """Return a block under a rough disc that sinks, and under a load, in cells that travel to the right and back."""
-    lines = lambda t: [fine_about(0, 2, 18, 0.4 + 1.2 * np.sin(2 * t) ** 2), fine_about(0, 1.2, 9, 0.9, 0.2, 2)]  # noqa: E731
+    y = fine_about(0, 1.2, 9, 0.9, 0.2, 2)
+    lines = lambda t: [fine_about(0, 2, 18, 0.4 + 1.2 * np.sin(2 * t) ** 2), y]  # noqa: E731
     grid = mpm.Grid(lines=lines(0), follow=lines)
     disc = mpm.Tool(mpm.Ball((1.0, 1.25), 0.25), lambda t: (0.001 * t, -0.002 * t), friction=0.3)
     load = mpm.Pressure("top", lambda t, X: 1e4 * t * (X[:, 0] < 0.5), region=([0, 0], [0.7, 2]))
@@ -30,6 +31,18 @@ def pressed(renewal=True, loaded=True):
     acting = {"conditions": [disc, mpm.Drained("top"), *[load] * loaded], "fluid": mpm.Fluid(), "gravity": GRAVITY}
     numerics = mpm.Numerics(renewal=renewal, tolerance=1e-11)
     return mpm.Simulation(grid, [mpm.box(grid, [0, 0], [2, 1])], [SOIL], walls=walls, numerics=numerics, **acting)
+
+
+def pressed_in_3d():
+    """Return a block under a rough ball that sinks, in cells that travel to the right and back."""
+    others = np.linspace(0, 0.9, 4), fine_about(0, 1.1, 5, 0.8, 0.2, 2)
+    lines = lambda t: [fine_about(0, 2, 8, 0.4 + 1.2 * np.sin(2 * t) ** 2, 0.2), *others]  # noqa: E731
+    grid = mpm.Grid(lines=lines(0), follow=lines)
+    ball = mpm.Tool(mpm.Ball((1.05, 0.45, 1.3), 0.3), lambda t: (0.001 * t, 0, -0.004 * t), friction=0.3)
+    walls = {"left": "x", "right": "x", "front": "y", "back": "y", "bottom": "xyz"}
+    acting = {"conditions": [ball, mpm.Drained("top")], "fluid": mpm.Fluid(), "gravity": (2.0, 0.5, -9.81)}
+    numerics, block = mpm.Numerics(renewal=True, tolerance=1e-11), mpm.box(grid, [0, 0, 0], [2, 0.9, 1.0])
+    return mpm.Simulation(grid, [block], [SOIL], walls=walls, numerics=numerics, **acting)
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from helpers import SOFT, imbalance, refused_in_one_line
 from meshes import box_mesh
-from mpi_division import GRAVITY, SOIL, fine_about, pressed
+from mpi_division import SOIL, fine_about, pressed, pressed_in_3d
 from scipy.spatial import cKDTree
 from test_many_sizes import EXACT, KINDS
 
@@ -118,14 +118,19 @@ def test_division_carries_the_accuracy_of_fine_cells_along(fluid):
     assert (errors[2] < 0.04).all() and (errors[2][:2] < 0.4 * errors[1][:2]).all()
 
 
-def test_forces_and_fluid_are_in_balance():
-    """In each step, below a rough disc that turns and sinks into the soil."""
-    s, replaced = pressed(loaded=False), 0
-    for _ in range(8):
+@pytest.mark.parametrize("press", [partial(pressed, loaded=False), pressed_in_3d], ids=["2D", "3D"])
+def test_forces_and_fluid_are_in_balance(press):
+    """In each step, below a rough disc or ball that turns and sinks into the soil."""
+    s, replaced = press(), 0
+    for _ in range(6):
         report = s.step(0.25)
         replaced += report.renewed
-        assert report.balance < 1e-10 and imbalance(s, s.scene.last[0].cut.points, SOIL, GRAVITY) < 1e-9
-    assert replaced > 1000 and s.tool_forces["tool"][1] < -1e3
+        on_grid = s.scene.last[0]
+        top = on_grid.cut.surface(s.state.stage.surfaces[0])
+        assert top.area0.sum() == pytest.approx(2.0 if s.grid.dim == 2 else 1.8, rel=1e-12)
+        gravity = s.state.stage.conditions["gravity"]
+        assert report.balance < 1e-10 and imbalance(s, on_grid.cut.points, SOIL, gravity) < 1e-9
+    assert replaced > 1000 and s.tool_forces["tool"][s.grid.dim - 1] < -1e3
 
 
 def test_a_run_goes_on_with_the_same_bits(tmp_path):
@@ -157,7 +162,7 @@ def test_domains_of_a_mesh_are_divided_and_merge_again():
 
 
 def in_a_frame(frame):
-    """Return a block with odd numbers of rows, as it is, mirrored, or with its axes exchanged, and its true positions."""
+    """Return a block with odd numbers of rows in a frame, and a function that maps positions to the first frame."""
     to = {"mirrored": lambda x: x * [-1, 1] + [1.7, 0], "exchanged": lambda x: x[:, ::-1]}.get(frame, lambda x: x)
 
     def lines(t):

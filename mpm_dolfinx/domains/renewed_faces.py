@@ -147,7 +147,9 @@ class SeededFaces:
             along = 1 - seeded.face[row] // 2
             low, high = (t[np.arange(len(row)), along, None] for t in (low, high))
             (first, last), middle = seeded.ends[row].swapaxes(0, 1), (low + high)[:, 0] / 2
-            share = (high - low)[:, 0] * (ring_share(*seeded.ends[row, :, 0].T, middle) if self._grid.axisymmetric else 1.0)
+            share = (high - low)[:, 0]
+            if self._grid.axisymmetric:
+                share = share * ring_share(*seeded.ends[row, :, 0].T, middle)
             ends = np.stack([first + low * (last - first), first + high * (last - first)], axis=1)
             columns.append((at, seeded.face[row], seeded.key[row], seeded.area[row] * share, ends))
         return OuterFaces(*map(np.concatenate, zip(*columns, strict=True)))

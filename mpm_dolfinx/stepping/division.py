@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from mpm_dolfinx.base.tolerances import SAME
 from mpm_dolfinx.domains.divided_domains import SeededDomains, halved, joined, with_defect
 from mpm_dolfinx.domains.pressure_transport import halved_pieces, joined_pieces
-from mpm_dolfinx.domains.renewed_faces import faces_of_parts, is_part, roots, with_parts
+from mpm_dolfinx.domains.renewed_faces import SeededFaces, faces_of_parts, is_part, roots, with_parts
 from mpm_dolfinx.materials.fields import SceneMaterials
 from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.material_points import MaterialPoints
@@ -32,13 +32,13 @@ from mpm_dolfinx.stepping.state import State
 class Division:
     """Division and merging of the particle domains in a scene.
 
-    domains, materials: domains of the bodies, and materials of the scene.
+    faces, materials: faces of the bodies, and materials of the scene.
     """
 
-    def __init__(self, domains: SeededDomains, materials: SceneMaterials):
+    def __init__(self, faces: SeededFaces, materials: SceneMaterials):
         self._grid = materials.grid
         self._materials = materials
-        self._domains = domains
+        self._domains = SeededDomains(faces.bodies)
 
     def divided(self, state: State) -> tuple[State, int]:
         """Return the state with divided and merged domains, and their number; all processes must call it."""

@@ -26,7 +26,6 @@ from mpm_dolfinx.conditions.conditions import OnSide
 from mpm_dolfinx.conditions.unit_weights import other_gravity, weighed
 from mpm_dolfinx.diagnostics.resolution import warn_overfilled, warn_smeared
 from mpm_dolfinx.domains.cut_domains import CutDomains
-from mpm_dolfinx.domains.divided_domains import SeededDomains
 from mpm_dolfinx.domains.renewed_faces import SeededFaces
 from mpm_dolfinx.flow.sources import Sources
 from mpm_dolfinx.flow.storage import CellPressure, StorageForms
@@ -308,8 +307,8 @@ class Scene:
             if grid.follow is not None:
                 found, allowed = found[1:], "dry or saturated, without inertia, on a grid whose lines move"
             raise ValueError(f"Numerics(renewal=True): the scene {' and '.join(found[0])}, must be {allowed}")
-        renewal = Renewal(SeededFaces(grid, self.bodies), self.materials)
-        division = Division(SeededDomains(self.bodies), self.materials)
+        faces = SeededFaces(grid, self.bodies)
+        renewal, division = (of(faces, self.materials) for of in (Renewal, Division))
         both = (division.divided, not found[1]), (renewal.renewed, not found[0])
         return [one for one, possible in both if possible]
 
