@@ -46,7 +46,10 @@ def pressed_in_3d():
 
 
 if __name__ == "__main__":
-    simulation = pressed()
-    result = simulation.run(2.0, 0.25, progress=False)
-    if state := gathered(simulation):
-        np.savez(sys.argv[1], **state, balance=result.balance, renewed=result.renewed)
+    simulation, solid = pressed(), pressed_in_3d()
+    result, other = (s.run(1.0, 0.25, progress=False) for s in (simulation, solid))
+    state, in_3d = gathered(simulation), gathered(solid)
+    if state:
+        in_3d = {f"{name} in 3D": rows for name, rows in in_3d.items() if name != "counts"}
+        balance, renewed = max(result.balance, other.balance), [result.renewed, other.renewed]
+        np.savez(sys.argv[1], **state, **in_3d, balance=balance, renewed=renewed)

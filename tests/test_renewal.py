@@ -18,6 +18,7 @@ from test_mpi import mpirun
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.domains.renewed_faces import SeededFaces
+from mpm_dolfinx.grid.grid import FACES
 from mpm_dolfinx.mechanics.inertia import velocity_gradients
 from mpm_dolfinx.points.cutting import cut, domain_volumes, volumes
 from mpm_dolfinx.points.polygons import Polygons
@@ -91,7 +92,7 @@ def test_masses_volumes_region_and_surface_stay(monkeypatch, hole, uneven, given
     total = [faces.area.sum() for faces in (before, after)]
     assert total[1] == pytest.approx(total[0], rel=1e-6 if uneven else 1e-12)  # near corners merge
     for faces, points in ((before, old), (after, new)):
-        ends = np.take_along_axis(points.corners[faces.point], renewal.FACES[2][faces.face][:, :, None], axis=1)
+        ends = np.take_along_axis(points.corners[faces.point], FACES[2][faces.face][:, :, None], axis=1)
         assert np.abs(ends - faces.ends).max() < 2e-3  # nothing has moved
 
 

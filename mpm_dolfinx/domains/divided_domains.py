@@ -15,11 +15,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from mpm_dolfinx.base.caching import Latest
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.domains.domain_gradient import gradient
 from mpm_dolfinx.domains.renewed_faces import PART, ROOT, roots
 from mpm_dolfinx.grid.grid import FACES, Grid, corner_bits, sum_by
-from mpm_dolfinx.points.cutting import centroids, domain_volumes, edges
+from mpm_dolfinx.points.cutting import centroids, domain_volumes
 from mpm_dolfinx.points.material_points import MaterialPoints
 
 PLACES = "corners", "reference", "origin"
@@ -29,7 +30,7 @@ PLACES = "corners", "reference", "origin"
 class SeededDomains:
     """Seeded domains of the bodies, and identifiers of their parts, which follow from domain and interval.
 
-    Identifiers are `points.body_of` numbers with an odd index in the body; renewed points have even indices.
+    An identifier is a number of `material_points.body_of` with an odd index in the body; renewed points have even ones.
 
     bodies: all bodies of the scene.
     """
@@ -38,6 +39,7 @@ class SeededDomains:
         self.starts = np.cumsum([0, *map(len, bodies)])
         self.bodies = bodies
         self._dim = bodies[0].dim
+        self._seeded: Latest[NDArray[np.float64]] = Latest()
         most = np.iinfo(np.int64).max // 16  # for `renewed_faces.keys`, too
         self._codes = int((most // (len(bodies) * int(self.starts[-1] + 1))) ** (1 / self._dim))
 
@@ -91,15 +93,18 @@ class SeededDomains:
     def sizes(self, grid: Grid, points: MaterialPoints) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the edge lengths (n, d) of domains in cells: now, and of their seeded domains at seeding."""
         root = roots(points)[0]
-        now = np.linalg.norm(edges(grid.in_cells(points.corners)), axis=1)
-        seeded = np.full(now.shape, np.nan)  # of renewed domains
+        return _lengths(grid.in_cells(points.corners)), self._seeded((root,), lambda: self._as_seeded(grid, root))
+
+    def _as_seeded(self, grid: Grid, root: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return the edge lengths (n, d) of domains in cells at seeding; nan for renewed domains."""
+        seeded = np.full((len(root), self._dim), np.nan)
         body = self.starts.searchsorted(root, side="right") - 1
         for i in np.unique(body[root < self.starts[-1]]):
             at = body == i
             x = self.bodies[i].corners(root[at] - self.starts[i]) - grid.base
             place = [np.interp(x[..., a], lines, np.arange(len(lines))) for a, lines in enumerate(grid.seeded)]
-            seeded[at] = np.linalg.norm(edges(np.stack(place, axis=-1)), axis=1)
-        return now, seeded
+            seeded[at] = _lengths(np.stack(place, axis=-1))
+        return seeded
 
     def from_middle(self, places: NDArray[np.int64], axis: int) -> NDArray[np.float64]:
         """Return the index (n,) of rows of the lattice along an axis, from the middle of the body.
@@ -133,6 +138,14 @@ class SeededDomains:
         return out
 
 
+def _lengths(corners: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the lengths (n, d) of the mean edges of domains with corners (n, 2^d, d)."""
+    x, d = np.ascontiguousarray(corners.transpose(1, 2, 0)), corners.shape[2]  # numpy is fast along the last axis
+    faces = [np.add.reduce(x[at]) for at in FACES[d]]
+    edges = [high - low for low, high in zip(faces[::2], faces[1::2], strict=True)]
+    return np.sqrt([np.add.reduce(edge**2) for edge in edges]).T / 2 ** (d - 1)
+
+
 def whole(part: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return which parts (n, d, 2) are whole seeded domains."""
     return (part == [0.0, 1.0]).all(axis=(1, 2))
@@ -160,7 +173,7 @@ def beyond_corners(points: MaterialPoints, axisymmetric: bool) -> NDArray[np.flo
 def halved(points: MaterialPoints, axis: int, domains: SeededDomains, axisymmetric: bool) -> MaterialPoints:
     """Return both halves (2n,) of each point, the lower half of all points first.
 
-    Volumes at rest and in the deformed state add up to those of the point.
+    The sum of the volumes, at rest and deformed, is the volume of the point.
     """
     root, part = roots(points)
     at, n = domains.middle(root, part, axis), len(points)
@@ -214,7 +227,7 @@ def _placed(
 
 
 def with_defect(new: MaterialPoints, old: MaterialPoints, into: NDArray[np.int64]) -> MaterialPoints:
-    """Return new points with a volume defect such that soil and fluid fill the same volume as those of the old points.
+    """Return new points with a volume defect such that soil and fluid fill the same volume as before.
 
     into: old point of each new point, or new point of each old point, if there are fewer.
     """

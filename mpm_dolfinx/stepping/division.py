@@ -24,7 +24,6 @@ from mpm_dolfinx.domains.divided_domains import SeededDomains, halved, joined, w
 from mpm_dolfinx.domains.pressure_transport import halved_pieces, joined_pieces
 from mpm_dolfinx.domains.renewed_faces import SeededFaces, faces_of_parts, is_part, roots, with_parts
 from mpm_dolfinx.materials.fields import SceneMaterials
-from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.stepping.state import State
 
@@ -42,7 +41,9 @@ class Division:
 
     def divided(self, state: State) -> tuple[State, int]:
         """Return the state with divided and merged domains, and their number; all processes must call it."""
-        if state.stay is not None:
+        now, seeded = self._domains.sizes(self._grid, state.points)
+        some = _divides(now, seeded).any() or _merges(now, seeded).any()
+        if not self._grid.comm.allreduce(int(some and state.stay is None)):
             return state, 0
         count, axes = 0, range(self._grid.dim)
         for change in (self._halved, self._joined):
@@ -93,19 +94,19 @@ class Division:
             made = rule(pieces.of(ids), (old, new), into, storage, self._materials.fluid.bulk)
             pieces = pieces.of(ids, kept=False).joined(made)
         points = state.points.of(ids, kept=False).joined(new)
-        return replace(state, points=points, pieces=pieces), over_all(self._grid.comm, len(ids))
+        return replace(state, points=points, pieces=pieces), self._grid.comm.allreduce(len(ids))
 
     # ---- division -------------------------------------------------------------------------------
 
     def _halved(self, state: State, axis: int) -> tuple[State, int]:
         now, seeded = self._domains.sizes(self._grid, state.points)
-        wants = now[:, axis] >= 2 * seeded[:, axis] * (1 - SAME)
-        if over_all(self._grid.comm, int(wants.any())):
+        wants = _divides(now, seeded)[:, axis]
+        if self._grid.comm.allreduce(int(wants.any())):
             wants &= self._free(state)
             part = roots(state.points)[1].copy()
             part[:, axis, 1] = part[:, axis].mean(axis=1)
             wants &= self._domains.known(part)
-        if not over_all(self._grid.comm, int(wants.any())):
+        if not self._grid.comm.allreduce(int(wants.any())):
             return state, 0
         state = replace(state, points=with_parts(state.points), trend=None)
         old = state.points.map(lambda rows: rows[wants])
@@ -122,8 +123,8 @@ class Division:
     def _merging(self, state: State, axis: int) -> NDArray[np.bool_]:
         """Return a mask (n,) of points whose domains are to be merged along a local axis, if there is another half."""
         now, seeded = self._domains.sizes(self._grid, state.points)
-        wants = 2 * now[:, axis] <= seeded[:, axis] * (1 + SAME)
-        if over_all(self._grid.comm, int(wants.any())):
+        wants = _merges(now, seeded)[:, axis]
+        if self._grid.comm.allreduce(int(wants.any())):
             wants &= self._free(state)
             inside = np.ptp(roots(state.points)[1], axis=2)[:, axis] < 1
             wants &= inside | ~self._outside(state.points)
@@ -148,7 +149,7 @@ class Division:
     def _joined(self, state: State, axis: int) -> tuple[State, int]:
         comm = self._grid.comm
         wants = self._merging(state, axis)
-        if not over_all(comm, int(wants.any())):
+        if not comm.allreduce(int(wants.any())):
             return state, 0
         if comm.size > 1:  # both halves move to one process
             rank = np.full(len(wants), comm.rank, dtype=np.int32)
@@ -163,7 +164,7 @@ class Division:
         soil = self._materials.soil_rows(state.points)[at]
         pair = (key[first] == key[other]).all(axis=1) & (soil[first] == soil[other]).all(axis=1)
         first, other = at[first[pair]], at[other[pair]]
-        if not over_all(comm, len(first)):
+        if not comm.allreduce(len(first)):
             return state, 0
         state = replace(state, points=with_parts(state.points), trend=None)
         points = state.points
@@ -177,3 +178,13 @@ class Division:
         new = replace(new, data={**new.data, **kept})
         old = points.map(lambda rows: rows[np.concatenate([first, other])])
         return self._replaced(state, old, new, np.tile(np.arange(len(new)), 2), joined_pieces)
+
+
+def _divides(now: NDArray[np.float64], seeded: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return whether halves of domains along each axis (n, d) count as many cells as the domains did at seeding."""
+    return now >= 2 * seeded * (1 - SAME)
+
+
+def _merges(now: NDArray[np.float64], seeded: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return whether pairs of domains along each axis (n, d) count as many cells as one domain did at seeding."""
+    return 2 * now <= seeded * (1 + SAME)
