@@ -124,6 +124,7 @@ BENCHMARK = {
     "layers off the grid lines": set(),
     "grid reset in each step": {"reset of the grid"},
     "grid lines that move": {"moving grid lines"},
+    "division that divides nothing": set(),
     "16 times the background grid": set(),
     "256 times the background grid": set(),
 }
