@@ -89,7 +89,6 @@ class SeededDomains:
                 out[at, 1:] = np.stack(np.unravel_index(lower, tuple(np.add(one.lattice, 1))), axis=1)
         return out
 
-
     def sizes(self, grid: Grid, points: MaterialPoints) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the edge lengths (n, d) of domains in cells: now, and of their seeded domains at seeding."""
         root = roots(points)[0]

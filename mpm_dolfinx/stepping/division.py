@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: MIT
 """Division and merging of elastic particle domains where grid cells become finer or coarser.
 
-A domain is bisected along a local axis if both halves then count as many cells as the domain did at seeding. Two halves
-merge if the merged domain counts as many cells as at seeding. Whole domains on a lattice inside a body merge
-too. Domains that yield, have probes, or are on sides whose displacement a condition needs, remain.
+A domain is bisected along a local axis if both halves then extend over as many cells as the domain did at seeding. Two
+halves merge if the merged domain extends over as many cells as at seeding. Whole domains on the lattice of a box merge
+too, except at the surface. Domains remain if they yield, contain probes, or have a side whose displacement a condition
+needs.
 
 Corners of elastic domains determine F, so a division adds no error: both halves share the mapping of the domain. After
-merging, F follows from the outer corners. Mass, fluid, and the volume that the fluid has to fill are exact. The number
-of cells in the deformed state includes the stretch of the domain.
+merging, F follows from the outer corners. Mass, fluid, and the volume that the fluid has to fill are exact. The stretch
+of a domain counts as well, because it changes the number of cells.
 """
 
 from __future__ import annotations
@@ -181,10 +182,10 @@ class Division:
 
 
 def _divides(now: NDArray[np.float64], seeded: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return whether halves of domains along each axis (n, d) count as many cells as the domains did at seeding."""
+    """Return whether halves of domains along each axis (n, d) extend over as many cells as the domains at seeding."""
     return now >= 2 * seeded * (1 - SAME)
 
 
 def _merges(now: NDArray[np.float64], seeded: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return whether pairs of domains along each axis (n, d) count as many cells as one domain did at seeding."""
+    """Return whether pairs of domains along each axis (n, d) extend over as many cells as one domain at seeding."""
     return 2 * now <= seeded * (1 + SAME)
