@@ -332,7 +332,8 @@ class Scene:
 
         def make() -> Assembled:
             problems = (self.momentum, self.storage, self.scheme, self._systems)
-            return assembled(*problems, on_grid, stage, as_cut(), begins)
+            pairs = [(on_grid.key, one.key) for one in now if one.couples]  # contact pairs depend on the positions
+            return assembled(*problems, on_grid, stage, as_cut(), begins, *pairs)
 
         return self._assembled((on_grid.key, stage, *(one.key for one in now)), make, self.grid.comm)
 

@@ -36,6 +36,9 @@ def set_up(scene: Scene, state: State, dt: float, how: tuple = ()) -> Start:
     place = Place(on_grid.cut, on_grid.fill, state.points, data, *now)
     stage.check_start(place)
     loads = [stage.placed(place._replace(t=t)) for t in times]
+    for substeps in zip(*loads, strict=True):
+        for one in substeps:
+            one.join(substeps)
     at_cut = place._replace(points=cut_points, pieces=on_grid.data, t=times[-1])
     as_cut = partial(stage.placed, at_cut) if state.stay else partial(loads.__getitem__, -1)
     matrices, loads = scene.assembled(on_grid, stage, loads[-1], as_cut, state.begins), at_rest(scene, state, loads)
