@@ -12,18 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.base.validation import check_names, given, line, numbers
-from mpm_dolfinx.contact.shapes import (
-    ROUNDED,
-    Ball,
-    Cone,
-    Convex,
-    Distance,
-    HalfSpace,
-    Shape,
-    Uniform,
-    uniform,
-    unit_vector,
-)
+from mpm_dolfinx.contact.shapes import ROUNDED, Ball, Convex, Distance, Placed, Shape, Uniform, uniform, unit_vector
 from mpm_dolfinx.grid.grid import Grid
 
 ONTO = 100  # largest number of projections onto the surface
@@ -138,7 +127,7 @@ class Tool:
         return f"Tool({', '.join(given)})"
 
     def __post_init__(self):
-        if not isinstance(self.shape, (HalfSpace, Ball, Convex, Cone)) and not callable(self.shape):
+        if not isinstance(self.shape, Placed) and not callable(self.shape):
             raise ValueError(f"Tool: shape = {line(self.shape)}, must be a HalfSpace, Ball, Convex, Cone or a function")
         for name in ("friction", "adhesion"):
             value = getattr(self, name)
@@ -150,7 +139,7 @@ class Tool:
         for name, value in vars(self).items():
             if name in ("displacement", "rotation_rad", "load") and callable(value):
                 check_names(f"{line(self)}: {name}", value, ("t",))
-            elif isinstance(value, (list, np.ndarray, HalfSpace, Ball, Convex, Cone)):
+            elif isinstance(value, (list, np.ndarray, Placed)):
                 object.__setattr__(self, name, deepcopy(value))  # protects against later changes
         if self.load is not None and not callable(self.load):
             self.pushes(0.0)
@@ -278,6 +267,10 @@ class Tool:
             of = self._uniform(dim)
             return (np.zeros(dim) if of is None else of.centroid) - self._base
         return numbers("Tool: centre", self.centre, (dim,), allowed=f"{dim} finite coordinates") - self._base
+
+    def middle(self, dim: int) -> NDArray[np.float64]:
+        """Return the initial position (d,), m, that grid lines follow.  It matters only if the tool rotates."""
+        return self._centre(dim) if callable(self.shape) else self.shape.middle - self._base
 
     def pose(self, t: float, dim: int, by_forces: NDArray[np.float64] | float = 0.0) -> Pose:
         """Return the pose at t (s).  by_forces: displacement by loads, m; of a free tool (d,), m, and rotation, rad."""

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.validation import takes
+from mpm_dolfinx.contact.tool import motion_by_forces
 from mpm_dolfinx.domains.cut_domains import STILL
 from mpm_dolfinx.grid.following import carried, lines_at
 from mpm_dolfinx.grid.grid import Grid
@@ -38,8 +39,8 @@ def with_lines(grid: Grid, state: State, left: Callable[[State], State]) -> Stat
     left
         Function that adds pressures of pieces to a state with kept pieces, for a reset; called before the grid moves.
     """
-    before = grid.seeded if state.lines is None else [state.lines[letter] for letter in sorted(state.lines)]
-    grid.move(before)
+    grid.move(state.lines)
+    before = grid.lines
     lines = _wanted(grid, state, before)
     if state.stay is not None:
         moved = [
@@ -52,8 +53,9 @@ def with_lines(grid: Grid, state: State, left: Callable[[State], State]) -> Stat
             state = left(state) if state.stays else state
             pieces = state.pieces and replace(state.pieces, of_cell=None, start=None)
             state = replace(state, stay=None, held=None, rest=None, pieces=pieces)
-    grid.move(lines)
-    return replace(state, lines=dict(zip("xyz", lines, strict=False)))
+    state = replace(state, lines=dict(zip("xyz", lines, strict=False)))
+    grid.move(state.lines)
+    return state
 
 
 def _wanted(grid: Grid, state: State, before: Sequence[NDArray[np.float64]]) -> Sequence[NDArray[np.float64]]:
@@ -61,8 +63,10 @@ def _wanted(grid: Grid, state: State, before: Sequence[NDArray[np.float64]]) -> 
     if hasattr(grid.follow, "pose"):
         if (name := followed_tool(grid, state.stage.given)) is None:
             return before
-        tool, travel = state.stage.given[name], state.outcome["tool_travel"][name]
-        return carried(grid.seeded, tool.pose(state.t, grid.dim, travel).shift)
+        tool = state.stage.given[name]
+        middle = tool.middle(grid.dim)
+        pose = tool.pose(state.t, grid.dim, motion_by_forces(state.outcome, name))
+        return carried(grid.seeded, pose.put(middle) - middle)
     x = _of_all(grid, state) if "x" in takes(grid.follow) else None
     lines = grid.from_base(
         lines_at(grid.follow, [x + start for x, start in zip(grid.seeded, grid.base, strict=True)], state.t, x)
