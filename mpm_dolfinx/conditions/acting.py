@@ -154,8 +154,9 @@ class Loads:
     key: Any = None
     """Key of everything on which the penalty, or the pattern, depends, except for the positions of faces."""
 
-    def join(self, substeps: Sequence[Any]) -> None:
-        """Extend the pattern to that of the same condition in all substeps of the step."""
+    def joined(self, substeps: Sequence[Any]) -> Loads:
+        """Return the loads with the pattern of the same condition in all substeps of the step."""
+        return self
 
     def begun(self, shares: Shares, earlier: Any) -> Loads:
         """Return the loads for a substep with inertia.  `earlier` is the result of `flown` in the previous substep."""

@@ -19,6 +19,7 @@ Forces are therefore f + (D e) (load - e . f) / s; minus their derivative is D -
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -178,9 +179,11 @@ class ContactProblem(Loads):
         """The cells under each of the tools that loads move; they depend on the length of the step."""
         return tuple(np.unique(self.pairs.cell[self.pairs.number == number]) for number in self._loaded)
 
-    def join(self, substeps: Sequence[ContactProblem]) -> None:
+    def joined(self, substeps: Sequence[ContactProblem]) -> ContactProblem:
         """See `Loads`."""
-        self.key = tuple(np.unique(np.concatenate(cells)) for cells in zip(*(one.key for one in substeps), strict=True))
+        out = copy(self)
+        out.key = tuple(np.unique(np.concatenate(cells)) for cells in zip(*(one.key for one in substeps), strict=True))
+        return out
 
     def found(self, at: At) -> Found:
         """Return the contact at the displacements u."""

@@ -268,20 +268,14 @@ class Tool:
             return (np.zeros(dim) if of is None else of.centroid) - self._base
         return numbers("Tool: centre", self.centre, (dim,), allowed=f"{dim} finite coordinates") - self._base
 
-    def middle(self, dim: int) -> NDArray[np.float64]:
-        """Return the initial position (d,), m, that grid lines follow.  It matters only if the tool rotates."""
-        return self._centre(dim) if callable(self.shape) else self.shape.middle - self._base
-
     def pose(self, t: float, dim: int, by_forces: NDArray[np.float64] | float = 0.0) -> Pose:
         """Return the pose at t (s).  by_forces: displacement by loads, m; of a free tool (d,), m, and rotation, rad."""
         shift = self._given("displacement", t, dim)
         if shift.ndim == 0 and shift:
             raise ValueError(f"{line(self)}: displacement at t = {t:g} s = {shift:g}, must be {dim} finite numbers")
-        R, angle = np.eye(dim), float(self._given("rotation_rad", t))
-        if angle:
-            R = rotation(angle)
-        shift_by_forces = by_forces if np.ndim(by_forces) else by_forces * self.along(dim)
-        return Pose(R, self._centre(dim), np.broadcast_to(shift, (dim,))).moved(shift_by_forces)
+        R = rotation(float(self._given("rotation_rad", t))) if dim == 2 else np.eye(dim)
+        pose = Pose(R, self._centre(dim), np.broadcast_to(shift, (dim,)))
+        return pose.moved(by_forces if np.ndim(by_forces) else by_forces * self.along(dim))
 
     def drawn(self, grid: Grid, t: float, by_forces: NDArray[np.float64] | float = 0.0) -> NDArray[np.float64]:
         """Return the corners (m, 2^d, d), m, of the grid cells inside the tool at time t (s), for pictures.

@@ -49,9 +49,8 @@ def check_options(
 
 def check_axisymmetry(grid: Grid, bodies: Sequence[Body], quadrature: str) -> None:
     """Raise an error for point quadrature on grids that exclude it.  Warn about narrow holes around the axis."""
-    for what, so in {"in axisymmetry": grid.axisymmetric, "on lines that follow": grid.follow is not None}.items():
-        if so and quadrature == "point":  # fine cells between the points of coarse cells would be empty
-            raise ValueError(f"quadrature = 'point', must be 'domain' {what}")
+    if quadrature == "point" and (grid.axisymmetric or grid.follow is not None):  # fine cells would become empty
+        raise ValueError("quadrature = 'point', must be 'domain' in axisymmetry, and on grid lines that follow")
     if not grid.has_axis:
         return
     x = np.concatenate([body.corners() for body in bodies])

@@ -64,8 +64,8 @@ def _wanted(grid: Grid, state: State, before: Sequence[NDArray[np.float64]]) -> 
         if (name := followed_tool(grid, state.stage.given)) is None:
             return before
         tool = state.stage.given[name]
-        middle = tool.middle(grid.dim)
         pose = tool.pose(state.t, grid.dim, motion_by_forces(state.outcome, name))
+        middle = getattr(tool.shape, "middle", pose.centre)
         return carried(grid.seeded, pose.put(middle) - middle)
     x = _of_all(grid, state) if "x" in takes(grid.follow) else None
     lines = grid.from_base(
