@@ -176,6 +176,20 @@ def test_lines_follow_the_middle_of_a_tool_that_turns(tool, way):
         assert lines[4:6] == pytest.approx(np.array([1.45, 1.55]) + np.trunc(by / 0.1 + np.sign(by) * 1e-9) * 0.1)
 
 
+def test_lines_stay_in_a_stage_without_the_tool_and_follow_one_with_its_name():
+    """Another condition may have the name."""
+    disc, again = (mpm.Tool(mpm.Ball((1.5, 1.5), 0.2), lambda t: (0.5 * t, 0), name="bar") for _ in range(2))
+    grid = mpm.Grid(lines=[[0, 1, 1.4, 1.6, 2, 3], LINES[1]], follow=disc)
+    s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [3, 1])], [SOFT], walls={"bottom": "xy"}, conditions=[disc])
+    found = []
+    for conditions in ([disc], [mpm.Displacement("left", (0, 0), name="bar")], [again]):
+        s.stage(conditions=conditions)
+        s.t += 0.41
+        s.step(1e-3)
+        found.append(grid.lines[0][2])
+    assert found == pytest.approx([1.6, 1.6, 2.0])
+
+
 def test_a_step_keeps_its_cut_by_the_cells_where_it_moves():
     """A block that is moved by half of STILL of the coarse cells keeps its cut there; in fine cells it does not."""
     kept, y = [], np.append(np.linspace(0, 0.1, 21), np.linspace(0.2, 1.2, 11))

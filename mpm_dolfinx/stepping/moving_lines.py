@@ -3,9 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
 
 from mpi4py import MPI
 
@@ -13,18 +12,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.validation import takes
-from mpm_dolfinx.contact.tool import motion_by_forces
+from mpm_dolfinx.contact.tool import Tool, motion_by_forces
 from mpm_dolfinx.domains.cut_domains import STILL
 from mpm_dolfinx.grid.following import carried, lines_at
 from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.parallel.exchange import over_all
+from mpm_dolfinx.stepping.stage import Stage
 from mpm_dolfinx.stepping.state import State
 
 
-def followed_tool(grid: Grid, conditions: Mapping[str, Any]) -> str | None:
-    """Return the name of the tool that the lines of a grid follow, among conditions by name; None if it is absent."""
-    for name, one in conditions.items():
-        if one is grid.follow or getattr(one, "name", None) == grid.follow.name is not None:
+def followed_tool(grid: Grid, stage: Stage) -> str | None:
+    """Return the name of the tool that the lines of a grid follow in a stage; None if it is absent."""
+    for name, one in stage.of(Tool).items():
+        if one is grid.follow or one.name == grid.follow.name is not None:
             return name
     return None
 
@@ -61,7 +61,7 @@ def with_lines(grid: Grid, state: State, left: Callable[[State], State]) -> Stat
 def _wanted(grid: Grid, state: State, before: Sequence[NDArray[np.float64]]) -> Sequence[NDArray[np.float64]]:
     """Return the coordinates (n,), m, of the grid lines along each axis for a state, relative to the base."""
     if hasattr(grid.follow, "pose"):
-        if (name := followed_tool(grid, state.stage.given)) is None:
+        if (name := followed_tool(grid, state.stage)) is None:
             return before
         tool = state.stage.given[name]
         pose = tool.pose(state.t, grid.dim, motion_by_forces(state.outcome, name))

@@ -270,7 +270,7 @@ class Scene:
     def check_followed(self, first: Stage) -> None:
         """Raise ValueError if grid lines follow a tool that is absent from the first stage: they would never move."""
         follow = self.grid.follow
-        if hasattr(follow, "pose") and followed_tool(self.grid, first.given) is None:
+        if hasattr(follow, "pose") and followed_tool(self.grid, first) is None:
             raise ValueError(f"grid: follow = {line(follow)}, not in the first stage, must be one of its conditions")
 
     def followed(self, state: State) -> State:
