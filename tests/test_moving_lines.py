@@ -129,6 +129,67 @@ def test_scenes_in_turn_on_one_grid_do_not_disturb_each_other():
     assert (one.points.corners == alone.points.corners).all()
 
 
+def test_bodies_and_scenes_made_after_a_run_begin_on_the_given_lines():
+    """With an initial stress and pressure that depend on the cells; bodies from boxes and meshes."""
+    ends, grid = [], jumping(2)
+    for used in (True, False):
+        grid = grid if used else jumping(2)
+        if used:
+            early = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [1.3, 1])], [SOFT], walls={"bottom": "xy"})
+            early.step(2.0)
+            early.step(2.0)
+            assert (grid.lines[0] != grid.seeded[0]).any()
+        corners, names = [(0.2, 0.9), (1, 0.9), (0.6, 1.2)], ["foot", "right", "left"]
+        bodies = [mpm.box(grid, [0, 0], [1.3, 0.9]), mpm.polygon(grid, corners, names, size=0.3)]
+        acting = {"fluid": mpm.Fluid(), "gravity": (0, -9.81), "walls": dict.fromkeys(SIDES[2], "xy")}
+        start = {"initial_stress": mpm.K0(0.5), "pressure": lambda x: 1e3 * np.sin(9 * x[:, 0]) * x[:, 1]}
+        s = mpm.Simulation(grid, bodies, [SOFT], **acting, **start)
+        s.step(1.0)
+        ends.append(s.points)
+    assert len(ends[0]) == len(ends[1]) and (ends[0].corners == ends[1].corners).all()
+    assert (ends[0].pressure == ends[1].pressure).all()
+
+
+TURNS = {"rotation_rad": lambda t: 2 * t, "centre": (1.5, 0.5)}
+TRIANGLE = mpm.Convex([(1, 1), (2, 1), (1.5, 1.9)])
+
+
+@pytest.mark.parametrize(
+    "tool, way",
+    [
+        (mpm.Tool(mpm.Ball((1.5, 1.5), 0.2), **TURNS), np.array([-np.sin(1), np.cos(1) - 1])),
+        (mpm.Tool(TRIANGLE, lambda t: (0, 0.25 * t), **TURNS), np.array([-0.8 * np.sin(1), 0.8 * np.cos(1) - 0.675])),
+        (mpm.Tool(lambda y: np.linalg.norm(y - 1.5, axis=1) - 0.2, lambda t: (0, 1.2 * t), **TURNS), np.array([0, 0.6])),
+        (mpm.Tool(mpm.Ball((1.5, 1.5), 0.2), rotation_rad=lambda t: 2 * t, centre=(1.5, 1.5)), np.zeros(2)),
+    ],
+    ids=["disc", "polygon", "function", "about itself"],
+)
+def test_lines_follow_the_middle_of_a_tool_that_turns(tool, way):
+    """By whole cells towards zero; of a function, its centre."""
+    given = [[0, 0.5, 0.8, 1.1, 1.45, 1.55, 1.9, 2.2, 2.5, 3]] * 2
+    grid = mpm.Grid(lines=given, follow=tool)
+    body = mpm.box(grid, [0, 0], [3, 0.2])
+    s = mpm.Simulation(grid, [body], [SOFT], walls={"bottom": "xy"}, conditions=[tool])
+    s.t = 0.5
+    s.step(1e-3)
+    for lines, by in zip(grid.lines, way, strict=True):
+        assert lines[4:6] == pytest.approx(np.array([1.45, 1.55]) + np.trunc(by / 0.1 + np.sign(by) * 1e-9) * 0.1)
+
+
+def test_lines_stay_in_a_stage_without_the_tool_and_follow_one_with_its_name():
+    """Another condition may have the name."""
+    disc, again = (mpm.Tool(mpm.Ball((1.5, 1.5), 0.2), lambda t: (0.5 * t, 0), name="bar") for _ in range(2))
+    grid = mpm.Grid(lines=[[0, 1, 1.4, 1.6, 2, 3], LINES[1]], follow=disc)
+    s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [3, 1])], [SOFT], walls={"bottom": "xy"}, conditions=[disc])
+    found = []
+    for conditions in ([disc], [mpm.Displacement("left", (0, 0), name="bar")], [again]):
+        s.stage(conditions=conditions)
+        s.t += 0.41
+        s.step(1e-3)
+        found.append(grid.lines[0][2])
+    assert found == pytest.approx([1.6, 1.6, 2.0])
+
+
 def test_a_step_keeps_its_cut_by_the_cells_where_it_moves():
     """A block that is moved by half of STILL of the coarse cells keeps its cut there; in fine cells it does not."""
     kept, y = [], np.append(np.linspace(0, 0.1, 21), np.linspace(0.2, 1.2, 11))
@@ -244,11 +305,11 @@ LINES = [[0, 1, 1.5, 2, 3], [0, 1, 1.5, 2, 3]]
 BALL = mpm.Tool(mpm.Ball((1.5, 1.5), 0.2), lambda t: (0, -t))
 
 
-def step(follow, lines=LINES, there=True):
+def step(follow, lines=LINES, there=True, **more):
     """Make a step, at t = 1 s, on lines that follow; a tool may be there or not."""
     grid = mpm.Grid(lines=lines, follow=follow)
     tool = [follow] if isinstance(follow, mpm.Tool) and there else []
-    s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [3, 1])], [SOFT], walls={"bottom": "xy"}, conditions=tool)
+    s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [3, 1])], [SOFT], walls={"bottom": "xy"}, conditions=tool, **more)
     s.t = 1.0
     s.step(0.1)
 
@@ -269,6 +330,7 @@ def step(follow, lines=LINES, there=True):
         (lambda: step(BALL), "grid: follow", "0 m between"),
         (lambda: step(BALL, there=False), "grid: follow", "not in the first stage"),
         (lambda: step(BALL, [LINES[0], [0, 0.5, 1, 2, 3]]), "grid: follow", "begin at a side"),
+        (lambda: step(lambda t: LINES, numerics=mpm.Numerics(quadrature="point")), "quadrature", "follow"),
     ],
 )
 def test_lines_that_cannot_follow_are_refused_in_one_line(make, name, value):

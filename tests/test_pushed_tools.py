@@ -181,6 +181,19 @@ def test_a_load_drags_a_tool_as_far_as_friction_holds_it():
         assert slips or s.tool_forces.array[0, 0] == pytest.approx(most, rel=1e-6)
 
 
+def test_steps_of_any_length_follow_a_tool_that_its_load_pushes_aside():
+    """The cells in contact under the tool depend on the length of the step; longer steps add some."""
+    press = {"load": lambda t: 1e6 * min(t, 1), "direction": (0, -1)}
+    ball = mpm.Tool(mpm.Ball((0.83, 1.15), 0.15), lambda t: (-4 * max(t - 1, 0), 0), **press)
+    grid, soil = mpm.Grid([0, 0], [1.6, 1.4], [16, 14]), mpm.Hencky(bulk=1e7 / 3, shear=5e6)
+    block, walls = mpm.box(grid, [0, 0], [1.6, 1]), {"left": "x", "right": "x", "bottom": "xy"}
+    s = mpm.Simulation(grid, [block], [soil], walls=walls, conditions=[ball])
+    s.run(1, 0.25, progress=False)
+    for dt in (0.001, 0.03):
+        state, _ = s.advanced(dt)
+        assert state.outcome["tool_forces"]["tool"][1] == pytest.approx(-1e6, rel=1e-6)
+
+
 def test_a_run_that_is_resumed_ends_with_the_same_bits(tmp_path):
     whole, half, again = (layer(pushed(lambda t: 2e4 * t)) for _ in range(3))
     whole.run(1.0, 0.25)

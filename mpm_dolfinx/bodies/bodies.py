@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.base.validation import asked, at_places, instance, numbers
-from mpm_dolfinx.grid.grid import FACES, SIDES, Grid, corner_bits, in_chunks
+from mpm_dolfinx.grid.grid import FACES, SIDES, Grid, begin_with, corner_bits, in_chunks
 from mpm_dolfinx.parallel.exchange import everywhere
 from mpm_dolfinx.points.cutting import centroids, domain_volumes, volumes
 from mpm_dolfinx.points.material_points import MaterialPoints
@@ -183,7 +183,7 @@ def mapped(grid: Grid, body: Body, map: Callable[[NDArray[np.float64]], NDArray[
     ValueError
         The map raises an exception, returns another shape or nan, leads out of the grid, or inverts a box.
     """
-    instance("body: grid", grid, Grid)
+    begin_with("body: grid", grid)
     instance("body to map", body, Body)
     inner = body.map
     bent = replace(body, map=map if inner is None else lambda x: map(np.asarray(inner(x), dtype=float)))

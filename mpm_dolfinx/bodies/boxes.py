@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.base.tolerances import NEAR, SAME
-from mpm_dolfinx.base.validation import asked, instance, numbers, whole
+from mpm_dolfinx.base.validation import asked, numbers, whole
 from mpm_dolfinx.bodies.bodies import Body, check_inside
-from mpm_dolfinx.grid.grid import MOST, Grid, among, corner_bits, in_chunks
+from mpm_dolfinx.grid.grid import MOST, Grid, among, begin_with, corner_bits, in_chunks
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -189,7 +189,7 @@ def box(grid: Grid, lower: ArrayLike, upper: ArrayLike, per_cell: int = 2, mater
     ValueError
         A corner outside the grid, `upper` not above `lower`, or an invalid `per_cell` or `material`.
     """
-    instance("body: grid", grid, Grid)
+    begin_with("body: grid", grid)
     lower, upper = (
         numbers(f"body: {name}", x, (grid.dim,), allowed=f"{grid.dim} finite coordinates")
         for name, x in (("lower", lower), ("upper", upper))
@@ -228,7 +228,7 @@ def shape(
     ValueError
         `inside` raises an exception, returns no booleans or is False everywhere; `per_cell` or `material` is invalid.
     """
-    instance("body: grid", grid, Grid)
+    begin_with("body: grid", grid)
     material, per_cell = whole("body: material", material, 0), whole("body: per_cell", per_cell)
     count = grid.shape * per_cell
     index = np.stack(np.meshgrid(*map(np.arange, count), indexing="ij"), axis=-1).reshape(-1, grid.dim)

@@ -24,7 +24,7 @@ from mpm_dolfinx.base.validation import instance, line, line_of, path
 from mpm_dolfinx.bodies import mesh_readers
 from mpm_dolfinx.bodies.mesh_cells import AS_LATTICE, KINDS, SECOND_ORDER, SIDES_OF, distinct, edges
 from mpm_dolfinx.bodies.meshes import Mesh, MeshBody, seeded
-from mpm_dolfinx.grid.grid import FACES, Grid
+from mpm_dolfinx.grid.grid import FACES, Grid, begin_with
 from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
 
 TAGS = ("gmsh:physical", "medit:ref", "cell_tags", "MaterialIDs", "attribute", "material", "nastran:ref", "su2:tag")
@@ -82,7 +82,7 @@ def from_mesh(
     OSError
         On several processes: a temporary file cannot be written.
     """
-    instance("body: grid", grid, Grid)
+    begin_with("body: grid", grid)
     name, names = "mesh", _numbers(names)
     if isinstance(mesh, (str, os.PathLike)):
         name, mesh = f"mesh {os.fspath(mesh)}", path("mesh", mesh)

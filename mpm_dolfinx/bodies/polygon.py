@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.base.tolerances import ROUND_OFF
-from mpm_dolfinx.base.validation import instance, line, numbers, whole
+from mpm_dolfinx.base.validation import line, numbers, whole
 from mpm_dolfinx.bodies.mesh_cells import AS_LATTICE
 from mpm_dolfinx.bodies.meshes import Mesh, MeshBody, seeded
-from mpm_dolfinx.grid.grid import Grid, cross_in_plane
+from mpm_dolfinx.grid.grid import Grid, begin_with, cross_in_plane
 
 
 def polygon(
@@ -56,7 +56,7 @@ def polygon(
     ValueError
         A polygon or hole that crosses itself or another outline, or leaves the grid.  Wrong number of side names.
     """
-    instance("body: grid", grid, Grid)
+    begin_with("body: grid", grid)
     if grid.dim != 2:
         raise ValueError(f"polygon: grid of {grid.dim} dimensions, must have 2; in 3D use a mesh (`from_mesh`)")
     outline = _outline("corners", corners)

@@ -152,7 +152,11 @@ class Loads:
     touches: bool = False
     """Whether this is a contact with a tool or another body, from which bodies may separate."""
     key: Any = None
-    """Key of everything on which the penalty depends, except for the positions of faces."""
+    """Key of everything on which the penalty, or the pattern, depends, except for the positions of faces."""
+
+    def joined(self, substeps: Sequence[Any]) -> Loads:
+        """Return the loads with the pattern of the same condition in all substeps of the step."""
+        return self
 
     def begun(self, shares: Shares, earlier: Any) -> Loads:
         """Return the loads for a substep with inertia.  `earlier` is the result of `flown` in the previous substep."""

@@ -19,7 +19,9 @@ Forces are therefore f + (D e) (load - e . f) / s; minus their derivative is D -
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from typing import Any, NamedTuple
 
 from mpi4py import MPI
@@ -172,6 +174,17 @@ class ContactProblem(Loads):
         """Indices of the tools that loads move; each of them couples all nodes under it."""
         return np.flatnonzero(~np.isnan(self.pushes.load)) if self.pushed else np.empty(0, dtype=np.int64)
 
+    @cached_property
+    def key(self) -> tuple[NDArray[np.int32], ...]:
+        """The cells under each of the tools that loads move; they depend on the length of the step."""
+        return tuple(np.unique(self.pairs.cell[self.pairs.number == number]) for number in self._loaded)
+
+    def joined(self, substeps: Sequence[ContactProblem]) -> ContactProblem:
+        """See `Loads`."""
+        out = copy(self)
+        out.key = tuple(np.unique(np.concatenate(cells)) for cells in zip(*(one.key for one in substeps), strict=True))
+        return out
+
     def found(self, at: At) -> Found:
         """Return the contact at the displacements u."""
 
@@ -217,8 +230,11 @@ class ContactProblem(Loads):
     def pattern(self, unknowns: Unknowns) -> PETSc.Mat | None:
         """Return a zero matrix with the entries that `coupling` may have outside the pattern of cells, or None."""
         out = self._pattern_of_pairs(unknowns) if self._cell_pairs is not None else None
-        for number in self._loaded:
-            own = self._nodal(unknowns, np.repeat((self.pairs.number == number)[:, None], self.grid.dim, axis=1))
+        for cells in self.key:
+            B, own = at_nodes(self.grid, unknowns, cells, np.ones((len(cells), 2**self.grid.dim))), unknowns.vector()
+            ones = B.createVecLeft()
+            ones.set(1.0)
+            B.multTranspose(ones, own)
             more = outer(own, own)
             out = more if out is None else out + more
         if out is not None:

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import NamedTuple, Protocol
 
@@ -60,8 +60,27 @@ def unit_vector(name: str, value: ArrayLike) -> NDArray[np.float64]:
     return v / np.linalg.norm(v)
 
 
+class Placed:
+    """Base class of shapes, with positions (d,) or (m, d), m, in their first field."""
+
+    @property
+    def dim(self) -> int:
+        """Number d of dimensions."""
+        return np.asarray(getattr(self, fields(self)[0].name)).shape[-1]
+
+    @property
+    def middle(self) -> NDArray[np.float64]:
+        """Mean (d,), m, of these positions."""
+        return np.atleast_2d(getattr(self, fields(self)[0].name)).mean(axis=0)
+
+    def moved(self, by: NDArray[np.float64]) -> Shape:
+        """Return the shape, translated by a vector (d,), m."""
+        place = fields(self)[0].name
+        return replace(self, **{place: np.asarray(getattr(self, place)) + by})
+
+
 @dataclass(frozen=True, eq=False)
-class HalfSpace:
+class HalfSpace(Placed):
     """The half-space behind a plane, for a plate, a wall, or the ground.
 
     Parameters
@@ -82,11 +101,6 @@ class HalfSpace:
     def _n(self) -> NDArray[np.float64]:
         return unit_vector("HalfSpace: outward", self.outward)
 
-    @property
-    def dim(self) -> int:
-        """Number d of dimensions."""
-        return len(self._n)
-
     def distance(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the signed distances (m,), m, from the surface."""
         return (y - self.point) @ self._n
@@ -99,13 +113,9 @@ class HalfSpace:
         """Return the second derivatives (m, d, d) of the distance, 1/m."""
         return _flat(y)
 
-    def moved(self, by: NDArray[np.float64]) -> HalfSpace:
-        """Return the shape, translated by a vector (d,), m."""
-        return replace(self, point=np.asarray(self.point) + by)
-
 
 @dataclass(frozen=True, eq=False)
-class Ball:
+class Ball(Placed):
     """A sphere; in 2D a disc, the section of a cylinder.
 
     Parameters
@@ -123,11 +133,6 @@ class Ball:
         numbers("Ball: centre", self.centre, (2,), (3,), allowed="2 or 3 finite coordinates")
         numbers("Ball: radius", self.radius, test=lambda r: (r > 0) & (r < np.inf), allowed="> 0 and finite")
 
-    @property
-    def dim(self) -> int:
-        """Number d of dimensions."""
-        return len(np.asarray(self.centre))
-
     def distance(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the signed distances (m,), m, from the surface."""
         return _across(y - self.centre)[0] - self.radius
@@ -140,13 +145,9 @@ class Ball:
         """Return the second derivatives (m, d, d) of the distance, 1/m."""
         return _across(y - self.centre)[2]
 
-    def moved(self, by: NDArray[np.float64]) -> Ball:
-        """Return the shape, translated by a vector (d,), m."""
-        return replace(self, centre=np.asarray(self.centre) + by)
-
 
 @dataclass(frozen=True, eq=False)
-class Convex:
+class Convex(Placed):
     """The convex hull of corners: a polygon, in 3D a polyhedron.
 
     The signed distance is the largest distance from the planes of the surface.  It is exact inside.  Outside, near
@@ -178,11 +179,6 @@ class Convex:
     def _planes(self) -> NDArray[np.float64]:
         return ConvexHull(np.asarray(self.corners, dtype=float)).equations
 
-    @property
-    def dim(self) -> int:
-        """Number d of dimensions."""
-        return self._planes.shape[1] - 1
-
     def _each(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
         return y @ self._planes[:, :-1].T + self._planes[:, -1]
 
@@ -200,10 +196,6 @@ class Convex:
         """Return the second derivatives (m, d, d) of the distance, 1/m."""
         return _flat(y)
 
-    def moved(self, by: NDArray[np.float64]) -> Convex:
-        """Return the shape, translated by a vector (d,), m."""
-        return replace(self, corners=np.asarray(self.corners) + by)
-
 
 def uniform(shape: Ball | Convex) -> Uniform:
     """Return centroid and radius of gyration of a disc, or of a polygon as a fan of triangles from one corner."""
@@ -220,7 +212,7 @@ def uniform(shape: Ball | Convex) -> Uniform:
 
 
 @dataclass(frozen=True, eq=False)
-class Cone:
+class Cone(Placed):
     """An infinite cone; in 2D a wedge.
 
     Parameters
@@ -244,11 +236,6 @@ class Cone:
     @cached_property
     def _axis(self) -> NDArray[np.float64]:
         return unit_vector("Cone: axis", self.axis)
-
-    @property
-    def dim(self) -> int:
-        """Number d of dimensions."""
-        return len(self._axis)
 
     def _polar(self, y: NDArray[np.float64]) -> tuple:
         """Return heights (m,) above the tip, and the results of `_across` for the offsets from the axis."""
@@ -275,10 +262,6 @@ class Cone:
         near_axis = r[:, None, None] <= NEAR * np.abs(y - self.tip).max(initial=0.0)
         along = self._axis[:, None] * self._axis / np.where(near_axis, np.inf, r[:, None, None])
         return np.where(near_axis, 0.0, second - along) * np.cos(np.radians(self.angle_deg))
-
-    def moved(self, by: NDArray[np.float64]) -> Cone:
-        """Return the shape, translated by a vector (d,), m."""
-        return replace(self, tip=np.asarray(self.tip) + by)
 
 
 @dataclass(frozen=True, eq=False)

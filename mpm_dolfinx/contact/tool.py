@@ -12,18 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.base.validation import check_names, given, line, numbers
-from mpm_dolfinx.contact.shapes import (
-    ROUNDED,
-    Ball,
-    Cone,
-    Convex,
-    Distance,
-    HalfSpace,
-    Shape,
-    Uniform,
-    uniform,
-    unit_vector,
-)
+from mpm_dolfinx.contact.shapes import ROUNDED, Ball, Convex, Distance, Placed, Shape, Uniform, uniform, unit_vector
 from mpm_dolfinx.grid.grid import Grid
 
 ONTO = 100  # largest number of projections onto the surface
@@ -138,7 +127,7 @@ class Tool:
         return f"Tool({', '.join(given)})"
 
     def __post_init__(self):
-        if not isinstance(self.shape, (HalfSpace, Ball, Convex, Cone)) and not callable(self.shape):
+        if not isinstance(self.shape, Placed) and not callable(self.shape):
             raise ValueError(f"Tool: shape = {line(self.shape)}, must be a HalfSpace, Ball, Convex, Cone or a function")
         for name in ("friction", "adhesion"):
             value = getattr(self, name)
@@ -150,7 +139,7 @@ class Tool:
         for name, value in vars(self).items():
             if name in ("displacement", "rotation_rad", "load") and callable(value):
                 check_names(f"{line(self)}: {name}", value, ("t",))
-            elif isinstance(value, (list, np.ndarray, HalfSpace, Ball, Convex, Cone)):
+            elif isinstance(value, (list, np.ndarray, Placed)):
                 object.__setattr__(self, name, deepcopy(value))  # protects against later changes
         if self.load is not None and not callable(self.load):
             self.pushes(0.0)
@@ -284,11 +273,9 @@ class Tool:
         shift = self._given("displacement", t, dim)
         if shift.ndim == 0 and shift:
             raise ValueError(f"{line(self)}: displacement at t = {t:g} s = {shift:g}, must be {dim} finite numbers")
-        R, angle = np.eye(dim), float(self._given("rotation_rad", t))
-        if angle:
-            R = rotation(angle)
-        shift_by_forces = by_forces if np.ndim(by_forces) else by_forces * self.along(dim)
-        return Pose(R, self._centre(dim), np.broadcast_to(shift, (dim,))).moved(shift_by_forces)
+        R = rotation(float(self._given("rotation_rad", t))) if dim == 2 else np.eye(dim)
+        pose = Pose(R, self._centre(dim), np.broadcast_to(shift, (dim,)))
+        return pose.moved(by_forces if np.ndim(by_forces) else by_forces * self.along(dim))
 
     def drawn(self, grid: Grid, t: float, by_forces: NDArray[np.float64] | float = 0.0) -> NDArray[np.float64]:
         """Return the corners (m, 2^d, d), m, of the grid cells inside the tool at time t (s), for pictures.

@@ -11,14 +11,14 @@ from mpm_dolfinx.base.tolerances import NEAR
 from mpm_dolfinx.base.validation import all_of, chosen, functions, instance, line, numbers
 from mpm_dolfinx.bodies.bodies import Body, check_bodies
 from mpm_dolfinx.conditions.conditions import OnSide
-from mpm_dolfinx.grid.grid import Grid
+from mpm_dolfinx.grid.grid import Grid, begin_with
 from mpm_dolfinx.materials.skeleton import Fluid, Skeleton
 from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
 
 
 def check_parts(grid: Grid, bodies: Sequence[Body], materials: Sequence[Skeleton], later: Sequence[int]) -> None:
     """Raise an error for invalid grid, bodies or materials, bodies outside the grid, or invalid `later` indices."""
-    instance("grid", grid, Grid)
+    begin_with("grid", grid)
     all_of("bodies", bodies, Body, 1)
     all_of("materials", materials, Skeleton, 1)
     check_bodies(grid, bodies)
@@ -48,9 +48,9 @@ def check_options(
 
 
 def check_axisymmetry(grid: Grid, bodies: Sequence[Body], quadrature: str) -> None:
-    """Raise an error for invalid axisymmetric scenes.  Warn about narrow holes around the axis."""
-    if grid.axisymmetric and quadrature == "point":
-        raise ValueError("quadrature = 'point', must be 'domain' in axisymmetry")
+    """Raise an error for point quadrature on grids that exclude it.  Warn about narrow holes around the axis."""
+    if quadrature == "point" and (grid.axisymmetric or grid.follow is not None):  # fine cells would become empty
+        raise ValueError("quadrature = 'point', must be 'domain' in axisymmetry, and on grid lines that follow")
     if not grid.has_axis:
         return
     x = np.concatenate([body.corners() for body in bodies])

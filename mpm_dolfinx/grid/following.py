@@ -100,10 +100,6 @@ def _filled(width: NDArray[np.float64], length: float, more: float, least: float
     if total < len(width) * least * (1 - SAME):
         allowed = f"must be at least {len(width) * least:.3g} m for the {len(width)} cells between them"
         raise ValueError(f"{what}, which leaves {total:.3g} m between the small cells and a side, {allowed}")
-
-    def beyond(factor: float) -> float:
-        return float((width * factor**power).sum() - total)
-
-    factor = brentq(beyond, 0.0, 1 + total / width[0])
+    factor = brentq(lambda f: float((width * f**power).sum() - total), 0.0, 1 + total / width[0])
     out = width * factor**power
     return out * (total / out.sum())

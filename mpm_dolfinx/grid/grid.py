@@ -9,7 +9,7 @@ The mesh is created at its first use.  Before that, a simulation distributes the
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache, cached_property, partial, reduce
 from math import prod
 from typing import Any, NamedTuple
@@ -314,7 +314,8 @@ class Grid:
         lines along all axes give a grid of equal cells.
     follow : Tool, or callable -> (n,) along each axis, m
         Object that the lines follow, at each reset of the grid.  With a tool, the smallest cells of `lines` move like
-        the tool, and the cells around them widen or narrow.  The tool must be a condition of the first stage; lines do
+        the centre of its ball, the tip of its cone, or the mean of its corners; if its shape is a function, like its
+        `centre`.  The cells around them widen or narrow.  The tool must be a condition of the first stage; lines do
         not move in stages without it.  A function depends on time t (s), the positions x (n, d) of all points, or both.
         It returns all lines: as many along each axis as `lines`, with the same first and last coordinate.
     axisymmetric
@@ -425,13 +426,15 @@ class Grid:
         snap = np.maximum(SNAP, [rounding(e) for e in zip(self.lower, self.upper, strict=True)] / finest)
         return Spacing(lines, widths, finest, float(finest.min()), float(most.max()), snap)
 
-    def move(self, lines: Sequence[NDArray[np.float64]]) -> None:
-        """Move the lines of a grid with `follow` to new coordinates (n,), m, along each axis, relative to the base.
+    def move(self, lines: Mapping[str, NDArray[np.float64]] | None) -> None:
+        """Move the lines of a grid with `follow` to coordinates (n,), m, by axis "x", "y", "z", relative to the base.
 
-        Afterwards all coordinates of nodes, cells and mesh are exactly as in a new grid with these lines.
+        None: the given lines.  Afterwards all coordinates of nodes, cells and mesh are exactly as in a new grid with
+        these lines.
         """
-        if any((new != old).any() for new, old in zip(lines, self.lines, strict=True)):
-            self._spacing = self._spaced(tuple(lines))
+        new = self.seeded if lines is None else tuple(lines[letter] for letter in "xyz"[: self.dim])
+        if self.follow is not None and any((x != old).any() for x, old in zip(new, self.lines, strict=True)):
+            self._spacing = self._spaced(new)
             if self._cells is not None:
                 self._cells.move(self)
 
@@ -823,6 +826,12 @@ class Grid:
         axis, end = side(name, self.dim)
         plane = (self.low, self.high)[end][axis]
         return np.abs(self.node_x[:, axis] - plane) < NEAR * self.finest[axis]
+
+
+def begin_with(name: str, grid: Any) -> None:
+    """Move lines that follow to where they were given, for new bodies and scenes; raise ValueError for no grid."""
+    instance(name, grid, Grid)
+    grid.move(None)
 
 
 class GridOfGroups(Grid):

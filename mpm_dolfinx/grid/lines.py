@@ -81,12 +81,8 @@ def graded(
     lower = numbers("graded: lower", lower, (2,), (3,), allowed="2 or 3 finite coordinates")
     d = lower.size
     upper = numbers("graded: upper", upper, (d,), allowed=f"{d} finite coordinates, as lower")
-    given, size = (
-        size,
-        np.broadcast_to(
-            numbers("graded: size", size, (), (d,), allowed="> 0", test=lambda v: (v > 0) & (v < np.inf)), (d,)
-        ),
-    )
+    least = numbers("graded: size", size, (), (d,), allowed="> 0", test=lambda v: (v > 0) & (v < np.inf))
+    given, size = size, np.broadcast_to(least, (d,))
     ratio = float(numbers("graded: ratio", ratio, allowed="> 1", test=lambda v: (v > 1) & (v < np.inf)))
     if largest != np.inf:
         largest = float(numbers("graded: largest", largest, test=lambda v: v >= size.max(), allowed=f">= {size.max()}"))

@@ -152,8 +152,7 @@ def resume(simulation: Simulation, file: str | os.PathLike) -> Result:
     if len(boxes) == comm.size > 1 and (boxes != simulation.grid.partition.boxes).any():
         distribute_by(simulation, boxes)
     nodal = {name: simulation.grid.from_rows(*of) for name in NODAL if (of := getattr(state, name)) is not None}
-    if state.lines is not None:
-        simulation.grid.move([state.lines[letter] for letter in sorted(state.lines)])
+    simulation.grid.move(state.lines)
     simulation.state = replace(state, stage=simulation.state.stage, **nodal).at_owners(simulation.grid)
     log(comm, "t = %g s: resumed from %s after %d steps", state.t, file, state.result.steps)
     return simulation.result

@@ -27,7 +27,6 @@ FIELDS = {
     "grid.pvd: the cells of the grid": {
         "fill": "-, volume fraction of the cell that bodies fill",
         "x": "m, centroid of the filled part, by components",
-        "step_displacement": "m, nodal displacement increment of the last step",
     },
     "history.csv: one row for each output time": {
         "t, wall": "s, time in the scene; wall time so far",

@@ -276,11 +276,9 @@ def _columns(name: str, rows: NDArray) -> Iterator[tuple[str, NDArray]]:
 
 
 def _grid_fields(simulation: Simulation) -> list[fem.Function]:
-    """Return the displacement increment of the step and the fields of the cells as functions with names."""
+    """Return the fields of the cells as functions with names."""
     scene, d = simulation.scene, simulation.grid.dim
-    cells, u = simulation.cells(), scene.momentum.u
-    moved = fem.Function(u.function_space, name="step_displacement")
-    moved.x.array[:] = u.x.array
+    cells = simulation.cells()
     fields = {"fill": scene.momentum.ghost.fill.x.array[cells.cell]}
     for i in range(d):
         fields |= {f"{name}_{'xyz'[i]}": getattr(cells, name)[:, i] for name in ("displacement", "x")}
@@ -290,7 +288,7 @@ def _grid_fields(simulation: Simulation) -> list[fem.Function]:
     for i, j in pairs:
         for name in ("effective_stress", "stress")[: 1 if cells.pressure is None else 2]:
             fields[f"{name}_{'xyz'[i]}{'xyz'[j]}"] = getattr(cells, name)[:, i, j]
-    out = [moved]
+    out = []
     for name, rows in fields.items():  # scalars only: dolfinx 0.5 writes vectors as nodal fields
         out.append(fem.Function(simulation.grid.cellwise(), name=name))
         out[-1].x.array[cells.cell] = rows

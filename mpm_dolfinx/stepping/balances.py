@@ -109,6 +109,11 @@ class Balances(NamedTuple):
         return self.storage and self.storage.net_inflow(rates)
 
 
+def joined(loads: list[list[Loads]]) -> list[list[Loads]]:
+    """Return the loads of each substep, with the pattern of all substeps."""
+    return [[one.joined(of) for one, of in zip(now, zip(*loads, strict=True), strict=True)] for now in loads]
+
+
 def at_rest(scene: Scene, state: State, loads: list[list[Loads]]) -> list[list[Loads]]:
     """Return the loads of each substep; with `State.rest`, supports also react to the initial stress."""
     if state.rest is None:

@@ -33,8 +33,7 @@ def distribute(simulation: Distributed) -> None:
     grid = simulation.scene.grid
     if grid.comm.size == 1 or (state := simulation.state).stays:
         return
-    if state.lines is not None:
-        grid.move([state.lines[letter] for letter in sorted(state.lines)])
+    grid.move(state.lines)
     boxes = None if simulation.scene.extended else grid.better(state.as_cut.x)
     if boxes is not None and distribute_by(simulation, boxes):
         log(grid.comm, "t = %g s: cells distributed anew among %d processes", state.t, grid.comm.size)

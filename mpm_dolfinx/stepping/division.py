@@ -13,7 +13,7 @@ of a domain counts as well, because it changes the number of cells.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property
 

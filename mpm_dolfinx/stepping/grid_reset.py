@@ -645,8 +645,11 @@ def assembled(
     stage: Stage,
     loads: Sequence[Loads],
     begins: bool,
+    *pairs: Any,
 ) -> Assembled:
-    """Return the matrices for cut domains and a stage; begins: whether every part of a body must have support.
+    """Return the matrices for cut domains and a stage.
+
+    begins: whether every part of a body must have support; pairs: keys of the pattern of contacts.
 
     Raises
     ------
@@ -664,7 +667,6 @@ def assembled(
 
     # a cell may become active between active nodes, so equal dofs do not mean equal cells
     with _compat.Timer("integration data"):
-        pairs = on_grid.key if any(one.couples for one in loads) else None  # contact pairs depend on the positions
         others = pairs, on_grid.not_full if stage.inertia else None, () if grid.follow is None else grid.lines
         system = systems((stage, on_grid.cells, dofs, on_grid.penalised, *others), make, grid.comm)
         return Assembled(momentum, storage, system, on_grid, stage, loads)

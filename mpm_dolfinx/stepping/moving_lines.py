@@ -3,9 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
 
 from mpi4py import MPI
 
@@ -20,14 +19,6 @@ from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.stepping.state import State
 
 
-def followed_tool(grid: Grid, conditions: Mapping[str, Any]) -> str | None:
-    """Return the name of the tool that the lines of a grid follow, among conditions by name; None if it is absent."""
-    for name, one in conditions.items():
-        if one is grid.follow or getattr(one, "name", None) == grid.follow.name is not None:
-            return name
-    return None
-
-
 def with_lines(grid: Grid, state: State, left: Callable[[State], State]) -> State:
     """Return the state for its next step, and move the grid to the lines of that step.
 
@@ -38,8 +29,8 @@ def with_lines(grid: Grid, state: State, left: Callable[[State], State]) -> Stat
     left
         Function that adds pressures of pieces to a state with kept pieces, for a reset; called before the grid moves.
     """
-    before = grid.seeded if state.lines is None else [state.lines[letter] for letter in sorted(state.lines)]
-    grid.move(before)
+    grid.move(state.lines)
+    before = grid.lines
     lines = _wanted(grid, state, before)
     if state.stay is not None:
         moved = [
@@ -52,17 +43,16 @@ def with_lines(grid: Grid, state: State, left: Callable[[State], State]) -> Stat
             state = left(state) if state.stays else state
             pieces = state.pieces and replace(state.pieces, of_cell=None, start=None)
             state = replace(state, stay=None, held=None, rest=None, pieces=pieces)
-    grid.move(lines)
-    return replace(state, lines=dict(zip("xyz", lines, strict=False)))
+    state = replace(state, lines=dict(zip("xyz", lines, strict=False)))
+    grid.move(state.lines)
+    return state
 
 
 def _wanted(grid: Grid, state: State, before: Sequence[NDArray[np.float64]]) -> Sequence[NDArray[np.float64]]:
     """Return the coordinates (n,), m, of the grid lines along each axis for a state, relative to the base."""
     if hasattr(grid.follow, "pose"):
-        if (name := followed_tool(grid, state.stage.given)) is None:
-            return before
-        tool, travel = state.stage.given[name], state.outcome["tool_travel"][name]
-        return carried(grid.seeded, tool.pose(state.t, grid.dim, travel).shift)
+        moved = state.stage.moved(grid, state.t, state.outcome)
+        return before if moved is None else carried(grid.seeded, moved)
     x = _of_all(grid, state) if "x" in takes(grid.follow) else None
     lines = grid.from_base(
         lines_at(grid.follow, [x + start for x, start in zip(grid.seeded, grid.base, strict=True)], state.t, x)

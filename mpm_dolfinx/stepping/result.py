@@ -34,7 +34,7 @@ class Result:
     steps, newton, coupling
         Numbers of steps, of Newton iterations and of coupling iterations so far.
     cuts, rejected
-        Numbers of steps that were reduced because they did not converge, and because of their estimated error.
+        Numbers of reduced steps: without convergence; with a large error, or if equal, with a jump of pressure.
     rederived
         Number of inverted domains that were re-initialised from F.
     renewed

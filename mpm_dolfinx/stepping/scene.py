@@ -44,7 +44,7 @@ from mpm_dolfinx.solve.numerics import Numerics
 from mpm_dolfinx.stepping.advance import Motion
 from mpm_dolfinx.stepping.division import Division
 from mpm_dolfinx.stepping.grid_reset import Assembled, OnGrid, System, assembled
-from mpm_dolfinx.stepping.moving_lines import followed_tool, with_lines
+from mpm_dolfinx.stepping.moving_lines import with_lines
 from mpm_dolfinx.stepping.renewal import Renewal
 from mpm_dolfinx.stepping.stage import Stage, stage
 from mpm_dolfinx.stepping.state import NODAL, State
@@ -272,7 +272,7 @@ class Scene:
     def check_followed(self, first: Stage) -> None:
         """Raise ValueError if grid lines follow a tool that is absent from the first stage: they would never move."""
         follow = self.grid.follow
-        if hasattr(follow, "pose") and followed_tool(self.grid, first.given) is None:
+        if hasattr(follow, "pose") and first.followed(self.grid) is None:
             raise ValueError(f"grid: follow = {line(follow)}, not in the first stage, must be one of its conditions")
 
     def followed(self, state: State) -> State:
@@ -347,7 +347,8 @@ class Scene:
 
         def make() -> Assembled:
             problems = (self.momentum, self.storage, self.scheme, self._systems)
-            return assembled(*problems, on_grid, stage, as_cut(), begins)
+            pairs = [(on_grid.key, one.key) for one in now if one.couples]  # contact pairs depend on the positions
+            return assembled(*problems, on_grid, stage, as_cut(), begins, *pairs)
 
         return self._assembled((on_grid.key, stage, *(one.key for one in now)), make, self.grid.comm)
 

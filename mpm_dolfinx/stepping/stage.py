@@ -35,13 +35,13 @@ from mpm_dolfinx.conditions.walls import fixed_nodes, with_axis
 from mpm_dolfinx.contact.groups import Contact
 from mpm_dolfinx.contact.pairing import Contacts
 from mpm_dolfinx.contact.ties import Ties
-from mpm_dolfinx.contact.tool import Tool
+from mpm_dolfinx.contact.tool import Tool, motion_by_forces
 from mpm_dolfinx.contact.tool_placing import Tools
 from mpm_dolfinx.domains.lattice import Lattice, lattices
 from mpm_dolfinx.dynamics.quiet_sides import QuietSides
 from mpm_dolfinx.flow.drained_sides import DrainedSides
 from mpm_dolfinx.flow.feeding import Feeding
-from mpm_dolfinx.grid.grid import SIDES
+from mpm_dolfinx.grid.grid import SIDES, Grid
 from mpm_dolfinx.materials.fields import SceneMaterials
 from mpm_dolfinx.mechanics.given_displacements import GivenDisplacements
 from mpm_dolfinx.mechanics.momentum import MomentumForms
@@ -105,6 +105,22 @@ class Stage:
     def of(self, *kinds: type) -> dict[str, Any]:
         """Return the conditions of the given classes, by name."""
         return {name: one for name, one in self.named.items() if isinstance(one, kinds)}
+
+    def followed(self, grid: Grid) -> str | None:
+        """Return the name of the tool that the lines of a grid follow; None if it is absent."""
+        for name, one in self.of(Tool).items():
+            if one is grid.follow or one.name == grid.follow.name is not None:
+                return name
+        return None
+
+    def moved(self, grid: Grid, t: float, outcome: Outcome) -> NDArray[np.float64] | None:
+        """Return the displacement (d,), m, at time t, s, of the tool that grid lines follow; None if it is absent."""
+        if (name := self.followed(grid)) is None:
+            return None
+        tool = self.given[name]
+        pose = tool.pose(t, grid.dim, motion_by_forces(outcome, name))
+        middle = getattr(tool.shape, "middle", pose.centre)
+        return pose.put(middle) - middle
 
     @property
     def symmetric(self) -> bool:

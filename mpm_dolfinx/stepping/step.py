@@ -13,7 +13,7 @@ from mpm_dolfinx.conditions.acting import Place
 from mpm_dolfinx.dynamics.energies import after, after_renewal
 from mpm_dolfinx.forms.unknowns import collect_garbage
 from mpm_dolfinx.solve.newton import Kept, note_pressures, solve_substep
-from mpm_dolfinx.stepping.balances import Acting, Start, at_rest, balances, flight_of, has_yielded, leads, left
+from mpm_dolfinx.stepping.balances import Acting, Start, at_rest, balances, flight_of, has_yielded, joined, leads, left
 from mpm_dolfinx.stepping.scene import Scene
 from mpm_dolfinx.stepping.state import State
 
@@ -35,7 +35,7 @@ def set_up(scene: Scene, state: State, dt: float, how: tuple = ()) -> Start:
     now = state.t, dt, state.t, state.outcome, stage.inertia, state.begins
     place = Place(on_grid.cut, on_grid.fill, state.points, data, *now)
     stage.check_start(place)
-    loads = [stage.placed(place._replace(t=t)) for t in times]
+    loads = joined([stage.placed(place._replace(t=t)) for t in times])
     at_cut = place._replace(points=cut_points, pieces=on_grid.data, t=times[-1])
     as_cut = partial(stage.placed, at_cut) if state.stay else partial(loads.__getitem__, -1)
     matrices, loads = scene.assembled(on_grid, stage, loads[-1], as_cut, state.begins), at_rest(scene, state, loads)
