@@ -154,12 +154,17 @@ TURNS = {"rotation_rad": lambda t: 2 * t, "centre": (1.5, 0.5)}
 TRIANGLE = mpm.Convex([(1, 1), (2, 1), (1.5, 1.9)])
 
 
+def away(y):
+    """Return the distance from a disc, as a function of the user's."""
+    return np.linalg.norm(y - 1.5, axis=1) - 0.2
+
+
 @pytest.mark.parametrize(
     "tool, way",
     [
         (mpm.Tool(mpm.Ball((1.5, 1.5), 0.2), **TURNS), np.array([-np.sin(1), np.cos(1) - 1])),
         (mpm.Tool(TRIANGLE, lambda t: (0, 0.25 * t), **TURNS), np.array([-0.8 * np.sin(1), 0.8 * np.cos(1) - 0.675])),
-        (mpm.Tool(lambda y: np.linalg.norm(y - 1.5, axis=1) - 0.2, lambda t: (0, 1.2 * t), **TURNS), np.array([0, 0.6])),
+        (mpm.Tool(away, lambda t: (0, 1.2 * t), **TURNS), np.array([0, 0.6])),
         (mpm.Tool(mpm.Ball((1.5, 1.5), 0.2), rotation_rad=lambda t: 2 * t, centre=(1.5, 1.5)), np.zeros(2)),
     ],
     ids=["disc", "polygon", "function", "about itself"],

@@ -67,7 +67,9 @@ def test_domains_that_meet_on_grid_lines_only_are_refused_in_3d(lower, per_cell,
     body, walls = mpm.box(grid, lower, np.add(lower, [0.6, 0.6, 0.5]), per_cell=per_cell), {"bottom": "xyz"}
     conditions = [mpm.Traction("top", (0, 0, -1e3))]
     if refused:
-        with pytest.raises(ValueError, match=r"body 0: one domain in each cell, in line with cells along x and y, .* >= 2$"):
+        with pytest.raises(
+            ValueError, match=r"body 0: one domain in each cell, in line with cells along x and y, .* >= 2$"
+        ):
             mpm.Simulation(grid, [body], [RUBBER], walls=walls, conditions=conditions)
         return
     s = mpm.Simulation(grid, [body], [RUBBER], walls={"bottom": "xyz", "left": "xyz"}, conditions=conditions)

@@ -179,7 +179,7 @@ def box(grid: Grid, lower: ArrayLike, upper: ArrayLike, per_cell: int = 2, mater
         Corners of the box, inside the grid; need not lie on grid lines.
     per_cell
         Points per cell and direction, >= 1, rounded to fit the box.  In grids of unequal cells, domains end at grid
-        lines.  With 1 point, bodies deflect too much and creep; a warning names slender ones.  In 3D, simulations refuse
+        lines.  With 1 point, bodies deflect too much and creep; a warning names slender ones.  In 3D, scenes refuse
         bodies with one domain in each cell that end at grid lines.
     material
         Index of the material in the scene's list, >= 0.

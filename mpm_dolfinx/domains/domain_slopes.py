@@ -42,9 +42,7 @@ class Neighbours:
     chosen (n,): whether to find the neighbours of each point.
     """
 
-    def __init__(
-        self, comm: MPI.Intracomm, bodies: Sequence[Body], points: MaterialPoints, chosen: NDArray[np.bool_]
-    ):
+    def __init__(self, comm: MPI.Intracomm, bodies: Sequence[Body], points: MaterialPoints, chosen: NDArray[np.bool_]):
         dim = bodies[0].dim
         seeded = points.id < sum(map(len, bodies))
         self.rows = rows = (chosen & (seeded | is_part(points))).nonzero()[0]

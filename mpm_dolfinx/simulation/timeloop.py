@@ -32,8 +32,8 @@ from mpm_dolfinx.probing.probes import Probes, check_there
 from mpm_dolfinx.simulation.events import Event, Events, Simulated, Step
 from mpm_dolfinx.simulation.step_size import StepSize, Times, measured, step_rule
 from mpm_dolfinx.simulation.summary import imbalance, peak_memory
-from mpm_dolfinx.stepping.result import GaveUp, Result
 from mpm_dolfinx.stepping.distribution import distribute
+from mpm_dolfinx.stepping.result import GaveUp, Result
 from mpm_dolfinx.stepping.scene import Scene
 from mpm_dolfinx.stepping.state import State, StepControl
 
