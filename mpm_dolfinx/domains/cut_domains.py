@@ -276,7 +276,8 @@ class CutDomains(Keyed):
 
     def _filled_cell(self, at: NDArray[np.int64], x: NDArray[np.float64], together: bool = False) -> NDArray[np.int64]:
         """Return the cell (m,) of each x; if the domain has no piece in this cell, the cell of its largest piece."""
-        grid, pieces, cells = self.grid, self.pieces, self.grid.all_cells
+        grid, pieces = self.grid, self.pieces
+        cells = grid.all_cells
         cell = grid.number(grid.index_from_base(x)) + grid.copy(self.points.id[at])
         key, keys = at * cells + cell, pieces.point * cells + pieces.cell
         found = np.minimum(keys.searchsorted(key), len(keys) - 1)
