@@ -111,7 +111,8 @@ def test_folded_domains_fill_no_cell_twice(dim):
     fill = np.bincount(pieces.cell, pieces.fraction * size[pieces.point], grid.cells)
     assert fill == pytest.approx(1, abs=1e-12)
     middle = np.stack([np.bincount(pieces.cell, pieces.fraction * size[pieces.point] * x) for x in pieces.x.T], axis=1)
-    assert middle == pytest.approx(np.stack(np.unravel_index(np.arange(grid.cells), grid.shape), axis=1) + 0.5, abs=1e-12)
+    index = np.stack(np.unravel_index(np.arange(grid.cells), grid.shape), axis=1)
+    assert middle == pytest.approx(index + 0.5, abs=1e-12)
 
 
 def test_shared_corners_of_folded_domains_move_together():
