@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from helpers import SOFT, imbalance, refused_in_one_line
 from meshes import box_mesh
-from mpi_division import SOIL, fine_about, pressed, pressed_in_3d
+from mpi_division import GRAVITY, SOIL, fine_about, pressed, pressed_in_3d
 from scipy.spatial import cKDTree
 from test_many_sizes import EXACT, KINDS
 
@@ -131,6 +131,17 @@ def test_forces_and_fluid_are_in_balance(press):
         gravity = s.state.stage.conditions["gravity"]
         assert report.balance < 1e-10 and imbalance(s, on_grid.cut.points, SOIL, gravity) < 1e-9
     assert replaced > 1000 and s.tool_forces["tool"][s.grid.dim - 1] < -1e3
+
+
+def test_clay_is_renewed_beside_soil_that_is_divided_with_all_balances():
+    """Wet clay that yields below a smooth disc, while the finest cells travel to the right."""
+    clay = mpm.DruckerPrager(2e6, 1e6, friction=0.0, dilation=0.0, cohesion=2e3, porosity=0.4, conductivity=1e-6)
+    s = pressed(loaded=False, soil=clay, disc=mpm.Tool(mpm.Ball((1.0, 1.25), 0.25), lambda t: (0, -0.06 * t)))
+    for _ in range(9):
+        report = s.step(0.05)
+        assert report.balance < 1e-9 and imbalance(s, s.scene.last[0].cut.points, clay, GRAVITY) < 1e-9
+    made = s.points.id[s.points.id >= len(s.bodies[0])] - len(s.bodies[0])
+    assert (made % 2 == 0).sum() > 100 < (made % 2 == 1).sum()  # renewed, divided
 
 
 def test_a_run_goes_on_with_the_same_bits(tmp_path):
