@@ -23,14 +23,15 @@ def fine_about(low, high, count, middle, width=0.15, times=6):
 DISC = mpm.Tool(mpm.Ball((1.0, 1.25), 0.25), lambda t: (0.001 * t, -0.002 * t), friction=0.3)
 
 
-def pressed(loaded=True, soil=SOIL, disc=DISC):
+def pressed(loaded=True, soil=SOIL, disc=DISC, axisymmetric=False):
     """Return a block under a disc that sinks, and under a load, in cells that travel to the right and back."""
     y = fine_about(0, 1.2, 9, 0.9, 0.2, 2)
     lines = lambda t: [fine_about(0, 2, 18, 0.4 + 1.2 * np.sin(2 * t) ** 2), y]  # noqa: E731
-    grid = mpm.Grid(lines=lines(0), follow=lines)
+    grid = mpm.Grid(lines=lines(0), follow=lines, axisymmetric=axisymmetric)
     load = mpm.Pressure("top", lambda t, X: 1e4 * t * (X[:, 0] < 0.5), region=([0, 0], [0.7, 2]))
     walls = {"left": "x", "right": "x", "bottom": "xy"}
-    acting = {"conditions": [disc, mpm.Drained("top"), *[load] * loaded], "fluid": mpm.Fluid(), "gravity": GRAVITY}
+    acting = {"conditions": [disc, mpm.Drained("top"), *[load] * loaded], "fluid": mpm.Fluid()}
+    acting["gravity"] = GRAVITY if not axisymmetric else (0, -9.81)
     numerics = mpm.Numerics(renewal=True, tolerance=1e-11)
     return mpm.Simulation(grid, [mpm.box(grid, [0, 0], [2, 1])], [soil], walls=walls, numerics=numerics, **acting)
 

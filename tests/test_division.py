@@ -133,15 +133,18 @@ def test_forces_and_fluid_are_in_balance(press):
     assert replaced > 1000 and s.tool_forces["tool"][s.grid.dim - 1] < -1e3
 
 
-def test_clay_is_renewed_beside_soil_that_is_divided_with_all_balances():
-    """Wet clay that yields below a smooth disc, while the finest cells travel to the right."""
+@pytest.mark.parametrize("axisymmetric, rate", [(False, 0.06), (True, 0.25)])
+def test_clay_is_renewed_beside_soil_that_is_divided_with_all_balances(axisymmetric, rate):
+    """Wet clay that yields below a smooth disc or ball, while the finest cells travel to the right."""
     clay = mpm.DruckerPrager(2e6, 1e6, friction=0.0, dilation=0.0, cohesion=2e3, porosity=0.4, conductivity=1e-6)
-    s = pressed(loaded=False, soil=clay, disc=mpm.Tool(mpm.Ball((1.0, 1.25), 0.25), lambda t: (0, -0.06 * t)))
+    ball = mpm.Tool(mpm.Ball((0.0 if axisymmetric else 1.0, 1.25), 0.25), lambda t: (0, -rate * t))
+    s = pressed(loaded=False, soil=clay, disc=ball, axisymmetric=axisymmetric)
     for _ in range(9):
         report = s.step(0.05)
-        assert report.balance < 1e-9 and imbalance(s, s.scene.last[0].cut.points, clay, GRAVITY) < 1e-9
+        before = s.scene.last[0].cut.points
+        assert report.balance < 1e-9 and (axisymmetric or imbalance(s, before, clay, GRAVITY) < 1e-9)
     made = s.points.id[s.points.id >= len(s.bodies[0])] - len(s.bodies[0])
-    assert (made % 2 == 0).sum() > 100 < (made % 2 == 1).sum()  # renewed, divided
+    assert (made % 2 == 0).sum() > 50 < (made % 2 == 1).sum()  # renewed, divided
 
 
 def test_a_run_goes_on_with_the_same_bits(tmp_path):

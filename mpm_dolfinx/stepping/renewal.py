@@ -231,7 +231,7 @@ class Renewal:
             elif name == ACROSS:
                 data[name] = across
             elif name == ROOT:
-                data |= {ROOT: np.full(n, -1), PART: np.zeros((n, d, 2))}
+                data |= {ROOT: np.full(n, -1), PART: np.zeros((n, 2, 2))}
             elif name not in (PARENT, AREA, ENDS, PART, *MOTION, "plastic"):
                 data[name] = kept(values)
         data |= {PARENT: parent, AREA: area, ENDS: ends}
