@@ -143,6 +143,8 @@ def test_clay_is_renewed_beside_soil_that_is_divided_with_all_balances(axisymmet
         report = s.step(0.05)
         before = s.scene.last[0].cut.points
         assert report.balance < 1e-9 and (axisymmetric or imbalance(s, before, clay, GRAVITY) < 1e-9)
+        area = s.scene.last[0].cut.surface(s.state.stage.surfaces[0]).area0.sum()
+        assert area == pytest.approx(4 * np.pi if axisymmetric else 2.0, rel=1e-7)
     made = s.points.id[s.points.id >= len(s.bodies[0])] - len(s.bodies[0])
     assert (made % 2 == 0).sum() > 50 < (made % 2 == 1).sum()  # renewed, divided
 

@@ -315,12 +315,27 @@ class RefilledCells:
 
     def _seeded(self, row: NDArray[np.int64], t: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the seeded areas (n,), m^(d-1), of the parts of faces between two coordinates t (n, 2) on each."""
+        return self._face_areas[row] * self._share(row, t)
+
+    @cached_property
+    def _face_areas(self) -> NDArray[np.float64]:
+        """Seeded areas of faces, increased so that the parts in remaining domains represent the other parts as well."""
+        parts, left = self.parts, self._left
+        of, share = self.faces.point[parts.row], self._share(parts.row, parts.t)
+        remains = np.isin(of * self.cells + parts.cell, self.pieces.point[left] * self.cells + self.cell[left])
+        remains |= self.chosen[parts.cell] | ~self.affected[of]
+        area = self.faces.area
+        whole, there = (sum_by(parts.row, share * weight, len(area)) for weight in (1.0, remains))
+        return area * np.divide(whole, there, out=np.ones(len(area)), where=there > 0)
+
+    def _share(self, row: NDArray[np.int64], t: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the fractions (n,) of faces between two coordinates t (n, 2) on each."""
         share = np.ptp(t, axis=1)
         if self.grid.axisymmetric:
             corners, face = self.points.corners[self.faces.point[row]], self.faces.face[row]
             r0, r1 = (corners[np.arange(len(row)), end[face], 0] for end in (START, END))
             share = share * ring_share(r0, r1, t.mean(axis=1))
-        return self.faces.area[row] * share
+        return share
 
     def _seeded_at(self, row: NDArray[np.int64], t: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the reference positions (n, 2), m, at coordinates t (n,) on faces, from 0 (start) to 1 (end)."""
@@ -374,11 +389,16 @@ class RefilledCells:
         return New(self._place(cells, local), self._group(cells), parent, area, ends)
 
     @cached_property
+    def _left(self) -> NDArray[np.int64]:
+        """Pieces (n,) of removed domains outside the renewed cells, without crumbs."""
+        left = np.flatnonzero(self.affected[self.pieces.point] & ~self.chosen[self.cell])
+        return left[self._areas[left] > CRUMB * self._volume(self.cell[left])]
+
+    @cached_property
     def remainders(self) -> tuple[New, NDArray[np.int64]]:
         """New domains, a group for each piece of a removed domain outside the renewed cells; and these pieces."""
         pieces, points = self.pieces, self.points
-        left = np.flatnonzero(self.affected[pieces.point] & ~self.chosen[self.cell])
-        left = left[self._areas[left] > CRUMB * self._volume(self.cell[left])]
+        left = self._left
         rings, of = _convex(points.corners[pieces.point[left]], self._volume(self.cell[left]))
         faces = self.faces
         index = np.full((len(points), 5), NONE)  # index of each face among the outer faces; the last one stays NONE
@@ -414,7 +434,7 @@ class RefilledCells:
             part = np.abs(t[1] - t[0])
             if self.grid.axisymmetric:
                 part = part * ring_share(low[:, 0], high[:, 0], (t[0] + t[1]) / 2)
-            area[at, face] = faces.area[row] * part
+            area[at, face] = self._face_areas[row] * part
             X0, X1 = faces.ends[row].transpose(1, 0, 2)
             ends[at, face] = np.stack([X0 + s[:, None] * (X1 - X0) for s in t], axis=1)
         return New(corners, int(self.chosen.sum()) + number.ravel(), parent, area, ends), left
