@@ -256,7 +256,7 @@ class CutDomains(Keyed):
     def _followed(self) -> tuple[Exchange, NDArray[np.int32]]:
         """Exchange of `_tracked` positions with the owners of their cells; and these cells (m,)."""
         grid, at = self.grid, np.arange(len(self.points))
-        cell = self.cells_at(at.repeat(2**grid.dim) if self.domains else at, self._tracked, True)
+        cell = self.cells_at(at.repeat(2**grid.dim) if self.domains else at, self._tracked)
         exchange = Exchange(grid.comm, grid.owner(cell))
         return exchange, grid.locals[exchange.send(cell)]
 
@@ -269,26 +269,20 @@ class CutDomains(Keyed):
         off0 = np.linalg.solve(stretch.swapaxes(1, 2)[pieces.point], off[:, :, None])[:, :, 0]
         return off + (middle(points.corners) - middle(points.origin))[pieces.point] - off0
 
-    def cells_at(self, at: NDArray[np.int64], x: NDArray[np.float64], together: bool = False) -> NDArray[np.int64]:
-        """Return the lexicographic index (m,) of the cell of each x (m, d), m, in or on the domain of point `at`.
-
-        together: whether the cell may also be filled by other domains, so that shared corners have one cell even if
-        domains are folded; all processes must then call it.
-        """
+    def cells_at(self, at: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Return the lexicographic index (m,) of the cell of each x (m, d), m, in or on the domain of point `at`."""
         # rounding must not assign a corner on a grid line to a cell outside the domain
-        return self._filled_cell(at, x + NEAR * (self.points.x[at] - x), together)
+        return self._filled_cell(at, x + NEAR * (self.points.x[at] - x))
 
-    def _filled_cell(self, at: NDArray[np.int64], x: NDArray[np.float64], together: bool = False) -> NDArray[np.int64]:
+    def _filled_cell(self, at: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:
         """Return the cell (m,) of each x; if the domain has no piece in this cell, the cell of its largest piece."""
-        grid, pieces = self.grid, self.pieces
-        cells = grid.all_cells
-        cell = grid.number(grid.index_from_base(x)) + grid.copy(self.points.id[at])
+        pieces, cells = self.pieces, self.grid.all_cells
+        cell = self.grid.number(self.grid.index_from_base(x)) + self.grid.copy(self.points.id[at])
         key, keys = at * cells + cell, pieces.point * cells + pieces.cell
+        if not len(key):
+            return cell
         found = np.minimum(keys.searchsorted(key), len(keys) - 1)
         empty = keys[found] != key
-        if together and over_all(grid.comm, int(empty.any())):
-            asked = Exchange(grid.comm, grid.owner(cell[empty]))
-            empty[empty] = ~asked.back(np.isin(grid.locals[asked.send(cell[empty])], self.cells))
         if empty.any():
             cell[empty] = pieces.cell[self._largest()[at[empty]]]
         return cell

@@ -8,9 +8,7 @@ One quadrature point per piece therefore integrates these gradients exactly, whe
 The surface of a domain has 4 edges, or in 3D 4 triangles about the middle of each face.  The triangles of neighbouring
 domains match, and prefer no diagonal.  The grid planes, axis by axis, slice this surface.  Gauss's theorem gives the
 volumes and first moments between a slice and the lower face of its cell, and in the column of cells below.  The
-interior of a domain is never cut.  Areas of the faces of pieces need no further cuts.  Inverted parts of a domain count
-with negative volume: they cancel the overlap with its neighbours, so a folded body fills no cell twice.  Pieces whose
-total volume is negative are left out.
+interior of a domain is never cut.  Areas of the faces of pieces need no further cuts.
 
 In axisymmetry pieces are rings. Their volume is 2 pi r_c times the area, with the radius r_c of the area's centroid
 (Pappus). Gradients are evaluated at the volume's centroid, (mean r^2 / r_c, mean r z / r_c). The hoop strain u_r / r is
@@ -135,7 +133,7 @@ def edges(corners: NDArray[np.float64]) -> NDArray[np.float64]:
 def centroids(corners: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the centroids (n, d), m, of domains with corners (n, 2^d, d); in axisymmetry of their sections.
 
-    As in `cut`, inverted simplices count with negative volume.
+    As in `cut`, inverted simplices count with positive volume.
     """
     chunks = _chunks(len(corners), corners.shape[2])
     return _centroids(corners) if len(chunks) == 1 else np.concatenate([_centroids(corners[part]) for part in chunks])
@@ -143,11 +141,11 @@ def centroids(corners: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _centroids(corners: NDArray[np.float64]) -> NDArray[np.float64]:
     v = vertices(np.ascontiguousarray(corners.transpose(1, 2, 0)))
-    volume, middle = simplex_volumes(v), v[-1]
+    volume, middle = np.abs(simplex_volumes(v)), v[-1]
     whole, moment = np.add.reduce(volume), np.zeros(middle.shape)
     for share, simplex in zip(volume, simplices(v.shape[1]), strict=True):
         moment += share * (np.add.reduce(v[simplex]) / len(simplex) - middle)
-    return (middle + np.divide(moment, whole, out=np.zeros(moment.shape), where=whole != 0)).T.copy()
+    return (middle + np.divide(moment, whole, out=np.zeros(moment.shape), where=whole > 0)).T.copy()
 
 
 def tangled(corners: NDArray[np.float64], volume: NDArray[np.float64], axisymmetric: bool = False) -> NDArray[np.bool_]:
@@ -227,14 +225,23 @@ def _cut(grid: Grid, corners: NDArray[np.float64], second: bool, faces: bool) ->
     x = true if grid.even else np.ascontiguousarray(corners.transpose(1, 2, 0))
     in_cells, y = on_planes(grid, true, x, 1)
     v = vertices(y)
-    flat = (~simplex_volumes(v).any(axis=0)).nonzero()[0]
+    volume = simplex_volumes(v)
+    flat = (~volume.any(axis=0)).nonzero()[0]
     if len(flat):  # domains on a plane and thinner than the snapping distance: snapping would leave no volume
         in_cells[:, :, flat] = true[:, :, flat]
         y[:, :, flat] = x[:, :, flat]
         v = vertices(y)
+        volume = simplex_volumes(v)
     # segments or triangles (d, d, m): vertices and coordinates first, for fast loops in numpy
     s = np.concatenate([v[facet] for facet in _FACETS[d][:, -1]], axis=2)
     outward, owner = _area_vectors(s), np.arange(len(corners))[None].repeat(len(_FACETS[d]), axis=0).ravel()
+    # an inverted simplex counts with positive volume: its negative volume is subtracted twice
+    simplex, folded = np.nonzero(volume < 0)
+    if len(folded):
+        turned = v[_FACETS[d][simplex], :, folded[:, None, None]].transpose(2, 3, 0, 1).reshape(d, d, -1)
+        s = np.concatenate([s, turned, turned], axis=2)
+        outward = np.concatenate([outward, *[-_area_vectors(turned)] * 2], axis=1)
+        owner = np.concatenate([owner, *[folded.repeat(d + 1)] * 2])
     facet = np.arange(s.shape[2])
     for axis in range(d):
         s, facet = sliced(s, facet, axis, grid)
