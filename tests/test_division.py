@@ -221,7 +221,6 @@ def refused(grid, **more):
     [
         (lambda: refused(mpm.Grid([0, 0], [1, 1], [4, 4])), "no soil that yields"),
         (lambda: refused(travelling(2, 1.0, 8, np.sin), inertia=True), "inertia"),
-        (lambda: refused(travelling(2, 1.0, 8, np.sin), numerics=mpm.Numerics("point", renewal=True)), "point"),
     ],
 )
 def test_scenes_that_cannot_be_divided_are_refused_in_one_line(make, value):

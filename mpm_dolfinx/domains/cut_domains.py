@@ -16,7 +16,7 @@ from mpm_dolfinx.base.caching import Keyed
 from mpm_dolfinx.base.tolerances import NEAR
 from mpm_dolfinx.bodies.faces import Surface, face_vectors, interpolate, on_face
 from mpm_dolfinx.domains.bending import followed
-from mpm_dolfinx.domains.renewed_faces import PARENT, RenewedFaces, on_parts, renewed_faces
+from mpm_dolfinx.domains.renewed_faces import PARENT, ROOT, RenewedFaces, on_parts, renewed_faces
 from mpm_dolfinx.grid.grid import TURN, Grid, sum_by
 from mpm_dolfinx.parallel.exchange import Exchange, over_all
 from mpm_dolfinx.points.cutting import Pieces, cut, cut_faces
@@ -203,8 +203,10 @@ class CutDomains(Keyed):
             self._patches.update(zip(new, self._cut_surfaces(new), strict=True))
         return [self._patches[faces] for faces in several]
 
-    def _cut_surfaces(self, given: Sequence[Surface]) -> list[Patches]:
-        several, origin = zip(*(on_parts(faces, self.points) for faces in given), strict=True)
+    def _cut_surfaces(self, several: Sequence[Surface]) -> list[Patches]:
+        origin = None
+        if ROOT in self.points.data:
+            several, origin = zip(*[on_parts(faces, self.points) for faces in several], strict=True)
         columns = ((faces.id, faces.face, faces.xi, faces.skew, np.arange(len(faces))) for faces in several)
         ids, number, xi, skew, row = map(np.concatenate, zip(*columns, strict=True))
         here, at = self.points.find(ids)
@@ -230,7 +232,8 @@ class CutDomains(Keyed):
         for k, faces in enumerate(several):
             own = (surface == k).nonzero()[0]
             anew = renewed and renewed.of(face[own] - (len(here) - len(renewed.row)))
-            out.append(Patches(self.grid, faces, origin[k][rows[0][own]], *[v[own] for v in rows], anew))
+            given = rows[0][own] if origin is None else origin[k][rows[0][own]]
+            out.append(Patches(self.grid, faces, given, *[v[own] for v in rows], anew))
         return out
 
     def displacement(self, u: NDArray[np.float64]) -> NDArray[np.float64]:

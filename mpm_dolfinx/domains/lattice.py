@@ -32,7 +32,7 @@ from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.bodies.boxes import RowsBody
 from mpm_dolfinx.bodies.faces import Surface
 from mpm_dolfinx.bodies.touching import Faces, covers
-from mpm_dolfinx.domains.renewed_faces import is_part, roots
+from mpm_dolfinx.domains.renewed_faces import ROOT, is_part, roots
 from mpm_dolfinx.grid.grid import FACES, Grid, among, corner_bits, in_chunks
 from mpm_dolfinx.parallel.exchange import Exchange
 from mpm_dolfinx.points.material_points import MaterialPoints
@@ -123,7 +123,7 @@ class Lattice:
         ids: NDArray[np.int64],
         d: NDArray[np.float64],
         crossed: NDArray[np.float64],
-        parts: NDArray[np.int64],
+        parts: Sequence[int],
     ) -> NDArray[np.float64]:
         """Return the change (n, 2^d, d), m, by which the filter corrects displacements of domain corners.
 
@@ -277,7 +277,8 @@ def filtered(
     out, cells = np.zeros(points.corners.shape), crossed(grid, points, then, free)
     for lattice in lattices:
         rows = lattice.rows(points)
-        moved, parts = points.corners[rows] - points.reference[rows], lattice.corners_of_parts(points)
+        moved = points.corners[rows] - points.reference[rows]
+        parts = lattice.corners_of_parts(points) if ROOT in points.data else ()
         out[rows] = lattice.corners_change(grid.comm, points.id[rows], moved, cells[rows], parts)
     return out
 

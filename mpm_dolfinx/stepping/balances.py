@@ -5,6 +5,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from itertools import chain
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 from mpi4py import MPI
@@ -111,6 +113,8 @@ class Balances(NamedTuple):
 
 def joined(loads: list[list[Loads]]) -> list[list[Loads]]:
     """Return the loads of each substep, with the pattern of all substeps."""
+    if not any(map(attrgetter("couples"), chain.from_iterable(loads))):
+        return loads
     return [[one.joined(of) for one, of in zip(now, zip(*loads, strict=True), strict=True)] for now in loads]
 
 
