@@ -105,9 +105,13 @@ class LatticeBody(Body):
         low, high = self._ends
         return tuple(high - low + 1)
 
+    def places(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the lattice indices (m, d) of domains, from the lower corner of the body's bounding box."""
+        return self._index(rows) - self._ends[0]
+
     def nodes(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return the lexicographic node indices (m, 2^d) of the corners of domains.  Shared corners have one index."""
-        corners = (self._index(rows) - self._ends[0])[:, None] + corner_bits(self.dim)
+        corners = self.places(rows)[:, None] + corner_bits(self.dim)
         return np.ravel_multi_index(tuple(np.moveaxis(corners, 2, 0)), tuple(np.add(self.lattice, 1)))
 
 

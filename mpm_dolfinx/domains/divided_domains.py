@@ -21,7 +21,7 @@ from mpm_dolfinx.domains.domain_gradient import gradient
 from mpm_dolfinx.domains.renewed_faces import PART, ROOT, roots
 from mpm_dolfinx.grid.grid import FACES, Grid, corner_bits, sum_by
 from mpm_dolfinx.points.cutting import centroids, domain_volumes
-from mpm_dolfinx.points.material_points import MaterialPoints
+from mpm_dolfinx.points.material_points import MaterialPoints, body_of
 
 PLACES = "corners", "reference", "origin"
 """Names of the arrays of points that contain corners of domains."""
@@ -52,7 +52,7 @@ class SeededDomains:
         code = np.zeros(len(root), dtype=np.int64)
         for column in self._code(part).T:
             code = code * self._codes + column
-        body = self.starts.searchsorted(root, side="right") - 1
+        body = body_of(root, self.starts)
         number = 2 * (root * self._codes**self._dim + code) + 1
         return np.where(whole(part), root, self.starts[-1] + body + len(self.bodies) * number)
 
@@ -70,7 +70,7 @@ class SeededDomains:
         """
         step = np.floor(lower).astype(np.int64)
         out, moved = root.copy(), step.any(axis=1).nonzero()[0]
-        body = self.starts.searchsorted(root[moved], side="right") - 1
+        body = body_of(root[moved], self.starts)
         for i in np.unique(body):
             at = moved[body == i]
             out[at] = self.starts[i] + self.bodies[i].neighbour(root[at] - self.starts[i], step[at])
@@ -79,14 +79,13 @@ class SeededDomains:
     def places(self, root: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return the body and lattice index (n, 1 + d) of seeded domains; -1 - id for domains that are not boxes."""
         out = np.zeros((len(root), 1 + self._dim), dtype=np.int64)
-        body = self.starts.searchsorted(root, side="right") - 1
+        body = body_of(root, self.starts)
         for i in np.unique(body):
             at, one = body == i, self.bodies[i]
             regular = one.lattice and one.aligned
             out[at, 0] = i if regular else -1 - root[at]
             if regular:
-                lower = one.nodes(root[at] - self.starts[i])[:, 0]
-                out[at, 1:] = np.stack(np.unravel_index(lower, tuple(np.add(one.lattice, 1))), axis=1)
+                out[at, 1:] = one.places(root[at] - self.starts[i])
         return out
 
     def sizes(self, grid: Grid, points: MaterialPoints) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -96,10 +95,9 @@ class SeededDomains:
 
     def _as_seeded(self, grid: Grid, root: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return the edge lengths (n, d) of domains in cells at seeding; nan for renewed domains."""
-        seeded = np.full((len(root), self._dim), np.nan)
-        body = self.starts.searchsorted(root, side="right") - 1
-        for i in np.unique(body[root < self.starts[-1]]):
-            at = body == i
+        seeded, body = np.full((len(root), self._dim), np.nan), body_of(root, self.starts)
+        for i in range(len(self.bodies)):
+            at = (body == i) & (root < self.starts[-1])
             x = self.bodies[i].corners(root[at] - self.starts[i]) - grid.base
             place = [np.interp(x[..., a], lines, np.arange(len(lines))) for a, lines in enumerate(grid.seeded)]
             seeded[at] = _lengths(np.stack(place, axis=-1))
@@ -124,7 +122,7 @@ class SeededDomains:
         Rows of boxes on a lattice may have different widths, so the middle of a merged domain may not be at 1/2.
         """
         out, size = np.full(len(root), 0.5), np.rint(np.ptp(part, axis=2)[:, axis]).astype(np.int64)
-        body = self.starts.searchsorted(root, side="right") - 1
+        body = body_of(root, self.starts)
         for i in np.unique(body[size > 1]):
             at = ((body == i) & (size > 1)).nonzero()[0]
             row, one = root[at] - self.starts[i], self.bodies[i]

@@ -110,12 +110,10 @@ class Lattice:
         own = ((root >= self._start) & (root < self._stop)).nonzero()[0]
         if not len(own) or self._count is None:
             return own[:0]
-        shape = tuple(np.add(self._count, 1))
-        first = np.stack(np.unravel_index(self._body.nodes(root[own] - self._start)[:, 0], shape), axis=1)
-        bits = corner_bits(self._dim)
+        bits, first = corner_bits(self._dim), self._body.places(root[own] - self._start)
         corners = first[:, None] + np.where(bits, part[own, None, :, 1], part[own, None, :, 0])
         corners = corners[(corners == np.rint(corners)).all(axis=2)].astype(np.int64)
-        return np.ravel_multi_index(tuple(corners.T), shape)
+        return np.ravel_multi_index(tuple(corners.T), tuple(np.add(self._count, 1)))
 
     def corners_change(
         self,

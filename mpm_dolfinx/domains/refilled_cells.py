@@ -29,7 +29,8 @@ GAP = 0.01
 changes the result of scene "flow" in tests/plateaus.py by 2.5e-05 (relative), doubling it by 0.0e+00, and
 finer cells by 9.0e-02."""
 CRUMB = NEAR
-"""Area of a part of a domain, divided by its cell's area, below which other parts receive its mass.  Source: `NEAR`."""
+"""Area of a part of a domain, divided by its cell's area, below which other parts receive its mass and its seeded
+faces.  Source: `NEAR`."""
 SMALL = (0.5 / EDGES) ** 2
 """Smallest part of an old domain that remains in a cell, divided by the cell area.  A cell with a smaller part is
 renewed too.  Source: definition, a square with half the length of a surface edge (`EDGES` edges in a cell)."""
