@@ -252,7 +252,8 @@ def following(o: Namespace, clay: mpm.Skeleton, fixed: Push) -> dict[str, float]
 
 def draw(o: Namespace, run: Push, wet: Dissipation | None) -> None:
     """Draw the resistance, the displacements and, in wet clay, the pore pressures and their dissipation."""
-    fig, axes = common.figure(1, 4, (17, 6))
+    columns = 2 if wet is None else 4
+    fig, axes = common.figure(1, columns, (4.25 * columns, 6))
     ax = axes[0, 0]
     ax.plot(run.N, run.depth)
     ax.axvline(published(), color="k", ls="--", lw=0.8)
@@ -266,7 +267,7 @@ def draw(o: Namespace, run: Push, wet: Dissipation | None) -> None:
         ax.semilogx(TEH, 1 - DISSIPATED, "ko", label="Teh and Houlsby (1991)")
         ax.set(xlabel="T* (-)", ylabel="remaining excess pressure (-)", ylim=(0, None), title="at the edge")
         ax.legend(fontsize=9)
-    for ax in axes[0, [0, 3]]:
+    for ax in axes[0, ::3]:
         ax.grid(alpha=0.3)
     common.save(fig, o.out / "cone.png", dpi=80)
 
