@@ -15,7 +15,7 @@ CEILINGS = {
     "assignments of three and more values": 19,
     "changes of hidden state": 0,
     "files that name a condition's class, most": 6,
-    "lines of the package": 38763,
+    "lines of the package": 38780,
 }
 
 HALF = 'Halving this value changes the result of scene "bank" in tests/plateaus.py by'

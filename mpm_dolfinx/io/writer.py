@@ -15,13 +15,12 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 from weakref import WeakValueDictionary, finalize
 from xml.etree import ElementTree
 
 from mpi4py import MPI
 
-import meshio
 import numpy as np
 from dolfinx import fem, io
 from numpy.typing import NDArray
@@ -35,6 +34,9 @@ from mpm_dolfinx.parallel.exchange import at_root, together
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.simulation.simulation import Simulation
 from mpm_dolfinx.stepping.result import Result
+
+if TYPE_CHECKING:  # meshio takes long to import, so functions import it
+    import meshio
 
 VTK_CELLS = {2: ("quad", [0, 1, 3, 2]), 3: ("hexahedron", [0, 1, 3, 2, 4, 5, 7, 6])}
 """VTK's cell type of a particle domain, and the order of the domain's corners in VTK."""
@@ -253,6 +255,8 @@ def solid(points: MaterialPoints, displacement: NDArray[np.float64], wet: bool) 
 
 def _cells(corners: NDArray[np.float64], fields: dict[str, NDArray]) -> meshio.Mesh:
     """Return unconnected cells with corners (n, 2^d, d), m, and their fields (n, ...)."""
+    import meshio
+
     kind, order = VTK_CELLS[corners.shape[2]]
     data = {label: [column] for name, rows in fields.items() for label, column in _columns(name, rows)}
     nodes = corners[:, order].reshape(-1, corners.shape[2])

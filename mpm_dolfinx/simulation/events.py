@@ -8,8 +8,8 @@ from dataclasses import replace
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.optimize import brentq
 
 from mpm_dolfinx.base.errors import Report, StepFailed
 from mpm_dolfinx.base.time_integration import Substep
@@ -100,7 +100,7 @@ class Events:
             for k in range(len(self._until)):
                 end = min(dt for dt, values in tried.items() if _crossed(before, values).any())
                 if _crossed(before, tried[end])[k] and tried[end][k] != 0:
-                    brentq(lambda dt, k=k: self._at(step, dt, tried)[k], 0.0, end, xtol=LOCATED * step.dt)
+                    scipy.optimize.brentq(lambda dt, k=k: self._at(step, dt, tried)[k], 0, end, xtol=LOCATED * step.dt)
         except StepFailed as failed:
             what = "until: the search for an event within a step of %.3g s stopped, because a shorter step failed: %s"
             warn(self._simulation.scene.grid.comm, ResolutionWarning, what, step.dt, failed)
