@@ -482,5 +482,5 @@ def _check_scene(file: Path, stored: dict[str, Any], present: dict[str, Any]) ->
     """Raise ValueError if the checkpoint belongs to another scene."""
     for name in {**stored, **present}:
         if stored.get(name) != present.get(name):
-            both = f"{stored.get(name)} in the file and {present.get(name)} in this scene, must be equal"
+            both = f"{stored.get(name)} in file, {present.get(name)} here, must be equal"
             raise ValueError(f"{file}: checkpoint of another scene: {name}: {both}")
