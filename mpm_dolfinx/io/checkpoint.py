@@ -165,7 +165,7 @@ def _scalars(result: Result) -> dict[str, Any]:
 
 
 def _arrays(state: State) -> dict[str, NDArray]:
-    """Return all arrays of a state by name, with slashes for nested dictionaries."""
+    """Return all arrays of a state by name.  Slashes in a name separate the keys of nested dictionaries."""
     named = {"points": vars(state.points), "outcome": state.outcome}
     named["result"] = {name: state.result.rows.column(name) for name in COLUMNS}
     for i, outcome in enumerate(state.result.rows.outcomes):
@@ -270,14 +270,14 @@ def _like(outcome: dict[str, dict[str, NDArray]], now: Outcome) -> dict[str, dic
             if quantity == "energy":
                 continue
             if value.shape != now[quantity][name].shape or value.dtype != np.float64:
-                raise ValueError(f"outcome/{quantity}/{name}: {value.dtype} of shape {value.shape}")
+                raise ValueError(f"outcome/{quantity}/{name}: wrong type or shape ({value.dtype}, {value.shape})")
             if quantity in ("tool_travel", *MOTIONS) and not np.isfinite(value).all():
                 raise ValueError(f"outcome/{quantity}/{name} is not finite")
     return found
 
 
 def _nested(arrays: dict[str, NDArray]) -> dict[str, Any]:
-    """Return arrays with slashes in their names as nested dictionaries."""
+    """Return nested dictionaries of the arrays.  Slashes in the name of an array separate the keys."""
     out: dict[str, Any] = {}
     for name, value in arrays.items():
         *folders, last = name.split("/")
@@ -298,9 +298,9 @@ def _points(arrays: dict[str, NDArray], like: MaterialPoints) -> MaterialPoints:
     for name, rows in {**arrays, **data}.items():
         kind = kinds[name]
         if rows.dtype != kind.dtype or rows.shape != (len(points), *kind.shape[1:]) or not np.isfinite(rows).all():
-            raise ValueError(f"points/{name}: {rows.dtype} of shape {rows.shape}, or not finite")
+            raise ValueError(f"points/{name}: wrong type or shape ({rows.dtype}, {rows.shape}), or not finite")
     if set(data) != set(like.data):
-        raise ValueError(f"points/data: {', '.join(data)}")
+        raise ValueError(f"points/data: {', '.join(data)}, must be the data of the points")
     return points
 
 
@@ -381,7 +381,7 @@ def _check_pieces(arrays: dict[str, NDArray], ids: NDArray[np.int64], dim: int) 
     for name, rows in arrays.items():
         kind = np.int64 if name in ("id", "cell") else np.float64
         if rows.dtype != kind or rows.shape != (count, *shapes.get(name, ())) or not np.isfinite(rows).all():
-            raise ValueError(f"pieces/{name}: {rows.dtype} of shape {rows.shape}, or not finite")
+            raise ValueError(f"pieces/{name}: wrong type or shape ({rows.dtype}, {rows.shape}), or not finite")
     if not np.array_equal(np.unique(arrays["id"]), ids):
         raise ValueError("pieces/id: points differ from the points of the bodies")
 
@@ -432,7 +432,7 @@ def _ranges(comm: MPI.Intracomm, file: Path, of: dict[str, Member]) -> dict[str,
         out[name] = first, last
     for name, member in of.items():
         if member.shape[0] != of[_numbered(name)].shape[0]:
-            raise ValueError(f"{name}: array of shape {member.shape}")
+            raise ValueError(f"{name}: array of shape {member.shape}, must have a row for each number")
     return {name: out[_numbered(name)] for name in of}
 
 

@@ -448,7 +448,7 @@ class Table:
     def _check(self, row: dict[str, float]) -> None:
         row_names, known = ([name for name in names if not name.startswith(self._own)] for names in (row, self.columns))
         if row_names != known:
-            both = f"{', '.join(known)}, the columns of the run {', '.join(row_names)}"
+            both = f"{', '.join(known)}, the columns of the run are {', '.join(row_names)}"
             raise ValueError(f"{self.file}: its columns are {both}; must be equal, or use another folder")
 
     def _append(self, file: Path, rows: Sequence[dict], mode: str) -> None:

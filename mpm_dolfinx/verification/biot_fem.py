@@ -200,7 +200,7 @@ class BiotFEM:
         tractions = [*tractions, *(plate.traction(area, self._inward(plate.side)) for plate, area in self._plates)]
         for outlet in drained:
             if callable(outlet.pressure):
-                raise ValueError(f"{line(outlet)}: the reference's pressures must be numbers")
+                raise ValueError(f"{line(outlet)}: in the reference the pressure must be a number")
         outlets = drained if element == "q1-dg0" else None
         with compiling(f"{type(material).__name__}, terms, sources", "UFL, terms linear in v or energies of u"):
             self._forms = self._compile(tractions, outlets, gravity, terms, sources)

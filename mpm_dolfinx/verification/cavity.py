@@ -108,7 +108,7 @@ class Cavity:
             while np.any(np.diff(r - length * step) <= 0):
                 length /= 2
             r = r - length * step
-        raise RuntimeError(f"cavity: no equilibrium at a radius of {radius:g}")
+        raise RuntimeError(f"cavity: no equilibrium was found at a radius of {radius:g}")
 
 
 def cavity(
