@@ -64,7 +64,7 @@ class Writer:
     If the folder has output from before the current time, the new run continues this output.  After `resume`, the
     files of a new writer are therefore equal to the files of an uninterrupted run.
 
-    Until `close`, the end of its `with` block, or its deletion, a writer locks its folder against other processes.
+    Until `close`, the end of its context, or its deletion, a writer locks its folder against other processes.
 
     Parameters
     ----------

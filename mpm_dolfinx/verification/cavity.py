@@ -48,7 +48,7 @@ class _Rings:
     def kirchhoff(self, stretches: NDArray[np.float64], state: State, repeat: int = 1) -> NDArray[np.float64]:
         """Return the radial and circumferential Kirchhoff stresses (n, 2), in Pa.
 
-        repeat: number of copies of all rings; stretches (n, 2) are those of all copies
+        repeat: number of copies of all rings in the stretches (n, 2)
         """
         stress = self._law.stress(self._data(stretches, state, repeat))
         return stress[:, [0, 1], [0, 1]] * stretches.prod(axis=1, keepdims=True)
@@ -125,7 +125,7 @@ def cavity(
     elements
         Number of elements; their sizes form a geometric progression.
     state
-        Initial state variables of the law; by default those of the material.
+        Initial state variables of the law; by default the state of the material.
     """
     R, rings = np.geomspace(1, outer, elements + 1), _Rings(material, elements, state)
     far = -float(rings.kirchhoff(np.ones((elements, 2)), rings.start)[-1, 0])
