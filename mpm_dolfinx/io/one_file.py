@@ -25,7 +25,7 @@ if TYPE_CHECKING:  # meshio takes long to import, so functions import it
 def one_file(folder: str | os.PathLike) -> Path:
     """Write the points in the folder of a `Writer` as one time series: `points.xdmf` and `points.h5`.
 
-    ParaView, VTK and meshio's `xdmf.TimeSeriesReader` read these files.  dolfinx reads the particle domains of one
+    ParaView, VTK and meshio (xdmf.TimeSeriesReader) read these files.  dolfinx reads the particle domains of one
     output time as a mesh.  For example, `XDMFFile.read_mesh(name="2", xpath="/Xdmf/Domain/Grid")` reads the third time.
     Each output time has separate domains, so bodies may be added or removed between two times.  The
     elements `<Information>` in points.xdmf describe the fields and their units.  The files of the `Writer` remain.  A
