@@ -339,7 +339,7 @@ def _ours(file: Path) -> Iterator[None]:
     try:
         yield
     except (ElementTree.ParseError, KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{file}: no Writer's file ({line_of(error)}); remove it, or use another folder") from error
+        raise ValueError(f"{file}: no Writer's file ({line_of(error)}), must be one, or use another folder") from error
 
 
 def kept(entries: Sequence[tuple[float, Any]], t: float) -> list[tuple[float, Any]]:
