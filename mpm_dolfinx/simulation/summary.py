@@ -115,8 +115,8 @@ def table(scene: Scene, state: State) -> str:
 def imbalance(scene: Scene, state: State) -> dict[str, float]:
     """Return for points, pieces and active cells the largest number on a process, divided by the mean over processes.
 
-    The ratio 1 means perfect balance. Ratios of pieces and cells are also 1 before the first step. The time of a step
-    is proportional to the number of pieces. All processes must call it.
+    The ratio 1 means perfect balance. Before the first step, the ratios of pieces and cells are set to 1. The time of a
+    step is proportional to the number of pieces. All processes must call it.
     """
     comm, (on_grid, _) = scene.grid.comm, scene.last
     pieces = on_grid.data.pieces if on_grid else None
