@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Thresholds between linear solvers: run times of both solvers below and above each threshold.
 
-Each row is a scene with a given number of displacement unknowns.  The threshold is changed so that each of the two
-solvers is used.  Times are processor times of two steps, the shortest of --repeat runs.  On several processes this is
-the largest time of a process, including waiting.  The table of thresholds is in `mpm_dolfinx/solve/solver_choice.py`.
+Each row is a scene with a given number of displacement unknowns.  Both solvers are measured, by changing the threshold.
+A time is the processor time of two steps, the shortest of --repeat runs.  On several processes it is the largest time
+of all processes, and includes waiting.  The table of thresholds is in `mpm_dolfinx/solve/solver_choice.py`.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ CASES: dict[str, tuple[Callable[[int], mpm.Simulation], tuple[int, ...], tuple[i
     "multigrid_2d": (lambda n: block(2, n, ELASTIC, True), (64, 96, 128, 192), (16,)),
     "mumps": (lambda n: block(2, n, YIELDS, True), (64, 128, 192, 256), (12,)),
 }
-"""For each threshold: function that returns a scene of n cells along an axis; values of n; values of n with --quick."""
+"""For each threshold: function that returns a scene of n cells along an axis, all n, and all n with --quick."""
 
 
 def took(make: Callable[[int], mpm.Simulation], n: int, name: str, least: int) -> tuple[float, int, plan.SolverPlan]:
@@ -66,7 +66,7 @@ def took(make: Callable[[int], mpm.Simulation], n: int, name: str, least: int) -
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Print the table and return its times by threshold and unknowns."""
+    """Print the table; return its times by threshold and number of unknowns."""
     parser = common.Parser(__doc__, __file__, processes=True)
     parser.add_argument("--repeat", type=int, default=2, help="turns of a pair")
     parser.add_argument("--quick", action="store_true", help="small blocks, one turn")

@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from mpm_dolfinx.simulation.simulation import Simulation
 
 WIDER, WIDEST = 2**0.5, 16.1
-"""Ratio of successive trial factors until bodies rest at one and slide at another; largest factor and largest inverse."""
+"""Ratio of successive trial factors until bodies rest at one and slide at another; largest factor, largest inverse."""
 LACKS = 0.25
 """Largest overload, divided by `rtol`, of a trial that comes to rest.
 
