@@ -12,7 +12,8 @@ In steps of a0 / 40, its pore pressures in normally consolidated clay are 1.5 % 
 2. Then the wall is fixed, the clay drains at the outer boundary, and excess pressures dissipate.
 3. Drained cavities are a well in Modified Cam Clay (Chen and Abousleiman 2013), and cavities in Mohr-Coulomb sand with
    phi = 30 degrees, without and with associated dilation (Yu and Houlsby 1991).  The published solutions are for
-   infinite soil.  The outer boundary of the ring therefore follows a radial solution (`mpm_dolfinx.verification.cavity`).
+   infinite soil.  The outer boundary of the ring therefore follows a radial solution
+   (`mpm_dolfinx.verification.cavity`).
 
 Pressures are divided by p_0.  Errors are relative errors of the cavity pressure, and in undrained clay also of the pore
 pressure at the wall.  Errors are evaluated at the radii `MARKS` in undrained clay, and at the radii with published

@@ -8,8 +8,8 @@ degrees.  In these experiments the front moves by 1.2 a L for a < 1.8, and by 1.
 The sand follows the Mohr-Coulomb law without dilation.  In simple shear its strength is sin(phi) times the normal
 stress (Davis 1968), so sin(phi) = tan(31 degrees).  In fast flow the friction coefficient grows by 0.93 I, with the
 inertial number I (Jop, Forterre and Pouliquen 2006).  This increase is equivalent to a viscosity of
-`0.93 d sqrt(p rho_s)`, with the grain size d = L/100 and the grain density rho_s.  The pressure p is the pressure in the middle of a
-heap of half the column's height.  With a constant viscosity, run-outs are as accurate as with a local viscosity
+`0.93 d sqrt(p rho_s)`, with the grain size d = L/100 and the grain density rho_s.  The pressure p is that in the middle
+of a heap half as high as the column.  With a constant viscosity, run-outs are as accurate as with a local viscosity
 (Ionescu et al. 2015).  Without viscosity, shear localises in single cells and dissipates energy numerically.  The front
 is the point at which the depth of the sand is one grain.
 

@@ -228,7 +228,10 @@ def well(cells: int) -> Example:
 
 @dataclass(frozen=True)
 class Damaged(mpm.NeoHookean):
-    """Neo-Hookean law with the energy `(1 - D) psi` and the damage `D = 1 - exp(-max(|ln J|) / 0.5)`."""
+    """Neo-Hookean law with the energy `(1 - D) psi`.
+
+    The damage is `D = 1 - exp(-m / 0.5)`, where m is the largest |ln J| so far.
+    """
 
     state: ClassVar = {"damage": 0.0}
 

@@ -2,12 +2,12 @@
 """Two gels are pressed together, slide along each other with friction, and separate.
 
 Each of two half-discs is a group of bodies with its own displacements.  The lower gel is fixed, and the upper gel
-follows a prescribed path.  While the gels are apart no force acts between them, however narrow the gap.  As the upper
-gel passes over the top of the lower one, the contact surface inclines.  The ratio of horizontal to vertical force is
-then less than the friction coefficient.
+follows a prescribed path.  While the gels are apart, no force acts between them, however narrow the gap is.  As the
+upper gel passes over the top of the lower gel, the contact surface inclines.  The ratio of horizontal to vertical force
+is then less than the friction coefficient.
 
 A second scene is the contact of a curved and a flat elastic body.  Largest pressure and half-width are compared with
-Hertz's solution for the computed force.  Both errors are due to the small number of cells over the half-width.
+Hertz's solution for the computed force.  The errors of both are due to the small number of cells over the half-width.
 """
 
 from __future__ import annotations
