@@ -74,7 +74,7 @@ def block(
 
 
 def meshed(grid: mpm.Grid, cells: int):
-    """Return the block, made from a mesh; its particle domains are equal to those of `mpm.box`."""
+    """Return the block, made from a mesh; its particle domains equal the domains that `mpm.box` makes."""
     square = mesh.create_rectangle(MPI.COMM_SELF, [[0, 0], [1, 1]], [2 * cells] * 2, mesh.CellType.quadrilateral)
     top = np.sort(mesh.locate_entities_boundary(square, 1, lambda x: np.isclose(x[1], 1)))
     tags = mesh.meshtags(square, 1, top, np.ones(len(top), dtype=np.int32))

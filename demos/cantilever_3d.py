@@ -62,7 +62,7 @@ def scene(cells: int, alpha: float) -> tuple[mpm.Simulation, mpm.surface.Probes]
 
 
 def run(cells: int, steps: int, alpha: float, taken: int | None = None) -> tuple[np.ndarray, mpm.Result, dict]:
-    """Return the tip displacement (3,), m, the result and the costs of a run.
+    """Return the tip displacement (3,), in m, the result and the costs of a run.
 
     steps: number of steps to the full load.
     taken: number of these steps that are computed; None means all.

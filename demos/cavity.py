@@ -6,7 +6,7 @@ moves by a fifth of a cell in drained soil, and by a tenth of a cell in undraine
 because laws with history are first-order accurate in the step.  A radial solution without a grid has such errors too.
 In steps of a0 / 40, its pore pressures in normally consolidated clay are 1.5 % too low at a = 1.1 a0.
 
-1. A cavity expands in saturated Modified Cam Clay so fast that no water flows, at two overconsolidation ratios.  The
+1. A cavity expands in saturated Modified Cam Clay of two overconsolidation ratios, so fast that no water flows.  The
    initial pressure acts on the outer boundary.  In incompressible soil the exact motion is known.  As the cavity grows
    to radius a, a point moves from radius R to r, with `r^2 - a^2 = R^2 - a0^2`.
 2. Then the wall is fixed, the clay drains at the outer boundary, and excess pressures dissipate.

@@ -4,8 +4,9 @@
 The cone has a tip angle of 60 degrees and a roughness of 0.3: its adhesion is 0.3 s_u.  The shaft behind the cone is a
 second tool, which is smooth.  The force on the cone is therefore known separately.  The scene is axisymmetric.  The
 clay is undrained and follows Tresca's law with the strength s_u.  With --mises it follows von Mises's law with this
-strength in pure shear.  Its shear modulus is G = 100 s_u.  The resistance is compared with that of a deep cone in clay
-with Tresca's law and equal initial stresses in all directions (Lu, Randolph, Hu and Bugarski 2004, Geotechnique 54),
+strength in pure shear.  The shear modulus of the clay is G = 100 s_u.  The resistance is compared with that of a deep
+cone in clay with Tresca's law and equal initial stresses in all directions (Lu, Randolph, Hu and Bugarski 2004,
+Geotechnique 54),
 
     N_c = F / (pi R^2 s_u) = 3.4 + 1.6 ln(G / s_u) + 1.3 alpha,
 
@@ -13,8 +14,8 @@ with the radius R of the shaft and the roughness alpha.
 
 Domains of clay that become longer than a cell are replaced by new domains (renewal).  Without renewal the run ends at a
 depth of two radii.  The shaft and the surface of the clay lie in the middle of cells.  A surface along a grid line
-would cross the same cells several times, and renewal does not refill such cells.  The edge between cone and shaft is
-rounded by a cell.
+would cross the same cells several times, and renewal does not refill such cells.  The edge between cone and shaft
+has a radius of one cell.
 
 The cone is pushed so fast into saturated ("wet") clay that the clay is undrained.  Then the cone stops, and the excess
 pressure at the edge between cone and shaft dissipates.  The fraction of this pressure that remains is compared with the

@@ -196,7 +196,7 @@ def worst(counts: list[Count]) -> float:
 
 
 def cells(s: mpm.Simulation) -> NDArray[np.float64]:
-    """Return the pressure of the cells (nx, ny), Pa; nan in empty cells and near the corners of the clamp."""
+    """Return the pressure of the cells (nx, ny), in Pa; nan in empty cells and near the corners of the clamp."""
     p = np.full(s.grid.shape.prod(), np.nan)
     body = s.bodies[0]
     corners = [[0, body.lower[:, 1].min()], [0, (body.lower + body.spacing)[:, 1].max()]]

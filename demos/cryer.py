@@ -7,8 +7,9 @@ falls (Cryer 1963).  Uncoupled theories of consolidation cannot show this rise. 
 and nu is 0.25.  One octant is computed: a lattice of boxes, mapped smoothly into the sphere.  With --axisymmetric, a
 quarter of a disc is computed.
 
-Errors of the pressure at the centre, with the reduced time T = c_v t / R² (coefficient of consolidation c_v, radius R):
-`peak` is the relative error of the largest pressure; `curve` is the largest error from T = 0.02 on, divided by p0.
+Errors are given for the pressure at the centre. `peak` is the relative error of the largest pressure. `curve` is the
+largest error from T = 0.02 on, divided by p0. The reduced time is `T = c_v t / R²`, with the coefficient of
+consolidation c_v and the radius R.
 """
 
 from __future__ import annotations

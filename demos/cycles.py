@@ -91,7 +91,8 @@ def cycle(
     Returns
     -------
     left: rms stress after each cycle, divided by the rms stress at the first peak.
-    away: rms stress after each cycle without points near the wall, divided in the same way.
+    away: rms stress after each cycle without points near the wall, divided by the rms stress of all points at that
+    peak.
     times, tips: time, in s, and tip deflection, in m, of each step.
     lost: work of the load in each cycle, divided by the work up to the first peak.
     volume: volume change of the beam minus the volume change of its water, divided by the volume of the beam.

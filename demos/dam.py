@@ -4,14 +4,14 @@
 A dam 6 m high with slopes of 1:2 stands on an impervious base.  At first the water table is at the level of the
 reservoir, 5 m.  Then the downstream slope becomes permeable, and the flow becomes steady.  After that the
 level of the reservoir falls by 2 m in five days, and the free surface (p = 0) falls as the soil drains.  Above the free
-surface water flows under suction (`mpm.VanGenuchten`).  The water of the reservoir loads the upstream slope.  The
+surface, water flows under suction (`mpm.VanGenuchten`).  The water of the reservoir loads the upstream slope.  The
 upstream slope above the reservoir and the downstream slope are seepage faces.
 
 Checks:
 
-* `flow`: ratio of the outflow of a rectangular dam to the exact outflow.  The dam is 9.6 m wide, with 10 m and 2 m of
-  water at its sides.  Above these levels the suction at the sides is hydrostatic.  Without suction the exact flow is
-  `k (H1^2 - H2^2) / (2 L)` (Dupuit, Charny), with the water levels H1 and H2 and the width L.  With suction,
+* `flow`: ratio of the outflow of a rectangular dam to the exact outflow.  The rectangular dam is 9.6 m wide, with 10 m
+  and 2 m of water at its sides.  Above these levels the suction at the sides is hydrostatic.  Without suction the exact
+  flow is `k (H1^2 - H2^2) / (2 L)` (Dupuit, Charny), with the water levels H1 and H2 and the width L.  With suction,
   Kirchhoff's potential (the integral of k_r over the head) replaces the head;
 * `steady`: ratio of the inflow of the dam to its outflow, before the reservoir falls;
 * `drained`: ratio of the outflow of a column to the outflow by finite elements on cells of a quarter of the size.  The

@@ -76,7 +76,7 @@ def hang(*_) -> None:
 
 
 def judge(row: Row, make: Make, bound: float, rtol: float | None = None) -> Row:
-    """Run a case and fill in its row. With `rtol`, steps are adaptive and not longer than those of the scene."""
+    """Run a case and fill in its row. With `rtol`, steps are adaptive, and not longer than the scene's steps."""
     signal.signal(signal.SIGPROF, hang)
     signal.setitimer(signal.ITIMER_PROF, LIMIT)
     began, result = time.process_time(), mpm.Result()

@@ -52,7 +52,7 @@ def scene(cells: int) -> tuple[mpm.Simulation, list[np.ndarray]]:
 def fall(s: mpm.Simulation, parts: list[np.ndarray], dt: float) -> tuple[mpm.Result, np.ndarray, list]:
     """Release the bodies; return the result, rows (times, 7), and corners of the domains, m, at some times.
 
-    Each row has the time, s, and the positions (x, y), m, of three centres of mass.
+    Each row has the time, s, and the positions (x, y), in m, of three centres of mass.
     """
     mass = s.scene.materials.density(s.points) * s.points.volume0 * s.points.J
     rows, shapes = [], []

@@ -143,7 +143,7 @@ class ExplicitFriction(mpm.DruckerPrager):
 
     @staticmethod
     def kirchhoff(F, bulk, shear, eta, xi, eta_flow, cohesion, plastic, hardened, mean, strength, dt):
-        """Return the Kirchhoff stress (3, 3), Pa, as UFL."""
+        """Return the Kirchhoff stress (3, 3), in Pa, as UFL."""
         now = ExplicitFriction.present(eta, xi, eta_flow, cohesion, mean, strength, dt)
         return mpm.DruckerPrager.kirchhoff(F, bulk, shear, eta_flow, 1.0, eta_flow, now, 0.0, plastic, hardened)
 

@@ -3,9 +3,9 @@
 
 The first scene is rain on exponential soil (`Gardner`) above a water table.  At t = 0 the rain increases from a tenth
 to nine tenths of the conductivity.  Heads are compared with the series of Srivastava and Yeh (1991).  The second scene
-is a wetting front in dry soil (`VanGenuchten`), the second case of Celia, Bouloutas and Zarba (1990).  The front is
-compared with a converged solution of Richards' equation, and with finite elements (Q1/DG0) on the same cells in the
-same steps.
+is a wetting front in dry soil (`VanGenuchten`), which is the second case of Celia, Bouloutas and Zarba (1990).  The
+front is compared with a converged solution of Richards' equation, and with finite elements (Q1/DG0) on the same cells
+in the same steps.
 
 The error for the rain, at 1, 6 and 12 h, is the largest error of the head, divided by the largest head.  The errors for
 the front, at 6 and 12 h, are the errors of the depth at which the head is -5 m, and of the infiltrated water.  They are

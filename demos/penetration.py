@@ -7,10 +7,10 @@ resistance of the bar is that of Randolph and Houlsby (1984) for an adhesion alp
 
     N = F / (s_u D) = pi + 2 asin(alpha) + 4 cos(pi/4 - asin(alpha)/2) (sqrt(2) + sin(pi/4 - asin(alpha)/2)).
 
-The clay is a block, eight diameters wide and high, between smooth walls; half of it is computed.  A pressure on its top
-keeps the gap behind the bar closed.  The clay settles under this pressure, and therefore first loads the bar downwards.
-In a narrower block the resistance is lower.  In a block four diameters wide, N of a rough bar is 10.9 with 8 cells over
-the diameter, and 10.8 with 16 cells.
+The clay is a block, eight diameters wide and high, between smooth walls; half of the block is computed.  A pressure on
+the top keeps the gap behind the bar closed.  The clay settles under this pressure, and therefore first loads the bar
+downwards.  In a narrower block the resistance is lower.  In a block four diameters wide, N of a rough bar is 10.9 with
+8 cells over the diameter, and 10.8 with 16 cells.
 
 Clay ahead of the bar flows around the bar and stretches exponentially, by a factor of about e^4 for each diameter of
 depth.  After each quarter of a diameter, new points are therefore seeded around the bar, with the present stresses
@@ -22,8 +22,8 @@ Saturated ("wet") clay is also computed: a smooth bar is pushed through it by on
 c_v.  The water on top has the pressure that loads the clay, so the clay starts without effective stress.  Wet clay is
 seeded only once.  Domains longer than a cell are replaced by new domains (renewal).
 
-With --follow the bar is pushed once more, on grid lines that follow it.  Small cells then move with the bar, and the
-larger cells widen behind the bar and narrow ahead of the bar.  The number of cells does not change.
+With --follow the bar is pushed once more, on grid lines that follow the bar.  Small cells then move with the bar, and
+the larger cells widen behind the bar and narrow ahead of the bar.  The number of cells does not change.
 """
 
 from __future__ import annotations

@@ -65,7 +65,7 @@ def slip_line(delta: float, way: int) -> np.ndarray:
 
 @dataclass
 class Tilted:
-    """Results of a run: tilts (n,), rad, and K (n,) from the thrust and from the moment.
+    """Results of a run: tilts (n,), in rad, and K (n,) from the thrust and from the moment.
 
     frame: final corners of the domains, m, plastic shear strains, and shape of the wall.
     """

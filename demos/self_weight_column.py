@@ -12,7 +12,8 @@ stiffness.  The demo runs on one process.
 Errors: `stress` is the mean of |sigma - exact(Y)| / (rho0 g l0) over the points, weighted by volume; `height` is the
 relative error of the column's height.  With 16 cells over the initial height, `stress` is 3.4e-4; the published error
 of GIMP is 3.7e-3.  With 64 cells, `stress` is 6.4e-6; the published error of GIMP is 4.4e-4.  `--quadrature point`
-integrates at the points instead of over the pieces of their domains; its error is about 8 % with any number of cells.
+integrates at the points instead of over the pieces of their domains. The error is then about 8 % with any number of
+cells.
 """
 
 from __future__ import annotations

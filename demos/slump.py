@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
 """A submarine bank loses its strength and slumps: large plastic deformation with pore pressures.
 
-A bank of saturated soil with a vertical side stands on a rough floor under water.  Half of it is computed, 10 m high
-and 10 m long; x = 0 is a plane of symmetry.  Pressures are in excess of the hydrostatic pressure outside.  The weight
-is a term in UFL.  The buoyant unit weight is `gamma' = (1 - n) (rho_s - rho_w) g`, with the porosity n and the
-densities rho_s of the grains and rho_w of the water.  Inertia is neglected.  The demo runs on one process.
+A bank of saturated soil with a vertical side stands on a rough floor under water.  The computed half is 10 m high and
+10 m long; x = 0 is a plane of symmetry.  Pressures are in excess of the hydrostatic pressure outside.  The weight is a
+term in UFL.  The buoyant unit weight is `gamma' = (1 - n) (rho_s - rho_w) g`, with the porosity n and the densities
+rho_s of the grains and rho_w of the water.  Inertia is neglected.  The demo runs on one process.
 
 1. Critical strength.  Without friction and drainage, the strength c is reduced by 1 % in each step.  A vertical side of
    height H is stable while gamma' H / c < 3.78 (limit analysis: between 3.76 and 3.79, Pastor, Thai and Francescato
@@ -23,8 +23,9 @@ densities rho_s of the grains and rho_w of the water.  Inertia is neglected.  Th
 The cohesion is a function of position, so the points carry it (`points.data["cohesion"]`).  A function in `observe`
 reduces it after each step.  A step that does not converge is cut, and repeated with unchanged strength.  The shorter
 step converges because a viscous stress of 2 eta times the strain rate, also a term in UFL, limits the velocity of the
-bank.  eta / T is a hundredth of gamma' H; part 1 has no viscosity.  A mesh could not represent this deformation,
-because the vertical side of the bank finally lies on the floor, and plastic strains are several hundred per cent.
+bank.  The ratio eta / T is a hundredth of gamma' H.  Part 1 has no viscosity.  A mesh could not represent this
+deformation, because the vertical side of the bank finally lies on the floor, and plastic strains are several hundred
+per cent.
 """
 
 from __future__ import annotations

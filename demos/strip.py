@@ -67,7 +67,7 @@ def conditions(load: float) -> dict:
 def times(a_decade: int) -> NDArray[np.float64]:
     """Return the times T at which steps end.
 
-    a_decade: number of steps in which T grows tenfold after `RAMP`; two thirds as many end at `RAMP` or before.
+    a_decade: number of steps in which T grows tenfold after `RAMP`; two thirds as many steps end at or before `RAMP`.
     """
     ramp = RAMP * np.linspace(0, 1, 1 + 2 * a_decade // 3)[1:]
     return np.append(ramp, RAMP * 10 ** (np.arange(1, 5 * a_decade // 2 + 1) / a_decade))

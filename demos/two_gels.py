@@ -37,7 +37,7 @@ def _round(x: np.ndarray) -> np.ndarray:
 
 
 def path(t: float) -> tuple[float, float]:
-    """Return the displacement (x, y), m, of the upper gel, which moves down, then sideways, then up."""
+    """Return the displacement (x, y), in m, of the upper gel, which moves down, then sideways, then up."""
     down = -DOWN * min(t / TIMES[0], 1) - GAP * min(t / TIMES[0], 1)
     along = ALONG * np.clip((t - TIMES[0]) / (TIMES[1] - TIMES[0]), 0, 1)
     return along, down + UP * np.clip((t - TIMES[1]) / (TIMES[2] - TIMES[1]), 0, 1)

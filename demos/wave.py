@@ -8,7 +8,7 @@
 2. A slow or a fast harmonic load acts on a saturated column of 10 m, drained at its top (Zienkiewicz, Chang and Bettess
    1980).  The complex amplitudes of settlement and pore pressures in the steady oscillation are compared.  In the slow
    case, water drains only from a layer of 0.3 m below the top.
-3. The same column, with incompressible water and grains and k = 0.01 m/s, takes a sudden load (after de Boer, Ehlers
+3. The same column, with incompressible water and grains and k = 0.01 m/s, carries a sudden load (after de Boer, Ehlers
    and Liu 1993).  Until a wave returns from the base, the settlement of the top at the time t is
    `q / (M a^(1/2)) int_0^t exp(-r s) I_0(r s) ds`.  Here `r = b / (2 a)`, I_0 is the modified Bessel function,
    `a = n_s (rho_s - rho_w) / M` and `b = g rho_w / (k M)`.  M is the oedometric modulus, and n_s is the volume fraction

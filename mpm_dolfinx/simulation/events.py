@@ -20,10 +20,7 @@ from mpm_dolfinx.stepping.scene import Scene
 from mpm_dolfinx.stepping.state import State
 
 LOCATED = 1e-3
-"""Accuracy of the time of an event, relative to the length of the step.
-
-Source: definition; the documentation of `until` gives this accuracy.
-"""
+"""Accuracy of an event's time, relative to the length of the step.  Source: definition, as documented in `until`."""
 
 Event = Callable[[Any], float]
 """A function of the simulation that returns a number or a boolean."""
@@ -36,7 +33,7 @@ class Simulated(Protocol):
     state: State
 
     def advanced(self, dt: float, *how: Sequence[Substep]) -> tuple[State, Report]:
-        """Return the state after a step of dt, s, and its report; how: substeps, by default those of the scene."""
+        """Return the state after a step of dt, s, and its report; how: substeps, by default the scene's substeps."""
 
 
 class Step(NamedTuple):

@@ -47,10 +47,7 @@ The stability function is never below -0.21, so an undetected jump overshoots by
 AGAIN = 2.0
 """A pressure jumps if its rate is more than `AGAIN` times the rate in the first substep of the previous step."""
 MOST = SAME / EPSILON
-"""Largest number of output intervals.
-
-Source: exact; with more intervals, `SAME` times an interval would be below the rounding of the time.
-"""
+"""Largest number of output intervals. Source: exact; with more, `SAME` times an interval is below rounding."""
 RESOLVED = 10
 """Smallest ratio of `rtol` to the solver tolerance; below it, solver errors would hide the error of the step."""
 FIRST = 1e-3

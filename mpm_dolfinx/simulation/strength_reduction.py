@@ -323,10 +323,7 @@ def _mean_stress(scene: Scene, points: MaterialPoints) -> float:
 
 
 def _shear_modulus(scene: Scene, points: MaterialPoints) -> float:
-    """Return the harmonic mean of G, Pa, over the volume of soil with a strength.
-
-    The harmonic mean gives the most weight to soft soil, which yields first.
-    """
+    """Return the harmonic mean of G, Pa, of soil with a strength; soft soil, which yields first, counts more."""
     softness = scene.materials.table(points, lambda m: 1 / m.shear if isinstance(m, Frictional) else 0 * m.shear)
     volume = points.volume0 * points.J
     total, whole_volume = over_all(scene.grid.comm, np.array([softness @ volume, (softness > 0) @ volume]))

@@ -71,12 +71,12 @@ def _storage(s: Scene, state: State) -> list[Part]:
     names = ("pore pressure", "fluxes between cells", "weight of the fluid", "open sides", "damping of pressure jumps")
     if storage is None:
         return [Part(name, False, "no fluid") for name in (*names, "pores that drain", "retention", "sources")]
-    still, f = "nothing conducts", storage.fluxes
+    still, f = "no conductivity", storage.fluxes
     return [
         Part(names[0], True, "finite volumes, coupled"),
         _either(names[1], f.flux, f"two-point, conductivities over {s.fluid.unit_weight:.6g} N/m^3", still),
         _either(names[2], f.gravity, "gravity", "no gravity" if f.flux else still),
-        _either(names[3], names[3] in count, f"{count.get(names[3])} drained or with inflow", "sealed"),
+        _either(names[3], names[3] in count, f"{count.get(names[3])} drained or with inflow", "no-flow sides only"),
         _either(names[4], f.damp.used, "little flow within a step", "enough flow within a step, so far"),
         _either("pores that drain", storage.drains, "as a free surface falls", "pores stay full"),
         _either("retention", storage.retains, _laws(s), "no suction drains pores"),

@@ -92,7 +92,7 @@ def run(
         soil the error of the water content is limited too, relative to its largest change in a step so far. The
         estimate is a fraction of a first-order step's error, see `solve.newton.ERROR`. The largest true error of a run
         was 0.7 to 5 times the largest estimate. The ratio is largest directly after a jump of the load.
-    t_eval : (m,), s
+    t_eval : (n,), s
         Output times, increasing, in (t, t_end]; t_end is always an output time. Steps end at output times.
     first_step, max_step
         First trial step of a new run, and longest step, s, > 0. Both require `rtol`. The default first step is 18 rtol
@@ -246,10 +246,7 @@ def _observe(observer: Callable, simulation: Simulated, comm: MPI.Intracomm) -> 
 def _histories(
     simulation: Simulated, times: Times, rule: StepSize, probes: Probes | None, after: Result | None
 ) -> tuple[Result, StepControl]:
-    """Return the histories and the step control.
-
-    The histories are new and start at the present state, or are the histories that the run continues.
-    """
+    """Return histories that start at the present state or that the run continues, and the step control."""
     state = simulation.state
     latest = simulation.state.result
     control = simulation.state.control
