@@ -176,9 +176,9 @@ def draw(o: Namespace, free: Slump, held: Slump) -> None:
     fig, axes = common.figure(2, 2, (13, 6.6))
     meets = next(k for k, f in enumerate(held.frames) if f.force[0] > 0)
     shown = [
-        (axes[0, 0], held.frames[meets], f"first contact after {held.frames[meets].t / 60:.1f} minutes"),
-        (axes[0, 1], held.frames[-1], "at rest against the barrier"),
-        (axes[1, 0], free.frames[-1], "at rest without a barrier"),
+        (axes[0, 0], held.frames[meets], f"First contact after {held.frames[meets].t / 60:.1f} minutes"),
+        (axes[0, 1], held.frames[-1], "At rest against the barrier"),
+        (axes[1, 0], free.frames[-1], "At rest without a barrier"),
     ]
     top = max(f.moved.max() for _, f, _ in shown)
     for ax, frame, title in shown:
@@ -197,7 +197,7 @@ def draw(o: Namespace, free: Slump, held: Slump) -> None:
     for k, name in enumerate(("active", "passive")):
         values = [f.bounds[k] / 1e3 for f in after]
         ax.plot([f.t / 60 for f in after], values, color="k", ls=("--", ":")[k], lw=1, label=f"{name}, of wedges")
-    ax.set(xlabel="time (minutes)", ylabel="force (kN/m)", title="normal force", xlim=(0, 2 * DURATION / 60))
+    ax.set(xlabel="time (minutes)", ylabel="force (kN/m)", title="Normal force", xlim=(0, 2 * DURATION / 60))
     ax.set(ylim=(0, 2.5 * F.max()))
     ax.legend(fontsize=9)
     ax.grid(alpha=0.3)

@@ -220,8 +220,8 @@ def draw(o: Namespace, dam: Dam) -> None:
             ax.tricontour(*corners.mean(axis=1).T, p, levels=[0.0], colors=color, linewidths=1.5)
             ax.plot([0, 1 + SLOPE * level], [level, level], color=f"C{k}", label=f"{day:g}")
             ax.set(aspect="equal", xlim=(0, BASE + 2), ylim=(0, HEIGHT + 0.5), xlabel="x (m)", ylabel="y (m)")
-    axes[0, 0].set_title("steady seepage through the dam; white: its free surface, p = 0")
-    axes[1, 0].set_title("free surfaces as the reservoir falls by 2 m in 5 days")
+    axes[0, 0].set_title("Steady seepage; white: free surface, p = 0")
+    axes[1, 0].set_title("Free surface while the reservoir falls by 2 m in 5 days")
     axes[1, 0].legend(title="days", fontsize=9, loc="upper right")
     common.save(fig, o.out / "dam.png")
 

@@ -92,13 +92,13 @@ def draw(o: Namespace, curves: list, settlement: list[float]) -> None:
     for i, (minutes, p, z) in enumerate(curves):
         left.plot(p / 1e3, z, color=f"C{i}", lw=1.2, label=f"{minutes} min")
         left.plot(np.array(CONVERGED[minutes][0]) / 1e3, HEIGHTS, "o", ms=4, color=f"C{i}")
-    left.set(xlabel="pore pressure, kPa", ylabel="height, m", title="Pore pressure; dots: converged")
+    left.set(xlabel="pore pressure (kPa)", ylabel="height (m)", title="Pore pressure; dots: converged")
     left.legend()
     minutes = np.array(list(CONVERGED))
     exact = 1e3 * np.array([values[1] for values in CONVERGED.values()])
     right.plot(minutes, exact * (1 + np.array(settlement)), "x-", lw=1, label="material points")
     right.plot(minutes, exact, "o", ms=4, mfc="none", color="black", label="converged")
-    right.set(xlabel="time, min", ylabel="settlement, mm", xscale="log", title="Settlement of the top")
+    right.set(xlabel="time (min)", ylabel="settlement (mm)", xscale="log", title="Settlement of the top")
     right.invert_yaxis()
     right.legend()
     for ax in (left, right):

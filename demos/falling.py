@@ -117,7 +117,7 @@ def draw(o: Namespace, result: mpm.Result, t, way, above, shapes, rigid) -> None
         if a is not None:
             ways.plot(t[::8], a * t[::8] ** 2 / 2, "o", ms=3, color=f"C{k}", label="rigid")
     ways.plot(t, above + DROP, "--", lw=1, color="C2", label="its height above the incline")
-    ways.set(xlabel="time (s)", ylabel="way along the incline (m)", title="Ways", ylim=(0, None))
+    ways.set(xlabel="time (s)", ylabel="distance along the incline (m)", title="Distance", ylim=(0, None))
     e = result.energies
     for name, label in (("external", "work of the weight"), ("kinetic",) * 2, ("friction",) * 2, ("elastic",) * 2):
         energy.plot(result.t, e[name], lw=1, label=label)

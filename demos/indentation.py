@@ -152,18 +152,25 @@ def draw(o: Namespace, wet: Pressed, contacts: tuple[Contact, Contact]) -> None:
     domains = common.domains(left, corners, p / 1e3, cmap="viridis")
     common.domains(left, tool, facecolor="0.8", edgecolor="0.8")
     fig.colorbar(domains, ax=left, label="pore pressure (kPa)", shrink=0.8)
-    left.set(aspect="equal", xlim=(0, SIZE), ylim=(0, SIZE + 0.25), title="at once", xlabel="x (m)", ylabel="y (m)")
-    named = zip(("at once", "drained"), contacts, (UNDRAINED, DRAINED), strict=True)
+    left.set(
+        aspect="equal",
+        xlim=(0, SIZE),
+        ylim=(0, SIZE + 0.25),
+        title="Just after the indentation",
+        xlabel="x (m)",
+        ylabel="y (m)",
+    )
+    named = zip(("undrained", "drained"), contacts, (UNDRAINED, DRAINED), strict=True)
     for k, (name, seen, stiff) in enumerate(named):
         half = 2 * np.sqrt(seen.force * RADIUS / (np.pi * stiff))
         most = np.sqrt(seen.force * stiff / (np.pi * RADIUS))
         x = np.linspace(0, half, 200)
         middle.plot(x, most * np.sqrt(1 - (x / half) ** 2) / 1e3, color=f"C{k}", lw=1, label=f"Hertz, {name}")
         middle.plot(seen.x, seen.p / 1e3, "o", color=f"C{k}", mfc="none", ms=4, label=name)
-    middle.set(title="under the cylinder", xlabel="x (m)", ylabel="contact pressure (kPa)")
+    middle.set(title="Contact pressure", xlabel="x (m)", ylabel="contact pressure (kPa)")
     right.semilogx(TIMES, np.array(wet.forces[1:]) / 1e3, "o-", ms=3, label="wet gel")
     right.axhline(contacts[1].force / 1e3, color="C1", ls="--", label="dry gel")
-    right.set(title="force on the cylinder", xlabel="t c_v / (5 m)² (-)", ylabel="force (kN/m)", ylim=(0, None))
+    right.set(title="Force on the cylinder", xlabel="t c_v / (5 m)² (-)", ylabel="force (kN/m)", ylim=(0, None))
     for ax in (middle, right):
         ax.legend(fontsize=9)
         ax.grid(alpha=0.3)

@@ -147,12 +147,12 @@ def draw(o: Namespace, heads: list, depths: list) -> None:
     for i, (hour, (heights, head)) in enumerate(zip(HOURS, heads, strict=True)):
         left.plot(series(z, 3600 * hour), z, color="black", lw=1, label=None if i else "exact")
         left.plot(head, heights, "o", ms=3, label=f"{hour} h")
-    left.set(xlabel="head, m", ylabel="height above the water table, m", title="rain on exponential soil")
+    left.set(xlabel="head (m)", ylabel="height above the water table (m)", title="Rain on exponential soil")
     for hour, (depth, head) in zip(FRONT, depths, strict=True):
         (line,) = right.plot(head, depth, "o-", ms=3, lw=1, label=f"{hour} h")
         right.axhline(FRONT[hour][0], color=line.get_color(), lw=0.8, ls="--")
     right.axvline(-5, color="black", lw=0.8, ls=":")
-    right.set(xlabel="head, m", ylabel="depth, m", title="front into dry soil; dashed: converged place of −5 m")
+    right.set(xlabel="head (m)", ylabel="depth (m)", title="Front into dry soil; dashed: converged position of −5 m")
     right.set_ylim(0.6, 0)
     for ax in (left, right):
         ax.legend(frameon=False)

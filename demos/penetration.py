@@ -284,8 +284,8 @@ def draw(o: Namespace, runs: dict[float, Push], wet: dict[str, Push]) -> None:
     most = max(np.abs(run.frame[1]).max() for run in wet.values())
     for ax, (name, run) in zip(axes[1, 1:], wet.items(), strict=True):
         show(ax, run, "excess pore pressure / s_u (-)", f"{name}, V = v D / c_v = {RATES[name]:g}", (-most, most))
-    axes[0, 3].set(ylabel="F / (s_u D) (-)", title="wet clay, smooth bar, at three rates V", ylim=(0, None))
-    axes[1, 0].set(ylabel="excess pore pressure / s_u (-)", title="wet clay, ahead of the bar")
+    axes[0, 3].set(ylabel="F / (s_u D) (-)", title="Saturated clay, smooth bar, three rates V", ylim=(0, None))
+    axes[1, 0].set(ylabel="excess pore pressure / s_u (-)", title="Saturated clay, ahead of the bar")
     for ax in (axes[0, 0], axes[0, 3], axes[1, 0]):
         ax.set_xlabel("depth / D (-)")
         ax.legend(fontsize=9)

@@ -275,8 +275,8 @@ def draw(o: Namespace, curves: list) -> None:
     for share in (0.0, 0.9):
         right.plot(exact(depth, share), depth, "k--", lw=0.9, label="exact" if share else None)
     right.axvline(1, color="grey", lw=0.8)
-    left.set(xlabel="head, m", ylabel="depth, m", title="Suction fades from above", ylim=(TABLE, 0))
-    right.set(xlabel="factor of safety", title="and with it the strength", ylim=(TABLE, 0), xlim=(0.9, 1.5))
+    left.set(xlabel="head (m)", ylabel="depth (m)", title="Suction", ylim=(TABLE, 0))
+    right.set(xlabel="factor of safety", title="Factor of safety", ylim=(TABLE, 0), xlim=(0.9, 1.5))
     for ax in (left, right):
         ax.grid(alpha=0.3)
         ax.legend()

@@ -131,7 +131,7 @@ def draw(out: Path, shown: list, t: np.ndarray, force: np.ndarray) -> None:
         t, np.where((t > TIMES[0]) & (force[:, 1] > 0), rigid, np.nan), "k--", label="rigid gels that slide"
     )
     axes[2, 1].set(xlabel="time (s)", ylabel="force along / force up (-)")
-    axes[2, 1].set_title(f"friction {FRICTION} on a contact that inclines more and more", fontsize=10)
+    axes[2, 1].set_title(f"Friction {FRICTION}, inclination of the contact grows", fontsize=10)
     for ax in axes[2]:
         ax.grid(alpha=0.3)
         ax.legend(fontsize=8)

@@ -129,7 +129,9 @@ def draw(o: Namespace, beams: dict, bar: dict[str, np.ndarray], own: np.ndarray)
     t = np.linspace(0, 3, 400)
     tip.plot(t, np.sin(2 * np.pi * t), color="black", lw=1, label="sine of the exact frequency", zorder=0)
     tip.set(
-        xlabel="time / exact period", ylabel="deflection of the tip / its largest", title="Beam that is struck across"
+        xlabel="time / exact period",
+        ylabel="deflection of the tip / its largest",
+        title="Beam after a transverse impulse",
     )
     last = bar["t"] > o.periods - min(3, o.periods)
     fine = np.linspace(bar["t"][last][0], o.periods, 400)

@@ -154,14 +154,14 @@ def draw(o: Namespace, curves: list, frames: list) -> None:
         first.plot(x, z, lw=1.4, color=f"C{i}", label=f"{hours:g} h")
         if hours:
             first.plot(PLACES, CONVERGED[hours], "o", ms=4, mfc="none", color=f"C{i}")
-    first.set(xlabel="x, m", ylabel="height, m", title="Water table under rain on 0 ... 0.5 m; circles: converged")
+    first.set(xlabel="x (m)", ylabel="height (m)", title="Water table under rain on x < 0.5 m; circles: converged")
     first.legend(ncols=5, fontsize=8)
     first.grid(alpha=0.3)
     for ax, (days, corners, pressure) in zip(others, frames, strict=True):
         patches = common.domains(ax, corners, pressure / 1e3, clim=(-20, 20), cmap="RdBu")
         ax.axhline(level(days * DAY), color="C0", lw=1)
         ax.set(title=f"Levee, day {days:g}", xlim=(0, corners[:, :, 0].max()), ylim=(0, LEVEE + 0.2))
-    fig.colorbar(patches, ax=others, label="pore pressure, kPa", shrink=0.8)
+    fig.colorbar(patches, ax=others, label="pore pressure (kPa)", shrink=0.8)
     common.save(fig, o.out / "water_table.png")
 
 

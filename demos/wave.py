@@ -190,7 +190,7 @@ def draw(o: Namespace, dry: dict, swings: dict, loaded: dict[str, np.ndarray]) -
         label = f"$\\Pi_1$ = {SWINGS[name][0]:g}, $\\Pi_2$ = {SWINGS[name][1]:g}"
         depth.plot(np.abs(p), at, "o", ms=5, label=label)
     depth.set(
-        xlabel="amplitude of pore pressure / load", ylabel="depth (m)", title="Load that swings, saturated column"
+        xlabel="amplitude of pore pressure / load", ylabel="depth (m)", title="Oscillating load, saturated column"
     )
     depth.invert_yaxis()
     top.plot(1e3 * loaded["t"], 1e3 * loaded["exact"], color="black", lw=1, label="exact")
