@@ -82,7 +82,7 @@ def took(make: Callable[[int], mpm.Simulation], n: int, name: str, least: int) -
 def factored(n: int, soil: mpm.Skeleton) -> Iterator[tuple[str, int, list[float]]]:
     """Yield for each direct solver its name, the number of unknowns, and three processor times, s.
 
-    The times are of a first factorisation of the stiffness, of the next with the same pattern, and of a solve.
+    Timed are a first factorisation of the stiffness, the next factorisation with the same pattern, and a solve.
     """
     s = block(2, n, soil, True)
     s.step(1.0)

@@ -36,7 +36,7 @@ from mpm_dolfinx.verification.exact import Mandel, terzaghi_consolidation
 PEER, TRUTH = "FEM Q1/DG0, same grid", "FEM Taylor-Hood"
 BY_ERROR, EQUAL, STANDARD = "MPM, steps by error", "MPM, equal steps", "standard MPM, at the points"
 RTOL = 6e-3
-"""Tolerance of the steps by error where the cell size varies."""
+"""Tolerance of adaptive steps in the runs of different cell size."""
 STYLES = {  # colour and marker of each method, the same in all cases
     BY_ERROR: ("C0", "o"),
     EQUAL: ("C5", "x"),
