@@ -15,7 +15,8 @@ points
 t
     Time at which the balances hold, s, as a UFL constant.  It is the end of the step or of its first substep.
 
-A function in `terms` is added to the balance of momentum, `int P : grad v dV - loads + term = 0`.  It may also have these arguments:
+A function in `terms` is added to the balance of momentum, `int P : grad v dV - loads + term = 0`.  It may also have
+these arguments:
 
 u
     Increment of the displacement in the step, m; Q1.
@@ -29,7 +30,8 @@ dt
 
 The tangent of a term with v is assumed to be unsymmetric.
 
-The function of a `Source` returns the inflow as a volume rate of fluid at zero pressure, m^d/s.  It may also have these arguments:
+The function of a `Source` returns the inflow as a volume rate of fluid at zero pressure, m^d/s.  It may also have
+these arguments:
 
 q
     Test function, constant in the cells.  The source is `s * q * points.dx` with s in 1/s.
