@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Inertia: consistent mass, velocities of material points and nodes, and accelerations in the substeps.
 
-In a substep of a step of length dt, the forces balance rho a with a = (u - u^) / (g dt)^2.  The inertial predictor u^
-is
+In a substep of a step of length dt, the forces balance rho a, with a = (u - u^) / (g dt)^2.  The predictor u^ is
 
     u^ = b dt v_1 + g dt (v_n + b dt a_1),      v = v_n + dt (b a_1 + g a).
 
@@ -53,14 +52,13 @@ from mpm_dolfinx.points.cutting import spreads
 from mpm_dolfinx.points.material_points import MaterialPoints, middle
 
 GHOST_MASS = 0.02
-"""Strength c of the ghost mass.  A rotating block has equal energies with 0.002, 0.02 and 0.2
-(`tests/test_inertia.py`)."""
+"""Strength c of the ghost mass.  A rotating block has equal energies for 0.002 and 0.2 (`tests/test_inertia.py`)."""
 RELAXES = 2.0
 """Relaxation rate of point velocities towards grid velocities, for domain corners that move by one cell size.
 
 Relaxation removes velocity modes of the points that the nodes cannot represent. In a test, a vibrating bar of 20 cells
-moves across 50 cells, with 40 steps a period. After 25 periods the errors of
-the velocity and the losses of energy are:
+moves across 50 cells, with 40 steps a period. After 25 periods the errors of the velocity and the losses of energy
+are:
 
     rate 0: error 1.7 %, loss 1.58 %
     rate 0.1: error 1.2 %, loss 1.60 %
@@ -160,8 +158,8 @@ def product(A: NDArray[np.float64], B: NDArray[np.float64]) -> NDArray[np.float6
 def chord(G: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the increment F~ - 1 at which a midpoint rule evaluates laws, and the rotation of the laws' stress.
 
-    The rule moves F from F_n to F_n + 2 D, with the midpoint F = F_n + D.  The mean of C at both ends of the step is
-    F^T F + D^T D, where C = F^T F.  Laws are evaluated at
+    The rule moves F from F_n to F_n + 2 D, with the midpoint F = F_n + D.  The mean of C = F^T F over both ends of the
+    step is F^T F + D^T D, with the midpoint's F on the right side.  Laws are evaluated at
 
         F~ = F + F^-T D^T D / 2,     F~^T F~ = F^T F + D^T D + O(D^4),     P = F F~^-1 P(F~).
 

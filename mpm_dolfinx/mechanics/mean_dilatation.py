@@ -6,8 +6,8 @@ Four volume constraints per cell suppress the bending modes of a Q1 quadrilatera
 
     Fbar = (theta J_n / det F)^(1/3) F,     theta = sum w det(Delta) / sum w   over the locking pieces of the cell.
 
-Here w is the volume of a piece.  Delta = I + grad u is the deformation gradient of the step, with F = Delta F_n and J_n
-= det F_n. The scaling acts along all three axes: in plane strain the points store an out-of-plane stretch, as in a
+Here w is the volume of a piece.  Delta = I + grad u is the deformation gradient of the step, with F = Delta F_n and
+J_n = det F_n.  The scaling acts along all three axes: in plane strain the points store an out-of-plane stretch, as in a
 slice of the body.  The material decides whether cells would lock (`Skeleton.nearly_incompressible`). In a cell of
 several materials, only the materials that would lock use Fbar. With the law's energy psi and Psi = psi(Fbar) / J_n, the
 energy sum w Psi has the derivative

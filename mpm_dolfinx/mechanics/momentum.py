@@ -198,8 +198,7 @@ class MomentumForms:
         return self.active.now
 
     def summed(self, room: int, adders: Sequence[Callable[[NDArray[np.float64]], None]]) -> NDArray[np.float64]:
-        """Return the sum of all `adders`' nodal forces over all processes, as a local array.  room: index of a
-        buffer."""
+        """Return the nodal forces of `adders`, summed over processes, as a local array.  room: index of a buffer."""
         carrier, out = self._rooms[room]
         out[self.active.now.dofs] = 0.0
         for add in adders:
