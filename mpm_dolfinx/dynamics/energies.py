@@ -3,8 +3,8 @@
 
 The work of forces f in a step is `dt sum b_i f_i . v_i` over its substeps, with the weights b_i of the time
 integration. The work of all forces is the work of loads minus the work of stresses, viscous resistance and friction.
-Without renewal, the work of all forces minus the change of kinetic energy is the numerical dissipation of the method
-and of grid resets.
+Without renewal, the work of all forces minus the change of kinetic energy is the numerical dissipation of method and
+grid resets.
 """
 
 from __future__ import annotations
@@ -36,8 +36,7 @@ def initial_energies(
 ) -> dict[str, NDArray[np.float64]]:
     """Return the energies, J, at the start, see `Result.energies`.  `internal` is the work of the stresses.
 
-    kinetic: kinetic energy of free tools, J
-    renews: whether domains may be renewed
+    kinetic: kinetic energy of free tools, J; renews: whether domains may be renewed.
     """
     works = dict.fromkeys(("internal", "viscous", "friction", "external", *["renewal"] * renews), 0.0)
     return _named(stored(materials, points), works, 0.0, kinetic)

@@ -105,13 +105,13 @@ def centred(work: RefilledCells, group: NDArray, x: NDArray, mass: NDArray, old:
 
 
 def _received(work: RefilledCells, mass: NDArray[np.float64]) -> tuple[NDArray, NDArray, NDArray]:
-    """Return the pieces of removed domains, their groups, and their masses (m,), from the masses of the points."""
+    """Return the pieces of removed domains, their groups, and their masses (k,), from the masses of the points."""
     piece, groups, share = work.into
     return piece, groups, share * mass[work.pieces.point[piece]]
 
 
 def _centre(group: NDArray, mass: NDArray, values: NDArray, count: int) -> tuple[NDArray, NDArray]:
-    """Return the mass (count,) of each group, and the mean (count, k) of values (m, k) in it, weighted by mass."""
+    """Return the mass (count,) of each group, and the mass-weighted mean (count, k) of values (n, k) in the group."""
     whole = np.bincount(group, mass, count)
     columns = [np.bincount(group, mass * column, count) for column in values.T]
     return whole, np.stack(columns, axis=1) / np.where(whole > 0, whole, 1.0)[:, None]

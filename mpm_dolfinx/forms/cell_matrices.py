@@ -177,10 +177,9 @@ def _of_hoops(tangent, gradients: list, hoops: list, row: tuple[int, int], colum
 class StackedElementMatrices:
     """The bilinear form (grad v F) : A : (grad u F) of Q1 vectors: kernels evaluate A, BLAS contracts it.
 
-    In 3D, cells contain many points, so that contraction by BLAS is faster than contraction in the kernel.  The
-    gradients of the shape functions, multiplied by F, are stacked for the n points of a cell.  The element matrix is
-    then the product of an 8 x 3n and a 3n x 72 matrix.  Each batch consists of cells with about the same number of
-    points.
+    In 3D, cells contain many points, so that contraction by BLAS is faster than in the kernel.  The gradients of the
+    shape functions, multiplied by F, are stacked for the n points of a cell.  The element matrix is then the product of
+    an 8 x 3n and a 3n x 72 matrix.  Each batch consists of cells with about the same number of points.
 
     The run time per point is 4.2 us for Hencky's law and 20 points per cell: 2.3 us for the kernel, 1.4 us for the
     products, and 0.4 us for the insertion.  If 24 x 24 entries were inserted for each point, the time would be 13.8 us.
@@ -239,8 +238,7 @@ class StackedElementMatrices:
 def batches(places: Places) -> list[tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]]:
     """Return batches of cells with similar numbers of points: cells (c,), points (c, most), padding (c, most).
 
-    Cells are indices in `Places.filled`, points are indices in `Places.cells`.  Padding is True after a cell's last
-    point.
+    Cells are indices in `Places.filled`, points in `Places.cells`.  Padding is True after a cell's last point.
     """
     cells = places.cells
     filled = places.filled

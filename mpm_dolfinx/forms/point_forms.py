@@ -170,8 +170,7 @@ class Places(Keyed):
     x : (n, d), m
         Positions of the points.
     mixed : (n, d), m^2
-        In 3D: mean products of offsets from a piece's centroid over the piece, see `Pieces`.  None means zero, for
-        points.
+        In 3D: mean products of the offsets from a piece's centroid, see `Pieces`.  None means zero, for points.
     hoop : (n, 4)
         In axisymmetry: moments of the pieces in the plane, see `Pieces`; None for points.
     """
@@ -330,8 +329,7 @@ Packed = tuple[NDArray[np.float64], list[tuple[slice, NDArray[np.float64], NDArr
 class Rows:
     """Coefficients of a compiled form at the points, with one row per point.
 
-    compiled: the compiled form
-    points: points of the form
+    compiled: the compiled form; points: points of the form.
     """
 
     def __init__(self, compiled: _compat.CompiledForm, points: FormPoints):
@@ -483,8 +481,7 @@ class PointExpression:
     functions are therefore allowed only if all cells are equal.  The kernel is called for as many arbitrary cells as
     there are points, so that the DG0 test function yields one value for each point.
 
-    expression: UFL expression of any shape in the fields of `points`
-    points: points of the expression
+    expression: UFL expression of any shape in the fields of `points`; points: points of the expression.
     """
 
     def __init__(self, expression: ufl.core.expr.Expr, points: FormPoints):
@@ -526,8 +523,7 @@ class PointExpression:
 class CellSums:
     """Sums over the points of each cell.  The assembler adds up the points through DG0 test functions.
 
-    quantities: scalar UFL expressions at the points
-    points: points of the expressions
+    quantities: scalar UFL expressions at the points; points: points of the expressions.
     """
 
     def __init__(self, quantities: Sequence[ufl.core.expr.Expr], points: FormPoints):

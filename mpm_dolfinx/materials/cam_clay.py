@@ -79,9 +79,8 @@ class ModifiedCamClay(Skeleton):
     M
         Slope of the critical state line Q = M P, -, > 0.
     lambda_, kappa
-        Slopes of ln v against ln P, -, 0 < kappa < lambda_.  lambda_ is the slope in first loading, kappa the slope in
-        unloading.  P is a Kirchhoff stress.  A slope C of v against the logarithm of the Cauchy stress corresponds to C
-        / (v - C).
+        Slopes of ln v against ln P, -, 0 < kappa < lambda_.  lambda_ applies to first loading, kappa to unloading.  P
+        is a Kirchhoff stress.  A slope C of v against the logarithm of the Cauchy stress corresponds to C / (v - C).
     initial_stress : (3,), Pa
         Normal effective stresses at F = I, tension positive.  Their mean must be < 0.  The last stress is out of plane
         in 2D, and circumferential in axisymmetry.  These stresses must be in equilibrium with the loads.

@@ -94,10 +94,7 @@ class LawAtPoints:
     def data(
         self, points: MaterialPoints, rows: NDArray[np.int64], values: dict[str, NDArray[np.float64]]
     ) -> PointData:
-        """Return form data at the points with indices `rows`.
-
-        values: F, parameters and state (n, ...) of all points, by name.
-        """
+        """Return form data at the points `rows`; values: F, parameters and state (n, ...) of all points, by name."""
         x = points.x[rows]
         cells = self.grid.locals[self.grid.number(self.grid.index_from_base(x))]
         inputs = {name: values[name][rows] for name in ("F", *self._shapes)}
@@ -228,8 +225,7 @@ class SoftnessAtPoints:
     of the current iterate would prevent convergence of Newton's method, or make the result depend on the iterates.
 
     At rest the strain is a rounding error with a random direction.  G_t is therefore a weighted mean.  The modulus of
-    the step has the weight e : e, and the old modulus has the weight `NEAR`^4.  A step at rest thus does not change the
-    softness.
+    the step has the weight e : e, and the old modulus has the weight `NEAR`^4.  A step at rest thus keeps the softness.
 
     grid, law, shapes, stretches: see `LawAtPoints`.
     """
@@ -281,8 +277,7 @@ class ConductivityAtPieces:
     laws
         Distinct conductivity laws of the materials.
     pieces
-        Integration points of the pieces.  If `laws` is not empty, they have the fields F, position, conductivity and
-        porosity0.
+        Integration points of the pieces.  With `laws` they have the fields F, position, conductivity and porosity0.
     displacement
         Increment of the displacement since the start of the step.
     pressure
@@ -321,15 +316,12 @@ class ConductivityAtPieces:
         )
 
     def evaluate(self, data: PointData, material: NDArray[np.int32], begins: bool) -> NDArray[np.float64]:
-        """Return the conductivities (n,) of n pieces, in m/s, at the present displacement.
-
-        material (n,): material indices of the pieces; begins: whether a step begins.
+        """Return the conductivities (n,), m/s, of pieces at the present displacement; material (n,): their materials.
 
         Raises
         ------
         ValueError, NotConverged
-            A conductivity is negative or not finite.  The error is ValueError at the start of a step, else
-            NotConverged.
+            A conductivity is negative or not finite.  This is a ValueError at the start of a step, else NotConverged.
         """
         out = data["conductivity"][:, 0].copy()
         for law, k in self._laws.items():

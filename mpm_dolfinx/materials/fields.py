@@ -283,10 +283,7 @@ class SceneMaterials:
     def saturation(
         self, points: MaterialPoints, p: NDArray[np.float64], of: NDArray[np.int64] | slice = slice(None)
     ) -> tuple[NDArray[np.float64], ...]:
-        """Return four arrays (k,): saturation S, dS/dp (1/Pa), Bishop's chi and relative permeability.
-
-        p (k,): pore pressures at the points `of`, in Pa.
-        """
+        """Return saturation, dS/dp (1/Pa), chi and relative permeability, each (k,), at p (k,), Pa, of points `of`."""
         return self.saturations(self.retention_rows(points)[of], p)
 
     @cached_property
@@ -471,10 +468,7 @@ class SceneMaterials:
         return np.array([not m.state for m in self.materials])[points.material]
 
     def soil_rows(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return constants (n, c) of the points.
-
-        Points of the same soil have equal constants, even with different initial stresses.
-        """
+        """Return constants (n, c) that are equal at points of one soil, even if their initial stresses differ."""
         fields = [points.data[name] for name in self.field_names if name != "seeded_stretch"]
         fields = [rows.reshape(len(rows), int(np.prod(rows.shape[1:]))) for rows in fields]
         return np.column_stack([points.material, *fields])
@@ -531,10 +525,7 @@ class SceneMaterials:
     def updated_state(
         self, points: MaterialPoints, before: MaterialPoints, dt: float
     ) -> dict[str, NDArray[np.float64]]:
-        """Return the point data after a step of dt, s.
-
-        points: points with the new F and the old state
-        before: points with the old F
+        """Return the point data after a step of dt, s; points have the new F and the old state, before have the old F.
 
         Raises
         ------
@@ -655,10 +646,7 @@ def _ends(grid: Grid, values: Sequence) -> tuple[float, float]:
 
 
 def _checksum(grid: Grid, ids: NDArray[np.int64], rows: NDArray[np.float64], total: int) -> int:
-    """Return the checksum of the rows (n, ...) of points of all processes, in the order of the points' ids.
-
-    total: number of points on all processes; all ids are below it.
-    """
+    """Return the checksum of all processes' rows (n, ...), in the order of ids (n,); total: number above all ids."""
     exchange, checksum = Exchange(grid.comm, (ids * grid.comm.size // total).astype(np.int32)), 0
     content = exchange.send(rows)[exchange.send(ids).argsort()].tobytes()
     for rank in range(grid.comm.size):

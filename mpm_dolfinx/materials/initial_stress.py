@@ -92,7 +92,7 @@ def hydrostatic(level: float, unit_weight: float | None = None) -> Callable[[NDA
 
 @dataclass(frozen=True)
 class OfWater:
-    """A water pressure with a unit weight, N/m^3; by default that of the scene's fluid, or 9810 outside a scene."""
+    """A water pressure with a unit weight, N/m^3: by default the fluid's unit weight, or 9810 outside a scene."""
 
     @property
     def unit_weight(self) -> float:
@@ -265,10 +265,7 @@ def stressed(
 
 @dataclass(frozen=True, eq=False)
 class _ElasticStrains:
-    """Elastic strains that cause the target stresses, by Newton's method.
-
-    A strain is ln `seeded_stretch` or ln(C_p^-1) / 2.
-    """
+    """Elastic strains for target stresses, by Newton's method.  A strain is ln `seeded_stretch` or ln(C_p^-1) / 2."""
 
     materials: SceneMaterials
     points: MaterialPoints  # n points
@@ -357,10 +354,7 @@ class _ElasticStrains:
 
 
 def strained(materials: SceneMaterials, points: MaterialPoints, moved: MaterialPoints) -> MaterialPoints:
-    """Return points with the elastic strains of `moved`, which are these points after deformation.
-
-    Positions do not change.
-    """
+    """Return the points, at their positions, with the elastic strains of `moved`, the points after deformation."""
     law = materials.law_of(points)
     own = {name: points.data[name] for name in MaterialPoints.INTERNAL if name in points.data}
     data = {**moved.data, **own}

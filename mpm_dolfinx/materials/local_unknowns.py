@@ -109,8 +109,7 @@ class LocalUnknowns:
     def update(self, data: PointData, derive: bool = True) -> None:
         """Solve for the local unknowns of the points at their present F; all processes must call it.
 
-        derive: whether to compute the derivatives with respect to the trial values too.  `values` needs the
-        derivatives; `known` does not.
+        derive: whether to differentiate by the trial values too.  `values` needs these derivatives; `known` does not.
 
         Raises
         ------
@@ -284,10 +283,7 @@ class _Equations:
         return out
 
     def _slope(self, of: str, by: str, given, n: int) -> NDArray[np.float64]:
-        """Return the derivative (n, ..., ...) of an unknown with respect to a trial value.
-
-        given: the derivative, or a function that returns it.
-        """
+        """Return the derivative (n, ..., ...) of an unknown by a trial value; given: array or callable."""
         what = f"{self._title}: derivative of {of} with respect to {by}"
         value = asked(what, "a function without arguments that gives it", given) if callable(given) else given
         return _real(what, value, (n, *self._unknowns[of], *self._trial[by]))
@@ -323,12 +319,10 @@ def _real(name: str, value, shape: tuple[int, ...]) -> NDArray[np.float64]:
 
 
 def _newton(system, y: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Solve f(y) = 0 at all points by Newton's method with a line search; return the indices of failed points.
+    """Solve f(y) = 0 at all points, in place, by Newton's method with a line search; return indices of failed points.
 
-    y is changed in place.
-
-    system: function of r point indices and of the y (r, m) of these points.  It stores the y, and returns f, df/dy and
-    the norms of f.
+    system: function of r point indices and of the y (r, m) of these points.  It stores y, and returns f, df/dy and
+    norms of f.
     """
     rows, failed = np.arange(len(y)), np.zeros(len(y), dtype=bool)
     f, slope, norm = system(rows, y)

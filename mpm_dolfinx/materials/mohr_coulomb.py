@@ -8,11 +8,11 @@ stresses t_1 >= t_2 >= t_3, tension positive,
 
 The direction of flow is (1 + sin psi) e_i - (1 - sin psi) e_j on a face f_ij, and e_i at the cut-off T.  e_i are
 principal directions; phi, psi, c and T are constants of `MohrCoulomb`.  The return mapping keeps the order of the
-principal stresses.  Its result therefore lies on one of ten faces, edges and vertices, see `_Return`.  Source: de Souza
-Neto, Peric and Owen (2008), 8.2, without the cut-off.  On each of them the final stress is linear in the trial stress.
-A final stress is valid if it is admissible, the order is kept, and all plastic multipliers are >= 0.  The return
-mapping uses the one of the ten final stresses with the smallest violation, which is a rounding error.  Derivatives are
-computed in numpy, and are exact even for equal eigenvalues.
+principal stresses.  Its result therefore lies on one of ten faces, edges and vertices, see `_Return`.  On each face,
+edge or vertex the final stress is linear in the trial stress (de Souza Neto, Peric and Owen 2008, 8.2, without the
+cut-off).  A final stress is valid if it is admissible, the order is kept, and all plastic multipliers are >= 0.  The
+return mapping uses the one of the ten final stresses with the smallest violation, which is a rounding error.
+Derivatives are computed in numpy, and are exact even for equal eigenvalues.
 """
 
 from __future__ import annotations
@@ -153,12 +153,7 @@ def _returned(e: NDArray, bulk: NDArray, shear: NDArray, sine: NDArray, sine_flo
 
 
 class _Surface:
-    """Yield surface for principal stresses in descending order.
-
-    p, q (n,): 1 + sin phi and 1 - sin phi
-    k (n,), Pa: 2 c cos phi
-    T (n,), Pa: tensile strength
-    """
+    """Yield surface for ordered principal stresses, with p = 1 + sin phi, q = 1 - sin phi, k = 2 c cos phi, and T."""
 
     def __init__(self, sine: NDArray, strength: NDArray, cutoff: NDArray):
         self.p = 1 + sine

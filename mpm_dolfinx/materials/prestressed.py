@@ -24,9 +24,7 @@ AT_REST = " at rest"
 
 
 def stressed(m: Skeleton, knows_space: bool) -> Skeleton:
-    """Return a material with a point field for its initial stress, or for the elastic strain that causes this stress.
-
-    The values of the field are set later.
+    """Return a material with a point field, set later, for its initial stress or for the strain that causes it.
 
     knows_space: whether the material's law accepts F (3, 3)
     """

@@ -25,8 +25,8 @@ from mpm_dolfinx.pores.retention import check_retention
 Field = float | Sequence[float] | Callable[[NDArray[np.float64]], ArrayLike]
 """A constant (number or vector), or a function of the reference positions X (n, d), m, that returns (n, ...).
 
-X are the points of one process.  On several processes, a value that depends on the other positions, as a mean does,
-raises ValueError.
+X are the points of one process.  On several processes, values that depend on other positions, like a mean, raise
+ValueError.
 """
 
 BY_SCENE = ("dt", "cell_size")
@@ -38,12 +38,9 @@ DRIED = ("suction", "suction_at_start")
 LOCKING = 0.43
 """Poisson's ratio nu above which cells use F-bar.  F-bar doubles the run time of a step.
 
-Errors of the drained beam's tip deflection, with the cell size h = 0.015 m:
-    nu = 0.3: -0.02 % without F-bar, +0.22 % with F-bar
-    nu = 0.45: -0.44 % without F-bar, +0.21 % with F-bar
-    nu = 0.49: -2.0 % without F-bar, +0.21 % with F-bar
-    nu = 0.499: -10.3 % without F-bar, -0.02 % with F-bar
-For h = 0.06 m and nu = 0.499 the error is -56 % without F-bar, and -0.4 % with F-bar.
+Errors of the drained beam's tip deflection with h = 0.015 m, without F-bar: -0.02 % at nu = 0.3, -0.44 % at nu = 0.45,
+-2.0 % at nu = 0.49, -10.3 % at nu = 0.499.  Errors with F-bar: +0.22 % at nu = 0.3, +0.21 % at nu = 0.45 and 0.49,
+-0.02 % at nu = 0.499.  With h = 0.06 m and nu = 0.499: -56 % without F-bar, -0.4 % with F-bar.
 """
 
 SEPARATION = 1e-4
@@ -83,8 +80,8 @@ class Skeleton:
     A law adds its parameters as fields of the dataclass and defines one of the static methods below.  Arguments of a
     method may be F, and the law's fields, properties and state variables.  F is (d, d).  In axisymmetry F is (3, 3),
     with the circumferential stretch last, see `axes`.  In plane strain F is (3, 3), with the out-of-plane stretch last,
-    in two cases: if Q1 cells would lock, and for soil with an initial stress.  If the law does not accept the shape (3,
-    3), F is (2, 2).
+    in two cases: if Q1 cells would lock, and for soil with an initial stress.  If the law does not accept this, F is
+    (2, 2).
 
     energy
         Stored energy psi per reference volume, Pa.  Stress and tangent are UFL's derivatives.
@@ -92,7 +89,8 @@ class Skeleton:
         Kirchhoff stress tau = J sigma', Pa, (d, d) or (3, 3), of a law without an energy.  UFL gives the tangent.
 
     The law's `state` contains the initial values of the history variables, by name.  `update` (F, ...) -> {name: UFL}
-    computes them at the points after every converged step.  If a new value is not finite, the time step is reduced.
+    computes new values at the points after every converged step.  If a new value is not finite, the time step is
+    reduced.
 
     A law whose stress has no closed formula has local unknowns.  `unknowns` contains the initial values of the unknowns
     in their iteration, by name.  Unknowns are arguments of `kirchhoff` and `update`.  Scale unknowns and residuals to
@@ -111,8 +109,7 @@ class Skeleton:
         derivatives are missing.
     trial
         Function (F, ...) -> {name: UFL}.  Residuals depend on F through these trial values only.  In a law without
-        `trial`, residuals have F itself as argument.  `kirchhoff` and `update` also receive the trial values that are
-        not UFL.
+        `trial`, residuals have F itself as argument.  `kirchhoff` and `update` also receive values other than UFL.
 
     All these functions may have the argument `dt`, the time since the start of the step, s, for rate-dependent laws.
     With the new state and dt = 0, a law must return the stress at the end of the step.  The argument `cell_size` is the
@@ -412,7 +409,7 @@ class NeoHookean(Skeleton):
 
 @dataclass(frozen=True)
 class LinearElastic(Skeleton):
-    """Linear elasticity of small strain: psi = lambda/2 (tr eps)^2 + G eps:eps, eps = sym F - I.
+    """Linear elasticity of small strain: psi = lambda/2 (tr eps)^2 + G eps:eps with eps = sym F - I.
 
     The law is not objective; use it for small rotations only.  Parameters as for `Skeleton`.
     """

@@ -2,8 +2,7 @@
 """User-defined functions that return UFL.
 
 The name of an argument determines its value.  Laws and conductivities belong to materials: see `skeleton.Skeleton`.
-`Simulation` takes terms of the balances, integrated over the configuration at the start of the step.  Terms may have
-these arguments:
+`Simulation` takes terms of the balances, integrated over the configuration at the start of the step.  Their arguments:
 
 points
     Quadrature points.  `points.dx` is their measure, which adds up to the volumes of the material points.

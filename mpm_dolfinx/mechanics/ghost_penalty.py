@@ -52,8 +52,7 @@ def stiffness(material: Skeleton) -> NDArray[np.float64]:
 
     In nearly empty cells of flowing soil the volume constraint opposes the penalty. With the modulus 2G, a penalty ten
     times as large raises a footing's limit load by 0.004 % at nu = 0.3, by 0.3 % at nu = 0.49, and by 0.75 % at nu =
-    0.499.  At low nu the penalty is not reduced, because Newton's method then fails in frictional soil at deep
-    penetration.
+    0.499.  At low nu the penalty is not reduced, else Newton's method fails in frictional soil at deep penetration.
     """
     share = np.minimum(1.0, 4 * material.shear / material.oedometric) ** 2 if material.state else 1.0
     return 2 * np.maximum(YIELDING, share) * material.shear
@@ -146,7 +145,7 @@ class GhostPenalty:
 
 
 class GhostLoads(Loads):
-    """Ghost penalty on all inner faces of partly filled cells, and on the faces among them at walls of the grid."""
+    """Ghost penalty on all inner faces of partly filled cells, with a separate sum over the faces at walls."""
 
     def __init__(self, everywhere: FacetSum, at_walls: FacetSum):
         self._everywhere, self._at_walls = everywhere, at_walls

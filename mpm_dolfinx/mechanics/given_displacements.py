@@ -323,7 +323,7 @@ class HoldLoads(Loads):
         return bool(more.any())
 
     def reached(self, at: At) -> NDArray[np.bool_]:
-        """Return whether each component (m,) lags at u by at most 1 / sqrt(`HOLD`) of its prescribed increment."""
+        """Return whether each component (k,) lags at u by at most `1 / sqrt(HOLD)` of its prescribed increment."""
         return np.abs(self._asked - self._along(at.nodal)) * np.sqrt(HOLD) <= np.abs(self._asked)
 
     def pulls(self, b: NDArray[np.float64]) -> None:
@@ -336,13 +336,13 @@ class HoldLoads(Loads):
             self._forms.hold.assemble_matrix(A, self.data)
 
     def moved(self, u: fem.Function) -> Loads:
-        """Return the same penalties with gaps reduced by a displacement u."""
+        """Return these penalties with gaps reduced by a displacement u."""
         out = copy(self)
         out.data = self.data.having(gap=self.data["gap"][:, 0] - self._along(u.x.array.reshape(-1, self._d)))
         return out
 
     def _along(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the displacement (m,), m, along each prescribed component, at nodal values u (nodes, d), m."""
+        """Return the displacement (k,), m, along each prescribed component, at nodal displacements u (nodes, d), m."""
         at_nodes = u[self.data.points.grid.cell_nodes[self.data.cells]]
         return np.einsum("mk,mkd,md->m", self.held.shape[self.row], at_nodes, self.data["direction"])
 
@@ -355,7 +355,7 @@ class HoldLoads(Loads):
         return float(self.pull(at.nodal) @ self._along(v.reshape(-1, self._d)))
 
     def counted(self, at: At) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """See `Loads`: penalty forces on walls."""
+        """Return the penalty forces on walls, see `Loads.counted`."""
         dofs = (
             self._d * self.data.points.grid.cell_nodes[self.data.cells] + self.data["direction"].argmax(axis=1)[:, None]
         )

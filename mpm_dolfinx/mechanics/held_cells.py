@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Prescribed displacements of sides in cells: a stiff penalty on the mean, a weak one on deviations from the mean.
+"""Prescribed displacements of sides in cells: a stiff penalty on the mean, a weak penalty on deviations from it.
 
 A Q1 field has too few nodal displacements in a cell to satisfy constraints at many points of a side. A stiff penalty at
 each point would lock sides that are curved or inclined to the grid. The weak penalty controls the modes with zero mean
@@ -212,7 +212,7 @@ class HeldCells:
     def _held_beside(
         self, number: NDArray[np.int64], nodes: NDArray[np.int32], N: NDArray[np.float64], stuck: NDArray[np.bool_]
     ) -> NDArray[np.bool_]:
-        """Return which penalties (k,) at a wall have a free node that the same condition also holds away from walls.
+        """Return which penalties (k,) at a wall have a free node that their condition also holds away from walls.
 
         number (k,): index of the condition
         nodes, N (k, 2^d): nodes, and values of their shape functions
@@ -236,9 +236,9 @@ class HeldCells:
         """Return index, and position (d,), m, of the worst force, of each condition with a force beyond its limit.
 
         A Q1 field cannot always have the prescribed means in two neighbouring cells, as at a side on a grid line. The
-        penalty forces of the two cells then oppose each other.  Only the sum of the penalty forces at a node acts on
-        the body and counts in the reaction. A force thus counts as too large only if the sums at its nodes exceed their
-        limits too.
+        forces of these penalties then oppose each other.  Only the sum of the penalty forces at a node acts on the body
+        and counts in the reaction. A force thus counts as too large only if the sums at its nodes exceed their limits
+        too.
 
         row (k,): index of the penalty of each of k prescribed components
         axis (k,), force (k,), N: axis and force of each component

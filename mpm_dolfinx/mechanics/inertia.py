@@ -9,8 +9,7 @@ The weight g multiplies the rate of the substep.  The weight b multiplies the ra
 (`time_integration`).  u^ is the displacement that would occur without forces.  Both u and u^ are measured from the
 start of the step, where the velocity is v_n.  v_1 and a_1 are velocity and acceleration of the previous substep.  Only
 velocities are carried from step to step.  In each step SDIRK2 dissipates the fraction GAMMA^4 (omega dt)^4 = 0.0074
-(omega dt)^4 of the energy of an oscillation of angular frequency omega.  This dissipation damps modes that the step
-cannot resolve.
+(omega dt)^4 of the energy of an oscillation of angular frequency omega.  This dissipation damps unresolved modes.
 
 The mass is integrated over the pieces of the particle domains.  Piece k has the mass m_k, the centroid x_k, and the
 second moments S_k about x_k:
@@ -21,7 +20,7 @@ with the shape functions N and the velocity gradient L.  The ghost mass `G = c r
 on faces of cells that are not full.  Here c is `GHOST_MASS`, h is the cell size, and [[d_n N]] is the jump of the
 normal derivative.  For an affine velocity field, G v_n vanishes, and M v_n equals the right side.  The transfer to the
 grid and back therefore conserves linear and angular momentum to rounding.  A material point carries v and F', the rate
-of F.  The velocity in its domain is v + F' F^-1 (x - x_p). Increments of v and F' come from the grid (Brackbill and
+of F.  The velocity in its domain is v + F' F^-1 (x - x_p).  Increments of v and F' come from the grid (Brackbill and
 Ruppel 1986; consistent mass: Burgess, Sulsky and Brackbill 1992). The first substep of SDIRK2 is a midpoint rule;
 `chord` corrects this rule's error for rotations.
 """
@@ -57,13 +56,8 @@ RELAXES = 2.0
 """Relaxation rate of point velocities towards grid velocities, for domain corners that move by one cell size.
 
 Relaxation removes velocity modes of the points that the nodes cannot represent. In a test, a vibrating bar of 20 cells
-moves across 50 cells, with 40 steps a period. After 25 periods the errors of the velocity and the losses of energy
-are:
-
-    rate 0: error 1.7 %, loss 1.58 %
-    rate 0.1: error 1.2 %, loss 1.60 %
-    rate 2: error 1.2 %, loss 1.60 %
-    rate 10: error 1.2 %, loss 1.67 %
+moves across 50 cells, with 40 steps a period. After 25 periods the velocity error is 1.7 % for a rate of 0, and 1.2 %
+for rates of 0.1, 2 and 10. The energy loss is 1.58 % for a rate of 0, 1.60 % for 0.1 and 2, and 1.67 % for 10.
 """
 
 VELOCITY, RATE = "velocity", "F_rate"
@@ -78,7 +72,7 @@ def resting(points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
 def checked_velocity(
     grid: Grid, quadrature: str, inertia: bool | None, velocity: ArrayLike | Callable | None
 ) -> ArrayLike | Callable | None:
-    """Return the initial velocity of a scene, zero by default; None if the argument `inertia` of the scene is None.
+    """Return the initial velocity of a scene, zero by default, or None if the scene's argument `inertia` is None.
 
     Raises
     ------
@@ -176,9 +170,7 @@ def chord(G: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float
 class InertiaForms:
     """Compiled forms of mass and momentum, and the midpoint rule's coefficients in the forms of stresses and fluxes.
 
-    points: all integration points
-    of_laws: the integration points of each law
-    u: displacement increment, m
+    points: all integration points; of_laws: the integration points of each law; u, m: displacement increment.
     """
 
     def __init__(self, points: FormPoints, of_laws: Sequence[FormPoints], u: fem.Function):
@@ -212,15 +204,12 @@ class InertiaForms:
             self._flight.x.array[:] = inertia.flight
 
     def at(self, cells: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return accelerations (n, d), m/s^2, at u, at one place in each of n cells.
-
-        values (n, 2^d): shape functions at these places.
-        """
+        """Return accelerations (n, d), m/s^2, at u, at a place in each of n cells; values: shape functions there."""
         nodal = self._rate.value * (self._u.x.array - self._flight.x.array).reshape(-1, self.grid.dim)
         return np.einsum("nk,nkd->nd", values, nodal[self.grid.cell_nodes[cells]])
 
     def _seen(self, chords: Latest[tuple[NDArray, NDArray]], which: int, data: PointData) -> NDArray[np.float64]:
-        """Return arrays (n, d^2) at the present u: gradients for the laws, or rotations of their stress; see `chord`.
+        """Return arrays (n, d^2) at the present u: gradients for laws, or rotations of the laws' stress; see `chord`.
 
         chords: the last result, shared by all forms at the same u; which: 0 for gradients, 1 for rotations.
         """

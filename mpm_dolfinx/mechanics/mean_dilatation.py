@@ -54,8 +54,7 @@ class SumsOfPart(NamedTuple):
 class FBar:
     """F-bar modification of laws, with the step's volume ratio theta and the conjugate mean stress pi of each cell.
 
-    grid: background grid
-    symmetric: whether the tangents of all laws are symmetric
+    grid: background grid; symmetric: whether the tangents of all laws are symmetric.
     """
 
     def __init__(self, grid: Grid, symmetric: bool):
@@ -140,7 +139,7 @@ class FBar:
 
             dtau = s C : dF + (theta dtau/dtheta) (dtheta / theta - F^-T : dF),   C = dtau/dFbar,
 
-        for F (d, d) and the same components of s F. In 3D this would take two minutes to compile.
+        for F (d, d) and the same components of s F. In 3D this formula would take two minutes to compile.
         """
         P, slope = self._stress(law, F, Fbar, values)
         if law.kirchhoff is None or self.grid.dim == 3:
@@ -280,11 +279,7 @@ class StressAtPoints:
 
 
 class Cells:
-    """Cells with pieces of any part.
-
-    filled: these cells
-    where: indices of each part's cells in `filled`
-    """
+    """Cells with pieces of any part.  filled: these cells; where: indices of each part's cells in `filled`."""
 
     def __init__(self, of_parts: Sequence[NDArray[np.int32]]):
         self.filled = np.unique(np.concatenate(of_parts))

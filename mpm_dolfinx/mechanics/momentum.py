@@ -70,8 +70,7 @@ class MomentumForms:
     pressure
         DG0 pore pressure, None without fluid.
     gravity : (d,), m/s^2
-        Acceleration, as a UFL constant, or None.  With gravity the integration points have `density`, kg/m^3, at the
-        start of the step.
+        Acceleration, as a UFL constant, or None.  With gravity the integration points have `density`, kg/m^3.
     materials
         Materials of the scene, and its fluid. With retention curves the points also have `retention`, `lever`, `pores`.
     at_points
@@ -239,10 +238,7 @@ class MomentumForms:
             self.dilatation.assemble_matrix(K, data, sums)
 
     def at_nodes(self, cells: NDArray[np.int32], values: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
-        """Return the sums (k, nodes) at nodes of k quantities of cells.
-
-        values: an array for each quantity, (cells, 2^d) for each node of a cell, or (cells, 1) for all its nodes
-        """
+        """Return nodal sums (k, nodes) of k quantities; values: for each, an array (cells, 2^d), or (cells, 1)."""
         (shared, values_at), nodes = self._rooms[0], self.active.now.nodes
         at = nodes.searchsorted(self.grid.cell_nodes[cells])
         of_nodes = np.array([of + np.zeros(at.shape) for of in values])
@@ -495,7 +491,7 @@ class MomentumProblem:
         return self._unbalanced()[0].copy()
 
     def _unbalanced(self) -> tuple[NDArray[np.float64], list[NDArray[np.float64]]]:
-        """Return the result of `unbalanced`, and a list with the norms (parts,), N, of each of its force terms."""
+        """Return the result of `unbalanced`, and a list of the norms (parts,), N, of its force terms."""
         forms, system = self.forms, self.system
         b = forms.internal(self.data, self.loads)
         forces, external = b[system.touched], self._external
@@ -541,8 +537,7 @@ class MomentumProblem:
         subtracted, so that even a load below the error causes a solve.  In the second residual, the force scale at an
         unknown is at least `of_whole` divided by the tolerance.  A residual within rounding then counts as converged.
 
-        r: residuals, N
-        scales (parts,), N: force scales
+        r: residuals, N; scales (parts,), N: force scales.
         """
         system, parts = self.system, self.system.of_parts
         both = np.zeros((2, system.unknowns.size))

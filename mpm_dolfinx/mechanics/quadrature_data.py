@@ -31,10 +31,10 @@ weight of 1, the stress change at a reset of the grid would exceed the stresses 
 STIFF_WET = 8
 """Value of (lambda + 2G) / G above which the corner-based ratio loses weight in wet bodies.
 
-The weight is 1 at nu = 0.43, and 0 at 0.47.  In skeletons above this value, the difference between corner-based ratio
-and Q1 field expels water in every step, however short.  With a weight of 1, the extreme pressures of a beam with eight
-cells across its depth have errors of 43 % at nu = 0.49.  At nu = 0.499 the pressures are six to thirty times too large,
-and adaptive steps never grow.
+The weight is 1 at nu = 0.43, and 0 at nu = 0.47.  In skeletons above this value, the difference between corner-based
+ratio and Q1 field expels water in every step, however short.  With a weight of 1, the extreme pressures of a beam with
+eight cells across its depth have errors of 43 % at nu = 0.49.  At nu = 0.499 the pressures are six to thirty times too
+large, and adaptive steps never grow.
 """
 SHARE = 0.5
 """Fraction of the gradient's deviation from its cell mean that laws use in cells of flowing, dilatant soil.

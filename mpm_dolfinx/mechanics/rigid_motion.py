@@ -34,8 +34,7 @@ def rigid_motion(
     comm
         The processes; all must call the function.
     holds
-        Penalties of prescribed displacements, with direction, gap along this direction, m, and stiffness.  The fit is
-        weighted by stiffness.
+        Penalties of prescribed displacements, with direction, gap along it, m, and stiffness, the weight in the fit.
     x : (n, d), m
         The positions.
     counts : (k,)

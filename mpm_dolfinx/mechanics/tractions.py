@@ -50,7 +50,7 @@ class SideLoads(Acting):
         return [faces for _, faces in self._loads]
 
     def forces(self, place: Place) -> tuple[Places, NDArray[np.float64]]:
-        """Return integration points in owned cells, and the forces (n, d), N, at them."""
+        """Return integration points in owned cells, and the forces (n, d), N, at these points."""
         grid, patches = self._grid, place.cut.surfaces(self.surfaces)
         travel, places = self._placed(place.cut.key, lambda: owners(grid, patches), grid.comm)
         both = [(load, p) for (load, _), p in zip(self._loads, patches, strict=True)]
@@ -118,10 +118,7 @@ def owners(grid: Grid, patches: Sequence[Patches]) -> tuple[Exchange, Places]:
 
 
 class PressureForms:
-    """Forms of the nodal forces of pressures, and of their negative derivative.
-
-    The field `push` is the force on the area at the start of the step.
-    """
+    """Forms of the nodal forces of pressures, and of their negative derivative; push: force on the initial area."""
 
     def __init__(self, grid: Grid, u: fem.Function):
         self.points = p = FormPoints(grid, push=(grid.dim,))

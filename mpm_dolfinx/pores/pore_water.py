@@ -44,11 +44,7 @@ class PoreWater:
         return self.sums(mass_potential(p, self.bulk), self.emptied(p)[0])
 
     def sums(self, pi: NDArray[np.float64], empty: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the fluid contents (n,), m^d, of the cells.
-
-        pi (k,), Pa: mass potentials of the pieces
-        empty (k,): (S - 1) rho of the pieces
-        """
+        """Return the cells' fluid contents (n,), m^d, for pi (k,), Pa, and `empty` = (S - 1) rho (k,) of the pieces."""
         return sum_by(self.slot, self.store * pi + self.pores * empty, len(self.scale))
 
     def level(
@@ -92,9 +88,6 @@ class PoreWater:
 def emptied(
     p: NDArray[np.float64], bulk: float, S: NDArray[np.float64], slope: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return (S - 1) rho at pressures p (k,), Pa, and its derivative by p, 1/Pa.
-
-    S (k,), slope (k,): saturations, and dS/dp, 1/Pa
-    """
+    """Return (S - 1) rho at pressures p (k,), Pa, and its derivative by p, 1/Pa; slope (k,): dS/dp, 1/Pa."""
     density = np.exp(p / bulk)
     return (S - 1) * density, (slope + (S - 1) / bulk) * density
