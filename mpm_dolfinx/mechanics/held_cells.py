@@ -233,7 +233,8 @@ class HeldCells:
     def beyond(
         self, row: NDArray, axis: NDArray, force: NDArray, reached: NDArray[np.bool_], told: Collection[int]
     ) -> list[tuple[int, NDArray[np.float64]]]:
-        """Return index, and position (d,), m, of the worst force, of each condition with a force beyond its limit.
+        """Return the conditions with forces beyond their limits: index, and position (d,), m, of the worst force of
+        each.
 
         A Q1 field cannot always have the prescribed means in two neighbouring cells, as at a side on a grid line. The
         forces of these penalties then oppose each other.  Only the sum of the penalty forces at a node acts on the body

@@ -320,7 +320,8 @@ class MomentumSystem:
         self.rounding = self.unknowns.vector()
         """Rounding error of the residual at each unknown, N."""
         self.of_whole = self.unknowns.vector()
-        """Norm, N, for each unknown: of a vector over its connected part, with its rounding error in every entry."""
+        """For each unknown, norm, N, of a vector over its connected part with the unknown's rounding error
+        everywhere."""
         self.K = matrix(self.unknowns, self.unknowns, 3**d * d)
         self.residual, self.step = self.unknowns.vector(), self.unknowns.vector()
         held = active[~among(active, dofs)]
