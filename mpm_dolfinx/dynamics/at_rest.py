@@ -33,12 +33,12 @@ def balancing_tractions(
     moment of the tractions may differ from the resultant and the moment of the reactions.  Rigid-body fields of
     tractions remove these differences.
 
-    cut, points: cut particle domains, and material points
-    stresses: total stresses (faces, k, k), Pa, on the sides, by name of the side
-    surfaces: the sides, by name
-    parts: connected parts of the bodies
-    forces (nodes, d), N: reactions of the sides at the owned nodes of this process, zero at other nodes
-    held (nodes, d): which displacement components remain fixed
+    cut, points: cut particle domains, and material points.
+    stresses: total stresses (faces, k, k), Pa, on the sides, by name of the side.
+    surfaces: the sides, by name.
+    parts: connected parts of the bodies.
+    forces (nodes, d), N: reactions of the sides at the owned nodes of this process, zero at other nodes.
+    held (nodes, d): which displacement components remain fixed.
     """
     grid, d = cut.grid, cut.grid.dim
     patches = cut.surfaces(list(surfaces.values()))

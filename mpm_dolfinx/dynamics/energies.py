@@ -52,9 +52,9 @@ def after(
 ) -> dict[str, NDArray[np.float64]]:
     """Return the energies, J, after a step, from the energies before the step.
 
-    kinetic: kinetic energy of free tools, J
-    seconds: time weights of the substeps, s
-    powers: powers of the substeps on this process, in W, see `MomentumProblem.powers`
+    kinetic: kinetic energy of free tools, J.
+    seconds: time weights of the substeps, s.
+    powers: powers of the substeps on this process, in W, see `MomentumProblem.powers`.
     """
     counted = seconds[-len(powers) :] @ np.array([list(of.values()) for of in powers])
     work = zip(powers[0], over_all(materials.grid.comm, counted), strict=True)

@@ -24,10 +24,10 @@ def motion_error(
     difference.  The error of a resolved mode of angular frequency omega in a step dt is 0.081 omega dt times this
     difference.  A solve with the substep's matrix bounds the estimate for unresolved modes (Hosea and Shampine 1996).
 
-    solvers, K, mass: linear solvers, momentum tangent and mass of the last substep
-    flights: states of motion after the two substeps
-    seconds: weight, s, of the first substep's rate in the last substep
-    own: weight, s, of the last substep's rate in the last substep
+    solvers, K, mass: linear solvers, momentum tangent and mass of the last substep.
+    flights: states of motion after the two substeps.
+    seconds: weight, s, of the first substep's rate in the last substep.
+    own: weight, s, of the last substep's rate in the last substep.
     """
     first, last = flights
     rate, M = 1 / own**2, mass.M

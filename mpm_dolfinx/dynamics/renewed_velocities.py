@@ -32,9 +32,9 @@ class Momenta(NamedTuple):
     ) -> Momenta:
         """Return the momenta of `count` groups.
 
-        piece, group (k,): index in `pieces` and group of each of k pieces
-        mass (k,), kg: mass of each piece
-        v (n, 2), m/s, L (n, 2, 2), 1/s: velocities and velocity gradients of n domains
+        piece, group (k,): index in `pieces` and group of each of k pieces.
+        mass (k,), kg: mass of each piece.
+        v (n, 2), m/s, L (n, 2, 2), 1/s: velocities and velocity gradients of n domains.
         """
         of, x = pieces.point[piece], pieces.x[piece]
         second = pieces.second[piece]
@@ -57,8 +57,8 @@ def velocities(
     The means are over the overlap with the old domains.  The correction is a rigid motion of each group of domains,
     which restores the momentum and the angular momentum of the group.
 
-    corners (n, 4, 2), m, x (n, 2), m, group (n,): corners, position and group of each new domain
-    masses: masses of the old points and of the new points, kg
+    corners (n, 4, 2), m, x (n, 2), m, group (n,): corners, position and group of each new domain.
+    masses: masses of the old points and of the new points, kg.
     """
     points = work.points
     n, count = len(x), int(group.max()) + 1
@@ -85,8 +85,8 @@ def centred(work: RefilledCells, group: NDArray, x: NDArray, mass: NDArray, old:
     Each renewed cell is a group.  Each domain outside these cells is a group of its own, and keeps its mass.  A mass
     changes by at most half.  If this limit applies, the centre of mass moves.
 
-    group (n,): group of each new domain
-    old (points,): masses of the old domains
+    group (n,): group of each new domain.
+    old (points,): masses of the old domains.
     """
     cells, inside = int(work.chosen.sum()), group < work.chosen.sum()
     received = _received(work, old)

@@ -57,8 +57,8 @@ class PointMeasure(ufl.Measure):
 class FormPoints:
     """The points in forms, as UFL coefficients; a `PointData` has the values of these coefficients.
 
-    grid: background grid
-    fields: shape of each quantity at the points, by name; `points.name` is the UFL coefficient
+    grid: background grid.
+    fields: shape of each quantity at the points, by name; `points.name` is the UFL coefficient.
     """
 
     def __init__(self, grid: Grid, **fields: tuple[int, ...]):
@@ -395,8 +395,8 @@ class Rows:
 class PointForm:
     """A form with the measure `points.dx`, compiled once and assembled for any positions of the points.
 
-    form: linear or bilinear UFL form; all integrals use `points.dx`
-    points: points of the form
+    form: linear or bilinear UFL form; all integrals use `points.dx`.
+    points: points of the form.
     dense: whether the values of a DG0 test function are numbered over the cells with points only, not over all cells.
     If so, kernels are called for other cells, as in `PointExpression`, and all cells must be equal.
     """
@@ -426,8 +426,8 @@ class PointForm:
 class FacetForm:
     """A form over active cells, or over faces between them.  It is compiled once any process has such cells or faces.
 
-    form: linear or bilinear UFL form over interior facets or cells
-    comm: communicator of the processes
+    form: linear or bilinear UFL form over interior facets or cells.
+    comm: communicator of the processes.
     """
 
     def __init__(self, form: ufl.Form, comm: MPI.Intracomm):

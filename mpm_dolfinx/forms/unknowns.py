@@ -21,8 +21,8 @@ from mpm_dolfinx.base import _compat
 class Unknowns:
     """Numbering of a subset of the degrees of freedom of a function's space.
 
-    function: any function of the space, with ghosts
-    dofs: unrolled local degrees of freedom that are unknowns, ghosts included
+    function: any function of the space, with ghosts.
+    dofs: unrolled local degrees of freedom that are unknowns, ghosts included.
     at: positions (entities, d), m, of the nodes or cells of this process, and whether their rows of matrices may have
     entries in columns of other processes.  If `at` is None, the space computes all positions at each request, and all
     rows may have entries in columns of other processes.

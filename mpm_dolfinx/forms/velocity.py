@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 class Velocity:
     """Velocity `(u - past) / own` at the end of a substep.  For backward Euler past = 0, and own is the step length.
 
-    u, m: displacement increment of the step
-    own, s: time weight of the rate in the substep
-    past, m: part of u that is due to the rate of the previous substep
+    u, m: displacement increment of the step.
+    own, s: time weight of the rate in the substep.
+    past, m: part of u that is due to the rate of the previous substep.
     """
 
     def __init__(self, u: fem.Function):

@@ -136,11 +136,11 @@ def returned(trial: Trial, bulk, shear, eta, xi, eta_flow, cohesion, hardening, 
 
     Returns
     -------
-    p: mean stress, Pa, > 0 in tension
-    ratio: final deviatoric stress divided by the trial one
-    hardened: increment of the accumulated plastic strain
-    yields: whether the trial stress is outside the yield surface
-    apex: 1 if the stress returns to the apex, else 0
+    p: mean stress, Pa, > 0 in tension.
+    ratio: final deviatoric stress divided by the trial one.
+    hardened: increment of the accumulated plastic strain.
+    yields: whether the trial stress is outside the yield surface.
+    apex: 1 if the stress returns to the apex, else 0.
     """
     p = bulk * trial.volumetric
     q = shear * ufl.sqrt(2 * ufl.inner(trial.deviatoric, trial.deviatoric) + LEAST)  # sqrt(J_2)

@@ -252,9 +252,9 @@ class SoftnessAtPoints:
     def __call__(self, at: PointData, dF: NDArray, shear: NDArray, dt: float, before: NDArray) -> NDArray[np.float64]:
         """Return the softness (n,), in [1, `MOST`], of points whose data `at` contain F, parameters and state.
 
-        dF (n, d, d): change of F in a step of dt, s
-        shear (n,), Pa: elastic shear modulus
-        before (n,): softness before the step
+        dF (n, d, d): change of F in a step of dt, s.
+        shear (n,), Pa: elastic shear modulus.
+        before (n,): softness before the step.
         """
         self._by_scene["dt"].value = dt
         fields = {name: at[name] for name in ("F", *self._shapes)}

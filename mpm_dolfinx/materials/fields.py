@@ -600,8 +600,8 @@ def _evaluated(grid: Grid, m: Skeleton, X: NDArray[np.float64], ids: NDArray[np.
     The first point has the lowest id on all processes.  A process without points of the material uses the constants at
     the first point in both.
 
-    X (n, d), m: reference positions of this process's points with the material
-    ids (n,): ids of these points
+    X (n, d), m: reference positions of this process's points with the material.
+    ids (n,): ids of these points.
 
     """
     names = _by_place(m)

@@ -128,9 +128,9 @@ def by_body(given, bodies: Sequence[Body], later: Sequence[int]) -> dict[int, In
 class InitialStresses:
     """Initial stresses of the bodies of a scene.
 
-    bodies: all bodies
-    given: result of `by_body`
-    pressure: initial pore pressure, Pa, a number or a function of x
+    bodies: all bodies.
+    given: result of `by_body`.
+    pressure: initial pore pressure, Pa, a number or a function of x.
     """
 
     def __init__(self, bodies: Sequence[Body], given: Mapping[int, InitialStress], pressure: float | Callable):
@@ -215,8 +215,8 @@ def _in_columns(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return corners and unit weights of all domains above and below domains of this process, in the order of ids.
 
-    ids (n,), corners (n, 2^d, d), m, unit_weight (n,), N/m^3: values of this process's domains in the scene
-    above (k, 2^d, d), m: corners of the domains whose columns this process needs
+    ids (n,), corners (n, 2^d, d), m, unit_weight (n,), N/m^3: values of this process's domains in the scene.
+    above (k, 2^d, d), m: corners of the domains whose columns this process needs.
     """
     ends = [above[..., :-1].min(axis=(0, 1), initial=np.inf), above[..., :-1].max(axis=(0, 1), initial=-np.inf)]
     low, high = corners[..., :-1].min(axis=1), corners[..., :-1].max(axis=1)

@@ -50,9 +50,9 @@ class Isotropic:
 class Trial:
     """Trial elastic strain for a deformation gradient, in UFL.
 
-    F: deformation gradient (d, d)
-    plastic: C_p^-1 (3, 3)
-    prestretch: principal elastic stretches (3,) at F = I, or None if all are 1
+    F: deformation gradient (d, d).
+    plastic: C_p^-1 (3, 3).
+    prestretch: principal elastic stretches (3,) at F = I, or None if all are 1.
     """
 
     def __init__(self, F, plastic, prestretch=None):
@@ -103,9 +103,9 @@ def eigen(b: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float
 class Coaxial:
     """Tensors coaxial with given tensors.
 
-    x (n, 3), axes (n, 3, 3): eigenvalues and axes of the given tensors, see `eigen`
-    y (n, 3): principal values of the coaxial tensors
-    plane: whether the given tensors have the components in `PLANE`, as in plane strain and axisymmetry
+    x (n, 3), axes (n, 3, 3): eigenvalues and axes of the given tensors, see `eigen`.
+    y (n, 3): principal values of the coaxial tensors.
+    plane: whether the given tensors have the components in `PLANE`, as in plane strain and axisymmetry.
     """
 
     def __init__(self, x: NDArray[np.float64], axes: NDArray[np.float64], y: NDArray[np.float64], plane: bool):

@@ -22,11 +22,11 @@ from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
 def suction_sums(points: FormPoints, F, slopes: Sequence, locks: bool) -> CellSums | None:
     """Return the sums over one part's pieces in each cell that `OfSuction` needs, or None if it needs no sums.
 
-    points: integration points of the pieces
-    F: deformation gradient (d, d), a UFL variable
+    points: integration points of the pieces.
+    F: deformation gradient (d, d), a UFL variable.
     slopes: UFL derivatives of two stresses with respect to the pressure, empty for laws without suction.  The stresses
     are the first Piola-Kirchhoff stress (d, d) and, with F-bar, the mean stress pi conjugate to theta.
-    locks: whether the law of the pieces uses F-bar
+    locks: whether the law of the pieces uses F-bar.
     """
     share = 1 / ufl.det(points.F)
     tensors = [share * ufl.diff(ufl.det(F), F)] if locks else []
@@ -38,9 +38,9 @@ def suction_sums(points: FormPoints, F, slopes: Sequence, locks: bool) -> CellSu
 class OfSuction:
     """Derivatives of the nodal forces with respect to the cells' pressures, for laws that depend on suction.
 
-    dim: number of axes
-    dilatation: volume ratios of cells for F-bar, or None if no cell would lock
-    sums: results of `suction_sums`, one for each part of the points (`SceneMaterials.parts`)
+    dim: number of axes.
+    dilatation: volume ratios of cells for F-bar, or None if no cell would lock.
+    sums: results of `suction_sums`, one for each part of the points (`SceneMaterials.parts`).
     """
 
     def __init__(self, dim: int, dilatation: MeanDilatation | None, sums: Sequence[CellSums | None]):

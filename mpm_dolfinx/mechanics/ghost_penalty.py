@@ -119,8 +119,8 @@ class GhostPenalty:
 
         Return all active local cells, ascending.  `fill` must be zero before the call.
 
-        volume (n,), m^d: volume of the material in each cell
-        moduli: two arrays (n,), `modulus` times volume and `shear` times volume
+        volume (n,), m^d: volume of the material in each cell.
+        moduli: two arrays (n,), `modulus` times volume and `shear` times volume.
         """
         grid, fill = self.grid, self.fill.x.array
         fill[own] = volume / grid.volumes(own)

@@ -246,8 +246,8 @@ class GivenDisplacements(Acting):
         A prism has the volume of its domain.  It keeps the tracked corners on the held face, because the penalty would
         pull a moved face back.
 
-        tracked, m: tracked corners
-        volume (n,): volumes of the domains, in axisymmetry areas of their sections
+        tracked, m: tracked corners.
+        volume (n,): volumes of the domains, in axisymmetry areas of their sections.
         """
         index = np.arange(2**self._grid.dim)
         for _, faces, _ in self._holds:
@@ -265,13 +265,13 @@ class GivenDisplacements(Acting):
 class HoldLoads(Loads):
     """Prescribed displacements in a substep.
 
-    acting: the prescribed displacements of the stage
-    forms: forms of the penalties
-    data: points of the forms, one for each of k prescribed components, with stiffness, direction and gap
-    held: geometry and stiffness of all penalties
-    row (k,): index in `held` of each component
-    share (k, 2^d): fraction of each component's force on each node, without the fraction that walls of the grid bear
-    place: time and cut domains of the substep
+    acting: the prescribed displacements of the stage.
+    forms: forms of the penalties.
+    data: points of the forms, one for each of k prescribed components, with stiffness, direction and gap.
+    held: geometry and stiffness of all penalties.
+    row (k,): index in `held` of each component.
+    share (k, 2^d): fraction of each component's force on each node, without the fraction that walls of the grid bear.
+    place: time and cut domains of the substep.
     """
 
     stiff = True

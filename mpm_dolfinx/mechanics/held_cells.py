@@ -75,11 +75,11 @@ def inner_cells(
     of the nodes beyond the line could satisfy both, and nothing resists this motion.  The constraints of the inner
     cells therefore contain these points too (aggregation; Badia, Verdugo and Martin 2018).
 
-    fill (cells,): volume fractions
-    sides: for each condition, the prescribed components, and the extent (d,), m, of the prescribed positions
-    number (n,): index of each point's condition
-    cell (n,): owned cell of each point
-    normal (n, d): outward area vector of each point
+    fill (cells,): volume fractions.
+    sides: for each condition, the prescribed components, and the extent (d,), m, of the prescribed positions.
+    number (n,): index of each point's condition.
+    cell (n,): owned cell of each point.
+    normal (n, d): outward area vector of each point.
     """
     inner = cell.astype(np.int64)
     for k, (axes, extent) in enumerate(sides):
@@ -181,8 +181,8 @@ class HeldCells:
         the step, the displacement must vary over the cell.  The penalty is then omitted if other penalties of the
         condition hold a free node of the cell.
 
-        given (conditions,): whether each condition prescribes component `axis`
-        free (nodes,): whether no wall fixes the node
+        given (conditions,): whether each condition prescribes component `axis`.
+        free (nodes,): whether no wall fixes the node.
 
         Return four arrays: indices (k,) of the penalties; their stiffness (k,), N/m; their gaps (k,), m; and fractions
         (k, 2^d) of the force on each node, without the wall's part.  Also return the index of a penalty that must move
@@ -214,9 +214,9 @@ class HeldCells:
     ) -> NDArray[np.bool_]:
         """Return which penalties (k,) at a wall have a free node that their condition also holds away from walls.
 
-        number (k,): index of the condition
-        nodes, N (k, 2^d): nodes, and values of their shape functions
-        stuck (k, 2^d): whether each node is at a wall
+        number (k,): index of the condition.
+        nodes, N (k, 2^d): nodes, and values of their shape functions.
+        stuck (k, 2^d): whether each node is at a wall.
         """
         grid = self.grid
         at_wall = stuck.any(axis=1)
@@ -233,18 +233,17 @@ class HeldCells:
     def beyond(
         self, row: NDArray, axis: NDArray, force: NDArray, reached: NDArray[np.bool_], told: Collection[int]
     ) -> list[tuple[int, NDArray[np.float64]]]:
-        """Return the conditions with forces beyond their limits: index, and position (d,), m, of the worst force of
-        each.
+        """Return for each condition with forces beyond their limits its index, and the worst force's position (d,), m.
 
         A Q1 field cannot always have the prescribed means in two neighbouring cells, as at a side on a grid line. The
         forces of these penalties then oppose each other.  Only the sum of the penalty forces at a node acts on the body
         and counts in the reaction. A force thus counts as too large only if the sums at its nodes exceed their limits
         too.
 
-        row (k,): index of the penalty of each of k prescribed components
-        axis (k,), force (k,), N: axis and force of each component
-        reached (k,): whether each component is at its prescribed position
-        told: indices of conditions that have been reported already; they are excluded
+        row (k,): index of the penalty of each of k prescribed components.
+        axis (k,), force (k,), N: axis and force of each component.
+        reached (k,): whether each component is at its prescribed position.
+        told: indices of conditions that have been reported already; they are excluded.
         """
         grid = self.grid
         comm = grid.comm

@@ -229,11 +229,11 @@ class InertiaForms:
     ) -> Mass:
         """Return the mass of the bodies on the grid.
 
-        cut: the cut particle domains
-        mass (n,), kg: masses of the points
-        fill (cells,): volume fractions of the local cells
-        facets: faces between two active cells, at least one of them not full
-        unknowns, held: unknown displacements, and displacements that grid boundary conditions fix
+        cut: the cut particle domains.
+        mass (n,), kg: masses of the points.
+        fill (cells,): volume fractions of the local cells.
+        facets: faces between two active cells, at least one of them not full.
+        unknowns, held: unknown displacements, and displacements that grid boundary conditions fix.
         """
         grid = self.grid
         rows = cut.pieces_to_cells(cut.pieces.fraction * mass[cut.pieces.point])
@@ -257,12 +257,12 @@ class InertiaForms:
 class Mass:
     """Mass of the bodies on the grid, constant until the next reset of the grid.
 
-    forms: compiled forms
-    cut: the cut particle domains
-    pieces: integration points of their pieces, with masses, kg, as weights
-    unknowns: unknown displacements
-    M: mass matrix, kg, with the rows of the unknowns
-    held: mass matrix, kg, with the rows of displacements that walls of the grid fix
+    forms: compiled forms.
+    cut: the cut particle domains.
+    pieces: integration points of their pieces, with masses, kg, as weights.
+    unknowns: unknown displacements.
+    M: mass matrix, kg, with the rows of the unknowns.
+    held: mass matrix, kg, with the rows of displacements that walls of the grid fix.
     """
 
     def __init__(
@@ -294,8 +294,8 @@ class Mass:
     ) -> dict[str, NDArray[np.float64]]:
         """Return the point data `VELOCITY` and `RATE` after a step.
 
-        points: material points at the start of the step
-        velocities: velocities, m/s, of the unknowns at the start and at the end of the step
+        points: material points at the start of the step.
+        velocities: velocities, m/s, of the unknowns at the start and at the end of the step.
         moved (n,): largest displacement of a corner, in cell sizes, in the connected part of the point.  It is 0 if the
         point keeps its pieces.
         """
@@ -346,9 +346,9 @@ def velocity_gradients(points: MaterialPoints) -> NDArray[np.float64]:
 class Inertia(Loads):
     """Inertia forces in a substep.
 
-    mass: mass of the bodies on the grid
-    flight, m: inertial predictor, the displacement without forces
-    rate, 1/s^2: acceleration divided by (displacement - flight)
+    mass: mass of the bodies on the grid.
+    flight, m: inertial predictor, the displacement without forces.
+    rate, 1/s^2: acceleration divided by (displacement - flight).
     """
 
     holding = True

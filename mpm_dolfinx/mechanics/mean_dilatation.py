@@ -170,8 +170,8 @@ class FBar:
 class MeanDilatation:
     """The volume ratio theta of the step in each cell, and its work-conjugate mean stress pi, for F-bar.
 
-    fbar: the fields theta and pi
-    parts: sums over each part in which cells would lock, by index of the part, see `QuadratureData`
+    fbar: the fields theta and pi.
+    parts: sums over each part in which cells would lock, by index of the part, see `QuadratureData`.
     """
 
     def __init__(self, fbar: FBar, parts: Mapping[int, SumsOfPart]):

@@ -320,8 +320,7 @@ class MomentumSystem:
         self.rounding = self.unknowns.vector()
         """Rounding error of the residual at each unknown, N."""
         self.of_whole = self.unknowns.vector()
-        """For each unknown, norm, N, of a vector over its connected part with the unknown's rounding error
-        everywhere."""
+        """For each unknown, the norm, N, of a vector over its connected part that has its rounding error throughout."""
         self.K = matrix(self.unknowns, self.unknowns, 3**d * d)
         self.residual, self.step = self.unknowns.vector(), self.unknowns.vector()
         held = active[~among(active, dofs)]
@@ -395,14 +394,14 @@ class MomentumSystem:
 class MomentumProblem:
     """Balance of momentum of one step.
 
-    forms: compiled forms
-    system: vectors and matrices, with assembled penalties
-    data: integration points
-    loads: loads on the bodies
-    tolerance: tolerance of the residual, relative to the forces
-    goes_on (unknowns,), m: local array of displacements extrapolated from the last step, or None
-    held (unknowns,), N: local array of forces that balance initial stresses where loads do not, or None
-    yielded: whether any soil has yielded before this step
+    forms: compiled forms.
+    system: vectors and matrices, with assembled penalties.
+    data: integration points.
+    loads: loads on the bodies.
+    tolerance: tolerance of the residual, relative to the forces.
+    goes_on (unknowns,), m: local array of displacements extrapolated from the last step, or None.
+    held (unknowns,), N: local array of forces that balance initial stresses where loads do not, or None.
+    yielded: whether any soil has yielded before this step.
     """
 
     def __init__(
@@ -579,8 +578,8 @@ class MomentumProblem:
     ) -> PETSc.Mat:
         """Return the tangent at u, regularised by a fraction of the elastic shear stiffness.
 
-        data: integration points, by default the problem's
-        firmness: the fraction, one number or one for each connected part
+        data: integration points, by default the problem's.
+        firmness: the fraction, one number or one for each connected part.
         """
         K = self.system.K
         # the first sum gives K its full sparsity pattern, because PETSc does not always notice a later change

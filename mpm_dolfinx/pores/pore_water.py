@@ -54,9 +54,9 @@ class PoreWater:
 
         Newton's method is applied to the logarithm of the suction, within a bracket.
 
-        content (n,), m^d: the fluid contents
-        p (n,), Pa: initial pressures, which are returned if they already give these contents
-        offset (k,), Pa: pressures of the pieces minus pressures of their cells
+        content (n,), m^d: the fluid contents.
+        p (n,), Pa: initial pressures, which are returned if they already give these contents.
+        offset (k,), Pa: pressures of the pieces minus pressures of their cells.
         """
         count, scale = len(p), self.scale
         rounding = 4 * EPSILON * sum_by(self.slot, self.pores, count)

@@ -258,9 +258,9 @@ class Retentions:
     the centroid of the material in its cell.  The pressure of a piece is the cell's pressure plus the hydrostatic rise
     along `lever`.
 
-    laws: distinct retention curves of the scene's materials
-    everywhere: whether every material has a retention curve
-    grid: background grid
+    laws: distinct retention curves of the scene's materials.
+    everywhere: whether every material has a retention curve.
+    grid: background grid.
     """
 
     def __init__(self, laws: Sequence, everywhere: bool, grid: Grid):
@@ -475,10 +475,10 @@ def restrained(
     most `FARTHEST`.  If the direction of the change reverses, the change is at most half of the previous change, so
     that the logarithm does not oscillate.
 
-    p (n,), Pa: pressures
-    dp (n,), Pa: decreases of the pressures by Newton's method
-    scale (n,), Pa: characteristic suctions
-    previous (n,): changes of the pressures' `logarithm` in the previous Newton step
+    p (n,), Pa: pressures.
+    dp (n,), Pa: decreases of the pressures by Newton's method.
+    scale (n,), Pa: characteristic suctions.
+    previous (n,): changes of the pressures' `logarithm` in the previous Newton step.
     """
     new, limit = p - dp, -scale
     new = np.where((p - limit) * (new - limit) < 0, limit, new)
