@@ -278,7 +278,7 @@ class PointData(Keyed):
         return PointData(points, places, self.volume[rows], fields)
 
     def having(self, **fields: NDArray[np.float64]) -> PointData:
-        """Return the same points, with new values (n, ...) of the named fields."""
+        """Return these points with new values (n, ...) of the named fields."""
         kept = {name: self.rows[name] for name in self.points.sizes}
         return PointData(self.points, self.places, self.volume, kept | fields)
 

@@ -264,8 +264,8 @@ class SceneMaterials:
     def conducting(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return two numbers (n, 2) for each point: its conductivity, m/s, and the index of its conductivity law.
 
-        Points with the same two numbers have the same conductivity.  If the law depends on position, each point has its
-        own index.  The fractional part of the index denotes the retention curve.
+        Points with equal pairs of numbers have equal conductivities.  If the law depends on position, each point has
+        its own index.  The fractional part of the index denotes the retention curve.
         """
         laws, known = [m.conductivity_law for m in self.materials], self.conductivity_laws
         law = np.array([known.index(law) if law in known else -1 for law in laws])[points.material]

@@ -114,7 +114,7 @@ class LocalUnknowns:
         Raises
         ------
         NotConverged
-            The equations of a point have no solution.  The message states the first such point.
+            The equations of a point have no solution.  The message states the first point without a solution.
         """
         trial = self._trial.evaluate(data)
         self._solved((data.key, trial, float(self._dt.value)), lambda: self._equations.solve(data, trial), self._comm)

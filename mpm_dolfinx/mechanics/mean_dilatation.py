@@ -139,7 +139,7 @@ class FBar:
 
             dtau = s C : dF + (theta dtau/dtheta) (dtheta / theta - F^-T : dF),   C = dtau/dFbar,
 
-        for F (d, d) and the same components of s F. In 3D this formula would take two minutes to compile.
+        for F (d, d) and the (d, d) components of s F. In 3D this formula would take two minutes to compile.
         """
         P, slope = self._stress(law, F, Fbar, values)
         if law.kirchhoff is None or self.grid.dim == 3:
