@@ -1,15 +1,16 @@
 # SPDX-License-Identifier: MIT
 """Flow through the sides of bodies: drained sides, seepage faces, rain, prescribed inflows.
 
-The outflow of a cell through a face is either prescribed, or computed as T r [p - p_out + rho_w g . (x_out - x)].  Here
-p is the pressure at the centroid x of the cell's material, and p_out the pressure outside at the face, x_out.  T is A
-kappa / d.  A is the area of the face, kappa the mobility (conductivity / unit weight), and d the distance from x to
-the face.  r is the density of the fluid divided by the density at zero pressure.  At a seepage face, fluid can only
-leave.  A primal-dual active-set method (Hintermueller, Ito and Kunisch 2002) opens faces with outflow and closes the
-others: at the start of the substep and after each solution (`SideFeeds.settle`).  Infiltration is the rain, but at most
-the inflow at the pressure of the pond.  Evaporation is at most the outflow at the driest pressure.  A pond of volume V
-supplies V / dt in a step in addition to the rain, uniformly over its side.  Infiltration, ponding and run-off add up to
-the rain within rounding.
+The outflow of a cell through a face is prescribed, or it is `T r [p - p_out + rho_w g . (x_out - x)]`.  Here p is the
+pressure at the centroid x of the cell's material.  The outside pressure p_out applies at the centroid x_out of the
+face.  T is `A kappa / d` with the area A of the face, the mobility kappa, and the distance d from x to the face.  The
+mobility is the conductivity divided by the unit weight of the fluid.  r is the density of the fluid divided by the
+density at zero pressure.  At a seepage face, fluid can only leave.  A primal-dual active-set method (Hintermueller, Ito
+and Kunisch 2002) opens faces with outflow and closes all other faces.  The method is applied at the start of the
+substep and after each solution (`SideFeeds.settle`).  Infiltration is the rain, but at most the inflow at the pressure
+of the pond.  Evaporation is at most the outflow at the driest pressure.  In addition to the rain, a pond of volume V
+supplies the inflow `V / dt` in a step of length dt, uniformly over its side.  Infiltration, ponding and run-off add up
+to the rain within rounding.
 """
 
 from __future__ import annotations
@@ -37,9 +38,9 @@ from mpm_dolfinx.parallel.exchange import everywhere, over_all
 THICK = np.sqrt(2)
 """Area of the largest plane section of a cube, divided by the area of a face.  Source: exact bound (Ball 1986).
 
-Let a convex body of volume V in a cell of edge length h lie on one side of a plane.  The distance from its centroid to
-the plane is at least V / ((d + 1) THICK h^(d-1)).  A face closer to the centroid of the cell's material, or behind it,
-bounds only a part of the material.  Such a face must not drain the whole cell.
+Let a convex body of volume V in a cell of edge length h lie on one side of a plane.  The distance from the body's
+centroid to the plane is at least `V / ((d + 1) THICK h^(d-1))`.  A face bounds only a part of the cell's material if it
+is closer than this to the material's centroid, or behind the centroid.  Such a face must not drain the whole cell.
 """
 
 
@@ -56,7 +57,7 @@ class DrainedSides(Feeding):
     Raises
     ------
     ValueError
-        A condition on a side without points, or two conditions on the same part of a face.
+        If a condition is on a side without points, or two conditions are on the same part of a face.
     """
 
     conditions, title = (Drained, Inflow, Rain), "open sides"
@@ -88,7 +89,7 @@ class DrainedSides(Feeding):
         return {name: np.array(value) for name, rain in zip(self._names, self._rains, strict=True) if rain}
 
     def empty(self) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return zero volumes of outflow, run-off and ponds before the first step; an empty dictionary without rain."""
+        """Return zeros as the volumes of outflow, run-off and ponds before the first step, or {} without rain."""
         if not any(self._rains):
             return {}
         return {"flowed": self.unknown(0.0), "ran_off": self.dry(0.0), "ponded": self.dry(0.0)}
@@ -156,9 +157,10 @@ class OpenFaces:
     def nonorthogonal(
         self, fluid: Fluid, difference: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64] | float, NDArray[np.float64] | float]:
-        """Return the non-orthogonal correction; `difference` (m,), Pa, corrects the cell pressure at each face.
+        """Return the non-orthogonal correction: a flow (m^d/s) and a fraction of the two-point flux.
 
-        The correction consists of a flow, m^d/s, and of a fraction of the two-point flux; both are added to this flux.
+        Both are added to the two-point flux.
+        difference (m,), Pa: correction of the cell pressure at each face
         """
         return np.where(self.seeps, 0.0, self.open_by(fluid) * difference * fluid.density[self.at]), 0.0
 
@@ -186,7 +188,7 @@ class UnsaturatedFaces(OpenFaces):
     def nonorthogonal(
         self, fluid: Fluid, correction: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64] | float, NDArray[np.float64] | float]:
-        """Return the non-orthogonal correction: zero flow, and a fraction of the two-point flux in [-1, 1].
+        """Return the non-orthogonal correction: zero flow, and a fraction in [-1, 1] of the two-point flux.
 
         Conductivities change by orders of magnitude in a step, so the correction must be proportional to the flux.
         The limits -1 and 1 keep the correction from emptying the soil.
@@ -204,16 +206,17 @@ class UnsaturatedFaces(OpenFaces):
         return self.conductance * self._through(fluid)[1]
 
     def _through(self, fluid: Fluid) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return k_r of the faces (m,), and d[k_r (p - outside + drop)]/dp (m,) with the cell pressure p."""
+        """Return two arrays (m,): k_r of the faces, and `d[k_r (p - outside + drop)]/dp` with the cell pressure p."""
         return self.relative.through_sides(self.cells, self.normal, fluid.p[self.at], self.outside, self.drop)
 
 
 @dataclass(frozen=True)
 class RainedFaces(OpenFaces):
-    """Faces on open sides; at least one of the faces has rain.
+    """Faces on open sides, at least one of which has rain.
 
-    With rain, the outflow is minus the rain, within two limits: the outflow at the pond's pressure, and the outflow at
-    the driest pressure.  The first limit includes seepage, so `seeps` is False at faces with rain.
+    Through a face with rain, the outflow is minus the rain.  This outflow is at least the outflow at the pond's
+    pressure, and at most the outflow at the driest pressure.  The lower limit includes seepage, so `seeps` is False at
+    faces with rain.
     """
 
     rain: NDArray[np.float64]  # rain (m,), m^d/s; nan for faces without rain
@@ -252,8 +255,10 @@ class RainedFaces(OpenFaces):
 class SideFeeds(Feeds):
     """Flow through open sides in a substep.
 
-    sides: faces of the open sides; wet: data of the substep; names: names of the conditions; ponds: largest pond
-    depths, m, or None without rain.  `OpenSides.number` are indices in `names` and `ponds`.
+    sides: faces of the open sides; `sides.number` are indices in `names` and `ponds`
+    wet: data of the substep
+    names: names of the conditions
+    ponds, m: largest depth of the pond of each condition, or None without rain
     """
 
     def __init__(self, sides: OpenSides, wet: Wet, names: tuple[str, ...], ponds: tuple[float | None, ...]):
@@ -272,9 +277,11 @@ class SideFeeds(Feeds):
     def _pond(
         self, sides: OpenSides, ponds: tuple[float | None, ...], dt: float
     ) -> tuple[OpenSides, NDArray[np.float64]]:
-        """Return the sides with the pressures and supply (in a time dt, s) of ponds; and the ponds' capacities, m^d.
+        """Return the sides under ponds with the present volumes; also return the largest volumes of the ponds, in m^d.
 
-        `ponds` are the largest depths of the ponds, m.
+        The rain of the returned sides includes the inflow that the ponds supply.
+        ponds, m: largest depth of each pond
+        dt, s: time in which a pond supplies its whole volume
         """
         depth, number = np.array([depth or 0.0 for depth in ponds]), sides.number
         size = np.linalg.norm(sides.area, axis=1)
@@ -312,7 +319,9 @@ class SideFeeds(Feeds):
         return UnsaturatedFaces(at, conductance, sides.given, self._seeps, offset, *rest)
 
     def begin(self, at: OpenFaces, fluid: Fluid, difference: NDArray[np.float64]) -> None:
-        """See `Feeds`.  Seepage faces open if their two-point flux (without non-orthogonal correction) is no inflow."""
+        """See `Feeds`.  A seepage face opens unless its two-point flux (without non-orthogonal correction) is an
+        inflow.
+        """
         self._flows = at.outflow(fluid) >= 0
         self._nonorthogonal, self._share = at.nonorthogonal(fluid, difference)
 
@@ -330,7 +339,7 @@ class SideFeeds(Feeds):
         return sum_by(at.at, self._if_open(at, (1 + self._share) * at.derivative(fluid)), len(fluid.pi))
 
     def settle(self, at: OpenFaces, fluid: Fluid) -> int:
-        """Update the active set: seepage faces with outflow become open, others closed; return the count of changes."""
+        """Open all seepage faces with outflow, close all others, and return the number of changes on this process."""
         flows = at.outflow(fluid) > 0
         changes = int(np.count_nonzero((flows != self._flows) & at.seeps))
         self._flows = flows
@@ -342,7 +351,10 @@ class SideFeeds(Feeds):
         return {name: np.array(sums[i]) for i, name in enumerate(self._names)}
 
     def run_off(self, at: OpenFaces, fluid: Fluid) -> dict[str, NDArray[np.float64]]:
-        """Return the run-off by name of the condition, m^d/s: rain that neither infiltrates nor fills the pond."""
+        """Return the run-off, in m^d/s, by name of the condition.
+
+        Run-off is rain that neither infiltrates nor fills a pond.
+        """
         if not any(self._rains):
             return {}
         excess = np.maximum(self._fallen, 0.0) + np.minimum(self._through(at, fluid), 0.0)  # nan without rain
@@ -351,7 +363,8 @@ class SideFeeds(Feeds):
         return {name: np.array(runs[i]) for i, name in enumerate(self._names) if self._rains[i]}
 
     def passing(self, at: OpenFaces, fluid: Fluid) -> dict[str, NDArray[np.float64]]:
-        """Return for each condition two rates (2,), m^d/s: the outflow through its sides, and the rain on them."""
+        """Return two rates (2,) (m^d/s) for each condition: outflow through its sides, and rain on these sides.
+        """
         if not any(self._rains):
             return {}
         both = np.stack([self._through(at, fluid), np.nan_to_num(self._fallen)])

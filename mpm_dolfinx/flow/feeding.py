@@ -68,10 +68,16 @@ class Feeds:
     """Faces with an outside pressure or a prescribed flux."""
 
     def conducting(self, flow: Conduction) -> Any:
-        """Return data that depend on conductivities and motion of the cells; stored until one of these changes."""
+        """Return data that depend on conductivities and motion of the cells.
+
+        The data are reused until conductivities or motion change.
+        """
 
     def begin(self, at: Any, fluid: Fluid, difference: NDArray[np.float64]) -> None:
-        """Start a substep.  `difference` (m,), Pa, corrects cell pressures at `sides`, see `nonorthogonal`."""
+        """Start a substep.
+
+        difference (m,), Pa: correction of the cell pressures at `sides`, see `nonorthogonal`
+        """
 
     def leaving(self, at: Any, fluid: Fluid) -> Leaving:
         """Return the outflow from the cells."""
@@ -86,23 +92,25 @@ class Feeds:
         return 0
 
     def outflows(self, at: Any, fluid: Fluid) -> dict[str, NDArray[np.float64]]:
-        """Return the outflow from the bodies through each condition, m^d/s, by name; all processes must call this."""
+        """Return the outflow from the bodies (m^d/s) through each condition, by name.  All processes must call this.
+        """
         return {}
 
     def run_off(self, at: Any, fluid: Fluid) -> dict[str, NDArray[np.float64]]:
-        """Return the run-off, m^d/s, by name of the condition; all processes must call this."""
+        """Return the run-off, in m^d/s, by name of the condition.  All processes must call this."""
         return {}
 
     def passing(self, at: Any, fluid: Fluid) -> Mapping[str, NDArray[np.float64]]:
-        """Return the rates of a substep from which `volumes` are computed; all processes must call this."""
+        """Return those rates of a substep from which `volumes` are computed.  All processes must call this."""
         return {}
 
     def volumes(
         self, rates: Sequence[Mapping[str, NDArray[np.float64]]], seconds: Sequence[float]
     ) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return volumes since the conditions began, m^d, by quantity and condition, after a step.
+        """Return the volumes since the conditions began, in m^d, by quantity and condition.
 
-        `rates` are the results of `passing` in the substeps, `seconds` the time weights of the substeps, s.
+        rates: results of `passing` in the substeps of the last step
+        seconds, s: time weights of these substeps
         """
         return {}
 
@@ -135,11 +143,11 @@ class Feeding:
         return np.empty(0, dtype=np.int64)
 
     def unknown(self, value: float) -> dict[str, NDArray[np.float64]]:
-        """Return the result of `Feeds.outflows` before the first step: all are equal to `value`."""
+        """Return the outflows before the first step, see `Feeds.outflows`.  All are equal to `value`."""
         return {}
 
     def dry(self, value: float) -> dict[str, NDArray[np.float64]]:
-        """Return the result of `Feeds.run_off` before the first step: all are equal to `value`."""
+        """Return the run-offs before the first step, see `Feeds.run_off`.  All are equal to `value`."""
         return {}
 
     def empty(self) -> dict[str, dict[str, NDArray[np.float64]]]:
