@@ -363,8 +363,7 @@ class SideFeeds(Feeds):
         return {name: np.array(runs[i]) for i, name in enumerate(self._names) if self._rains[i]}
 
     def passing(self, at: OpenFaces, fluid: Fluid) -> dict[str, NDArray[np.float64]]:
-        """Return two rates (2,) (m^d/s) for each condition: outflow through its sides, and rain on these sides.
-        """
+        """Return two rates (2,) (m^d/s) for each condition: outflow through its sides, and rain on these sides."""
         if not any(self._rains):
             return {}
         both = np.stack([self._through(at, fluid), np.nan_to_num(self._fallen)])

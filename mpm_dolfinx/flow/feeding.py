@@ -92,8 +92,7 @@ class Feeds:
         return 0
 
     def outflows(self, at: Any, fluid: Fluid) -> dict[str, NDArray[np.float64]]:
-        """Return the outflow from the bodies (m^d/s) through each condition, by name.  All processes must call this.
-        """
+        """Return the outflow from the bodies (m^d/s) through each condition, by name.  All processes must call this."""
         return {}
 
     def run_off(self, at: Any, fluid: Fluid) -> dict[str, NDArray[np.float64]]:

@@ -195,8 +195,7 @@ class MixedCells:
         return Paths(*(np.stack(parts, axis=1).reshape(*shape, parts[0].shape[1]) for parts in padded))
 
     def _path(self, axis: int, end: int, kappa, law, laws: int, place: NDArray[np.float64]) -> Paths:
-        """Return the paths (n, ...) along an axis from the position `place` (n,) in each cell to one of its ends.
-        """
+        """Return the paths (n, ...) along an axis from the position `place` (n,) in each cell to one of its ends."""
         n, lines = len(place), self._lines[axis]
         middle = (2 * end - 1) * (self._x[lines.piece, axis] - place[self._at[lines.line]])
         length = np.clip(middle + lines.length / 2, 0.0, lines.length)  # of the part between position and end

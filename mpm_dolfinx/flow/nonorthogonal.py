@@ -199,6 +199,5 @@ def off_middle(sides: OpenSides, grid: Grid) -> NDArray[np.bool_]:
 
 
 def _along(sides: OpenSides) -> NDArray[np.float64]:
-    """Return vectors (m, d) along faces, from the foot of the perpendicular through the centroid to the centre.
-    """
+    """Return vectors (m, d) along faces, from the foot of the perpendicular through the centroid to the centre."""
     return sides.offset - np.add.reduce(sides.offset * sides.normal, axis=1, keepdims=True) * sides.normal

@@ -56,9 +56,7 @@ class Sources(Feeding):
         return self._sum(self._forms, pieces)
 
     def slope(self, pieces: PointData) -> NDArray[np.float64]:
-        """Return the derivative (m^d/(Pa s)) of `gain` with respect to the cell's pressure, as an array over local
-        cells.
-        """
+        """Return the derivative (m^d/(Pa s)) of `gain` with respect to cell pressures, as an array over local cells."""
         return self._sum(self._slopes, pieces)
 
     def _sum(self, forms: Sequence[PointForm], pieces: PointData) -> NDArray[np.float64]:
