@@ -70,7 +70,7 @@ def check_axisymmetry(grid: Grid, bodies: Sequence[Body], quadrature: str) -> No
 
 
 def _functions_of(terms):
-    """Return the functions of terms in bodies and on sides; an invalid list is returned unchanged."""
+    """Return the functions of terms in bodies and on sides.  An invalid list is returned unchanged."""
     if isinstance(terms, str) or not isinstance(terms, Sequence):
         return terms
     return [term.term if isinstance(term, OnSide) else term for term in terms]
