@@ -49,10 +49,7 @@ def warn_overfilled(cut: CutDomains, bodies: Sequence[Body]) -> Callable[..., An
 
 
 def bodies_in(cut: CutDomains, bodies: Sequence[Body], cell: int) -> tuple[list[int], NDArray[np.float64]]:
-    """Return the bodies in the cell with this lexicographic number, and the cell's midpoint (d,), in m.
-
-    All processes must call it.
-    """
+    """Return the bodies in a cell, and the cell's midpoint (d,), in m.  All processes must call this."""
     grid, ids = cut.grid, cut.points.id[cut.pieces.point[cut.pieces.cell == cell]]
     own = body_of(ids, np.cumsum([0, *map(len, bodies)]))
     found = sorted({int(i) for rows in grid.comm.allgather(own) for i in rows})

@@ -178,11 +178,7 @@ class BorderFaces:
     bulk: float  # bulk modulus of the fluid, Pa
 
     def flows(self, p: NDArray[np.float64], force: NDArray[np.float64] | None) -> BorderFlows:
-        """Return the fluxes at the pressures p on both sides of the faces.
-
-        p (2, m), Pa: pressures
-        force (c, d), N/m^3: inertia force on the fluid in the local cells
-        """
+        """Return the fluxes at pressures p (2, m), in Pa.  force (c, d), N/m^3: inertia force in local cells."""
         weight = (
             self.weight
             if force is None

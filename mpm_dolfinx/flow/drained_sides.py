@@ -351,10 +351,7 @@ class SideFeeds(Feeds):
         return {name: np.array(sums[i]) for i, name in enumerate(self._names)}
 
     def run_off(self, at: OpenFaces, fluid: Fluid) -> dict[str, NDArray[np.float64]]:
-        """Return the run-off, in m^d/s, by name of the condition.
-
-        Run-off is rain that neither infiltrates nor fills a pond.
-        """
+        """Return the run-off (m^d/s), rain that neither infiltrates nor fills a pond, by name of the condition."""
         if not any(self._rains):
             return {}
         excess = np.maximum(self._fallen, 0.0) + np.minimum(self._through(at, fluid), 0.0)  # nan without rain

@@ -68,16 +68,10 @@ class Feeds:
     """Faces with an outside pressure or a prescribed flux."""
 
     def conducting(self, flow: Conduction) -> Any:
-        """Return data that depend on conductivities and motion of the cells.
-
-        The data are reused until conductivities or motion change.
-        """
+        """Return data that depend on conductivities and motion of cells.  They are reused until these change."""
 
     def begin(self, at: Any, fluid: Fluid, difference: NDArray[np.float64]) -> None:
-        """Start a substep.
-
-        difference (m,), Pa: correction of the cell pressures at `sides`, see `nonorthogonal`
-        """
+        """Start a substep.  difference (m,), Pa: correction of cell pressures at `sides`, see `nonorthogonal`."""
 
     def leaving(self, at: Any, fluid: Fluid) -> Leaving:
         """Return the outflow from the cells."""

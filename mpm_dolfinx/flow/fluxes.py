@@ -149,10 +149,7 @@ class OpenSides:
         return conductance, self.given + conductance * self.outer(at, flow)
 
     def outer(self, at: NDArray[np.int64], flow: Conduction) -> NDArray[np.float64]:
-        """Return the mass potentials (m,), in Pa, at the outside pressures minus the hydrostatic drops.
-
-        These drops are the pressure drops from the centroids to the faces.
-        """
+        """Return the mass potentials (m,), in Pa, at outside pressures minus hydrostatic drops from centroids."""
         outer = self.pressure if flow.weight is None else self.pressure - flow.deformed(at, self.offset) @ flow.weight
         return mass_potential(outer, flow.bulk)
 
@@ -242,10 +239,7 @@ class CellContents(Keyed):
         self.centroid, self.open = forms.active.centroid, forms.active.opening
         self.centroid[active] = centroid[active]
         self.open[active, :, 0], self.open[active, :, 1] = lower[active], upper[active]
-        """Vectors (c, d), in m, from cell midpoints to centroids of material.
-
-        `open` has open fractions (c, d, 2) of faces.
-        """
+        """Vectors (c, d), in m, from cell midpoints to centroids.  `open`: open fractions (c, d, 2) of faces."""
 
     def total(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the sums (..., n) of values (..., m) over the pieces of each filled cell."""
@@ -353,10 +347,7 @@ class FluxForms:
         h0, h1, across = across_faces(grid, n0)
 
         def opening(side, sign):
-            """Open fraction (covered by material) of the face in direction `sign * n0`.
-
-            In axisymmetry the fraction is multiplied by `Grid.around`.
-            """
+            """Open fraction of the face in direction `sign * n0`, in axisymmetry multiplied by `Grid.around`."""
             lower, upper = self.lower_face(side), self.upper_face(side)
             return sum(
                 ufl.conditional(ufl.gt(sign * n0[a], 0.5), upper[a], 0.0)
@@ -418,10 +409,7 @@ class FluxForms:
             if relative is not None:
 
                 def by_k(k):
-                    """Return `dT / dk_r` of a law.
-
-                    Squares of conductivities are avoided because they would underflow.
-                    """
+                    """Return `dT / dk_r` of a law without squares of conductivities, which would underflow."""
                     return share * (
                         d0 * (k1 / resistance) ** 2 * ufl.diff(k0, k) + d1 * (k0 / resistance) ** 2 * ufl.diff(k1, k)
                     )
@@ -458,10 +446,7 @@ class FluxForms:
         return sum_ghosts(self._sum)
 
     def set_conduction(self, contents: CellContents, flow: Conduction) -> NDArray[np.float64]:
-        """Set the coefficients from the conductivities of filled owned cells.
-
-        Return the mobilities (n, d) along the axes.
-        """
+        """Set the coefficients for the conductivities of cells.  Return the mobilities (n, d) along the axes."""
         d = self.grid.dim
         filled = contents.filled
         shift = flow.mobility.shift

@@ -43,10 +43,7 @@ PAIRS = 2**16
 
 @dataclass(frozen=True)
 class Lines:
-    """Lines along an axis through the centroids of pieces.
-
-    Arrays have an entry for each pair of a line and a crossed piece.
-    """
+    """Lines along an axis through centroids of pieces.  Arrays are over pairs of a line and a crossed piece."""
 
     line: NDArray[np.int64]  # index, among pieces of mixed cells, of the piece through whose centroid the line runs
     piece: NDArray[np.int64]  # index of the crossed piece

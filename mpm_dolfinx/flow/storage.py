@@ -274,10 +274,7 @@ class StorageSystem:
 
     @property
     def gravity(self) -> FacetSum | None:
-        """Form of the fluxes between cells of the same soil, due to p and the fluid's weight.
-
-        None for saturated soil without weight, because the matrix of the fluxes suffices.
-        """
+        """Form of fluxes between cells of one soil, due to p and weight.  None in saturated soil without weight."""
         return (self._uniform or self._over_uniform())[1]
 
     def _over_uniform(self) -> tuple[FacetSum | None, FacetSum | None]:
@@ -334,10 +331,7 @@ class StorageSystem:
         return Outflow([one.conducting(flow) for one in feeds], total, mobility, nonorthogonal)
 
     def assemble_fluxes(self, force: NDArray[np.float64] | None = None) -> None:
-        """Assemble the matrix of the fluxes between cells, which depends on p in unsaturated soil.
-
-        `force`: see `StorageForms.driven`.
-        """
+        """Assemble the matrix of fluxes (in unsaturated soil at p).  `force`: see `StorageForms.driven`."""
         zero(self.T)
         relative, borders = self._forms.fluxes.relative, None
         if relative is not None:
@@ -502,17 +496,11 @@ class StorageProblem:
         return self._contents.fill
 
     def sealed(self, volumes: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the pressure rises (n,), in Pa, of cells that keep their lost fluid, at fixed stress.
-
-        volumes (n,), m^d: fluid volumes that the cells have lost
-        """
+        """Return the pressure rises (Pa) of cells at fixed stress that keep their lost fluid `volumes` (m^d)."""
         return volumes / (self.forms.derivatives(self.data)[0] + self._contents.fixed_stress)
 
     def filling(self, error: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return two arrays (n,): errors of the water content due to pressure errors, and changes of this content.
-
-        error (n,), Pa: pressure errors
-        """
+        """Return errors (n,) of the water content by pressure errors (Pa), and changes (n,) of this content."""
         capacity, _ = self.forms.drained(self.data)
         change = self.forms.change(self.data)[self.system.unknowns.owned]
         share = self.fill / self._contents.volume
@@ -525,10 +513,7 @@ class StorageProblem:
         return float(whole / area)
 
     def _begin(self, outflow: Outflow) -> NDArray[np.float64] | float:
-        """Start the substep for all conditions.
-
-        Return the non-orthogonal correction of fluxes between cells, in m^d/s.
-        """
+        """Start the substep.  Return the non-orthogonal correction (m^d/s) of fluxes between cells."""
         p, fluid = self._p[0], self._fluid
         sides = [0 if one.sides is None else len(one.sides.cells) for one in self._feeds]
         between, difference = 0.0, np.zeros(sum(sides))

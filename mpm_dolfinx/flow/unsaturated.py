@@ -97,10 +97,7 @@ def _log_sinhc(z, of: Functions) -> tuple[Any, Any]:
 
 
 class Laws:
-    """Relative conductivities as functions of pressure, by index of the retention curve.
-
-    Index 0 is soil without a curve.
-    """
+    """Relative conductivities as functions of pressure.  Index 0 is soil without a retention curve."""
 
     def __init__(self, grid: Grid, laws: Sequence):
         self.conductances = [Conductance(grid, law) for law in laws]

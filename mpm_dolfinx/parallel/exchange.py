@@ -70,10 +70,7 @@ class Exchange:
         return self._transfer(rows, 1, self._sf.reduceBegin, self._sf.reduceEnd)
 
     def back(self, rows: NDArray) -> NDArray:
-        """Send back one answer for each received row.
-
-        Return the answers to the rows of this process, in their order.
-        """
+        """Send back one answer for each received row.  Return the answers to own rows, in the order of the rows."""
         if self.comm.size == 1:
             return rows
         return self._transfer(rows, 0, self._sf.bcastBegin, self._sf.bcastEnd)
@@ -141,10 +138,7 @@ def everywhere(comm: MPI.Intracomm, ask: Callable[[], T]) -> T:
 
 
 def together(comm: MPI.Intracomm, action: Callable[[], T]) -> T:
-    """Return the result of an action on this process.
-
-    If it raises on any process, all processes raise the first error.
-    """
+    """Return the result of an action on this process.  If it raises on any process, all raise the first error."""
     value = error = None
     try:
         value = action()

@@ -162,10 +162,7 @@ def _row_bytes(dtype: np.dtype, shape: tuple[int, ...]) -> int:
 
 
 def _joined(crc: int, parts: Iterable[tuple[int, int]]) -> int:
-    """Return the checksum of bytes that are followed by parts.  crc: checksum of these bytes.
-
-    parts: checksum and length of each part
-    """
+    """Return the checksum of bytes with checksum `crc` and more parts.  parts: checksum and length of each."""
     for more, length in parts:
         for k in range(length.bit_length()):
             crc = _product(_power(k), crc) if length >> k & 1 else crc

@@ -57,10 +57,7 @@ class Halving:
     """Largest growth of the residual at the end of a step."""
 
     def after(self, work: float, growth: float) -> Halving | None:
-        """Return the next trial, or None if the search ends.
-
-        growth: growth factor of the residual in the last trial.
-        """
+        """Return the next trial, or None if the search ends. growth: factor by which the residual grew."""
         ends = growth <= self.limit or self.step < 2 * SHORTEST
         return None if ends else Halving(0.5 * self.step)
 

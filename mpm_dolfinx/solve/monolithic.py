@@ -209,10 +209,7 @@ class BlockSolver:
         return count, factors
 
     def _iterate(self, inverses: Inverses, scale: tuple, slopes: tuple, rtol: float, most: int) -> int:
-        """Solve with the approximations `inverses` of K^-1 and P^-1.
-
-        Return the number of iterations, at most `most`.
-        """
+        """Solve with approximations of K^-1 and P^-1.  Return the number of iterations, at most `most`."""
         operator = BlockOperator(self._momentum, self._storage, inverses, self._work, scale, slopes)
         self._A.setPythonContext(operator)
         self._ksp.pc.setPythonContext(operator)
@@ -236,10 +233,7 @@ class BlockSolver:
 
 
 def _foresight(many: int) -> Callable[[PETSc.KSP, int, float], None]:
-    """Return a monitor that ends a solve if its rate of convergence predicts more than `many` iterations.
-
-    The rate is that of the last `many / 4` iterations.
-    """
+    """Return a monitor that ends a solve if the last `many / 4` iterations predict more than `many` in all."""
     quarter = max(1, many // 4)
 
     def monitor(ksp: PETSc.KSP, count: int, norm: float) -> None:

@@ -238,11 +238,7 @@ class Newton:
         return self._stable(self._iterations(errors, as_reset, key, fresh))
 
     def _iterations(self, errors: Errors, as_reset: AsReset, key: Hashable, fresh: bool) -> Errors:
-        """Iterate from the present (u, p).
-
-        errors: errors at this (u, p)
-        fresh: whether to start with a new tangent
-        """
+        """Iterate from the present (u, p). errors: errors there; fresh: whether to start with a new tangent."""
         elastic = self._momentum.forms.elastic
         tolerance = self._scheme.tolerance
         keep = self._solvers.plan.keep

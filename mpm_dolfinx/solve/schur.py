@@ -153,10 +153,7 @@ class LinearSolvers:
 
     @property
     def schur(self) -> tuple[PETSc.Mat, PETSc.KSP]:
-        """The Schur complement and its preconditioned solver.
-
-        Raise ValueError for monolithic multigrid, which has no Schur complement.
-        """
+        """The Schur complement and its preconditioned solver. Raise ValueError for monolithic multigrid."""
         if self._schur is None:
             raise ValueError("solvers: monolithic multigrid has no Schur complement; direct solvers must be used")
         return self._schur, self._solve_s
@@ -320,10 +317,7 @@ class LinearSolvers:
         return self._g
 
     def filtered(self, volumes: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the pressures `P^-1 volumes`, in Pa, with the fixed-stress operator P.
-
-        volumes (n,), m^d: volumes of owned cells
-        """
+        """Return pressures `P^-1 volumes` (Pa) from volumes (m^d) of owned cells. P: fixed-stress operator."""
         self._g.array_w[:] = volumes
         self._solve_s.pc.apply(self._g, self.dp)
         return self.dp.array_r

@@ -260,10 +260,7 @@ class Motion:
         return replace(after, data=self._materials.updated_state(after, points, 0.0))
 
     def _dried(self, points: MaterialPoints, on_grid: OnGrid, data: QuadratureData) -> MaterialPoints:
-        """Return the points with their suctions if laws depend on suction.
-
-        Each is the mean over the pieces of a domain.
-        """
+        """Return the points with their suctions, means over the pieces of domains, if laws depend on suction."""
         if self._storage is None or "suction" not in self._materials.state_names:
             return points
         cut, pieces = on_grid.cut, data.pieces
@@ -357,10 +354,7 @@ class Motion:
     def _corrected(
         self, points: MaterialPoints, state: State, loads: Sequence[Loads], keeps: NDArray[np.bool_]
     ) -> MaterialPoints:
-        """Return the points after `with_volumes` has corrected the corners of yielded domains.
-
-        Points in `keeps` (n,) are not corrected.
-        """
+        """Return the points after `with_volumes` has corrected yielded domains, except those in `keeps` (n,)."""
         grid, stage = self._momentum.grid, state.stage
         yielded = self._materials.evolved(points) & ~keeps
         if not over_all(grid.comm, int(yielded.sum())):
@@ -469,10 +463,7 @@ class Motion:
     def _left(
         self, carried: PiecePressures, points: MaterialPoints, stage: Stage, t: float, on_grid: OnGrid, some: bool
     ) -> PiecePressures:
-        """Return the pieces with pressures at time t (s) for the next grid.
-
-        some: whether any point keeps its pieces.
-        """
+        """Return the pieces with pressures at t (s) for the next grid. some: whether any point keeps its pieces."""
         with _compat.Timer("remap"):
             pieces = on_grid.cut.pieces
             store = self._materials.storage(points) * points.volume0 * points.J

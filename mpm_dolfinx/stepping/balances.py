@@ -50,10 +50,7 @@ class Start(NamedTuple):
     renewed: int = 0  # number of renewed particle domains
 
     def begun(self, acting: Acting, earlier: Sequence[Any] | None) -> Acting:
-        """Return the loads at the beginning of a substep.
-
-        earlier: data that the loads returned in the previous substep.
-        """
+        """Return the loads at the beginning of a substep.  earlier: data of the loads in the previous substep."""
         if not self.state.stage.inertia:
             return acting
         shares = Shares(acting.substep.own * self.dt, acting.substep.before * self.dt, acting.gravity)
@@ -150,10 +147,7 @@ def flight_of(start: Start) -> Flight | None:
 
 
 def leads(scene: Scene, loads: Sequence[Loads]) -> bool:
-    """Return whether laws may yield, or contact is quasi-static.
-
-    Newton's method may then start from extrapolated motion.
-    """
+    """Return whether Newton's method may start from extrapolated motion: with yield, or quasi-static contact."""
     momentum = scene.momentum
     return not momentum.elastic or (momentum.inertia is None and any([one.touches for one in loads]))
 

@@ -42,10 +42,7 @@ class Division:
         self._domains = SeededDomains(faces.bodies)
 
     def divided(self, state: State) -> tuple[State, int]:
-        """Return the state with divided and merged domains, and the number of replaced domains.
-
-        All processes must call it.
-        """
+        """Return the state with divided and merged domains, and their number. All processes must call it."""
         now, seeded = self._domains.sizes(self._grid, state.points)
         some = _divides(now, seeded).any() or _merges(now, seeded).any()
         if not self._grid.comm.allreduce(int(some and state.stay is None)):

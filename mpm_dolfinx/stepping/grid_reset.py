@@ -99,10 +99,7 @@ class OnGrid(Keyed):
         """Faces with a ghost penalty."""
         rows = quadrature.rows(cut, points, lambda m: m.oedometric) * grid.around(cut.x)
         self.stiffness = np.zeros(grid.num_local)
-        """Largest oedometric modulus in each local cell, in Pa.
-
-        In axisymmetry it is multiplied by the circumference.
-        """
+        """Largest oedometric modulus (Pa) in each local cell, in axisymmetry times the circumference (N/m)."""
         order = rows.argsort(kind="stable")
         self.stiffness[cut.cells[order]] = rows[order]  # the largest value of a cell is assigned last
         self.contents = None
@@ -213,10 +210,7 @@ class OnGrid(Keyed):
 
     @contextmanager
     def as_reset(self, state: State) -> Iterator[QuadratureData]:
-        """Yield the integration points at the last reset.
-
-        Within the context, u is 0, and p is the pressure at the reset.
-        """
+        """Yield the integration points at the last reset. Until exit, u is 0, and p has its values at the reset."""
         at = [(self._u.x.array, self._momentum.active.now.dofs)]
         if self._storage is not None:
             at += [(f.x.array, self.cells) for f in (self._storage.p, self._storage.p_n)]
@@ -443,10 +437,7 @@ class OnGrid(Keyed):
         return self.cut.valid(points, part, count)[part]
 
     def parts_of_cells(self, loads: Sequence[Loads]) -> tuple[NDArray[np.int64], int]:
-        """Return the connected parts of cells, see `ActiveSet.parts_of_cells`.
-
-        Parts that may touch count as one part.
-        """
+        """Return the parts of cells, see `ActiveSet.parts_of_cells`. Parts that may touch count as one part."""
         if self.cut.grid.copies == 1:
             return self.active.parts_of_cells
         pairs = np.concatenate([one.within_reach() for one in loads])
@@ -461,10 +452,7 @@ class OnGrid(Keyed):
         return self._of_points(*self.active.parts_of_cells)
 
     def _of_points(self, part: NDArray[np.int64], count: int) -> tuple[NDArray[np.int64], int]:
-        """Return the index (n,) of the connected part of each point, from 0, and `count`.
-
-        part: index of the connected part of each cell, from 1
-        """
+        """Return the index (n,) of each point's part, from 0, and `count`. part: index for each cell, from 1."""
         out = np.zeros(len(self.cut.points), dtype=np.int64)
         out[self.cut.pieces.point] = self.cut.to_pieces(part[self.cut.cells] - 1)
         return out, count

@@ -261,10 +261,7 @@ def _holds_as(after: Stage, before: Stage) -> bool:
 
 
 def _check_weight(after: Stage, before: Stage | None, t: float) -> None:
-    """Raise ValueError if a stage with quiet sides changes the weight.
-
-    The tractions of these sides would not bear it.
-    """
+    """Raise ValueError if a stage with quiet sides changes the weight, which their tractions would not bear."""
     quiet = after.of(Quiet)
     now = after.gravity_at(t) if quiet else None
     was = None if before is None else before.gravity_at(t)
@@ -304,10 +301,7 @@ def _warn_moved_on(scene: Scene, before: Stage, after: Stage) -> None:
 def _filled(
     scene: Scene, points: MaterialPoints, standing: Sequence[int], add: Sequence[int], gravity: NDArray | None
 ) -> tuple[MaterialPoints, MaterialPoints]:
-    """Return all points including added bodies, and the points of added bodies.
-
-    Those that touch others are added first.
-    """
+    """Return all points, and the points of added bodies. Bodies that touch others are added first."""
     standing = list(standing)
     waiting = list(add)
     new = scene.materials.seeded.of(np.empty(0, np.int64))
@@ -329,10 +323,7 @@ def _filled(
 def _without_extra(
     scene: Scene, points: MaterialPoints, add: Sequence[int], fields: Mapping[str, ArrayLike]
 ) -> MaterialPoints:
-    """Return the points without data that added bodies lack.
-
-    Raise ValueError if `fields` does not give these data anew.
-    """
+    """Return the points without data that added bodies lack. Raise ValueError if `fields` lacks these data."""
     extra = points.data.keys() - scene.materials.seeded.data.keys()
     for name in sorted(extra - fields.keys()):
         what = f"stage: add: body {add[0]}: its points have no {name!r}"
@@ -496,10 +487,7 @@ def _as_reset(scene: Scene, start: Start) -> State:
 
 
 def _mixed(unknowns: Unknowns, seen: Sequence[tuple[NDArray, NDArray]]) -> NDArray[np.float64]:
-    """Return the next displacement of a fixed-point iteration.
-
-    seen: earlier displacements and steps, as local arrays.
-    """
+    """Return the next displacement of a fixed-point iteration. seen: earlier displacements and steps."""
     (w, u), owned = seen[-1], unknowns.owned
     if len(seen) == 1:
         return w + u

@@ -66,10 +66,7 @@ class Renewal:
         return misshapen(self._grid, points.corners, LONGEST)
 
     def flowed(self, points: MaterialPoints) -> NDArray[np.bool_]:
-        """Return a mask (n,) of points that yielded or were renewed.
-
-        It is False for laws without the state `plastic`.
-        """
+        """Return a mask (n,) of yielded or renewed points. It is False for laws without the state `plastic`."""
         if "plastic" not in points.data:
             return np.zeros(len(points), dtype=bool)
         known = np.array(["plastic" in law.state for law in self._materials.laws])[self._materials.law_of(points)]

@@ -103,10 +103,7 @@ class Result:
 
     @property
     def pressure(self) -> NDArray[np.float64]:
-        """Smallest and largest pore pressure (n, 2) of the material points, in Pa.
-
-        The shape is (n, 0) without fluid.
-        """
+        """Smallest and largest pore pressure (n, 2) of the material points, in Pa, or (n, 0) without fluid."""
         return self.rows.column("pressure")
 
     @property
@@ -116,10 +113,7 @@ class Result:
 
     @property
     def probe_stress(self) -> NDArray[np.float64]:
-        """Effective stresses (n, probes, 3, 3), in Pa, tension positive.
-
-        The shape is (n, 0, 3, 3) if they are not recorded.
-        """
+        """Effective stresses (n, probes, 3, 3), in Pa, tension positive, or (n, 0, 3, 3) if not recorded."""
         return self.rows.column("probe_stress")
 
     @cached_property
@@ -139,10 +133,7 @@ class Result:
 
     @cached_property
     def tool_forces(self) -> ByName[NDArray[np.float64]]:
-        """Forces (N) and moments (N m) of each tool and contact on bodies, by name.
-
-        The shape is (times, 3), in 3D (times, 6).
-        """
+        """Forces (N) and moments (N m) of tools and contacts on bodies, by name; (times, 3), in 3D (times, 6)."""
         return self.outcome("tool_forces")
 
     @cached_property
@@ -209,7 +200,7 @@ class Result:
         )
 
     def shares(self) -> str:
-        """Return a table with memory, imbalance, and for each part of the run its time (s) and share of the wall time."""
+        """Return a table: time (s) and share of the wall time of each part of the run, memory, and imbalance."""
         rows = [*self.profile.items(), ("rest", self.wall - sum(self.profile.values()))]
         lines = [f"{name:18} {s:8.2f} s {100 * s / max(self.wall, 1e-9):5.1f} %" for name, s in rows]
         if self.points:  # measured at the end of a run

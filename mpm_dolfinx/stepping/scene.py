@@ -253,10 +253,7 @@ class Scene:
         return stage(self.bodies, self.materials, self.momentum, fed, conditions, present, later)
 
     def check(self, state: State) -> None:
-        """Raise ValueError for an object that is not a state of this scene.
-
-        The materials of its stage identify the scene.
-        """
+        """Raise ValueError for an object that is not a state of this scene, with the materials of this scene."""
         if not isinstance(state, State) or state.stage.materials is not self.materials:
             raise ValueError(f"state = {line(state)}, must be a state of this simulation")
 
@@ -277,10 +274,7 @@ class Scene:
         return self._on_grid((points.arrays, lines), make, grid.comm)
 
     def check_followed(self, first: Stage) -> None:
-        """Raise ValueError if grid lines follow a tool that is absent from the first stage.
-
-        These lines would never move.
-        """
+        """Raise ValueError if grid lines follow a tool that is absent from the first stage, and never move."""
         follow = self.grid.follow
         if hasattr(follow, "pose") and first.followed(self.grid) is None:
             raise ValueError(f"grid: follow = {line(follow)}, not in the first stage, must be one of its conditions")
