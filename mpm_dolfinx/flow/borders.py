@@ -81,11 +81,11 @@ class Borders:
     ) -> BorderFaces:
         """Return the faces with their current conductivities.
 
-        laws: relative conductivities as functions of pressure, see `Laws`
-        contents: material in the cells
-        flow: conductivities of the filled owned cells
-        places (c, d), m: vectors from the midpoints of local cells to the pressure positions of these cells
-        moved (c, d), m: displacements of the cells in the step
+        `laws`: relative conductivities as functions of pressure, see `Laws`.
+        `contents`: material in the cells.
+        `flow`: conductivities of the filled owned cells.
+        `places` (c, d), m: vectors from the midpoints of local cells to the pressure positions of these cells.
+        `moved` (c, d), m: displacements of the cells in the step.
         """
         grid, d = self.grid, self.grid.dim
         paths, slots = flow.mobility.paths, 1
@@ -178,7 +178,7 @@ class BorderFaces:
     bulk: float  # bulk modulus of the fluid, Pa
 
     def flows(self, p: NDArray[np.float64], force: NDArray[np.float64] | None) -> BorderFlows:
-        """Return the fluxes at pressures p (2, m), in Pa.  force (c, d), N/m^3: inertia force in local cells."""
+        """Return the fluxes at pressures p (2, m), in Pa.  `force` (c, d), N/m^3: inertia force in local cells."""
         weight = (
             self.weight
             if force is None

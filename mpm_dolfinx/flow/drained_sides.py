@@ -160,7 +160,7 @@ class OpenFaces:
         """Return the non-orthogonal correction: a flow (m^d/s) and a fraction of the two-point flux.
 
         Both are added to the two-point flux.
-        difference (m,), Pa: correction of the cell pressure at each face
+        `difference` (m,), Pa: correction of the cell pressure at each face.
         """
         return np.where(self.seeps, 0.0, self.open_by(fluid) * difference * fluid.density[self.at]), 0.0
 
@@ -255,10 +255,10 @@ class RainedFaces(OpenFaces):
 class SideFeeds(Feeds):
     """Flow through open sides in a substep.
 
-    sides: faces of the open sides; `sides.number` are indices in `names` and `ponds`
-    wet: data of the substep
-    names: names of the conditions
-    ponds, m: largest depth of the pond of each condition, or None without rain
+    `sides`: faces of the open sides; `sides.number` are indices in `names` and `ponds`.
+    `wet`: data of the substep.
+    `names`: names of the conditions.
+    `ponds`, m: largest depth of the pond of each condition, or None without rain.
     """
 
     def __init__(self, sides: OpenSides, wet: Wet, names: tuple[str, ...], ponds: tuple[float | None, ...]):
@@ -280,8 +280,8 @@ class SideFeeds(Feeds):
         """Return the sides under ponds with the present volumes; also return the largest volumes of the ponds, in m^d.
 
         The rain of the returned sides includes the inflow that the ponds supply.
-        ponds, m: largest depth of each pond
-        dt, s: time in which a pond supplies its whole volume
+        `ponds`, m: largest depth of each pond.
+        `dt`, s: time in which a pond supplies its whole volume.
         """
         depth, number = np.array([depth or 0.0 for depth in ponds]), sides.number
         size = np.linalg.norm(sides.area, axis=1)

@@ -71,7 +71,7 @@ class Feeds:
         """Return data that depend on conductivities and motion of cells.  They are reused until these change."""
 
     def begin(self, at: Any, fluid: Fluid, difference: NDArray[np.float64]) -> None:
-        """Start a substep.  difference (m,), Pa: correction of cell pressures at `sides`, see `nonorthogonal`."""
+        """Start a substep.  `difference` (m,), Pa: correction of cell pressures at `sides`, see `nonorthogonal`."""
 
     def leaving(self, at: Any, fluid: Fluid) -> Leaving:
         """Return the outflow from the cells."""
@@ -102,8 +102,8 @@ class Feeds:
     ) -> dict[str, dict[str, NDArray[np.float64]]]:
         """Return the volumes since the conditions began, in m^d, by quantity and condition.
 
-        rates: results of `passing` in the substeps of the last step
-        seconds, s: time weights of these substeps
+        `rates`: results of `passing` in the substeps of the last step.
+        `seconds`, s: time weights of these substeps.
         """
         return {}
 

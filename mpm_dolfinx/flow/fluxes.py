@@ -94,8 +94,8 @@ class Conduction:
         """Return the ratio (m,) of two distances of each face: from the centroid, and from the pressure position.
 
         See `layers` for pressure positions.
-        normal (m, d): normals of the faces
-        offset (m, d), m: vectors from the centroids to the faces
+        `normal` (m, d): normals of the faces.
+        `offset` (m, d), m: vectors from the centroids to the faces.
         """
         distance = (offset * normal).sum(axis=1)
         shifted = distance - (self.mobility.shift[at] * normal).sum(axis=1)
@@ -140,7 +140,7 @@ class OpenSides:
         """Return two arrays (m,): outflow per unit of the cell's mass potential (m^d/(Pa s)), and inflow (m^d/s).
 
         The inflow is prescribed, or caused by the outside pressure and gravity.
-        at (m,): indices of the cells among the filled cells
+        `at` (m,): indices of the cells among the filled cells.
         """
         shape = self.shape
         if flow.mobility.shift is not None:
@@ -159,8 +159,8 @@ class OpenSides:
         The indices are: cell, axis, end of the cell along this axis, and 0 for the difference or 1 for the slope.  Ends
         without a drained side have nan for both.
 
-        at (m,): index of the cell of each face among the filled cells
-        p (n,), Pa: pressures of the filled cells
+        `at` (m,): index of the cell of each face among the filled cells.
+        `p` (n,), Pa: pressures of the filled cells.
         """
         out = np.full((len(p), self.normal.shape[1], 2, 2), np.nan)
         distance = np.add.reduce(self.offset * self.normal, axis=1)
@@ -202,9 +202,9 @@ class PieceContents:
 class CellContents(Keyed):
     """Material in the cells, at the last grid reset.  Arrays over local cells have valid values in active cells only.
 
-    forms: forms whose coefficients this class sets
-    pieces: contributions of the pieces
-    filled: owned active cells
+    `forms`: forms whose coefficients this class sets.
+    `pieces`: contributions of the pieces.
+    `filled`: owned active cells.
     """
 
     def __init__(self, forms: FluxForms, pieces: PieceContents, filled: NDArray[np.int64]):
@@ -256,8 +256,8 @@ class CellContents(Keyed):
     ) -> NDArray[np.float64]:
         """Set the damping strength tau (n,) of elastic soil in the filled cells, and return tau, in 1/Pa.
 
-        share (n,): factor of tau
-        less (n,), 1/Pa: storage due to changes of saturation, which is subtracted from `share * tau`
+        `share` (n,): factor of tau.
+        `less` (n,), 1/Pa: storage due to changes of saturation, which is subtracted from `share * tau`.
         """
         tau, values = self._damped.x, np.maximum(share * self.mean(self._damping) - less, 0.0)
         tau.array[self.filled] = values
@@ -275,8 +275,8 @@ class CellContents(Keyed):
     def motion(self, nodal: NDArray[np.float64], rests: NDArray[np.int64] | None = None) -> CellMotion:
         """Return the motion of the filled cells at the centroids of their material.
 
-        nodal (n, d, 2^d), m: nodal displacements
-        rests: indices of the filled cells that do not move
+        `nodal` (n, d, 2^d), m: nodal displacements.
+        `rests`: indices of the filled cells that do not move.
         """
         hoop, d = None, self.grid.dim
         at_centroids = nodal @ self._shapes
@@ -432,9 +432,9 @@ class FluxForms:
     ) -> NDArray[np.float64]:
         """Return the outflow of the local cells through `facets` due to slopes in `cells`, in m^d/s.
 
-        slope (n, d), Pa/m: see `Gradients`
-        active (c,): active local cells
-        density (c,): density of the fluid in the active local cells, divided by the density at zero pressure
+        `slope` (n, d), Pa/m: see `Gradients`.
+        `active` (c,): active local cells.
+        `density` (c,): density of the fluid in the active local cells, divided by the density at zero pressure.
         """
         self.density.x.array[active] = density
         self._sum.x.array[active] = 0.0

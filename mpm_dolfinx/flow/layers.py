@@ -102,7 +102,7 @@ class MixedCells:
 
         The lines run through the centroids of the pieces `rows`.  Weights are < 1 if the line runs along the border of
         the piece.
-        first, count (m,): first piece and number of pieces in the cell of each piece
+        `first`, `count` (m,): first piece and number of pieces in the cell of each piece.
         """
         line, piece = ranges(first[rows], count[rows])
         line += rows.start
@@ -135,10 +135,10 @@ class MixedCells:
         """Return the mobility of filled cells.
 
         With `now`, only inclined layers shift the pressure position of a cell away from the centroid.
-        kappa, m^2/(Pa s): mobilities of all pieces
-        mean (n,), m^2/(Pa s): means of `kappa` in the filled cells
-        share (n, d): mobility along each axis divided by `mean`; values of mixed cells are set in place
-        now, m^2/(Pa s): in unsaturated soil, mobilities of all pieces at their pressures
+        `kappa`, m^2/(Pa s): mobilities of all pieces.
+        `mean` (n,), m^2/(Pa s): means of `kappa` in the filled cells.
+        `share` (n, d): mobility along each axis divided by `mean`; values of mixed cells are set in place.
+        `now`, m^2/(Pa s): in unsaturated soil, mobilities of all pieces at their pressures.
         """
         along, off = self._along(kappa[self._rows])
         if now is not None:
@@ -153,8 +153,8 @@ class MixedCells:
         """Return two arrays (n, d) for mixed cells: mobilities along the axes, and shifts of the pressure position.
 
         The shifts are divided by the cell sizes.
-        kappa: mobilities of the pieces
-        mean: 1 for shifts to the position of mean pressure, 0 for shifts due to inclined layers only
+        `kappa`: mobilities of the pieces.
+        `mean`: 1 for shifts to the position of mean pressure, 0 for shifts due to inclined layers only.
         """
         n, d = len(self._filled), self._x.shape[1]
         mobility = np.zeros((n, d))
@@ -180,9 +180,10 @@ class MixedCells:
     ) -> Paths:
         """Return the flow paths (n, d, 2, ...) of the mixed cells, see `Paths`.
 
-        kappa (m,), m^2/(Pa s): mobilities of all pieces at saturation
-        law (m,): index of the retention curve of each piece, < `laws`
-        shift (n, d), m: vectors from the centroids of filled cells to their pressure positions, or None if all are zero
+        `kappa` (m,), m^2/(Pa s): mobilities of all pieces at saturation.
+        `law` (m,): index of the retention curve of each piece, < `laws`.
+        `shift` (n, d), m: vectors from the centroids of filled cells to their pressure positions, or None if all are
+        zero.
         """
         kappa, law = kappa[self._rows], law[self._rows]
         place = 0.5 + self._middle + (0.0 if shift is None else shift[self._filled] / self._h)
@@ -258,9 +259,9 @@ def graded(
     is not along an axis, the difference between arithmetic and harmonic mean is distributed over the axes.  The share
     of an axis is proportional to the variance that a linear variation along this axis explains.
 
-    offset (m, d), m: positions of the pieces relative to the midpoints of cells
-    kappa (m,), m^2/(Pa s): mobilities of the pieces
-    mean (n,), m^2/(Pa s): mean mobilities of the filled cells
+    `offset` (m, d), m: positions of the pieces relative to the midpoints of cells.
+    `kappa` (m,), m^2/(Pa s): mobilities of the pieces.
+    `mean` (n,), m^2/(Pa s): mean mobilities of the filled cells.
     """
     with np.errstate(divide="ignore"):
         series = 1 / contents.mean(1 / kappa)
@@ -280,7 +281,7 @@ def graded(
 def mixed_cells(cut: CutDomains, soils: NDArray[np.float64], contents: CellContents) -> MixedCells | None:
     """Return the owned cells with pieces of different conductivity, or None if no process has such cells.
 
-    soils (m, k): numbers that identify the soil of each piece.  Pieces with equal rows have equal conductivities.
+    `soils` (m, k): numbers that identify the soil of each piece.  Pieces with equal rows have equal conductivities.
     """
     grid = cut.grid
     cells = cut.cells

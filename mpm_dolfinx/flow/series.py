@@ -108,11 +108,11 @@ def through(
 ) -> Through:
     """Return the conductances of m faces for the pressures on both sides.
 
-    laws: relative conductivities as functions of pressure
-    p (m,), Pa: pressures on each of both sides
-    paths (m, ...): paths of one or two cells, from their pressure positions to the face
-    lengths (m,), m: lengths of each of these paths
-    drops (m,), Pa: pressure drops caused by the fluid's weight along each path, from the first to the second side
+    `laws`: relative conductivities as functions of pressure.
+    `p` (m,), Pa: pressures on each of both sides.
+    `paths` (m, ...): paths of one or two cells, from their pressure positions to the face.
+    `lengths` (m,), m: lengths of each of these paths.
+    `drops` (m,), Pa: pressure drops caused by the fluid's weight along each path, from the first to the second side.
     """
     counts = [np.maximum((path.law >= 0).sum(axis=1), 1) for path in paths]
     kinds, kind = np.unique(np.stack(counts, axis=1), axis=0, return_inverse=True)

@@ -194,7 +194,7 @@ class StorageForms:
     ) -> NDArray[np.float64]:
         """Return the outflow (c,) of active cells to other cells, in m^d/s, caused by p and by the fluid's weight.
 
-        force (c, d), N/m^3: inertia force on the fluid in the local cells, or None
+        `force` (c, d), N/m^3: inertia force on the fluid in the local cells, or None.
         """
         relative, borders = self.fluxes.relative, None
         if relative is not None:
@@ -439,9 +439,9 @@ class StorageProblem:
     ) -> PETSc.Mat:
         """Return the matrix of additional damping in soft cells.
 
-        tau (n,), 1/Pa: strength of the damping for elastic soil
-        softest (n,): softness of the cells
-        mobility (n, d), m^2/(Pa s): mobilities along the axes
+        `tau` (n,), 1/Pa: strength of the damping for elastic soil.
+        `softest` (n,): softness of the cells.
+        `mobility` (n, d), m^2/(Pa s): mobilities along the axes.
         """
         contents, grid = self._contents, self.forms.grid
         flow = self.dt * mobility / grid.sizes(contents.filled) ** 2
@@ -536,8 +536,8 @@ class StorageProblem:
         """Return two arrays (n,): limited pressure decreases (Pa), and the resulting changes of the suction's
         logarithm.
 
-        dp (n,), Pa: pressure decreases in the Newton step
-        previous (n,): change of the suction's logarithm in the previous iteration
+        `dp` (n,), Pa: pressure decreases in the Newton step.
+        `previous` (n,): change of the suction's logarithm in the previous iteration.
         """
         p = self._p[0][self.system.unknowns.owned]
         dp = restrained(p, dp, self._scale, previous)
@@ -562,7 +562,7 @@ class StorageProblem:
 
         The function computes a matrix-free finite difference (Knoll and Keyes 2004) of the conductivity laws and of the
         geometry of the fluxes.  Its caller must then reset the fluxes with `set_fluxes`.
-        dofs: active dofs of u
+        `dofs`: active dofs of u.
         """
         h = self.forms.grid.least
         base, density = self._rates(self._flow(False)).cells, self._density
@@ -635,7 +635,7 @@ class StorageProblem:
         """Return the net inflow (n,) into each filled owned cell in the step by fluxes and sources, in m^d.
 
         Volumes refer to the density at mid-step, as in `change`.
-        rates: rates at the end of the substep
+        `rates`: rates at the end of the substep.
         """
         return (-self.dt * rates.cells - self._before.cells) / self._density
 
@@ -644,9 +644,9 @@ class StorageProblem:
     ) -> None:
         """Assemble the derivatives `C = d/dp` and `B = d/du` of the residual at (u, p).
 
-        data: quadrature points of the pieces, by default those of the problem
-        of_suction: for laws that depend on suction, cells (c,) and derivatives (c, n), m^(d-1), of their nodal forces
-        with respect to p
+        `data`: quadrature points of the pieces, by default those of the problem.
+        `of_suction`: for laws that depend on suction, cells (c,) and derivatives (c, n), m^(d-1), of their nodal forces
+        with respect to p.
         """
         forms = self.forms
         system = self.system

@@ -42,8 +42,8 @@ def _lasting(handle: int) -> PETSc.Vec:
 class Exchange:
     """A fixed assignment of array rows to processes, which can be used for several transfers.
 
-    comm: processes of the exchange
-    destination (n,): rank of the process that receives each row
+    `comm`: processes of the exchange.
+    `destination` (n,): rank of the process that receives each row.
     """
 
     def __init__(self, comm: MPI.Intracomm, destination: NDArray[np.int32]):

@@ -44,8 +44,8 @@ def write(comm: MPI.Intracomm, file: Path, arrays: Mapping[str, NDArray], rows: 
 
     If a process cannot write, all processes raise its error.
 
-    arrays: on rank 0, arrays by name
-    rows (n, ...): rows of this process of further arrays, by name.  The rows of all processes are in the order of the
+    `arrays`: on rank 0, arrays by name.
+    `rows` (n, ...): rows of this process of further arrays, by name.  The rows of all processes are in the order of the
     ranks.
     """
     part = file.with_name(file.name + ".part")
@@ -133,9 +133,9 @@ def read(
 
     Raise ValueError on all processes if the bytes of an array differ from its checksum.
 
-    of: the arrays by name
-    ranges: by name, first row of this process, and last row plus one.  The processes read all rows, in the order of the
-    ranks.
+    `of`: the arrays by name.
+    `ranges`: by name, first row of this process, and last row plus one.  The processes read all rows, in the order of
+    the ranks.
     """
     rows = together(comm, lambda: {name: some_rows(file, of[name], *ranges[name]) for name in of})
     sums = comm.gather([(zlib.crc32(found), found.nbytes) for found in rows.values()])
@@ -162,7 +162,7 @@ def _row_bytes(dtype: np.dtype, shape: tuple[int, ...]) -> int:
 
 
 def _joined(crc: int, parts: Iterable[tuple[int, int]]) -> int:
-    """Return the checksum of bytes with checksum `crc` and more parts.  parts: checksum and length of each."""
+    """Return the checksum of bytes with checksum `crc` and more parts.  `parts`: checksum and length of each."""
     for more, length in parts:
         for k in range(length.bit_length()):
             crc = _product(_power(k), crc) if length >> k & 1 else crc

@@ -53,9 +53,9 @@ def direct_solver(
 ) -> PETSc.KSP:
     """Return a solver that factorises A at the first solve and after changes of A.
 
-    symmetric: whether the factors are L D L^T
-    gathered: whether only the last process holds the factors, which suits many solves with the same matrix
-    package: package of the factorisation, by default PETSc on one process, and MUMPS on several
+    `symmetric`: whether the factors are L D L^T.
+    `gathered`: whether only the last process holds the factors, which suits many solves with the same matrix.
+    `package`: package of the factorisation, by default PETSc on one process, and MUMPS on several.
     """
     if symmetric:
         A.setOption(PETSc.Mat.Option.SYMMETRIC, True)
@@ -226,8 +226,8 @@ class SingleFactors:
 class NodalFactors:
     """Factors of displacement matrices with a block for each node, on the first process, computed on demand.
 
-    unknowns: unknown displacements, with consecutive components of each node
-    symmetric: whether the factors are U^T D U instead of L U
+    `unknowns`: unknown displacements, with consecutive components of each node.
+    `symmetric`: whether the factors are U^T D U instead of L U.
     """
 
     def __init__(self, unknowns: Unknowns, symmetric: bool):

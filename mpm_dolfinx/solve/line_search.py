@@ -50,14 +50,14 @@ steps with 0.05, 41 with 0.1, and 43 with 0.2.
 
 @dataclass(frozen=True)
 class Halving:
-    """Search for the step length without yield. step: next trial, as a fraction of the full step."""
+    """Search for the step length without yield. `step`: next trial, as a fraction of the full step."""
 
     step: float = 1.0
     limit = EXPLODES
     """Largest growth of the residual at the end of a step."""
 
     def after(self, work: float, growth: float) -> Halving | None:
-        """Return the next trial, or None if the search ends. growth: factor by which the residual grew."""
+        """Return the next trial, or None if the search ends. `growth`: factor by which the residual grew."""
         ends = growth <= self.limit or self.step < 2 * SHORTEST
         return None if ends else Halving(0.5 * self.step)
 
@@ -80,8 +80,8 @@ class Search:
 
         A full step that does not increase the residual ends the search if `|work| <= 1`. A secant gives the next trial.
         Bisection replaces the secant if one bound stays in place twice.
-        work: work in the last trial divided by the initial work, or nan
-        growth: growth factor of the residual in the last trial
+        `work`: work in the last trial divided by the initial work, or nan.
+        `growth`: growth factor of the residual in the last trial.
         """
         if not np.isfinite(work):
             end = self.step < 2 * SHORTEST

@@ -134,9 +134,9 @@ class BlockOperator:
 class BlockSolver:
     """GMRES for displacements and pressures together.
 
-    how: solver plan
-    momentum, storage: the matrices
-    cycles: two preconditioners, a multigrid cycle on K and a multigrid cycle on P
+    `how`: solver plan.
+    `momentum`, `storage`: the matrices.
+    `cycles`: two preconditioners, a multigrid cycle on K and a multigrid cycle on P.
     """
 
     def __init__(self, how: SolverPlan, momentum: MomentumSystem, storage: StorageSystem, cycles: Inverses):

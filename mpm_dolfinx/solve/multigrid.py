@@ -185,8 +185,8 @@ def _shared(
 
     The process of lowest rank with a candidate owns the unknown. Keys are distributed over processes to find owners.
 
-    keys (n,): coarse candidates of this process, ascending, below `count`
-    stated (n,): status `MAYBE`, `NOT` or `IS` of each candidate on this process. The largest value of all processes
+    `keys` (n,): coarse candidates of this process, ascending, below `count`.
+    `stated` (n,): status `MAYBE`, `NOT` or `IS` of each candidate on this process. The largest value of all processes
     counts.
     """
     ask = Exchange(comm, (keys * comm.size // count).astype(np.int32))

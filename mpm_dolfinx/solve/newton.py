@@ -173,10 +173,10 @@ def note_pressures(
     Hosea and Shampine (1996). The error of the step is assumed to be `ERROR` times this pressure. Errors and changes in
     a cell are weighted by the filling of the cell.
 
-    seconds, s: time weight of the rates of the first substep
-    dt, s: length of the step
-    of_bodies: function of n active owned cells and values (k, n), which returns the largest values (k, bodies) in each
-    body; see `Motion.of_bodies`
+    `seconds`, s: time weight of the rates of the first substep.
+    `dt`, s: length of the step.
+    `of_bodies`: function of n active owned cells and values (k, n), which returns the largest values (k, bodies) in
+    each body; see `Motion.of_bodies`.
     """
     if storage is None or not report.newton:
         return
@@ -224,8 +224,8 @@ class Newton:
         """Solve the balances by Newton's method.
 
         A tangent is reused while the iterations converge, and with linear laws over many steps.
-        serves: whether the tangent of the previous substep may be reused
-        ahead: see `solve_substep`
+        `serves`: whether the tangent of the previous substep may be reused.
+        `ahead`: see `solve_substep`.
         """
         errors, other = self._begin(ahead)
         fresh = self._linear or not serves
@@ -238,7 +238,7 @@ class Newton:
         return self._stable(self._iterations(errors, as_reset, key, fresh))
 
     def _iterations(self, errors: Errors, as_reset: AsReset, key: Hashable, fresh: bool) -> Errors:
-        """Iterate from the present (u, p). errors: errors there; fresh: whether to start with a new tangent."""
+        """Iterate from the present (u, p). `errors`: errors there; fresh: whether to start with a new tangent."""
         elastic = self._momentum.forms.elastic
         tolerance = self._scheme.tolerance
         keep = self._solvers.plan.keep
@@ -405,7 +405,7 @@ class Newton:
     def _errors(self, start: NDArray[np.float64] | None = None) -> Errors:
         """Assemble both residuals. Return the norm of each residual divided by its scale, and add both to the history.
 
-        start (parts,), N: forces at the start of the step. Forces at earlier iterates are not part of the scale,
+        `start` (parts,), N: forces at the start of the step. Forces at earlier iterates are not part of the scale,
         because after a diverging iterate every residual would seem small.
 
         Residuals within round-off are returned as 0. In the history these residuals are divided by scales of at least
@@ -432,7 +432,7 @@ class Newton:
         return Errors(u, p, forces, exchanged, forces if start is None else start, fluid)
 
     def _linearise(self, firmness: NDArray[np.float64] | float = 0.0) -> None:
-        """Set the tangent at the present (u, p), for this step only. firmness: see `LinearSolvers.linearise`."""
+        """Set the tangent at the present (u, p), for this step only. `firmness`: see `LinearSolvers.linearise`."""
         self._solvers.tangent.clear()
         self._solvers.linearise(self._momentum, self._storage, self._kept, firmness=firmness)
 
@@ -446,8 +446,8 @@ class Newton:
     def _direction(self, errors: Errors, slow: bool) -> int:
         """Solve the linearised problem, and return the number of coupling iterations.
 
-        slow: whether a new tangent has hardly reduced the residual of the storage, and this is the larger residual. The
-        tangent then also contains the derivative of fluxes with respect to displacements.
+        `slow`: whether a new tangent has hardly reduced the residual of the storage, and this is the larger residual.
+        The tangent then also contains the derivative of fluxes with respect to displacements.
         """
         # the next residual needs no more accuracy
         iterative, least = self._solvers.plan.iterative, self._solvers.plan.forcing

@@ -59,10 +59,10 @@ def planned(scheme: Scheme, momentum: MomentumSystem, storage: StorageSystem | N
 class SchurComplement:
     """Matrix-free Schur complement S = C + B K^-1 B^T for PETSc's Krylov solvers.
 
-    storage: the matrices B and C
-    solve: solver for systems with K
-    f, v: work vectors for the forces `B^T x` and the displacements `K^-1 f`
-    slopes: derivative of the fluxes with respect to displacements, if the tangent includes this derivative
+    `storage`: the matrices B and C.
+    `solve`: solver for systems with K.
+    `f`, `v`: work vectors for the forces `B^T x` and the displacements `K^-1 f`.
+    `slopes`: derivative of the fluxes with respect to displacements, if the tangent includes this derivative.
     """
 
     storage: StorageSystem
@@ -86,8 +86,8 @@ class SchurComplement:
 class Kept:
     """Data that the tangents of a step share. Each step starts without these data.
 
-    operator: whether the factors of the fixed-stress operator can be reused
-    factors: direct solvers that replace multigrid, or None
+    `operator`: whether the factors of the fixed-stress operator can be reused.
+    `factors`: direct solvers that replace multigrid, or None.
     """
 
     operator: bool = False
@@ -97,9 +97,9 @@ class Kept:
 class LinearSolvers:
     """Linear solvers for the matrices of one set of active cells.
 
-    how: solver plan, see `planned`
-    scheme: coupling scheme
-    momentum, storage: matrices and vectors of the balances; `storage` is None without fluid
+    `how`: solver plan, see `planned`.
+    `scheme`: coupling scheme.
+    `momentum`, `storage`: matrices and vectors of the balances; `storage` is None without fluid.
     """
 
     def __init__(self, how: SolverPlan, scheme: Scheme, momentum: MomentumSystem, storage: StorageSystem | None):
@@ -168,9 +168,10 @@ class LinearSolvers:
     ) -> bool:
         """Assemble the tangents at (u, p), and factorise them.
 
-        kept: data that the tangents of the step share
-        data: integration points, by default the points of the problems
-        firmness: fraction of the elastic shear stiffness that is added, as one number or as one for each connected part
+        `kept`: data that the tangents of the step share.
+        `data`: integration points, by default the points of the problems.
+        `firmness`: fraction of the elastic shear stiffness that is added, as one number or as one for each connected
+        part.
         """
         kept = kept or Kept()
         with _compat.Timer("tangent"):
@@ -268,7 +269,7 @@ class LinearSolvers:
     ) -> None:
         """Solve iteratively for x with equal relative accuracy in all connected parts, whose scales may differ.
 
-        measured: function that converts b to the vector whose norm the solver computes, or None for b itself
+        `measured`: function that converts b to the vector whose norm the solver computes, or None for b itself.
         """
         if of.count <= 1:
             ksp.solve(b, x)

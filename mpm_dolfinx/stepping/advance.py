@@ -64,9 +64,9 @@ Halving this value changes the result of scene "beam" in tests/plateaus.py by 1.
 class Motion:
     """Motion of a scene's material points in a step.
 
-    materials, bodies: all materials and bodies of the scene
-    momentum, storage: forms of the two balances, with u and p of a solved step; `storage` is None without fluid
-    keeps_volumes: whether yielded domains keep the volumes of their points, see `kept_volumes`
+    `materials`, `bodies`: all materials and bodies of the scene.
+    `momentum`, `storage`: forms of the two balances, with u and p of a solved step; `storage` is None without fluid.
+    `keeps_volumes`: whether yielded domains keep the volumes of their points, see `kept_volumes`.
     """
 
     def __init__(
@@ -224,7 +224,7 @@ class Motion:
         """Return a function for the hydrostatic pressures (Pa) at time t (s), up to a constant, or None without
         gravity.
 
-        nodal (nodes, d), m: displacement since the domains were cut
+        `nodal` (nodes, d), m: displacement since the domains were cut.
         """
         gravity, grid = stage.gravity_at(t), self._momentum.grid
         if gravity is None:  # even if nothing conducts: a distant body that conducts must not change pressures
@@ -463,7 +463,7 @@ class Motion:
     def _left(
         self, carried: PiecePressures, points: MaterialPoints, stage: Stage, t: float, on_grid: OnGrid, some: bool
     ) -> PiecePressures:
-        """Return the pieces with pressures at t (s) for the next grid. some: whether any point keeps its pieces."""
+        """Return the pieces with pressures at t (s) for the next grid. `some`: whether any point keeps its pieces."""
         with _compat.Timer("remap"):
             pieces = on_grid.cut.pieces
             store = self._materials.storage(points) * points.volume0 * points.J

@@ -265,8 +265,8 @@ class OnGrid(Keyed):
         storage, or by volume in cells without storage. With `water`, the sum of pore water in a cell is conserved. With
         gravity the reconstruction then acts on differences from the hydrostatic pressures `at_rest`.
 
-        store (m,), m^d/Pa: storage of the pieces
-        t, s: time of the pressures on open sides
+        `store` (m,), m^d/Pa: storage of the pieces.
+        `t`, s: time of the pressures on open sides.
         """
         pieces = self.data.pieces
         contents = self.contents
@@ -318,8 +318,8 @@ class OnGrid(Keyed):
         from hydrostatic pressures, which cause no flow through no-flow sides. In axisymmetry centroids and means refer
         to the sections.
 
-        t, s: time of the pressures on drained sides
-        at_rest: hydrostatic pressures, or None without gravity
+        `t`, s: time of the pressures on drained sides.
+        `at_rest`: hydrostatic pressures, or None without gravity.
         """
         places, p = self._places.pieces, self._storage.p.x.array
         seen = self._cell_pressures(p, stage, t, at_rest=at_rest)
@@ -334,9 +334,9 @@ class OnGrid(Keyed):
     ) -> CellPressures:
         """Return the cell pressures as mass potentials, with the data from which slopes are computed.
 
-        p (cells,), Pa: pressures of the local cells
-        bulk, Pa: bulk modulus of the fluid
-        at_rest: hydrostatic pressures that are subtracted
+        `p` (cells,), Pa: pressures of the local cells.
+        `bulk`, Pa: bulk modulus of the fluid.
+        `at_rest`: hydrostatic pressures that are subtracted.
         """
         contents = self.contents
         wet = Wet(self.cut, self.cut.points, contents, t)
@@ -355,7 +355,7 @@ class OnGrid(Keyed):
         return CellPressures(contents.filled, seen, contents.centroid, contents.open, outer)
 
     def mobility(self, data: QuadratureData, begins: bool) -> Mobility:
-        """Return the mobility of the filled owned cells at u. begins: whether invalid values raise ValueError."""
+        """Return the mobility of the filled owned cells at u. `begins`: whether invalid values raise ValueError."""
         at_pieces = self._quadrature.mobility(self.cut, self._storage.conductivity, data.pieces, begins)
         mean, share = self.contents.mean(at_pieces), None
         if self._storage.conductivity is not None:
@@ -369,8 +369,8 @@ class OnGrid(Keyed):
     ) -> Mobility:
         """Return the mobility of cells in unsaturated soil.
 
-        full (m,), m^2/(Pa s): mobilities of the pieces at saturation
-        mean, share: see `Mobility`, at saturation
+        `full` (m,), m^2/(Pa s): mobilities of the pieces at saturation.
+        `mean`, `share`: see `Mobility`, at saturation.
         """
         cut = self.cut
         law = cut.to_cells(self._quadrature.materials.retention_of(cut.points))
@@ -452,7 +452,7 @@ class OnGrid(Keyed):
         return self._of_points(*self.active.parts_of_cells)
 
     def _of_points(self, part: NDArray[np.int64], count: int) -> tuple[NDArray[np.int64], int]:
-        """Return the index (n,) of each point's part, from 0, and `count`. part: index for each cell, from 1."""
+        """Return the index (n,) of each point's part, from 0, and `count`. `part`: index for each cell, from 1."""
         out = np.zeros(len(self.cut.points), dtype=np.int64)
         out[self.cut.pieces.point] = self.cut.to_pieces(part[self.cut.cells] - 1)
         return out, count
@@ -602,11 +602,11 @@ class Assembled(Keyed):
 
         Without a conductivity law, cells whose points all keep their pieces have the flux geometry of the last reset.
 
-        state: state at the start of the step
-        weight (d,), N/m^3: unit weight of the fluid, or None without gravity
-        data: integration points
-        t, s: time of the pressures and fluxes on open sides
-        dt, s: length of the step
+        `state`: state at the start of the step.
+        `weight` (d,), N/m^3: unit weight of the fluid, or None without gravity.
+        `data`: integration points.
+        `t`, s: time of the pressures and fluxes on open sides.
+        `dt`, s: length of the step.
         """
         on_grid = self._on_grid
         contents = self._on_grid.contents
@@ -670,8 +670,8 @@ def assembled(
 ) -> Assembled:
     """Return the matrices for cut domains and a stage.
 
-    begins: whether every connected part of a body must have supports
-    pairs: keys of the pattern of contacts
+    `begins`: whether every connected part of a body must have supports.
+    `pairs`: keys of the pattern of contacts.
 
     Raises
     ------

@@ -108,7 +108,7 @@ def begin_stage(
     reset_displacement: bool,
     fields: Mapping[str, ArrayLike],
 ) -> State:
-    """Return the state at the beginning of a stage, see `Simulation.stage`. named: new conditions."""
+    """Return the state at the beginning of a stage, see `Simulation.stage`. `named`: new conditions."""
     before = state.stage
     if "gravity" in named and scene.gravity is None:
         raise ValueError("gravity: the scene has none; for changes it must be created with gravity=(0, 0)")
@@ -181,7 +181,7 @@ def _released(
 
     The tractions are a dict by name of point data. Its values are the ids (n,) of points on a side, and the tractions
     (n, d), in Pa, at these points. The stresses are in equilibrium with these tractions, the loads of the previous
-    stage, and the remaining supports. after: the new stage.
+    stage, and the remaining supports. `after`: the new stage.
     """
     start = set_up(scene, state, 0.0)
     state, momentum = start.state, scene.momentum
@@ -444,8 +444,8 @@ def balanced(scene: Scene, state: State) -> State:
 def _report(scene: Scene, seeded: State, points: MaterialPoints, count: int, left: float, touches: bool) -> None:
     """Log the changes by balancing. Raise ValueError for a large relative residual.
 
-    touches: whether contact may act. Contact is detected only in the first step, so a large residual then causes only a
-    warning.
+    `touches`: whether contact may act. Contact is detected only in the first step, so a large residual then causes only
+    a warning.
     """
     materials, comm = scene.materials, scene.grid.comm
     if left > REMARKABLE and not touches:
@@ -487,7 +487,7 @@ def _as_reset(scene: Scene, start: Start) -> State:
 
 
 def _mixed(unknowns: Unknowns, seen: Sequence[tuple[NDArray, NDArray]]) -> NDArray[np.float64]:
-    """Return the next displacement of a fixed-point iteration. seen: earlier displacements and steps."""
+    """Return the next displacement of a fixed-point iteration. `seen`: earlier displacements and steps."""
     (w, u), owned = seen[-1], unknowns.owned
     if len(seen) == 1:
         return w + u

@@ -49,8 +49,8 @@ LONGEST = 1.0
 class Renewal:
     """Renewal of the particle domains in a scene.
 
-    faces: faces of the bodies
-    materials: materials of the scene
+    `faces`: faces of the bodies.
+    `materials`: materials of the scene.
     """
 
     def __init__(self, faces: SeededFaces, materials: SceneMaterials):
@@ -142,7 +142,7 @@ class Renewal:
 
         All domains of a group have equal pressures: the mean of the old pressures, weighted by storage, or by volume
         without storage.
-        group (m,): group of each new domain, see `RefilledCells`
+        `group` (m,): group of each new domain, see `RefilledCells`.
         """
         materials, pieces = self._materials, work.pieces
         bulk = materials.fluid.bulk

@@ -158,7 +158,7 @@ class Result:
     def outcome(self, quantity: str) -> ByName[NDArray[np.float64]]:
         """Return the results (n, ...) of conditions at the output times, by name.
 
-        Values are nan at times without the condition. quantity: name of the results, such as "reactions".
+        Values are nan at times without the condition. `quantity`: name of the results, such as "reactions".
         """
         rows = [outcome.get(quantity, {}) for outcome in self.rows.outcomes]
         like = {name: np.full_like(value, np.nan) for row in rows for name, value in row.items()}

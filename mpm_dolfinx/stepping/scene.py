@@ -177,10 +177,10 @@ class Scene:
     ) -> MomentumProblem:
         """Return the balance of momentum at the end of a substep, with all coefficients of its forms set.
 
-        when: the substep
-        system, data, loads, options: see `MomentumProblem`
-        u (unknowns,), m: displacements at which the iterations begin, a local array, by default the present
-        displacements
+        `when`: the substep.
+        `system`, `data`, `loads`, `options`: see `MomentumProblem`.
+        `u` (unknowns,), m: displacements at which the iterations begin, a local array, by default the present
+        displacements.
         """
         self.t.value, self.dt.value = when.t, when.since
         if when.gravity is not None:
@@ -213,7 +213,7 @@ class Scene:
         cells.
 
         If gravity varies, each step resets the grid.
-        t, s: start of a step, at which the gravity of `stage` is evaluated
+        `t`, s: start of a step, at which the gravity of `stage` is evaluated.
         """
         if self.materials.retentions is not None:
             gravity = stage.gravity_at(t) if self.materials.conducts else None
@@ -346,9 +346,9 @@ class Scene:
     ) -> Assembled:
         """Return the matrices for a stage of the bodies on the grid.
 
-        now: present loads
-        as_cut: function that returns the loads at the positions at which domains were cut
-        begins: whether all parts of the bodies must have supports
+        `now`: present loads.
+        `as_cut`: function that returns the loads at the positions at which domains were cut.
+        `begins`: whether all parts of the bodies must have supports.
         """
 
         def make() -> Assembled:

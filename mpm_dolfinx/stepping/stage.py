@@ -193,7 +193,7 @@ class Stage:
         }
 
     def kinetic(self, outcome: Outcome) -> float:
-        """Return the kinetic energy (J) of free tools.  outcome: results of conditions, with velocities of tools."""
+        """Return the kinetic energy (J) of free tools.  `outcome`: results of conditions, with velocities of tools."""
         d, tools = self.free.shape[1], self.of(Tool)
         moving = [(tools[name].mass, v) for name, v in outcome.get("tool_velocity", {}).items() if name in tools]
         moving += [(tools[name].inertia(d), v) for name, v in outcome.get("tool_spin", {}).items() if name in tools]

@@ -101,7 +101,7 @@ class Trend:
     def over(self, seconds: float, implicit: bool = False, first: float = 0.0) -> NDArray[np.float64]:
         """Return the changes (n, ...) in a time `seconds` (s), from the polynomial through the last states.
 
-        implicit: whether the rate at the end of this time replaces the mean rate. If `first` > 0, the implicit change
+        `implicit`: whether the rate at the end of this time replaces the mean rate. If `first` > 0, the implicit change
         in a first substep of this length (s), times `seconds / first`, is subtracted.
         """
         order, last = np.arange(1, len(self.lengths) + 1), self.lengths[0]
