@@ -73,7 +73,7 @@ def warn_smeared(
     Parameters
     ----------
     least
-        Smallest lost fraction, in [0, 1], of which the function warns.
+        Smallest lost fraction, in [0, 1], for which the function warns.
 
     Returns
     -------
@@ -163,7 +163,7 @@ def check_stiff(grid: Grid, bodies: Sequence[Body]) -> None:
 
     Displacements that alternate from node to node along both axes then have no mean gradient in any piece.  They thus
     have no stiffness, however they vary along the third axis.  In 2D each component has a single field of this kind,
-    and walls prevent it.
+    and walls prevent this field.
     """
     for i, body in enumerate(bodies if grid.dim == 3 else ()):
         low, between = np.array([[np.inf], [-np.inf]]) * np.ones(grid.dim)  # of domains; the highest end inside a cell

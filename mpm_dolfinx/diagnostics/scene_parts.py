@@ -48,7 +48,7 @@ def check_options(
 
 
 def check_axisymmetry(grid: Grid, bodies: Sequence[Body], quadrature: str) -> None:
-    """Raise an error for point quadrature on grids that exclude it.  Warn about narrow holes around the axis."""
+    """Raise an error for point quadrature on grids that do not support it.  Warn about narrow holes around the axis."""
     if quadrature == "point" and (grid.axisymmetric or grid.follow is not None):  # fine cells would become empty
         raise ValueError("quadrature = 'point', must be 'domain' in axisymmetry, and on grid lines that follow")
     if not grid.has_axis:

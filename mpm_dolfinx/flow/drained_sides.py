@@ -4,13 +4,13 @@
 The outflow of a cell through a face is prescribed, or it is `T r [p - p_out + rho_w g . (x_out - x)]`.  Here p is the
 pressure at the centroid x of the cell's material.  The outside pressure p_out applies at the centroid x_out of the
 face.  T is `A kappa / d` with the area A of the face, the mobility kappa, and the distance d from x to the face.  The
-mobility is the conductivity divided by the unit weight of the fluid.  r is the density of the fluid divided by the
-density at zero pressure.  At a seepage face, fluid can only leave.  A primal-dual active-set method (Hintermueller, Ito
-and Kunisch 2002) opens faces with outflow and closes all other faces.  The method is applied at the start of the
-substep and after each solution (`SideFeeds.settle`).  Infiltration is the rain, but at most the inflow at the pressure
-of the pond.  Evaporation is at most the outflow at the driest pressure.  In addition to the rain, a pond of volume V
-supplies the inflow `V / dt` in a step of length dt, uniformly over its side.  Infiltration, ponding and run-off add up
-to the rain within rounding.
+mobility is the conductivity divided by the unit weight of the fluid.  The factor r is the density of the fluid divided
+by the density at zero pressure.  At a seepage face, fluid can only leave.  A primal-dual active-set method
+(Hintermueller, Ito and Kunisch 2002) opens faces with outflow and closes all other faces.  The method is applied at the
+start of the substep and after each solution (`SideFeeds.settle`).  Infiltration is the rain, but at most the inflow at
+the pressure of the pond.  Evaporation is at most the outflow at the driest pressure.  In addition to the rain, a pond
+of volume V supplies the inflow `V / dt` in a step of length dt, uniformly over its side.  Infiltration, ponding and
+run-off add up to the rain within rounding.
 """
 
 from __future__ import annotations
@@ -145,11 +145,11 @@ class OpenFaces:
     offset: NDArray[np.float64]  # vector from the centroid of the cell's material to the face (m, d), m
 
     def outflow(self, fluid: Fluid) -> NDArray[np.float64]:
-        """Return the outflow through each face (m,), m^d/s, as if all faces were open in both directions."""
+        """Return the outflow (m,) through each face, in m^d/s, as if all faces were open in both directions."""
         return self.conductance * fluid.pi[self.at] - self.inflow
 
     def open_by(self, fluid: Fluid) -> NDArray[np.float64]:
-        """Return the outflow through each face (m,) per unit of the cell's mass potential, m^d/(Pa s)."""
+        """Return the outflow (m,) through each face per unit of the cell's mass potential, in m^d/(Pa s)."""
         return self.conductance
 
     derivative = open_by
@@ -165,7 +165,7 @@ class OpenFaces:
         return np.where(self.seeps, 0.0, self.open_by(fluid) * difference * fluid.density[self.at]), 0.0
 
     def driven(self, fluid: Fluid) -> NDArray[np.float64]:
-        """Return the outflow through each face (m,), m^d/s, caused by inertia forces on the fluid."""
+        """Return the outflow (m,) through each face due to inertia forces on the fluid, in m^d/s."""
         along = np.einsum("md,md->m", fluid.force[self.at], self.offset)
         return np.where(self.seeps, 0.0, self.open_by(fluid) * along)
 
@@ -182,7 +182,7 @@ class UnsaturatedFaces(OpenFaces):
     drop: NDArray[np.float64]  # hydrostatic pressure drop from the centroid to the face (m,), Pa
 
     def outflow(self, fluid: Fluid) -> NDArray[np.float64]:
-        """Return the outflow through each face (m,), m^d/s, as if all faces were open in both directions."""
+        """Return the outflow (m,) through each face, in m^d/s, as if all faces were open in both directions."""
         return self.open_by(fluid) * (fluid.pi[self.at] - self.outer) - self.inflow
 
     def nonorthogonal(
@@ -198,11 +198,11 @@ class UnsaturatedFaces(OpenFaces):
         return 0.0, np.where(self.seeps, 0.0, share)
 
     def open_by(self, fluid: Fluid) -> NDArray[np.float64]:
-        """Return the outflow through each face (m,) per unit of the difference of mass potentials, m^d/(Pa s)."""
+        """Return the outflow (m,) through each face per unit difference of mass potentials, in m^d/(Pa s)."""
         return self.conductance * self._through(fluid)[0]
 
     def derivative(self, fluid: Fluid) -> NDArray[np.float64]:
-        """Return the derivative of the outflow with respect to the pressure of the cell, >= 0, m^d/(Pa s)."""
+        """Return the derivative (>= 0) of the outflow with respect to the pressure of the cell, in m^d/(Pa s)."""
         return self.conductance * self._through(fluid)[1]
 
     def _through(self, fluid: Fluid) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -224,7 +224,7 @@ class RainedFaces(OpenFaces):
     dry: OpenFaces  # these faces with the driest pressure outside
 
     def outflow(self, fluid: Fluid) -> NDArray[np.float64]:
-        """Return the outflow through each face (m,), m^d/s."""
+        """Return the outflow (m,) through each face, in m^d/s."""
         ponded = self.pond.outflow(fluid)
         return np.where(
             np.isnan(self.rain), ponded, np.minimum(np.maximum(-self.rain, ponded), self.dry.outflow(fluid))
@@ -239,15 +239,15 @@ class RainedFaces(OpenFaces):
         )
 
     def driven(self, fluid: Fluid) -> NDArray[np.float64]:
-        """Return the outflow through each face (m,), m^d/s, caused by inertia forces; zero on faces with rain."""
+        """Return the outflow (m,) through each face due to inertia forces, in m^d/s.  It is zero on faces with rain."""
         return np.where(np.isnan(self.rain), super().driven(fluid), 0.0)
 
     def open_by(self, fluid: Fluid) -> NDArray[np.float64]:
-        """Return the outflow through each face (m,) per unit of the difference of mass potentials, m^d/(Pa s)."""
+        """Return the outflow (m,) through each face per unit difference of mass potentials, in m^d/(Pa s)."""
         return self.pond.open_by(fluid)
 
     def derivative(self, fluid: Fluid) -> NDArray[np.float64]:
-        """Return the derivative of the outflow with respect to the pressure of the cell, m^d/(Pa s)."""
+        """Return the derivative of the outflow with respect to the pressure of the cell, in m^d/(Pa s)."""
         out = np.where(self.rain <= -self.dry.outflow(fluid), self.dry.derivative(fluid), 0.0)
         return np.where(self.rain < -self.pond.outflow(fluid), out, self.pond.derivative(fluid))
 
@@ -277,7 +277,7 @@ class SideFeeds(Feeds):
     def _pond(
         self, sides: OpenSides, ponds: tuple[float | None, ...], dt: float
     ) -> tuple[OpenSides, NDArray[np.float64]]:
-        """Return the sides under ponds with the present volumes; also return the largest volumes of the ponds, in m^d.
+        """Return the open sides with the effect of the present ponds, and the largest volumes of the ponds, in m^d.
 
         The rain of the returned sides includes the inflow that the ponds supply.
         `ponds`, m: largest depth of each pond.
@@ -294,7 +294,7 @@ class SideFeeds(Feeds):
 
     @property
     def _ponded(self) -> NDArray[np.float64]:
-        """Volume of the pond of each condition at the start of the step, m^d."""
+        """Volume (m^d) of the pond of each condition at the start of the step."""
         volumes = self._before.get("ponded", {})
         return np.array([float(volumes.get(name, 0.0)) for name in self._names])
 
@@ -326,7 +326,7 @@ class SideFeeds(Feeds):
         self._nonorthogonal, self._share = at.nonorthogonal(fluid, difference)
 
     def leaving(self, at: OpenFaces, fluid: Fluid) -> Leaving:
-        """Return the outflow of the cells.  The non-orthogonal correction is computed at the start of the substep."""
+        """Return the outflow of the cells, with the non-orthogonal correction from the start of the substep."""
         flux = self._through(at, fluid)
         if fluid.force is not None:
             flux = flux + at.driven(fluid)
@@ -346,7 +346,7 @@ class SideFeeds(Feeds):
         return changes
 
     def outflows(self, at: OpenFaces, fluid: Fluid) -> dict[str, NDArray[np.float64]]:
-        """Return the outflow through the sides of each condition, m^d/s, by name of the condition."""
+        """Return the outflow (m^d/s) through the sides of each condition, by name of the condition."""
         sums = over_all(self._comm, sum_by(self.sides.number, self._through(at, fluid), len(self._names)))
         return {name: np.array(sums[i]) for i, name in enumerate(self._names)}
 
@@ -370,7 +370,7 @@ class SideFeeds(Feeds):
     def volumes(
         self, rates: Sequence[Mapping[str, NDArray[np.float64]]], seconds: Sequence[float]
     ) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return the volumes of outflow, run-off and ponded water, m^d."""
+        """Return the volumes of outflow, run-off and ponded water, in m^d."""
         if not any(self._rains):
             return {}
         flowed, rained = np.einsum("s,snk->kn", seconds, [[of[name] for name in self._names] for of in rates])
@@ -391,5 +391,5 @@ class SideFeeds(Feeds):
         return np.where(self._flows | ~at.seeps, values, 0.0) if self.settles else values
 
     def _through(self, at: OpenFaces, fluid: Fluid) -> NDArray[np.float64]:
-        """Return the outflow through each face (m,), m^d/s."""
+        """Return the outflow (m,) through each face, in m^d/s."""
         return self._if_open(at, (1 + self._share) * at.outflow(fluid)) + self._nonorthogonal

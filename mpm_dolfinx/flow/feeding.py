@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Interface of the conditions on the pore fluid: drained sides, inflows, rain, sources.
 
-The method `feeding(setting)` of a condition returns a `Feeding`, which is created once in a stage and holds the faces.
+The method `feeding(setting)` of a condition returns a `Feeding`, which has the faces and is created once in a stage.
 `Feeding.placed` returns the `Feeds` of a substep.  At each assembly of the residual, `Feeds` add flow rates to the
 outflow of the cells.  `conditions/acting.py` has the corresponding interface for the momentum balance.
 """
@@ -46,7 +46,7 @@ class Fluid(NamedTuple):
 
 
 class Leaving(NamedTuple):
-    """Outflow from the n active owned cells by a condition, m^d/s."""
+    """Outflow (m^d/s) from the n active owned cells due to a condition."""
 
     cells: NDArray[np.float64]  # outflow (n,)
     turnover: NDArray[np.float64] | float = 0.0  # sum of absolute flows, the scale of rounding errors
@@ -78,11 +78,11 @@ class Feeds:
         raise NotImplementedError
 
     def slope(self, at: Any, fluid: Fluid) -> NDArray[np.float64] | float:
-        """Return the derivative (n,) of the outflow with respect to the pressure of the cell, m^d/(Pa s)."""
+        """Return the derivative (n,) of the outflow with respect to the pressure of the cell, in m^d/(Pa s)."""
         return 0.0
 
     def settle(self, at: Any, fluid: Fluid) -> int:
-        """Update the active set; return the number of changes on this process."""
+        """Update the active set, and return the number of changes on this process."""
         return 0
 
     def outflows(self, at: Any, fluid: Fluid) -> dict[str, NDArray[np.float64]]:
@@ -94,7 +94,7 @@ class Feeds:
         return {}
 
     def passing(self, at: Any, fluid: Fluid) -> Mapping[str, NDArray[np.float64]]:
-        """Return those rates of a substep from which `volumes` are computed.  All processes must call this."""
+        """Return the rates of a substep that determine `volumes`.  All processes must call this."""
         return {}
 
     def volumes(

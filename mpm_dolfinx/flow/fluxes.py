@@ -222,7 +222,7 @@ class CellContents(Keyed):
         self.volume, area, self.fixed_stress = sums[:3]
         """Volumes (n,) of the material in filled cells, in m^d.  `fixed_stress` has mean coefficients times volumes."""
         self.fill = np.minimum(area / grid.volumes(filled), 1.0)
-        """Volume fractions of material in the filled cells (n,)."""
+        """Volume fractions (n,) of material in the filled cells."""
         shapes = (forms.centroid, forms.lower_face, forms.upper_face)
         self._damped, self._damping = forms.damping, pieces.damping
         forms.fixed_stress.x.array[filled] = self.fixed_stress

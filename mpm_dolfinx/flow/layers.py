@@ -3,9 +3,9 @@
 
 Soils along a line are in series, and lines are in parallel.  The mobility of a line is the harmonic mean of the
 mobilities along it.  The mobility of a cell along an axis is the arithmetic mean over the lines along this axis
-(Cardwell and Parsons 1945).  It is exact for flow along and across any number of layers parallel to the grid.  Inclined
-layers must be at least a cell thick.  Only then does a seam of low conductivity block all lines of some cell, and only
-then does a drain contain complete lines.
+(Cardwell and Parsons 1945).  This mobility is exact for flow along and across any number of layers parallel to the
+grid.  Inclined layers must be at least a cell thick.  Only then does a seam of low conductivity block all lines of some
+cell, and only then does a drain contain complete lines.
 
 The pressure of a cell refers to one position in the cell, the pressure position.  Steady flow along a line has the mean
 pressure of the line at this position.  Let R be the resistance of the line, and let s increase from 0 to 1 along the
@@ -58,7 +58,7 @@ class MixedCells:
     Parameters
     ----------
     rows
-        Indices of the pieces (m,) in mixed cells, ordered by cell.
+        Indices (m,) of the pieces in mixed cells, ordered by cell.
     cells
         Cells (m,) of the pieces.
     low, high

@@ -36,7 +36,7 @@ def second_differences(
     coefficient has the same effect on alternating pressures.
     `centroid` (c, d), m: centroids of the material in the local cells, relative to the midpoints of the cells.
     `opening` (c, d, 2): open fractions of the lower and upper faces of the local cells, in axisymmetry times
-    `Grid.around`
+    `Grid.around`.
     """
     own = unknowns.owned
     number = unknowns.map.indices

@@ -65,7 +65,7 @@ class Paths(NamedTuple):
 
 
 class Through(NamedTuple):
-    """Conductances of m faces between two pressures."""
+    """Conductances of m faces for the pressures on both sides."""
 
     conductance: NDArray[np.float64]  # conductances (m,), m/(Pa s)
     slopes: tuple[NDArray[np.float64], NDArray[np.float64]]  # d flux / dp[0] and -d flux / dp[1]
@@ -109,9 +109,9 @@ def through(
     """Return the conductances of m faces for the pressures on both sides.
 
     `laws`: relative conductivities as functions of pressure.
-    `p` (m,), Pa: pressures on each of both sides.
+    `p` (m,), Pa: pressures on both sides, as two arrays.
     `paths` (m, ...): paths of one or two cells, from their pressure positions to the face.
-    `lengths` (m,), m: lengths of each of these paths.
+    `lengths` (m,), m: lengths of the paths.
     `drops` (m,), Pa: pressure drops caused by the fluid's weight along each path, from the first to the second side.
     """
     counts = [np.maximum((path.law >= 0).sum(axis=1), 1) for path in paths]
@@ -186,7 +186,7 @@ class _Chain:
         raise NotConverged("soils in series: no solution for the pressure at their interface")
 
     def _flows(self, p: NDArray[np.float64]) -> _Flows:
-        """Return the flows at node pressures p (m, nodes), Pa."""
+        """Return the flows at the node pressures p (m, nodes), in Pa."""
         links = self._links
         ends = p[links.face, links.low], p[links.face, links.high]
         k, slopes = self._laws.between(links.law, ends, links.drop)

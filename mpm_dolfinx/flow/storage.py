@@ -6,16 +6,16 @@
     int r [zeta(J_Delta, p) - zeta_n] dV_n  +  int sum_faces Q dt  =  0,      d zeta = alpha dJ + S J dp,
     Q = T r [p+ - p- + rho_w g . (x- - x+)],   T = A / (d+ / kappa+ + d- / kappa-),   kappa = k / (rho_w g).
 
-(With div u instead of J_Delta, rotations would cause volume changes.)  r = exp(p / K_w) is the fluid density divided by
-the density rho_w at zero pressure.  In the storage term, r is taken at the pressure `(p_n + p) / 2`.  On a face, r is
-the logarithmic mean over both cells.  With this mean, `r [p+ - p-]` is the jump of the mass potential
+With div u instead of J_Delta, rotations would cause volume changes.  The factor `r = exp(p / K_w)` is the fluid density
+divided by the density rho_w at zero pressure.  In the storage term, r is taken at the pressure `(p_n + p) / 2`.  On a
+face, r is the logarithmic mean over both cells.  With this mean, `r [p+ - p-]` is the jump of the mass potential
 (`fluid_content`), and the mass that leaves a cell enters the neighbour.  The residual is the left side of the balance,
 divided by the r of the storage term.  The tangent neglects the difference between the r of a face and the r of the
-storage term.  A is the exact area of the body on the face, and k is the conductivity.  x+- are the centroids of the
-material in both cells, and d+- their distances from the face.  `layers` defines kappa and d of mixed cells.  With
-distances from centroids, the error is 0.2 % for any filling of the cells.  With half of the cell size as distance, the
-error would be up to 12 %.  `nonorthogonal` corrects fluxes if the two centroids are offset along the face.  The sum of
-the balances of all cells is the fluid balance of the bodies.  `fluid_content` defines the change of the content, and
+storage term.  A is the exact area of the body on the face, and k is the conductivity.  The points x+- are the centroids
+of the material in both cells, and d+- are their distances from the face.  `layers` defines kappa and d of mixed cells.
+With distances from centroids, the error is 0.2 % for any filling of the cells.  With half of the cell size as distance,
+the error would be up to 12 %.  `nonorthogonal` corrects fluxes if the two centroids are offset along the face.  The sum
+of the balances of all cells is the fluid balance of the bodies.  `fluid_content` defines the change of the content, and
 `time_integration` the integral over a substep.
 
 The volumes of domains drift from their fluid content, for three reasons: corners do not follow u alone, points move to
@@ -64,8 +64,8 @@ from mpm_dolfinx.points.parts import OfParts, Parts
 from mpm_dolfinx.pores.retention import logarithm, restrained
 
 FILTER = 0.75
-"""Fraction, in [0, 1], of `beta V` that the filtered fixed-stress operator omits for checkerboard modes.  beta is the
-fixed-stress coefficient, and V is the volume.  Halving this value changes the result of scene "beam" in
+"""Fraction, in [0, 1], of `beta V` that the filtered fixed-stress operator omits for checkerboard modes.  Here beta is
+the fixed-stress coefficient, and V is the volume.  Halving this value changes the result of scene "beam" in
 tests/plateaus.py by 5.2e-11 (relative), doubling it by 1.3e-10, and finer cells by 1.5e-02.
 """
 
@@ -278,7 +278,7 @@ class StorageSystem:
         return (self._uniform or self._over_uniform())[1]
 
     def _over_uniform(self) -> tuple[FacetSum | None, FacetSum | None]:
-        """Return two forms over the faces between cells of the same soil: that of the flux matrix, and `gravity`."""
+        """Return two forms over the faces between cells of one soil: the form of the flux matrix, and `gravity`."""
         fluxes, facets = self._forms.fluxes, self._facets
         facets = facets if fluxes.relative is None else fluxes.relative.uniform(facets)
         return tuple(form and form.on(facets) for form in (fluxes.flux, fluxes.gravity))
@@ -425,7 +425,7 @@ class StorageProblem:
         """Whether jumps of the pressure are damped in any cell."""
         self._softer = self._damping_of_soft_soil(tau, softest, outflow.mobility) if flows else None
         self._correction = self._begin(outflow)
-        """Non-orthogonal correction of the fluxes at the start of the substep, m^d/s.  The tangent omits this
+        """Non-orthogonal correction (m^d/s) of the fluxes at the start of the substep.  The tangent omits this
         correction.
         """
         if self.damped:
@@ -467,12 +467,12 @@ class StorageProblem:
         return {name: values for one, at in both for name, values in one.outflows(at, fluid).items()}
 
     def run_off(self) -> dict[str, NDArray[np.float64]]:
-        """Return the run-off, m^d/s, by name of the condition."""
+        """Return the run-off, in m^d/s, by name of the condition."""
         fluid, both = self._fluid, zip(self._feeds, self._flow(False).at, strict=True)
         return {name: values for one, at in both for name, values in one.run_off(at, fluid).items()}
 
     def passing(self) -> list[Mapping[str, NDArray[np.float64]]]:
-        """Return those rates of a converged substep from which `volumes` are computed."""
+        """Return the rates of a converged substep that determine `volumes`."""
         fluid, both = self._fluid, zip(self._feeds, self._flow(False).at, strict=True)
         return [one.passing(at, fluid) for one, at in both]
 
@@ -492,7 +492,7 @@ class StorageProblem:
 
     @property
     def fill(self) -> NDArray[np.float64]:
-        """Volume fraction of material in each cell.  Errors and changes of the cell's pressure are weighted with it."""
+        """Volume fraction of material in each cell, the weight of errors and changes of the cell's pressure."""
         return self._contents.fill
 
     def sealed(self, volumes: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -527,7 +527,7 @@ class StorageProblem:
 
     @property
     def accuracy(self) -> float:
-        """Largest relative tolerance of linear solves.  Dry cells store little fluid, so errors there must be small."""
+        """Largest relative tolerance of linear solves.  Dry cells store little fluid, so their errors must be small."""
         return SAME if self.forms.retains else 1.0
 
     def restrained(
@@ -679,10 +679,10 @@ class StorageProblem:
         factor
             Multiple of beta, >= 0.
         share
-            Weight of the filter L, in [0, 1]; 0 gives the fixed-stress operator.  With the stiffness K, `B K^-1 B^T`
-            equals `beta V` for a smooth pressure, and zero for a checkerboard.  For a pressure that alternates along
-            one axis, it equals `beta V / 2` at nu = 0.  The matrix `beta V - L` gives these three values.  L is the sum
-            of `min(beta V+, beta V-) / (4 d) [p][q]` over the faces.
+            Weight of the filter L, in [0, 1].  The weight 0 gives the fixed-stress operator.  With the stiffness K, `B
+            K^-1 B^T` equals `beta V` for a smooth pressure, and zero for a checkerboard.  For a pressure that
+            alternates along one axis, it equals `beta V / 2` at nu = 0.  The matrix `beta V - L` gives these three
+            values.  L is the sum of `min(beta V+, beta V-) / (4 d) [p][q]` over the faces.
         """
         system = self.system
         system.C.copy(system.P, structure=PETSc.Mat.Structure.SAME_NONZERO_PATTERN)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Fluxes in unsaturated soil: conductivities of faces from the pressures on both sides.
 
-The relative conductivity k_r of a face is the mean of k_r over all pressures between those on both sides
+The relative conductivity k_r of a face is the mean of k_r over all pressures between the pressures on both sides
 (`retention.Conductance`).  With the value of the wetter side, a wetting front would move too fast.  With gravity the
 mean is modified (`fitted`), so that steady flow with exponential k_r is exact.  See `series` for mixed cells.
 """
@@ -182,7 +182,7 @@ class Relative:
         return facets if faces is None else faces.borders.uniform
 
     def at(self, cells: NDArray[np.int64], p: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return k_r (m,) of owned cells at pressures (m,), Pa."""
+        """Return k_r (m,) of owned cells at the pressures p (m,), in Pa."""
         k = np.stack([np.ones(len(p)), *(law(p)[:, 1] for law in self._laws.conductances)], axis=1)
         return (self.shares.x.array.reshape(-1, self.count)[cells] * k).sum(axis=1)
 

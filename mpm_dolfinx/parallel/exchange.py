@@ -107,7 +107,7 @@ def to_root(comm: MPI.Intracomm, rows: int) -> Exchange:
 
 
 def evenly(comm: MPI.Intracomm, numbers: NDArray[np.int64]) -> NDArray[np.int32]:
-    """Return ranks (n,) for ascending numbers (n,) >= 0.  No number occurs twice on all processes.
+    """Return ranks (n,) for ascending numbers (n,) >= 0.  All numbers of all processes differ.
 
     The ranks get equal shares of all numbers, in ascending order: the smallest numbers go to rank 0, and so on.
     """
@@ -138,7 +138,10 @@ def everywhere(comm: MPI.Intracomm, ask: Callable[[], T]) -> T:
 
 
 def together(comm: MPI.Intracomm, action: Callable[[], T]) -> T:
-    """Return the result of an action on this process.  If it raises on any process, all raise the first error."""
+    """Return the result of an action on this process.
+
+    If the action fails on any process, all raise the first error.
+    """
     value = error = None
     try:
         value = action()

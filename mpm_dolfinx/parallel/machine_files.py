@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Arrays with one copy on each machine, in a temporary file that all processes of the machine map into memory.
 
-A process loads only those pages of the file that it reads.  The operating system may drop these pages again.  The file
+A process loads only the pages of the file that it reads.  The operating system may drop these pages again.  The file
 loses its name once all processes have opened it.  Its space becomes free when the last array is deleted.
 """
 

@@ -1,18 +1,19 @@
 # SPDX-License-Identifier: MIT
-"""Direct linear solvers, used where they are faster than multigrid (`multigrid`): see `plan`.
+"""Direct linear solvers, which are used where they are faster than multigrid (`multigrid`), see `plan`.
 
 PETSc's own factors of displacement matrices, with a block for each node, take a third of the time of scalar factors.
 With 44000 unknowns in 2D and minimum degree ordering, the first factorisation takes 110 ms in blocks, 430 ms in
 scalars, 260 ms with MUMPS, 290 ms with UMFPACK and 285 ms with CHOLMOD. The next factorisation with the same sparsity
 pattern takes 60 ms in blocks, 150 ms in scalars, 155 ms with MUMPS, 265 ms with UMFPACK and 290 ms with CHOLMOD. A
-solve takes 4 ms, 15 ms with MUMPS, and 9 ms with CHOLMOD. Copying the entries into blocks takes a tenth of the
-factorisation. On two processes, MUMPS factorises in the same time as on one process, and a solve takes 25 ms. On
+solve takes 4 ms in blocks, 15 ms with MUMPS, and 9 ms with CHOLMOD. Copying the entries into blocks takes a tenth of
+the factorisation. On two processes, MUMPS factorises in the same time as on one process, and a solve takes 25 ms. On
 several processes, one of them therefore holds the factors of displacements, which many solves use. Another process
 computes and holds the factors of pressures at the same time. When each of four processes computed both factors itself,
 this took 1.7 times as long, because processes share the bandwidth of the memory. In large scenes MUMPS distributes the
-factors over processes (`Thresholds.mumps`). SuperLU_DIST is slower. With 100100 unknowns, factors of K take 841 ms
-(MUMPS 476 ms), and a solve takes 56 ms (MUMPS 57 ms). With 25500 unknowns, they take 125 ms and 9 ms with SuperLU_DIST.
-MUMPS then factorises K and the storage together in 385 ms, four times as long as K alone.
+factors over processes (`Thresholds.mumps`). SuperLU_DIST is slower. With 100100 unknowns, SuperLU_DIST takes 841 ms for
+the factors of K (MUMPS 476 ms), and 56 ms for a solve (MUMPS 57 ms). With 25500 unknowns, SuperLU_DIST takes 125 ms for
+the factors, and 9 ms for a solve. MUMPS then factorises K and the storage together in 385 ms, four times as long as K
+alone.
 
 Large bodies need nested dissection. With 504000 unknowns in 2D, a repeated factorisation ordered by grid lines
 (`dissection`) takes 3.0 s, and the factors have 4.6e7 entries. PETSc's nested dissection takes 5.1 s, with 5.0e7
@@ -110,7 +111,7 @@ def negative_pivots(solver: PETSc.KSP) -> int:
 
 
 def displacement_solver(A: PETSc.Mat, name: str, unknowns: Unknowns, how: str, symmetric: bool) -> PETSc.KSP:
-    """Return a direct solver for many solves with the same matrix A of displacements; how: see `plan`."""
+    """Return a direct solver for many solves with one matrix A of displacements. `how`: see `plan`."""
     if how != NODAL:
         return direct_solver(A, name, symmetric, package="mumps" if how == MUMPS else None)
     ksp = _preonly(A, name)
@@ -257,7 +258,7 @@ class NodalFactors:
 
 
 def dissection(x: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return the nested-dissection order (n,) of nodes of a grid at positions x (n, d), m.
+    """Return the nested-dissection order (n,) of nodes of a grid at positions x (n, d), in m.
 
     The middle grid line halves a box of nodes. Nodes on this line come last. Each half is divided in the same way.
     """
@@ -286,7 +287,7 @@ class BlockFactors:
     Parameters
     ----------
     rows, columns
-        The pattern, in compressed rows.
+        The sparsity pattern, in compressed rows.
     block, axis
         Node and component of each unknown.
     x : (n, d)

@@ -6,7 +6,7 @@ spurious stretch. The step is halved until all laws can be evaluated at its end,
 enormously.
 
 In yielding soil, the criterion is the work of the residual forces along the step. The step is full if the work at its
-end is less than half of the initial work. It is also full if the residual falls, and the work does not exceed the
+end is less than half of the initial work. The step is also full if the residual falls, and the work does not exceed the
 initial work. Otherwise bracketed secants look for the step length at which the work is zero. The secants end at less
 than half of the initial work (Matthies and Strang 1979). If the work were nearer to zero, soil might unload, and would
 then be elastic in the next tangent. The work of the fluid's residual is added, because forces do nearly no work if only
@@ -78,8 +78,8 @@ class Search:
     def after(self, work: float, growth: float) -> Search | None:
         """Return the next trial, or None if the search ends.
 
-        A full step that does not increase the residual ends the search if `|work| <= 1`. A secant gives the next trial.
-        Bisection replaces the secant if one bound stays in place twice.
+        A full step that does not increase the residual ends the search if `abs(work) <= 1`. A secant gives the next
+        trial. Bisection replaces the secant if one bound stays in place twice.
         `work`: work in the last trial divided by the initial work, or nan.
         `growth`: growth factor of the residual in the last trial.
         """

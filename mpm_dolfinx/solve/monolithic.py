@@ -13,9 +13,9 @@ multigrid cycle approximates K^-1, and another cycle P^-1.  The bodies that need
 In 3D, GMRES takes 7 to 12 iterations to the tolerance 1e-3, each with one cycle on K.  Other methods are slower.  They
 were tested with algebraic multigrid and Jacobi smoothing, with which GMRES takes 10 to 15 iterations.  Conjugate
 gradients on the Schur complement took 3 iterations, but 35 to 60 cycles in their inner solves.  Flexible GMRES with
-inner solves to 0.1 or 0.01 took 12 to 24 cycles.  MINRES with the diagonal blocks took 17 to 23 cycles, and left a
-residual five times as large.  In 2D, GMRES takes 8 iterations to the tolerance 1e-5, and 12 iterations with algebraic
-multigrid on P.
+inner solves to tolerances of 0.1 or 0.01 took 12 to 24 cycles.  MINRES with the diagonal blocks took 17 to 23 cycles,
+and left a residual five times as large.  In 2D, GMRES takes 8 iterations to the tolerance 1e-5, and 12 iterations with
+algebraic multigrid on P.
 
 At nu = 0.499 the cycle is inaccurate, and GMRES takes more than 100 iterations with 14^3 cells.  If a solve takes too
 many iterations (see `plan`), or is predicted to take too many, factors of K replace the cycle.  These factors are kept

@@ -76,7 +76,7 @@ def multigrid_solver(
     firmly
         Whether to use the stronger smoother `FIRMLY`.
     lines : (n,) along each axis, m
-        Grid lines, for cells of different sizes. The weights of displacements then depend on the distances of nodes.
+        Grid lines, for cells of different sizes. Interpolation of displacements then uses the distances of nodes.
     """
     ksp = PETSc.KSP().create(A.comm)
     ksp.setType(PETSc.KSP.Type.GMRES)
@@ -102,7 +102,7 @@ def interpolations(
     coarsest: int,
     lines: Sequence[NDArray[np.float64]] | None = None,
 ) -> list[PETSc.Mat]:
-    """Return the interpolations from each coarse grid to the next finer grid, the finest first.
+    """Return the interpolations from each coarse grid to the next finer grid, beginning with the finest grid.
 
     comm: processes that share the unknowns; other parameters as in `multigrid_solver`.
     """

@@ -59,7 +59,7 @@ SETTLED = 1e-2  # residual below which slip of contacts may end; above it the co
 ERROR = 1 / 20
 """Assumed pressure error of a run, divided by the estimated error e of a first-order step (`note_pressures`).
 
-For a mode with decay rate l, the stability function of sdirk2 gives an error of `0.081 dt |l| e` in a step, at most
+For a mode with decay rate l, the stability function of sdirk2 gives an error of `0.081 dt abs(l) e` in a step, at most
 0.28 e. A pressure that follows a varying load has an error of at most 0.14 e. With little decay, the errors of all
 steps add up to 0.081 e. Errors were measured against steps an eighth as long. They are 0.05 to 0.08 e if loads rise or
 oscillate, or if the prescribed pressure on a drained side oscillates. They are 0.01 to 0.04 e with an oscillating
@@ -67,12 +67,12 @@ source, and 0.01 to 0.05 e late in a consolidation. The error is 0.17 e in a fir
 a jump. In a run it is at most 5 e / 20.
 """
 SUDDEN = np.sqrt(2)
-"""sdirk2 overshoots if a pressure changes in the second substep by less than this multiple of its first change.
+"""sdirk2 overshoots if the ratio of pressure changes in the second and the first substep is less than this value.
 
-The first change is that in the first substep. With `z = -(decay rate) dt`, the stability function `(1 + (1 - 2 gamma)
-z) / (1 - gamma z)^2` changes its sign at `z = -1 - sqrt(2)`. At this z, a pressure changes by `-gamma z / (1 - gamma z)
-= sqrt(2) - 1` in the first substep, and by `2 - sqrt(2)` in the second substep. If pressures follow loads, the ratio of
-these changes is `(1 - gamma) / gamma`. Source: exact, the ratio of these changes.
+With `z = -(decay rate) dt`, the stability function `(1 + (1 - 2 gamma) z) / (1 - gamma z)^2` changes its sign at `z =
+-1 - sqrt(2)`. At this z, a pressure changes by `-gamma z / (1 - gamma z) = sqrt(2) - 1` in the first substep, and by `2
+- sqrt(2)` in the second substep. If pressures follow loads, the ratio of these changes is `(1 - gamma) / gamma`.
+Source: exact, the ratio of these changes.
 """
 
 
@@ -238,7 +238,7 @@ class Newton:
         return self._stable(self._iterations(errors, as_reset, key, fresh))
 
     def _iterations(self, errors: Errors, as_reset: AsReset, key: Hashable, fresh: bool) -> Errors:
-        """Iterate from the present (u, p). `errors`: errors there; fresh: whether to start with a new tangent."""
+        """Iterate from the present (u, p). `errors`: errors at (u, p). `fresh`: whether to start with a new tangent."""
         elastic = self._momentum.forms.elastic
         tolerance = self._scheme.tolerance
         keep = self._solvers.plan.keep

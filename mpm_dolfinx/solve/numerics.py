@@ -26,14 +26,15 @@ class Numerics:
     coupling
         Coupling scheme of the balances of momentum and fluid, one of `COUPLINGS`.
     tolerance
-        Tolerance of both residuals, relative to the forces and to the exchanged fluid volume, in (0, 1).
+        Tolerance, in (0, 1), of the momentum residual relative to the forces, and of the fluid residual relative to the
+        exchanged fluid volume.
     method
         Time integration: "sdirk2" (second order) or "backward-euler".
     renewal
-        Whether to replace particle domains of yielded soil that are longer than a cell, see `stepping/renewal.py`. It
-        requires quadrature "domain", yielding dry or saturated soil in 2D, no `Contact`, and in axisymmetry no inertia.
-        On a grid with `follow`, elastic domains are also divided and merged, see `stepping/division.py`. Division and
-        merging require quadrature "domain", dry or saturated soil, no `Contact` and no inertia.
+        Whether to replace particle domains of yielded soil that are longer than a cell, see `stepping/renewal.py`.
+        Renewal requires quadrature "domain", yielding dry or saturated soil in 2D, no `Contact`, and in axisymmetry no
+        inertia. On a grid with `follow`, elastic domains are also divided and merged, see `stepping/division.py`.
+        Division and merging require quadrature "domain", dry or saturated soil, no `Contact` and no inertia.
     keep_volumes
         Whether yielded domains keep the volumes of their points, see `domains/kept_volumes.py`. With "point" it has no
         effect.

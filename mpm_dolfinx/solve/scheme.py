@@ -31,7 +31,8 @@ class Scheme:
     coupling
         Name in `COUPLINGS`.
     tolerance
-        Tolerance of both residuals, relative to the forces and to the exchanged fluid volume, in (0, 1).
+        Tolerance, in (0, 1), of the momentum residual relative to the forces, and of the fluid residual relative to the
+        exchanged fluid volume.
     most_newton, most_coupling
         Largest numbers of Newton steps and of coupling iterations (with `fixed-stress`) in a step.
     petsc_options

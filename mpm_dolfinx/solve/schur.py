@@ -8,9 +8,9 @@
 solved by conjugate gradients (or FGMRES), with the fixed-stress operator as preconditioner. For large bodies GMRES
 solves for both unknowns (`monolithic`).
 
-PETSc's PCFIELDSPLIT (full Schur factorisation) with equal solvers takes equally many iterations, and gives equal
-digits. It takes 0.8 to 1 times the time of the present solves. But PCFIELDSPLIT needs a copy of -B^T for each tangent,
-and fixed-stress iterations would still need the blocks.
+PETSc's PCFIELDSPLIT (full Schur factorisation) with equal solvers takes equally many iterations, and its results have
+equal digits. It takes 0.8 to 1 times the time of the present solves. But PCFIELDSPLIT needs a copy of -B^T for each
+tangent, and fixed-stress iterations would still need separate blocks.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from mpm_dolfinx.solve.solver_choice import AT_ONCE, MULTIGRID, MUMPS, SolverPla
 
 
 def planned(scheme: Scheme, momentum: MomentumSystem, storage: StorageSystem | None, symmetric: bool) -> SolverPlan:
-    """Return the solver plan for problems with these matrices; symmetric: whether K is symmetric."""
+    """Return the solver plan for problems with these matrices. `symmetric`: whether K is symmetric."""
     unknowns = momentum.unknowns
     return plan(
         unknowns.global_size,
@@ -57,7 +57,7 @@ def planned(scheme: Scheme, momentum: MomentumSystem, storage: StorageSystem | N
 
 @dataclass(frozen=True, eq=False)
 class SchurComplement:
-    """Matrix-free Schur complement S = C + B K^-1 B^T for PETSc's Krylov solvers.
+    """Matrix-free Schur complement `S = C + B K^-1 B^T` for PETSc's Krylov solvers.
 
     `storage`: the matrices B and C.
     `solve`: solver for systems with K.

@@ -29,14 +29,15 @@ class Thresholds:
         takes 0.06 s (10400 unknowns), 0.19 s (25500), 0.53 s (51000) and 2.3 s (151000) with a direct solver. It takes
         0.05 s (10400 unknowns), 0.14 s (25500), 0.32 s (51000) and 1.0 s (151000) with multigrid.
     mumps
-        Number of unknown displacements from which MUMPS computes factors in wet scenes, if K is not symmetric or on
-        several processes. The processes then share the factors. Below this number one process holds the factors of K,
-        which have 1.5e7 entries (0.12 GB) at the limit. On two processes, the factors of K take 20 ms (5700 unknowns),
-        174 ms (25500), 708 ms (61400) and 1481 ms (100100) with PETSc on one of the processes. With MUMPS they take 16
-        ms (5700 unknowns), 98 ms (25500), 306 ms (61400) and 476 ms (100100). A solve takes 0.5 ms (5700 unknowns), 3.5
-        ms (25500), 11 ms (61400) and 18 ms (100100) with PETSc. With MUMPS it takes 3.8 ms (5700 unknowns), 15 ms
-        (25500), 37 ms (61400) and 57 ms (100100). Without pressures, MUMPS thus pays if a tangent is used for fewer
-        solves than 1 (5700 unknowns), 7 (25500), 16 (61400) or 26 (100100). A Newton step of a footing takes 15 solves.
+        Number of unknown displacements from which MUMPS computes factors in wet scenes. It does so only if K is not
+        symmetric, or on several processes. The processes then share the factors. Below this number one process holds
+        the factors of K, which have 1.5e7 entries (0.12 GB) at the limit. On two processes, the factors of K take 20 ms
+        (5700 unknowns), 174 ms (25500), 708 ms (61400) and 1481 ms (100100) with PETSc on one of the processes. With
+        MUMPS they take 16 ms (5700 unknowns), 98 ms (25500), 306 ms (61400) and 476 ms (100100). A solve takes 0.5 ms
+        (5700 unknowns), 3.5 ms (25500), 11 ms (61400) and 18 ms (100100) with PETSc. With MUMPS it takes 3.8 ms (5700
+        unknowns), 15 ms (25500), 37 ms (61400) and 57 ms (100100). Without pressures, MUMPS thus pays if a tangent is
+        used for fewer solves than 1 (5700 unknowns), 7 (25500), 16 (61400) or 26 (100100). A Newton step of a footing
+        takes 15 solves.
     fallback_3d
         Largest number of unknown displacements in 3D for which a direct solver may replace multigrid. MUMPS takes 8 s
         and 0.2 GB for this number, and 15 s and 0.4 GB with an unsymmetric K.
@@ -94,9 +95,9 @@ class SolverPlan:
     many, coarsest
         See `Thresholds`.
     forcing
-        Tightest relative tolerance of a linear solve; see `plan`.
+        Tightest relative tolerance of a linear solve, see `plan`.
     keep
-        Largest ratio of successive residuals for which the tangent is reused; see `plan`.
+        Largest ratio of successive residuals for which the tangent is reused, see `plan`.
     """
 
     route: str

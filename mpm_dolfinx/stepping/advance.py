@@ -310,8 +310,8 @@ class Motion:
 
         Also return whether each point (n,) keeps its pieces (see `OnGrid.valid`), and the number of inverted domains.
 
-        If Q1 cells would lock, F is scaled so that det F equals that of `deformed`. In yielded soil F is `deformed`,
-        because kinks of its motion are permanent, and the corners of domains in kinks would give a wrong F.
+        If Q1 cells would lock, F is scaled so that det F equals that of `deformed`. In yielded soil F is `deformed`.
+        Kinks in the motion of this soil are permanent, and the corners of domains in kinks would give a wrong F.
         """
         cut, stage = on_grid.cut, state.stage
         grid, folded = cut.grid, 0
@@ -354,7 +354,7 @@ class Motion:
     def _corrected(
         self, points: MaterialPoints, state: State, loads: Sequence[Loads], keeps: NDArray[np.bool_]
     ) -> MaterialPoints:
-        """Return the points after `with_volumes` has corrected yielded domains, except those in `keeps` (n,)."""
+        """Return the points after `with_volumes` has corrected yielded domains that are not in `keeps` (n,)."""
         grid, stage = self._momentum.grid, state.stage
         yielded = self._materials.evolved(points) & ~keeps
         if not over_all(grid.comm, int(yielded.sum())):
@@ -386,8 +386,8 @@ class Motion:
 
         The step adds `(c - q) / alpha` to the defect. Here c is the increase of the fluid content, which follows from
         volumes and cell pressures, and q is the net inflow. Both c and q are fluid masses divided by the density at
-        zero pressure. Soil with a free surface has no defect, because its content excludes drained water. Points in
-        `keeps` (n,) have no correction.
+        zero pressure. Soil with a free surface has no defect, because the fluid content of this soil excludes drained
+        water. Points in `keeps` (n,) have no correction.
         """
         before = state.points
         cut = on_grid.cut
@@ -502,7 +502,7 @@ def untangled(
     grid: Grid,
     loads: Sequence[Loads],
 ) -> NDArray[np.float64]:
-    """Return the corners (n, 2^d, d), in m, after those of inverted domains `bad` (n,) are re-initialised from F."""
+    """Return corners (n, 2^d, d), in m, with the corners of inverted domains `bad` (n,) re-initialised from F."""
     at = bad.nonzero()[0]
     X = points.reference[bad]
     d = grid.dim

@@ -67,7 +67,7 @@ class Start(NamedTuple):
         """Return the error and the size of the motion in the step (see `motion_error`), or zeros if a run does not need
         these.
 
-        flights: velocities after each substep; substep: the last substep.
+        `flights`: velocities after each substep.  `substep`: the last substep.
         """
         control = self.state.control
         if control is None or control.motion is None or len(flights) < 2:
@@ -85,7 +85,7 @@ class Balances(NamedTuple):
     ahead: Callable[[], list[NDArray[np.float64]]] | None = None  # see `Motion.ahead`; None without a trend
 
     def flown(self, flight: Flight | None, substep: Substep, dt: float) -> Flight | None:
-        """Return the velocities at the end of a solved substep, or None without inertia.  dt, s: length of the step."""
+        """Return the velocities at the end of a solved substep, or None without inertia.  `dt`: step length, s."""
         if self.inertia is None:
             return None
         acceleration = self.inertia.acceleration(self.momentum.at)

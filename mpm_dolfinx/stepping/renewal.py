@@ -7,15 +7,14 @@ than `LONGEST` are filled anew:
 
 * A full cell is divided into four equal domains.
 * A cell that the surface crosses once is filled with quadrilaterals about the centroid of the filled part. `EDGES`
-edges replace the surface in the cell. Ends, sharp corners and area do not change, in axisymmetry volume instead of
-area.
+edges replace the surface in the cell. Ends, sharp corners and area (in axisymmetry volume) do not change.
 
 Remainders of old domains outside these cells become domains. Masses, volumes and the mass of the fluid are exact in
 each cell, as are mass-weighted sums of other point data, such as the logarithm of the elastic left Cauchy-Green tensor.
-Point data of a new domain are means over its overlaps with old domains. They are shifted to the new centroid by fitted
-slopes, within the range of the old values. With inertia, the centre of mass, the momentum and the angular momentum of
-each cell are exact too. Cells are unchanged if they contain elastic soil, several bodies, several crossings of the
-surface, or domains on a side whose displacement a condition needs.
+Point data of a new domain are means over its overlaps with old domains. The means are shifted to the new centroid by
+fitted slopes, within the range of the old values. With inertia, the centre of mass, the momentum and the angular
+momentum of each cell are exact too. Cells are unchanged if they contain elastic soil, several bodies, several crossings
+of the surface, or domains on a side whose displacement a condition needs.
 """
 
 from __future__ import annotations

@@ -34,8 +34,8 @@ class Result:
     steps, newton, coupling
         Numbers of steps, of Newton iterations and of coupling iterations so far.
     cuts, rejected
-        Numbers of reduced steps. `cuts` counts steps without convergence. `rejected` counts steps with a large error,
-        and in runs with equal steps those with a jump of pressure.
+        Numbers of reduced steps. `cuts` counts steps without convergence. `rejected` counts steps with a large error.
+        In runs with equal steps, `rejected` counts steps with a jump of pressure.
     rederived
         Number of inverted domains that were re-initialised from F.
     renewed
@@ -47,7 +47,7 @@ class Result:
     residual
         Largest relative residual of the momentum and fluid equations so far.
     wall, profile
-        Wall time, s, of the whole run, and of each part of the run on this process.
+        Wall times, s: of the whole run, and of each part of the run on this process.
     converged
         Whether the run has reached its end.
     event
@@ -88,7 +88,7 @@ class Result:
 
     @property
     def t(self) -> NDArray[np.float64]:
-        """Output times (n,), s."""
+        """Output times (n,), in s."""
         return self.rows.column("t")
 
     @property
@@ -133,7 +133,7 @@ class Result:
 
     @cached_property
     def tool_forces(self) -> ByName[NDArray[np.float64]]:
-        """Forces (N) and moments (N m) of tools and contacts on bodies, by name; (times, 3), in 3D (times, 6)."""
+        """Forces (N) and moments (N m) (times, 3), in 3D (times, 6), of tools and contacts on bodies, by name."""
         return self.outcome("tool_forces")
 
     @cached_property

@@ -199,7 +199,7 @@ class Scene:
         return set()
 
     def look_at(self, gravity: Sequence[NDArray[np.float64] | None]) -> None:
-        """Warn, once, if the gravity of a step differs from the gravity that defines the conductivities."""
+        """Warn once if the gravity of a step differs from the gravity that defines the conductivities."""
         if self.fluid is None or not self.materials.conducts or gravity[0] is None or "gravity" in self._warned:
             return
         if strength := other_gravity(self.fluid, gravity):
@@ -248,7 +248,7 @@ class Scene:
         return replace(state, stage=after, **nodal).at_owners(self.grid)
 
     def stage(self, conditions: Mapping[str, Any], present: Sequence[bool], later: Sequence[int]) -> Stage:
-        """Return a stage of the scene; conditions, present, later: see `stepping.stage.stage`."""
+        """Return a stage of the scene.  `conditions`, `present`, `later`: see `stepping.stage.stage`."""
         fed = self.storage.feeding if self.storage else ()
         return stage(self.bodies, self.materials, self.momentum, fed, conditions, present, later)
 

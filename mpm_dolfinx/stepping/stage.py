@@ -151,13 +151,13 @@ class Stage:
         return {data for one in self.acting for name, of in one.kept(0).items() if name in names for data in of}
 
     def same(self, before: Stage) -> set[str]:
-        """Return names of conditions that are the same object in both stages, or have a user's name in both."""
+        """Return the names of conditions that are one object in both stages, or have equal user-defined names."""
         shared = ((name, one) for name, one in self.given.items() if name in before.given)
         return {name for name, one in shared if one is before.given[name] or getattr(one, "name", None) == name}
 
     @property
     def lasting(self) -> list[Surface]:
-        """Faces whose displacements from the seeded positions conditions need.  Domains there must not be replaced."""
+        """Faces for which conditions need displacements from seeded positions.  Domains there must not be replaced."""
         return [*(faces for _, faces, _ in self.held), *(faces for one in self.acting for faces in one.seeded)]
 
     @property
@@ -225,7 +225,7 @@ def stage(
     bodies, materials
         All bodies and materials of the scene.
     momentum, fed
-        Forms with the loads that act in all stages, and those terms in the balance of fluid that act in all stages.
+        Forms, with the loads of all stages, and terms that act in the balance of fluid in all stages.
     conditions
         walls, conditions, gravity and inertia: see `Simulation`.
     present

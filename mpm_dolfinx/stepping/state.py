@@ -84,7 +84,7 @@ class Stay:
 
 @dataclass(frozen=True, eq=False)
 class Trend:
-    """Motion of the points in the last steps, of which there are at most three.
+    """Motion of the points in the last steps (at most three).
 
     lengths : (k,)
         Lengths (s) of the steps, beginning with the last step.
@@ -155,8 +155,8 @@ class State:
         Motion in the last steps, for the initial guess in elastic bodies. None in other scenes, and after bodies were
         added.
     held : (unknowns,), N
-        Nodal forces on this process, with ghosts, that balance an initial stress where loads do not, or a body at rest
-        when inertia begins. None without such forces, in other stages, and after a reset of the grid.
+        Nodal forces on this process, with ghosts. They balance an initial stress where loads do not, or keep a body at
+        rest when inertia begins. None without such forces, in other stages, and after a reset of the grid.
     rest : (unknowns,), m
         Nodal displacement on this process, with ghosts, for which prescribed displacements and plates balance an
         initial stress. None after a stage that changes these conditions, and after a reset of the grid.
@@ -219,7 +219,7 @@ class State:
         return out
 
     def migrated(self, destination: NDArray[np.int32], comm: MPI.Intracomm) -> State:
-        """Return the state after every point has moved to the process destination (n,), with its pieces."""
+        """Return the state after every point has moved with its pieces to its process `destination` (n,)."""
         exchange = Exchange(comm, destination)
         pieces = self.pieces
         if pieces is not None:
