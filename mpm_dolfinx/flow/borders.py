@@ -81,8 +81,7 @@ class Borders:
     ) -> BorderFaces:
         """Return the faces with their current conductivities.
 
-        `laws`: relative conductivities as functions of pressure, see `Laws`.
-        `contents`: material in the cells.
+        `laws`: relative conductivities as functions of pressure, see `Laws`.  `contents`: material in the cells.
         `flow`: conductivities of the filled owned cells.
         `places` (c, d), m: vectors from the midpoints of local cells to the pressure positions of these cells.
         `moved` (c, d), m: displacements of the cells in the step.

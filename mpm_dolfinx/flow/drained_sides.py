@@ -255,10 +255,8 @@ class RainedFaces(OpenFaces):
 class SideFeeds(Feeds):
     """Flow through open sides in a substep.
 
-    `sides`: faces of the open sides; `sides.number` are indices in `names` and `ponds`.
-    `wet`: data of the substep.
-    `names`: names of the conditions.
-    `ponds`, m: largest depth of the pond of each condition, or None without rain.
+    `sides`: faces of the open sides; `sides.number` are indices in `names` and `ponds`.  `wet`: data of the substep.
+    `names`: names of the conditions.  `ponds`, m: largest depth of the pond of each condition, or None without rain.
     """
 
     def __init__(self, sides: OpenSides, wet: Wet, names: tuple[str, ...], ponds: tuple[float | None, ...]):
@@ -280,8 +278,7 @@ class SideFeeds(Feeds):
         """Return the open sides with the effect of the present ponds, and the largest volumes of the ponds, in m^d.
 
         The rain of the returned sides includes the inflow that the ponds supply.
-        `ponds`, m: largest depth of each pond.
-        `dt`, s: time in which a pond supplies its whole volume.
+        `ponds`, m: largest depth of each pond.  `dt`, s: time in which a pond supplies its whole volume.
         """
         depth, number = np.array([depth or 0.0 for depth in ponds]), sides.number
         size = np.linalg.norm(sides.area, axis=1)
@@ -319,9 +316,7 @@ class SideFeeds(Feeds):
         return UnsaturatedFaces(at, conductance, sides.given, self._seeps, offset, *rest)
 
     def begin(self, at: OpenFaces, fluid: Fluid, difference: NDArray[np.float64]) -> None:
-        """See `Feeds`.  A seepage face opens unless its two-point flux (without non-orthogonal correction) is an
-        inflow.
-        """
+        """See `Feeds`.  Seepage faces open unless their flux (without non-orthogonal correction) is an inflow."""
         self._flows = at.outflow(fluid) >= 0
         self._nonorthogonal, self._share = at.nonorthogonal(fluid, difference)
 

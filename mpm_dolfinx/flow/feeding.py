@@ -102,8 +102,7 @@ class Feeds:
     ) -> dict[str, dict[str, NDArray[np.float64]]]:
         """Return the volumes since the conditions began, in m^d, by quantity and condition.
 
-        `rates`: results of `passing` in the substeps of the last step.
-        `seconds`, s: time weights of these substeps.
+        `rates`: results of `passing` in the substeps of the last step.  `seconds`, s: time weights of these substeps.
         """
         return {}
 

@@ -94,8 +94,7 @@ class Conduction:
         """Return the ratio (m,) of two distances of each face: from the centroid, and from the pressure position.
 
         See `layers` for pressure positions.
-        `normal` (m, d): normals of the faces.
-        `offset` (m, d), m: vectors from the centroids to the faces.
+        `normal` (m, d): normals of the faces.  `offset` (m, d), m: vectors from the centroids to the faces.
         """
         distance = (offset * normal).sum(axis=1)
         shifted = distance - (self.mobility.shift[at] * normal).sum(axis=1)
@@ -159,8 +158,7 @@ class OpenSides:
         The indices are: cell, axis, end of the cell along this axis, and 0 for the difference or 1 for the slope.  Ends
         without a drained side have nan for both.
 
-        `at` (m,): index of the cell of each face among the filled cells.
-        `p` (n,), Pa: pressures of the filled cells.
+        `at` (m,): index of the cell of each face among the filled cells.  `p` (n,), Pa: pressures of the filled cells.
         """
         out = np.full((len(p), self.normal.shape[1], 2, 2), np.nan)
         distance = np.add.reduce(self.offset * self.normal, axis=1)
@@ -202,8 +200,7 @@ class PieceContents:
 class CellContents(Keyed):
     """Material in the cells, at the last grid reset.  Arrays over local cells have valid values in active cells only.
 
-    `forms`: forms whose coefficients this class sets.
-    `pieces`: contributions of the pieces.
+    `forms`: forms whose coefficients this class sets.  `pieces`: contributions of the pieces.
     `filled`: owned active cells.
     """
 
@@ -273,11 +270,7 @@ class CellContents(Keyed):
         return u[self._nodes].transpose(0, 2, 1)
 
     def motion(self, nodal: NDArray[np.float64], rests: NDArray[np.int64] | None = None) -> CellMotion:
-        """Return the motion of the filled cells at the centroids of their material.
-
-        `nodal` (n, d, 2^d), m: nodal displacements.
-        `rests`: indices of the filled cells that do not move.
-        """
+        """Return the motion of filled cells at centroids from displacements `nodal` (m).  Cells `rests` do not move."""
         hoop, d = None, self.grid.dim
         at_centroids = nodal @ self._shapes
         F, moved = self._unit + at_centroids[:, :, :d], at_centroids[:, :, d].copy()
@@ -432,8 +425,7 @@ class FluxForms:
     ) -> NDArray[np.float64]:
         """Return the outflow of the local cells through `facets` due to slopes in `cells`, in m^d/s.
 
-        `slope` (n, d), Pa/m: see `Gradients`.
-        `active` (c,): active local cells.
+        `slope` (n, d), Pa/m: see `Gradients`.  `active` (c,): active local cells.
         `density` (c,): density of the fluid in the active local cells, divided by the density at zero pressure.
         """
         self.density.x.array[active] = density

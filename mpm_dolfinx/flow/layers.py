@@ -135,8 +135,7 @@ class MixedCells:
         """Return the mobility of filled cells.
 
         With `now`, only inclined layers shift the pressure position of a cell away from the centroid.
-        `kappa`, m^2/(Pa s): mobilities of all pieces.
-        `mean` (n,), m^2/(Pa s): means of `kappa` in the filled cells.
+        `kappa`, m^2/(Pa s): mobilities of all pieces.  `mean` (n,), m^2/(Pa s): means of `kappa` in the filled cells.
         `share` (n, d): mobility along each axis divided by `mean`; values of mixed cells are set in place.
         `now`, m^2/(Pa s): in unsaturated soil, mobilities of all pieces at their pressures.
         """
@@ -260,8 +259,7 @@ def graded(
     of an axis is proportional to the variance that a linear variation along this axis explains.
 
     `offset` (m, d), m: positions of the pieces relative to the midpoints of cells.
-    `kappa` (m,), m^2/(Pa s): mobilities of the pieces.
-    `mean` (n,), m^2/(Pa s): mean mobilities of the filled cells.
+    `kappa` (m,), m^2/(Pa s): mobilities of the pieces.  `mean` (n,), m^2/(Pa s): mean mobilities of the filled cells.
     """
     with np.errstate(divide="ignore"):
         series = 1 / contents.mean(1 / kappa)

@@ -56,8 +56,7 @@ class Gradients:
     side.
 
     The object is valid for one cut of the domains.
-    `contents`: material in the cells.
-    `sides`: open sides of the bodies.
+    `contents`: material in the cells.  `sides`: open sides of the bodies.
     """
 
     def __init__(self, contents: CellContents, sides: OpenSides):
@@ -131,8 +130,7 @@ class Gradients:
     ) -> NDArray[np.float64]:
         """Return the pressure gradients minus the unit weight of the fluid (rows, d), in Pa/m.
 
-        `p` (c,), Pa: pressures of all local cells.
-        `outer` (m,), Pa: pressures outside the open sides.
+        `p` (c,), Pa: pressures of all local cells.  `outer` (m,), Pa: pressures outside the open sides.
         `weight` (d,), N/m^3: unit weight of the fluid, or None without gravity.
         """
         of_cells, of_sides = self._units
@@ -177,8 +175,7 @@ class NonorthogonalFlow(NamedTuple):
         """Return two arrays: added outflows (n,) from filled cells to other cells, and corrections (m,) of pressures.
 
         The outflows are in m^d/s.  The corrections (Pa) apply to the cell pressures at open sides.
-        `p` (c,), Pa: pressures of the local cells.
-        `bulk`, Pa: bulk modulus of the fluid.
+        `p` (c,), Pa: pressures of the local cells.  `bulk`, Pa: bulk modulus of the fluid.
         """
         slope = self.gradients(p, self.sides.pressure, self.weight)
         through = self.gradients.through_sides(slope, len(self.sides.cells))

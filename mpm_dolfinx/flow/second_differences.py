@@ -30,8 +30,7 @@ def second_differences(
 ) -> PETSc.Mat:
     """Return the matrix H.  The pattern depends on the active cells only.
 
-    `unknowns`: pressure unknowns of the active cells.
-    `grid`: background grid.
+    `unknowns`: pressure unknowns of the active cells.  `grid`: background grid.
     `strength` (n, d), m^d/Pa: coefficient, >= 0, of each owned active cell and axis.  A damping of jumps with this
     coefficient has the same effect on alternating pressures.
     `centroid` (c, d), m: centroids of the material in the local cells, relative to the midpoints of the cells.

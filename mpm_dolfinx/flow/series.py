@@ -108,8 +108,7 @@ def through(
 ) -> Through:
     """Return the conductances of m faces for the pressures on both sides.
 
-    `laws`: relative conductivities as functions of pressure.
-    `p` (m,), Pa: pressures on both sides, as two arrays.
+    `laws`: relative conductivities as functions of pressure.  `p` (m,), Pa: pressures on both sides, as two arrays.
     `paths` (m, ...): paths of one or two cells, from their pressure positions to the face.
     `lengths` (m,), m: lengths of the paths.
     `drops` (m,), Pa: pressure drops caused by the fluid's weight along each path, from the first to the second side.

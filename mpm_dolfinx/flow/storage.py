@@ -182,10 +182,7 @@ class StorageForms:
         return [sums[:, 0], *[sums[:, start : start + count] for start in range(1, sums.shape[1], count)]]
 
     def drained(self, data: PointData) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return two arrays (n,) for filled cells: storage due to changes of saturation (m^d/Pa), and coupling (m^d).
-
-        The coupling is `int S d(chi p)/dp dV`, with the degree of saturation S.
-        """
+        """Return two arrays (n,): storage of cells due to saturation (m^d/Pa), and `int S d(chi p)/dp dV` (m^d)."""
         capacity, coupled = self._capacity(data).T
         return capacity, coupled
 
@@ -289,10 +286,7 @@ class StorageSystem:
         return places, places[:0]
 
     def change_by(self, u: PETSc.Vec, out: PETSc.Vec, *slopes: FluxSlope) -> None:
-        """Set `out` to the change of the residual (m^d) that a change u of the displacements causes.
-
-        The content changes and, with `slopes`, also the fluxes.
-        """
+        """Set `out` to the change (m^d) of the residual due to u: by content and, with `slopes`, by fluxes."""
         self.B.mult(u, out)
         for slope in slopes:
             out.array_w[:] += slope(u)
@@ -437,12 +431,7 @@ class StorageProblem:
     def _damping_of_soft_soil(
         self, tau: NDArray[np.float64], softest: NDArray[np.float64], mobility: NDArray[np.float64]
     ) -> PETSc.Mat:
-        """Return the matrix of additional damping in soft cells.
-
-        `tau` (n,), 1/Pa: strength of the damping for elastic soil.
-        `softest` (n,): softness of the cells.
-        `mobility` (n, d), m^2/(Pa s): mobilities along the axes.
-        """
+        """Return the matrix of additional damping in soft cells.  `tau` (n,), 1/Pa: strength for elastic soil."""
         contents, grid = self._contents, self.forms.grid
         flow = self.dt * mobility / grid.sizes(contents.filled) ** 2
         more = np.maximum((softest * tau)[:, None] - flow, 0) - np.maximum(tau[:, None] - flow, 0)

@@ -107,12 +107,7 @@ class Laws:
     def between(
         self, law: NDArray[np.int64], p: Sequence[NDArray[np.float64]], drop: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return k_r (m,) between two pressures, and the derivatives (2, m) of k_r, see `fitted`.
-
-        `law` (m,): index of the retention curve.
-        `p` (2, m), Pa: the two pressures.
-        `drop` (m,), Pa: pressure drop caused by the weight of the fluid.
-        """
+        """Return k_r (m,) of curves `law` (m,) between pressures p (Pa), and its derivatives (2, m), see `fitted`."""
         k, slopes = np.ones(len(law)), np.zeros((2, len(law)))
         for number, one in enumerate(self.conductances, 1):
             rows = np.flatnonzero(law == number)
@@ -167,8 +162,7 @@ class Relative:
         """Set the coefficients of forms for the pressures of the local cells.
 
         Return the fluxes through faces between cells of different soil (see `borders`), or None without such faces.
-        `p` (c,), Pa: pressures of the local cells.
-        `force` (c, d), N/m^3: inertia force on the fluid.
+        `p` (c,), Pa: pressures of the local cells.  `force` (c, d), N/m^3: inertia force on the fluid.
         """
         self._tables.x.array[:] = np.concatenate([law(p) for law in self._laws.conductances], axis=1).ravel()
         if (faces := self._borders.value) is None:
@@ -196,10 +190,8 @@ class Relative:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return two arrays (m,): k_r between cells and sides, and `d[k_r (p - outer + drop)]/dp`.
 
-        `cells` (m,): owned cells.
-        `normal` (m, d): normals of the sides.
-        `p` (m,), Pa: pressures in the cells.
-        `outer` (m,), Pa: pressures outside.
+        `cells` (m,): owned cells.  `normal` (m, d): normals of the sides.
+        `p` (m,), Pa: pressures in the cells.  `outer` (m,), Pa: pressures outside.
         `drop` (m,), Pa: pressure drop from the centroid to the face caused by the weight of the fluid.
         """
         shares = self.shares.x.array.reshape(-1, self.count)[cells]

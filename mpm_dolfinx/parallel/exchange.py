@@ -42,8 +42,7 @@ def _lasting(handle: int) -> PETSc.Vec:
 class Exchange:
     """A fixed assignment of array rows to processes, which can be used for several transfers.
 
-    `comm`: processes of the exchange.
-    `destination` (n,): rank of the process that receives each row.
+    `comm`: processes of the exchange.  `destination` (n,): rank of the process that receives each row.
     """
 
     def __init__(self, comm: MPI.Intracomm, destination: NDArray[np.int32]):
@@ -138,10 +137,7 @@ def everywhere(comm: MPI.Intracomm, ask: Callable[[], T]) -> T:
 
 
 def together(comm: MPI.Intracomm, action: Callable[[], T]) -> T:
-    """Return the result of an action on this process.
-
-    If the action fails on any process, all raise the first error.
-    """
+    """Return the result of an action on this process.  If it fails on any process, all raise the first error."""
     value = error = None
     try:
         value = action()

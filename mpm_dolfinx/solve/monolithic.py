@@ -134,8 +134,7 @@ class BlockOperator:
 class BlockSolver:
     """GMRES for displacements and pressures together.
 
-    `how`: solver plan.
-    `momentum`, `storage`: the matrices.
+    `how`: solver plan.  `momentum`, `storage`: the matrices.
     `cycles`: two preconditioners, a multigrid cycle on K and a multigrid cycle on P.
     """
 

@@ -173,8 +173,7 @@ def note_pressures(
     Hosea and Shampine (1996). The error of the step is assumed to be `ERROR` times this pressure. Errors and changes in
     a cell are weighted by the filling of the cell.
 
-    `seconds`, s: time weight of the rates of the first substep.
-    `dt`, s: length of the step.
+    `seconds`, s: time weight of the rates of the first substep. `dt`, s: length of the step.
     `of_bodies`: function of n active owned cells and values (k, n), which returns the largest values (k, bodies) in
     each body; see `Motion.of_bodies`.
     """
@@ -224,8 +223,7 @@ class Newton:
         """Solve the balances by Newton's method.
 
         A tangent is reused while the iterations converge, and with linear laws over many steps.
-        `serves`: whether the tangent of the previous substep may be reused.
-        `ahead`: see `solve_substep`.
+        `serves`: whether the tangent of the previous substep may be reused. `ahead`: see `solve_substep`.
         """
         errors, other = self._begin(ahead)
         fresh = self._linear or not serves

@@ -59,8 +59,7 @@ def planned(scheme: Scheme, momentum: MomentumSystem, storage: StorageSystem | N
 class SchurComplement:
     """Matrix-free Schur complement `S = C + B K^-1 B^T` for PETSc's Krylov solvers.
 
-    `storage`: the matrices B and C.
-    `solve`: solver for systems with K.
+    `storage`: the matrices B and C. `solve`: solver for systems with K.
     `f`, `v`: work vectors for the forces `B^T x` and the displacements `K^-1 f`.
     `slopes`: derivative of the fluxes with respect to displacements, if the tangent includes this derivative.
     """
@@ -97,8 +96,7 @@ class Kept:
 class LinearSolvers:
     """Linear solvers for the matrices of one set of active cells.
 
-    `how`: solver plan, see `planned`.
-    `scheme`: coupling scheme.
+    `how`: solver plan, see `planned`. `scheme`: coupling scheme.
     `momentum`, `storage`: matrices and vectors of the balances; `storage` is None without fluid.
     """
 

@@ -29,7 +29,7 @@ class Thresholds:
         takes 0.06 s (10400 unknowns), 0.19 s (25500), 0.53 s (51000) and 2.3 s (151000) with a direct solver. It takes
         0.05 s (10400 unknowns), 0.14 s (25500), 0.32 s (51000) and 1.0 s (151000) with multigrid.
     mumps
-        Number of unknown displacements from which MUMPS computes factors in wet scenes. It does so only if K is not
+        Number of unknown displacements from which MUMPS computes factors in wet scenes. MUMPS is used only if K is not
         symmetric, or on several processes. The processes then share the factors. Below this number one process holds
         the factors of K, which have 1.5e7 entries (0.12 GB) at the limit. On two processes, the factors of K take 20 ms
         (5700 unknowns), 174 ms (25500), 708 ms (61400) and 1481 ms (100100) with PETSc on one of the processes. With

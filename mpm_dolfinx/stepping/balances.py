@@ -98,8 +98,7 @@ class Balances(NamedTuple):
     def outcome(self, state: State, passed: Sequence[Sequence[Mapping]], seconds: NDArray[np.float64]) -> Outcome:
         """Return the results of conditions at the end of a step, by quantity and name, see `State`.
 
-        `passed`: flow in each substep, see `passing`.
-        `seconds`, s: time weights of the substeps.
+        `passed`: flow in each substep, see `passing`.  `seconds`, s: time weights of the substeps.
         """
         stage, out = state.stage, {quantity: {} for quantity in QUANTITIES} | self.momentum.outcome()
         out["wall_reactions"] = self.momentum.wall_forces(stage.conditions["walls"])
@@ -177,8 +176,7 @@ def balances(
 ) -> Balances:
     """Return the balances at the end of a substep, at the present u and p.
 
-    `before`: rates of the previous substep.
-    `flight`: present velocities, or None without inertia.
+    `before`: rates of the previous substep.  `flight`: present velocities, or None without inertia.
     """
     substep = acting.substep
     on_grid = start.on_grid

@@ -32,8 +32,7 @@ from mpm_dolfinx.stepping.state import State
 class Division:
     """Division and merging of the particle domains in a scene.
 
-    `faces`: faces of the bodies.
-    `materials`: materials of the scene.
+    `faces`: faces of the bodies. `materials`: materials of the scene.
     """
 
     def __init__(self, faces: SeededFaces, materials: SceneMaterials):
@@ -87,8 +86,7 @@ class Division:
     ) -> tuple[State, int]:
         """Return the state with new points, and the number of old points.
 
-        `into`: see `with_defect`.
-        `rule`: function that returns the pieces of the new points.
+        `into`: see `with_defect`. `rule`: function that returns the pieces of the new points.
         """
         new, ids = with_defect(new, old, into), old.id
         pieces = state.pieces

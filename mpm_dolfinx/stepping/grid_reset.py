@@ -265,8 +265,7 @@ class OnGrid(Keyed):
         storage, or by volume in cells without storage. With `water`, the sum of pore water in a cell is conserved. With
         gravity the reconstruction then acts on differences from the hydrostatic pressures `at_rest`.
 
-        `store` (m,), m^d/Pa: storage of the pieces.
-        `t`, s: time of the pressures on open sides.
+        `store` (m,), m^d/Pa: storage of the pieces. `t`, s: time of the pressures on open sides.
         """
         pieces = self.data.pieces
         contents = self.contents
@@ -318,8 +317,7 @@ class OnGrid(Keyed):
         from hydrostatic pressures, which cause no flow through no-flow sides. In axisymmetry centroids and means refer
         to the sections.
 
-        `t`, s: time of the pressures on drained sides.
-        `at_rest`: hydrostatic pressures, or None without gravity.
+        `t`, s: time of the pressures on drained sides. `at_rest`: hydrostatic pressures, or None without gravity.
         """
         places, p = self._places.pieces, self._storage.p.x.array
         seen = self._cell_pressures(p, stage, t, at_rest=at_rest)
@@ -334,8 +332,7 @@ class OnGrid(Keyed):
     ) -> CellPressures:
         """Return the cell pressures as mass potentials, with the data from which slopes are computed.
 
-        `p` (cells,), Pa: pressures of the local cells.
-        `bulk`, Pa: bulk modulus of the fluid.
+        `p` (cells,), Pa: pressures of the local cells. `bulk`, Pa: bulk modulus of the fluid.
         `at_rest`: hydrostatic pressures that are subtracted.
         """
         contents = self.contents
@@ -367,11 +364,7 @@ class OnGrid(Keyed):
     def _relative_mobility(
         self, full: NDArray[np.float64], mean: NDArray[np.float64], share: NDArray[np.float64] | None
     ) -> Mobility:
-        """Return the mobility of cells in unsaturated soil.
-
-        `full` (m,), m^2/(Pa s): mobilities of the pieces at saturation.
-        `mean`, `share`: see `Mobility`, at saturation.
-        """
+        """Return the mobility of cells in unsaturated soil. `full` (m,), m^2/(Pa s): mobilities at saturation."""
         cut = self.cut
         law = cut.to_cells(self._quadrature.materials.retention_of(cut.points))
         count = self._storage.fluxes.relative.count
@@ -404,10 +397,7 @@ class OnGrid(Keyed):
 
     @cached_property
     def scale(self) -> NDArray[np.float64] | None:
-        """Suctions (Pa) at which pores of the filled owned cells drain, or None in scenes without retention curves.
-
-        The value is 1 in cells without a retention curve.
-        """
+        """Suctions (Pa) at which filled owned cells drain (1 without retention curve), or None in saturated scenes."""
         if self._quadrature.materials.retentions is None:
             return None
         scale = np.full(len(self.contents.filled), np.inf)
@@ -429,10 +419,7 @@ class OnGrid(Keyed):
         return (self.contents.total(moves) == 0).nonzero()[0]
 
     def valid(self, points: MaterialPoints, loads: Sequence[Loads]) -> NDArray[np.bool_]:
-        """Return a mask (n,) of points that keep their pieces.
-
-        The connected part of such a point hardly moves, and so do parts in contact with this part.
-        """
+        """Return a mask (n,) of points whose connected part, and parts in contact with it, hardly move."""
         part, count = self.parts if self.cut.grid.copies == 1 else self._of_points(*self.parts_of_cells(loads))
         return self.cut.valid(points, part, count)[part]
 
@@ -603,10 +590,8 @@ class Assembled(Keyed):
         Without a conductivity law, cells whose points all keep their pieces have the flux geometry of the last reset.
 
         `state`: state at the start of the step.
-        `weight` (d,), N/m^3: unit weight of the fluid, or None without gravity.
-        `data`: integration points.
-        `t`, s: time of the pressures and fluxes on open sides.
-        `dt`, s: length of the step.
+        `weight` (d,), N/m^3: unit weight of the fluid, or None without gravity. `data`: integration points.
+        `t`, s: time of the pressures and fluxes on open sides. `dt`, s: length of the step.
         """
         on_grid = self._on_grid
         contents = self._on_grid.contents
@@ -670,8 +655,7 @@ def assembled(
 ) -> Assembled:
     """Return the matrices for cut domains and a stage.
 
-    `begins`: whether every connected part of a body must have supports.
-    `pairs`: keys of the pattern of contacts.
+    `begins`: whether every connected part of a body must have supports. `pairs`: keys of the pattern of contacts.
 
     Raises
     ------

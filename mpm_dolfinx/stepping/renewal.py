@@ -48,8 +48,7 @@ LONGEST = 1.0
 class Renewal:
     """Renewal of the particle domains in a scene.
 
-    `faces`: faces of the bodies.
-    `materials`: materials of the scene.
+    `faces`: faces of the bodies. `materials`: materials of the scene.
     """
 
     def __init__(self, faces: SeededFaces, materials: SceneMaterials):

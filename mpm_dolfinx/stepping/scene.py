@@ -177,8 +177,7 @@ class Scene:
     ) -> MomentumProblem:
         """Return the balance of momentum at the end of a substep, with all coefficients of its forms set.
 
-        `when`: the substep.
-        `system`, `data`, `loads`, `options`: see `MomentumProblem`.
+        `when`: the substep.  `system`, `data`, `loads`, `options`: see `MomentumProblem`.
         `u` (unknowns,), m: displacements at which the iterations begin, a local array, by default the present
         displacements.
         """
@@ -346,8 +345,7 @@ class Scene:
     ) -> Assembled:
         """Return the matrices for a stage of the bodies on the grid.
 
-        `now`: present loads.
-        `as_cut`: function that returns the loads at the positions at which domains were cut.
+        `now`: present loads.  `as_cut`: function that returns the loads at the positions at which domains were cut.
         `begins`: whether all parts of the bodies must have supports.
         """
 

@@ -283,10 +283,9 @@ def stage(
 
 
 def _check_inertia(by_name: Mapping[str, Any], inertia: bool) -> None:
-    """Raise ValueError for conditions that do not fit the stage.
+    """Raise ValueError in a stage with inertia for conditions that do not support inertia.
 
-    In a stage with inertia these are conditions that do not support inertia.  In a quasi-static stage these are
-    conditions that require inertia.
+    In a quasi-static stage, raise ValueError for conditions that require inertia.
     """
     for name, one in by_name.items():
         if isinstance(one, Quiet) and not inertia:

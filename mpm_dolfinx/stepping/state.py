@@ -195,10 +195,7 @@ class State:
 
     @property
     def as_cut(self) -> MaterialPoints:
-        """Points at the positions where the grid cuts their domains.
-
-        Points that keep their pieces have the positions at the last reset, and all others have their present positions.
-        """
+        """Points at the positions of their cut: at the last reset if they keep their pieces, else at present."""
         if self.stay is None:
             return self.points
         return self.stay.points if self.stay.keeps is None else self.stay.points.where(self.stay.keeps, self.points)
