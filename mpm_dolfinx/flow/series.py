@@ -42,7 +42,7 @@ class Paths(NamedTuple):
     resistance: NDArray[np.float64]  # length divided by mobility and by the fraction of lines (s,), Pa s/m^2
 
     def at(self, *index) -> Paths:
-        """Return the paths for an index that applies to all arrays."""
+        """Return the paths at an index of all arrays."""
         return Paths(*(values[index] for values in self))
 
     def everywhere(self, dim: int) -> Paths:
@@ -79,7 +79,10 @@ def none(count: int, laws: int, slots: int) -> Paths:
 
 
 class _Links(NamedTuple):
-    """Segments of soil along the flow path through a face.  Each one connects two nodes (positions with a pressure)."""
+    """Segments of soil along the flow path through a face.
+
+    Each segment connects two nodes (positions with a pressure).
+    """
 
     face: NDArray[np.int64]  # index of the face
     low: NDArray[np.int64]  # first node

@@ -633,7 +633,7 @@ class StorageProblem:
     ) -> None:
         """Assemble the derivatives `C = d/dp` and `B = d/du` of the residual at (u, p).
 
-        `data`: quadrature points of the pieces, by default those of the problem.
+        `data`: quadrature points of the pieces, by default the points of the problem.
         `of_suction`: for laws that depend on suction, cells (c,) and derivatives (c, n), m^(d-1), of their nodal forces
         with respect to p.
         """
