@@ -62,7 +62,7 @@ class Events:
         Simulation at the start of the run.
     until
         One function of the simulation, or several. An event occurs when a returned number changes sign within a step,
-        or when a returned boolean becomes True.
+        or when a returned boolean changes.
 
     Raises
     ------

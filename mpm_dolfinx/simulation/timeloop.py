@@ -99,9 +99,9 @@ def run(
         times the diffusion time of a cell, but at least 0.001 and at most 1 times the first output interval. With
         inertia it is also at most the time in which a wave crosses a cell.
     until
-        One function of the simulation, or several, that end the run before t_end. An event occurs when a returned
-        number changes sign within a step, or a returned boolean becomes True. A boolean that is True at the start is no
-        event. Example of a number: `lambda s: -s.points.displacement[:, 1].min() - 0.1`. Trial steps locate the event.
+        One function of the simulation, or several, that end the run before t_end. An event occurs within a step when a
+        returned number changes its sign, or a returned boolean changes. A number that is zero at the start is no event.
+        Example of a number: `lambda s: -s.points.displacement[:, 1].min() - 0.1`. Trial steps locate the event.
         The run ends at the first state found after the event, at most a thousandth of the step later. This state is an
         output; `Result.event` has the function's index and the time. The functions must return equal values on all
         processes. An event completes the histories, as t_end does; a later run without `until` continues them.
