@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: MIT
-"""Liakopoulos's column: saturated sand drains at its foot under gravity; suction contracts the sand, and it settles.
+"""Liakopoulos's column: saturated sand drains at its foot under gravity, and settles under suction.
 
-In a column of 1 m, p = 0 everywhere at first, as in uniform downward flow.  Then no water enters at the top, and the
-column drains at its foot.  Its retention curve is user-defined.  The effective stress uses chi p, with chi the
+A column of 1 m initially has p = 0 everywhere, as in uniform downward flow.  Then no water enters at the top, and the
+column drains at its foot.  Its retention curve is user-defined.  The effective stress contains chi p, where chi is the
 saturation.  The reference is a converged solution with 400 finite volumes, for small strain.  Source: Liakopoulos
 (1965), with the constants of Lewis and Schrefler (1998).
 
-Errors at 5, 10, 30 and 120 minutes: the largest pressure error at five heights, divided by the suction at the highest
-of them; the relative error of the settlement; the relative error of the outflow at the foot.  On one process.
+Three errors are given at 5, 10, 30 and 120 minutes.  The pressure error is the largest error at five heights, divided
+by the suction at the highest of these.  The others are the relative errors of the settlement and of the outflow at the
+foot.  The demo runs on one process.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ CONVERGED = {
     30: ((-631.67, -1582.23, -3205.4, -4983.1, -6211.2), 1.15932e-3, 1.57255e-6),
     120: ((-906.99, -2267.84, -4542.4, -6847.5, -8264.9), 1.55827e-3, 3.33066e-7),
 }
-"""Converged values by time, min: pressures at the heights, Pa, settlement, m, and outflow at the foot, m/s."""
+"""Converged values by time (min): pressures (Pa) at the five heights, settlement (m), and outflow (m/s) at the foot."""
 
 
 class Sand:

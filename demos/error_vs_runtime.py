@@ -6,10 +6,10 @@ also the points per cell, the quadrature and the coupling.  Two body-fitted fini
 on cells of the same size, and Taylor-Hood.  The time is the shortest of `--repeat` runs of the time loop; compile times
 are separate.  Reference solutions are converged in space and in time.
 
-* beam: the poroelastic beam; largest error of the tip deflection at all output times `beam.TIMES`, and at those from
-  0.1 s on.  The reference has 67 x 20 Taylor-Hood elements and steps of 0.005 s
-* drained: the same beam without water, loaded in ten steps; error of the tip deflection against 67 x 20 Taylor-Hood
-  elements
+* beam: the poroelastic beam; largest error of the tip deflection at all output times `beam.TIMES`, and largest error
+  from 0.1 s on.  The reference has 67 x 20 Taylor-Hood elements and steps of 0.005 s
+* drained: the poroelastic beam without water, loaded in ten steps; error of the tip deflection against 67 x 20
+  Taylor-Hood elements
 * terzaghi: error of the settlement at T_v = 0.5, against the exact settlement
 * mandel: error of the settlement of the plate at T = 0.1, against the exact settlement
 * column: error of the height of the soft column under its own weight, against the exact height
@@ -36,7 +36,7 @@ from mpm_dolfinx.verification.exact import Mandel, terzaghi_consolidation
 PEER, TRUTH = "FEM Q1/DG0, same grid", "FEM Taylor-Hood"
 BY_ERROR, EQUAL, STANDARD = "MPM, steps by error", "MPM, equal steps", "standard MPM, at the points"
 RTOL = 6e-3
-"""Tolerance of the steps by error where the cell size varies."""
+"""Tolerance of adaptive steps in the runs of different cell size."""
 STYLES = {  # colour and marker of each method, the same in all cases
     BY_ERROR: ("C0", "o"),
     EQUAL: ("C5", "x"),
@@ -70,7 +70,7 @@ class Row:
 
 
 def beam_runs(drained: bool, quick: bool) -> Iterator[tuple[str, str, Run]]:
-    """Yield (method, setting, run) of the beam, with water or (`drained`) without."""
+    """Yield (method, setting, run) of the beam; drained: whether the beam has no water."""
     time = "--drained --ramp 1 --t-end 1 --dt 0.1" if drained else f"--t-end {0.4 if quick else 1.2}"
     times, truth = np.array(beam.TIMES), np.array(beam.TRUTH)
     if drained:
@@ -130,9 +130,11 @@ def scene_runs(
 ) -> Iterator[tuple[str, str, Run]]:
     """Yield (method, setting, run) of a box, first for all cell sizes, then for all numbers of steps.
 
-    width: number of cells over the width, or -1 for as many as over the height.  time: end time, s, and number of steps
-    for all cell sizes.  exact: displacement of the top, m.  cells: numbers of cells over the height.  steps: numbers of
-    steps, on the finest cells.
+    width: number of cells over the width, or -1 for as many as over the height.
+    time: end time, in s, and number of steps in runs of different cell size.
+    exact: exact displacement of the top, in m.
+    cells: numbers of cells over the height.
+    steps: numbers of steps in runs on the smallest cells.
     """
 
     def points(n: int, m: int, rtol: float | None = None, **options) -> Run:
@@ -251,7 +253,7 @@ def time_at(rows: list[Row], error: float) -> float:
 
 
 def compare(rows: list[Row]) -> list[dict]:
-    """Compare runs with Q1/DG0 elements: errors and times on equal cells, and times at equal error."""
+    """Compare runs with Q1/DG0 elements: errors and run times on equal cells, and run times at equal error."""
     out = []
     for r in (r for r in rows if r.method in (BY_ERROR, EQUAL)):
         peers = [q for q in rows if q.case == r.case and q.method == PEER]

@@ -5,14 +5,14 @@ The scene is in plane strain, and only half of the gel is computed, by symmetry.
 on a smooth base, and drains at its side, far from the cylinder.  The cylinder moves down in the first step and is then
 held.
 
-* Initially no water has flowed, and the gel is incompressible.  The pressure under the cylinder is Hertz's,
+* Initially no water has flowed, and the gel is incompressible.  By Hertz's theory the pressure under the cylinder is
 
       p = p_0 sqrt(1 - x^2 / a^2),    a = 2 sqrt(F R / (pi E*)),    p_0 = sqrt(F E* / (pi R)),
 
   at a distance x from the middle, with the half-width a of the contact, the radius R of the cylinder, and E* = 4 G of
   the undrained gel.  For a layer of finite height, these equations hold with the computed force F per length.
-* Finally the pore pressure has dissipated, and the contact is Hertz's with E* = E / (1 - nu^2) of the drained gel.  The
-  force equals that on a dry gel, which the demo also computes.
+* Finally the pore pressure has dissipated.  Hertz's theory then holds with `E* = E / (1 - nu^2)` of the drained gel.
+  The force must equal the force on a dry gel, which the demo also computes.
 """
 
 from __future__ import annotations
@@ -37,9 +37,10 @@ TIMES = np.geomspace(1e-4, 10, 21)  # times at which the force is recorded, divi
 
 @dataclass
 class Contact:
-    """Contact at one time: force, N/m, and positions (k,), m, and pressures (k,), Pa, of points at the gel's surface.
+    """Contact at one time; force, in N/m.
 
-    most, half: largest pressure, Pa, and half-width, m, of the ellipse fitted to these pressures.
+    x, p (k,): positions, in m, and pressures, in Pa, of points at the gel's surface.
+    most, half: largest pressure, in Pa, and half-width, in m, of the ellipse fitted to these pressures.
     """
 
     force: float
@@ -89,9 +90,11 @@ def scene(cells: int, wet: bool) -> mpm.Simulation:
 class Pressed:
     """Results of a run.
 
-    contacts: initial contact and, if wet, final contact.  forces: N/m, initially and at `TIMES`.  frame: initial
-    corners, pore pressures, and shape of the cylinder.  balance: largest error of the fluid balance.  cuts: number of
-    cut steps.
+    contacts: initial contact and, if wet, final contact.
+    forces: forces, in N/m, initially and at `TIMES`.
+    frame: initial corners, pore pressures, and shape of the cylinder.
+    balance: largest error of the fluid balance.
+    cuts: number of cut steps.
     """
 
     contacts: list[Contact]
