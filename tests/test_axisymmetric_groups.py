@@ -14,7 +14,10 @@ TURN = 2 * np.pi
 @pytest.mark.parametrize(("offset", "order", "spacings"), [(0.0, 1, (2, 3)), (0.3, -1, (2, 2)), (0.7, 1, (3, 2))])
 def test_discs_under_pressure_press_each_other_evenly(offset, order, spacings):
     grid, y = mpm.Grid([0, 0], [1, 2], [8, 16], axisymmetric=True), 0.5 + offset / 8
-    bodies = [mpm.box(grid, *box, per_cell=n) for box, n in zip(([[0, 0], [1, y]], [[0, y], [1, 0.98]]), spacings)]
+    bodies = [
+        mpm.box(grid, *box, per_cell=n)
+        for box, n in zip(([[0, 0], [1, y]], [[0, y], [1, 0.98]]), spacings, strict=True)
+    ]
     press = mpm.Traction("top", (0, -1e4), region=([0, 0.95], [1, 1.1]))
     conditions = [press, mpm.Contact(*(0, 1)[::order], friction=0.3)]
     s = mpm.Simulation(grid, bodies, [SOIL], walls={"bottom": "y", "right": "x"}, conditions=conditions)
@@ -24,7 +27,7 @@ def test_discs_under_pressure_press_each_other_evenly(offset, order, spacings):
 
 
 def in_sleeve(n, stiff, inner=0.43, outer=0.9, p=100.0):
-    """Return the radial force on a core, and its exact value, in a sleeve under a pressure; both without strain in z."""
+    """Return the radial force on a core, and its exact value, in a sleeve under a pressure, without strain in z."""
     grid = mpm.Grid([0, 0], [1 + 2 / n, 2 / n], [n + 2, 2], axisymmetric=True)
     core = mpm.box(grid, [0, 0], [inner, 2 / n])
     sleeve = mpm.box(grid, [inner, 0], [outer, 2 / n], per_cell=3, material=1)
