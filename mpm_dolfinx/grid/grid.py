@@ -543,7 +543,7 @@ class Grid:
         return np.append(self.lines[axis], np.inf)[self.lines[axis].searchsorted(x, side="right")]
 
     def cells_along(self, axis: int, x: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the indices of the cells in the grid nearest to coordinates x, in m, along an axis of unequal cells."""
+        """Return the indices of cells in the grid nearest to coordinates x, in m, along an axis of unequal cells."""
         return np.minimum(np.maximum(self.lines[axis].searchsorted(x, side="right") - 1, 0), self.shape[axis] - 1)
 
     mesh = of_cells("mesh")

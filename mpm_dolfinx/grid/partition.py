@@ -16,8 +16,7 @@ UNEVEN = 1.2
 The results of a scene do not depend on the limit.  Source: definition, the documented limit of the imbalance.
 """
 EMPTY = 1e-2
-"""Weight of an empty cell divided by the mean weight of a filled cell.  Empty cells need memory and time.
-"""
+"""Weight of an empty cell divided by the mean weight of a filled cell.  Empty cells need memory and time."""
 
 
 class Partition:
