@@ -172,11 +172,7 @@ def test_results_are_found_by_names_and_not_by_positions():
 
 @pytest.mark.parametrize(
     "names, value",
-    [
-        (("foot", "foot"), "must differ from the names of other conditions"),
-        (("a/b", None), "'a/b'"),
-        ((3, None), "name = 3"),
-    ],
+    [(("foot", "foot"), "of another condition, must be unique"), (("a/b", None), "'a/b'"), ((3, None), "name = 3")],
 )
 def test_a_name_that_is_none_or_of_two_conditions_is_refused(names, value, tmp_path):
     held = [mpm.Displacement(side, (0, 0), "y", name=name) for side, name in zip(("left", "right"), names, strict=True)]

@@ -41,7 +41,7 @@ def named(conditions: Sequence[Any]) -> dict[str, Any]:
         if name is not None and not (isinstance(name, str) and re.fullmatch(r"[\w .-]+", name)):
             raise ValueError(f"{line(one)}: name = {line(name)}, must consist of letters, digits, blanks and _ . -")
         if name is not None and given.count(name) > 1:
-            raise ValueError(f"{line(one)}: name = {line(name)}, must differ from the names of other conditions")
+            raise ValueError(f"{line(one)}: name = {line(name)} is the name of another condition, must be unique")
     out: dict[str, Any] = {}
     for name, one in zip(given, conditions, strict=True):
         base, count = name or _default(one), 1

@@ -37,7 +37,7 @@ class Sides:
         if not len(found):
             where = " in the region" if condition.region is not None else ""
             where += " off the axis" if self.grid.has_axis else ""
-            raise ValueError(f"{line(condition)}: no point lies on this side{where}; the side must be that of a body")
+            raise ValueError(f"{line(condition)}: no point has this side{where}, must be a side of a body")
         copies = np.unique(self.grid.copy(found.id))
         if len(copies) > 1:
             what = f"{line(condition)}: {len(copies)} groups of bodies have this side"
