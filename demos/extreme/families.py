@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""The families of `extreme_cases`: scenes with one extreme property each, exact solutions, and bounds of the errors."""
+"""The families of `extreme_cases`.  The scenes of a family have one extreme property, a reference, and a bound of the
+error.
+"""
 
 from __future__ import annotations
 
@@ -35,9 +37,10 @@ from mpm_dolfinx.verification.exact import SelfWeightColumn
 
 @dataclass(frozen=True)
 class Family:
-    """Scenes with the same extreme property.
+    """Scenes that share one extreme property.
 
-    cases: generator of (setting, scene); bound: largest allowed error of a scene.
+    cases: generator of pairs (setting, scene)
+    bound: largest allowed error of a scene
     """
 
     cases: Callable[[], Iterator[tuple[str, Make]]]
@@ -48,7 +51,7 @@ FAMILIES: dict[str, Family] = {}
 
 
 def family(bound: float):
-    """Register a generator of (setting, scene) as a family."""
+    """Register a generator of pairs (setting, scene) as a family."""
 
     def register(cases):
         FAMILIES[cases.__name__.replace("_", "-")] = Family(cases, bound)
@@ -58,7 +61,7 @@ def family(bound: float):
 
 
 def decades(low: int, high: int, step: int = 1) -> list[float]:
-    """Return the powers of ten from 10^low to 10^high; step: increment of the exponent."""
+    """Return the powers of ten from 10^low to 10^high.  `step` is the increment of the exponent."""
     return [float(f"1e{n}") for n in range(low, high + 1, step)]
 
 
