@@ -45,7 +45,7 @@ logger = logging.getLogger("mpm_dolfinx")
 _settings = jit.get_options if hasattr(jit, "get_options") else jit.get_parameters  # OLD
 _ffcx_settings = ffcx.get_options if hasattr(ffcx, "get_options") else ffcx.get_parameters  # OLD
 _replacements: dict[Path, Path] = {}
-"""Temporary folders of this run.  The key of each is the cache folder, not writable, that it replaces."""
+"""Temporary folders of this run, by the cache folder that each replaces.  These cache folders are not writable."""
 _warnings: dict[Path, str] = {}
 """Warnings still to be issued, by temporary folder.  The first compilation in a folder issues its warning."""
 

@@ -231,7 +231,7 @@ class Loads:
         return self
 
     def counted(self, at: At) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return flat local dofs (n,) on walls, and the loads (n,), in N, there that are no part of wall reactions."""
+        """Return flat local dofs (n,) on walls, and loads (n,), in N, at these dofs that wall reactions exclude."""
         return np.empty(0, dtype=np.int64), np.empty(0)
 
     def within_reach(self) -> NDArray[np.int64]:
@@ -251,7 +251,7 @@ class Loads:
         return np.empty(0, dtype=np.int32)
 
     def rounding(self, of_cells: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return rounding errors (cells,), in N, of forces in local cells.  `of_cells`: without this condition."""
+        """Return rounding errors (cells,), in N, of forces in local cells.  `of_cells`: errors without the condition."""
         return of_cells
 
     @property
@@ -280,8 +280,8 @@ class Loads:
     ) -> NDArray[np.float64]:
         """Return the corners (n, 2^d, d), in m, after they are moved out of forbidden regions.
 
-        `free` (n, 2^d, d) tells which components no other condition prescribes.  By default only small penetrations
-        are corrected; with `everywhere`, penetrations of any depth are corrected.
+        `free` (n, 2^d, d) tells which components no other condition prescribes.  By default only small penetrations are
+        corrected.  With `everywhere`, penetrations of any depth are corrected.
         """
         return corners
 

@@ -41,8 +41,7 @@ TURN = 2 * np.pi
 CHUNK = 2**14
 """Number of rows of an array that are processed together.  This number limits the size of temporary arrays."""
 SNAP = 1e-10
-"""Vertices at most this distance, in cell sizes, from a grid plane count as on the plane.  `Grid.snap` adds rounding.
-"""
+"""Vertices nearer to a grid plane than this distance, in cell sizes, count as on it.  `Grid.snap` adds rounding."""
 ORDER = "the order is Grid(lower, upper, cells)"
 MANY = "grid: h is undefined for unequal cells, must be replaced by sizes"
 
@@ -114,7 +113,7 @@ def polynomial(
 
 
 def ranges(first: NDArray[np.int64], count: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """List all n integers of the ranges with these first integers and counts: index of the range (n,), integer (n,)."""
+    """Return, for each integer in these ranges, the index (n,) of its range and the integer (n,) itself."""
     of = np.arange(len(count)).repeat(count)
     return of, np.arange(len(of)) + np.repeat(first - (np.cumsum(count) - count), count)
 
@@ -129,7 +128,7 @@ def among(numbers: NDArray[np.integer], chosen: NDArray[np.integer]) -> NDArray[
 def values_at(
     chosen: NDArray[np.int64], numbers: NDArray[np.int64], values: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the values (n, k) of the numbers `chosen` (n,), given those of sorted `numbers` (m,).  Others have 0."""
+    """Return the values (n, k) of the numbers `chosen` (n,), given those of sorted `numbers` (m,), else 0."""
     at = numbers.searchsorted(chosen)
     found = np.append(numbers, -1)[at] == chosen
     return np.concatenate([values, np.zeros((1, values.shape[1]))])[np.where(found, at, len(numbers))]
@@ -658,7 +657,7 @@ class Grid:
         return int(np.prod(self.shape + 1))
 
     def copy(self, ids: NDArray[np.int64]) -> NDArray[np.int64] | int:
-        """Return, for material points with these ids (n,), the index of the first cell of their copy of the box."""
+        """Return the index of the first cell in the copy of the box to which material points `ids` (n,) belong."""
         return 0
 
     def cellwise(self, shape: tuple[int, ...] = ()):
@@ -712,9 +711,7 @@ class Grid:
         return self.partition.owner(np.array(np.unravel_index(number % self.cells, tuple(self.shape))))
 
     def gathered(self, rows: Sequence[tuple], width: int) -> tuple[NDArray, NDArray, NDArray]:
-        """Send rows (cells, positions, values) to the owners of the cells.turn the received rows in three arrays: local
-        cells, positions and values.
-        """
+        """Send rows (cells, positions, values) to the owners of the cells.  Return received rows with local cells."""
         empty = (np.empty(0, dtype=np.int64), np.empty((0, self.dim)), np.empty((0, width)))
         parts = [np.concatenate(column) for column in zip(empty, *rows, strict=True)]
         travel = Exchange(self.comm, self.owner(parts[0]))
@@ -877,5 +874,5 @@ class GridOfGroups(Grid):
         return GridOfGroups(self, self._group, self._starts)
 
     def copy(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return, for material points with these ids (n,), the index of the first cell of their copy of the box."""
+        """Return the index of the first cell in the copy of the box to which material points `ids` (n,) belong."""
         return self._group[self._starts.searchsorted(ids, side="right") - 1] * np.int64(self.cells)
