@@ -251,7 +251,7 @@ class Loads:
         return np.empty(0, dtype=np.int32)
 
     def rounding(self, of_cells: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return rounding errors (cells,), in N, of forces in local cells.  `of_cells`: errors without the condition."""
+        """Return rounding errors (cells,), in N, of forces in local cells.  `of_cells`: errors without it."""
         return of_cells
 
     @property
