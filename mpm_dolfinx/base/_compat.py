@@ -49,7 +49,7 @@ def box_mesh(
     x : (m, d), m
         Positions of the nodes that this process contributes.  Nodes are numbered globally in the order of the ranks.
     ranks, offsets
-        Ranks that hold each cell.  Those of cell i are `ranks[offsets[i] : offsets[i + 1]]`, the owner first.
+        Ranks that hold each cell.  Cell i has `ranks[offsets[i] : offsets[i + 1]]`, the owner first.
     """
     kind = {4: "quadrilateral", 8: "hexahedron"}[cells.shape[1]]
     where = (ranks, offsets)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 @dataclass
 class Report:
-    """Report of a converged time step.  Pressures are those of cells.  For the motion see `motion_error`."""
+    """Report of a converged time step.  Pressures are cell pressures.  For the motion see `motion_error`."""
 
     newton: int = 0  # Newton iterations
     coupling: int = 0  # iterations of the coupled linear solver

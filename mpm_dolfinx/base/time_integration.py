@@ -9,10 +9,9 @@ Without inertia the momentum balance has no time derivative.  The fluid content 
                      zeta(u2, p2) - zeta_n + gamma dt Q(u2, p2) + (1 - gamma) dt Q(u1, p1) = 0    loads at t + dt.
 
 With gamma = 1 - 1 / sqrt(2), `sdirk2` is Alexander's method (1977).  It is second-order and L-stable.  The rate at the
-start of the step is not used, because a transfer between grids makes this rate noisy.  The values (u2, p2) are those at
-the end of the step.  After a jump of the loads, one long step overshoots by a fifth of the change, but two half steps
-do not, see `step_size`.  The error of a step is estimated from the rates of the two substeps: see
-`solve.newton.note_pressures`.
+start of the step is not used, because a transfer between grids makes this rate noisy.  The step ends with the values
+(u2, p2).  After a jump of the loads, one long step overshoots by a fifth of the change, but two half steps do not, see
+`step_size`.  The error of a step is estimated from the rates of the two substeps: see `solve.newton.note_pressures`.
 """
 
 from __future__ import annotations

@@ -205,7 +205,7 @@ class Source:
 
 
 def sorted_terms(terms: Sequence[Callable | OnSide | Source]) -> tuple[list[Callable | OnSide], list[Callable]]:
-    """Return two lists of the user's terms: those of the momentum balance, and those of the fluid balance."""
+    """Return two lists of the user's terms: terms of the momentum balance, and terms of the fluid balance."""
     if isinstance(terms, (str, bytes)) or not isinstance(terms, Sequence):
         raise ValueError(f"terms = {line(terms)}, must be a list of functions, OnSide and Source")
     sources = [term.term for term in terms if isinstance(term, Source)]
@@ -435,7 +435,7 @@ class Displacement(Condition):
         Side of the bodies, as for `Traction`.
     value : (d,) or callable (t, X) -> (d,) or (m, d), m
         Displacement since the start, or since a stage set it to zero, at reference positions X (m, d).  In a mapped
-        body, the map converts X to seeded positions.  The value has all d components, even those not prescribed.
+        body, the map converts X to seeded positions.  The value has all d components, even if some are not prescribed.
     components
         Prescribed components, such as "y".  By default all d components are prescribed.
     region : ((d,), (d,)), m

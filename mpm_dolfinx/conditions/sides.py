@@ -53,7 +53,7 @@ class Sides:
         return self._found[key]
 
     def held(self, condition: Displacement, others: Sequence[Displacement]) -> Surface:
-        """Return the faces of a prescribed displacement, without cells of which its region covers at most one half.
+        """Return the faces of a prescribed displacement, without cells that its region covers by at most one half.
 
         The last prescribed node also moves half a cell of the side beyond it.  If the region covers at most half of the
         cell in which it ends, the faces therefore end where the region enters this cell.  On a side inclined to the

@@ -52,7 +52,7 @@ def fixed_corners(grid: Grid, walls: Mapping[str, str], corners: NDArray[np.floa
 def stopped(
     grid: Grid, walls: Mapping[str, str], corners: NDArray[np.float64], before: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return corners (n, 2^d, d), in m, after some of those outside the grid are moved to its sides.
+    """Return corners (n, 2^d, d), in m, after some corners outside the grid are moved to its sides.
 
     Corners move to a side if its wall fixes the normal component, or if their old position `before` was in the grid.
     """

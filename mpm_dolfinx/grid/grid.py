@@ -128,14 +128,14 @@ def among(numbers: NDArray[np.integer], chosen: NDArray[np.integer]) -> NDArray[
 def values_at(
     chosen: NDArray[np.int64], numbers: NDArray[np.int64], values: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the values (n, k) of the numbers `chosen` (n,), given those of sorted `numbers` (m,), else 0."""
+    """Return the values (n, k) of the numbers `chosen` (n,), given values of sorted `numbers` (m,), else 0."""
     at = numbers.searchsorted(chosen)
     found = np.append(numbers, -1)[at] == chosen
     return np.concatenate([values, np.zeros((1, values.shape[1]))])[np.where(found, at, len(numbers))]
 
 
 def across_faces(grid: Grid, n: Any) -> tuple[Any, Any, Any]:
-    """Return three UFL lengths along the normal n of a face: those of the "+" and of the "-" cell, and their mean."""
+    """Return three UFL lengths along the normal n of a face: of the "+" cell, of the "-" cell, and the mean length."""
     h = grid.edge_in_forms()
     if grid.even:
         return (sum(abs(n[a]) * h[a] for a in range(grid.dim)),) * 3
@@ -287,7 +287,7 @@ def of_cells(name: str) -> cached_property:
 
 
 def of_places(name: str) -> property:
-    """Return a property of a grid that is an attribute of `Cells.at`: current positions of nodes or of midpoints."""
+    """Return a property of a grid: current positions of nodes or of midpoints, an attribute of `at` of its `Cells`."""
     return property(lambda grid: getattr((grid._cells or grid._of_process).at, name))
 
 
@@ -318,8 +318,8 @@ class Grid:
         the centre of the tool's ball, the tip of its cone, or the mean of its corners.  If the tool's shape is a
         function, they move like its `centre`.  The other cells widen or narrow.  The tool must be a condition of the
         first stage.  Lines do not move in stages without this tool.  A function depends on time t (s), the positions x
-        (n, d) of all points, or both.  The function returns all lines.  Along each axis their number, and the first and
-        last coordinate, must be those of `lines`.
+        (n, d) of all points, or both.  The function returns all lines.  Along each axis, their number, first and last
+        coordinate must be as in `lines`.
     axisymmetric
         Whether the first axis is the radius r >= 0, and the second axis is the axis of revolution.  There is no
         torsion.  Volumes (m^3), forces (N) and outflows (m^3/s) refer to the whole revolution.  If the grid begins at r
@@ -464,7 +464,7 @@ class Grid:
         return self.h[axis] if self.even else self._of_process.at.sizes[cells, axis]
 
     def between(self, cells: Any, others: Any, axis: Any) -> NDArray[np.float64]:
-        """Return the distances (n,), in m, from midpoints of local cells (n,) to those of neighbours along an axis."""
+        """Return the distances (n,), in m, between midpoints of local cells (n,) and of neighbours along an axis."""
         return self.h[axis] if self.even else (self.along(cells, axis) + self.along(others, axis)) / 2
 
     def volumes(self, cells: Any) -> NDArray[np.float64] | float:
@@ -731,7 +731,7 @@ class Grid:
         return np.ravel_multi_index(tuple(index), tuple(self.shape + 1)) + copy * self.nodes
 
     def from_other(self, other: Grid, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return nodal values (unknowns,) of this grid from those of `other`, an equal grid with another partition."""
+        """Convert nodal values (unknowns,) from `other`, an equal grid with another partition, to this grid."""
         rows = nodal.reshape(-1, self.dim)
         some = rows.any(axis=1)
         return self.from_rows(other.node_numbers()[some], rows[some])
@@ -753,7 +753,7 @@ class Grid:
         return np.array([*np.unravel_index(number, tuple(self.shape)), copy]).T.copy()
 
     def neighbours(self, cells: NDArray[np.integer]) -> NDArray[np.int64]:
-        """Return the local indices (n, d, 2) of neighbours of local cells, by axis and end.  Those not on this process
+        """Return the local indices (n, d, 2) of neighbours of local cells, by axis and end.  Cells of other processes
         have -1.
         """
         index = self.cell_places(cells)
@@ -804,7 +804,7 @@ class Grid:
         return np.where(bits, self.signs / (self.h if self.even else 1.0), 0.5).prod(axis=2)
 
     def over_edges(self, coefficients: NDArray[np.float64], cells: NDArray[np.int32]) -> NDArray[np.float64]:
-        """Convert coefficients (d, 2^d, cells) of `monomials` for offsets in m.  Those of equal cells are unchanged."""
+        """Convert coefficients (d, 2^d, cells) of `monomials` for offsets in m.  Equal cells need no change."""
         if self.even:
             return coefficients
         bits = corner_bits(self.dim)[:, None]
