@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Names of conditions, by which their results are found."""
+"""Names of conditions.  Results of a condition are found by its name."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class ByName(dict[str, T]):
 
     @property
     def array(self) -> NDArray[np.float64]:
-        """All values (conditions, ...) as one array; shape (0,) if there are no conditions."""
+        """All values (conditions, ...) as one array.  Without conditions its shape is (0,)."""
         return np.stack(list(self.values())) if self else np.zeros(0)
 
     def __missing__(self, name: Any) -> T:
@@ -29,19 +29,19 @@ class ByName(dict[str, T]):
 
 
 def named(conditions: Sequence[Any]) -> dict[str, Any]:
-    """Return the conditions by name.  A default name consists of kind and side, and if necessary a number.
+    """Return the conditions by name.  A default name consists of kind and side, and a number if necessary.
 
     Raises
     ------
     ValueError
-        An invalid name, or a name used twice.
+        A name is invalid, or two conditions have an equal name.
     """
     given = [getattr(one, "name", None) for one in conditions]
     for name, one in zip(given, conditions, strict=True):
         if name is not None and not (isinstance(name, str) and re.fullmatch(r"[\w .-]+", name)):
             raise ValueError(f"{line(one)}: name = {line(name)}, must consist of letters, digits, blanks and _ . -")
         if name is not None and given.count(name) > 1:
-            raise ValueError(f"{line(one)}: name = {line(name)} of another condition, must be unique")
+            raise ValueError(f"{line(one)}: name = {line(name)} is the name of another condition, must be unique")
     out: dict[str, Any] = {}
     for name, one in zip(given, conditions, strict=True):
         base, count = name or _default(one), 1
