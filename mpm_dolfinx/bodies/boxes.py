@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Bodies of boxes on a regular lattice, stored as a few numbers for any number of boxes."""
+"""Bodies of boxes on a regular lattice.  A few numbers describe any number of boxes."""
 
 from __future__ import annotations
 
@@ -45,17 +45,17 @@ class LatticeBody(Body):
         return np.stack(np.unravel_index(numbers, self.count), axis=-1)
 
     def _at(self, index: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the positions (..., d), m, of lattice corners with indices (..., d)."""
+        """Return the positions (..., d), in m, of lattice corners with indices (..., d)."""
         return self.origin + index * self.spacing
 
     def lower_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the lower corners (m, d), m, of the boxes of the chosen domains."""
+        """Return the lower corners (m, d), in m, of the boxes of the chosen domains."""
         return self._at(self._index(chosen))
 
     def reference(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
-        """Return the reference positions (m, 2^d, d), m, of the corners of the chosen domains, before the map.
+        """Return the reference positions (n, 2^d, d), in m, of corners of the chosen domains, before the map.
 
-        Domains have the same digits at a shared corner, so that no gap opens between them far from the origin.
+        Domains have bitwise equal coordinates at a shared corner, so that rounding opens no gaps far from the origin.
         """
         return self._at(self._index(chosen)[:, None] + corner_bits(self.dim))
 
@@ -90,23 +90,23 @@ class LatticeBody(Body):
 
     @property
     def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Lower and upper corner (d,), m, of the bounding box of the body, before the map."""
+        """Lower and upper corners (d,) of the body's bounding box before the map, in m."""
         low, high = self._ends
         return self._at(low), self._at(high + 1)
 
     def neighbour(self, rows: NDArray[np.int64], step: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the domains (m,) of the body at lattice steps (m, d) from domains `rows` (m,)."""
+        """Return the domains (n,) of the body that lie at lattice steps (n, d) from the domains `rows` (n,)."""
         number = np.ravel_multi_index(tuple((self._index(rows) + step).T), self.count)
         return number if self.filled is None else np.searchsorted(self.filled, number)
 
     @property
     def lattice(self) -> tuple[int, ...]:
-        """Number of lattice boxes along each axis within the bounding box of the body; some may not be filled."""
+        """Number of lattice boxes along each axis within the body's bounding box.  Some of these boxes may be empty."""
         low, high = self._ends
         return tuple(high - low + 1)
 
     def places(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the lattice indices (m, d) of domains, from the lower corner of the body's bounding box."""
+        """Return the lattice indices (n, d) of domains, counted from the lower corner of the body's bounding box."""
         return self._index(rows) - self._ends[0]
 
     def nodes(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -117,25 +117,25 @@ class LatticeBody(Body):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RowsBody(LatticeBody):
-    """A body of boxes on a lattice with rows of different widths; `spacing` (d,), m, are the smallest widths."""
+    """A body of boxes on a lattice with rows of different widths.  `spacing` (d,) has the smallest widths, in m."""
 
     rows: tuple[NDArray[np.float64], ...]  # coordinates of the rows' boundaries along each axis (count + 1,), m
 
     def _at(self, index: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the positions (..., d), m, of lattice corners with indices (..., d)."""
+        """Return the positions (..., d), in m, of lattice corners with indices (..., d)."""
         return np.stack([rows[i] for rows, i in zip(self.rows, np.moveaxis(index, -1, 0), strict=True)], axis=-1)
 
     def boxes(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
-        """Return the edge lengths (m, d), m, of the boxes of the chosen domains, before the map."""
+        """Return the edge lengths (m, d), in m, of the boxes of the chosen domains, before the map."""
         index = self._index(chosen)
         return self._at(index + 1) - self._at(index)
 
     def centre_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the reference positions (m, d), m, of the centres of the chosen domains."""
+        """Return the reference positions (m, d), in m, of the centres of the chosen domains."""
         return self.lower_of(chosen) + 0.5 * self.boxes(chosen)
 
     def across(self, axis: int) -> tuple[float, float]:
-        """Return means over the body: number of domains in a row along an axis, and their edge length along it, m."""
+        """Return two means over the body: number of domains in a row along an axis, and their edge length in m."""
         low, high = self.bounds
         return super().across(axis)[0], float(high[axis] - low[axis]) / self.lattice[axis]
 
@@ -145,13 +145,16 @@ class RowsBody(LatticeBody):
         return sum(float(self.boxes(part).prod(axis=1).sum()) for part in in_chunks(len(self)))
 
     def corner_rows(self, axis: int) -> NDArray[np.float64]:
-        """Return the coordinates (n,), m, of the boundaries of the rows that the body occupies along an axis."""
+        """Return the coordinates (n,), in m, of the boundaries of the rows that the body occupies along an axis."""
         low, high = self._ends
         return self.rows[axis][low[axis] : high[axis] + 2]
 
 
 def _rows(grid: Grid, axis: int, low: float, high: float, per_cell: int) -> NDArray[np.float64]:
-    """Return boundaries of rows from low to high, m: `per_cell` rows in a whole cell, fewer in a part of a cell."""
+    """Return the boundaries of rows from `low` to `high`, in m.
+
+    A whole cell has `per_cell` rows.  A part of a cell has fewer rows, in proportion to its width.
+    """
     lines = grid.lines[axis] + grid.base[axis]
     tolerance = SAME * grid.finest[axis]
     ends = np.concatenate([[low], lines[(lines > low + tolerance) & (lines < high - tolerance)], [high]])
@@ -162,12 +165,12 @@ def _rows(grid: Grid, axis: int, low: float, high: float, per_cell: int) -> NDAr
 
 
 def _rounded(rows: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return numbers of rows as integers >= 1, which do not depend on small rounding errors of coordinates."""
+    """Return numbers of rows as integers >= 1.  Small rounding errors of coordinates do not change these integers."""
     return np.maximum(1, np.rint(NEAR * np.rint(rows / NEAR))).astype(np.int64)
 
 
 def _lattice(rows: list[NDArray[np.float64]], **more: Any) -> RowsBody:
-    """Return a body on the lattice with these boundaries of rows along each axis, m."""
+    """Return a body on a lattice.  `rows` are the boundaries of the lattice's rows along each axis, in m."""
     narrowest, count = np.array([np.diff(r).min() for r in rows]), tuple(len(r) - 1 for r in rows)
     return RowsBody(origin=np.array([r[0] for r in rows]), spacing=narrowest, count=count, rows=tuple(rows), **more)
 
@@ -183,8 +186,8 @@ def box(grid: Grid, lower: ArrayLike, upper: ArrayLike, per_cell: int = 2, mater
         Corners of the box, inside the grid; need not lie on grid lines.
     per_cell
         Points per cell and direction, >= 1, rounded to fit the box.  In grids of unequal cells, domains end at grid
-        lines.  With 1 point, bodies deflect too much and creep; a warning names slender ones.  In 3D, scenes refuse
-        bodies with one domain in each cell that end at grid lines.
+        lines.  With 1 point, bodies deflect too much and creep.  A warning names slender bodies.  In 3D, scenes
+        refuse bodies that end at grid lines and have one domain in each cell.
     material
         Index of the material in the scene's list, >= 0.
 
@@ -212,16 +215,17 @@ def box(grid: Grid, lower: ArrayLike, upper: ArrayLike, per_cell: int = 2, mater
 def shape(
     grid: Grid, inside: Callable[[NDArray[np.float64]], NDArray[np.bool_]], per_cell: int = 2, material: int = 0
 ) -> Body:
-    """Seed a body from a lattice over the whole grid: all domains with centres inside a shape; return the body.
+    """Seed a body from a lattice over the whole grid, and return it.
 
-    The surface of the body has steps of the size of a domain.  `mapped` gives smooth sides.
+    The body consists of all domains of the lattice with centres inside a shape.  Its surface has steps of the size of a
+    domain.  `mapped` gives smooth sides.
 
     Parameters
     ----------
     grid
         Background grid.
     inside
-        Function from positions (n, d), m, to booleans (n,).
+        Function from positions (n, d), in m, to booleans (n,).
     per_cell
         Points per cell and direction, >= 1.
     material
