@@ -45,10 +45,7 @@ MAKES = ("NGEN", "NFILL", "NCOPY", "NMAP", "ELGEN", "ELCOPY", "SYSTEM", "SYMMETR
 
 @dataclass
 class _Set:
-    """A set of elements.  Entries are pairs.
-
-    A pair has the name of an instance (or ""), and element numbers or the name of another set.
-    """
+    """A set of elements.  Each entry has an instance's name or "", and element numbers or the name of another set."""
 
     name: str
     internal: bool

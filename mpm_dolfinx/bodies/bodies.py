@@ -222,10 +222,7 @@ def check_inside(grid: Grid, body: Body, name: str = "body") -> Body:
 
 
 def pressure_at(pressure: float | Callable[[NDArray], ArrayLike], x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the seeded pore pressures (n,), in Pa, at positions x (n, d), in m.
-
-    `pressure` is a number or a function of position.
-    """
+    """Return the pore pressures (n,), in Pa, that a number or a function of position gives at x (n, d), in m."""
     if callable(pressure) and len(x):
         allowed = f"a finite number, or one for each of {len(x)} places"
         given = at_places("pressure", allowed, pressure, "x", x)

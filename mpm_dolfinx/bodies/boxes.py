@@ -151,10 +151,7 @@ class RowsBody(LatticeBody):
 
 
 def _rows(grid: Grid, axis: int, low: float, high: float, per_cell: int) -> NDArray[np.float64]:
-    """Return the boundaries of rows from `low` to `high`, in m.
-
-    A whole cell has `per_cell` rows.  A part of a cell has fewer rows, in proportion to its width.
-    """
+    """Return row boundaries from `low` to `high`, in m.  A cell has `per_cell` rows, a part of a cell fewer rows."""
     lines = grid.lines[axis] + grid.base[axis]
     tolerance = SAME * grid.finest[axis]
     ends = np.concatenate([[low], lines[(lines > low + tolerance) & (lines < high - tolerance)], [high]])

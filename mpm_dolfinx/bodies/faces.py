@@ -263,10 +263,7 @@ def _interval(X: NDArray[np.float64], region: NDArray[np.float64]) -> tuple[NDAr
 def _clipped(
     X: NDArray[np.float64], t: NDArray[np.float64], region: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Clip parts of faces to a region.  Return triangles, and for each triangle the index of its part.
-
-    X (n, 4, 3), in m, are the corners of the faces.  t (n, 4, 2) are the corners of the parts in face coordinates.
-    """
+    """Clip parts t (n, 4, 2) of faces X (n, 4, 3) to a region.  Return triangles, and the part of each triangle."""
     places = np.einsum("npk,nkd->npd", weights(t.reshape(-1, 2)).reshape(*t.shape[:2], 4), X)
     three = (t[:, 2] == t[:, 3]).all(axis=1)[:, None]  # in triangles, the middle is a corner
     middle = np.where(three, places[:, 2], places.mean(axis=1))

@@ -47,10 +47,7 @@ class Contact:
         return self.own.row[face][:, None], self.own.index[face]
 
     def given(self) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
-        """Return which corners (n, 4) of the fill's paired faces lie on the paired faces of the body.
-
-        Also return the displacements (n, 4, d) of the body at these corners, in m.
-        """
+        """Return which corners (n, 4) of the fill's faces touch the body, and displacements of the body there (m)."""
         face, by = self.cover.face, self.cover.by
         s, _ = local(self.other.corners[by], self.own.corners[face], self.other.outward[by])
         on = np.abs(s - 0.5).max(axis=2) <= 0.5 + np.maximum(self.cover.slack, SAME)[:, None]
@@ -180,8 +177,7 @@ def _springs(body: Body, node: NDArray[np.int64], count: int) -> csr_array:
 
 
 def _between(K: csr_array, fixed: NDArray[np.bool_], u: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return displacements (n,) of nodes along an axis: u at fixed nodes, equilibrium of springs K at all other nodes.
-    """
+    """Return displacements (n,) along an axis: u at fixed nodes, equilibrium of springs K at all other nodes."""
     out, free = u.copy(), np.flatnonzero(~fixed)
     if len(free):
         held = np.flatnonzero(fixed)
@@ -225,10 +221,9 @@ def _check_shape(grid: Grid, fill: int, corners: NDArray, u: NDArray) -> None:
 def _penetration(
     grid: Grid, bodies: Sequence[Body], other: int, corners: NDArray, points: MaterialPoints, misfit: float
 ) -> tuple[float, float, NDArray[np.float64]]:
-    """Return the depth, in m, by which a body penetrates the fill, the relative gap between both, and the position.
+    """Return how deep a body penetrates the fill, in m, the gap between both in cells, and the position (d,), in m.
 
-    The gap is divided by the cell size.  The position (d,), in m, is that of the depth or the gap.  At least one of
-    depth and gap is zero.
+    At least one of depth and gap is zero.
     """
     start = _start(bodies, other)
     rows = np.flatnonzero((points.id >= start) & (points.id < start + len(bodies[other])))

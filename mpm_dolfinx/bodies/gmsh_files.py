@@ -53,10 +53,7 @@ def version(file: Path) -> str:
 
 
 def read(file: Path) -> meshio.Mesh:
-    """Return the mesh of a file of format 4.1.
-
-    `cell_sets` contains the cells of physical groups by tag.  `field_data` contains the groups by name.
-    """
+    """Return the mesh of a file of format 4.1.  `cell_sets` has physical groups by tag, `field_data` by name."""
     data = file.read_bytes()
     _, kind, size = _section(data, "MeshFormat").split()[:3]
     binary = kind == b"1"

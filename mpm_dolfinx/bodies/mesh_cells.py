@@ -126,11 +126,7 @@ class Polytopes:
 
     @classmethod
     def of(cls, x: NDArray[np.float64], cells: dict[str, NDArray[np.int64]]) -> Polytopes:
-        """Return all cells as polytopes.
-
-        x (nodes, d), in m: positions of the nodes
-        cells: nodes (n, k) of the cells of each type
-        """
+        """Return all cells as polytopes.  `x` (nodes, d), in m: nodes.  `cells`: nodes (n, k) of cells by type."""
         d = x.shape[1]
         most = [max(len(of) for of in parts) for parts in zip(*(_shape(kind) for kind in cells), strict=True)]
         rows = [_polytopes(d, kind, x[nodes], *most) for kind, nodes in cells.items()]
@@ -183,10 +179,7 @@ def _shape(kind: str) -> tuple[range, list, list]:
 
 
 def _polytopes(dim: int, kind: str, x: NDArray[np.float64], vertices: int, facets: int, edges: int) -> tuple:
-    """Return the arrays of `Polytopes` for cells of one type with vertices x (n, k, d).
-
-    Their second dimensions are padded to the numbers `vertices`, `facets` and `edges`.
-    """
+    """Return arrays of `Polytopes` for cells x (n, k, d) of a type, padded to `vertices`, `facets` and `edges`."""
     _, loops, ends = _shape(kind)
     corners = np.concatenate([x, np.repeat(x[:, -1:], vertices - x.shape[1], axis=1)], axis=1)
     normals, warp = np.zeros((len(x), facets, dim)), np.zeros(len(x))

@@ -210,11 +210,10 @@ def _divided(grid: Grid, mesh: Mesh, part: str | None, per_cell: int, name: str)
 
 
 def _domains(mesh: Mesh, cells: Mapping[str, NDArray[np.int64]]) -> list[tuple[NDArray, NDArray, NDArray]]:
-    """Return tuples of three arrays: corners, facets and cells of n domains.
+    """Return tuples for n domains: corners (n, 2^d, d), facets of the mesh (n, 2d, 2^(d-1)), cells of the mesh (n,).
 
-    The corners (n, 2^d, d) of the domains are in m.  The facets (n, 2d, 2^(d-1)) are the nodes of the mesh facet that
-    contains each face.  These nodes ascend, and -1 precedes the nodes of a triangle.  A face inside a cell has only -1.
-    The cells (n,) are indices of the cells that contain the domains.
+    Facets are the nodes of the mesh facet that contains each face.  Nodes ascend; -1 precedes the nodes of a triangle.
+    A face inside a cell has only -1.
     """
     d = mesh.x.shape[1]
     start = 0
@@ -253,9 +252,8 @@ def _check_sides(
 ) -> None:
     """Raise an error if both cells of a facet lie on one side of this facet.
 
-    The outward vectors of both cells then do not cancel.
-    facet: index of the facet that contains each face of `domains`
-    shared (n,): whether each facet belongs to two cells
+    `facet` is the facet of each face of `domains`.  `shared` (m,) tells which facets belong to two cells.  Outward
+    vectors of both cells do not cancel if the cells lie on one side.
     """
     d, size = domains.shape[2], len(facets)
     outward = np.stack([face_vectors(domains, face) for face in range(2 * d)], axis=1).reshape(-1, d)
@@ -314,8 +312,7 @@ def _box_overlaps(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return n pairs of cells with overlapping bounding boxes as two arrays (n,).  The first has cells of `outer` only.
 
-    Boxes are searched in groups of similar size.  A search over all sizes would use the radius of the largest box for
-    small boxes also.  Sizes in a group differ by a factor of at most 2.
+    Boxes are grouped by size, in octaves.  In one group, small boxes would be searched with the largest box's radius.
     """
     octave, middle = np.frexp(size.max(axis=1))[1], (boxes[:, 0] + boxes[:, 1]) / 2
     of = [[rows[octave[rows] == k] for k in np.unique(octave[rows])] for rows in (outer, np.arange(len(boxes)))]
@@ -362,8 +359,7 @@ def _check_convex(domains: NDArray[np.float64], name: str) -> None:
 
 
 def _facets(keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the different facets (m, k), and the facet index (n, 2d) of each face.  Faces inside cells have index 0.
-    """
+    """Return the different facets (m, k), and the facet index (n, 2d) of each face.  It is 0 for faces inside cells."""
     rows = np.concatenate([np.full((1, keys.shape[2]), -1), keys.reshape(-1, keys.shape[2])])
     first, facet = distinct(rows)
     return rows[first], facet[1:].reshape(keys.shape[:2])

@@ -38,10 +38,7 @@ def overburden(
 
 
 def _along(corners: NDArray, unit_weight: NDArray, x: NDArray, places: NDArray) -> tuple[NDArray, NDArray]:
-    """Return overburden stresses (k,), in Pa, and ground levels (k,), in m, for x, on the vertical lines at `places`.
-
-    `places` (k, d-1) are the horizontal coordinates of the lines, in m.
-    """
+    """Return overburden stresses, in Pa, and ground levels, in m, for x, on vertical lines at `places` (k, d-1)."""
     low, high = corners[..., :-1].min(axis=1), corners[..., :-1].max(axis=1)
     half = (high - low).max(initial=0.0) / 2
     across, line = np.unique(places, axis=0, return_inverse=True)

@@ -99,10 +99,7 @@ def weights(t: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def near(a: NDArray[np.float64], b: NDArray[np.float64], distance: float = 0.0) -> tuple[NDArray, NDArray]:
-    """Return n pairs of polytopes a (k, c, d) and b (l, c, d) whose bounding boxes may be within a distance, in m.
-
-    The result is two index arrays (n,).
-    """
+    """Return two index arrays (n,) of polytopes a (k, c, d), b (l, c, d) with boxes within about `distance`, in m."""
     if not (len(a) and len(b)):
         return (np.empty(0, dtype=np.int64),) * 2
     low, high = np.maximum(a.min(axis=(0, 1)), b.min(axis=(0, 1))), np.minimum(a.max(axis=(0, 1)), b.max(axis=(0, 1)))
@@ -190,11 +187,7 @@ def covered(count: int, cover: Cover) -> NDArray[np.float64]:
 def uncovered_triangles(
     own: Faces, cover: Cover, faces: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Divide the uncovered parts of chosen faces into n triangles.
-
-    Return the face (n,) of each triangle, and its corners (n, 3, 2) in face coordinates.  `faces` (m,) are the chosen
-    faces.
-    """
+    """Return the face (n,) and corners (n, 3, 2), in face coordinates, of n triangles that fill uncovered parts."""
     corners = own.corners[faces]
     normal = own.outward[faces] / np.linalg.norm(own.outward[faces], axis=1, keepdims=True)
     whole, _ = local(_parallelograms(corners), corners, normal)
@@ -234,10 +227,7 @@ def uncovered_triangles(
 
 
 def within(s: NDArray, owner: NDArray, low: NDArray, high: NDArray) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Clip triangles (3, 2, n) to boxes.  Return the parts inside the boxes, and the face (owner) of each part.
-
-    `low` and `high` are the corners of the boxes.  Their shape is (n, 2), or (2,) for one box.
-    """
+    """Clip triangles (3, 2, n) to boxes `low`, `high`, (2,) or (n, 2).  Return parts, and the owner of each part."""
     low, high = (np.broadcast_to(x, (s.shape[2], 2)) for x in (low, high))
     index = np.arange(s.shape[2])
     for axis in (0, 1):
@@ -258,10 +248,7 @@ def _areas(s: NDArray) -> NDArray[np.float64]:
 
 
 def split(s: NDArray, owner: NDArray, axis: int, plane) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-    """Divide triangles (3, e, n) at a plane normal to an axis.
-
-    Return the parts below the plane and their owners, then the parts above the plane and their owners.
-    """
+    """Divide triangles (3, e, n) at a plane normal to an axis.  Return parts and owners below it, then above it."""
     plane = np.broadcast_to(plane, len(owner))
     low, high = s[:, axis].min(axis=0) < plane, s[:, axis].max(axis=0) > plane
     both = np.flatnonzero(low & high)
@@ -274,9 +261,7 @@ def split(s: NDArray, owner: NDArray, axis: int, plane) -> tuple[NDArray, NDArra
 def uncovered(
     count: int, face: NDArray[np.int64], low: NDArray[np.float64], high: NDArray[np.float64], slack: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    """Divide the parts of faces that no box covers into m rectangles.
-
-    Return the face (m,), the lower corner (m, 2) and the upper corner (m, 2) of each rectangle.
+    """Return the face (m,), lower corner and upper corner (m, 2) of rectangles that fill uncovered parts of faces.
 
     count: number of faces
     face (n,): index of the face that each box covers in part
@@ -356,10 +341,7 @@ def separation(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.flo
 
 
 def _between_planes(a: NDArray, b: NDArray, normals: Iterable[NDArray]) -> NDArray[np.float64]:
-    """Return the largest distances (n,), in m, of two parallel planes that separate domains a and b.
-
-    `normals` are the normals (n, d) of the planes that are tried.
-    """
+    """Return the largest distances (n,), in m, of two parallel planes with any of `normals` that separate a and b."""
     out, size = np.full(len(a), -np.inf), np.ptp(a, axis=1).max(axis=1)
     for n in normals:
         length = np.linalg.norm(n, axis=1)
@@ -371,10 +353,7 @@ def _between_planes(a: NDArray, b: NDArray, normals: Iterable[NDArray]) -> NDArr
 
 
 def solids(body: Body) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return convex domains (n, 2^d, d) of a body, and the tolerances (n,) of their gaps and overlaps, both in m.
-
-    A body that fills a box has only one convex domain here.
-    """
+    """Return convex domains (n, 2^d, d) of a body, one for a box, and the tolerances (n,) of overlaps, both in m."""
     low, high = body.bounds
     size, edge = high - low, body.spacing.min()
     if body.aligned and np.isclose(size.prod(), body.volume_of_boxes, rtol=SAME, atol=0):
@@ -400,11 +379,10 @@ def meeting(
     b: tuple[NDArray[np.float64], NDArray[np.float64]],
     in_cells: Callable[[NDArray[np.float64]], NDArray[np.float64]],
 ) -> tuple[float, float, NDArray[np.float64]]:
-    """Return the largest overlap of two bodies, in m, the smallest relative gap between both, and the position of it.
+    """Return the largest overlap of two bodies, in m, the smallest gap, in cells, and its position (d,), in m.
 
-    The gap is divided by the cell size.  The position (d,), in m, is that of the overlap or the gap.  Touching bodies
-    have overlap 0 and gap 0.  The gap of distant bodies is inf.  `a` and `b` are the domains of the bodies with their
-    tolerances, see `solids`.  `in_cells` divides positions by the cell size.
+    Touching bodies have overlap 0 and gap 0.  The gap of distant bodies is inf.  `a` and `b` are the domains of the
+    bodies with their tolerances, see `solids`.  `in_cells` divides positions by the cell size.
     """
     i, j = near(a[0], b[0])
     separations, slack = separation(a[0][i], b[0][j]), a[1][i] + b[1][j] + rounding(a[0])

@@ -158,8 +158,7 @@ class FreeTools(ContactProblem):
         return last.motion + last.shift + np.einsum("kij,kj->ki", last.inverse, on[:, 1:])
 
     def _free_motion(self, w: NDArray[np.float64], motion: NDArray[np.float64]) -> FreeMotion:
-        """Return the motion of the tools, linearised about `motion` (k, q) and the pairs' displacements w (m, d), in m.
-        """
+        """Return the motion of tools, linearised about `motion` (k, q) and about w (m, d), in m, of the pairs."""
         found = self._find_at(w, motion)
         equation = self._equation(found)
         return FreeMotion(w, motion, equation.shift, equation.inverse, found)

@@ -45,10 +45,7 @@ class Origin:
     def means(
         self, contacts: Mapping[str, Rough], points: MaterialPoints, push: NDArray, shear: NDArray
     ) -> MaterialPoints:
-        """Return the points with means of the pressures `push` and the shear tractions `shear` of pairs, in Pa.
-
-        Means are over the pairs of each point, weighted by area.
-        """
+        """Return the points with area-weighted means of their pairs' pressures `push` and tractions `shear`, in Pa."""
         push = self.exchange.back(push)
         shear = self.exchange.back(shear)
         data = dict(points.data)

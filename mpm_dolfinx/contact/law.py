@@ -94,8 +94,7 @@ class Touch:
 class ContactLaw:
     """Contact pressures, shear tractions and their derivatives in a substep.
 
-    names: names of the `contacts`
-    pairs: possible contact pairs
+    `names` are the names of the `contacts`.  `pairs` are the possible contact pairs.
     """
 
     def __init__(self, names: Sequence[str], contacts: Sequence[Rough], pairs: Pairs):
@@ -159,12 +158,8 @@ class ContactLaw:
     ) -> tuple:
         """Return the fields of `Touch` from `sticks` to `by_pressure`.
 
-        The arguments are means over the pairs of each condition, and whether it is in contact:
-        n (k, d): normal
-        slip (k, d), in m: slip in the step
-        old (k, d), in Pa: shear traction before the step
-        pressure (k,), in Pa: contact pressure
-        on (k,): whether any pair of the condition is in contact
+        n, slip, old (k, d): means of normal, slip (m), and shear traction before the step (Pa) over each condition's
+        pairs
         """
         P = np.eye(n.shape[1]) - n[:, :, None] * n[:, None, :]
         hold = np.where(self.strength.any(axis=1), self._hold, 0.0) * on
@@ -181,10 +176,7 @@ class ContactLaw:
         return ~slips & on, trial, shear, most, grip, by_pressure
 
     def tangent(self, touch: Touch, at: Geometry) -> scipy.sparse.csr_matrix:
-        """Return D (m d, m d): minus the derivative of forces with respect to w.
-
-        The rotation of shear tractions is neglected.
-        """
+        """Return D (m d, m d), minus the derivative of forces by w.  The rotation of shear tractions is neglected."""
         pairs = self.pairs
         d = self.grid.dim
         m = len(self.pairs.cell)
@@ -223,10 +215,7 @@ class ContactLaw:
         return area * out
 
     def choose(self, state: ContactState, touch: Touch, sticks: bool) -> tuple[ContactState, bool]:
-        """Update which conditions slip.  Return the new state, and whether any condition changed.
-
-        sticks: whether conditions may return from slip to stick
-        """
+        """Update which conditions slip.  Return the state, and whether any changed.  sticks: allow return to stick."""
         before = state.slips
         left = ~before & ~touch.sticks & state.stuck.any(axis=1)
         parts = state.parts | (left & state.resticks)
@@ -245,8 +234,8 @@ class ContactLaw:
     def augmented(self, state: ContactState, touch: Touch, largest: Callable[[NDArray], NDArray]) -> ContactState:
         """Return the state after an augmentation.  Raise NotConverged if there have been too many augmentations.
 
-        lambda is set to the contact pressures in connected parts with too large penetrations.  `largest` is a function
-        of values (k,) of the conditions.  It returns the largest value (k,) in the connected part of each condition.
+        lambda is set to the contact pressures in connected parts with too large penetrations.  `largest` returns the
+        largest of some values (k,) in the connected part of each condition (k,).
         """
         # small parts of faces in a cell cannot correct their penetration alone, but follow their neighbours
         x = self.pairs.x
@@ -293,7 +282,7 @@ class ContactLaw:
     def tractions(self, touch: Touch, at: Geometry) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the pressures (m,) and shear tractions (m, d), in Pa, of the pairs.
 
-        In stick, pairs keep their deviations from the cell's mean shear traction.  Repeated averaging would otherwise
+        In stick, pairs keep their deviations from the cell's mean shear traction, because repeated averaging would
         cause creep.
         """
         off = (at.shear - self.mean(at.shear)[self.of]) * touch.sticks[self.of, None]

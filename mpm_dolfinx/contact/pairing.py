@@ -73,11 +73,7 @@ class Pairs(NamedTuple):
 
 
 class Contacts(Touching):
-    """The contacts between groups in a stage.
-
-    setting: data of the stage
-    contacts: contacts by name
-    """
+    """The contacts between groups in a stage.  `setting` is the stage's data.  `contacts` has contacts by name."""
 
     conditions, title = (Contact,), "contacts"
 
@@ -117,12 +113,10 @@ class Contacts(Touching):
         present: MaterialPoints,
         cell_pairs: Callable[[], NDArray[np.int64]],
     ) -> tuple[ContactLaw, Origin]:
-        """Return the contact law and the origin of pairs.
+        """Return the contact law and the origin of pairs that were found for the points `seen`.
 
         points: points at the start of the step, with the contact history
-        found: facets and pairs of each contact
-        seen: points with the positions at which the pairs were found
-        present: points with the current positions
+        present: points at their current positions
         """
         grid = self.grid
         d = self.grid.dim
@@ -308,8 +302,7 @@ class Contacts(Touching):
 class ContactLoads(ContactProblem):
     """Contact loads between groups.  The contact pairs follow the motion of the bodies.
 
-    cut: cut particle domains
-    law, origin, again, cell_pairs: see `ContactProblem`
+    `cut` has the cut particle domains.  For the other parameters see `ContactProblem`.
     """
 
     def __init__(self, contacts: Contacts, cut: CutDomains, law: ContactLaw, origin: Origin, again, cell_pairs):
@@ -363,10 +356,7 @@ def _on(corners: NDArray[np.float64], t: NDArray[np.float64]) -> NDArray[np.floa
 
 
 def _along(corners: NDArray, x: NDArray, n: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Intersect faces with lines from x (m, d) along n (m, d).
-
-    Return the face coordinates (m, 2) of the intersections, and their distances (m,), in m, from x.
-    """
+    """Return face coordinates (m, 2), and distances (m,) from x, in m, where lines from x along n intersect faces."""
     if corners.shape[2] == 2:  # as in `Faces`, with unit width along a third axis
         corners = np.dstack([corners[:, BITS[:, 0]], np.broadcast_to(BITS[:, 1], (len(x), 4))])
         x, n = np.column_stack([x, np.full(len(x), 0.5)]), np.column_stack([n, np.zeros(len(x))])

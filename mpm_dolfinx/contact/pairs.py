@@ -65,10 +65,7 @@ class Pairs:
         return self.grid.reach
 
     def other_side(self) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
-        """Return the lexicographic cells (m,) of opposite positions, and the shape functions (m, 2^d) at the positions.
-
-        Return None for positions on tools.
-        """
+        """Return lexicographic cells (m,) of opposite positions, and their shape functions (m, 2^d); None on tools."""
         return None
 
     def operator(self, unknowns: Unknowns) -> PETSc.Mat:
@@ -128,10 +125,7 @@ class ToolPairs(Pairs):
 
 @dataclass(frozen=True, eq=False)
 class FacePairs(Pairs):
-    """Contact pairs between points on the surface of a group and opposite positions on another group.
-
-    The opposite position of a point lies on the normal at the point.
-    """
+    """Contact pairs of points on the surface of one group with positions, along their normals, on another group."""
 
     other: NDArray[np.int64]  # lexicographic cell of the other side (m,)
     y: NDArray[np.float64]  # opposite position in the undeformed grid (m, d), m

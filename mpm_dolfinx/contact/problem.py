@@ -297,10 +297,7 @@ class ContactProblem(Loads):
         return np.clip(linear.motion + linear.shift + more, -h, h)
 
     def _linearised(self, w: NDArray[np.float64], motion: NDArray[np.float64]) -> LinearMotion:
-        """Return the displacements of tools, linearised about `motion` (tools,), in m.
-
-        w (m, d), in m: relative displacements of the pairs
-        """
+        """Return the displacements of tools, linearised about `motion` (tools,) and pairs at w (m, d), in m."""
         law, of = self.now.law, self.pairs.number
         at, touch, *_ = found = self._find_at(w, motion)
         _, slope, _ = self._reactions(found)
@@ -319,10 +316,7 @@ class ContactProblem(Loads):
         return reaction, slope, law.by_contact(off[:, None])[:, 0]
 
     def _seek(self, found: Found) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Return the smallest tool displacements (tools,), in m, at which a single point bears the load.
-
-        Also return which tools touch a body.
-        """
+        """Return least displacements (tools,), in m, at which one point bears the load, and which tools touch."""
         law, state = self.now.law, self.now.state
         of = self.pairs.number
         along, k = (found.at.n * self.pushes.direction[of]).sum(axis=1), law.stiffness(state)
@@ -343,10 +337,7 @@ class ContactProblem(Loads):
         return np.divide(off, slope, out=seeks, where=slope > 0)
 
     def _begins(self) -> NDArray[np.float64]:
-        """Return initial guesses (tools,), in m, of the tool displacements, with bodies at rest.
-
-        Each tool moves at most until a single point bears the load.
-        """
+        """Return guessed tool displacements (tools,), in m, for bodies at rest, until a point bears the load."""
         motion = np.zeros(len(self.now.law.contacts))
         still = np.zeros_like(self.pairs.x)
         h = self.grid.least
@@ -414,10 +405,9 @@ class ContactProblem(Loads):
         return bool(late.any())
 
     def _continued(self, new: Current, at: At) -> tuple[Current, NDArray[np.bool_]]:
-        """Return the contact with pairs found at u, and which connected parts (parts,) must use these pairs.
+        """Return the contact with pairs found at u, and in which parts (parts,) gaps change by more than `DEPTH` cells.
 
-        These are parts in which a gap changes by more than `DEPTH` cells.  Pairs that are open before and after the
-        update are ignored.  Parts with `FOLLOWS` updates are not updated again.
+        Pairs that are open before and after the update are ignored.  Parts after `FOLLOWS` updates are also ignored.
         """
         found = self.found(at)
         law, state = self.now.law, self.now.state
@@ -472,10 +462,7 @@ class ContactProblem(Loads):
         return 0.0
 
     def outcome(self, at: At) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """See `Loads`.  Results are forces (N) and moments (N m) on the bodies, and displacements that loads cause (m).
-
-        Forces and moments of a contact are one array (3,), in 3D (6,).
-        """
+        """See `Loads`: forces (N) and moments (N m) on bodies, (3,) or in 3D (6,), and displacements by loads (m)."""
         where, touch, motion, _ = self.found(at)
         names = self.now.law.names
         if self.pairs.other_side() is not None:  # arms to present positions: moments of a body at rest sum to zero

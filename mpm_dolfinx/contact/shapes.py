@@ -198,10 +198,7 @@ class Convex(Placed):
 
 
 def uniform(shape: Ball | Convex) -> Uniform:
-    """Return the centroid and the squared radius of gyration of a disc or polygon.
-
-    A polygon is divided into triangles with one common corner.
-    """
+    """Return the centroid and squared radius of gyration of a disc, or of a polygon divided into triangles."""
     if isinstance(shape, Ball):
         return Uniform(np.array(shape.centre, dtype=float), shape.radius**2 / 2)
     hull = ConvexHull(np.asarray(shape.corners, dtype=float))

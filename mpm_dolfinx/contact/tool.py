@@ -273,8 +273,7 @@ class Tool:
     def pose(self, t: float, dim: int, by_forces: NDArray[np.float64] | float = 0.0) -> Pose:
         """Return the pose at time t (s).
 
-        `by_forces` is the displacement along `direction` that the load causes, in m.  For a free tool, it is a vector:
-        displacement (d,), in m, and possibly rotation, in rad.
+        `by_forces`: displacement that the load causes, in m; or of a free tool (d,), in m, and rotation, in rad.
         """
         shift = self._given("displacement", t, dim)
         if shift.ndim == 0 and shift:

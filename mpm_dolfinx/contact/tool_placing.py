@@ -39,10 +39,7 @@ FACING = 0.5  # smallest cosine between the normal of a face that faces the tool
 
 
 def _box(x: NDArray[np.float64]) -> list[tuple[NDArray[np.float64], MPI.Op]]:
-    """Return the corners (d,) of the bounding box of positions (n, d) on this process, each with an MPI operation.
-
-    The operation combines the corners of all processes.
-    """
+    """Return both corners (d,) of the bounding box of x (n, d), each with the MPI operation for all processes."""
     return [(x.min(axis=0, initial=np.inf), MPI.MIN), (x.max(axis=0, initial=-np.inf), MPI.MAX)]
 
 
@@ -52,10 +49,7 @@ def motion_count(dim: int) -> int:
 
 
 class LoadMotion(NamedTuple):
-    """Displacements (k,), in m, that loads of k tools cause in a step.
-
-    If any tool is free, the shape is (k, q), with rotations in rad.
-    """
+    """Displacements (k,), in m, that loads of k tools cause in a step.  Free tools: (k, q), with rotations in rad."""
 
     start: float  # start of the step, s
     end: float  # end of the step, s
@@ -69,11 +63,7 @@ class LoadMotion(NamedTuple):
 
 
 class Tools(Touching):
-    """The tools of a stage, with their motion in a step.
-
-    setting: data of the stage
-    tools: tools by name
-    """
+    """The tools of a stage, with their motion in a step.  `setting` is the stage's data.  `tools` has tools by name."""
 
     conditions, title = (Tool,), "tools"
 
@@ -152,8 +142,8 @@ class Tools(Touching):
     def _posed(self, tool: Tool, start: float, t: float) -> Pose:
         """Return the pose of a tool at time t (s), the end of a substep.
 
-        With inertia, `in_step` corrects a prescribed pose after the first of two substeps.  The velocity of the tool is
-        then second-order accurate.
+        With inertia, `in_step` corrects a prescribed pose after the first of two substeps.  Velocities are then second
+        order.
         """
         pose = self._pose(tool, t)
         if self._end is None or not start < t < self._end or tool.free:
@@ -189,10 +179,7 @@ class Tools(Touching):
         return out
 
     def _before(self, place: Place) -> NDArray[np.float64]:
-        """Return the displacements (tools,), in m, that loads caused before a step.
-
-        If any tool is free, return displacements and rotations (tools, q).
-        """
+        """Return displacements (tools,), in m, that loads caused before a step; with free tools motions (tools, q)."""
         if self.free:
             return self._of_free(place.before, "tool_travel", "tool_rotation")
         return np.array([place.before["tool_travel"][name] for name in self.names], dtype=float)
@@ -257,9 +244,9 @@ class Tools(Touching):
     ) -> NDArray[np.bool_]:
         """Return which positions that face a tool lie within half a cell of an edge of the tool.
 
-        Edges beyond which the body does not continue are ignored.  The last loaded node also represents half a cell of
-        the surface outside the edge.  Half a cell inside the edge has therefore no contact.  A tool narrower than a
-        cell keeps its whole contact.
+        Edges beyond which the body ends are ignored.  The last loaded node also represents half a cell outside the
+        edge.  Half a cell inside the edge has therefore no contact.  A tool narrower than a cell keeps its whole
+        contact.
 
         x (n, d), in m: positions on the surface
         unit (n, d): outward unit normals at these positions
@@ -400,11 +387,7 @@ class Tools(Touching):
 
 
 class ToolLoads(ContactProblem):
-    """Contact loads of tools in a substep.
-
-    tools: tools and their motion in the step
-    place: positions and times
-    """
+    """Contact loads of tools in a substep.  `tools` has their motion in the step.  `place` has positions and times."""
 
     def __init__(self, tools: Tools, place: Place):
         super().__init__(*tools.contact(place))

@@ -94,8 +94,7 @@ class Patches:
         return lambda name: self.X if name == "X" else self.now(points) + self.base
 
     def area(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the current outward area vectors (n, d), in m^(d-1).  In axisymmetry, they are those of rings, in m^2.
-        """
+        """Return the current outward area vectors (n, d), in m^(d-1), or in axisymmetry those of rings, in m^2."""
         share = self._share0 / self._whole0
         if self._grid.axisymmetric:
             share = share * self._grid.around(self.now(points))
@@ -145,10 +144,7 @@ class CutDomains(Keyed):
         """Pieces of this process's points, without areas and mean products.  Only integrals over cells need these."""
 
     def faces(self) -> NDArray[np.float64]:
-        """Return the areas (m, d, 2), in m^(d-1), of the pieces on faces of their cells.
-
-        They need as much memory as F.  They are therefore not kept, and can be returned only once.
-        """
+        """Return the areas (m, d, 2), in m^(d-1), of pieces on cell faces, once.  They are deleted to save memory."""
         faces, self._faces = self._faces, None
         return faces
 
@@ -172,10 +168,7 @@ class CutDomains(Keyed):
         return self.pieces_to_cells(values[self.pieces.point])
 
     def plane(self, volume: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the volumes (m,), in m^d, and the centroids (m, d), in m, of pieces.
-
-        In axisymmetry, return the areas and the centroids of their sections in the plane.
-        """
+        """Return volumes (m,) and centroids (m, d) of pieces; in axisymmetry areas and centroids of their sections."""
         if not self.grid.axisymmetric:
             return volume, self.x
         return volume / (TURN * self.hoop[:, 3]), self.grid.midpoints[self.cells] + self.hoop[:, :2]
@@ -265,8 +258,7 @@ class CutDomains(Keyed):
 
     @cached_property
     def _followed(self) -> tuple[Exchange, NDArray[np.int32]]:
-        """Exchange that sends `_tracked` positions to the owners of their cells, and local indices (m,) of these cells.
-        """
+        """Exchange that sends `_tracked` positions to owners of their cells, and local indices (m,) of these cells."""
         grid, at = self.grid, np.arange(len(self.points))
         cell = self.cells_at(at.repeat(2**grid.dim) if self.domains else at, self._tracked)
         exchange = Exchange(grid.comm, grid.owner(cell))

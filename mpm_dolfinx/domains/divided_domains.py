@@ -79,10 +79,7 @@ class SeededDomains:
         return out, lower - step
 
     def places(self, root: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the body and lattice index (n, 1 + d) of seeded domains.
-
-        Domains that are not boxes on a lattice have -1 - id instead of the body.
-        """
+        """Return body and lattice index (n, 1 + d) of seeded domains.  Without a lattice, the body is -1 - id."""
         out = np.zeros((len(root), 1 + self._dim), dtype=np.int64)
         body = body_of(root, self.starts)
         for i in np.unique(body):
@@ -154,11 +151,7 @@ def whole(part: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 
 def halves(corners: NDArray[np.float64], axis: int, middle: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the corners (2, n, 2^d, d) of both halves of domains that are divided along an axis.
-
-    corners (n, 2^d, d): corners of the domains
-    middle (n,): local coordinate, from 0 to 1, at which each domain is divided
-    """
+    """Return both halves (2, n, 2^d, d) of domains (n, 2^d, d), divided at the local coordinates `middle` (n,)."""
     low, high = FACES[corners.shape[2]][2 * axis : 2 * axis + 2]
     t = middle[:, None, None]
     out = np.stack([corners, corners])
@@ -224,13 +217,7 @@ def _placed(
     of: tuple[NDArray[np.int64], NDArray[np.float64]],
     beyond: NDArray[np.float64],
 ) -> MaterialPoints:
-    """Return points with new corners and the F that follows from these corners.
-
-    places: new corners, reference corners and corners at zero displacement, by name
-    id (n,): new identifiers
-    of: new data `ROOT` and `PART`
-    beyond: result of `beyond_corners`
-    """
+    """Return points with new `places`, identifiers, `ROOT` and `PART` (`of`), and F from corners and `beyond`."""
     root, part = of
     is_whole = whole(part)
     data = {ROOT: np.where(is_whole, -1, root), PART: np.where(is_whole[:, None, None], 0.0, part)}

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Deformation gradients of particle domains and volume ratios of cells.
-
-They follow from corner positions alone, so they do not depend on the path of deformation.
-"""
+"""Deformation gradients of particle domains and volume ratios of cells, which follow from corner positions alone."""
 
 from __future__ import annotations
 
@@ -101,13 +98,11 @@ def cell_ratios(
     their reference volume.  This ratio does not depend on the path of deformation.  Differences between the volume
     ratios of domains in a cell do no work.  If the ratio of a cell were updated by increments only, it could drift from
     the volume of the domains, and no force would oppose this drift.  Without F-bar, pieces have the ratio of their
-    point.  In cells with yielded soil they also have this ratio, because corner volumes are meaningless near plastic
-    flow.
+    point.  Cells with yielded soil are treated likewise, because corner volumes are meaningless near plastic flow.
 
     cut: cut particle domains
     points: points at the start of the step
-    share (n,): weight, from 0 to 1, of the ratio from corners in its geometric mean with the point's ratio; 0 without
-    F-bar
+    share (n,): weight, 0 to 1, of the ratio from corners in the geometric mean with the point's ratio; 0 without F-bar
     flows (n,): whether points have yielded
     """
     cells, size = cut.cells, cut.grid.num_local

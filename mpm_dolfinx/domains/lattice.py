@@ -161,10 +161,8 @@ def _at_sites(
     values at all sites of the slab to rows.
 
     shape: number of lattice sites along each axis
-    number (m,): lexicographic index of the site of each row of values
-    values (m, k): k values in each row
-    tolerance (k,): largest difference between rows of a site; for larger differences the domains have separated, and
-    the site is nan
+    number (m,): lexicographic index of the site of each row of values (m, k)
+    tolerance (k,): largest difference between rows of a site; if domains differ by more, the site is nan
     """
     across, starts = int(np.prod(shape[1:])), np.arange(comm.size + 1) * shape[0] // comm.size
     layer = number // across
@@ -262,10 +260,7 @@ def given(lattices: Sequence[Lattice], points: MaterialPoints) -> NDArray[np.boo
 
 
 def seeded(lattices: Sequence[Lattice], points: MaterialPoints) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Return the indices (n, 2^d) of corners in their bodies, and which corners (n, 2^d) touch other bodies.
-
-    Corners of renewed domains have the index -1.
-    """
+    """Return indices (n, 2^d) of corners in bodies, or -1 in renewed domains, and which corners touch other bodies."""
     numbers, touching = np.full(points.corners.shape[:2], -1), np.zeros(points.corners.shape[:2], dtype=bool)
     for lattice in lattices:
         rows = lattice.rows(points)

@@ -144,8 +144,7 @@ class Reconstruction:
     def _differences(self, pressures: CellPressures) -> tuple[NDArray, NDArray, NDArray, NDArray]:
         """Return four arrays (n, d, 2) by axis and end of cells.
 
-        They are pressure differences in Pa, slopes in Pa/m, a mask of neighbours, and a mask of drained sides.  All are
-        zero without a neighbour or drained side.
+        They are pressure differences in Pa, slopes in Pa/m, and masks of neighbours and of drained sides.
         """
         cells, p, centroid, faces, outer = pressures
         neighbours, own = self._neighbour[cells], cells[:, None, None]
@@ -331,10 +330,7 @@ def joined_pieces(
 def _missing(
     held: NDArray[np.float64], store: NDArray[np.float64], potential: NDArray[np.float64], of: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Return the change (n,), in Pa, of the potentials of points that conserves the fluid `held` (n,) by the points.
-
-    store, potential, of (m,): storage, potential and point of each row
-    """
+    """Return the change (n,), in Pa, of potentials (m,) for which points `of` (m,) contain the fluid `held` (n,)."""
     (total, now), n = sum_by(of, np.array([store, store * potential]), len(held)), len(held)
     return np.divide(held - now, total, out=np.zeros(n), where=total > 0)
 

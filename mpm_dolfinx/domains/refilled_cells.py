@@ -75,10 +75,7 @@ class New(NamedTuple):
 
 
 def ring_lengths(grid: Grid, x: NDArray[np.float64]) -> NDArray[np.float64] | float:
-    """Return the factor from lengths in the plane to areas at x (n, 2), in m, see `Grid.around`.
-
-    The factor is positive even on the axis.
-    """
+    """Return the factor (> 0) from lengths in the plane to areas at x (n, 2), in m, see `Grid.around`."""
     return np.maximum(grid.around(x), TURN * EPSILON * grid.least) if grid.axisymmetric else 1.0
 
 
@@ -154,10 +151,7 @@ class RefilledCells:
         return out
 
     def _excluded(self, flowed: NDArray[np.bool_], signs: tuple[NDArray, NDArray]) -> NDArray[np.bool_]:
-        """Return which cells cannot be renewed.
-
-        These cells contain points that have not `flowed`, several bodies, or faces whose conditions differ or fix them.
-        """
+        """Return which cells cannot be renewed: they have points not `flowed`, two bodies, or differing conditions."""
         of, cell = self.pieces.point, self.cell
         parts = self.parts
         low, high = np.full(self.cells, np.iinfo(np.int64).max), np.full(self.cells, -1)
@@ -329,8 +323,7 @@ class RefilledCells:
 
     @cached_property
     def _face_areas(self) -> NDArray[np.float64]:
-        """Seeded areas of faces.  They are increased so that remaining parts of a face also represent the other parts.
-        """
+        """Seeded areas of faces, increased so that remaining parts of a face also represent its other parts."""
         parts, left = self.parts, self._left
         of, share = self.faces.point[parts.row], self._share(parts.row, parts.t)
         remains = np.isin(of * self.cells + parts.cell, self.pieces.point[left] * self.cells + self.cell[left])
@@ -364,10 +357,7 @@ class RefilledCells:
         area: NDArray[np.float64],
         ends: NDArray[np.float64],
     ) -> New:
-        """Return new domains in cells (n,).
-
-        Faces on a side of a cell become surface faces if the surface runs along this side.
-        """
+        """Return new domains in cells (n,).  If the surface runs along a cell's side, faces there are surface faces."""
         parts = self.parts
         on = np.flatnonzero(parts.side != NONE)
         place = 4 * parts.cell[on] + parts.side[on]
@@ -410,10 +400,7 @@ class RefilledCells:
 
     @cached_property
     def remainders(self) -> tuple[New, NDArray[np.int64]]:
-        """New domains in the pieces of removed domains outside the renewed cells, and these pieces.
-
-        The new domains in each piece are a group.
-        """
+        """New domains in pieces of removed domains outside renewed cells, and these pieces.  Each piece is a group."""
         pieces, points = self.pieces, self.points
         left = self._left
         rings, of = _convex(points.corners[pieces.point[left]], self._volume(self.cell[left]))
@@ -459,10 +446,7 @@ class RefilledCells:
     # ---- transfer of values ---------------------------------------------------------------------
 
     def slopes(self, values: NDArray[np.float64], group: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the slopes (n, 2, k), per m, of point values (points, k) in new domains.
-
-        The slopes are least-squares fits to the values of the points in each cell.
-        """
+        """Return slopes (n, 2, k), in 1/m, of point values (points, k) in new domains, from least squares in a cell."""
         pieces, grid = self.pieces, self.grid
         weight = pieces.fraction * self.points.volume0[pieces.point]
         whole = np.maximum(sum_by(self.cell, weight, self.cells), TINY)
@@ -542,10 +526,7 @@ def no_faces(n: int) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np
 
 
 def ring_share(r0: NDArray[np.float64], r1: NDArray[np.float64], t: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the radii (n,) at coordinates t (n,) on faces, divided by the mean radius of each face.
-
-    Radii of the ends of a face are r0 and r1 (n,), in m.
-    """
+    """Return radii (n,) at coordinates t (n,) on faces from radius r0 to r1 (n,), divided by the mean radius."""
     mean = (r0 + r1) / 2
     return np.divide(r0 + t * (r1 - r0), mean, out=np.ones(len(t)), where=mean > 0)
 

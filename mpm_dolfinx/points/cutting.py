@@ -159,11 +159,7 @@ def tangled(corners: NDArray[np.float64], volume: NDArray[np.float64], axisymmet
 def parallelepipeds(
     x: NDArray[np.float64], F: NDArray[np.float64], spacing: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the corners (n, 2^d, d), in m, of boxes that are deformed by F (n, d, d).
-
-    x (n, d), in m: centres of the boxes
-    spacing (n, d), in m: edge lengths of the boxes
-    """
+    """Return corners (n, 2^d, d), in m, of boxes with centres x and edges `spacing` (n, d), deformed by F (n, d, d)."""
     offset = (corner_bits(x.shape[1]) - 0.5) * spacing[:, None, :]
     return x[:, None] + np.einsum("nab,nkb->nka", F, offset)
 
@@ -449,8 +445,7 @@ def _rings(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Return the radii (m,), in m, of pieces, the centroids (m, 2) of their volumes, and `hoop` of `Pieces`.
 
-    The parameters except the first, and the centroids, use coordinates r, z from 0 to 1 in the cell of each piece.
-
+    Coordinates r, z of centroids, and in the last parameters, are from 0 to 1 in the cell of each piece.
     cell (m, 2): grid indices of the pieces' cells
     c (m, 2): centroids of the pieces' sections
     squares, products (m,): means of r^2 and of r z over the sections
@@ -475,9 +470,7 @@ def _products(
     total: Callable[[NDArray[np.float64]], NDArray[np.float64]],
     slots: _Slots,
 ) -> list[NDArray[np.float64]]:
-    """Return integrals over the pieces of products of two coordinates.
-
-    Coordinates are relative to the lower corners of the pieces' cells.
+    """Return integrals over the pieces of products of two coordinates, from the lower corners of the pieces' cells.
 
     pairs: axes of the two coordinates, ascending
     x (d, d, m): vertices of the slices

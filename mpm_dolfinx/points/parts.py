@@ -36,9 +36,7 @@ class Parts:
 class OfParts:
     """Entries of a distributed vector on this process, with the connected part of each entry.
 
-    comm: the processes
-    of (n,): index of each entry's part
-    count: number of parts
+    `of` (n,) is the index of each entry's part, and `count` is the number of parts.
     """
 
     comm: MPI.Comm
@@ -79,12 +77,9 @@ def largest_of_parts(comm: MPI.Comm, part: NDArray, values: NDArray, count: int)
 def largest_of_bodies(
     comm: MPI.Comm, part: NDArray[np.int64], values: NDArray[np.float64], inside: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
-    """Return the largest values (k, bodies) in the connected parts of each body, over all processes.
+    """Return the largest values (k, bodies) in the connected parts of each body on all processes, or 0 without parts.
 
-    Bodies without parts have 0.
-
-    part (m,): index, from 0, of the connected part of each column of `values`
-    values (k, m): k rows of values
+    part (m,): index, from 0, of the connected part of each column of `values` (k, m)
     inside (bodies, parts): whether a part contains points of a body on this process
     """
     largest = largest_of_parts(comm, part, values.T, inside.shape[1]).T[:, None]
@@ -125,10 +120,7 @@ def parts_of_cells(grid: Grid, active: NDArray[np.bool_]) -> tuple[NDArray[np.in
 
 
 def parts_of_domains(grid: Grid, corners: NDArray[np.float64], copy: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the index (n,), from 0, of each domain's connected part.
-
-    copy (n,): first cell of each domain's copy of the grid
-    """
+    """Return the index (n,), from 0, of each domain's connected part.  `copy` (n,): first cell of its grid copy."""
     cell = grid.number(grid.index(corners.reshape(-1, grid.dim))).reshape(corners.shape[:2]) + copy.reshape(-1, 1)
     cell, at = np.unique(cell, return_inverse=True)
     own, count = _touching(
@@ -141,12 +133,9 @@ def parts_of_domains(grid: Grid, corners: NDArray[np.float64], copy: NDArray[np.
 def joined_parts(
     grid: Grid, part: NDArray[np.int64], count: int, pairs: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], int]:
-    """Join the connected parts of some pairs of cells.  Return the indices of parts, and the number of parts.
+    """Join the parts of some pairs of cells.  Return the new `part` and `count`, results of `parts_of_cells`.
 
-    All processes must call this function, with any pairs.
-
-    part, count: result of `parts_of_cells`
-    pairs (m, 2): lexicographic indices of active cells
+    pairs (m, 2): lexicographic indices of active cells; each process may have other pairs. All processes must call it.
     """
     cells, at = np.unique(np.concatenate(grid.comm.allgather(np.unique(pairs, axis=0))), return_inverse=True)
     of = np.where(grid.owner(cells) == grid.comm.rank, part[grid.locals[cells]], 0)
@@ -170,10 +159,7 @@ def _touching(index: NDArray[np.int64]) -> tuple[NDArray[np.int64], int]:
 
 
 def _joined(rows: NDArray[np.int64], columns: NDArray[np.int64], shape: Sequence[int]) -> tuple[NDArray[np.int64], int]:
-    """Return the component of each row, as an index from 0, and the number of components.
-
-    Rows with a common column are connected.
-    """
+    """Return the component of each row, from 0, and their number.  Rows with a common column are connected."""
     n = sum(shape)
     pairs = coo_array((np.ones(len(rows)), (rows, shape[0] + columns)), shape=(n, n)).tocsr()
     count, part = connected_components(pairs, directed=False)

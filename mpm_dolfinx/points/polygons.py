@@ -151,8 +151,7 @@ class Polygons:
         return Polygons.rings(x[:, :size], part), Polygons.rings(x[:, [0, *range(size - 1, n)]], rest)
 
     def _of_four(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Return vertices (n, 4, 2) and edge identifiers (n, 4) of triangles with the middle of the longest edge added.
-        """
+        """Return triangles as vertices (n, 4, 2) and edge identifiers (n, 4), with the middle of the longest edge."""
         size = np.linalg.norm(self.after - self.x, axis=2)
         order = (size.argmax(axis=1)[:, None] + np.arange(3)) % 3
         x, edge = np.take_along_axis(self.x, order[:, :, None], axis=1), np.take_along_axis(self.edge, order, axis=1)

@@ -75,11 +75,7 @@ class Region:
     def quadrilaterals(
         self, chosen: NDArray[np.bool_]
     ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.bool_]]:
-        """Return three arrays for m new domains in the chosen cells.
-
-        These are the index (m,) of the domain's cell in `cells`, corners (m, 4, 2), and which faces (m, 4) are on the
-        surface.
-        """
+        """Return index in `cells` (m,), corners (m, 4, 2) and surface flags (m, 4) of new domains in chosen cells."""
         rows = np.flatnonzero(chosen[self.cells])
         corners, of = [np.zeros((0, 4, 2))], [rows[:0]]
         surface = [np.zeros((0, 4), dtype=bool)]
