@@ -315,7 +315,7 @@ BAD = {
         lambda f: written(f, PARTS.replace(" 3., 1., 0.\n 3., 1., 0., 3., 1., 1., 90.\n", " 1.,\n")),
         "scene.inp: ", "must share nodes or belong to two parts"),
     "half a turn": (
-        lambda f: written(f, PARTS.replace(", 1., 90.", "")), "*INSTANCE Wall-1: translation", "0 or 7 for the rotation"),
+        lambda f: written(f, PARTS.replace(", 1., 90.", "")), "*INSTANCE Wall-1: translation", "0 or 7 for"),
     "an old format of gmsh": (
         lambda f: written(f, "$MeshFormat\n4.0 0 8\n$EndMeshFormat\n", "a.msh"), "a.msh: gmsh's format 4.0", "2.2"),
     "a broken file of gmsh": (
