@@ -141,7 +141,7 @@ class RowsBody(LatticeBody):
 
     @property
     def volume_of_boxes(self) -> float:
-        """Total volume of all boxes, m^d."""
+        """Total volume of all boxes, in m^d."""
         return sum(float(self.boxes(part).prod(axis=1).sum()) for part in in_chunks(len(self)))
 
     def corner_rows(self, axis: int) -> NDArray[np.float64]:
@@ -191,7 +191,7 @@ def box(grid: Grid, lower: ArrayLike, upper: ArrayLike, per_cell: int = 2, mater
     Raises
     ------
     ValueError
-        A corner outside the grid, `upper` not above `lower`, or an invalid `per_cell` or `material`.
+        A corner is outside the grid, `upper` is not above `lower`, or `per_cell` or `material` is invalid.
     """
     begin_with("body: grid", grid)
     lower, upper = (

@@ -91,7 +91,7 @@ class Surface:
         return interpolate(domain, self.xi.reshape(-1, self.xi.shape[2])).reshape(self.xi.shape)
 
     def reference(self, at: NDArray[np.int64], xi: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the reference positions (n, d), m, at local coordinates xi (n, d) of the domains in rows `at` (n,)."""
+        """Return the reference positions (n, d), in m, at local coordinates xi (n, d) of domains in rows `at` (n,)."""
         return np.clip(interpolate(self.before[at], xi), *self.region)
 
     @cached_property
@@ -126,7 +126,7 @@ Region = tuple[ArrayLike, ArrayLike]
 def limits(region: Region | None, dim: int) -> NDArray[np.float64]:
     """Return the lower and upper corners (2, d) of a region, in m.  They are infinite if there is no region.
 
-    Equal regions give equal bytes (`tobytes`), which serve as a key.
+    Equal regions give equal bytes (`tobytes`), so that these bytes can be used as a key.
     """
     if region is None:
         return np.repeat([[-np.inf], [np.inf]], dim, axis=1)
@@ -211,8 +211,8 @@ def _limited(
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Limit n parts of k faces to a region.  Return the face (m,) and the corners xi of each limited part.
 
-    `row` and `face` (k,) are domains and indices of the faces.  `part` (n,) is the face of each part, and t (n, 4, 2)
-    are its corners in face coordinates.  xi is explained in `Surface`.
+    `row` and `face` (k,) are domains and indices of the faces.  `part` (n,) is the face of each part, and `t` (n, 4, 2)
+    are the part's corners in face coordinates.  For xi see `Surface`.
     """
     dim, three = body.dim, (t[:, 2] == t[:, 3]).all(axis=1)
     X = _face_corners(body, row[part], face[part])

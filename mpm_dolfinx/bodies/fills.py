@@ -38,7 +38,7 @@ class Contact:
     moved: NDArray[np.float64]  # displacement of the corners of the body's faces since seeding (n, 4, d), m
 
     def area(self) -> float:
-        """Return the contact area, m^(d-1)."""
+        """Return the contact area, in m^(d-1)."""
         return float(covered(len(self.own.row), self.cover) @ np.linalg.norm(self.own.outward, axis=1))
 
     def corners(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -140,7 +140,7 @@ def _contacts(grid: Grid, bodies: Sequence[Body], other: int, fill: Body, points
 
 
 def _follow(grid: Grid, body: Body, corners: NDArray[np.float64], contacts: Sequence[Contact]) -> NDArray[np.float64]:
-    """Return the displacements (n, 2^d, d), m, of the corners of a fill whose touching sides follow the neighbours."""
+    """Return the displacements (n, 2^d, d), in m, of a fill's corners.  Touching sides follow the neighbours."""
     number = body.nodes(np.arange(len(body)))
     nodes, node = np.unique(number, return_inverse=True)
     node = node.reshape(number.shape)

@@ -36,7 +36,7 @@ class _Numbers:
         self._bytes, self._words = BytesIO(section), iter(() if binary else section.split())
 
     def take(self, count: int, kind: str = "i") -> NDArray:
-        """Return the next `count` numbers.  kind: "i" for the type int, "u" for size_t, "d" for double."""
+        """Return the next `count` numbers.  `kind` is "i" for the type int, "u" for size_t, "d" for double."""
         dtype, out = np.dtype({"i": "<i4", "u": "<u8", "d": "<f8"}[kind]), float if kind == "d" else np.int64
         if self._binary:
             return np.frombuffer(self._bytes.read(count * dtype.itemsize), dtype).astype(out)

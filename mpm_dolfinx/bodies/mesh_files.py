@@ -194,7 +194,7 @@ def _check_nodes(rows: NDArray[np.int64], count: int) -> None:
 
 
 def _edge_node_distance(x: NDArray[np.float64], rows: NDArray[np.int64], kind: str) -> float:
-    """Return the largest distance, m, between the edge nodes of second-order cells and the midpoints of edges.
+    """Return the largest distance, in m, between the edge nodes of second-order cells and the midpoints of edges.
 
     Edge nodes follow the vertices in the row of a cell, in an order that depends on the format.
     """

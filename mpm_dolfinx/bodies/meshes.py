@@ -310,7 +310,7 @@ def _check_overlaps(
 def _box_overlaps(
     boxes: NDArray[np.float64], size: NDArray[np.float64], outer: NDArray[np.int64], slack: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return n pairs of cells with overlapping bounding boxes as two arrays (n,).  The first has cells of `outer` only.
+    """Return n pairs of cells with overlapping bounding boxes as two arrays (n,).  The first array has cells of `outer`.
 
     Boxes are grouped by size, in octaves.  In one group, small boxes would be searched with the largest box's radius.
     """

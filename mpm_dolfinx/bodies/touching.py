@@ -51,7 +51,7 @@ class Faces:
         return cls.of(body, *body.outer())
 
     def edge(self) -> NDArray[np.float64]:
-        """Return the length (n,), in m, of the shortest edge of each face.  Plane strain's unit width is no edge."""
+        """Return the length (n,), in m, of the shortest edge of each face.  The unit width in plane strain is no edge."""
         c = self.corners
         pairs = [(1, 0), (3, 2), (2, 0), (3, 1)] if (self.index[:, 0] != self.index[:, 2]).any() else [(1, 0)]
         return np.min([np.linalg.norm(c[:, i] - c[:, j], axis=1) for i, j in pairs], axis=0)
@@ -227,7 +227,7 @@ def uncovered_triangles(
 
 
 def within(s: NDArray, owner: NDArray, low: NDArray, high: NDArray) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Clip triangles (3, 2, n) to boxes `low`, `high`, (2,) or (n, 2).  Return parts, and the owner of each part."""
+    """Clip triangles (3, 2, n) to boxes from `low` to `high`, (2,) or (n, 2).  Return parts, and each part's owner."""
     low, high = (np.broadcast_to(x, (s.shape[2], 2)) for x in (low, high))
     index = np.arange(s.shape[2])
     for axis in (0, 1):

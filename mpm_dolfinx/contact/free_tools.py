@@ -7,8 +7,8 @@ inertia, and q^ is the motion without forces in the step.  g is the time weight 
 length of the step.  l are load and weight, and f are the contact forces on the points.  `A q` is the displacement of
 the contact positions on the tool.  The columns of A are e_x, e_y, and `e_z x r` with the lever arm r.
 
-The unknowns q are condensed.  Let D be minus the derivative of f with respect to the displacement w of the points, and
-let dw be the increment of w.  Forces rotate with the tool, so f changes by `(D A + E) dq`, where E has the columns 0,
+The unknowns q are eliminated (static condensation).  Let D be minus the derivative of f with respect to the
+displacement w of the points, and let dw be the increment of w.  Forces rotate with the tool, so f changes by `(D A + E) dq`, where E has the columns 0,
 0, `e_z x f`.  The force on the tool changes by the product of dq with the matrix
 
     A^T D A + [[0, e_z x F], [(e_z x F)^T, sum r . f]],     F = sum f.
@@ -145,7 +145,7 @@ class FreeTools(ContactProblem):
         return np.hstack([force, moment[:, None][:, : self.grid.dim == 2]])
 
     def _motion(self, w: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the motions (k, q) of the tools at w (m, d), in m, from the last linearisation."""
+        """Return the motions (k, q) of tools at relative displacements w (m, d), in m, from the last linearisation."""
         last = self.now.linear
         law = self.now.law
         dw = w - last.w
@@ -158,7 +158,7 @@ class FreeTools(ContactProblem):
         return last.motion + last.shift + np.einsum("kij,kj->ki", last.inverse, on[:, 1:])
 
     def _free_motion(self, w: NDArray[np.float64], motion: NDArray[np.float64]) -> FreeMotion:
-        """Return the motion of tools, linearised about `motion` (k, q) and about w (m, d), in m, of the pairs."""
+        """Return the motion of tools, linearised about `motion` (k, q) and relative displacements w (m, d), in m."""
         found = self._find_at(w, motion)
         equation = self._equation(found)
         return FreeMotion(w, motion, equation.shift, equation.inverse, found)

@@ -158,8 +158,9 @@ class ContactLaw:
     ) -> tuple:
         """Return the fields of `Touch` from `sticks` to `by_pressure`.
 
-        n, slip, old (k, d): means of normal, slip (m), and shear traction before the step (Pa) over each condition's
-        pairs
+        n (k, d): mean normal of the pairs of each condition
+        slip (k, d), in m: mean slip of these pairs in the step
+        old (k, d), in Pa: mean shear traction of these pairs before the step
         """
         P = np.eye(n.shape[1]) - n[:, :, None] * n[:, None, :]
         hold = np.where(self.strength.any(axis=1), self._hold, 0.0) * on
@@ -215,7 +216,7 @@ class ContactLaw:
         return area * out
 
     def choose(self, state: ContactState, touch: Touch, sticks: bool) -> tuple[ContactState, bool]:
-        """Update which conditions slip.  Return the state, and whether any changed.  sticks: allow return to stick."""
+        """Update which conditions slip.  Return the state, and whether any changed.  `sticks` allows stick after slip."""
         before = state.slips
         left = ~before & ~touch.sticks & state.stuck.any(axis=1)
         parts = state.parts | (left & state.resticks)
@@ -234,8 +235,8 @@ class ContactLaw:
     def augmented(self, state: ContactState, touch: Touch, largest: Callable[[NDArray], NDArray]) -> ContactState:
         """Return the state after an augmentation.  Raise NotConverged if there have been too many augmentations.
 
-        lambda is set to the contact pressures in connected parts with too large penetrations.  `largest` returns the
-        largest of some values (k,) in the connected part of each condition (k,).
+        lambda is set to the contact pressures in connected parts with too large penetrations.  `largest` is a function
+        of values (k,), which returns the largest value (k,) in the connected part of each condition.
         """
         # small parts of faces in a cell cannot correct their penetration alone, but follow their neighbours
         x = self.pairs.x

@@ -325,7 +325,8 @@ class ContactLoads(ContactProblem):
 def _ranks(setting: Setting) -> NDArray[np.int64]:
     """Return the rank (points,) of the connected part of each point.  Parts are ranked by surface area, then by extent.
 
-    Of two parts, one therefore ranks first in all stages, for any order of the bodies, and whatever other parts exist.
+    The order of two parts is therefore the same in all stages.  It does not depend on other parts, nor on the order of
+    the bodies.
     """
     grid, bodies = setting.grid, setting.sides.bodies
     corners = np.concatenate([body.corners() for body in bodies])

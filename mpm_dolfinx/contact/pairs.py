@@ -65,7 +65,7 @@ class Pairs:
         return self.grid.reach
 
     def other_side(self) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
-        """Return lexicographic cells (m,) of opposite positions, and their shape functions (m, 2^d); None on tools."""
+        """Return lexicographic cells (m,) of opposite positions, and their shape functions (m, 2^d), or None on tools."""
         return None
 
     def operator(self, unknowns: Unknowns) -> PETSc.Mat:
@@ -144,7 +144,7 @@ class FacePairs(Pairs):
 
 
 def shape_values_in(grid: Grid, cells: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the Q1 shape functions (m, 2^d) of lexicographic cells (m,) of any process, at positions x (m, d), m."""
+    """Return Q1 shape functions (m, 2^d) of lexicographic cells (m,) of any process at positions x (m, d), in m."""
     index = np.stack(np.unravel_index(cells % grid.cells, tuple(grid.shape)), axis=1)
     off = grid.in_cells(x) - index - 0.5
     return np.prod(0.5 + off[:, None] * grid.signs, axis=2)

@@ -297,7 +297,7 @@ class ContactProblem(Loads):
         return np.clip(linear.motion + linear.shift + more, -h, h)
 
     def _linearised(self, w: NDArray[np.float64], motion: NDArray[np.float64]) -> LinearMotion:
-        """Return the displacements of tools, linearised about `motion` (tools,) and pairs at w (m, d), in m."""
+        """Return displacements of tools, linearised about `motion` (tools,) and relative displacements w (m, d)."""
         law, of = self.now.law, self.pairs.number
         at, touch, *_ = found = self._find_at(w, motion)
         _, slope, _ = self._reactions(found)
@@ -316,7 +316,7 @@ class ContactProblem(Loads):
         return reaction, slope, law.by_contact(off[:, None])[:, 0]
 
     def _seek(self, found: Found) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Return least displacements (tools,), in m, at which one point bears the load, and which tools touch."""
+        """Return tool displacements (tools,), in m, at which a first point bears the load, and which tools touch."""
         law, state = self.now.law, self.now.state
         of = self.pairs.number
         along, k = (found.at.n * self.pushes.direction[of]).sum(axis=1), law.stiffness(state)
@@ -337,7 +337,7 @@ class ContactProblem(Loads):
         return np.divide(off, slope, out=seeks, where=slope > 0)
 
     def _begins(self) -> NDArray[np.float64]:
-        """Return guessed tool displacements (tools,), in m, for bodies at rest, until a point bears the load."""
+        """Return guesses (tools,), in m, of tool displacements.  Tools move at most until a point bears the load."""
         motion = np.zeros(len(self.now.law.contacts))
         still = np.zeros_like(self.pairs.x)
         h = self.grid.least

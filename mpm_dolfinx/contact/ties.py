@@ -62,7 +62,7 @@ class Ties(Acting):
     Raises
     ------
     ValueError
-        The sides are not opposite, or their faces differ.  Or a side is tied twice, quiet, or open to water.
+        The sides are not opposite, or their faces differ.  A side is tied twice, quiet, or open to water.
     """
 
     conditions, title = (Tied,), "tied sides"

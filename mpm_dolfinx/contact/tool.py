@@ -35,7 +35,7 @@ class Pose(NamedTuple):
         return y + self.shift + (y - self.centre) @ (self.R - np.eye(len(self.R))).T
 
     def moved(self, by_forces: NDArray[np.float64]) -> Pose:
-        """Return the pose after a further motion `by_forces`: displacement (d,) (m), and possibly rotation (rad)."""
+        """Return the pose after a motion `by_forces`: displacement (d,), in m, and possibly rotation, in rad."""
         d = len(self.R)
         R = rotation(by_forces[d]) @ self.R if by_forces[d:].any() else self.R
         return Pose(R, self.centre, self.shift + by_forces[:d])
@@ -231,7 +231,7 @@ class Tool:
         return self.friction > 0 or self.adhesion > 0
 
     def solid(self, h: float) -> Shape:
-        """Return the shape; `h` is the cell size, m."""
+        """Return the shape.  `h` is the cell size, in m."""
         return Distance(self.shape, h, self._base) if callable(self.shape) else self._moved or self.shape
 
     def check(self, dim: int) -> None:
@@ -273,7 +273,8 @@ class Tool:
     def pose(self, t: float, dim: int, by_forces: NDArray[np.float64] | float = 0.0) -> Pose:
         """Return the pose at time t (s).
 
-        `by_forces`: displacement that the load causes, in m; or of a free tool (d,), in m, and rotation, in rad.
+        `by_forces` is the displacement that the load causes, in m.  For a free tool, it is a vector of displacement
+        (d,), in m, and possibly rotation, in rad.
         """
         shift = self._given("displacement", t, dim)
         if shift.ndim == 0 and shift:

@@ -49,7 +49,8 @@ def motion_count(dim: int) -> int:
 
 
 class LoadMotion(NamedTuple):
-    """Displacements (k,), in m, that loads of k tools cause in a step.  Free tools: (k, q), with rotations in rad."""
+    """Displacements (k,), in m, that loads of k tools cause in a step.  With free tools, motions (k, q), in m and rad.
+    """
 
     start: float  # start of the step, s
     end: float  # end of the step, s
@@ -142,8 +143,8 @@ class Tools(Touching):
     def _posed(self, tool: Tool, start: float, t: float) -> Pose:
         """Return the pose of a tool at time t (s), the end of a substep.
 
-        With inertia, `in_step` corrects a prescribed pose after the first of two substeps.  Velocities are then second
-        order.
+        With inertia, `in_step` corrects a prescribed pose after the first of two substeps.  Velocities are then second-order
+        accurate.
         """
         pose = self._pose(tool, t)
         if self._end is None or not start < t < self._end or tool.free:
@@ -179,7 +180,7 @@ class Tools(Touching):
         return out
 
     def _before(self, place: Place) -> NDArray[np.float64]:
-        """Return displacements (tools,), in m, that loads caused before a step; with free tools motions (tools, q)."""
+        """Return displacements (tools,), in m, by loads before a step, or with free tools, motions (tools, q)."""
         if self.free:
             return self._of_free(place.before, "tool_travel", "tool_rotation")
         return np.array([place.before["tool_travel"][name] for name in self.names], dtype=float)
@@ -311,7 +312,7 @@ class Tools(Touching):
                 raise NotConverged(f"{line(tool)}: has passed through a body within a step, at {where}")
 
     def near(self, corners: NDArray[np.float64], t: float) -> NDArray[np.bool_]:
-        """Return which corners (n, 2^d, d) of domains touch tools at time t (s).  These follow the Q1 field.
+        """Return which corners (n, 2^d, d) of domains touch tools at time t (s).  Such corners follow the Q1 field.
 
         The tool would reverse any other motion of these corners in the next step, and pressures would oscillate.
         """

@@ -144,7 +144,8 @@ class CutDomains(Keyed):
         """Pieces of this process's points, without areas and mean products.  Only integrals over cells need these."""
 
     def faces(self) -> NDArray[np.float64]:
-        """Return the areas (m, d, 2), in m^(d-1), of pieces on cell faces, once.  They are deleted to save memory."""
+        """Return the areas (m, d, 2), in m^(d-1), of pieces on cell faces.  Call this once: the areas are then deleted.
+        """
         faces, self._faces = self._faces, None
         return faces
 
@@ -265,7 +266,7 @@ class CutDomains(Keyed):
         return exchange, grid.locals[exchange.send(cell)]
 
     def total_displacement(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return total displacements (m, d), m, of the pieces' centroids, computed from the corners of the domains."""
+        """Return total displacements (m, d), in m, of the pieces' centroids.  They follow from corners of the domains."""
         pieces = self.pieces
         now, then = (c - c.mean(axis=1, keepdims=True) for c in (points.corners, points.origin))
         stretch = np.linalg.solve(then.swapaxes(1, 2) @ then, then.swapaxes(1, 2) @ now)  # affine fit to the corners

@@ -217,7 +217,7 @@ def _placed(
     of: tuple[NDArray[np.int64], NDArray[np.float64]],
     beyond: NDArray[np.float64],
 ) -> MaterialPoints:
-    """Return points with new `places`, identifiers, `ROOT` and `PART` (`of`), and F from corners and `beyond`."""
+    """Return points with new corners, identifiers and parts `of`.  F follows from the corners and `beyond_corners`."""
     root, part = of
     is_whole = whole(part)
     data = {ROOT: np.where(is_whole, -1, root), PART: np.where(is_whole[:, None, None], 0.0, part)}

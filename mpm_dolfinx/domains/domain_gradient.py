@@ -98,7 +98,7 @@ def cell_ratios(
     their reference volume.  This ratio does not depend on the path of deformation.  Differences between the volume
     ratios of domains in a cell do no work.  If the ratio of a cell were updated by increments only, it could drift from
     the volume of the domains, and no force would oppose this drift.  Without F-bar, pieces have the ratio of their
-    point.  Cells with yielded soil are treated likewise, because corner volumes are meaningless near plastic flow.
+    point.  In cells with yielded soil they also do, because corner volumes are meaningless near plastic flow.
 
     cut: cut particle domains
     points: points at the start of the step

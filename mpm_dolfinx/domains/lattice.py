@@ -286,5 +286,5 @@ def filtered(
 
 
 def crossed(grid: Grid, points: MaterialPoints, then: MaterialPoints, free: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return the numbers (n, 2^d) of cells that corners of `free` points have crossed since the grid reset, else 0."""
+    """Return the numbers (n, 2^d) of cells that corners have crossed since the grid reset, or 0 if not `free`."""
     return grid.cells_between(then.corners, points.corners).sum(axis=2) * free[:, None]

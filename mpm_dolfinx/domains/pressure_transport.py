@@ -65,7 +65,7 @@ class PiecePressures:
         return self._each(exchange.send)._ordered()
 
     def potentials(self, bulk: float) -> PiecePressures:
-        """Return mass potentials (see `fluid_content`) instead of pressures.  bulk (Pa): bulk modulus of the fluid."""
+        """Return mass potentials (see `fluid_content`) instead of pressures.  `bulk` is the fluid's bulk modulus, in Pa."""
         pi, bounds = mass_potential(self.pressure, bulk), mass_potential(self.bounds, bulk)
         slope = np.exp(self.pressure / bulk)[:, None] * self.slope
         return replace(self, pressure=pi, slope=slope, bounds=bounds)
@@ -218,7 +218,7 @@ def _bounds_of(jump: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[
 
 
 def transport(old: PiecePressures, points: MaterialPoints, new: Pieces) -> NDArray[np.float64]:
-    """Return the pressures (m,), in Pa, of new pieces.  Mass potentials (`fluid_content`) in `old` give potentials."""
+    """Return the pressures (m,), in Pa, of new pieces, or mass potentials (`fluid_content`) if `old` has potentials."""
     n = len(points)
     if not n:
         return np.empty(0)

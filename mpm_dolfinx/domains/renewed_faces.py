@@ -253,7 +253,7 @@ def renewed_faces(points: MaterialPoints, several: Sequence[Surface]) -> Renewed
 
 
 def _within(ends: NDArray[np.float64], region: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the fractions (n,) of their lengths at which edges (n, 2, 2) enter a region (2, 2), and those of exit."""
+    """Return two fractions (n,) of the lengths of edges (n, 2, 2) at which edges enter and leave a region (2, 2)."""
     low, high = np.zeros(len(ends)), np.ones(len(ends))
     edge_vector = ends[:, 1] - ends[:, 0]
     slack = SAME * np.abs(edge_vector).max(axis=1)

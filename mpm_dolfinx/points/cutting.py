@@ -81,7 +81,7 @@ def simplices(dim: int) -> NDArray[np.int64]:
 
 
 def vertices(y: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the corners y (2^d, d, n) of domains, followed in 3D by the middles of faces, and by those of domains."""
+    """Return the corners y (2^d, d, n) of domains, in 3D the middles of their faces, and the middles of domains."""
     faces = [y[index].sum(axis=0) / 4 for index in FACES[3]] if y.shape[1] == 3 else []
     return np.concatenate([y, *(v[None] for v in faces), y.sum(axis=0)[None] / len(y)])
 
@@ -133,7 +133,7 @@ def edges(corners: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def centroids(corners: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the centroids (n, d), in m, of domains with corners (n, 2^d, d), or in axisymmetry of domains' sections.
+    """Return the centroids (n, d), in m, of domains with corners (n, 2^d, d), or in axisymmetry of their sections.
 
     Inverted simplices count with positive volume, as in `cut`.
     """
@@ -421,7 +421,7 @@ def _sum(
 def spreads(corners: NDArray[np.float64], rings: bool) -> NDArray[np.float64]:
     """Return the second moments (n, d, d) of domains about their centroids, divided by their volumes, in m^2.
 
-    The results are exact for parallelepipeds.  rings: whether the domains are sections of rings, in axisymmetry.
+    The results are exact for parallelepipeds.  `rings`: whether the domains are sections of rings, in axisymmetry.
     """
     E = edges(corners)
     out = E @ E.swapaxes(1, 2) / 12  # 1/12: second moment of a unit length, exact
@@ -446,6 +446,7 @@ def _rings(
     """Return the radii (m,), in m, of pieces, the centroids (m, 2) of their volumes, and `hoop` of `Pieces`.
 
     Coordinates r, z of centroids, and in the last parameters, are from 0 to 1 in the cell of each piece.
+
     cell (m, 2): grid indices of the pieces' cells
     c (m, 2): centroids of the pieces' sections
     squares, products (m,): means of r^2 and of r z over the sections
@@ -562,8 +563,7 @@ def _polygons(
 
     The slices of a triangle in one cell form a convex polygon. The polygon is divided about the mean of its corners.
 
-    s (3, a, n): corners of the slices; rows are first positions for slicing, last barycentric coordinates in the
-    triangle
+    s (3, a, n): corners of the slices, as positions for slicing and, last, barycentric coordinates in the triangle
     owner (n,): index of the triangle of each slice
     """
     cut = np.bincount(owner, minlength=1)[owner] > 1

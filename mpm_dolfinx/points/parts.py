@@ -146,7 +146,7 @@ def joined_parts(
 
 
 def _touching(index: NDArray[np.int64]) -> tuple[NDArray[np.int64], int]:
-    """Return the part (n,), from 0, of cells, and the number of parts.  index (n, d + 1): grid indices and copy."""
+    """Return the part (n,), from 0, of cells, and the number of parts.  `index` (n, d + 1): grid indices and copy."""
     if not len(index):
         return np.empty(0, dtype=np.int64), 0
     low = index.min(axis=0)
@@ -159,7 +159,7 @@ def _touching(index: NDArray[np.int64]) -> tuple[NDArray[np.int64], int]:
 
 
 def _joined(rows: NDArray[np.int64], columns: NDArray[np.int64], shape: Sequence[int]) -> tuple[NDArray[np.int64], int]:
-    """Return the component of each row, from 0, and their number.  Rows with a common column are connected."""
+    """Return each row's component, from 0, and the number of components.  Rows with a common column are connected."""
     n = sum(shape)
     pairs = coo_array((np.ones(len(rows)), (rows, shape[0] + columns)), shape=(n, n)).tocsr()
     count, part = connected_components(pairs, directed=False)
