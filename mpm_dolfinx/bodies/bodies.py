@@ -38,11 +38,11 @@ class Body:
         raise NotImplementedError
 
     def lower_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the lower corners (m, d), in m, of the boxes of the chosen domains."""
+        """Return the lower corners (n, d), in m, of the boxes of the chosen domains."""
         raise NotImplementedError
 
     def sides_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return whether the faces (m, d, 2) of the chosen domains lie on the surface of the body."""
+        """Return whether the faces (n, d, 2) of the chosen domains lie on the surface of the body."""
         raise NotImplementedError
 
     @property
@@ -61,7 +61,7 @@ class Body:
         return self.centre_of(slice(None))
 
     def centre_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the reference positions (m, d), in m, of the centres of the chosen domains."""
+        """Return the reference positions (n, d), in m, of the centres of the chosen domains."""
         return self.lower_of(chosen) + 0.5 * self.spacing
 
     @cached_property
@@ -98,7 +98,7 @@ class Body:
         return row, np.full(len(row), 2 * axis + end)
 
     def _with_face(self, axis: int, end: int) -> NDArray[np.int64]:
-        """Return the domains (m,), in ascending order, whose face at an end of an axis lies on the surface."""
+        """Return the domains (n,), in ascending order, whose face at an end of an axis lies on the surface."""
         rows = [part.start + np.flatnonzero(self.sides_of(part)[:, axis, end]) for part in in_chunks(len(self))]
         return np.concatenate([np.empty(0, np.int64), *rows])
 
@@ -107,7 +107,7 @@ class Body:
         return len(self) / max(1, len(self._with_face(axis, 0))), float(self.spacing[axis])
 
     def outer(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the domains (m,) and face indices (m,) of all surface faces, sorted by face index."""
+        """Return the domains (n,) and face indices (n,) of all surface faces, sorted by face index."""
         rows = [self._with_face(axis, end) for axis in range(self.dim) for end in (0, 1)]
         return np.concatenate(rows), np.repeat(np.arange(len(rows)), list(map(len, rows)))
 
@@ -147,7 +147,7 @@ class Body:
         return out
 
     def boxes(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
-        """Return the edge lengths (m, d), in m, of the boxes of the chosen domains, before the map."""
+        """Return the edge lengths (n, d), in m, of the boxes of the chosen domains, before the map."""
         return np.broadcast_to(self.spacing, (len(self), self.dim))[chosen]
 
     @property
@@ -255,7 +255,7 @@ def material_points(
 
 
 def _own(grid: Grid, body: Body) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the domains (m,) whose centroids lie in cells of this process, and their corners (m, 2^d, d), in m."""
+    """Return the domains (n,) whose centroids lie in cells of this process, and their corners (n, 2^d, d), in m."""
     rows, corners = [np.empty(0, dtype=np.int64)], [np.empty((0, 2**grid.dim, grid.dim))]
     for part in in_chunks(len(body)):
         of_part = body.corners(part) - grid.base

@@ -35,7 +35,7 @@ class LatticeBody(Body):
         return len(self.count)
 
     def _index(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the lattice indices (m, d) of the chosen domains."""
+        """Return the lattice indices (n, d) of the chosen domains."""
         if self.filled is not None:
             numbers = self.filled[chosen]
         elif isinstance(chosen, slice):
@@ -49,7 +49,7 @@ class LatticeBody(Body):
         return self.origin + index * self.spacing
 
     def lower_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the lower corners (m, d), in m, of the boxes of the chosen domains."""
+        """Return the lower corners (n, d), in m, of the boxes of the chosen domains."""
         return self._at(self._index(chosen))
 
     def reference(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
@@ -60,7 +60,7 @@ class LatticeBody(Body):
         return self._at(self._index(chosen)[:, None] + corner_bits(self.dim))
 
     def sides_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return whether the faces (m, d, 2) of the chosen domains lie on the surface of the body."""
+        """Return whether the faces (n, d, 2) of the chosen domains lie on the surface of the body."""
         index = self._index(chosen)
         out = np.stack([index == 0, index == np.array(self.count) - 1], axis=-1)
         if self.filled is None:
@@ -73,7 +73,7 @@ class LatticeBody(Body):
         return out
 
     def _with_face(self, axis: int, end: int) -> NDArray[np.int64]:
-        """Return the domains (m,), in ascending order, whose face at an end of an axis lies on the surface."""
+        """Return the domains (n,), in ascending order, whose face at an end of an axis lies on the surface."""
         if self.filled is not None:
             return super()._with_face(axis, end)
         along = [np.arange(n) for n in self.count]
@@ -110,7 +110,7 @@ class LatticeBody(Body):
         return self._index(rows) - self._ends[0]
 
     def nodes(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the lexicographic node indices (m, 2^d) of the corners of domains.  Shared corners have one index."""
+        """Return the lexicographic node indices (n, 2^d) of the corners of domains.  Shared corners have one index."""
         corners = self.places(rows)[:, None] + corner_bits(self.dim)
         return np.ravel_multi_index(tuple(np.moveaxis(corners, 2, 0)), tuple(np.add(self.lattice, 1)))
 
@@ -126,12 +126,12 @@ class RowsBody(LatticeBody):
         return np.stack([rows[i] for rows, i in zip(self.rows, np.moveaxis(index, -1, 0), strict=True)], axis=-1)
 
     def boxes(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
-        """Return the edge lengths (m, d), in m, of the boxes of the chosen domains, before the map."""
+        """Return the edge lengths (n, d), in m, of the boxes of the chosen domains, before the map."""
         index = self._index(chosen)
         return self._at(index + 1) - self._at(index)
 
     def centre_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the reference positions (m, d), in m, of the centres of the chosen domains."""
+        """Return the reference positions (n, d), in m, of the centres of the chosen domains."""
         return self.lower_of(chosen) + 0.5 * self.boxes(chosen)
 
     def across(self, axis: int) -> tuple[float, float]:

@@ -183,7 +183,7 @@ def joined(surfaces: Sequence[Surface]) -> Surface:
 
 
 def _face_corners(body: Body, row: NDArray[np.int64], face: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return the reference positions (m, 2^(d-1), d), in m, of the corners of faces."""
+    """Return the reference positions (n, 2^(d-1), d), in m, of the corners of faces."""
     return np.take_along_axis(body.reference(row), FACES[body.dim][face][:, :, None], axis=1)
 
 

@@ -343,9 +343,9 @@ def _of_dolfinx(grid: Grid, mesh, cell_tags, facet_tags, names: Mapping[str, int
 def _of_rows(dim: int, kind: str, rows: list[tuple], curved: bool, names: Mapping[str, int]) -> Mesh:
     """Convert a dolfinx mesh.
 
-    rows: from each process, indices of nodes, positions of nodes, nodes of cells, tags of cells, tags of facets, and
-    distance of edge nodes from edge midpoints, in m
-    curved: whether cells are of second order
+    `rows`: from each process, indices of nodes, positions of nodes, nodes of cells, tags of cells, tags of facets, and
+    distance of edge nodes from edge midpoints, in m.
+    `curved`: whether cells are of second order.
     """
     number, x, cells, tag, side, off = map(np.concatenate, zip(*rows, strict=True))
     if curved:

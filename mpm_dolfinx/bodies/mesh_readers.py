@@ -28,7 +28,7 @@ def read(file: Path) -> meshio.Mesh:
 
 
 def _bulk(file: Path) -> meshio.Mesh:
-    """Return the mesh of a Nastran file.  meshio needs a header, which is added if it is missing, as in gmsh's files."""
+    """Return the mesh of a Nastran file.  meshio needs a header, which is added if it is missing."""
     text = file.read_text(errors="replace")
     if re.search(r"^BEGIN\s+BULK", text, re.MULTILINE | re.IGNORECASE):
         return meshio.read(file, "nastran")

@@ -84,20 +84,20 @@ class MeshBody(Body):
         return np.min([self.boxes(part).min(axis=0) for part in in_chunks(len(self))], axis=0)
 
     def boxes(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
-        """Return the edge lengths (m, d), in m, of the bounding boxes of the chosen domains, before the map."""
+        """Return the edge lengths (n, d), in m, of the bounding boxes of the chosen domains, before the map."""
         x = self.vertices[chosen]
         return x.max(axis=1) - x.min(axis=1)
 
     def lower_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the lower corners (m, d), in m, of the bounding boxes of the chosen domains."""
+        """Return the lower corners (n, d), in m, of the bounding boxes of the chosen domains."""
         return self.vertices[chosen].min(axis=1)
 
     def sides_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return whether the faces (m, d, 2) of the chosen domains lie on the surface of the body."""
+        """Return whether the faces (n, d, 2) of the chosen domains lie on the surface of the body."""
         return self.surface[chosen]
 
     def centre_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the reference positions (m, d), in m, of the centres of the chosen domains."""
+        """Return the reference positions (n, d), in m, of the centres of the chosen domains."""
         return centroids(self.vertices[chosen])
 
     @property
@@ -134,7 +134,7 @@ class MeshBody(Body):
         return self.vertices[chosen]
 
     def nodes(self, rows: slice | NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return node indices (m, 2^d) of the corners of domains.  Shared corners have one index."""
+        """Return node indices (n, 2^d) of the corners of domains.  Shared corners have one index."""
         return self.numbers[rows]
 
 
@@ -158,8 +158,8 @@ def seeded(
 ) -> MeshBody:
     """Return the body of a part of a mesh, or of the whole mesh; see `from_mesh`.
 
-    mesh: function that returns the mesh on rank 0
-    warns: whether to warn about domains that are too small
+    `mesh`: function that returns the mesh on rank 0.
+    `warns`: whether to warn about domains that are too small.
     """
     per_cell, material = whole("body: per_cell", per_cell), whole("body: material", material, 0)
 
@@ -280,10 +280,10 @@ def _check_overlaps(
     only across the surface.  If any cells overlap, at least one overlapping cell is at the surface.  It is therefore
     sufficient to check the cells at the surface.
 
-    x (nodes, d), in m: positions of the nodes
-    cells: nodes of the cells by cell type
-    outer (k,): cells with a facet on the surface
-    neighbours (n, 2): pairs of cells that share a facet
+    `x` (nodes, d), in m: positions of the nodes.
+    `cells`: nodes of the cells by cell type.
+    `outer` (k,): cells with a facet on the surface.
+    `neighbours` (n, 2): pairs of cells that share a facet.
     """
     corners = [x[nodes] for nodes in cells.values()]
     boxes = np.concatenate([np.stack([c.min(axis=1), c.max(axis=1)], axis=1) for c in corners])
@@ -310,7 +310,7 @@ def _check_overlaps(
 def _box_overlaps(
     boxes: NDArray[np.float64], size: NDArray[np.float64], outer: NDArray[np.int64], slack: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return n pairs of cells with overlapping bounding boxes as two arrays (n,).  The first array has cells of `outer`.
+    """Return n pairs of cells with overlapping bounding boxes as two arrays (n,).  The first has cells of `outer`.
 
     Boxes are grouped by size, in octaves.  In one group, small boxes would be searched with the largest box's radius.
     """

@@ -25,9 +25,9 @@ def overburden(
     Domains may meet exactly above a position.  Both results are therefore means over vertical lines on all sides of the
     position, very close to it.
 
-    corners (n, 2^d, d), in m: corners of the particle domains of all bodies; the last axis is vertical
-    unit_weight (n,), in N/m^3: unit weights of the domains
-    x (k, d), in m: positions in the domains
+    `corners` (n, 2^d, d), in m: corners of the particle domains of all bodies; the last axis is vertical.
+    `unit_weight` (n,), in N/m^3: unit weights of the domains.
+    `x` (k, d), in m: positions in the domains.
     """
     if not len(x):
         return np.zeros(0), np.zeros(0)

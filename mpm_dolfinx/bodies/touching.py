@@ -51,7 +51,7 @@ class Faces:
         return cls.of(body, *body.outer())
 
     def edge(self) -> NDArray[np.float64]:
-        """Return the length (n,), in m, of the shortest edge of each face.  The unit width in plane strain is no edge."""
+        """Return the length (n,), in m, of the shortest edge of each face.  Unit width in plane strain is no edge."""
         c = self.corners
         pairs = [(1, 0), (3, 2), (2, 0), (3, 1)] if (self.index[:, 0] != self.index[:, 2]).any() else [(1, 0)]
         return np.min([np.linalg.norm(c[:, i] - c[:, j], axis=1) for i, j in pairs], axis=0)
@@ -263,10 +263,10 @@ def uncovered(
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
     """Return the face (m,), lower corner and upper corner (m, 2) of rectangles that fill uncovered parts of faces.
 
-    count: number of faces
-    face (n,): index of the face that each box covers in part
-    low, high (n, 2): corners of the boxes, in face coordinates from 0 to 1
-    slack (n,): largest difference between ends of boxes that count as equal
+    `count`: number of faces.
+    `face` (n,): index of the face that each box covers in part.
+    `low`, `high` (n, 2): corners of the boxes, in face coordinates from 0 to 1.
+    `slack` (n,): largest difference between ends of boxes that count as equal.
     """
     touched, row = np.unique(face, return_inverse=True)
     whole = np.setdiff1d(np.arange(count), touched)

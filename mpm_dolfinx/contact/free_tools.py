@@ -8,8 +8,9 @@ length of the step.  l are load and weight, and f are the contact forces on the 
 the contact positions on the tool.  The columns of A are e_x, e_y, and `e_z x r` with the lever arm r.
 
 The unknowns q are eliminated (static condensation).  Let D be minus the derivative of f with respect to the
-displacement w of the points, and let dw be the increment of w.  Forces rotate with the tool, so f changes by `(D A + E) dq`, where E has the columns 0,
-0, `e_z x f`.  The force on the tool changes by the product of dq with the matrix
+displacement w of the points, and let dw be the increment of w.  Forces rotate with the tool, so f changes by
+`(D A + E) dq`, where E has the columns 0, 0, `e_z x f`.  The force on the tool changes by the product of dq with
+==
 
     A^T D A + [[0, e_z x F], [(e_z x F)^T, sum r . f]],     F = sum f.
 
@@ -57,11 +58,11 @@ class MotionEquation(NamedTuple):
 class FreeTools(ContactProblem):
     """Base class that adds the motion of free tools to `ToolLoads`.
 
-    placed: arguments of `ToolLoads`
-    mass (k, q): masses, in kg, and moments of inertia, in kg m^2; 0 for tools that are not free
-    guides (k, q, q): projections on the motions that each tool can perform, see `motion_count`
-    velocity (k, q): velocities at the start of the step, in m/s and rad/s
-    pushes (k, q): prescribed loads, in N and N m
+    `placed`: arguments of `ToolLoads`.
+    `mass` (k, q): masses, in kg, and moments of inertia, in kg m^2; 0 for tools that are not free.
+    `guides` (k, q, q): projections on the motions that each tool can perform, see `motion_count`.
+    `velocity` (k, q): velocities at the start of the step, in m/s and rad/s.
+    `pushes` (k, q): prescribed loads, in N and N m.
     """
 
     couples = True

@@ -158,9 +158,9 @@ class ContactLaw:
     ) -> tuple:
         """Return the fields of `Touch` from `sticks` to `by_pressure`.
 
-        n (k, d): mean normal of the pairs of each condition
-        slip (k, d), in m: mean slip of these pairs in the step
-        old (k, d), in Pa: mean shear traction of these pairs before the step
+        `n` (k, d): mean normal of the pairs of each condition.
+        `slip` (k, d), in m: mean slip of these pairs in the step.
+        `old` (k, d), in Pa: mean shear traction of these pairs before the step.
         """
         P = np.eye(n.shape[1]) - n[:, :, None] * n[:, None, :]
         hold = np.where(self.strength.any(axis=1), self._hold, 0.0) * on
@@ -216,7 +216,7 @@ class ContactLaw:
         return area * out
 
     def choose(self, state: ContactState, touch: Touch, sticks: bool) -> tuple[ContactState, bool]:
-        """Update which conditions slip.  Return the state, and whether any changed.  `sticks` allows stick after slip."""
+        """Update which conditions slip.  Return the state and whether any changed.  `sticks` allows return to stick."""
         before = state.slips
         left = ~before & ~touch.sticks & state.stuck.any(axis=1)
         parts = state.parts | (left & state.resticks)

@@ -115,8 +115,8 @@ class Contacts(Touching):
     ) -> tuple[ContactLaw, Origin]:
         """Return the contact law and the origin of pairs that were found for the points `seen`.
 
-        points: points at the start of the step, with the contact history
-        present: points at their current positions
+        `points`: points at the start of the step, with the contact history.
+        `present`: points at their current positions.
         """
         grid = self.grid
         d = self.grid.dim

@@ -65,7 +65,7 @@ class Pairs:
         return self.grid.reach
 
     def other_side(self) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
-        """Return lexicographic cells (m,) of opposite positions, and their shape functions (m, 2^d), or None on tools."""
+        """Return lexicographic cells (m,) of opposite positions and shape functions (m, 2^d), or None on tools."""
         return None
 
     def operator(self, unknowns: Unknowns) -> PETSc.Mat:

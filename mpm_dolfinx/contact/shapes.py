@@ -24,13 +24,13 @@ class Shape(Protocol):
     """A rigid solid.  Positions y (n, d), in m, are in the frame of the tool."""
 
     def distance(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the signed distances (m,), in m, from the surface."""
+        """Return the signed distances (n,), in m, from the surface."""
 
     def normal(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the gradients (m, d) of the distance."""
+        """Return the gradients (n, d) of the distance."""
 
     def curvature(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the second derivatives (m, d, d) of the distance, in 1/m."""
+        """Return the second derivatives (n, d, d) of the distance, in 1/m."""
 
 
 def _flat(y: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -102,15 +102,15 @@ class HalfSpace(Placed):
         return unit_vector("HalfSpace: outward", self.outward)
 
     def distance(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the signed distances (m,), in m, from the surface."""
+        """Return the signed distances (n,), in m, from the surface."""
         return (y - self.point) @ self._n
 
     def normal(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the gradients (m, d) of the distance."""
+        """Return the gradients (n, d) of the distance."""
         return np.broadcast_to(self._n, y.shape)
 
     def curvature(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the second derivatives (m, d, d) of the distance, in 1/m."""
+        """Return the second derivatives (n, d, d) of the distance, in 1/m."""
         return _flat(y)
 
 
@@ -134,15 +134,15 @@ class Ball(Placed):
         numbers("Ball: radius", self.radius, test=lambda r: (r > 0) & (r < np.inf), allowed="> 0 and finite")
 
     def distance(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the signed distances (m,), in m, from the surface."""
+        """Return the signed distances (n,), in m, from the surface."""
         return _across(y - self.centre)[0] - self.radius
 
     def normal(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the gradients (m, d) of the distance."""
+        """Return the gradients (n, d) of the distance."""
         return _across(y - self.centre)[1]
 
     def curvature(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the second derivatives (m, d, d) of the distance, in 1/m."""
+        """Return the second derivatives (n, d, d) of the distance, in 1/m."""
         return _across(y - self.centre)[2]
 
 
@@ -183,7 +183,7 @@ class Convex(Placed):
         return y @ self._planes[:, :-1].T + self._planes[:, -1]
 
     def distance(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the signed distances (m,), in m, from the surface."""
+        """Return the signed distances (n,), in m, from the surface."""
         return self._each(y).max(axis=1)
 
     def normal(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -193,7 +193,7 @@ class Convex(Placed):
         return near @ self._planes[:, :-1] / near.sum(axis=1, keepdims=True)
 
     def curvature(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the second derivatives (m, d, d) of the distance, in 1/m."""
+        """Return the second derivatives (n, d, d) of the distance, in 1/m."""
         return _flat(y)
 
 
@@ -243,7 +243,7 @@ class Cone(Placed):
         return z, *_across(y - self.tip - z[:, None] * self._axis)
 
     def distance(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the signed distances (m,), in m, from the flank."""
+        """Return the signed distances (n,), in m, from the flank."""
         z, r, _, _ = self._polar(y)
         beta = np.radians(self.angle_deg)
         return r * np.cos(beta) - z * np.sin(beta)
@@ -255,7 +255,7 @@ class Cone(Placed):
         return away * (r > ROUNDED * np.abs(z))[:, None] * np.cos(beta) - self._axis * np.sin(beta)
 
     def curvature(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the second derivatives (m, d, d) of the distance, in 1/m."""
+        """Return the second derivatives (n, d, d) of the distance, in 1/m."""
         _, r, _, second = self._polar(y)
         if y.shape[1] == 2:
             return _flat(y)
@@ -277,7 +277,7 @@ class Distance:
     base: NDArray[np.float64] | float = 0.0  # origin of the positions (d,), m
 
     def distance(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the signed distances (m,), in m, from the surface."""
+        """Return the signed distances (n,), in m, from the surface."""
         return self._at(y + self.base)
 
     def _at(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -289,7 +289,7 @@ class Distance:
         return numbers("Tool: shape", value, (len(y),), allowed=allowed)
 
     def normal(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the gradients (m, d) of the distance."""
+        """Return the gradients (n, d) of the distance."""
         return self._slopes(y + self.base, _power_of_two(CENTRAL * self.size))
 
     def _slopes(self, y: NDArray[np.float64], step: float) -> NDArray[np.float64]:
@@ -298,7 +298,7 @@ class Distance:
         return np.stack(slopes, axis=1)
 
     def curvature(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the second derivatives (m, d, d) of the distance, in 1/m."""
+        """Return the second derivatives (n, d, d) of the distance, in 1/m."""
         y, wide = y + self.base, _power_of_two(SECOND * self.size)
         steps = wide * np.eye(y.shape[1])
         slopes = [(self._slopes(y + e, wide) - self._slopes(y - e, wide)) / (2 * wide) for e in steps]

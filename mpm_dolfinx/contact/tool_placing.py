@@ -49,8 +49,7 @@ def motion_count(dim: int) -> int:
 
 
 class LoadMotion(NamedTuple):
-    """Displacements (k,), in m, that loads of k tools cause in a step.  With free tools, motions (k, q), in m and rad.
-    """
+    """Displacements (k,), in m, by loads of k tools in a step.  With free tools: motions (k, q), in m and rad."""
 
     start: float  # start of the step, s
     end: float  # end of the step, s
@@ -143,8 +142,8 @@ class Tools(Touching):
     def _posed(self, tool: Tool, start: float, t: float) -> Pose:
         """Return the pose of a tool at time t (s), the end of a substep.
 
-        With inertia, `in_step` corrects a prescribed pose after the first of two substeps.  Velocities are then second-order
-        accurate.
+        With inertia, `in_step` corrects a prescribed pose after the first of two substeps.  Velocities are then
+        second-order accurate.
         """
         pose = self._pose(tool, t)
         if self._end is None or not start < t < self._end or tool.free:
@@ -249,9 +248,9 @@ class Tools(Touching):
         edge.  Half a cell inside the edge has therefore no contact.  A tool narrower than a cell keeps its whole
         contact.
 
-        x (n, d), in m: positions on the surface
-        unit (n, d): outward unit normals at these positions
-        faces (n,): whether the surface at each position faces the tool
+        `x` (n, d), in m: positions on the surface.
+        `unit` (n, d): outward unit normals at these positions.
+        `faces` (n,): whether the surface at each position faces the tool.
         """
         grid, (y, n) = self.grid, (x[faces], unit[faces])
         h = grid.sizes_at(y)
@@ -328,10 +327,10 @@ class Tools(Touching):
 
         Tools constrain means over cells.  Without this correction, corners of sliding domains would stay inside a tool.
 
-        corners (n, 2^d, d), in m: corners of the domains
-        t, in s: time
-        free (n, 2^d, d): whether no other condition prescribes a component
-        most: largest corrected penetration, divided by the cell size
+        `corners` (n, 2^d, d), in m: corners of the domains.
+        `t`, in s: time.
+        `free` (n, 2^d, d): whether no other condition prescribes a component.
+        `most`: largest corrected penetration, divided by the cell size.
         """
         out, h = corners.copy(), self.grid.least
         for tool in self.tools:

@@ -30,10 +30,10 @@ def followed(
 
     Far nodes of empty neighbour cells are not used, because such nodes may belong to another body.
 
-    cells (n,): owned cells that contain the corners
-    x (n, d), in m: positions of the corners
-    u (nodes, d), in m: nodal displacements
-    filled (cells,): whether local cells contain material
+    `cells` (n,): owned cells that contain the corners.
+    `x` (n, d), in m: positions of the corners.
+    `u` (nodes, d), in m: nodal displacements.
+    `filled` (cells,): whether local cells contain material.
     """
     used = np.bincount(cells, minlength=1).nonzero()[0]
     slot = np.zeros(used.max(initial=0) + 1, dtype=np.intp)

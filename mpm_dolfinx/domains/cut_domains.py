@@ -144,8 +144,7 @@ class CutDomains(Keyed):
         """Pieces of this process's points, without areas and mean products.  Only integrals over cells need these."""
 
     def faces(self) -> NDArray[np.float64]:
-        """Return the areas (m, d, 2), in m^(d-1), of pieces on cell faces.  Call this once: the areas are then deleted.
-        """
+        """Return areas (m, d, 2), in m^(d-1), of pieces on cell faces.  Call it once, because they are then deleted."""
         faces, self._faces = self._faces, None
         return faces
 
@@ -266,7 +265,7 @@ class CutDomains(Keyed):
         return exchange, grid.locals[exchange.send(cell)]
 
     def total_displacement(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return total displacements (m, d), in m, of the pieces' centroids.  They follow from corners of the domains."""
+        """Return total displacements (m, d), in m, of the pieces' centroids, computed from the domains' corners."""
         pieces = self.pieces
         now, then = (c - c.mean(axis=1, keepdims=True) for c in (points.corners, points.origin))
         stretch = np.linalg.solve(then.swapaxes(1, 2) @ then, then.swapaxes(1, 2) @ now)  # affine fit to the corners

@@ -33,7 +33,7 @@ class SeededDomains:
     The identifier of a part follows from its domain and its interval.  It is a number for `material_points.body_of`
     with an odd index in the body.  Renewed points have even indices.
 
-    bodies: all bodies of the scene
+    `bodies`: all bodies of the scene.
     """
 
     def __init__(self, bodies: Sequence[Body]):
@@ -67,8 +67,8 @@ class SeededDomains:
     def at(self, root: NDArray[np.int64], lower: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Return the domain (n,) that has the lower corner of each part, and this corner (n, d) relative to the domain.
 
-        root (n,): any domain of the body
-        lower (n, d): lower corner of the part, relative to `root`
+        `root` (n,): any domain of the body.
+        `lower` (n, d): lower corner of the part, relative to `root`.
         """
         step = np.floor(lower).astype(np.int64)
         out, moved = root.copy(), step.any(axis=1).nonzero()[0]
@@ -228,7 +228,7 @@ def _placed(
 def with_defect(new: MaterialPoints, old: MaterialPoints, into: NDArray[np.int64]) -> MaterialPoints:
     """Return new points with a volume defect such that soil and fluid fill the same volume as before.
 
-    into: index of the old point of each new point; if points were merged, index of the new point of each old point
+    `into`: index of the old point of each new point; if points were merged, index of the new point of each old point.
     """
     if "owed" not in new.data:
         return new

@@ -22,7 +22,7 @@ def gradient(
     second-order term.)  In axisymmetry F has the shape (n, 3, 3).  The circumferential stretch is the ratio of the
     centroid radii, and det F is the ratio of the ring volumes.
 
-    corners, reference (n, 2^d, d), in m: current corners, and reference corners
+    `corners`, `reference` (n, 2^d, d), in m: current corners, and reference corners.
     """
     if corners.shape[2] == 2:
         dx, dX = (y[:, :1:-1] - y[:, :2] for y in (corners, reference))  # the diagonals
@@ -100,10 +100,10 @@ def cell_ratios(
     the volume of the domains, and no force would oppose this drift.  Without F-bar, pieces have the ratio of their
     point.  In cells with yielded soil they also do, because corner volumes are meaningless near plastic flow.
 
-    cut: cut particle domains
-    points: points at the start of the step
-    share (n,): weight, 0 to 1, of the ratio from corners in the geometric mean with the point's ratio; 0 without F-bar
-    flows (n,): whether points have yielded
+    `cut`: cut particle domains.
+    `points`: points at the start of the step.
+    `share` (n,): weight, 0 to 1, of the ratio from corners in the mean (geometric) with the point's; 0 without F-bar.
+    `flows` (n,): whether points have yielded.
     """
     cells, size = cut.cells, cut.grid.num_local
     corner_ratio = cut.to_cells(determinant(gradient(points.corners, points.reference, cut.grid.axisymmetric)))

@@ -38,10 +38,10 @@ from mpm_dolfinx.points.material_points import MaterialPoints, body_of, cofactor
 class Neighbours:
     """Neighbours of domains across shared faces, including neighbours on other processes.
 
-    comm: communicator of the processes
-    bodies: all bodies of the scene
-    points: material points of this process
-    chosen (n,): whether to find the neighbours of each point
+    `comm`: communicator of the processes.
+    `bodies`: all bodies of the scene.
+    `points`: material points of this process.
+    `chosen` (n,): whether to find the neighbours of each point.
     """
 
     def __init__(self, comm: MPI.Intracomm, bodies: Sequence[Body], points: MaterialPoints, chosen: NDArray[np.bool_]):
@@ -62,10 +62,10 @@ class Neighbours:
         self._partner = partner.reshape(-1, 2 * dim).T.copy()  # index of the opposite face; -1 if there is none
 
     def at_neighbours(self, own: NDArray[np.float64], faces: Sequence[NDArray[np.float64]]) -> Callable[[int], tuple]:
-        """Return a function of a face index.  It returns neighbours' data (c, k), face centres, and a mask of neighbours.
+        """Return a function of a face index.  It returns neighbours' data (c, k), face centres, and their mask.
 
-        own (c, k): c data columns of the points
-        faces: centres (d, k), in m, of the points' faces, for each face index
+        `own` (c, k): c data columns of the points.
+        `faces`: centres (d, k), in m, of the points' faces, for each face index.
         """
         centres = np.array(faces).transpose(1, 2, 0).reshape(len(faces[0]), own.shape[1] * len(faces))
         point = np.arange(own.shape[1]).repeat(len(faces))
@@ -87,8 +87,8 @@ class Neighbours:
 class LinearGradients:
     """Deformation gradients at the pieces of the domains in a scene.
 
-    comm: communicator of the processes
-    bodies: all bodies of the scene
+    `comm`: communicator of the processes.
+    `bodies`: all bodies of the scene.
     """
 
     def __init__(self, comm: MPI.Intracomm, bodies: Sequence[Body]):
@@ -161,10 +161,10 @@ def linear_gradients(
 ) -> NDArray[np.float64]:
     """Return deformation gradients (m, k, k) at the pieces of this process's points.
 
-    neighbours: neighbours of the domains in which F may vary
-    cut: cut particle domains
-    F (n, k, k): deformation gradients of the points
-    soils (n, c): constants of the points' soil; points with equal rows have the same material
+    `neighbours`: neighbours of the domains in which F may vary.
+    `cut`: cut particle domains.
+    `F` (n, k, k): deformation gradients of the points.
+    `soils` (n, c): constants of the points' soil; points with equal rows have the same material.
     """
     # the last axis is the point or piece: numpy takes several times as long for rows of a few numbers each
     of, fraction = cut.pieces.point, cut.pieces.fraction

@@ -31,10 +31,10 @@ def fitted_at(
     The fit uses points of the same body and material, weighted by the distance in the reference configuration.  Results
     in removed domains are meaningless.
 
-    sizes: number of points of each body of the scene
-    id (m,): identifiers of the points in whose domains the positions lie, the same on all processes
-    xi (m, d): local coordinates of the positions in these domains, the same on all processes
-    tensor: function from material points to tensors (n, k, k)
+    `sizes`: number of points of each body of the scene.
+    `id` (m,): identifiers of the points in whose domains the positions lie, the same on all processes.
+    `xi` (m, d): local coordinates of the positions in these domains, the same on all processes.
+    `tensor`: function from material points to tensors (n, k, k).
     """
     m = len(id)
     d = xi.shape[1]

@@ -52,9 +52,9 @@ MARGIN = len(THIRD) - 1
 class Lattice:
     """Lattice of the domain corners of an active body, and the held corners.  Bodies from meshes are not filtered.
 
-    start: identifier of the body's first point
-    given: for each condition, the faces on which it prescribes displacements, and the prescribed axes
-    contacts: for faces that touch other bodies, the domain (m,), and the indices (m, 4) of the face's corners in it
+    `start`: identifier of the body's first point.
+    `given`: for each condition, the faces on which it prescribes displacements, and the prescribed axes.
+    `contacts`: for faces that touch other bodies, the domain (m,), and the indices (m, 4) of the face's corners in it.
     """
 
     def __init__(
@@ -127,9 +127,9 @@ class Lattice:
     ) -> NDArray[np.float64]:
         """Return the change (n, 2^d, d), in m, by which the filter corrects displacements of domain corners.
 
-        d (n, 2^d, d), in m: displacements of the corners
-        crossed (n, 2^d): numbers of cells that the corners have crossed since the grid reset
-        parts (k,): indices of corners of parts of domains; these corners are not filtered
+        `d` (n, 2^d, d), in m: displacements of the corners.
+        `crossed` (n, 2^d): numbers of cells that the corners have crossed since the grid reset.
+        `parts` (k,): indices of corners of parts of domains; these corners are not filtered.
         """
         if self._count is None:
             return np.zeros_like(d)
@@ -160,9 +160,9 @@ def _at_sites(
     Also return the range of first layers of third differences in this process's slab, and a function that converts
     values at all sites of the slab to rows.
 
-    shape: number of lattice sites along each axis
-    number (m,): lexicographic index of the site of each row of values (m, k)
-    tolerance (k,): largest difference between rows of a site; if domains differ by more, the site is nan
+    `shape`: number of lattice sites along each axis.
+    `number` (m,): lexicographic index of the site of each row of values (m, k).
+    `tolerance` (k,): largest difference between rows of a site; if domains differ by more, the site is nan.
     """
     across, starts = int(np.prod(shape[1:])), np.arange(comm.size + 1) * shape[0] // comm.size
     layer = number // across

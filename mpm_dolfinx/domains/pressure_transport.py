@@ -65,7 +65,7 @@ class PiecePressures:
         return self._each(exchange.send)._ordered()
 
     def potentials(self, bulk: float) -> PiecePressures:
-        """Return mass potentials (see `fluid_content`) instead of pressures.  `bulk` is the fluid's bulk modulus, in Pa."""
+        """Return mass potentials (see `fluid_content`) instead of pressures.  `bulk`, in Pa: the fluid's modulus."""
         pi, bounds = mass_potential(self.pressure, bulk), mass_potential(self.bounds, bulk)
         slope = np.exp(self.pressure / bulk)[:, None] * self.slope
         return replace(self, pressure=pi, slope=slope, bounds=bounds)
@@ -168,8 +168,8 @@ class Reconstruction:
         continued.  Pressures stay between the extremes of cell, neighbours and drained sides, and of the reconstructed
         value at the surface.
 
-        x (m, d), in m: positions relative to the midpoints of their cells
-        slot (m,): index of the cell of each position in `pressures.cells`
+        `x` (m, d), in m: positions relative to the midpoints of their cells.
+        `slot` (m,): index of the cell of each position in `pressures.cells`.
         """
         cells, p, centroid, *_ = pressures
         jump, one_sided, is_open, drained = self._differences(pressures)
@@ -218,7 +218,7 @@ def _bounds_of(jump: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[
 
 
 def transport(old: PiecePressures, points: MaterialPoints, new: Pieces) -> NDArray[np.float64]:
-    """Return the pressures (m,), in Pa, of new pieces, or mass potentials (`fluid_content`) if `old` has potentials."""
+    """Return the pressures (n,), in Pa, of new pieces, or mass potentials (`fluid_content`) if `old` has potentials."""
     n = len(points)
     if not n:
         return np.empty(0)
@@ -268,11 +268,11 @@ def halved_pieces(
 ) -> PiecePressures:
     """Return one piece for each new point.  Its pressure follows from the mean slope in its old point.
 
-    pieces: pieces of the n old points
-    points: old points, and m new points
-    into (m,): old point of each new point
-    storage (n,), (m,), in 1/Pa: storage coefficients of old points, and of new points
-    bulk, in Pa: K_w
+    `pieces`: pieces of the n old points.
+    `points`: old points, and m new points.
+    `into` (m,): old point of each new point.
+    `storage` (n,), (m,), in 1/Pa: storage coefficients of old points, and of new points.
+    `bulk`, in Pa: K_w.
     """
     (old, new), n = points, len(points[0])
     order = np.argsort(into, kind="stable")
@@ -300,7 +300,7 @@ def joined_pieces(
 ) -> PiecePressures:
     """Return the pieces of merged points.  Pieces of the old points of a new point become one piece in each cell.
 
-    into (n,): new point of each old point
+    `into` (n,): new point of each old point.
     For the other parameters see `halved_pieces`.
     """
     old, new = points

@@ -93,12 +93,12 @@ def misshapen(grid: Grid, corners: NDArray[np.float64], longest: float) -> NDArr
 class RefilledCells:
     """Renewal: replacement of distorted particle domains by new domains, in one grid reset.
 
-    body (n,): index of each point's body
-    flowed (n,): whether points may be renewed
-    needs (n,): whether the domains of points need renewal
-    faces: surface of the bodies
-    signs: keys of seeded faces, and index of each face's set of conditions, see `SeededFaces.signatures`
-    second: whether to compute second moments of the pieces
+    `body` (n,): index of each point's body.
+    `flowed` (n,): whether points may be renewed.
+    `needs` (n,): whether the domains of points need renewal.
+    `faces`: surface of the bodies.
+    `signs`: keys of seeded faces, and index of each face's set of conditions, see `SeededFaces.signatures`.
+    `second`: whether to compute second moments of the pieces.
     """
 
     def __init__(
@@ -151,7 +151,7 @@ class RefilledCells:
         return out
 
     def _excluded(self, flowed: NDArray[np.bool_], signs: tuple[NDArray, NDArray]) -> NDArray[np.bool_]:
-        """Return which cells cannot be renewed.  They have points that have not `flowed`, two bodies, or two conditions."""
+        """Return which cells cannot be renewed: they have points not yet `flowed`, two bodies, or two conditions."""
         of, cell = self.pieces.point, self.cell
         parts = self.parts
         low, high = np.full(self.cells, np.iinfo(np.int64).max), np.full(self.cells, -1)
@@ -400,7 +400,7 @@ class RefilledCells:
 
     @cached_property
     def remainders(self) -> tuple[New, NDArray[np.int64]]:
-        """New domains in pieces of removed domains outside renewed cells, and these pieces.  Each piece has one group."""
+        """New domains in pieces of removed domains outside renewed cells, and these pieces.  One piece is one group."""
         pieces, points = self.pieces, self.points
         left = self._left
         rings, of = _convex(points.corners[pieces.point[left]], self._volume(self.cell[left]))

@@ -75,7 +75,7 @@ def faces_of_parts(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
     """Return which parts of domains lie on faces of seeded domains.
 
-    id, face (m,): seeded domains and indices of their faces.
+    `id`, `face` (m,): seeded domains and indices of their faces.
 
     Returns
     -------
@@ -121,8 +121,8 @@ def on_parts(faces: Surface, points: MaterialPoints) -> tuple[Surface, NDArray[n
 class SeededFaces:
     """Outer faces of the bodies of a scene in 2D: the seeded faces, and the faces that represent them now.
 
-    grid: background grid
-    bodies: all bodies of the scene
+    `grid`: background grid.
+    `bodies`: all bodies of the scene.
     """
 
     def __init__(self, grid: Grid, bodies: Sequence[Body]):

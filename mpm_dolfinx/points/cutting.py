@@ -173,8 +173,8 @@ def _chunks(count: int, dim: int) -> list[slice]:
 def cut(grid: Grid, corners: NDArray[np.float64], second: bool = False, faces: bool = True) -> Pieces:
     """Cut the particle domains by the grid.
 
-    corners (n, 2^d, d), in m: corners of the domains, inside the grid; corner k is at the ends `corner_bits(d)[k]`
-    second, faces: whether to compute second moments and face areas of the pieces
+    `corners` (n, 2^d, d), in m: corners of the domains, inside the grid; corner k is at the ends `corner_bits(d)[k]`.
+    `second`, `faces`: whether to compute second moments and face areas of the pieces.
 
     Returns
     -------
@@ -198,9 +198,9 @@ def on_planes(
     Both are snapped to grid planes nearer than `Grid.snap`.  If all cells are equal, positions for slicing are in units
     of cells.  Otherwise they are in m, because domain edges are straight in m.
 
-    true: positions from the grid's lower corner, in units of cells
-    x, in m: these positions from the grid's base
-    axes: array axis of the position's components
+    `true`: positions from the grid's lower corner, in units of cells.
+    `x`, in m: these positions from the grid's base.
+    `axes`: array axis of the position's components.
     """
     shape = [1] * true.ndim
     shape[axes] = grid.dim
@@ -433,8 +433,8 @@ def of_rings(spread: NDArray[np.float64], radius: NDArray[np.float64]) -> NDArra
 
     Third moments are neglected.  The vector from the section's to the ring's centroid is `spread[:, 0] / radius`.
 
-    spread (n, 2, 2), in m^2: second moments of the sections, divided by their areas
-    radius (n,), in m: radii of the sections' centroids
+    `spread` (n, 2, 2), in m^2: second moments of the sections, divided by their areas.
+    `radius` (n,), in m: radii of the sections' centroids.
     """
     off = spread[:, 0] / radius[:, None]
     return spread - off[:, :, None] * off[:, None]
@@ -443,13 +443,13 @@ def of_rings(spread: NDArray[np.float64], radius: NDArray[np.float64]) -> NDArra
 def _rings(
     grid: Grid, cell: NDArray[np.int64], c: NDArray[np.float64], squares: NDArray, products: NDArray
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return the radii (m,), in m, of pieces, the centroids (m, 2) of their volumes, and `hoop` of `Pieces`.
+    """Return the radii (n,), in m, of pieces, the centroids (n, 2) of their volumes, and `hoop` of `Pieces`.
 
     Coordinates r, z of centroids, and in the last parameters, are from 0 to 1 in the cell of each piece.
 
-    cell (m, 2): grid indices of the pieces' cells
-    c (m, 2): centroids of the pieces' sections
-    squares, products (m,): means of r^2 and of r z over the sections
+    `cell` (n, 2): grid indices of the pieces' cells.
+    `c` (n, 2): centroids of the pieces' sections.
+    `squares`, `products` (n,): means of r^2 and of r z over the sections.
     """
     (h, height), (x, z) = grid.widths_of(cell).T, c.T
     squares = np.minimum(np.maximum(squares, x**2), x)  # rounding may violate these bounds in very thin pieces
@@ -473,12 +473,12 @@ def _products(
 ) -> list[NDArray[np.float64]]:
     """Return integrals over the pieces of products of two coordinates, from the lower corners of the pieces' cells.
 
-    pairs: axes of the two coordinates, ascending
-    x (d, d, m): vertices of the slices
-    sums (d, m): sums over these vertices
-    area (m,): slice areas projected along the first axis
-    pair: function that returns the sum of the product of two coordinates over the vertices of each slice
-    total: function that returns the sum of slice values in each slot
+    `pairs`: axes of the two coordinates, ascending.
+    `x` (d, d, m): vertices of the slices.
+    `sums` (d, m): sums over these vertices.
+    `area` (m,): slice areas projected along the first axis.
+    `pair`: function that returns the sum of the product of two coordinates over the vertices of each slice.
+    `total`: function that returns the sum of slice values in each slot.
     """
     d = len(x)
 
@@ -511,8 +511,8 @@ def cut_faces(
     If a face crosses a grid line, its part on each side must load the nodes of that side.  With one point for each
     face, the error would move nodes of partly filled cells in every step without limit.
 
-    corners (faces, 2^(d-1), d), in m: corners of the faces; triangles repeat their last corner
-    local (faces, 2^(d-1), e): coordinates of the corners, to be interpolated
+    `corners` (faces, 2^(d-1), d), in m: corners of the faces; triangles repeat their last corner.
+    `local` (faces, 2^(d-1), e): coordinates of the corners, to be interpolated.
 
     Returns
     -------
@@ -563,8 +563,8 @@ def _polygons(
 
     The slices of a triangle in one cell form a convex polygon. The polygon is divided about the mean of its corners.
 
-    s (3, a, n): corners of the slices, as positions for slicing and, last, barycentric coordinates in the triangle
-    owner (n,): index of the triangle of each slice
+    `s` (3, a, n): corners of the slices, as positions for slicing and, last, barycentric coordinates in the triangle.
+    `owner` (n,): index of the triangle of each slice.
     """
     cut = np.bincount(owner, minlength=1)[owner] > 1
     part, of = s[:, :, cut], owner[cut]

@@ -49,10 +49,10 @@ def fitted(
 ) -> NDArray[np.float64]:
     """Return the fitted values (count, width) at `count` positions, on every process.  Without data they are zero.
 
-    degree: degree of the polynomials, 1 or 2
-    at (r,): index, from 0, of the position to whose fit each row of this process's data belongs
-    offset (r, d): offset from this position, in spacings of the data
-    values, weight (r, width), (r,): values and weights of the data
+    `degree`: degree of the polynomials, 1 or 2.
+    `at` (r,): index, from 0, of the position to whose fit each row of this process's data belongs.
+    `offset` (r, d): offset from this position, in spacings of the data.
+    `values`, `weight` (r, width), (r,): values and weights of the data.
     """
     powers = [rows for k in range(degree + 1) for rows in combinations_with_replacement(range(offset.shape[1]), k)]
     size = len(powers)

@@ -193,7 +193,7 @@ class MaterialPoints:
     def map(self, function: Callable[[NDArray], NDArray], shared: bool = True) -> MaterialPoints:
         """Return points with a function applied to each array.  The function selects, copies or transfers entries.
 
-        shared: whether fields that share an array also share the new array
+        `shared`: whether fields that share an array also share the new array.
         """
         cache: dict[int, NDArray] = {}
 

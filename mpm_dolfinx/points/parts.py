@@ -79,8 +79,8 @@ def largest_of_bodies(
 ) -> NDArray[np.float64]:
     """Return the largest values (k, bodies) in the connected parts of each body on all processes, or 0 without parts.
 
-    part (m,): index, from 0, of the connected part of each column of `values` (k, m)
-    inside (bodies, parts): whether a part contains points of a body on this process
+    `part` (m,): index, from 0, of the connected part of each column of `values` (k, m).
+    `inside` (bodies, parts): whether a part contains points of a body on this process.
     """
     largest = largest_of_parts(comm, part, values.T, inside.shape[1]).T[:, None]
     inside = over_all(comm, inside.astype(int), MPI.MAX) > 0
@@ -135,7 +135,8 @@ def joined_parts(
 ) -> tuple[NDArray[np.int64], int]:
     """Join the parts of some pairs of cells.  Return the new `part` and `count`, results of `parts_of_cells`.
 
-    pairs (m, 2): lexicographic indices of active cells; each process may have other pairs. All processes must call it.
+    `pairs` (m, 2): lexicographic indices of active cells.  Each process may have other pairs.  All processes must call
+    this function.
     """
     cells, at = np.unique(np.concatenate(grid.comm.allgather(np.unique(pairs, axis=0))), return_inverse=True)
     of = np.where(grid.owner(cells) == grid.comm.rank, part[grid.locals[cells]], 0)
@@ -171,9 +172,9 @@ def _over_processes(
 ) -> tuple[NDArray[np.int64], int]:
     """Return for each cell the index of its connected part, unique on all processes, and the number of parts.
 
-    own, count: index of each cell's part, and number of parts, on this process alone
-    nodes (n,): local indices of the cells' nodes
-    of_node (n,): index of each node's part on this process
+    `own`, `count`: index of each cell's part, and number of parts, on this process alone.
+    `nodes` (n,): local indices of the cells' nodes.
+    `of_node` (n,): index of each node's part on this process.
     """
     counts = grid.comm.allgather(count)
     start = sum(counts[: grid.comm.rank])

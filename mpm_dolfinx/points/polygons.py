@@ -78,7 +78,7 @@ class Polygons:
     def within(self, others: NDArray[np.float64], near: float = 0.0) -> Polygons:
         """Return the intersection of each polygon with a convex, anti-clockwise polygon with vertices (n, m, 2).
 
-        near, in m: tolerance; vertices that are outside by at most this distance count as inside
+        `near`, in m: tolerance; vertices that are outside by at most this distance count as inside.
         """
         out = self
         for k in range(others.shape[1]):

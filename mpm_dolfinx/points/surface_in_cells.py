@@ -29,8 +29,8 @@ _HALVES = np.array([[0, 0], [1, 0], [2, 0], [2, 1], [2, 2], [1, 2], [0, 2], [0, 
 class Region:
     """The filled part of n cells that the surface crosses once, in cell coordinates from 0 to 1.
 
-    cells: local indices of the cells
-    surface (n, EDGES + 1, 2): vertices of the surface in each cell, from entry to exit, with the body on the left
+    `cells`: local indices of the cells.
+    `surface` (n, EDGES + 1, 2): vertices of the surface in each cell, from entry to exit, with the body on the left.
     """
 
     def __init__(self, cells: NDArray[np.int64], surface: NDArray[np.float64]):
@@ -107,9 +107,9 @@ def resampled(
     Vertices lie at sharp bends.  Nearly straight parts are divided evenly.  The vertices are then shifted so that the
     area between surface and chord is preserved, or in axisymmetry the volume of this area's ring.
 
-    of (m,): index of each segment's cell, ascending
-    x (m, 2, 2): both ends of each segment, from 0 to 1 in its cell
-    around (n, 2): `Grid.around` at the lower and the upper side of each cell along the first axis
+    `of` (m,): index of each segment's cell, ascending.
+    `x` (m, 2, 2): both ends of each segment, from 0 to 1 in its cell.
+    `around` (n, 2): `Grid.around` at the lower and the upper side of each cell along the first axis.
     """
     length = np.linalg.norm(x[:, 1] - x[:, 0], axis=1)
     arc = np.concatenate([[0.0], np.cumsum(length)])
