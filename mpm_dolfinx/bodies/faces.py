@@ -53,7 +53,7 @@ class Surface:
         return len(self.id)
 
     def off_axis(self) -> Surface:
-        """Return the surface without the faces on the axis of revolution.  Those faces have no area."""
+        """Return the surface without the faces on the axis of revolution.  They have no area."""
         off = self.places()[:, :, 0].max(axis=1, initial=0.0) > SAME * self.whole0
         if off.all():
             return self

@@ -74,7 +74,7 @@ def put(
 
     Sides of the fill that touched a neighbour when seeded follow the neighbour's displacement.  The side opposite to
     the largest contact stays where it was seeded.  Displacements in between are interpolated.  The fill has zero
-    velocity.  The initial volumes of its domains are those of the displaced shape.
+    velocity.  The initial volumes of its domains belong to the displaced shape.
 
     Parameters
     ----------

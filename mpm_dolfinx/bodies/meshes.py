@@ -5,7 +5,7 @@
 local coordinates.
 
 The first process reads and divides a mesh.  Each machine then has one file with all domains.  The processes of the
-machine map this file into memory.  A process loads only the domains that it needs, such as those of its own points.
+machine map this file into memory.  A process loads only the domains that it needs, such as the domains of its points.
 """
 
 from __future__ import annotations

@@ -187,7 +187,7 @@ def covered(count: int, cover: Cover) -> NDArray[np.float64]:
 def uncovered_triangles(
     own: Faces, cover: Cover, faces: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the face (n,) and corners (n, 3, 2), in face coordinates, of n triangles that fill uncovered parts."""
+    """Return face (n,) and corners (n, 3, 2), in face coordinates, of triangles that cover free parts of `faces`."""
     corners = own.corners[faces]
     normal = own.outward[faces] / np.linalg.norm(own.outward[faces], axis=1, keepdims=True)
     whole, _ = local(_parallelograms(corners), corners, normal)

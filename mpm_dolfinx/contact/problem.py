@@ -316,7 +316,7 @@ class ContactProblem(Loads):
         return reaction, slope, law.by_contact(off[:, None])[:, 0]
 
     def _seek(self, found: Found) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Return tool displacements (tools,), in m, at which a first point bears the load, and which tools touch."""
+        """Return displacements (tools,), in m, at which one point would bear the load, and which tools touch bodies."""
         law, state = self.now.law, self.now.state
         of = self.pairs.number
         along, k = (found.at.n * self.pushes.direction[of]).sum(axis=1), law.stiffness(state)
@@ -462,7 +462,10 @@ class ContactProblem(Loads):
         return 0.0
 
     def outcome(self, at: At) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """See `Loads`: forces (N) and moments (N m) on bodies, (3,) or in 3D (6,), and displacements by loads (m)."""
+        """See `Loads`.  Results are forces (N) and moments (N m) on bodies, and displacements of tools by loads (m).
+
+        The forces and moments of each contact are one array: (3,), or (6,) in 3D.
+        """
         where, touch, motion, _ = self.found(at)
         names = self.now.law.names
         if self.pairs.other_side() is not None:  # arms to present positions: moments of a body at rest sum to zero

@@ -97,7 +97,7 @@ class Tool:
     spin
         Initial angular velocity of a free tool, rad/s, counterclockwise.
     name
-        Name of the tool in results; by default "tool".  The field `NAME_pressure` of points is the contact pressure.
+        Name of the tool in results; by default "tool".  The field NAME_pressure of points is the contact pressure.
         In a later stage, a tool of equal name takes over this pressure.
 
     Raises

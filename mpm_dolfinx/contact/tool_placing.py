@@ -39,7 +39,7 @@ FACING = 0.5  # smallest cosine between the normal of a face that faces the tool
 
 
 def _box(x: NDArray[np.float64]) -> list[tuple[NDArray[np.float64], MPI.Op]]:
-    """Return both corners (d,) of the bounding box of x (n, d), each with the MPI operation for all processes."""
+    """Return both corners (d,) of the box around x (n, d), each with the MPI operation that combines processes."""
     return [(x.min(axis=0, initial=np.inf), MPI.MIN), (x.max(axis=0, initial=-np.inf), MPI.MAX)]
 
 
@@ -179,7 +179,7 @@ class Tools(Touching):
         return out
 
     def _before(self, place: Place) -> NDArray[np.float64]:
-        """Return displacements (tools,), in m, by loads before a step, or with free tools, motions (tools, q)."""
+        """Return displacements (tools,), in m, by loads before a step.  With free tools, return motions (tools, q)."""
         if self.free:
             return self._of_free(place.before, "tool_travel", "tool_rotation")
         return np.array([place.before["tool_travel"][name] for name in self.names], dtype=float)

@@ -94,7 +94,7 @@ class Patches:
         return lambda name: self.X if name == "X" else self.now(points) + self.base
 
     def area(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the current outward area vectors (n, d), in m^(d-1), or in axisymmetry those of rings, in m^2."""
+        """Return the current outward area vectors (n, d), in m^(d-1), or in axisymmetry of rings, in m^2."""
         share = self._share0 / self._whole0
         if self._grid.axisymmetric:
             share = share * self._grid.around(self.now(points))

@@ -102,7 +102,8 @@ def cell_ratios(
 
     `cut`: cut particle domains.
     `points`: points at the start of the step.
-    `share` (n,): weight, 0 to 1, of the ratio from corners in the mean (geometric) with the point's; 0 without F-bar.
+    `share` (n,): weight, from 0 to 1, of the ratio from corners in its geometric mean with the point's ratio.  It is 0
+    without F-bar.
     `flows` (n,): whether points have yielded.
     """
     cells, size = cut.cells, cut.grid.num_local

@@ -62,7 +62,7 @@ class Neighbours:
         self._partner = partner.reshape(-1, 2 * dim).T.copy()  # index of the opposite face; -1 if there is none
 
     def at_neighbours(self, own: NDArray[np.float64], faces: Sequence[NDArray[np.float64]]) -> Callable[[int], tuple]:
-        """Return a function of a face index.  It returns neighbours' data (c, k), face centres, and their mask.
+        """Return a function of a face index.  It returns neighbours' data (c, k), face centres, and which exist.
 
         `own` (c, k): c data columns of the points.
         `faces`: centres (d, k), in m, of the points' faces, for each face index.

@@ -77,7 +77,7 @@ class PiecePressures:
         return replace(self, pressure=self.pressure - even, slope=self.slope - slope, bounds=bounds)
 
     def of(self, ids: NDArray[np.int64], kept: bool = True) -> PiecePressures:
-        """Return the pieces of the points with these ids.  Without `kept`, return those of all other points."""
+        """Return the pieces of the points with these ids.  Without `kept`, return the pieces of all others."""
         rows = np.isin(self.id, ids) == kept
         return self._each(lambda values: values[rows])
 

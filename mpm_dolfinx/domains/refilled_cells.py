@@ -151,7 +151,10 @@ class RefilledCells:
         return out
 
     def _excluded(self, flowed: NDArray[np.bool_], signs: tuple[NDArray, NDArray]) -> NDArray[np.bool_]:
-        """Return which cells cannot be renewed: they have points not yet `flowed`, two bodies, or two conditions."""
+        """Return which cells cannot be renewed.
+
+        They contain points that have not `flowed`, points of two bodies, or faces whose conditions prevent renewal.
+        """
         of, cell = self.pieces.point, self.cell
         parts = self.parts
         low, high = np.full(self.cells, np.iinfo(np.int64).max), np.full(self.cells, -1)

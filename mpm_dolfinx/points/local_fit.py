@@ -6,7 +6,7 @@
 P is a polynomial, v_i are the data, o_i are the offsets of the data from the position, and w is a weight.  The value is
 the constant term of P (Lancaster and Salkauskas 1981).  Polynomials up to the degree of P are exact.  The weights
 decrease smoothly to zero, so values are continuous when data enter or leave the fit.  Data may not determine all
-coefficients.  The small terms then set coefficients to zero, those of higher degrees first.
+coefficients.  The small terms then set coefficients to zero, higher degrees first.
 """
 
 from __future__ import annotations
