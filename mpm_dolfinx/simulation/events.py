@@ -20,20 +20,20 @@ from mpm_dolfinx.stepping.scene import Scene
 from mpm_dolfinx.stepping.state import State
 
 LOCATED = 1e-3
-"""Accuracy of the time of an event, relative to the step. Source: definition, the documented accuracy of `until`."""
+"""Accuracy of an event's time, relative to the length of the step.  Source: definition, as documented in `until`."""
 
 Event = Callable[[Any], float]
-"""A number or a boolean, as a function of the simulation."""
+"""A function of the simulation that returns a number or a boolean."""
 
 
 class Simulated(Protocol):
-    """A `Simulation`; `state` is replaced as a whole."""
+    """Interface of a `Simulation`. Its `state` is only replaced as a whole."""
 
     scene: Scene
     state: State
 
     def advanced(self, dt: float, *how: Sequence[Substep]) -> tuple[State, Report]:
-        """Return the state after a step of dt, s, and its report; how: substeps, if not the scene's."""
+        """Return the state after a step of dt, s, and its report; how: substeps, by default the scene's substeps."""
 
 
 class Step(NamedTuple):
@@ -62,12 +62,12 @@ class Events:
         Simulation at the start of the run.
     until
         One function of the simulation, or several. An event occurs when a returned number changes sign within a step,
-        or when a returned boolean becomes True.
+        or when a returned boolean changes.
 
     Raises
     ------
     ValueError
-        An entry is not a function, returns no number, or differs between processes.
+        An entry is not a function, returns no number, or returns different numbers on different processes.
     """
 
     def __init__(self, simulation: Simulated, until: Event | Sequence[Event] | None):
@@ -80,9 +80,10 @@ class Events:
     def within(self, step: Step, new: State) -> Found | None:
         """Return the first event within a step that ends in the state `new`, or None if there is no event.
 
-        Trial steps of other lengths start from `step.start`. Brent's method chooses the lengths for functions that
-        return numbers, bisection for booleans. The result is the first state found after the event, at most the
-        fraction `LOCATED` of the step later. Afterwards the simulation has the state `step.start`, even after an error.
+        Trial steps from `step.start` locate the event. Brent's method chooses their lengths for functions that return
+        numbers; booleans are located by bisection. The result is the first state found after the event, at most the
+        fraction `LOCATED` of the step later. Afterwards, even after an error, `state` of the simulation is
+        `step.start`.
         """
         if not self._until:
             return None
@@ -110,7 +111,7 @@ class Events:
         return Found(int(_crossed(before, tried[end]).argmax()), end, new, report)
 
     def _at(self, step: Step, dt: float, tried: dict[float, list[float]]) -> list[float]:
-        """Return the values at the end of a step of length dt, s, and store them in `tried`."""
+        """Return the functions' values at the end of a step of length dt, s, and store them in `tried`."""
         if dt not in tried:
             self._simulation.state = step.start
             new, _ = self._simulation.advanced(dt, *step.how)
@@ -119,7 +120,7 @@ class Events:
         return tried[dt]
 
     def _values(self) -> list[float]:
-        """Return the values of the functions, booleans as 1 or -1; an error of one process is raised on all."""
+        """Return the values of the functions, with booleans as 1 or -1. An error on one process is raised on all."""
         comm = self._simulation.scene.grid.comm
         out = []
         error = None
@@ -140,7 +141,7 @@ class Events:
 
 
 def _crossed(before: Sequence[float], now: Sequence[float]) -> NDArray[np.bool_]:
-    """Return a mask of values with another sign than at the start of a step; a zero at the start is no event."""
+    """Return a mask of values with another sign than at the start of a step, where they are not zero."""
     sign = np.sign(before)
     return (sign != 0) & (np.sign(now) != sign)
 
