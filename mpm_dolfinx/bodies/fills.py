@@ -73,7 +73,7 @@ def put(
     """Return the material points of a fill, placed onto the active bodies.
 
     Sides of the fill that touched a neighbour when seeded follow the neighbour's displacement.  The side opposite to
-    the largest contact stays where it was seeded.  Displacements in between are interpolated.  The fill has zero
+    the largest contact stays where it was seeded.  Displacements between these sides are interpolated.  The fill has no
     velocity.  The initial volumes of its domains belong to the displaced shape.
 
     Parameters

@@ -379,7 +379,7 @@ def meeting(
     b: tuple[NDArray[np.float64], NDArray[np.float64]],
     in_cells: Callable[[NDArray[np.float64]], NDArray[np.float64]],
 ) -> tuple[float, float, NDArray[np.float64]]:
-    """Return the largest overlap of two bodies, in m, the smallest gap, in cells, and its position (d,), in m.
+    """Return the largest overlap of two bodies, in m, the smallest gap, in cells, and the position (d,), in m.
 
     Touching bodies have overlap 0 and gap 0.  The gap of distant bodies is inf.  `a` and `b` are the domains of the
     bodies with their tolerances, see `solids`.  `in_cells` divides positions by the cell size.

@@ -108,8 +108,8 @@ class SeededDomains:
     def from_middle(self, places: NDArray[np.int64], axis: int) -> NDArray[np.float64]:
         """Return the indices (n,) of rows of the lattice along an axis, counted from the middle of the body.
 
-        Pairs of rows are therefore the same in a mirrored scene.  The result is nan for the middle row of an odd number
-        of rows, which has no pair, and for domains that are not on a lattice.
+        Rows merge in pairs, which are therefore the same in a mirrored scene.  The result is nan for the middle row of
+        an odd number of rows, which has no pair, and for domains that are not on a lattice.
         """
         out = np.full(len(places), np.nan)
         for i in np.unique(places[places[:, 0] >= 0, 0]):

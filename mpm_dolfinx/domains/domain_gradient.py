@@ -18,8 +18,8 @@ def gradient(
     """Return the deformation gradients F (n, d, d) of particle domains.  F is a mean over the simplices of the domain.
 
     In 2D the diagonals determine F, and det F is the ratio of the areas.  In 3D F is scaled so that det F is the ratio
-    of the volumes.  (For a twisted hexahedron, the determinant of the unscaled mean differs from this ratio by a
-    second-order term.)  In axisymmetry F has the shape (n, 3, 3).  The circumferential stretch is the ratio of the
+    of the volumes.  For a twisted hexahedron, the determinant of the unscaled mean differs from this ratio by a
+    second-order term.  In axisymmetry F has the shape (n, 3, 3).  The circumferential stretch is the ratio of the
     centroid radii, and det F is the ratio of the ring volumes.
 
     `corners`, `reference` (n, 2^d, d), in m: current corners, and reference corners.

@@ -28,7 +28,7 @@ class Parts:
     nodes: NDArray[np.int64]  # index, from 0, of each active local node's part, else -1
 
     def largest(self, comm: MPI.Comm, part: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the largest value (count, ...) in each part, or -inf.  `part` (n,): parts of the values (n, ...)."""
+        """Return the largest value (count, ...) in each part, or -inf if empty.  `part` (n,): parts of `values`."""
         return largest_of_parts(comm, part, values, self.count)
 
 

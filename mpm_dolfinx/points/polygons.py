@@ -159,7 +159,7 @@ class Polygons:
         return np.concatenate([x[:, :1], middle, x[:, 1:]], axis=1), edge[:, [0, 0, 1, 2]]
 
     def _joined(self, other: Polygons) -> Polygons:
-        """Return these polygons, followed by `other`.  Arrays of `other` have at most as many vertices per polygon."""
+        """Return these polygons, followed by `other`.  Polygons of `other` have at most as many vertices as these."""
         more = self.x.shape[1] - other.x.shape[1]
         x = np.concatenate([self.x, np.pad(other.x, ((0, 0), (0, more), (0, 0)), mode="edge")])
         edge = np.concatenate([self.edge, np.pad(other.edge, ((0, 0), (0, more)), constant_values=NONE)])
