@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Evaluation of laws: stresses and new state at material points, and conductivities in pieces of particle domains."""
+"""Stresses and new state at material points, and conductivities in pieces of particle domains."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 
 
 class LawAtPoints:
-    """Evaluation of a law at its material points.
+    """A law at its material points.
 
     Parameters
     ----------
@@ -40,7 +40,7 @@ class LawAtPoints:
     shapes
         Shape of each parameter and state variable of the law.
     stretches
-        Number of rows of the law's deformation gradients, 2 or 3; by default `grid.stretches`.
+        Number of rows, 2 or 3, of the deformation gradients that the law receives; by default `grid.stretches`.
     cell_size
         Cell size passed to the law, m; by default the mean edge length of the cell that contains the point.
     """
@@ -86,7 +86,7 @@ class LawAtPoints:
         return {**self._given, **own}
 
     def _solve(self, data: PointData, dt: float) -> None:
-        """Set the time since the start of the step, s, and solve for the local unknowns."""
+        """Set the time since the start of the step, and solve for the local unknowns."""
         self._by_scene["dt"].value = dt
         if self._local is not None:
             self._local.update(data, derive=False)
@@ -94,7 +94,10 @@ class LawAtPoints:
     def data(
         self, points: MaterialPoints, rows: NDArray[np.int64], values: dict[str, NDArray[np.float64]]
     ) -> PointData:
-        """Return form data at the points `rows`; values: F, parameters and state (n, ...) of all points, by name."""
+        """Return form data at the points `rows`.
+
+        values: F, parameters and state (n, ...) of all points, by name.
+        """
         x = points.x[rows]
         cells = self.grid.locals[self.grid.number(self.grid.index_from_base(x))]
         inputs = {name: values[name][rows] for name in ("F", *self._shapes)}
@@ -107,7 +110,10 @@ class LawAtPoints:
         return PointExpression(self.law.first_piola(F, self._values) * F.T / ufl.det(F), self.points)
 
     def stress(self, data: PointData, dt: float = 0.0) -> NDArray[np.float64]:
-        """Return the effective Cauchy stress (n, d, d), Pa; dt: time since the last update of the state, s."""
+        """Return the effective Cauchy stress (n, d, d), in Pa.
+
+        dt: time since the last update of the state, in s.
+        """
         stress = self._stress
         self._solve(data, dt)
         return stress.evaluate(data)
@@ -117,7 +123,7 @@ class LawAtPoints:
         return PointExpression(expression(self.law.energy, [()], "F", F=self._F, **self._values), self.points)
 
     def energy(self, data: PointData) -> NDArray[np.float64]:
-        """Return the stored energy (n,) per reference volume, Pa, of a law with an energy."""
+        """Return the stored energy (n,) per reference volume, in Pa, of a law with an energy."""
         energy = self._energy
         self._solve(data, 0.0)
         return energy.evaluate(data)
@@ -128,7 +134,7 @@ class LawAtPoints:
         return None if across is None else PointExpression(across, self.points)
 
     def stress_3d(self, data: PointData) -> NDArray[np.float64]:
-        """Return the effective Cauchy stress (n, 3, 3), Pa.  It is nan out of plane if the law does not define it."""
+        """Return the effective Cauchy stress (n, 3, 3), in Pa, with nan out of plane if the law does not define it."""
         if self._stretches == 3:
             return self.stress(data)
         out = np.zeros((len(data.cells), 3, 3))
@@ -146,7 +152,7 @@ class LawAtPoints:
             return PointExpression(ufl.as_vector(parts), self.points), {name: shapes[name] for name in new}
 
     def new_state(self, data: PointData, dt: float) -> list[tuple[str, NDArray[np.float64]]]:
-        """Return name and values (n, ...) of each updated state variable.  data contain F after a step of dt, s."""
+        """Return the name and the values of each updated state variable after a step of length dt, in s."""
         if self.law.update is None:
             return []
         expression, shapes = self._update
@@ -162,9 +168,11 @@ class LawAtPoints:
 
 
 def knows_space(grid: Grid, m: Skeleton) -> bool:
-    """Return whether a material's law accepts F (3, 3) in plane strain; some user-defined laws accept F (2, 2) only.
+    """Return whether a material's law accepts F (3, 3) in plane strain.
 
-    m: material with constants as arrays for one point.  The result is True for laws with local unknowns.
+    Some user-defined laws accept F (2, 2) only.  The result is True for laws with local unknowns.
+
+    m: material with constants as arrays for one point.
     """
     law = type(m)
     function, shape = (law.energy, ()) if law.kirchhoff is None else (law.kirchhoff, (3, 3))
@@ -191,7 +199,7 @@ def by_scene(
 ) -> dict[str, Any]:
     """Return the arguments `BY_SCENE` of laws as UFL: the time, which the caller sets, and the cell size.
 
-    points: integration points of the law.  On a grid with several cell sizes, each point stores the size of its cell.
+    points: integration points of the law.  If cells have several sizes, each point stores the size of its cell.
     """
     if points is not None and not grid.even and cell_size is None and "cell_size" in law.by_scene:
         sizes = points.follow("cell_size", (), lambda data: grid.volumes(data.cells)[:, None] ** (1 / grid.dim))
@@ -201,7 +209,7 @@ def by_scene(
 
 
 def mean_size(grid: Grid) -> float:
-    """Return the edge length, m, of a square or cube with the volume of the largest cell."""
+    """Return the edge length, in m, of a square or cube with the volume of the largest cell."""
     h = grid.h if grid.even else [w.max() for w in grid.widths]
     return float(np.prod(h) ** (1 / grid.dim))
 
@@ -214,18 +222,17 @@ finer cells by 3.0e-02.
 
 
 class SoftnessAtPoints:
-    """Softness of yielding points: ratio of elastic to tangent shear modulus along the strain of the last step.
+    """Softness of yielding points: elastic shear modulus divided by tangent shear modulus.
 
-    Volume strains that alternate from cell to cell grow with the strain.  They cause alternating pressures.  The
-    pressures are these volume strains divided by the damping coefficient tau, 1/Pa.  In plastic flow the strain grows
-    at constant stress.  tau must then grow with the softness, else the alternating pressures reach the soil's strength.
+    In plastic flow, volume strains that alternate from cell to cell grow at constant stress.  They cause alternating
+    pressures, equal to the volume strains divided by the damping coefficient tau.  tau must therefore grow with the
+    softness, or the alternating pressures reach the strength of the soil.
 
-    The strain of a step is e = dev sym dF F^-1.  With the Kirchhoff stress T(s) at F - (1 - s) dF, the tangent shear
-    modulus is G_t = (dT/ds) : e / (2 e : e) at s = 1.  The forms use the softness of the previous step.  The softness
-    of the current iterate would prevent convergence of Newton's method, or make the result depend on the iterates.
-
-    At rest the strain is a rounding error with a random direction.  G_t is therefore a weighted mean.  The modulus of
-    the step has the weight e : e, and the old modulus has the weight `NEAR`^4.  A step at rest thus keeps the softness.
+    The strain of a step is e = dev sym dF F^-1, with the change dF of F.  With the Kirchhoff stress T(s) at
+    F - (1 - s) dF, the tangent shear modulus is G_t = (dT/ds) : e / (2 e : e) at s = 1.  At rest the direction of e is
+    random.  G_t is therefore a weighted mean of the modulus of the step, with the weight e : e, and of the old modulus,
+    with the weight `NEAR`^4.  The forms use the softness of the previous step, because Newton's method may not converge
+    with the softness of the current iterate.
 
     grid, law, shapes, stretches: see `LawAtPoints`.
     """
@@ -250,10 +257,11 @@ class SoftnessAtPoints:
         self._along = PointExpression(ufl.as_vector([ufl.inner(e, e), ufl.inner(ufl.diff(tau, s), e)]), points)
 
     def __call__(self, at: PointData, dF: NDArray, shear: NDArray, dt: float, before: NDArray) -> NDArray[np.float64]:
-        """Return the softness (n,), in [1, `MOST`], of points whose data `at` contain F, parameters and state.
+        """Return the softness of points, in [1, `MOST`].
 
-        dF (n, d, d): change of F in a step of dt, s.
-        shear (n,), Pa: elastic shear modulus.
+        at: data with F, parameters and state of n points.
+        dF (n, d, d): change of F in a step of dt, in s.
+        shear (n,), in Pa: elastic shear modulus.
         before (n,): softness before the step.
         """
         self._by_scene["dt"].value = dt
@@ -316,12 +324,16 @@ class ConductivityAtPieces:
         )
 
     def evaluate(self, data: PointData, material: NDArray[np.int32], begins: bool) -> NDArray[np.float64]:
-        """Return the conductivities (n,), m/s, of pieces at the present displacement; material (n,): their materials.
+        """Return the conductivities of pieces, in m/s, at the present displacement.
+
+        material (n,): index of the material of each piece.
 
         Raises
         ------
-        ValueError, NotConverged
-            A conductivity is negative or not finite.  This is a ValueError at the start of a step, else NotConverged.
+        ValueError
+            At the start of a step, a conductivity is negative or not finite.
+        NotConverged
+            Later in a step, a conductivity is negative or not finite.
         """
         out = data["conductivity"][:, 0].copy()
         for law, k in self._laws.items():
@@ -337,7 +349,7 @@ class ConductivityAtPieces:
 
 
 def sampled(law: Callable) -> list[float | None]:
-    """Return the conductivities of a law in three deformation states, as a fingerprint of the law."""
+    """Return numbers that identify a law: its conductivities in three states of deformation."""
     out = []
     for J in (0.75, 1.0, 1.25):
         F = ufl.as_matrix([[J, J / 8], [0.0, 1.0]])

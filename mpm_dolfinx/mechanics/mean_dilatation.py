@@ -1,23 +1,23 @@
 # SPDX-License-Identifier: MIT
 """F-bar: one volume ratio per cell, against volumetric locking of nearly incompressible skeletons.
 
-Four volume constraints per cell suppress the bending modes of a Q1 quadrilateral, with errors of up to 50 % at nu =
-0.499. F-bar scales the law's deformation gradient so that its volume ratio in the step is theta, a mean over the cell,
+Without F-bar, four volume constraints per cell suppress the bending modes of a Q1 quadrilateral, with errors of up to
+50 % at nu = 0.499.  F-bar scales the deformation gradient F that the law receives.  The scaled gradient Fbar has the
+volume ratio theta in the step, which is a mean over the cell:
 
     Fbar = (theta J_n / det F)^(1/3) F,     theta = sum w det(Delta) / sum w   over the locking pieces of the cell.
 
-Here w is the volume of a piece.  Delta = I + grad u is the deformation gradient of the step, with F = Delta F_n and
-J_n = det F_n.  The scaling acts along all three axes: in plane strain the points store an out-of-plane stretch, as in a
-slice of the body.  The material decides whether cells would lock (`Skeleton.nearly_incompressible`). In a cell of
-several materials, only the materials that would lock use Fbar. With the law's energy psi and Psi = psi(Fbar) / J_n, the
-energy sum w Psi has the derivative
+Here w is the volume of a piece, Delta = I + grad u is the deformation gradient of the step, F = Delta F_n, and
+J_n = det F_n.  The scaling acts along all three axes, so that points in plane strain store an out-of-plane stretch.  In
+a cell of several materials, only the nearly incompressible materials use Fbar (`Skeleton.nearly_incompressible`).  With
+the law's energy psi and Psi = psi(Fbar) / J_n, the energy sum w Psi has the derivative
 
     sum w [dPsi/dF : dF + pi d(det Delta)],   pi = (sum w dPsi/dtheta) / (sum w).
 
 The residual has the additional term with pi.  The tangent of the residual at fixed theta and pi is symmetric.  The
-derivatives with respect to theta and pi add a matrix of rank two in each cell (Simo, Taylor and Pister 1985). Coombs et
-al. (2018) used incremental F-bar in the material point method. For a law without an energy, P(Fbar) : dFbar replaces
-dPsi. The points store Fbar.  The next step starts from a J_n computed from the particle domains in the cell
+derivatives with respect to theta and pi add a matrix of rank two in each cell (Simo, Taylor and Pister 1985).  Coombs
+et al. (2018) used incremental F-bar in the material point method.  For a law without an energy, P(Fbar) : dFbar
+replaces dPsi.  The points store Fbar.  The next step starts from the volume ratios of the particle domains
 (`cell_ratios`).
 """
 
@@ -45,16 +45,16 @@ from mpm_dolfinx.points.material_points import ACROSS, with_ratio
 
 
 class SumsOfPart(NamedTuple):
-    """Sums for theta and pi, in each cell, over one part of the scene's integration points: see `MeanDilatation`."""
+    """Sums over one part of the integration points in each cell, for theta and pi, see `MeanDilatation`."""
 
     ratio: CellSums
     stress: StressAtPoints
 
 
 class FBar:
-    """F-bar modification of laws, with the step's volume ratio theta and the conjugate mean stress pi of each cell.
+    """F-bar modification of laws, with the volume ratio theta of the step and the mean stress pi of each cell.
 
-    grid: background grid; symmetric: whether the tangents of all laws are symmetric.
+    symmetric: whether the tangents of all laws are symmetric.
     """
 
     def __init__(self, grid: Grid, symmetric: bool):
@@ -64,7 +64,7 @@ class FBar:
         self._theta = ufl.variable(self.theta)
 
     def of(self, points: FormPoints, F):
-        """Return Fbar (3, 3) as a UFL variable; (2, 2) for laws that accept only F (2, 2)."""
+        """Return Fbar (3, 3) as a UFL variable, or (2, 2) for laws that accept only F (2, 2)."""
         ratio = self._theta * ufl.det(points.F) / ufl.det(F)
         if self.grid.stretches == 2 and ACROSS not in points.functions:
             return ufl.variable(ufl.sqrt(ratio) * F)
@@ -86,28 +86,19 @@ class FBar:
     ) -> tuple:
         """Return the stress and the cell sums of points with one law, whose Q1 cells would lock without F-bar.
 
-        Parameters
-        ----------
-        law
-            Class of the part's law.
-        points
-            Integration points of the part, with the field F (d, d): deformation gradient at the start of the step.
-        F
-            Deformation gradient (d, d), a UFL variable.
-        Fbar
-            F-bar modification of F, see `of`.
-        ratio
-            det Delta, with Delta F_n = F.
-        values
-            UFL values of the law's parameters, state and local unknowns.
-        known
-            The same values for expressions that are not differentiated, see `LocalUnknowns`.
+        points: integration points with the law, with the field F at the start of the step.
+        F: deformation gradient (d, d), a UFL variable.
+        Fbar: result of `of`.
+        ratio: det Delta, with Delta F_n = F.
+        values: UFL values of the law's parameters, state and local unknowns.
+        known: the same values for expressions that are not differentiated, see `LocalUnknowns`.
 
         Returns
         -------
-        The first Piola-Kirchhoff stress, Pa, as UFL of F, theta and pi, for the residual.  The derivative (d, d, d, d),
-        Pa, of this stress with respect to F, for the tangent.  Further UFL integrands of the tangent (`Beside`), for
-        sums over each cell.  Kernels that sum theta and pi over each cell, for `MeanDilatation`.
+        The first Piola-Kirchhoff stress, in Pa, as UFL of F, theta and pi, for the residual.
+        The derivative (d, d, d, d) of this stress with respect to F, in Pa, for the tangent.
+        Further integrals over each cell for the tangent (`Beside`).
+        Kernels that sum theta and pi over each cell, for `MeanDilatation`.
         """
         J_n, J = ufl.det(points.F), ufl.det(F)
         P, slope = self._stress(law, F, Fbar, known)
@@ -155,7 +146,7 @@ class FBar:
         s = sum(Fbar[a, b] * G[a, b] for a in d for b in d) / len(d)
 
         def by_F(part, by_theta):
-            """Return dtau/dF for one component of tau; part(a, b): dtau/dFbar; by_theta: dtau/dtheta."""
+            """Return dtau/dF for one component of tau, from dtau/dFbar and dtau/dtheta."""
             return ufl.as_matrix([[s * part(a, b) - theta * by_theta * G[a, b] for b in d] for a in d])
 
         mean_theta = ufl.tr(tau_theta) / n
@@ -170,7 +161,6 @@ class FBar:
 class MeanDilatation:
     """The volume ratio theta of the step in each cell, and its work-conjugate mean stress pi, for F-bar.
 
-    fbar: the fields theta and pi.
     parts: sums over each part in which cells would lock, by index of the part, see `QuadratureData`.
     """
 
@@ -185,11 +175,11 @@ class MeanDilatation:
     def total(
         self, data: QuadratureData, sums: Sequence[NDArray[np.float64]]
     ) -> tuple[NDArray[np.int32], NDArray[np.float64], NDArray[np.float64]]:
-        """Return the cells with F-bar, totals (cells, k) of `sums` over all parts, and the result of `_volume_of`."""
+        """Return the cells with F-bar, the totals of `sums` over all parts, and the result of `_volume_of`."""
         return self._cells(data).filled, self._cells(data).total(sums), self._volume_of(data)
 
     def update(self, data: QuadratureData, solve: Callable[[], None]) -> None:
-        """Set theta, the stresses and pi at the present displacement; solve: function that solves local unknowns."""
+        """Set theta, the stresses and pi at the present displacement; `solve` solves for local unknowns."""
         self._set_mean(self.theta, [of.ratio for of in self._sums], data)
         solve()
         self._set_mean(self.pi, [of.stress for of in self._sums], data)
@@ -197,13 +187,13 @@ class MeanDilatation:
     def _set_mean(self, f: fem.Function, sums: Sequence[CellSums | StressAtPoints], data: QuadratureData) -> None:
         """Set f in each cell to the volume mean of a quantity over the pieces with F-bar.
 
-        sums: for each part of the scene's points, a function that sums quantity times volume in each cell.
+        sums: for each part, a function that sums quantity times volume in each cell.
         """
         total = self._cells(data).total([of(part) for of, part in zip(sums, self._parts(data), strict=True)])
         f.x.array[self._cells(data).filled] = total[:, 0] / self._volume_of(data)[:, 0]
 
     def assemble_matrix(self, A: PETSc.Mat, data: QuadratureData, sums: Sequence[NDArray[np.float64]]) -> None:
-        """Add the contribution of theta and pi at the last update to the tangent; the caller finalises the matrix.
+        """Add the contribution of theta and pi at the last update to the tangent, without final assembly.
 
         sums: for each part, the integrals (cells, quantities) of `Beside` from `FBar.forms` over each cell.
         """
@@ -221,7 +211,7 @@ class MeanDilatation:
         insert(A, self._grid, self._cells(data).filled, matrices)
 
     def average(self, delta: NDArray[np.float64], data: QuadratureData) -> None:
-        """Scale the gradients Delta (n, d, d) of pieces with F-bar to their cells' volume ratios."""
+        """Scale the gradients Delta of pieces with F-bar to the volume ratios of their cells."""
         for number in self.numbers:
             rows = data.rows[number]
             theta, own = self.theta.x.array[data.parts[number].cells], delta[rows]
@@ -236,7 +226,7 @@ class MeanDilatation:
         return self._filled(tuple(p.key for p in places), lambda: Cells([p.filled for p in places]))
 
     def _volume_of(self, data: QuadratureData) -> NDArray[np.float64]:
-        """Return for each filled cell the total volume (cells, 1), m^d, of its pieces that use F-bar."""
+        """Return the total volume, in m^d, of the pieces with F-bar in each filled cell."""
         key = tuple(part.key for part in self._parts(data))
 
         def volumes() -> NDArray[np.float64]:
@@ -247,16 +237,13 @@ class MeanDilatation:
 
 
 def _dev(tau, F):
-    """Return the components (d, d) of the deviator of a UFL tensor, in the axes of F (d, d)."""
+    """Return the components of the deviator of a UFL tensor in the axes of F (d, d)."""
     d, mean = range(F.ufl_shape[0]), ufl.tr(tau) / tau.ufl_shape[0]
     return ufl.as_matrix([[tau[a, b] - mean if a == b else tau[a, b] for b in d] for a in d])
 
 
 class StressAtPoints:
-    """Stress P of a law and its derivative with respect to theta, evaluated once for both residual and pi.
-
-    P (d, d), slope: the stress and its derivative, as UFL; points: integration points of the part.
-    """
+    """Stress P of a law and its derivative with respect to theta, evaluated once for both residual and pi."""
 
     def __init__(self, P, slope, points: FormPoints):
         shape, self._last = P.ufl_shape, Latest()
@@ -266,12 +253,12 @@ class StressAtPoints:
         """The stress as UFL, with the values of the last evaluation."""
 
     def __call__(self, data: PointData) -> NDArray[np.float64]:
-        """Evaluate stress and derivative; return the integrals (cells, 1) of the derivative over the points' cells."""
+        """Evaluate the stress and its derivative, and return the integrals of the derivative over each cell."""
         _, values = self._last(object(), lambda: (data.key, self._values.evaluate(data)))
         return sum_by(data.places.slots, data.volume * values[:, -1], len(data.places.filled))[:, None]
 
     def _stress(self, data: PointData) -> NDArray[np.float64]:
-        """Return the stresses (n, d^2), Pa, of the last evaluation."""
+        """Return the stresses of the last evaluation."""
         of, values = self._last.value or (None, None)
         if of is not data.key:
             raise RuntimeError("stresses at points are used before their evaluation")
@@ -279,14 +266,14 @@ class StressAtPoints:
 
 
 class Cells:
-    """Cells with pieces of any part.  filled: these cells; where: indices of each part's cells in `filled`."""
+    """Cells with pieces of any part, `filled`, and the indices in `filled` of the cells of each part, `where`."""
 
     def __init__(self, of_parts: Sequence[NDArray[np.int32]]):
         self.filled = np.unique(np.concatenate(of_parts))
         self.where = [np.searchsorted(self.filled, cells) for cells in of_parts]
 
     def total(self, values: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
-        """Return the sums (cells, quantities) over the parts in the cells `filled`; values: one array for each part."""
+        """Return the sums (cells, quantities) over the parts in the cells `filled`, from one array for each part."""
         if len(values) == 1:
             return values[0]
         out = np.zeros((len(self.filled), values[0].shape[1]))
