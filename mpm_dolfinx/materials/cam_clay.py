@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Modified Cam Clay at finite strain (Borja and Tamagnini 1998), and the Barcelona Basic Model for suction.
 
-The problem is the stress of a clay whose yield surface grows with plastic compaction.  Plasticity is multiplicative, in
-principal logarithmic strains.  tau is the Kirchhoff stress, e_v is the elastic volume strain, and e is the elastic
+The law is for clay whose yield surface grows with plastic compaction.  Plasticity is multiplicative, in principal
+logarithmic strains.  tau is the Kirchhoff stress, e_v is the elastic volume strain, and e is the elastic
 deviatoric strain (tension positive).  With P = -tr(tau)/3 and Q = sqrt(3/2) |dev tau|, the law is
 
     P = P_0 exp(-e_v / kappa),   dev tau = 2G e,
@@ -248,8 +248,8 @@ class BarcelonaBasic(ModifiedCamClay):
         lambda(s) = lambda(0) [(1 - r) exp(-beta s) + r],   dP_c0 / P_c0 = -de_v^p / (lambda(0) - kappa),
 
     with the constants P_r, r and beta below.  At constant suction the law is Modified Cam Clay with lambda(s).  Suction
-    has no effect on the yield surface if P_c0 is below P_r.  The effects of suction on strength, and of wetting on
-    swelling, follow from Bishop's stress alone.  The suction is evaluated at the end of a substep.
+    has no effect on the yield surface if P_c0 is below P_r.  Bishop's stress alone determines the strength due
+    to suction, and the swelling on wetting.  The suction is evaluated at the end of a substep.
 
     Parameters
     ----------

@@ -56,10 +56,10 @@ class DruckerPrager(Frictional):
         Linear hardening modulus H, Pa, >= 0: c = c_0 + H kappa, with the accumulated plastic strain kappa.  In
         associated flow, kappa is work conjugate to c.
     match
-        Stress states in which the cone coincides with Mohr and Coulomb's yield surface.  "plane strain" gives equal
-        collapse loads, exactly in associated flow.  "compression" is the outer cone of triaxial compression, and
-        "extension" is the inner cone of triaxial extension.  In axisymmetry no cone coincides in all stress states: a
-        circular footing bears 10 % less on von Mises's soil than on Tresca's.
+        Stress states in which the cone coincides with Mohr and Coulomb's yield surface.  "plane strain" gives the same
+        collapse load in plane strain, exactly for associated flow.  "compression" is the outer cone of triaxial
+        compression, and "extension" is the inner cone of triaxial extension.  In axisymmetry no cone coincides in all
+        stress states: a circular footing bears 10 % less on von Mises's soil than on Tresca's.
 
     Other parameters: see `Skeleton`.  All parameters are passed by name.  The state variable `plastic` in `points.data`
     is the inverse plastic metric C_p^-1 (3, 3), and `hardened` is kappa.  Source: de Souza Neto, Peric and Owen (2008),

@@ -3,8 +3,8 @@
 
 A soil with an initial stress responds as if loading had caused this stress.  The law is therefore evaluated at F F_i.
 F is the deformation gradient relative to the seeded state, and F_i is an initial stretch (3, 3) at each point.
-Volumes, porosities and conductivities refer to the seeded state.  Laws with the state variable `plastic`, which is the
-inverse plastic metric C_p^-1, change this metric in place of F_i.
+Volumes, porosities and conductivities refer to the seeded state.  In laws with the state variable `plastic`, the
+inverse plastic metric C_p^-1 replaces F_i.
 """
 
 from __future__ import annotations

@@ -38,9 +38,11 @@ DRIED = ("suction", "suction_at_start")
 LOCKING = 0.43
 """Poisson's ratio nu above which cells use F-bar, which doubles the run time of a step.
 
-Error of the drained beam's tip deflection (h = 0.015 m): at nu = 0.3, -0.02 % without and +0.22 % with F-bar.  At
-nu = 0.45, -0.44 % without and +0.21 % with F-bar.  At nu = 0.49, -2.0 % without and +0.21 % with F-bar.
-At nu = 0.499, -10.3 % without and -0.02 % with F-bar.
+The tip deflection of the drained beam with h = 0.015 m has these errors:
+nu = 0.3: -0.02 % without F-bar, +0.22 % with F-bar.
+nu = 0.45: -0.44 % without F-bar, +0.21 % with F-bar.
+nu = 0.49: -2.0 % without F-bar, +0.21 % with F-bar.
+nu = 0.499: -10.3 % without F-bar, -0.02 % with F-bar.
 """
 
 SEPARATION = 1e-4
@@ -297,10 +299,10 @@ class Skeleton:
     def pressure_damping(self) -> float:
         """Return the damping coefficient tau, in 1/Pa, which damps increments of alternating pressures.
 
-        For macroelements of 2 x 2 cells the value is 3 alpha^2 / (8 (lambda + 3G)).  tau is 1/2 of this value for laws
-        with a state, and 1/4 for other laws, with better conditioning and less smearing (Silvester and Kechkar 1990;
-        Camargo, White and Borja 2021).  The smaller value for 2 x 2 x 2 cells would not damp pressures that alternate
-        along two axes only.  Oscillations due to first yield remain.
+        The value for macroelements of 2 x 2 cells is 3 alpha^2 / (8 (lambda + 3G)) (Silvester and Kechkar 1990;
+        Camargo, White and Borja 2021).  tau is half of this value for laws with a state, and a quarter for other laws.
+        A quarter gives better conditioning and less smearing.  The value for 2 x 2 x 2 cells is too small to damp
+        pressures that alternate along two axes only.  Oscillations due to first yield remain.
         """
         lam = self.bulk - 2 * self.shear / 3
         return (0.5 if self.state else 0.25) * self.biot**2 * 3 / (8 * (lam + 3 * self.shear))

@@ -177,8 +177,8 @@ class HeldCells:
         Returns
         -------
         index (k,): indices of the penalties.
-        stiffness (k,), in N/m.
-        gap (k,), in m.
+        stiffness (k,), in N/m: stiffness of these penalties.
+        gap (k,), in m: gaps of these penalties.
         share (k, 2^d): fractions of the force on each node, without the fraction of the wall.
         stuck: index of a penalty that must move but has fixed nodes only, or -1.
         """

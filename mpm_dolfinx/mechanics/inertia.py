@@ -6,9 +6,9 @@ the displacement since the start of the step.  The predictor u^ is the displacem
 
     u^ = b dt v_1 + g dt (v_n + b dt a_1),      v = v_n + dt (b a_1 + g a).
 
-v_n is the velocity at the start of the step.  v_1 and a_1 are velocity and acceleration of the previous substep.  The
-weight g multiplies the rate of the substep, and the weight b multiplies the rate of the previous substep
-(`time_integration`).  In each step SDIRK2 dissipates the fraction GAMMA^4 (omega dt)^4 = 0.0074 (omega dt)^4 of the
+v_n is the velocity at the start of the step, and v is the velocity at the end of the substep.  v_1 and a_1 are velocity
+and acceleration of the previous substep.  The weight g multiplies the rate of the substep, and the weight b multiplies
+the rate of the previous substep (`time_integration`).  In each step SDIRK2 dissipates the fraction GAMMA^4 (omega dt)^4 = 0.0074 (omega dt)^4 of the
 energy of an oscillation of angular frequency omega.  This dissipation damps unresolved modes.
 
 The mass is integrated over the pieces of the particle domains.  Piece k has the mass m_k, the centroid x_k, and the
@@ -23,8 +23,8 @@ angular momentum to rounding.
 
 A material point carries the velocity v and the rate F' of F.  The velocity in its domain is v + F' F^-1 (x - x_p), with
 the position x_p of the point.  Increments of v and F' come from the grid (Brackbill and Ruppel 1986; consistent mass:
-Burgess, Sulsky and Brackbill 1992).  The first substep of SDIRK2 is a midpoint rule, whose error in rotations `chord`
-corrects.
+Burgess, Sulsky and Brackbill 1992).  The first substep of SDIRK2 is a midpoint rule.  `chord` corrects the error
+of this rule in rotations.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ from mpm_dolfinx.points.cutting import spreads
 from mpm_dolfinx.points.material_points import MaterialPoints, middle
 
 GHOST_MASS = 0.02
-"""Strength c of the ghost mass.  A rotating block has equal energies for 0.002 and 0.2 (`tests/test_inertia.py`)."""
+"""Strength c of the ghost mass.  A rotating block has equal energies for c = 0.002 and c = 0.2 (`tests/test_inertia.py`)."""
 RELAXES = 2.0
 """Relaxation rate of point velocities towards grid velocities, for domain corners that move by one cell size.
 

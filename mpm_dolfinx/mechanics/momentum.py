@@ -301,7 +301,7 @@ class MomentumSystem:
         self.rounding = self.unknowns.vector()
         """Rounding error of the residual at each unknown, in N."""
         self.of_whole = self.unknowns.vector()
-        """Norm, in N, of a vector over the connected part of each unknown that has its rounding error throughout."""
+        """Norm, in N, of a vector with the rounding error of an unknown at all unknowns of the same connected part."""
         self.K = matrix(self.unknowns, self.unknowns, 3**d * d)
         self.residual, self.step = self.unknowns.vector(), self.unknowns.vector()
         held = active[~among(active, dofs)]

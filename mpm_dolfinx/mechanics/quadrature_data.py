@@ -31,9 +31,9 @@ weight of 1, the stress change at a reset of the grid would exceed the stresses 
 STIFF_WET = 8
 """Value of (lambda + 2G) / G above which the volume ratio from the corners loses weight in wet bodies.
 
-The weight is 1 at nu = 0.43, and 0 at nu = 0.47.  With a weight of 1, the difference between this ratio and the Q1
-field expels water in every step, however short.  The extreme pressures of a beam with eight cells across its depth then
-have errors of 43 % at nu = 0.49.  At nu = 0.499 the pressures are six to thirty times too large.
+The weight is 1 at nu = 0.43, and 0 at nu = 0.47.  With a weight of 1, the difference between the ratio from the
+corners and the Q1 field expels water in every step, however short.  The extreme pressures of a beam with eight cells
+across its depth then have errors of 43 % at nu = 0.49.  At nu = 0.499 the pressures are six to thirty times too large.
 """
 SHARE = 0.5
 """Fraction of the gradient's deviation from its cell mean that laws use in cells of flowing, dilatant soil.
@@ -257,7 +257,7 @@ class QuadraturePoints:
         return cut.to_cells(self.materials.conducting(cut.points))
 
     def fixed_stress(self, cut: CutDomains, points: MaterialPoints, of_fluid: bool) -> NDArray[np.float64]:
-        """Return beta, in 1/Pa, at the integration points, for the fixed-stress operator C + f beta V (f: `Scheme`).
+        """Return beta, in 1/Pa, at the integration points, for the fixed-stress operator C + f beta V, see `Scheme`.
 
         of_fluid: whether to return 1/K_w in place of beta, with which the iteration converges for stiff skeletons only.
         """

@@ -2,7 +2,7 @@
 """Pressures of cells from the water content of their pieces, in unsaturated soil.
 
 A piece is the part of a particle domain in one cell.  The piece has the storage s, in m^d/Pa, and the pore volume n, in
-m^d.  Its fluid content at the pressure p, relative to zero pressure, is `c(p) = s pi(p) + n (S(p) - 1) rho(p)`.  Here
+m^d.  Its fluid content at the pressure p, minus that at zero pressure, is `c(p) = s pi(p) + n (S(p) - 1) rho(p)`.  Here
 `pi = K_w (exp(p / K_w) - 1)` and `rho = exp(p / K_w)`, with the bulk modulus K_w of the fluid, and S is the saturation
 of the soil of the piece.  The pressure of a piece differs from the pressure of its cell by an offset.
 """

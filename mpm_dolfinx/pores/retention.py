@@ -2,7 +2,7 @@
 """Retention curves: saturation, relative permeability and Bishop's coefficient as functions of the pore pressure.
 
 Pores contain water and air.  Air has zero pressure everywhere, so the suction is s = -p, with the pore pressure p.  At
-p >= 0 the pores are saturated.  The saturation S and the relative permeability k_r are functions of p.  They change
+p >= 0 the pores are saturated.  The saturation S and the relative permeability k_r are functions of p.  The soil has
 
     content of fluid   n S,      conductivity   k k_r,      stress   sigma = sigma' - alpha chi p
 
@@ -448,6 +448,7 @@ FARTHEST = np.log(10)
 
 Without this limit, fronts in dry soil do not converge.  With the limit 2, Celia's column takes 310 Newton steps with 25
 cells, and 500 with 100 cells.  With the limit 4, it takes 330 Newton steps with 25 cells, and 920 with 100 cells.
+
 Halving this value changes the result of scene "dry" in tests/plateaus.py by 7.6e-10 (relative), doubling it by 9.8e-10,
 and finer cells by 6.6e-03.
 """

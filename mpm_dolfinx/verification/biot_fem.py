@@ -8,9 +8,10 @@ F = I + grad u, and J = det F.  A step starts from state n.  The equations in th
     storage    int rho [zeta(J, p) - zeta_n] q dV
                + int int kappa J F^-1 (F^-T grad pi - rho rho_w g) . grad q dV dt  =  0
 
-with the stored energy psi, tractions t (dead loads or pressures), the mass m of soil and fluid, and test functions v
-and q.  The mobility is kappa = k/(rho_w g), and the relative density is rho = exp((p + p_n)/(2 K_w)).  `fluid_content`
-defines the content zeta and the mass potential pi.  In saturated soil chi = 1.
+with the stored energy psi, Biot's coefficient alpha, Bishop's coefficient chi, tractions t (dead loads or pressures),
+the mass m of soil and fluid, the acceleration of gravity g, and test functions v and q.  The mobility is
+kappa = k/(rho_w g), and the relative density is rho = exp((p + p_n)/(2 K_w)).  `fluid_content` defines the content zeta
+and the mass potential pi.  In saturated soil chi = 1.
 
 In unsaturated soil, kappa is multiplied by the relative permeability k_r.  With the saturation S and the porosity n_n
 in state n, rho [zeta - zeta_n] becomes S rho [zeta - zeta_n] + (S - S_n) J_n n_n exp(p_n/K_w).
