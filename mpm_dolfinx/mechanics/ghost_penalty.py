@@ -39,8 +39,10 @@ GHOST = 0.05
 YIELDING = 0.02
 """Smallest reduction factor of the penalty for nearly incompressible laws with a state."""
 RATIO = 0.3
-"""A face has the penalty if the filling of the emptier cell, divided by the filling of the fuller cell, is smaller.
-Halving this value changes the result of scene "soil" in tests/plateaus.py by 1.3e-03 (relative), doubling it by 5.9e-04, and finer cells by 3.0e-02.
+"""A face has the penalty if the filling of the emptier cell, divided by that of the fuller cell, is below this value.
+
+Halving this value changes the result of scene "soil" in tests/plateaus.py by 1.3e-03 (relative), doubling it by
+5.9e-04, and finer cells by 3.0e-02.
 """
 SPARSE, FULL = 0.2, 0.9
 """Two numbers for integration at points: strength of the penalty, and largest volume fraction of a cell with it."""

@@ -8,8 +8,9 @@ the displacement since the start of the step.  The predictor u^ is the displacem
 
 v_n is the velocity at the start of the step, and v is the velocity at the end of the substep.  v_1 and a_1 are velocity
 and acceleration of the previous substep.  The weight g multiplies the rate of the substep, and the weight b multiplies
-the rate of the previous substep (`time_integration`).  In each step SDIRK2 dissipates the fraction GAMMA^4 (omega dt)^4 = 0.0074 (omega dt)^4 of the
-energy of an oscillation of angular frequency omega.  This dissipation damps unresolved modes.
+the rate of the previous substep (`time_integration`).  In each step SDIRK2 dissipates the fraction
+GAMMA^4 (omega dt)^4 = 0.0074 (omega dt)^4 of the energy of an oscillation of angular frequency omega.  The dissipation
+damps unresolved modes.
 
 The mass is integrated over the pieces of the particle domains.  Piece k has the mass m_k, the centroid x_k, and the
 second moments S_k about x_k.  With the shape functions N and the velocity gradient L,
@@ -53,7 +54,7 @@ from mpm_dolfinx.points.cutting import spreads
 from mpm_dolfinx.points.material_points import MaterialPoints, middle
 
 GHOST_MASS = 0.02
-"""Strength c of the ghost mass.  A rotating block has equal energies for c = 0.002 and c = 0.2 (`tests/test_inertia.py`)."""
+"""Strength c of the ghost mass.  A rotating block has the same energies with 0.002 and 0.2 (tests/test_inertia.py)."""
 RELAXES = 2.0
 """Relaxation rate of point velocities towards grid velocities, for domain corners that move by one cell size.
 
