@@ -17,7 +17,7 @@ from mpm_dolfinx.solve.schur import LinearSolvers
 def motion_error(
     solvers: LinearSolvers, K: PETSc.Mat, mass: Mass, flights: Sequence[Flight], seconds: float, own: float
 ) -> tuple[float, float]:
-    """Return the estimated error and the size of the motion of a step, each as the square root of twice an energy.
+    """Return the estimated error and the size of the motion of a step, in J^(1/2).
 
     The substeps end with the velocities v1, v2 and accelerations a1, a2.  A first-order step differs by
     `seconds * (a2 - a1)` in velocity, and by `seconds * (v2 - v1)` in displacement.  The estimate is `ERROR` times this

@@ -84,7 +84,7 @@ def velocities(
 
 
 def centred(work: RefilledCells, group: NDArray, x: NDArray, mass: NDArray, old: NDArray) -> NDArray[np.float64]:
-    """Return the masses of new domains that keep the centre of mass of each renewed cell, in kg.
+    """Return masses of new domains, in kg, that keep the centre of mass of each renewed cell.
 
     Each domain outside renewed cells keeps its mass.  A mass changes by at most half; a cell that reaches this limit
     does not keep its centre of mass.
@@ -117,7 +117,7 @@ def _received(work: RefilledCells, mass: NDArray[np.float64]) -> tuple[NDArray, 
 
 
 def _centre(group: NDArray, mass: NDArray, values: NDArray, count: int) -> tuple[NDArray, NDArray]:
-    """Return the mass of each group, and the mean of `values` in each group, weighted by mass."""
+    """Return the mass and the mass-weighted mean of `values` in each group."""
     whole = np.bincount(group, mass, count)
     columns = [np.bincount(group, mass * column, count) for column in values.T]
     return whole, np.stack(columns, axis=1) / np.where(whole > 0, whole, 1.0)[:, None]

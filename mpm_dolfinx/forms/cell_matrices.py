@@ -37,7 +37,7 @@ def shape_gradients(points: FormPoints) -> list:
 
 
 def shape_hoops(points: FormPoints) -> list:
-    """Return the means of N / r over each piece as UFL, for the Q1 shape functions N in axisymmetry."""
+    """Return the means of N / r over each piece as UFL, for the shape functions N."""
     grid, hoop = points.grid, points.functions["hoop"]
     h, out = grid.edge_in_forms(), []
     for s in grid.signs.tolist():
@@ -47,7 +47,7 @@ def shape_hoops(points: FormPoints) -> list:
 
 
 def along_shapes(T, points: FormPoints) -> list:
-    """Return T : grad v as UFL, where v is the shape function of each node along each axis."""
+    """Return T : grad v as UFL for each shape function v along each axis."""
     gradients, d = shape_gradients(points), points.grid.dim
     if not points.grid.axisymmetric:
         return [ufl.dot(T, g)[i] for g in gradients for i in range(d)]
@@ -79,7 +79,7 @@ def insert_rows(A: PETSc.Mat, grid: Grid, cells: NDArray[np.int32], rows: NDArra
 
 
 def _entries(count: int, symmetric: bool) -> tuple[NDArray, NDArray, NDArray]:
-    """Return the row and column of each entry of a matrix, and the index of its stored value."""
+    """Return row, column and storage index of each entry of a matrix."""
     rows, columns = np.triu_indices(count) if symmetric else np.divmod(np.arange(count**2), count)
     place = np.empty((count, count), dtype=np.int64)
     if symmetric:
@@ -115,7 +115,7 @@ NOTHING = Beside()
 
 
 class ElementMatrices:
-    """The bilinear form grad v : A : grad u of Q1 vectors, summed over the points of each cell before insertion.
+    """The bilinear form grad v : A : grad u of Q1 vectors, summed in each cell before insertion.
 
     The assembler sums the entries of an element matrix over the points of its cell, through DG0 test functions.  Each
     element matrix is then inserted once.  Insertion of a matrix for each point would cost twice as much as the
@@ -175,7 +175,7 @@ def _of_hoops(tangent, gradients: list, hoops: list, row: tuple[int, int], colum
 
 
 class StackedElementMatrices:
-    """The bilinear form (grad v F) : A : (grad u F) of Q1 vectors: kernels evaluate A, and BLAS multiplies it.
+    """The bilinear form (grad v F) : A : (grad u F) of Q1 vectors, with products by BLAS.
 
     In 3D, cells contain many points, so that products by BLAS are faster than products in the kernel.  The gradients of
     the shape functions, multiplied by F, are stacked for the n points of a cell.  The element matrix is then the

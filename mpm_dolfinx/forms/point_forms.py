@@ -101,13 +101,13 @@ class FormPoints:
         return self._taylor(ufl.grad(f), self.grid.dim - 1)
 
     def hoop(self, f):
-        """Return f_r / r of a Q1 vector f in axisymmetry, averaged over the piece of each point."""
+        """Return f_r / r of a Q1 vector f in axisymmetry, as a mean over each piece."""
         *offset, product, radius = (self.functions["hoop"][i] for i in range(4))
         slope = ufl.grad(f[0])
         return (f[0] + ufl.dot(slope, ufl.as_vector(offset)) + ufl.grad(slope)[0, 1] * product) / radius
 
     def gradient(self, u: fem.Function) -> fem.Function:
-        """Return grad u at the points as a coefficient that numpy evaluates, for a Q1 vector function u.
+        """Return grad u at the points as a coefficient that numpy evaluates.
 
         All forms with the same u share the values.  UFL would otherwise expand u as a Taylor polynomial, with many
         terms in 3D.  With the coefficient, a kernel of Hencky's law runs in half of the time, and compiles in a fifth.
@@ -201,7 +201,7 @@ class Places(Keyed):
 
     @cached_property
     def dofs(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Dofs (n,) of Q1 vectors in all cells with points, and the indices of the dofs of each cell in this array."""
+        """Dofs of Q1 vectors in all cells with points, and indices of each cell's dofs in this array."""
         d = self.grid.dim
         nodes, at = np.unique(self.grid.cell_nodes[self.filled], return_inverse=True)
         return tuple((rows.reshape(-1, 1) * d + np.arange(d)).astype(np.intp).ravel() for rows in (nodes, at))
@@ -212,7 +212,7 @@ class Places(Keyed):
         return Places(self.grid, self.cells[rows], self.x[rows], mixed, hoop)
 
     def shape_gradients(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the gradients (n, 2^d, d), in 1/m, of the shape functions at points, or their means over pieces."""
+        """Return the gradients of the shape functions at points, or their means over pieces, in 1/m."""
         mixed = None if self.mixed is None else self.mixed[chosen]
         return self.grid.shape_gradients(self.cells[chosen], self.x[chosen], mixed)
 
@@ -234,7 +234,7 @@ class Places(Keyed):
         return along
 
     def stretch(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return 1 + u_r / r at the points for nodal displacements u (nodes, d), in m, see `FormPoints.hoop`."""
+        """Return 1 + u_r / r at the points for nodal displacements u, in m."""
         grid, (*offset, product, radius) = self.grid, self.hoop.T
         h = grid.h if grid.even else grid.sizes(self.cells).T[..., None]
         hats = [0.5 + x[:, None] * grid.signs[:, a] / h[a] for a, x in enumerate(offset)]
@@ -295,7 +295,7 @@ class PointData(Keyed):
         self._stored = Latest()
 
     def increments(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return I + grad u (n, 9), with the circumferential stretch, for the nodal values u of a Q1 vector."""
+        """Return I + grad u (n, 9) for the nodal values u of a Q1 vector."""
         out = np.zeros((len(self.cells), 3, 3))
         out[:, :2, :2] = np.eye(2) + self.gradients_of(u).reshape(-1, 2, 2)
         out[:, 2, 2] = self.places.stretch(u.reshape(-1, 2))
@@ -306,7 +306,7 @@ class PointData(Keyed):
         return self._of_nodal(u.take(self.places.nodal))
 
     def _of_nodal(self, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the gradients (n, d^2) of a Q1 vector from its values at the nodes of the cells."""
+        """Return the gradients of a Q1 vector from its values at the nodes of cells."""
         places = self.places
         grid = self.points.grid
         d = self.points.grid.dim
@@ -377,7 +377,7 @@ class Rows:
         return rows
 
     def _pack(self, data: PointData, chosen: slice | NDArray[np.int64]) -> Packed:
-        """Return rows with the fields that do not change for the same points, and the dofs of grid functions."""
+        """Return rows with the constant fields, and the dofs of grid functions."""
         cells = data.cells[chosen]
         rows, dofs = self.room(len(cells))[: len(cells)], []
         for columns, name in self._fixed:

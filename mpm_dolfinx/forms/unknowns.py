@@ -63,7 +63,7 @@ class Unknowns:
 
     @property
     def positions(self) -> NDArray[np.float64]:
-        """Positions (n, d), in m, of the nodes or cells that the entries of a vector belong to."""
+        """Positions (n, d), in m, of the entries of a vector."""
         x = self._space.tabulate_dof_coordinates() if self._x is None else self._x
         return x[self.owned // self.dim, : self._space.mesh.geometry.dim]
 
@@ -83,7 +83,7 @@ class Unknowns:
         return v
 
     def gather(self, values: NDArray[np.float64], out: PETSc.Vec) -> PETSc.Vec:
-        """Copy the values of the unknowns from a local array over the whole grid into `out`, and return `out`."""
+        """Copy the values of the unknowns from a local array into `out`, and return `out`."""
         out.array_w[:] = values[self.owned]
         return out
 
@@ -124,14 +124,14 @@ def collect_garbage(comm: MPI.Intracomm) -> None:
 
 
 def sum_ghosts(function: fem.Function) -> NDArray[np.float64]:
-    """Add the ghost entries of other processes to the owned entries, and return the local array of the function."""
+    """Add the ghost entries to the owned entries, and return the local array."""
     if function.function_space.mesh.comm.size > 1:
         _compat.scatter_reverse_add(function)
     return function.x.array
 
 
 def with_ghosts(space, rows: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return values at the local dofs of a scalar space after an update of the ghosts from their owners.
+    """Return values at local dofs after an update of the ghosts from their owners.
 
     rows (n, k): values at the n local dofs.
     """

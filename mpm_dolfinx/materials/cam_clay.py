@@ -210,7 +210,7 @@ LC = {"r": "> kappa / lambda_, <= 1", "beta": ">= 0 1/Pa and finite", "reference
 
 
 def _dried(function: Callable) -> Callable:
-    """Return a function of Modified Cam Clay that uses lambda(s) and P_c(s) at the suction s."""
+    """Return a function of Modified Cam Clay with lambda(s) and P_c(s) at the suction s."""
     arguments = Skeleton.arguments_of(function)
 
     def of(**given):
@@ -307,7 +307,7 @@ class BarcelonaBasic(ModifiedCamClay):
 
 
 class _Return:
-    """Return to the yield surface for a value of d, see the docstring of the module.
+    """Return to the yield surface for a value of the unknown d.
 
     compaction: a.
     flow: h.

@@ -134,7 +134,7 @@ class LawAtPoints:
         return None if across is None else PointExpression(across, self.points)
 
     def stress_3d(self, data: PointData) -> NDArray[np.float64]:
-        """Return the effective Cauchy stress (n, 3, 3), in Pa, with nan out of plane if the law does not define it."""
+        """Return the effective Cauchy stress (n, 3, 3), in Pa, with nan for undefined out-of-plane stresses."""
         if self._stretches == 3:
             return self.stress(data)
         out = np.zeros((len(data.cells), 3, 3))
@@ -144,7 +144,7 @@ class LawAtPoints:
 
     @cached_property
     def _update(self) -> tuple[PointExpression, dict[str, tuple[int, ...]]]:
-        """Expression of all components of the new state as one vector, and the shapes of the state variables."""
+        """Expression of the new state as one vector, and the shapes of the state variables."""
         what, shapes = f"{self.law.__name__}.update", {name: np.shape(value) for name, value in self.law.state.items()}
         new = named(what, call(self.law.update, F=self._F, **self._values), shapes, some=True)
         parts = [f[i] if i else f for f in new.values() for i in np.ndindex(f.ufl_shape)]
@@ -152,7 +152,7 @@ class LawAtPoints:
             return PointExpression(ufl.as_vector(parts), self.points), {name: shapes[name] for name in new}
 
     def new_state(self, data: PointData, dt: float) -> list[tuple[str, NDArray[np.float64]]]:
-        """Return the name and the values of each updated state variable after a step of length dt, in s."""
+        """Return names and values of the updated state variables after a step of length dt, in s."""
         if self.law.update is None:
             return []
         expression, shapes = self._update
@@ -197,7 +197,7 @@ def knows_space(grid: Grid, m: Skeleton) -> bool:
 def by_scene(
     grid: Grid, cell_size: float | None = None, law: type[Skeleton] | None = None, points: FormPoints | None = None
 ) -> dict[str, Any]:
-    """Return the arguments `BY_SCENE` of laws as UFL: the time, which the caller sets, and the cell size.
+    """Return the time and the cell size as UFL, the arguments `BY_SCENE` of laws.
 
     points: integration points of the law.  If cells have several sizes, each point stores the size of its cell.
     """
@@ -209,7 +209,7 @@ def by_scene(
 
 
 def mean_size(grid: Grid) -> float:
-    """Return the edge length, in m, of a square or cube with the volume of the largest cell."""
+    """Return the edge length, in m, of the square or cube as large as the largest cell."""
     h = grid.h if grid.even else [w.max() for w in grid.widths]
     return float(np.prod(h) ** (1 / grid.dim))
 

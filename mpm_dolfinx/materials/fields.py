@@ -187,7 +187,7 @@ class SceneMaterials:
         return self.stretches if (law, True, True) in self._parts else self.grid.stretches
 
     def _add_shapes(self, m: Skeleton, seeded: dict[str, NDArray[np.float64]], count: int) -> None:
-        """Add the shapes of a law's parameters and state, and initialise the state of `count` points."""
+        """Add the shapes of a law's parameters and state, and initialise the state."""
         law = type(m)
         if (law.energy is None) == (law.kirchhoff is None):
             which = "neither" if law.energy is None else "both"
@@ -227,7 +227,7 @@ class SceneMaterials:
             raise ValueError(f"{law.__name__}: {name} has shape {shape}, in another law {other}; must be equal")
 
     def parts(self, pieces: FormPoints, common: Sequence[str]) -> list[tuple[type[Skeleton], FormPoints, bool]]:
-        """Return the parts of the scene's points, each as law, integration points, and whether Q1 cells would lock.
+        """Return the parts of the points: law, integration points, and whether Q1 cells would lock.
 
         A part contains the points of one law.  If only some materials of a law are nearly incompressible, the law has
         two parts.  A single part uses `pieces`.  Several parts have their own integration points, with the fields
@@ -264,7 +264,7 @@ class SceneMaterials:
         return np.array([known for *_, known in self._parts])[self.part_of(points)]
 
     def conducting(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the conductivity of each point, in m/s, and a number for its conductivity law and retention curve.
+        """Return the conductivity, in m/s, and a number for the law of conductivity at each point.
 
         The result has the shape (n, 2).  Points with equal rows conduct equally.  If the conductivity law depends on
         position, each point has its own number.
@@ -279,7 +279,7 @@ class SceneMaterials:
         return np.stack([conductivity, number], axis=1)
 
     def retention_of(self, points: MaterialPoints) -> NDArray[np.int64]:
-        """Return the number of the retention curve of each point, from 1, or 0 if its pores stay saturated."""
+        """Return the number of the retention curve of each point, or 0 if its pores stay saturated."""
         return np.array([self.retentions.number(m.retention) for m in self.materials])[points.material]
 
     def saturation(
@@ -304,7 +304,7 @@ class SceneMaterials:
         return self._saturation(rows, p)
 
     def retention_scale(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the suction, in Pa, at which the pores of each point drain, or infinity if they stay saturated."""
+        """Return the suction, in Pa, at which the pores of each point drain."""
         scales = [np.inf if m.retention is None else scale_of(m.retention) for m in self.materials]
         return np.array(scales)[points.material]
 
@@ -338,7 +338,7 @@ class SceneMaterials:
         return out
 
     def changed(self, what: str, points: MaterialPoints, named: Collection[str]) -> MaterialPoints:
-        """Return the points after a change of the fields `named`, with all fields that depend on these fields.
+        """Return the points after a change of named fields and of all fields that depend on them.
 
         Raises
         ------
@@ -414,7 +414,7 @@ class SceneMaterials:
         return any(getattr(law, "specific_yield", 0.0) > 0 for law in self.conductivity_laws)
 
     def drainage(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the specific yield, and the suction, in Pa, at which drainable pores are empty, as an array (n, 2)."""
+        """Return the specific yield, and the suction, in Pa, at which drainable pores are empty."""
         names = {"specific_yield": 0.0, "suction": 1.0}
         return np.stack(
             [self.table(points, lambda m, k=k, v=v: getattr(m.conductivity_law, k, v)) for k, v in names.items()],
@@ -564,7 +564,7 @@ class SceneMaterials:
         return out
 
     def _placed(self, points: MaterialPoints) -> list[tuple[LawAtPoints, NDArray[np.int64], PointData]]:
-        """Return for each law the law, the indices of its points, and the form data of these points."""
+        """Return each law with the indices and the form data of its points."""
         number, values = self.law_of(points), {**self.parameters(points), **self.state(points)}
         values["F"] = points.F_of_laws
         rows = [(number == k).nonzero()[0] for k in range(len(self.laws))]
@@ -624,7 +624,7 @@ def _evaluated(grid: Grid, m: Skeleton, X: NDArray[np.float64], ids: NDArray[np.
 
 
 def _check_local(all_points: Skeleton, half: Skeleton, names: Sequence[str]) -> None:
-    """Raise ValueError if fields at every other point change when they are evaluated without the points between."""
+    """Raise ValueError if fields at points depend on other points."""
     for name in names:
         value, alone = getattr(all_points, name)[::2], getattr(half, name)
         if np.abs(value - alone).max() > SAME * np.abs(value).max():
@@ -633,7 +633,7 @@ def _check_local(all_points: Skeleton, half: Skeleton, names: Sequence[str]) -> 
 
 
 def _places(bodies: Sequence[Body], material: int, ids: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return the reference positions of the points with a material, in m, for their ids in ascending order."""
+    """Return the reference positions, in m, of the points with a material."""
     starts = np.cumsum([0, *map(len, bodies)])
     at = ids.searchsorted(starts)
     each = zip(bodies, starts[:-1], pairwise(at), strict=True)
@@ -658,7 +658,7 @@ def _checksum(grid: Grid, ids: NDArray[np.int64], rows: NDArray[np.float64], tot
 
 
 def _expanded(m: Skeleton, values: dict[str, NDArray[np.float64]], n: int) -> Skeleton:
-    """Return a copy of a material with values (n, ...) in some fields and other constants repeated n times."""
+    """Return a copy of a material with an array of n values for each constant."""
     out = copy(m)
     for name in constants_of(m):
         value = getattr(m, name)

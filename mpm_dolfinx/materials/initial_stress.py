@@ -61,7 +61,7 @@ class K0:
         return numbers(f"K0: {name}", value, (), *shapes, **test)
 
     def values(self, name: str, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the ratio or the surcharge at positions x (n, d), in m, as one value or an array (n,)."""
+        """Return the ratio or the surcharge at positions x (n, d), in m."""
         value = getattr(self, name)
         given = at_places(f"K0: {name}", "one value per position", value, "x", x) if callable(value) else value
         return self._checked(name, given, (len(x),))
@@ -92,7 +92,7 @@ def hydrostatic(level: float, unit_weight: float | None = None) -> Callable[[NDA
 
 @dataclass(frozen=True)
 class OfWater:
-    """A water pressure with a unit weight, by default the fluid's unit weight, or 9810 N/m^3 outside a scene."""
+    """A water pressure with a unit weight."""
 
     @property
     def unit_weight(self) -> float:
@@ -162,7 +162,7 @@ class InitialStresses:
         return stressed(materials, points, rows, target)
 
     def _at(self, stress: InitialStress, body: int, points: MaterialPoints, above: list[NDArray]) -> NDArray:
-        """Return the effective stress (n, 3, 3), in Pa, of points of a body, from the results of `_above`."""
+        """Return the effective stress, in Pa, of points of a body."""
         n, d = points.x.shape
         if not isinstance(stress, K0):
             name = f"initial_stress of body {body}: {line(stress)}"
@@ -185,7 +185,7 @@ class InitialStresses:
         return normal[:, :, None] * np.eye(3)
 
     def _above(self, materials: SceneMaterials, points: MaterialPoints, present, gravity) -> list[NDArray]:
-        """Return the overburden, in Pa, the height of the surface, in m, and alpha chi p, in Pa, above each point."""
+        """Return the overburden, the height of the surface, and alpha chi p at each point."""
         if not any(isinstance(stress, K0) for stress in self.given.values()):
             return [points.pressure] * 3
         if gravity is None or np.any(gravity[:-1]) or not gravity[-1] <= 0:
@@ -208,7 +208,7 @@ def _in_columns(
     unit_weight: NDArray[np.float64],
     above: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the corners and unit weights of all domains in the columns of this process's domains, in order of ids.
+    """Return corners and unit weights of all domains above and below this process's domains.
 
     ids (n,), corners (n, 2^d, d), in m, unit_weight (n,), in N/m^3: this process's domains in the scene.
     above (k, 2^d, d), in m: corners of the domains whose columns are needed.
@@ -362,7 +362,7 @@ def strained(materials: SceneMaterials, points: MaterialPoints, moved: MaterialP
 
 
 def _with(points: MaterialPoints, chosen: NDArray[np.bool_], **values: NDArray) -> MaterialPoints:
-    """Return the points with new values at the chosen points, for those names that the points have."""
+    """Return the points with new values at the chosen points."""
     data = dict(points.data)
     for name, new in values.items():
         if name in data and chosen.any():
@@ -385,7 +385,7 @@ def _prestretch(m) -> NDArray[np.float64]:
 
 
 def _no_constants(points: MaterialPoints, target: NDArray[np.float64], given: NDArray[np.bool_]) -> str:
-    """Return an error message if Modified Cam Clay does not allow a target stress, or an empty string."""
+    """Return the reason why Modified Cam Clay does not allow a target stress, or an empty string."""
     shear = np.abs(target - np.diagonal(target, axis1=1, axis2=2)[:, :, None] * np.eye(3)).max(axis=(1, 2), initial=0.0)
     invalid = given & ((shear > 0) | ~(np.trace(target, axis1=1, axis2=2) < 0))
     what = "must have no shear and a compressive mean for ModifiedCamClay"

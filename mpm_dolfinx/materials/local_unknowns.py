@@ -134,7 +134,7 @@ class LocalUnknowns:
 
 
 class _Equations:
-    """The equations f(y, z) = 0 of a law, as functions of data at the points."""
+    """The equations f(y, z) = 0 of a law at points."""
 
     def __init__(
         self,
@@ -273,7 +273,7 @@ class _Equations:
         return _real(what, value, (n, *self._unknowns[of], *self._trial[by]))
 
     def _slopes_of(self, of: str, given: Mapping[str, object], n: int) -> NDArray[np.float64]:
-        """Return the derivatives (n, m, k) of one unknown with m components with respect to all k trial components.
+        """Return the derivatives (n, m, k) of one unknown with respect to all trial values.
 
         given: derivatives by name of the trial value.  Missing derivatives are zero.
         """
@@ -285,12 +285,12 @@ class _Equations:
 
 
 def _along(by_y, by_z, Y, m: int, i: tuple[int, ...], j: int):
-    """Return the derivative of component i with respect to component j of z, along y = y* + Y (z - z*), as UFL."""
+    """Return the derivative of component i with respect to component j of z as UFL."""
     return by_z[(*i, j)] + sum(by_y[(*i, a)] * Y[a, j] for a in range(m))
 
 
 def _real(name: str, value, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    """Return a value as an array of real numbers, or raise ValueError for a wrong shape or type."""
+    """Return a value as an array of real numbers with this shape."""
     try:
         value = np.asarray(value)
     except ValueError as error:  # rows of different lengths
@@ -303,7 +303,7 @@ def _real(name: str, value, shape: tuple[int, ...]) -> NDArray[np.float64]:
 
 
 def _newton(system, y: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Solve f(y) = 0 in place at all points, and return the indices of points without a solution.
+    """Solve f(y) = 0 in place, and return the indices of points without a solution.
 
     system: function of r point indices and of the y (r, m) of these points.  It stores y, and returns f, df/dy and the
     norms of f.
@@ -337,7 +337,7 @@ def _newton(system, y: NDArray[np.float64]) -> NDArray[np.int64]:
 
 
 def _solve(A: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return A^-1 b for matrices A (n, m, m), with results that are not finite for singular matrices."""
+    """Return A^-1 b for matrices A, not finite if A is singular."""
     with np.errstate(all="ignore"):
         if A.shape[1] == 1:
             return b / A
@@ -362,7 +362,7 @@ def _size(shape: tuple[int, ...]) -> int:
 
 
 def _named(shapes: Mapping[str, tuple[int, ...]], vector) -> dict:
-    """Return tensors by name from a UFL vector, in which the components of each tensor are consecutive."""
+    """Return tensors by name from the components of a UFL vector."""
     out, start = {}, 0
     for name, shape in shapes.items():
         index = np.arange(start, start + _size(shape)).reshape(shape)

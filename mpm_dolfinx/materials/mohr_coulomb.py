@@ -101,7 +101,7 @@ class MohrCoulomb(Frictional):
 
     @staticmethod
     def solution(trial, bulk, shear, sine, sine_flow, strength, cutoff):
-        """Return the final stress components, in Pa, their derivatives, and a flag that is 1 in plastic flow."""
+        """Return the final stress, in Pa, its derivatives, and whether the flow is plastic (1 or 0)."""
         x, axes = eigen(trial["b"])
         with np.errstate(invalid="ignore", divide="ignore"):  # in a diverging iterate, which is rejected later
             e = np.log(x) / 2
@@ -132,7 +132,7 @@ class MohrCoulomb(Frictional):
 
 
 def _returned(e: NDArray, bulk: NDArray, shear: NDArray, sine: NDArray, sine_flow: NDArray, *limits: NDArray) -> tuple:
-    """Return principal Kirchhoff stresses, in Pa, their derivatives with respect to e, and flags of plastic flow.
+    """Return principal stresses, their derivatives with respect to e, and flags of plastic flow.
 
     e (n, 3): principal trial strains, in descending order.
     """
@@ -155,7 +155,7 @@ def _returned(e: NDArray, bulk: NDArray, shear: NDArray, sine: NDArray, sine_flo
 
 
 class _Surface:
-    """Yield surface of ordered principal stresses, with p = 1 + sin phi, q = 1 - sin phi, k = 2 c cos phi, and T."""
+    """Yield surface of ordered principal stresses."""
 
     def __init__(self, sine: NDArray, strength: NDArray, cutoff: NDArray):
         self.p = 1 + sine
@@ -164,12 +164,12 @@ class _Surface:
         self.T = cutoff
 
     def outside(self, t: NDArray) -> NDArray:
-        """Return the largest yield function at stresses t (n, 3), which is > 0 outside the yield surface."""
+        """Return the largest yield function at stresses t, > 0 outside the yield surface."""
         return np.maximum(self.p * t[:, 0] - self.q * t[:, 2] - self.k, t[:, 0] - self.T)
 
 
 class _Return:
-    """Return mapping of principal trial stresses t (n, 3) outside the yield surface, in descending order."""
+    """Return mapping of ordered principal trial stresses outside the yield surface."""
 
     def __init__(self, t, elastic, bulk, shear, sine, sine_flow, strength, cutoff):
         self._trial = t
@@ -210,7 +210,7 @@ class _Return:
         return stresses, slopes, violation[best, n]
 
     def _violation(self, t: NDArray, multipliers: Sequence[NDArray]) -> NDArray:
-        """Return the largest violation, in Pa, of the yield functions, the order and the signs of the multipliers."""
+        """Return the largest violation, in Pa, of the conditions for a final stress."""
         multipliers = [-2 * self._G * m for m in multipliers]
         return np.max([self._surface.outside(t), t[:, 1] - t[:, 0], t[:, 2] - t[:, 1], *multipliers], axis=0)
 
@@ -227,23 +227,23 @@ class _Return:
         return t, slopes, self._violation(t, multipliers.T)
 
     def _at(self, t: NDArray, conditions: Callable) -> tuple[NDArray, NDArray, NDArray]:
-        """Return the results of `end` at a vertex with the stresses t and conditions like `_in_apex`."""
+        """Return the results of `end` for a vertex with the stresses t."""
         drop = self._trial - t
         mean = drop.mean(axis=1)
         plastic = drop / (2 * self._G)[:, None] + (mean / (3 * self._K) - mean / (2 * self._G))[:, None]
         return t, np.zeros((len(t), 3, 3)), self._violation(t, conditions(plastic))
 
     def _in_apex(self, x: NDArray) -> list[NDArray]:
-        """Return quantities that are >= 0 if an ordered plastic strain x is in the cone of all six flow directions."""
+        """Return quantities that are >= 0 if the apex is the final stress."""
         total, difference = x.sum(axis=1), self._p - self._q
         return [total, self._q * total + difference * x[:, 2], self._q * total + difference * (x[:, 1] + x[:, 2])]
 
     def _in_triaxial(self, x: NDArray) -> list[NDArray]:
-        """Like `_in_apex`, for the vertex of two faces with t_2 = t_3 and the cut-off of t_1."""
+        """Like `_in_apex`, for the vertex with t_2 = t_3 at the cut-off of t_1."""
         return [-x[:, 1], -x[:, 2], x[:, 0] + self._p / self._q * (x[:, 1] + x[:, 2])]
 
     def _in_extension(self, x: NDArray) -> list[NDArray]:
-        """Like `_in_apex`, for the vertex of two faces with t_1 = t_2 and the cut-offs of t_1 and t_2."""
+        """Like `_in_apex`, for the vertex with t_1 = t_2 at their cut-offs."""
         return [x[:, 0], x[:, 1], -x[:, 2], x[:, 0] + x[:, 1] + self._p / self._q * x[:, 2]]
 
 

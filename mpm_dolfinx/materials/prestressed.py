@@ -54,7 +54,7 @@ def prestressed(law: type[Skeleton], knows_space: bool) -> type[Skeleton]:
 
 
 def _from_seeded(function: Callable, name: str, knows_space: bool) -> Callable:
-    """Return a function of a law, evaluated at F F_i, with results per volume of the seeded state."""
+    """Return a function of a law that is evaluated at F F_i."""
     names = Skeleton.arguments_of(function)
 
     def of(**given):

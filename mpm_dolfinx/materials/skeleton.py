@@ -248,14 +248,14 @@ class Skeleton:
 
     @classmethod
     def kirchhoff_in_plane(cls, F, values: Mapping[str, object]):
-        """Return the Kirchhoff stress, in Pa, of a law without an energy, as UFL in the shape of F."""
+        """Return the Kirchhoff stress, in Pa, as UFL in the shape of F."""
         d = F.ufl_shape[0]
         tau = cls._kirchhoff(F, values, (d, d))
         return ufl.as_matrix([[tau[a, b] for b in range(d)] for a in range(d)])
 
     @classmethod
     def _kirchhoff(cls, F, values: Mapping[str, object], shape: tuple[int, int]):
-        """Return the Kirchhoff stress, in Pa, as UFL, after a check of its shape and of its dependence on F."""
+        """Return the Kirchhoff stress, in Pa, as UFL of the right shape."""
         return expression(cls.kirchhoff, [shape, (3, 3)], "" if cls.unknowns else "F", F=F, **values)
 
     @classmethod
@@ -278,7 +278,7 @@ class Skeleton:
         return ufl.diff(energy, whole)[2, 2] / ufl.det(F)
 
     def drained_modulus(self, dim: int) -> float:
-        """Return the drained bulk modulus, in Pa, for F (dim, dim): K for dim = 3, lambda + G in plane strain."""
+        """Return the drained bulk modulus, in Pa: K in 3D, lambda + G in plane strain."""
         return self.bulk if dim == 3 else self.bulk + self.shear / 3
 
     @property
@@ -325,7 +325,7 @@ def check_given(obj, allowed: Mapping[str, str]) -> None:
 
 
 def _check(obj, name: str, test: Callable, allowed: str) -> None:
-    """Raise ValueError if a constant, or a value of an array, is out of its range."""
+    """Raise ValueError if a constant is out of its range."""
     value = getattr(obj, name)
     if callable(value):
         return
@@ -363,7 +363,7 @@ class Hencky(Skeleton):
 
 
 def _deviatoric(F):
-    """Return `sum l_i^2 - (sum l_i)^2 / 3` as UFL, with the logarithmic stretches l_i of F."""
+    """Return `sum l_i^2 - (sum l_i)^2 / 3` as UFL for the logarithmic stretches l_i."""
     whole = F.T * F
     C = ufl.as_matrix([[whole[i, j] for j in (0, 1)] for i in (0, 1)])
     return _stretch_difference(C) ** 2 / 2 + (ufl.ln(ufl.det(C)) / 2 - ufl.ln(whole[2, 2])) ** 2 / 6
@@ -380,7 +380,7 @@ def _stretch_difference(C):
 
 
 def _eigenvalues(C, separation: float = SEPARATION):
-    """Return the eigenvalues of a symmetric 2x2 or 3x3 tensor as UFL, apart from each other by `separation` or more."""
+    """Return separated eigenvalues of a symmetric 2x2 or 3x3 tensor as UFL."""
     if C.ufl_shape[0] == 2:
         mean = (C[0, 0] + C[1, 1]) / 2
         radius = ufl.sqrt((C[0, 0] - C[1, 1]) ** 2 + 4 * C[0, 1] ** 2 + separation**2) / 2
@@ -439,7 +439,7 @@ def kozeny_carman(conductivity, porosity, porosity0):
 
 
 def filled(p, suction):
-    """Return the saturation of drainable pores at a pressure p: a cubic from 0 at -`suction` to 1 at `suction`."""
+    """Return the saturation of drainable pores, a cubic from 0 at -`suction` to 1 at `suction`."""
     x = ufl.max_value(0.0, ufl.min_value(1.0, (1 + p / suction) / 2))
     return x**2 * (3 - 2 * x)
 

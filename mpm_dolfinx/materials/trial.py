@@ -66,7 +66,7 @@ class Trial:
 
 
 def components(b, plane: bool):
-    """Return the six components of a symmetric UFL tensor (3, 3) as a vector, or the four in `PLANE`."""
+    """Return the components of a symmetric UFL tensor (3, 3), six or the four in `PLANE`."""
     return ufl.as_vector([b[i] for i in (PLANE if plane else SPACE)])
 
 
@@ -79,7 +79,7 @@ def symmetric(values):
 
 
 def eigen(b: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the eigenvalues (n, 3) and axes (n, 3, 3), as columns, of tensors with components b (n, 4) or (n, 6)."""
+    """Return eigenvalues (n, 3), and axes (n, 3, 3) as columns, of tensors with components b."""
     n = len(b)
     if b.shape[1] == len(SPACE):
         full = np.empty((n, 3, 3))

@@ -93,7 +93,7 @@ def expression(function: Callable, shapes: Sequence[tuple[int, ...]], of: str = 
 
 
 def _check_parts(what: str, out: ufl.core.expr.Expr) -> None:
-    """Raise ValueError for infinite numbers, for NaN, and for sums over an index of two sizes."""
+    """Raise ValueError for infinite numbers, NaN, and sums over an index of two sizes."""
     for part in unique_pre_traversal(out):
         if isinstance(part, ufl.constantvalue.RealValue) and not np.isfinite(float(part)):
             raise ValueError(f"{what}: contains {float(part)}, must be finite")
@@ -143,7 +143,7 @@ def form(kind: str, function: Callable, **available) -> ufl.Form:
 
 
 def term_of(term: Callable, unknown: ufl.Coefficient, test: ufl.Argument, **available) -> tuple[ufl.Form, bool]:
-    """Return a user-defined term as a linear form in the test function, and whether it derives from an energy.
+    """Return a user-defined term as a linear form, and whether it derives from an energy.
 
     ValueError is raised if the term fails or depends on neither the unknown nor v.
     """
@@ -157,7 +157,7 @@ def term_of(term: Callable, unknown: ufl.Coefficient, test: ufl.Argument, **avai
 
 @contextmanager
 def compiling(what: str, allowed: str) -> Iterator[None]:
-    """Turn errors of UFL and its compiler into a ValueError that names the object and the allowed values."""
+    """Turn errors of UFL and its compiler into a ValueError that names the object."""
     try:
         yield
     except (Exception, ArityMismatch) as error:  # UFL and FFCx raise many kinds; one is no Exception
@@ -168,7 +168,7 @@ def compiling(what: str, allowed: str) -> Iterator[None]:
 
 
 def _is_ours(error: Exception) -> bool:
-    """Return whether this package raised an error, which then has a message that names the object."""
+    """Return whether this package raised an error."""
     frames = error.__traceback__
     while frames.tb_next is not None:
         frames = frames.tb_next

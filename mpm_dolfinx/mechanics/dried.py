@@ -20,7 +20,7 @@ from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
 
 
 def suction_sums(points: FormPoints, F, slopes: Sequence, locks: bool) -> CellSums | None:
-    """Return the sums over pieces in each cell that `OfSuction` needs, or None if it needs no sums.
+    """Return the sums over pieces in each cell that `OfSuction` needs, or None.
 
     F: deformation gradient (d, d), a UFL variable.
     slopes: UFL derivatives with respect to the pressure, empty for laws without suction.  The first derivative is that
@@ -48,7 +48,7 @@ class OfSuction:
         self._free = {number: of for number, of in found.items() if number not in self._locked}
 
     def rows(self, data: QuadratureData) -> list[tuple[NDArray[np.int32], NDArray[np.float64]]]:
-        """Return pairs of cells (c,) and derivatives (c, n) of their nodal forces with respect to their pressures."""
+        """Return cells, and the derivatives of their nodal forces with respect to their pressures."""
         out = [(data.parts[number].places.filled, sums(data.parts[number])) for number, sums in self._free.items()]
         if self._locked:
             width = 2 * self._width + 1

@@ -99,7 +99,7 @@ class GhostPenalty:
         self.firmness = FacetForm(2 * self.fill * self.shear * around * ufl.inner(*strains) * dx, grid.comm)
 
     def _scale(self):
-        """Return the strength of a face times the harmonic mean of both cells' moduli, in Pa, as UFL."""
+        """Return the strength of a face times the mean modulus of both cells, as UFL."""
         fills, moduli, beside = ([f("+"), f("-")] for f in (self.fill, self.modulus, self.beside))
         full, little = ufl.max_value(*fills), ufl.min_value(*fills)
         fullest = ufl.conditional(ufl.lt(*fills), *beside)  # largest filling next to the emptier cell

@@ -289,7 +289,7 @@ class HoldLoads(Loads):
         self._lacked = np.full(1, np.inf)  # for each side of a part: last sum of gaps in `augment`, at first infinite
 
     def augment(self, at: At) -> bool:
-        """Add the penalty forces on cell means to the multipliers of the means, on sides that lag behind.
+        """Add the penalty forces on sides that lag behind to the multipliers.
 
         This is needed if a whole body, such as undrained soil, resists a side more stiffly than one cell.  The updates
         end when the mean gap of a side over a connected part of the bodies no longer falls by half.

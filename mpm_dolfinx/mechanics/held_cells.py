@@ -206,7 +206,7 @@ class HeldCells:
     def _held_beside(
         self, number: NDArray[np.int64], nodes: NDArray[np.int32], N: NDArray[np.float64], stuck: NDArray[np.bool_]
     ) -> NDArray[np.bool_]:
-        """Return which penalties at a wall have a free node that their condition also holds away from walls.
+        """Return which penalties at a wall have a node that other penalties of the condition hold.
 
         N (k, 2^d): values of the shape functions of the nodes.
         stuck (k, 2^d): whether each node is at a wall.
@@ -226,7 +226,7 @@ class HeldCells:
     def beyond(
         self, row: NDArray, axis: NDArray, force: NDArray, reached: NDArray[np.bool_], told: Collection[int]
     ) -> list[tuple[int, NDArray[np.float64]]]:
-        """Return the index of each condition with too large forces, and the position of its largest force, in m.
+        """Return the conditions with too large forces, and the position of the largest force of each.
 
         A Q1 field cannot always have the prescribed means in two neighbouring cells, as at a side on a grid line.  The
         forces of their penalties then oppose each other.  A force therefore counts as too large only if the sums of the

@@ -101,7 +101,7 @@ def moving(
     base: NDArray[np.float64],
     rings: bool = False,
 ) -> dict[str, NDArray[np.float64]]:
-    """Return the point data `VELOCITY` and `RATE` of a velocity field, or raise ValueError for an invalid field.
+    """Return the point data `VELOCITY` and `RATE` of a velocity field.
 
     velocity: vector (d,), in m/s, or function of positions x (n, d) with values (n, d).  Each domain stores the affine
     field nearest to the values at its corners.
@@ -127,7 +127,7 @@ def moving(
 
 
 def inverses(A: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the inverses of matrices (n, d, d), for d = 2 in a tenth of numpy's time."""
+    """Return the inverses of matrices (n, d, d), faster than numpy."""
     if A.shape[1] > 2:
         return np.linalg.inv(A)
     (a, b), (c, e) = np.ascontiguousarray(A.transpose(1, 2, 0))
@@ -135,7 +135,7 @@ def inverses(A: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def product(A: NDArray[np.float64], B: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the products of matrices (n, d, d), in a third of numpy's time."""
+    """Return the products of matrices (n, d, d), faster than numpy."""
     A, B = (np.ascontiguousarray(of.transpose(1, 2, 0)) for of in (A, B))
     return sum(A[:, j, None] * B[None, j] for j in range(len(B))).transpose(2, 0, 1)
 
@@ -159,7 +159,7 @@ def chord(G: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float
 
 
 class InertiaForms:
-    """Compiled forms of mass and momentum, and the midpoint rule's coefficients in the forms of stresses and fluxes.
+    """Compiled forms of mass and momentum, with the coefficients of the midpoint rule.
 
     points, of_laws: all integration points, and the integration points of each law.
     """
@@ -195,12 +195,12 @@ class InertiaForms:
             self._flight.x.array[:] = inertia.flight
 
     def at(self, cells: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return accelerations, in m/s^2, at a place in each of n cells, from the shape functions at this place."""
+        """Return accelerations, in m/s^2, at one place in each cell from the shape functions there."""
         nodal = self._rate.value * (self._u.x.array - self._flight.x.array).reshape(-1, self.grid.dim)
         return np.einsum("nk,nkd->nd", values, nodal[self.grid.cell_nodes[cells]])
 
     def _seen(self, chords: Latest[tuple[NDArray, NDArray]], which: int, data: PointData) -> NDArray[np.float64]:
-        """Return the gradients for laws (which = 0), or the rotations of the laws' stress (which = 1); see `chord`.
+        """Return the gradients for laws (which = 0), or the rotations of stresses (which = 1); see `chord`.
 
         chords: the last result, shared by all forms at the same u.
         """
@@ -296,7 +296,7 @@ class Mass:
         return out
 
     def local(self, v: PETSc.Vec) -> NDArray[np.float64]:
-        """Return a vector of the unknowns as a local array with ghosts, and with zeros at fixed displacements."""
+        """Return a vector of the unknowns as a local array with zeros at fixed displacements."""
         work = self._forms.work
         work.x.array[:] = 0.0
         self.unknowns.add(work, 1.0, v)
@@ -304,7 +304,7 @@ class Mass:
 
     @cached_property
     def _off(self) -> NDArray[np.float64]:
-        """Vectors, in m, from the centroids of the particle domains to the centroids of their pieces."""
+        """Vectors, in m, from the centroids of domains to the centroids of their pieces."""
         pieces = self._cut.pieces
         return pieces.x - self._cut.mean(pieces.x)[pieces.point]
 
@@ -314,7 +314,7 @@ class Mass:
         return inverses(self._cut.mean(self._off[:, :, None] * self._off[:, None] + self._cut.pieces.second))
 
     def _at_points(self, points: MaterialPoints, v: PETSc.Vec) -> dict[str, NDArray[np.float64]]:
-        """Return `VELOCITY` and `RATE` of the affine field in each domain that is nearest to the grid's velocities."""
+        """Return the affine velocity field in each domain that is nearest to the grid's velocities."""
         cut, grid, places, nodal = self._cut, self._forms.grid, self._pieces.places, self.local(v)
         d, of_cells = grid.dim, grid.over_edges(grid.monomials @ nodal.take(places.nodal), places.filled)
         at, slope = polynomial(of_cells, places.offset.T, places.slots).T, self._pieces.gradients_of(nodal)
@@ -388,7 +388,7 @@ class Flight(NamedTuple):
     acceleration: PETSc.Vec | None = None  # acceleration in the last substep, m/s^2
 
     def free(self, own: float, before: float) -> PETSc.Vec:
-        """Return the predictor, in m, of a substep with the weights, in s, of its own rate and the previous rate."""
+        """Return the predictor of the next substep, in m."""
         flight = self.start * own
         if self.acceleration is not None:
             flight += self.velocity * before + self.acceleration * (own * before)

@@ -52,7 +52,7 @@ class SumsOfPart(NamedTuple):
 
 
 class FBar:
-    """F-bar modification of laws, with the volume ratio theta of the step and the mean stress pi of each cell.
+    """F-bar modification of laws, with theta and pi of each cell as fields.
 
     symmetric: whether the tangents of all laws are symmetric.
     """
@@ -84,7 +84,7 @@ class FBar:
         values: Mapping[str, object],
         known: Mapping[str, object],
     ) -> tuple:
-        """Return the stress and the cell sums of points with one law, whose Q1 cells would lock without F-bar.
+        """Return the stress and the cell sums of points with a law that uses F-bar.
 
         points: integration points with the law, with the field F at the start of the step.
         F: deformation gradient (d, d), a UFL variable.
@@ -110,7 +110,7 @@ class FBar:
         return sums.stress.P + shared, P_F + ufl.diff(shared, F), beside, sums
 
     def _stress(self, law: type[Skeleton], F, Fbar, values: Mapping[str, object]) -> tuple:
-        """Return the derivatives of psi(Fbar), or of the work of a law without energy, with respect to F and theta."""
+        """Return the derivatives of psi(Fbar) with respect to F and theta."""
         if law.kirchhoff is None:
             energy = expression(law.energy, [()], F=Fbar, **values)
             return ufl.diff(energy, F), ufl.diff(energy, self._theta)
@@ -159,7 +159,7 @@ class FBar:
 
 
 class MeanDilatation:
-    """The volume ratio theta of the step in each cell, and its work-conjugate mean stress pi, for F-bar.
+    """The volume ratio theta and the mean stress pi of each cell, for F-bar.
 
     parts: sums over each part in which cells would lock, by index of the part, see `QuadratureData`.
     """
@@ -185,7 +185,7 @@ class MeanDilatation:
         self._set_mean(self.pi, [of.stress for of in self._sums], data)
 
     def _set_mean(self, f: fem.Function, sums: Sequence[CellSums | StressAtPoints], data: QuadratureData) -> None:
-        """Set f in each cell to the volume mean of a quantity over the pieces with F-bar.
+        """Set f in each cell to a mean over the pieces with F-bar.
 
         sums: for each part, a function that sums quantity times volume in each cell.
         """
@@ -237,13 +237,13 @@ class MeanDilatation:
 
 
 def _dev(tau, F):
-    """Return the components of the deviator of a UFL tensor in the axes of F (d, d)."""
+    """Return the components (d, d) of the deviator of a UFL tensor."""
     d, mean = range(F.ufl_shape[0]), ufl.tr(tau) / tau.ufl_shape[0]
     return ufl.as_matrix([[tau[a, b] - mean if a == b else tau[a, b] for b in d] for a in d])
 
 
 class StressAtPoints:
-    """Stress P of a law and its derivative with respect to theta, evaluated once for both residual and pi."""
+    """Stress of a law and its derivative with respect to theta, evaluated once for all forms."""
 
     def __init__(self, P, slope, points: FormPoints):
         shape, self._last = P.ufl_shape, Latest()
@@ -253,7 +253,7 @@ class StressAtPoints:
         """The stress as UFL, with the values of the last evaluation."""
 
     def __call__(self, data: PointData) -> NDArray[np.float64]:
-        """Evaluate the stress and its derivative, and return the integrals of the derivative over each cell."""
+        """Evaluate the stress, and return the integrals of its derivative over each cell."""
         _, values = self._last(object(), lambda: (data.key, self._values.evaluate(data)))
         return sum_by(data.places.slots, data.volume * values[:, -1], len(data.places.filled))[:, None]
 
@@ -266,14 +266,14 @@ class StressAtPoints:
 
 
 class Cells:
-    """Cells with pieces of any part, `filled`, and the indices in `filled` of the cells of each part, `where`."""
+    """The cells with pieces that use F-bar, with indices of the cells of each part."""
 
     def __init__(self, of_parts: Sequence[NDArray[np.int32]]):
         self.filled = np.unique(np.concatenate(of_parts))
         self.where = [np.searchsorted(self.filled, cells) for cells in of_parts]
 
     def total(self, values: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
-        """Return the sums (cells, quantities) over the parts in the cells `filled`, from one array for each part."""
+        """Return the sums (cells, quantities) over all parts."""
         if len(values) == 1:
             return values[0]
         out = np.zeros((len(self.filled), values[0].shape[1]))

@@ -228,7 +228,7 @@ class MomentumForms:
             self.dilatation.assemble_matrix(K, data, sums)
 
     def at_nodes(self, cells: NDArray[np.int32], values: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
-        """Return nodal sums (k, nodes) of k quantities with values (cells, 2^d) or (cells, 1) in the cells."""
+        """Return nodal sums (k, nodes) of k quantities from their values in the cells."""
         (shared, values_at), nodes = self._rooms[0], self.active.now.nodes
         at = nodes.searchsorted(self.grid.cell_nodes[cells])
         of_nodes = np.array([of + np.zeros(at.shape) for of in values])
@@ -249,7 +249,7 @@ class MomentumForms:
         return Parts(count, of - 1, nodes)
 
     def active_nodes(self, cells: NDArray[np.int32]) -> NDArray[np.bool_]:
-        """Return whether each local node belongs to an active cell, from the owned active cells of all processes."""
+        """Return whether each local node belongs to an active cell of any process."""
         nodes = np.zeros(len(self.grid.node_x), dtype=bool)
         nodes[self.grid.cell_nodes[cells]] = True
         if self.grid.comm.size == 1:
@@ -262,7 +262,7 @@ class MomentumForms:
 
 
 def _by_pressure(law: type[Skeleton], F, values: Mapping[str, object], p) -> list:
-    """Return the derivative of a law's first Piola-Kirchhoff stress with respect to a pressure p, a UFL variable."""
+    """Return the derivative of the stress of a law with respect to a pressure, as UFL."""
     return [ufl.diff(law.first_piola(F, values), p)]
 
 
@@ -442,7 +442,7 @@ class MomentumProblem:
         return np.where(self.system.unknowns.map.indices[self.forms.active.now.dofs] >= 0, values, 0.0)
 
     def assemble_residual(self) -> tuple[PETSc.Vec, float]:
-        """Return the out-of-balance nodal forces at u, and the norm of the force scales of all parts, in N."""
+        """Return the out-of-balance nodal forces at u, and the norm of the force scales, in N."""
         r, scales = self.residual_of_parts()
         return r, float(np.linalg.norm(scales))
 
@@ -469,7 +469,7 @@ class MomentumProblem:
         return self._unbalanced()[0].copy()
 
     def _unbalanced(self) -> tuple[NDArray[np.float64], list[NDArray[np.float64]]]:
-        """Return the result of `unbalanced`, and the norms of its force terms in each part, in N."""
+        """Return the result of `unbalanced`, and the norms of its terms in each part, in N."""
         forms, system = self.forms, self.system
         b = forms.internal(self.data, self.loads)
         forces, external = b[system.touched], self._external

@@ -28,7 +28,7 @@ from mpm_dolfinx.parallel.exchange import over_all
 
 
 class PlateForms:
-    """Forms of a penalty on the tilt of a side under a plate: stiffness, and forces from the present tilt."""
+    """Forms of a penalty on the tilt of a side under a plate."""
 
     def __init__(self, grid: Grid, u: fem.Function):
         self.points = p = FormPoints(grid, rigidity=(), normal=(grid.dim,), tilt=(grid.dim,))

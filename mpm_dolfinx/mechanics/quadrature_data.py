@@ -46,7 +46,7 @@ too small with 9 cells, and 3.2 % too small with 17 cells.
 
 
 def corner_share(material: Skeleton, wet: bool) -> NDArray[np.float64]:
-    """Return the weight of the corner-based volume ratio in cells of a material at the start of a step."""
+    """Return the weight of the volume ratio from the corners at the start of a step."""
     stiffness = material.oedometric / material.shear
     return (
         np.minimum(np.maximum(2 - stiffness / STIFF_WET, 0.0), 1.0) if wet else np.minimum(1.0, STIFF_DRY / stiffness)
@@ -63,7 +63,7 @@ class QuadratureData:
     of_points: PointData  # like `pieces`, but volumes and F are not scaled for F-bar; for user-defined terms
 
     def increments(self, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return I + grad u at the positions where laws use it, from nodal displacements u, in m."""
+        """Return I + grad u at the positions where laws use it."""
         n, d = self.pieces.x.shape
         out, nodes = np.empty((n, d, d)), self.pieces.points.grid.cell_nodes
         for rows, part in zip(self.rows, self.parts, strict=True):
@@ -243,7 +243,7 @@ class QuadraturePoints:
     def mobility(
         self, cut: CutDomains, law: ConductivityAtPieces | None, data: PointData, begins: bool
     ) -> NDArray[np.float64]:
-        """Return the mobilities k / (rho_w g) at the integration points, in m^2/(Pa s), at the present displacement."""
+        """Return the mobilities k / (rho_w g) at the integration points, in m^2/(Pa s)."""
         if law is None:
             return self.rows(cut, cut.points, lambda m: m.conductivity) / self._fluid.unit_weight
         return law.evaluate(data, cut.to_cells(cut.points.material), begins) / self._fluid.unit_weight
@@ -257,7 +257,7 @@ class QuadraturePoints:
         return cut.to_cells(self.materials.conducting(cut.points))
 
     def fixed_stress(self, cut: CutDomains, points: MaterialPoints, of_fluid: bool) -> NDArray[np.float64]:
-        """Return beta, in 1/Pa, at the integration points, for the fixed-stress operator C + f beta V, see `Scheme`.
+        """Return the coefficient beta of the fixed-stress operator at the integration points, in 1/Pa.
 
         of_fluid: whether to return 1/K_w in place of beta, with which the iteration converges for stiff skeletons only.
         """

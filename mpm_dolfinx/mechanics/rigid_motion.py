@@ -68,7 +68,7 @@ def rigid_motion(
 def turned(
     comm: MPI.Intracomm, weight: NDArray[np.float64], x: NDArray[np.float64], to: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the rotation (d, d) nearest to a motion of weighted positions from x to `to` (Kabsch 1976).
+    """Return the rotation nearest to a motion of weighted positions (Kabsch 1976).
 
     The result is the identity for a negligible rotation or a poor fit.  All processes must call this function.
     """
@@ -92,7 +92,7 @@ def _apply(turn: Rotation, x: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _spin(x: NDArray[np.float64], e: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the velocities along directions e (n, d) at x (n, d) for a unit angular velocity about each axis."""
+    """Return the velocities along directions e for unit angular velocities about each axis."""
     if x.shape[1] == 2:
         return (x[:, :1] * e[:, 1:] - x[:, 1:] * e[:, :1]).copy()
     return np.cross(x, e)

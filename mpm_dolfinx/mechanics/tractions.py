@@ -59,7 +59,7 @@ class SideLoads(Acting):
         return places, travel.send(np.concatenate(forces))
 
     def _given(self, load: Any, t: float, side: Any) -> NDArray[np.float64]:
-        """Return the value of a load at time t, in s, on a side with these positions."""
+        """Return the value of a load on a side at time t, in s."""
         raise NotImplementedError
 
     def _on(
@@ -111,14 +111,14 @@ class DeadLoads(Loads):
 
 
 def owners(grid: Grid, patches: Sequence[Patches]) -> tuple[Exchange, Places]:
-    """Return the exchange that sends patch data to the owners of their cells, and the positions at the owners."""
+    """Return the exchange that sends patch data to the owners of cells, and the positions there."""
     cell, x = (np.concatenate([getattr(p, name) for p in patches]) for name in ("cell", "x"))
     travel = Exchange(grid.comm, grid.owner(cell))
     return travel, Places(grid, grid.locals[travel.send(cell)], travel.send(x))
 
 
 class PressureForms:
-    """Forms of the nodal forces of pressures; `push` is the force on the area at the start of the step."""
+    """Forms of the nodal forces of pressures, and of their derivatives."""
 
     def __init__(self, grid: Grid, u: fem.Function):
         self.points = p = FormPoints(grid, push=(grid.dim,))
@@ -199,7 +199,7 @@ def _held_walls(grid: Grid, free: NDArray[np.bool_]) -> list[tuple[int, float]]:
 
 
 def _closed(grid: Grid, walls: Sequence[tuple[int, float]], surfaces: Sequence[Surface]) -> bool:
-    """Return whether every edge of the faces belongs to two faces, or lies in a fixed wall."""
+    """Return whether every edge belongs to two faces or lies in a fixed wall."""
     x = np.concatenate([faces.places() for faces in surfaces])
     count, edges = x.shape[1], _EDGES[grid.dim]
     number = np.rint(

@@ -45,7 +45,7 @@ class PoreWater:
         return self.sums(mass_potential(p, self.bulk), self.emptied(p)[0])
 
     def sums(self, pi: NDArray[np.float64], empty: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the fluid contents of the cells, in m^d, from pi and (S - 1) rho of their pieces."""
+        """Return the fluid contents of the cells, in m^d, from values of their pieces."""
         return sum_by(self.slot, self.store * pi + self.pores * empty, len(self.scale))
 
     def level(

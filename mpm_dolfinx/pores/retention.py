@@ -186,7 +186,7 @@ def _number(law: Retention, name: str, test: Callable, allowed: str) -> None:
 
 
 def check_retention(what: str, law) -> None:
-    """Raise ValueError if S or k_r leaves [0, 1], is not 1 at p >= 0, or increases with the suction."""
+    """Raise ValueError if a retention curve is invalid."""
     missing = [name for name in METHODS if not callable(getattr(law, name, None))]
     if missing:
         raise ValueError(f"{what} = {line(law)}, must have {' and '.join(f'{name}(p)' for name in METHODS)}")
@@ -222,7 +222,7 @@ def chi_at(law, p: float) -> float:
 
 
 def _empty(function: Callable, suction: float) -> bool:
-    """Return whether a function is at most 0.5, or not a number, at a suction in Pa."""
+    """Return whether a function is at most 0.5, or not a number, at a suction."""
     try:
         return not _value(function, -suction) > 0.5
     except OverflowError:
@@ -288,7 +288,7 @@ class Retentions:
         return 0 if law is None else 1 + self.laws.index(law)
 
     def heads(self, lever: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the pressure of each piece minus the pressure of its cell, in Pa, from the field `lever`."""
+        """Return the pressure of each piece minus the pressure of its cell, in Pa."""
         return lever @ self.weight.value
 
     def at(self, p, points: FormPoints):
@@ -333,14 +333,14 @@ def _lifted(law, values: Sequence):
 
 
 def property_of(law, name: str, p):
-    """Return a property of a law at the pressure p, in Pa, as UFL; see `Retentions.of` for the names."""
+    """Return a property of a law at the pressure p, in Pa, as UFL."""
     if name == "bishop" and not hasattr(law, "bishop"):
         name = "saturation"
     return _called(law, name, p)
 
 
 def _called(law, name: str, p):
-    """Return the result of a method of a law as UFL, or raise ValueError if the method fails."""
+    """Return the result of a method of a law as UFL."""
     what = f"{line(law)}: {name}"
     out = asked(what, "UFL of p", lambda: ufl.as_ufl(getattr(law, name)(p)))
     if out.ufl_shape:

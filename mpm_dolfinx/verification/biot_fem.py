@@ -247,7 +247,7 @@ class BiotFEM:
         return f
 
     def _box(self, name: str, region: Region | None = None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the corners of a flat box around a side, or around the part of a side in a region."""
+        """Return the corners of a flat box around a side or a part of it."""
         grid, (axis, end) = self.grid, side(name, self.grid.dim)
         low, high = limits(region, grid.dim) - grid.base
         plane, near = (grid.low, grid.high)[end][axis], NEAR * grid.h
@@ -258,7 +258,7 @@ class BiotFEM:
         return low, high
 
     def _prescribe(self, space, value: float, name: str, region: Region | None = None):
-        """Return the boundary condition for a value of a scalar subspace on a side or a part of it."""
+        """Return the boundary condition for a value on a side or a part of it."""
         msh = self.grid.mesh
         d = self.grid.dim
         (low, high) = np.array(self._box(name, region))[:, :, None]
@@ -290,7 +290,7 @@ class BiotFEM:
         return area * float(np.squeeze(self.grid.around(middle[None])))
 
     def _on(self, condition: Traction | Pressure | Drained | RigidPlate, integrand):
-        """Return the integral over the part of a side on which a condition acts, as UFL."""
+        """Return the integral over the area on which a condition acts, as UFL."""
         low, high = map(self._constant, self._box(condition.side, condition.region))
         for a, x in enumerate(ufl.SpatialCoordinate(self.grid.mesh)):
             integrand = ufl.conditional(ufl.And(ufl.ge(x, low[a]), ufl.le(x, high[a])), integrand, 0.0)
@@ -359,7 +359,7 @@ class BiotFEM:
         return Forms(_compat.compiled(residual), _compat.compiled(tangent), flux, load, dt, since, t, given)
 
     def _grad(self, f):
-        """Return grad f as UFL; in axisymmetry the gradient of a vector has the shape (3, 3)."""
+        """Return grad f as UFL, with the shape (3, 3) for vectors in axisymmetry."""
         grad = ufl.grad(f)
         if not (self.grid.axisymmetric and f.ufl_shape):
             return grad
@@ -386,7 +386,7 @@ class BiotFEM:
         return self._pores.of("saturation", p) * (J - self._constant(1 - self.material.porosity))
 
     def _storage(self, F, u, J_n, p, p_n, q, dt: fem.Constant, outlets: Sequence[Drained] | None, pull):
-        """Return the change of the fluid content times q, and the flux in a time dt, as UFL.
+        """Return the change of the fluid content times q, and the flux, as UFL.
 
         pull: acceleration of gravity, in m/s^2
         """
@@ -523,7 +523,7 @@ class BiotFEM:
         return numbers("gravity", gravity(t), (d,), allowed=f"{d} finite numbers")
 
     def _solve(self, substep: Substep, dt: float) -> tuple[int, float]:
-        """Solve one substep of a step of length dt, and return the number of Newton iterations and the residual."""
+        """Solve one substep, and return the number of Newton iterations and the residual."""
         forms = self._forms
         space = self._space
         snes = self._snes
@@ -589,7 +589,7 @@ class BiotFEM:
         return [*norms, last], reason
 
     def _traction(self, load: Traction | Pressure, t: float) -> NDArray[np.float64] | float:
-        """Return the components (d,) of a traction at a time, or the value of a pressure, in Pa."""
+        """Return a traction (d,) or a pressure, in Pa, at a time."""
         if isinstance(load, Pressure):
             return float(load.at(t))
         value = load.at(t, self.grid.dim)
@@ -638,11 +638,11 @@ class BiotFEM:
         return replace(result, wall=time.perf_counter() - start, converged=True)
 
     def displacement(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the displacements (n, d), in m, at reference positions x (n, d) in the body, on every process."""
+        """Return the displacements (n, d), in m, at reference positions x (n, d), on every process."""
         return self._at(self._space.u, x, self.grid.dim)
 
     def pressure(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the pore pressures (n,), in Pa, at reference positions x (n, d) in the body, on every process."""
+        """Return the pore pressures (n,), in Pa, at reference positions x (n, d), on every process."""
         return self.scale * self._at(self._space.p, x, 1)[:, 0]
 
     def water(self) -> float:
@@ -653,7 +653,7 @@ class BiotFEM:
         return self.grid.comm.allreduce(fem.assemble_scalar(held))
 
     def _at(self, f: fem.Function, x: NDArray[np.float64], size: int) -> NDArray[np.float64]:
-        """Return the values (n, size) of a function at reference positions x (n, d), on every process."""
+        """Return the values of a function at reference positions on every process."""
         grid = self.grid
         out = np.zeros((len(x), size))
         x = x - self.grid.base

@@ -51,7 +51,7 @@ class _Rings:
         return stress[:, [0, 1], [0, 1]] * stretches.prod(axis=1, keepdims=True)
 
     def nominal(self, stretches: NDArray[np.float64], state: State) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the nominal stresses (n, 2), in Pa, and their derivatives (n, 2, 2) with respect to the stretches."""
+        """Return the nominal stresses, in Pa, and their derivatives with respect to the stretches."""
         nudges = SAME * np.array([[0, 0], [1, 0], [0, 1]])
         near = (stretches + nudges[:, None, :]).reshape(-1, 2)
         P = (self.kirchhoff(near, state, len(nudges)) / near).reshape(len(nudges), -1, 2)

@@ -37,7 +37,7 @@ ITERATIONS, CUTS, CLOSE = 30, 12, 1e-11  # limits: Newton iterations, halvings o
 
 @dataclass(frozen=True)
 class ElementTest:
-    """Results of an element test, as arrays with a row for the start and a row for each step.
+    """Results of an element test, as arrays with rows for the start and each step.
 
     F, stress : (n, 3, 3), -, Pa
         Deformation gradient, and effective Cauchy stress, tension positive.
@@ -201,7 +201,7 @@ class _Point:
         self._bulk = float(material.bulk)
 
     def _data(self, F: NDArray[np.float64], state: dict[str, NDArray[np.float64]]):
-        """Return the form data of the point for several deformation gradients F (m, 3, 3) and one state."""
+        """Return the form data of the point for several deformation gradients and one state."""
         m, grid = len(F), self._law.grid
         inputs = {name: np.tile(v, (m, *[1] * v.ndim)) for name, v in (self._parameters | state).items()}
         cells = np.arange(m, dtype=np.int32) % 8
@@ -263,7 +263,7 @@ class _Point:
         return self._balanced(at, F, free, start.stress[[0, 1], [0, 1]], strain, dt)
 
     def _wetted(self, at: _At, start: _At, suction: float, free: Sequence, dt: float) -> _At:
-        """Return the sample at a new suction, in Pa, with constant net stresses in the free components."""
+        """Return the sample at a new suction, with constant net stresses."""
         m = self._material
         effective, before = (m.biot * chi_at(m.retention, -s) * s for s in (suction, start.strain))
         goal = [start.stress[i] + before - effective for i in free]
@@ -273,7 +273,7 @@ class _Point:
     def _balanced(
         self, at: _At, F: NDArray[np.float64], free: Sequence, goal: ArrayLike, strain: float, dt: float
     ) -> _At:
-        """Return the sample after dt, in s, with free components of F that give prescribed Cauchy stresses, in Pa."""
+        """Return the sample after dt, in s, with prescribed stresses in the free components."""
         if not free:
             return self._updated(F, strain, at, dt)
         F, rows, columns = F.copy(), *np.array(free).T

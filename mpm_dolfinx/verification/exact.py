@@ -59,7 +59,7 @@ def _transient(k: complex, z: ArrayLike, T: Array) -> NDArray:
 
 
 def terzaghi_pressure(z: ArrayLike, t: ArrayLike, height: float, cv: float, p0: float = 1.0) -> Array:
-    """Return the pore pressure of a layer that drains at one end and is undrained at the other end.
+    """Return the pore pressure of a layer that drains at one end only.
 
     Parameters
     ----------
@@ -95,7 +95,7 @@ def terzaghi_consolidation(t: ArrayLike, height: float, cv: float) -> Array:
 
 @dataclass(frozen=True)
 class Mandel:
-    """Mandel's slab in plane strain, loaded at t = 0 by rigid smooth plates, and drained at its free lateral sides.
+    """Mandel's slab in plane strain, loaded by rigid smooth plates and drained at its lateral sides.
 
     The model is a quarter of the slab, with symmetry at x = 0 and y = 0.  The plate is at y = b, and the drained side
     is at x = a.
@@ -189,7 +189,7 @@ class Mandel:
         return lateral / self._oedometric, strain * y
 
     def _pressures(self, x: ArrayLike, t: ArrayLike) -> Array:
-        """Return the pressure, and the integral of the pressure from 0 to x divided by a, in Pa."""
+        """Return the pressure, and its integral from 0 to x divided by a, in Pa."""
         _positive(t=t)
         xi, T = np.broadcast_arrays(_within("x", x, self.a) / self.a, self.cv * np.asarray(t, dtype=float) / self.a**2)
         p0 = self.skempton * (1 + self.nu_undrained) * self.force / (3 * self.a)
@@ -356,7 +356,7 @@ def shear_flexible_rod(
 
 
 def _rod(loads: Array, axial: float, shear: float):
-    """Solve for (x, y, rotation, moment) of the rod with unit length and unit bending stiffness, in load steps."""
+    """Solve for (x, y, rotation, moment) of the rod with unit length and stiffness."""
     s, state = np.linspace(0, 1, 41), np.zeros((4, 41))
     state[0] = s
 
