@@ -35,12 +35,15 @@ from numpy.typing import NDArray
 from mpm_dolfinx.base.caching import Latest
 from mpm_dolfinx.forms.axes import block, embedded
 from mpm_dolfinx.forms.cell_matrices import Beside, insert
-from mpm_dolfinx.forms.point_forms import CellSums, FormPoints, PointData, PointExpression
+from mpm_dolfinx.forms.point_forms import CellSums, FormPoints, Given, PointData, PointExpression
 from mpm_dolfinx.grid.grid import Grid, sum_by
 from mpm_dolfinx.materials.skeleton import Skeleton
 from mpm_dolfinx.materials.user_functions import expression
 from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
 from mpm_dolfinx.points.material_points import ACROSS, with_ratio
+
+STRESS = "stress of the law"
+Key = tuple
 
 
 class SumsOfPart(NamedTuple):
@@ -180,6 +183,8 @@ class MeanDilatation:
         self._sums = list(parts.values())
         self._filled: Latest[Cells] = Latest()
         self._volume: Latest[NDArray[np.float64]] = Latest()
+        self._ratios: Latest[None] = Latest()
+        self._stresses: Latest[list[Given]] = Latest()
 
     def total(
         self, data: QuadratureData, sums: Sequence[NDArray[np.float64]]
@@ -187,22 +192,55 @@ class MeanDilatation:
         """Return the cells with F-bar, totals (cells, k) of `sums` over all parts, and the result of `_volume_of`."""
         return self._cells(data).filled, self._cells(data).total(sums), self._volume_of(data)
 
-    def update(self, data: QuadratureData, solve: Callable[[], None]) -> None:
-        """Set theta, the stresses and pi at the present displacement; solve: function that solves local unknowns."""
-        self._set_mean(self.theta, [of.ratio for of in self._sums], data)
-        solve()
-        self._set_mean(self.pi, [of.stress for of in self._sums], data)
+    def at(self, data: QuadratureData, motion: Key, others: Key, solve: Callable[[], Sequence[Given]]) -> list[Given]:
+        """Set theta and pi; all processes must call it.
 
-    def _set_mean(self, f: fem.Function, sums: Sequence[CellSums | StressAtPoints], data: QuadratureData) -> None:
+        Parameters
+        ----------
+        data
+            Integration points.
+        motion
+            Everything by which the deformation of the points changes, a key for `Latest`.
+        others
+            Everything else by which their stresses change, a key for `Latest`.
+        solve
+            Function that returns the values that the forms of each part are given; it solves for local unknowns.
+
+        Returns
+        -------
+        The values that the forms of each part are given, with stresses.
+        """
+
+        def stresses() -> list[Given]:
+            given, sums = [*solve()], []
+            for number, part, of in zip(self.numbers, self._parts(data), self._sums, strict=True):
+                values = of.stress.evaluate(part, given[number])
+                sums.append(sum_by(part.places.slots, part.volume * values[:, -1], len(part.places.filled))[:, None])
+                given[number] = {**given[number], STRESS: values[:, :-1]}
+            self._set_mean(self.pi, sums, data)
+            return given
+
+        self._set_ratios(data, motion)
+        return self._stresses((self._key(data), motion, others), stresses, self._grid.comm)
+
+    def _set_ratios(self, data: QuadratureData, motion: Key) -> None:
+        """Set theta; motion: see `at`."""
+
+        def ratios() -> None:
+            sums = [of.ratio(part) for of, part in zip(self._sums, self._parts(data), strict=True)]
+            self._set_mean(self.theta, sums, data)
+
+        self._ratios((self._key(data), motion), ratios)
+
+    def _set_mean(self, f: fem.Function, sums: Sequence[NDArray[np.float64]], data: QuadratureData) -> None:
         """Set f in each cell to the volume mean of a quantity over the pieces with F-bar.
 
-        sums: for each part of the scene's points, a function that sums quantity times volume in each cell.
+        sums: for each part of the scene's points, the sums (cells, 1) of quantity times volume in its cells.
         """
-        total = self._cells(data).total([of(part) for of, part in zip(sums, self._parts(data), strict=True)])
-        f.x.array[self._cells(data).filled] = total[:, 0] / self._volume_of(data)[:, 0]
+        f.x.array[self._cells(data).filled] = self._cells(data).total(sums)[:, 0] / self._volume_of(data)[:, 0]
 
     def assemble_matrix(self, A: PETSc.Mat, data: QuadratureData, sums: Sequence[NDArray[np.float64]]) -> None:
-        """Add the contribution of theta and pi at the last update to the tangent; the caller finalises the matrix.
+        """Add the contribution of theta and pi to the tangent; the caller finalises the matrix.
 
         sums: for each part, the integrals (cells, quantities) over each cell of `Beside` from `FBar.forms`.
         """
@@ -219,8 +257,9 @@ class MeanDilatation:
         matrices = b[:, :, None] * columns[:, None, :] + rows[:, :, None] * b[:, None, :]
         insert(A, self._grid, self._cells(data).filled, matrices)
 
-    def average(self, delta: NDArray[np.float64], data: QuadratureData) -> None:
-        """Scale the gradients Delta (m, d, d) of the pieces to the cell's volume ratio where F-bar is used."""
+    def average(self, delta: NDArray[np.float64], data: QuadratureData, motion: Key) -> None:
+        """Scale the gradients Delta (m, d, d) of the pieces to the cell's ratio theta where F-bar is used; see `at`."""
+        self._set_ratios(data, motion)
         for number in self.numbers:
             rows = data.rows[number]
             theta, own = self.theta.x.array[data.parts[number].cells], delta[rows]
@@ -234,15 +273,17 @@ class MeanDilatation:
         places = [part.places for part in self._parts(data)]
         return self._filled(tuple(p.key for p in places), lambda: Cells([p.filled for p in places]))
 
+    def _key(self, data: QuadratureData) -> Key:
+        return tuple(part.key for part in self._parts(data))
+
     def _volume_of(self, data: QuadratureData) -> NDArray[np.float64]:
         """Return the volumes (cells, 1), m^d, of the pieces that use F-bar."""
-        key = tuple(part.key for part in self._parts(data))
 
         def volumes() -> NDArray[np.float64]:
             sums = [sum_by(p.places.slots, p.volume, len(p.places.filled))[:, None] for p in self._parts(data)]
             return self._cells(data).total(sums)
 
-        return self._volume(key, volumes)
+        return self._volume(self._key(data), volumes)
 
 
 def _dev(tau, F):
@@ -258,23 +299,15 @@ class StressAtPoints:
     """
 
     def __init__(self, P, slope, points: FormPoints):
-        shape, self._last = P.ufl_shape, Latest()
+        shape = P.ufl_shape
         self._values = PointExpression(ufl.as_vector([*(P[i] for i in np.ndindex(shape)), slope]), points)
-        stress = points.follow("stress of the law", shape, self._stress)
+        stress = points.follow(STRESS, shape)
         self.P = block(stress) if points.grid.axisymmetric else stress
-        """The stress as UFL, with the values of the last evaluation."""
+        """The stress as UFL, with the values that its forms are given."""
 
-    def __call__(self, data: PointData) -> NDArray[np.float64]:
-        """Evaluate stress and derivative; return the sums (cells, 1) of the derivative in the cells of the points."""
-        _, values = self._last(object(), lambda: (data.key, self._values.evaluate(data)))
-        return sum_by(data.places.slots, data.volume * values[:, -1], len(data.places.filled))[:, None]
-
-    def _stress(self, data: PointData) -> NDArray[np.float64]:
-        """Return the stresses (n, d^2), Pa, of the last evaluation."""
-        of, values = self._last.value or (None, None)
-        if of is not data.key:
-            raise RuntimeError("stresses at points are used before their evaluation")
-        return values[:, :-1]
+    def evaluate(self, data: PointData, given: Given) -> NDArray[np.float64]:
+        """Return the components of the stress and the derivative, (n, d^2 + 1), Pa; given: of the law's forms."""
+        return self._values.evaluate(data, live=self._values.live(data, given))
 
 
 class Cells:

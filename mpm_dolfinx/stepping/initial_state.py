@@ -426,7 +426,6 @@ def balanced(scene: Scene, state: State) -> State:
             seen = [*seen[-DEPTH:], (w, forms.u.x.array.copy())]
             w, count = _mixed(unknowns, seen), count + 1
             forms.u.x.array[:] = w
-            forms.internal(start.data)  # sets the mean dilatation at w
             points = strained(materials, seeded.points, scene.motion.strained(seeded.points, start.on_grid, start.data))
     except StepFailed as error:
         scene.forget()
