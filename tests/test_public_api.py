@@ -16,7 +16,7 @@ GRID = mpm.Grid([0, 0], [1.0, 1.2], [4, 5])
 BODY = mpm.box(GRID, [0, 0], [1, 1])
 SOIL = mpm.Hencky(bulk=1e6, shear=6e5, conductivity=1e-5)
 WALLS = {"left": "x", "right": "x", "bottom": "y"}
-LONGEST = 14  # of `Simulation`, with inertia and velocity
+LONGEST = 12  # of `run` and `Simulation`
 LAWS = ("kirchhoff", "update")  # functions of laws, which name each constant that they use
 
 

@@ -163,6 +163,29 @@ class Body:
         return boxes * ratio[:, None] ** (1 / self.dim)
 
 
+@dataclass(frozen=True, eq=False)
+class Later:
+    """A body that is absent until `Simulation.stage` adds it: `Simulation(grid, [ground, Later(fill)], ...)`."""
+
+    body: Body
+
+    def __post_init__(self):
+        instance("Later: body", self.body, Body)
+
+
+@dataclass(frozen=True, eq=False)
+class Moving:
+    """Initial motion of bodies with inertia: `Simulation(..., inertia=Moving((0, -1)))`.
+
+    Parameters
+    ----------
+    velocity : (d,) or callable x (n, d) -> (n, d), m/s
+        Initial velocity of all bodies, or a function of position.
+    """
+
+    velocity: ArrayLike | Callable[[NDArray], ArrayLike]
+
+
 def mapped(grid: Grid, body: Body, map: Callable[[NDArray[np.float64]], NDArray[np.float64]]) -> Body:
     """Return a body deformed by a map: its boxes become quadrilaterals or hexahedra with mapped corners.
 

@@ -9,7 +9,6 @@ from contextlib import nullcontext
 from dataclasses import replace
 from inspect import signature
 from logging import INFO, WARNING
-from math import inf
 from typing import Any
 
 from mpi4py import MPI
@@ -30,7 +29,7 @@ from mpm_dolfinx.parallel.messages import ResolutionWarning, log, logger, warn
 from mpm_dolfinx.probing.probe_fields import probe_pressures, probe_stresses
 from mpm_dolfinx.probing.probes import Probes, check_there
 from mpm_dolfinx.simulation.events import Event, Events, Simulated, Step
-from mpm_dolfinx.simulation.step_size import StepSize, Times, measured, step_rule
+from mpm_dolfinx.simulation.step_size import Adaptive, StepSize, Times, measured, step_rule
 from mpm_dolfinx.simulation.summary import imbalance, peak_memory
 from mpm_dolfinx.stepping.distribution import distribute
 from mpm_dolfinx.stepping.result import GaveUp, Result
@@ -60,10 +59,8 @@ def run(
     t_end: float,
     dt: float | None = None,
     *,
-    rtol: float | None = None,
+    rtol: float | Adaptive | None = None,
     t_eval: Sequence[float] | None = None,
-    first_step: float | None = None,
-    max_step: float = inf,
     until: Event | Sequence[Event] | None = None,
     probes: Probes | None = None,
     observe: Observer | Sequence[Observer] = (),
@@ -84,20 +81,17 @@ def run(
         Step and output interval, s, > 0; limited to t_end - t. With `rtol`, `dt` is only the output interval. With
         `rtol`, and neither `dt` nor `t_eval`, every step is an output.
     rtol
-        Tolerance of adaptive steps. The estimated error of the pore pressures stays below about `rtol` times the
-        larger of two changes: the largest since the start of the run, and the undrained change of the step. `rtol` is
-        at least ten times `tolerance`, and < 1. If no fluid flows, the steps are the output intervals; a term or law
-        that depends on velocity then raises ValueError: its error cannot be estimated. With inertia the error of the
-        motion is limited too, relative to the largest motion since the start, see `motion_error`. In unsaturated soil
-        the error of the water content is limited too, relative to its largest change in a step so far. The estimate is
-        a fraction of a first-order step's error, see `solve.newton.ERROR`. The largest true error of a run was 0.7 to 5
-        times the largest estimate; the largest ratio occurs directly after a jump of the load.
+        Tolerance of adaptive steps, or this tolerance with limits of the steps: `Adaptive`. The estimated error of the
+        pore pressures stays below about `rtol` times the larger of two changes: the largest since the start of the run,
+        and the undrained change of the step. `rtol` is at least ten times `tolerance`, and < 1. If no fluid flows, the
+        steps are the output intervals; a term or law that depends on velocity then raises ValueError: its error cannot
+        be estimated. With inertia the error of the motion is limited too, relative to the largest motion since the
+        start, see `motion_error`. In unsaturated soil the error of the water content is limited too, relative to its
+        largest change in a step so far. The estimate is a fraction of a first-order step's error, see
+        `solve.newton.ERROR`. The largest true error of a run was 0.7 to 5 times the largest estimate; the largest ratio
+        occurs directly after a jump of the load.
     t_eval : (m,), s
         Output times, increasing, in (t, t_end]; t_end is always an output time. Steps end at output times.
-    first_step, max_step
-        With `rtol`: first trial step of a new run, and longest step, s, > 0. The default first step is 18 rtol times
-        the diffusion time of a cell, but at least 0.001 and at most 1 times the first output interval. With inertia it
-        is at most the time in which a wave crosses a cell.
     until
         One function of the simulation, or several, that end the run before t_end. An event occurs when a returned
         number changes sign within a step, or a returned boolean becomes True. A condition that holds at the start is no
@@ -132,7 +126,7 @@ def run(
     """
     comm = simulation.scene.grid.comm
     simulation.scene.check(simulation.state)
-    _check_alike(comm, {"t_end": t_end, "dt": dt, "rtol": rtol, "t_eval": t_eval, "max_step": max_step})
+    _check_alike(comm, {"t_end": t_end, "dt": dt, "rtol": rtol, "t_eval": t_eval})
     if probes is not None and not isinstance(probes, Probes):
         raise ValueError(f"probes = {line(probes)}, must be a result of `probes`")
     observers = [observe] if callable(observe) else observe
@@ -153,7 +147,7 @@ def run(
     start = now if after is None else after.rows[0].t
     times = Times(start, now, t_end, dt, t_eval, rtol, after is not None)
     state = simulation.scene.followed(simulation.state)  # the first step depends on the size of the cells
-    rule = step_rule(times, rtol, first_step, max_step, simulation.scene, state.points)
+    rule = step_rule(times, rtol, simulation.scene, state.points)
     result, control = _histories(simulation, times, rule, probes, after)
     stopwatch, last = _Stopwatch(result), result.rows[-1].t
     events = Events(simulation, until)
