@@ -185,5 +185,5 @@ def test_what_a_stage_gave_the_points_must_be_given_anew_when_a_body_comes():
         ValueError, match=r"stage: add: body 1: its points have no 'damage', must be given for all points"
     ):
         s.stage(add=[1])
-    s.stage(add=[1], fields={"damage": np.arange(sum(map(len, bodies)))})
+    s.stage(add=[1], fields={"damage": np.arange(sum(map(len, s.bodies)))})
     assert (s.points.data["damage"] == np.arange(len(s.points))).all()

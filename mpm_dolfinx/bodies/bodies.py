@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.base.validation import asked, at_places, instance, numbers
 from mpm_dolfinx.grid.grid import FACES, SIDES, Grid, begin_with, corner_bits, in_chunks
-from mpm_dolfinx.parallel.exchange import everywhere
+from mpm_dolfinx.parallel.exchange import together
 from mpm_dolfinx.points.cutting import centroids, domain_volumes, volumes
 from mpm_dolfinx.points.material_points import MaterialPoints
 
@@ -269,7 +269,7 @@ def material_points(
         F=np.broadcast_to(np.eye(grid.stretches), (n, grid.stretches, grid.stretches)),
         volume0=domain_volumes(corners, True) if grid.axisymmetric else size.prod(axis=1),
         material=material,
-        pressure=everywhere(grid.comm, lambda: pressure_at(pressure, x + grid.base)),
+        pressure=together(grid.comm, lambda: pressure_at(pressure, x + grid.base)),
         x=x,
         origin=corners,
         reference=corners,

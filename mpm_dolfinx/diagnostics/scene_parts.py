@@ -75,20 +75,16 @@ def check_axisymmetry(grid: Grid, bodies: Sequence[Body], quadrature: str) -> No
 
 
 def initial_velocity(grid: Grid, quadrature: str, inertia: bool | Moving | None) -> ArrayLike | Callable | None:
-    """Return the initial velocity of a scene; None if bodies have no inertia in all stages.
-
-    Raises
-    ------
-    ValueError
-        The velocity is invalid, or the scene does not support inertia.
-    """
+    """Return the initial velocity, None without inertia in all stages; ValueError if the scene does not allow it."""
     if inertia is None:
         return None
-    if not isinstance(inertia, Moving):
+    velocity = np.zeros(grid.dim)
+    if isinstance(inertia, Moving):
+        velocity = inertia.velocity
+    else:
         flag("inertia", inertia)
     if quadrature != "domain":
         raise ValueError(f"inertia = {line(inertia)} with quadrature {quadrature!r}, must be None")
-    velocity = inertia.velocity if isinstance(inertia, Moving) else np.zeros(grid.dim)
     if callable(velocity):
         check_names("velocity", velocity, ("x",))
     elif grid.axisymmetric and np.ravel(velocity)[:1].any():

@@ -31,7 +31,7 @@ from mpm_dolfinx.base.validation import asked, instance, line
 from mpm_dolfinx.forms.point_forms import FormPoints, Given, PointData, PointExpression
 from mpm_dolfinx.materials.skeleton import BY_SCENE, Skeleton
 from mpm_dolfinx.materials.user_functions import call, named
-from mpm_dolfinx.parallel.exchange import everywhere, first
+from mpm_dolfinx.parallel.exchange import first, together
 
 MOST, HALVINGS = 60, 25  # largest numbers of Newton iterations, and of step halvings in all iterations together
 
@@ -103,13 +103,9 @@ class LocalUnknowns:
         self.known = self.values if self._of_energy else given | _named(shapes, at["unknowns"])
 
     def solve(self, data: PointData, derive: bool = True) -> Given:
-        """Solve for the local unknowns of the points at their present F; all processes must call it.
+        """Return values that forms of the points are given: unknowns at their present F; all processes must call it.
 
         derive: whether to differentiate with respect to the trial values too; `values` needs this, `known` does not.
-
-        Returns
-        -------
-        The values that the forms of the points must be given.
 
         Raises
         ------
@@ -225,12 +221,12 @@ class _Equations:
             return [found[of][0].reshape(n, _size(shape)) for of, shape in self._unknowns.items()]
 
         def derive() -> Derived:
-            each = everywhere(self._grid.comm, lambda: [self._slopes_of(of, found[of][1], n) for of in self._unknowns])
+            each = together(self._grid.comm, lambda: [self._slopes_of(of, found[of][1], n) for of in self._unknowns])
             slopes = np.concatenate(each, axis=1)
             self._refuse(data, np.flatnonzero(~np.isfinite(slopes).all(axis=(1, 2))), ".solution: is not finite")
             return Derived(slopes.reshape(n, self.count * k))
 
-        y = np.concatenate(everywhere(self._grid.comm, solution), axis=1)
+        y = np.concatenate(together(self._grid.comm, solution), axis=1)
         self._refuse(data, np.flatnonzero(~np.isfinite(y).all(axis=1)), ".solution: is not finite")
         return Solved(y, trial, derive)
 

@@ -153,8 +153,8 @@ class InertiaForms:
         self._u, self._flight, self._rate = u, fem.Function(V), fem.Constant(grid.mesh, 0.0)
         self.acceleration = self._rate * (u - self._flight)
         """Acceleration at u as UFL, m/s^2."""
-        self.midpoint = False
-        """Whether the forms are those of a midpoint rule."""
+        self.midpoint = fem.Constant(grid.mesh, 0.0)
+        """1 in a substep with a midpoint rule, else 0."""
         for seen in dict.fromkeys([points, *of_laws] if not grid.axisymmetric else []):  # axisymmetric bodies: no spin
             chords: Latest[tuple[NDArray, NDArray]] = Latest()
             seen.follow("gradient", (d, d), partial(self._seen, chords, 0))
@@ -173,7 +173,7 @@ class InertiaForms:
 
     def set_substep(self, inertia: Inertia | None, midpoint: bool) -> None:
         """Set the forms' acceleration, zero if inertia is None; midpoint: whether the substep uses a midpoint rule."""
-        self.midpoint = midpoint and inertia is not None
+        self.midpoint.value = float(midpoint and inertia is not None)
         self._rate.value = 0.0 if inertia is None else inertia.rate
         if inertia is not None:
             self._flight.x.array[:] = inertia.flight
@@ -189,7 +189,7 @@ class InertiaForms:
         chords: the last result, shared by all forms at the same u; which: 0 for gradients, 1 for rotations.
         """
         G, d = data.gradients(self._u.x.array), self.grid.dim
-        if self.midpoint:
+        if self.midpoint.value:
             return chords(G, lambda: chord(G.reshape(-1, d, d)))[which].reshape(-1, d * d)
         return np.broadcast_to(np.eye(d).ravel(), G.shape) if which else G
 

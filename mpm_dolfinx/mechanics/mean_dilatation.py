@@ -43,14 +43,13 @@ from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
 from mpm_dolfinx.points.material_points import ACROSS, with_ratio
 
 STRESS = "stress of the law"
-Key = tuple
 
 
 class SumsOfPart(NamedTuple):
     """Sums in each cell over one part of the scene's integration points, for theta and pi: see `MeanDilatation`."""
 
     ratio: CellSums
-    stress: StressAtPoints
+    stress: PointExpression  # components of the stress P, and its derivative with respect to theta
 
 
 class FBar:
@@ -112,15 +111,17 @@ class FBar:
         to be summed over each cell.  Kernels that sum theta and pi over each cell, for `MeanDilatation`.
         """
         J_n, J = ufl.det(points.F), ufl.det(F)
-        P, slope = self._stress(law, F, Fbar, known)
-        sums = SumsOfPart(CellSums([ratio], points), StressAtPoints(P, slope / J_n, points))
+        P, slope = self.stresses(law, F, Fbar, known)
+        # evaluated once for both residual and pi
+        stress = PointExpression(ufl.as_vector([*(P[i] for i in np.ndindex(P.ufl_shape)), slope / J_n]), points)
+        sums, own = SumsOfPart(CellSums([ratio], points), stress), points.follow(STRESS, P.ufl_shape)
         P_F, P_theta, slope_F, slope_theta = self._slopes(law, F, Fbar, values)
         shared, share = self.pi * ufl.diff(J, F), 1 / J_n
         along = [share * T for T in (ufl.diff(J, F), slope_F, *([] if self.symmetric else [P_theta]))]
         beside = Beside(along, [share * slope_theta])
-        return sums.stress.P + shared, P_F + ufl.diff(shared, F), beside, sums
+        return (block(own) if self.grid.axisymmetric else own) + shared, P_F + ufl.diff(shared, F), beside, sums
 
-    def _stress(self, law: type[Skeleton], F, Fbar, values: Mapping[str, object]) -> tuple:
+    def stresses(self, law: type[Skeleton], F, Fbar, values: Mapping[str, object]) -> tuple:
         """Return the derivatives of psi(Fbar), or of the work of a law without energy, with respect to F and theta."""
         if law.kirchhoff is None:
             energy = expression(law.energy, [()], F=Fbar, **values)
@@ -129,12 +130,8 @@ class FBar:
         mean = ufl.tr(tau) / Fbar.ufl_shape[0]
         return _dev(tau, F) * ufl.inv(F).T, mean / self._theta
 
-    def by_pressure(self, law: type[Skeleton], F, Fbar, values: Mapping[str, object], p) -> list:
-        """Return the derivatives of both results of `_stress` with respect to a pressure p, a UFL variable."""
-        return [ufl.diff(of, p) for of in self._stress(law, F, Fbar, values)]
-
     def _slopes(self, law: type[Skeleton], F, Fbar, values: Mapping[str, object]) -> tuple:
-        """Return the derivatives of both results of `_stress` with respect to F and theta.
+        """Return the derivatives of both results of `stresses` with respect to F and theta.
 
         In 2D a law without an energy is differentiated with respect to Fbar only, which halves the time for tangents.
         With Fbar = s F,
@@ -143,7 +140,7 @@ class FBar:
 
         for F (d, d) and the same components of s F. In 3D this would take two minutes to compile.
         """
-        P, slope = self._stress(law, F, Fbar, values)
+        P, slope = self.stresses(law, F, Fbar, values)
         if law.kirchhoff is None or self.grid.dim == 3:
             return tuple(ufl.diff(of, by) for of in (P, slope) for by in (F, self._theta))
         d, n = range(F.ufl_shape[0]), Fbar.ufl_shape[0]
@@ -173,10 +170,11 @@ class MeanDilatation:
     """The volume ratio theta of the step in each cell, and its work-conjugate mean stress pi, for F-bar.
 
     fbar: the fields theta and pi; parts: sums of the parts in which cells would lock, by index of the part, see
-    `QuadratureData`.
+    `QuadratureData`; dt: time since the start of the step, s; suction: pressures by which stresses change, or None.
     """
 
-    def __init__(self, fbar: FBar, parts: Mapping[int, SumsOfPart]):
+    def __init__(self, fbar: FBar, parts: Mapping[int, SumsOfPart], dt: fem.Constant, suction: fem.Function | None):
+        self._dt, self._suction = dt, suction
         self._grid, self._symmetric = fbar.grid, fbar.symmetric
         self.theta, self.pi = fbar.theta, fbar.pi
         self.numbers = list(parts)
@@ -192,38 +190,28 @@ class MeanDilatation:
         """Return the cells with F-bar, totals (cells, k) of `sums` over all parts, and the result of `_volume_of`."""
         return self._cells(data).filled, self._cells(data).total(sums), self._volume_of(data)
 
-    def at(self, data: QuadratureData, motion: Key, others: Key, solve: Callable[[], Sequence[Given]]) -> list[Given]:
-        """Set theta and pi; all processes must call it.
+    def at(self, data: QuadratureData, motion: tuple, solve: Callable[[], Sequence[Given]]) -> list[Given]:
+        """Set theta and pi, and return the values that the forms of each part are given; all processes must call it.
 
-        Parameters
-        ----------
-        data
-            Integration points.
-        motion
-            Everything by which the deformation of the points changes, a key for `Latest`.
-        others
-            Everything else by which their stresses change, a key for `Latest`.
-        solve
-            Function that returns the values that the forms of each part are given; it solves for local unknowns.
-
-        Returns
-        -------
-        The values that the forms of each part are given, with stresses.
+        motion: everything by which deformations change at the integration points `data`, a key for `Latest`; solve:
+        function that returns these values without stresses, see `LocalUnknowns`.
         """
 
-        def stresses() -> list[Given]:
+        def given_stresses() -> list[Given]:
             given, sums = [*solve()], []
             for number, part, of in zip(self.numbers, self._parts(data), self._sums, strict=True):
-                values = of.stress.evaluate(part, given[number])
+                values = of.stress.evaluate(part, live=of.stress.live(part, given[number]))
                 sums.append(sum_by(part.places.slots, part.volume * values[:, -1], len(part.places.filled))[:, None])
                 given[number] = {**given[number], STRESS: values[:, :-1]}
             self._set_mean(self.pi, sums, data)
             return given
 
         self._set_ratios(data, motion)
-        return self._stresses((self._key(data), motion, others), stresses, self._grid.comm)
+        suction = None if self._suction is None else self._suction.x.array.copy()
+        key = self._key(data), motion, float(self._dt.value), suction
+        return self._stresses(key, given_stresses, self._grid.comm)
 
-    def _set_ratios(self, data: QuadratureData, motion: Key) -> None:
+    def _set_ratios(self, data: QuadratureData, motion: tuple) -> None:
         """Set theta; motion: see `at`."""
 
         def ratios() -> None:
@@ -257,7 +245,7 @@ class MeanDilatation:
         matrices = b[:, :, None] * columns[:, None, :] + rows[:, :, None] * b[:, None, :]
         insert(A, self._grid, self._cells(data).filled, matrices)
 
-    def average(self, delta: NDArray[np.float64], data: QuadratureData, motion: Key) -> None:
+    def average(self, delta: NDArray[np.float64], data: QuadratureData, motion: tuple) -> None:
         """Scale the gradients Delta (m, d, d) of the pieces to the cell's ratio theta where F-bar is used; see `at`."""
         self._set_ratios(data, motion)
         for number in self.numbers:
@@ -273,41 +261,24 @@ class MeanDilatation:
         places = [part.places for part in self._parts(data)]
         return self._filled(tuple(p.key for p in places), lambda: Cells([p.filled for p in places]))
 
-    def _key(self, data: QuadratureData) -> Key:
+    def _key(self, data: QuadratureData) -> tuple:
         return tuple(part.key for part in self._parts(data))
 
     def _volume_of(self, data: QuadratureData) -> NDArray[np.float64]:
         """Return the volumes (cells, 1), m^d, of the pieces that use F-bar."""
+        key = self._key(data)
 
         def volumes() -> NDArray[np.float64]:
             sums = [sum_by(p.places.slots, p.volume, len(p.places.filled))[:, None] for p in self._parts(data)]
             return self._cells(data).total(sums)
 
-        return self._volume(self._key(data), volumes)
+        return self._volume(key, volumes)
 
 
 def _dev(tau, F):
     """Return the components (d, d) of the deviator of a UFL tensor, in the axes of F (d, d)."""
     d, mean = range(F.ufl_shape[0]), ufl.tr(tau) / tau.ufl_shape[0]
     return ufl.as_matrix([[tau[a, b] - mean if a == b else tau[a, b] for b in d] for a in d])
-
-
-class StressAtPoints:
-    """Stress P of a law and its derivative with respect to theta, evaluated once for both residual and pi.
-
-    P (d, d), slope: the stress and its derivative, as UFL; points: integration points of the part.
-    """
-
-    def __init__(self, P, slope, points: FormPoints):
-        shape = P.ufl_shape
-        self._values = PointExpression(ufl.as_vector([*(P[i] for i in np.ndindex(shape)), slope]), points)
-        stress = points.follow(STRESS, shape)
-        self.P = block(stress) if points.grid.axisymmetric else stress
-        """The stress as UFL, with the values that its forms are given."""
-
-    def evaluate(self, data: PointData, given: Given) -> NDArray[np.float64]:
-        """Return the components of the stress and the derivative, (n, d^2 + 1), Pa; given: of the law's forms."""
-        return self._values.evaluate(data, live=self._values.live(data, given))
 
 
 class Cells:

@@ -111,10 +111,9 @@ class MomentumForms:
         self.law_forms = [self._forms_of_law(*law, pressure, dried, symmetric, dt) for law in laws]
         """Forms of each part of the points."""
         locked = {number: part.means for number, part in enumerate(self.law_forms) if part.means is not None}
-        self.dilatation = MeanDilatation(self._fbar, locked) if locked else None
+        self.dilatation = MeanDilatation(self._fbar, locked, dt, pressure if dried else None) if locked else None
         sums = [part.dried for part in self.law_forms]
         self._of_suction = OfSuction(grid.dim, self.dilatation, sums) if dried else None
-        self._dt, self._pressure = dt, pressure
         self.velocity = Velocity(self.u)
         self.conditions = FormsOf(grid, self.u, self.velocity)
         """Forms of the scene's conditions."""
@@ -167,7 +166,8 @@ class MomentumForms:
             P, A = law.first_piola(F, known), ufl.diff(law.first_piola(F, values), F)
         slopes = []
         if p is not None:
-            slopes = self._fbar.by_pressure(law, F, seen, values, p) if locks else _by_pressure(law, F, values, p)
+            stresses = self._fbar.stresses(law, F, seen, values) if locks else [law.first_piola(F, values)]
+            slopes = [ufl.diff(of, p) for of in stresses]
         sums = suction_sums(points, F, slopes, locks) if dried else None
         if pressure is not None:
             of_pressure = -points.biot * pressure * ufl.diff(ufl.det(F), F)
@@ -213,7 +213,7 @@ class MomentumForms:
     def internal(self, data: QuadratureData, loads: Sequence[Loads] = ()) -> NDArray[np.float64]:
         """Return the nodal forces of the stresses at u and of `Loads.takes_up`, N, a local array."""
 
-        given = self._given(data)
+        given = self._nothing or self._given(data)
 
         def add(b: NDArray[np.float64]) -> None:
             for forms, part, values in zip(self.law_forms, data.parts, given, strict=True):
@@ -223,7 +223,7 @@ class MomentumForms:
 
     def assemble_tangent(self, K: PETSc.Mat, data: QuadratureData) -> None:
         """Add the tangent of the stresses at u to K; the caller finalises K."""
-        parts = zip(self.law_forms, data.parts, self._given(data, derive=True), strict=True)
+        parts = zip(self.law_forms, data.parts, self._nothing or self._given(data, derive=True), strict=True)
         sums = [forms.tangent.assemble_matrix(K, part, given) for forms, part, given in parts]
         if self.dilatation is not None:
             self.dilatation.assemble_matrix(K, data, sums)
@@ -236,7 +236,13 @@ class MomentumForms:
     @property
     def _motion(self) -> tuple:
         """Everything by which deformations change for the same integration points, a key for `Latest`."""
-        return self.u.x.array[self.active.now.dofs], self.inertia is not None and self.inertia.midpoint
+        return self.u.x.array[self.active.now.dofs], self.inertia and float(self.inertia.midpoint.value)
+
+    @cached_property
+    def _nothing(self) -> list[Given]:
+        """Result of `_given` if no law has local unknowns or F-bar, else an empty list."""
+        some = self.dilatation is not None or any(forms.local is not None for forms in self.law_forms)
+        return [] if some else [NONE] * len(self.law_forms)
 
     def _given(self, data: QuadratureData, derive: bool = False) -> Sequence[Given]:
         """Return the values at u that the forms of each part are given, and set theta and pi; see `LocalUnknowns`."""
@@ -247,8 +253,7 @@ class MomentumForms:
 
         if self.dilatation is None:
             return solve(derive)
-        others = float(self._dt.value), None if self._of_suction is None else self._pressure.x.array.copy()
-        given = self.dilatation.at(data, self._motion, others, solve)
+        given = self.dilatation.at(data, self._motion, solve)
         return [{**a, **b} for a, b in zip(given, solve(derive), strict=True)] if derive else given
 
     def at_nodes(self, cells: NDArray[np.int32], values: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
@@ -283,11 +288,6 @@ class MomentumForms:
         _compat.scatter_reverse_add(shared)
         shared.x.scatter_forward()
         return values[:: self.grid.dim] > 0
-
-
-def _by_pressure(law: type[Skeleton], F, values: Mapping[str, object], p) -> list:
-    """Return the derivative of a law's first Piola-Kirchhoff stress with respect to a pressure p, a UFL variable."""
-    return [ufl.diff(law.first_piola(F, values), p)]
 
 
 class MomentumSystem:

@@ -34,7 +34,7 @@ from mpm_dolfinx.stepping.distribution import distribute
 from mpm_dolfinx.stepping.initial_state import balanced, begin_stage, first_state
 from mpm_dolfinx.stepping.result import Result
 from mpm_dolfinx.stepping.scene import Scene
-from mpm_dolfinx.stepping.stage import Condition, checked
+from mpm_dolfinx.stepping.stage import Condition, checked, contacts_of
 from mpm_dolfinx.stepping.state import State
 from mpm_dolfinx.stepping.step import step
 
@@ -109,7 +109,7 @@ class Simulation:
         bodies, later = checked_parts(grid, bodies, materials)
         terms, sources = sorted_terms(terms)
         check_options(bodies, fluid, pressure, terms, sources, quadrature)
-        grid = grouped(grid, bodies, checked(conditions), quadrature, {"terms": terms, "sources": sources})
+        grid = grouped(grid, bodies, contacts_of(checked(conditions)), quadrature, {"terms": terms, "sources": sources})
         grid = grid.shared(points_in_cells(grid, bodies), keep=bool(len(terms) + len(sources)))
         check_stiff(grid, bodies)
         warn_thin(grid, bodies, with_axis(grid, walls), fluid is not None)

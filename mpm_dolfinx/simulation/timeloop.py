@@ -7,11 +7,10 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
+from functools import partial
 from inspect import signature
 from logging import INFO, WARNING
 from typing import Any
-
-from mpi4py import MPI
 
 import numpy as np
 from tqdm import tqdm
@@ -24,11 +23,11 @@ from mpm_dolfinx.base.time_integration import EULER
 from mpm_dolfinx.base.tolerances import SAME
 from mpm_dolfinx.base.validation import flag, functions, instance, line
 from mpm_dolfinx.dynamics.energies import initial_energies
-from mpm_dolfinx.parallel.exchange import first
+from mpm_dolfinx.parallel.exchange import by_user
 from mpm_dolfinx.parallel.messages import ResolutionWarning, log, logger, warn
 from mpm_dolfinx.probing.probe_fields import probe_pressures, probe_stresses
 from mpm_dolfinx.probing.probes import Probes, check_there
-from mpm_dolfinx.simulation.events import Event, Events, Simulated, Step
+from mpm_dolfinx.simulation.events import Event, Events, Simulated, Step, check_alike
 from mpm_dolfinx.simulation.step_size import Adaptive, StepSize, Times, measured, step_rule
 from mpm_dolfinx.simulation.summary import imbalance, peak_memory
 from mpm_dolfinx.stepping.distribution import distribute
@@ -126,7 +125,7 @@ def run(
     """
     comm = simulation.scene.grid.comm
     simulation.scene.check(simulation.state)
-    _check_alike(comm, {"t_end": t_end, "dt": dt, "rtol": rtol, "t_eval": t_eval})
+    check_alike(comm, {"t_end": t_end, "dt": dt, "rtol": rtol, "t_eval": t_eval})
     if probes is not None and not isinstance(probes, Probes):
         raise ValueError(f"probes = {line(probes)}, must be a result of `probes`")
     observers = [observe] if callable(observe) else observe
@@ -160,7 +159,7 @@ def run(
             ended = replace(simulation.state.result, converged=converged)
             _note(simulation, stopwatch.read(ended).more(_row(simulation, probes)))
             for observer in observers:
-                _observe(observer, simulation, comm)
+                by_user(comm, f"observe: {line(observer)}", partial(observer, simulation))
             if checkpoint is not None:
                 _note(simulation, stopwatch.read(simulation.state.result))
                 checkpoint(simulation)
@@ -180,16 +179,6 @@ def run(
             simulation.state = replace(simulation.state, t=target)
             output(target == times.end)
     return _note(simulation, stopwatch.read(_measured(simulation)))
-
-
-def _check_alike(comm: MPI.Intracomm, given: dict[str, Any]) -> None:
-    """Raise ValueError if arguments differ between processes: the processes would wait for each other."""
-    texts = comm.allgather([line(value) for value in given.values()])
-    for k, name in enumerate(given):
-        for rank, text in enumerate(texts):
-            if text[k] != texts[0][k]:
-                what = f"{name} = {texts[0][k]} on process 0, {text[k]} on process {rank}"
-                raise ValueError(f"{what}, must be the same on all")
 
 
 def _bar(start: float, now: float, end: float, shown: bool) -> tqdm:
@@ -219,20 +208,6 @@ def _takes_nothing(function: Callable) -> bool:
         return not signature(function).parameters
     except (TypeError, ValueError):
         return False
-
-
-def _observe(observer: Callable, simulation: Simulated, comm: MPI.Intracomm) -> None:
-    """Call an observer; an error on one process is raised on all, so that no process waits for the others."""
-    raised = None
-    try:
-        observer(simulation)
-    except BaseException as error:  # including Ctrl-C
-        raised = error
-    where = first(comm, "" if raised is None else f"process {comm.rank}")
-    if raised is not None:
-        raise raised
-    if where:
-        raise RuntimeError(f"observe: {line(observer)} raised an error on {where}")
 
 
 def _histories(
