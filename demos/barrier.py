@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: MIT
 """A bank of clay loses strength and slides against a rigid barrier: run-out, and force on the barrier.
 
-Half of a bank of undrained clay, H = 10 m high and 10 m long, stands with a vertical side on a rough floor.  Within ten
-minutes the strength c of the clay falls from 0.3 to 0.07 gamma H (gamma: unit weight); the bank is stable while c >
-0.26 gamma H.  Inertia is neglected.  A viscous stress, a term in UFL, limits the velocity, and vanishes without
-motion.  A wall with an adhesion of c / 2 stops the clay.
+The scene is half of a bank of undrained clay on a rough floor.  This half is H = 10 m high and 10 m long, with a
+vertical side.  Within ten minutes the strength c of the clay decreases from 0.3 to 0.07 gamma H, with the unit weight
+gamma.  The bank is stable while c > 0.26 gamma H.  Inertia is neglected.  A viscous stress (a term in UFL) limits the
+velocity, and vanishes at rest.  A wall with an adhesion of c / 2 stops the clay.
 
-After the slide the shear stress on any plane is at most c.  Consider a wedge of weight W between the wall and a plane
-through the foot of the wall, of inclination theta and length l.  The equilibrium of this wedge bounds the force F
-normal to the wall.  The shear force V on the wall is at most c D / 2, with D the depth of clay at the wall:
+After the slide the shear stress on any plane is at most c.  Consider a plane of inclination theta and length l through
+the foot of the wall.  The clay between the wall and this plane is a wedge of weight W.  The shear force V on the wall
+is at most c D / 2, with the depth D of the clay at the wall.  The equilibrium of the wedge then bounds the force F
+normal to the wall:
 
     F >= ((W - V) sin(theta) - c l) / cos(theta),        F <= ((W + V) sin(theta) + c l) / cos(theta).
 
@@ -40,7 +41,7 @@ ANGLES = np.radians(np.linspace(20, 85, 261))  # angles of the planes of wedges
 
 
 def bank(cells: int, barrier: bool) -> mpm.Simulation:
-    """Return the bank in equilibrium at t = 0, with a number of cells over its height."""
+    """Return the bank, `cells` cells high, in equilibrium at t = 0."""
     h = HEIGHT / cells
     grid = mpm.Grid([0, 0], [LENGTH, HEIGHT + h], [round(LENGTH / h), cells + 1])
     clay = mpm.DruckerPrager(
@@ -63,9 +64,11 @@ def bank(cells: int, barrier: bool) -> mpm.Simulation:
 class Frame:
     """The bank at a time, s.
 
-    corners (n, 4, 2), m; moved (n,), m: magnitudes of the displacements of the points; force on the barrier (3,):
-    normal and shear force, N/m, and moment about the foot, N; bounds: bounds of the normal force, N/m; depth of the
-    clay at the barrier, m.
+    corners (n, 4, 2): corners of the domains, in m.
+    moved (n,): magnitudes of the displacements of the points, in m.
+    force (3,): normal and shear force on the barrier, in N/m, and moment about its foot, in N.
+    bounds: bounds of the normal force, in N/m.
+    depth: depth of the clay at the barrier, in m.
     """
 
     t: float
@@ -82,7 +85,7 @@ class Frame:
 
 
 def bounds(s: mpm.Simulation, depth: float) -> tuple[float, float]:
-    """Return the active and the passive force, N/m, of the clay in front of the barrier, for its present strength."""
+    """Return the active and the passive force, N/m, on the barrier for the present strength of the clay."""
     x, c = s.points.x, s.points.data["cohesion"][0]
     sin, cos, rubs = np.sin(ANGLES), np.cos(ANGLES), ADHESION * depth
     off = x[:, 1, None] * cos - (WALL - x[:, 0, None]) * sin  # (n, planes), m
@@ -173,9 +176,9 @@ def draw(o: Namespace, free: Slump, held: Slump) -> None:
     fig, axes = common.figure(2, 2, (13, 6.6))
     meets = next(k for k, f in enumerate(held.frames) if f.force[0] > 0)
     shown = [
-        (axes[0, 0], held.frames[meets], f"first contact after {held.frames[meets].t / 60:.1f} minutes"),
-        (axes[0, 1], held.frames[-1], "at rest against the barrier"),
-        (axes[1, 0], free.frames[-1], "at rest without a barrier"),
+        (axes[0, 0], held.frames[meets], f"First contact after {held.frames[meets].t / 60:.1f} minutes"),
+        (axes[0, 1], held.frames[-1], "At rest against the barrier"),
+        (axes[1, 0], free.frames[-1], "At rest without a barrier"),
     ]
     top = max(f.moved.max() for _, f, _ in shown)
     for ax, frame, title in shown:
@@ -194,7 +197,7 @@ def draw(o: Namespace, free: Slump, held: Slump) -> None:
     for k, name in enumerate(("active", "passive")):
         values = [f.bounds[k] / 1e3 for f in after]
         ax.plot([f.t / 60 for f in after], values, color="k", ls=("--", ":")[k], lw=1, label=f"{name}, of wedges")
-    ax.set(xlabel="time (minutes)", ylabel="force (kN/m)", title="normal force", xlim=(0, 2 * DURATION / 60))
+    ax.set(xlabel="time (minutes)", ylabel="force (kN/m)", title="Normal force", xlim=(0, 2 * DURATION / 60))
     ax.set(ylim=(0, 2.5 * F.max()))
     ax.legend(fontsize=9)
     ax.grid(alpha=0.3)

@@ -1,15 +1,16 @@
 # SPDX-License-Identifier: MIT
 """Cost of each feature of a scene, measured with a pair of scenes, one with and one without this feature.
 
-A square block of 1 m between smooth walls carries a load so small that the active cells do not change.  In each pair
-one scene has no such feature, and in the other scene the feature has almost no effect.  Examples are a gravity of zero,
-a conductivity of 1e-30 m/s, a plastic law far from yield, and a stabilisation without anything to damp.  `settlement`
-is the relative difference between the final settlements of the two scenes.  In the pair for mean dilatation, this
-difference is caused by different Poisson ratios.
+A square block of 1 m between smooth walls carries a load so small that the active cells do not change.  In each pair,
+one scene lacks the feature, and the other scene has it almost without effect.  Examples are a gravity of zero, a
+conductivity of 1e-30 m/s, a plastic law far from yield, and a stabilisation without anything to damp.  `settlement` is
+the relative difference between the final settlements of the two scenes.  In the pair "mean dilatation" (F-bar),
+different Poisson ratios cause this difference.
 
 The two scenes are timed in turn, one step each, --repeat times.  The shortest step of each scene is used, because other
-work on the machine only increases times.  The compile time is the additional time for the scene and its first step if
-the cache of compiled forms is empty.  Memory is the peak memory with a full cache.  All times are processor times.
+work on the machine only increases times.  The compile time is the extra time for a scene and its first step with an
+empty cache of compiled forms.  Memory is the peak memory with a full cache of compiled forms.  All times are processor
+times.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ HEAVY = {"gravity": (0, 0), "numerics": mpm.Numerics(coupling="schur-fgmres"), *
 
 
 def soil(law: type[mpm.Skeleton] = mpm.Hencky, nu: float = 0.0, **options) -> mpm.Skeleton:
-    """Return a skeleton with a Poisson ratio."""
+    """Return a skeleton with the law `law` and the Poisson ratio nu."""
     return law(bulk=2 * SHEAR * (1 + nu) / (3 * (1 - 2 * nu)), shear=SHEAR, **options)
 
 
@@ -73,7 +74,7 @@ def block(
 
 
 def meshed(grid: mpm.Grid, cells: int):
-    """Return the block, made from a mesh, with the same particle domains as by `mpm.box`."""
+    """Return the block, made from a mesh; its particle domains equal the domains that `mpm.box` makes."""
     square = mesh.create_rectangle(MPI.COMM_SELF, [[0, 0], [1, 1]], [2 * cells] * 2, mesh.CellType.quadrilateral)
     top = np.sort(mesh.locate_entities_boundary(square, 1, lambda x: np.isclose(x[1], 1)))
     tags = mesh.meshtags(square, 1, top, np.ones(len(top), dtype=np.int32))
@@ -92,7 +93,7 @@ def weighted(cells: int) -> mpm.Simulation:
 
 
 def restless(cells: int, **options) -> mpm.Simulation:
-    """Return the block with the grid reset in each step, as if it had moved."""
+    """Return the block with the grid reset in each step, as if the block had moved."""
     simulation = block(cells, **options)
     motion = simulation.scene.motion
     motion.advanced = partial(motion.advanced, stays=False)
@@ -100,7 +101,7 @@ def restless(cells: int, **options) -> mpm.Simulation:
 
 
 def of_many_sizes(cells: int, moves: bool, **options) -> mpm.Simulation:
-    """Return the block with the grid reset in each step, in cells of two sizes; moves: whether grid lines oscillate."""
+    """Return the block in cells of two sizes, with the grid reset in each step; moves: whether grid lines oscillate."""
 
     def lines(t: float) -> list[np.ndarray]:
         even = [np.linspace(0, end, n + 1) for end, n in ((1, cells), (1 + 2 / cells, cells + 2))]
@@ -148,9 +149,10 @@ class Watched(mpm.Hencky):
 
 
 def conducting(cells: int, law: type[mpm.Skeleton]) -> mpm.Simulation:
-    """Return the draining block with kappa dt = 8 tau h² in a substep: mobility kappa, damping tau of Hencky's law.
+    """Return the draining block, with the mobility `kappa = 8 tau h² / dt` for the damping tau of Hencky's law.
 
-    Pressure jumps are evaluated if kappa dt < 4 tau h², and damped if kappa dt < tau h², with tau of the law `law`.
+    In a substep dt, pressure jumps are evaluated if `kappa dt < 4 tau h²`, and damped if `kappa dt < tau h²`. In these
+    conditions tau is the damping of the law `law`.
     """
     kappa = 8 * soil().pressure_damping() / cells**2 / (GAMMA * DT)
     return block(cells, soil(law, conductivity=kappa * WATER["fluid"].unit_weight), **WATER)
@@ -159,7 +161,7 @@ def conducting(cells: int, law: type[mpm.Skeleton]) -> mpm.Simulation:
 def sealed_soil(cells: int, yields: bool = True) -> mpm.Simulation:
     """Return the undrained block of plastic soil.
 
-    yields: damp pressure jumps as in yielding soil; otherwise as in elastic soil.
+    yields: whether pressure jumps are damped as in yielding soil, instead of as in elastic soil.
     """
     simulation = block(cells, soil(mpm.DruckerPrager, friction=0.0, dilation=0.0, cohesion=LOAD), **SEALED)
     if not yields:
@@ -179,7 +181,10 @@ def yielded(cells: int, **options) -> mpm.Simulation:
 
 
 def clayey(cells: int) -> mpm.Simulation:
-    """Return the block of overconsolidated clay of the same bulk modulus, under its initial stress and a load."""
+    """Return the block of overconsolidated clay, under its initial stress and a load.
+
+    Its initial bulk modulus is that of `soil`.
+    """
     p = 1e5  # Pa
     moduli = {"shear": SHEAR, "kappa": p / soil().bulk, "lambda_": 5 * p / soil().bulk}
     clay = mpm.ModifiedCamClay(M=1.2, OCR=4.0, initial_stress=(-p, -p, -p), **moduli)
@@ -199,7 +204,7 @@ def drying(cells: int, law: type[mpm.ModifiedCamClay], **constants) -> mpm.Simul
 
 
 def apart(cells: int, **options) -> mpm.Simulation:
-    """Return the block with a second body, a quarter as wide, that touches nothing."""
+    """Return the block and a second body that is a quarter as wide and touches nothing."""
     h = 1 / cells
     grid = mpm.Grid([0, 0], [1.5, 1 + 2 * h], [round(1.5 * cells), cells + 2])
     bodies = [mpm.box(grid, [0, 0], [1, 1]), mpm.box(grid, [1.25, 0], [1.5, 1])]
@@ -305,7 +310,7 @@ MAKES = [make for pair in PAIRS.values() for make in pair]
 
 
 def take(simulation: mpm.Simulation, folder: str | None) -> tuple[float, mpm.Result]:
-    """Take some steps; return the processor time of one step, s, and the result."""
+    """Take `STEPS` steps; return the processor time per step, s, and the result."""
     probe = mpm.probes(simulation.bodies, [[0.5, 1.0]])
     observe = [mpm.Writer(simulation, folder)] if folder else []
     end, began = simulation.t + STEPS * DT, time.process_time()
@@ -336,7 +341,7 @@ def compiled(make: Make, cells: int) -> tuple[float, float]:
 
 
 def measure(name: str, cells: int, repeat: int) -> dict:
-    """Return the costs of a pair of scenes, as lists: without the feature, with the feature."""
+    """Return the costs of a pair of scenes. Each cost is a list of two: without and with the feature."""
     pair = [make(cells) for make in PAIRS[name]]
     least, tops = [np.inf, np.inf], [0.0, 0.0]
     with TemporaryDirectory() as folder:

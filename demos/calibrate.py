@@ -1,21 +1,32 @@
 # SPDX-License-Identifier: MIT
 """Thresholds between linear solvers: run times of both solvers below and above each threshold.
 
-Each row is a scene with a given number of displacement unknowns.  The threshold is changed so that each of the two
-solvers is used.  Times are processor times of two steps, the shortest of --repeat runs.  On several processes this is
-the largest time of a process, including waiting.  The table of thresholds is in `mpm_dolfinx/solve/solver_choice.py`.
+Each row is a scene with a given number of displacement unknowns.  Both solvers are measured, by changing the threshold.
+A time is the processor time of two steps, the shortest of --repeat runs.  On several processes it is the largest time
+of all processes, and includes waiting.  The table of thresholds is in `mpm_dolfinx/solve/solver_choice.py`.
+
+On one process a second table follows.  For each direct solver it lists three times: of a first factorisation of the
+stiffness, of a repeated factorisation, and of a solve.
 """
 
 from __future__ import annotations
 
+import itertools
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import replace
+from functools import partial
+
+from mpi4py import MPI
+from petsc4py import PETSc
 
 import common
+import numpy as np
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.solve import solver_choice as plan
+from mpm_dolfinx.solve.factors import BlockFactors, direct_solver
 
 HUGE = 10**9
 STEPS = 2
@@ -44,7 +55,10 @@ CASES: dict[str, tuple[Callable[[int], mpm.Simulation], tuple[int, ...], tuple[i
     "multigrid_2d": (lambda n: block(2, n, ELASTIC, True), (64, 96, 128, 192), (16,)),
     "mumps": (lambda n: block(2, n, YIELDS, True), (64, 128, 192, 256), (12,)),
 }
-"""For each threshold: function that returns a scene of n cells along an axis; values of n; values of n with --quick."""
+"""For each threshold: function that returns a scene of n cells along an axis, numbers n, numbers n with --quick."""
+
+FACTORED = (16, 128, 256)
+"""Cells along an axis of the blocks whose stiffness each direct solver factorises; --quick: only the first."""
 
 
 def took(make: Callable[[int], mpm.Simulation], n: int, name: str, least: int) -> tuple[float, int, plan.SolverPlan]:
@@ -65,16 +79,59 @@ def took(make: Callable[[int], mpm.Simulation], n: int, name: str, least: int) -
         plan.THRESHOLDS = usual
 
 
+def factored(n: int, soil: mpm.Skeleton) -> Iterator[tuple[str, int, list[float]]]:
+    """Yield for each direct solver its name, the number of unknowns, and three processor times, s.
+
+    Timed are a first factorisation of the stiffness, the next factorisation with the same pattern, and a solve.
+    """
+    s = block(2, n, soil, True)
+    s.step(1.0)
+    tangent = s.tangent(1.0)
+    stiffness, nodes = tangent.stiffness, np.unique(tangent.nodes, return_inverse=True)[1]
+    rows = stiffness.indptr.astype(PETSc.IntType), stiffness.indices.astype(PETSc.IntType)
+    symmetric, load = soil is ELASTIC, np.ones(len(nodes))
+
+    def in_blocks() -> tuple[Callable, Callable, Callable]:
+        factors = BlockFactors(*rows, nodes, tangent.components, tangent.x, 2, symmetric)
+        return lambda: factors.take(stiffness.data), factors.factorise, lambda: factors.solve(load)
+
+    def by_entries(package: str | None, dissection: bool) -> tuple[Callable, Callable, Callable]:
+        A = PETSc.Mat().createAIJ(stiffness.shape, csr=(*rows, stiffness.data), comm=PETSc.COMM_SELF)
+        x, b = A.createVecs()
+        b.array_w[:] = load
+        ksp = direct_solver(A, "calibrate", symmetric and package != "umfpack", dissection, package)
+        return A.assemble, ksp.pc.setUp, lambda: ksp.solve(b, x)
+
+    makers = {"PETSc, blocks of nodes, dissection by grid lines": in_blocks}
+    makers |= {"PETSc, nested dissection": partial(by_entries, None, True)}
+    makers |= {"PETSc, minimum degree": partial(by_entries, None, False)}
+    makers |= {package: partial(by_entries, package, False) for package in ("mumps", "umfpack", "cholmod")}
+    for name, make in makers.items():
+        with suppress(PETSc.Error):  # PETSc has no such package, or none for this symmetry
+            began = time.process_time()
+            actions = make()
+            times = [began]
+            for action in (*actions[:2], *actions):
+                action()
+                times.append(time.process_time())
+            yield name, len(nodes), [times[2] - began, times[4] - times[2], times[5] - times[4]]
+
+
 def main(argv: list[str] | None = None) -> dict:
-    """Print the table and return its times by threshold and unknowns."""
+    """Print the table; return its times by threshold and number of unknowns."""
     parser = common.Parser(__doc__, __file__, processes=True)
     parser.add_argument("--repeat", type=int, default=2, help="turns of a pair")
     parser.add_argument("--quick", action="store_true", help="small blocks, one turn")
     o = parser.parse_args(argv)
-    lines = [common.markdown([["threshold", "unknowns", "below it (s)", "above it (s)", "plan below", "plan above"]])]
-    with common.results(o) as out:
+    lines = []
+
+    def show(line: str) -> None:
+        lines.append(line)
         if common.first():
-            print(lines[0], flush=True)
+            print(line, flush=True)
+
+    with common.results(o) as out:
+        show(common.markdown([["threshold", "unknowns", "below it (s)", "above it (s)", "plan below", "plan above"]]))
         for name, (make, sizes, small) in CASES.items():
             for n in small if o.quick else sizes:
                 pairs = [[took(make, n, name, least) for least in (HUGE, 0)] for _ in range(1 if o.quick else o.repeat)]
@@ -82,9 +139,13 @@ def main(argv: list[str] | None = None) -> dict:
                 (_, unknowns, one), (_, _, other) = pairs[0]
                 out[f"{name}_{n}"] = [unknowns, below, above]
                 usual = getattr(plan.THRESHOLDS, name)
-                lines.append(f"| {name} {usual} | {unknowns} | {below:.3f} | {above:.3f} | {one} | {other} |")
-                if common.first():
-                    print(lines[-1], flush=True)
+                show(f"| {name} {usual} | {unknowns} | {below:.3f} | {above:.3f} | {one} | {other} |")
+        if MPI.COMM_WORLD.size == 1:
+            show(common.markdown([["direct solver", "unknowns", "symmetric", "first (s)", "next (s)", "solve (s)"]]))
+            for n, soil in itertools.product(FACTORED[:1] if o.quick else FACTORED, (ELASTIC, YIELDS)):
+                for name, unknowns, times in factored(n, soil):
+                    out[f"{name}, {unknowns}, {soil is ELASTIC}"] = times
+                    show(f"| {name} | {unknowns} | {soil is ELASTIC} | " + " | ".join(f"{t:.3f}" for t in times) + " |")
         if common.first():
             o.out.mkdir(parents=True, exist_ok=True)
             (o.out / "calibration.md").write_text("\n".join(lines) + "\n")

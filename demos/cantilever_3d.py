@@ -5,15 +5,15 @@ A dry beam of 1 m x 0.1 m x 0.1 m, clamped at x = 0, carries a dead load P on it
 square section has the same stiffness about all axes.  The beam must therefore bend in the direction of the load, like
 the geometrically exact rod with stretch and shear (Reissner 1972, Simo 1985).  The load parameter is alpha = P
 L² / (E I).  The material is elastic, so the deflection must not depend on the number of steps.  This tests the exact
-integration over the particle domains.  Runs on any number of processes; --profile prints the cost of a step.
+integration over the particle domains.  The demo runs on any number of processes; --profile prints the cost of a step.
 
-Errors divided by L: `v` of the tip deflection and `u` of the shortening, compared with the rod.  `w` is the
-displacement normal to the plane of bending.  `drift` is the largest distance of the tip from its position in the run
-with the most steps.
+All errors are divided by L.  `v` is the error of the tip deflection, and `u` that of the shortening, compared with the
+rod.  `w` is the displacement of the tip normal to the plane of bending.  `drift` is the largest distance of the tip
+from its position in the run with the most steps.
 
 The tip deflection is too large because the stress is constant in each domain.  With n domains over the height the error
-is about 1/n².  In 10 steps with 2, 4 and 8 cells (n = 4, 8, 16), `v` is 0.0129, 0.0034, 0.0010 in 3D, and 0.0127,
-0.0033, 0.0010 in plane strain.
+is about 1/n².  In 10 steps, `v` is 0.0129 with 2 cells (n = 4), 0.0034 with 4 cells and 0.0010 with 8 cells.  In plane
+strain it is 0.0127 with 2 cells, 0.0033 with 4 cells and 0.0010 with 8 cells.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def rod(alpha: float) -> tuple[float, float]:
 
 
 def scene(cells: int, alpha: float) -> tuple[mpm.Simulation, mpm.surface.Probes]:
-    """Return the beam, `cells` cells high, and the middle of its end; at time 1 the load parameter is alpha."""
+    """Return the beam, `cells` cells high, and the middle of its free end; at time 1 s the load parameter is alpha."""
     h = SIDE / cells
     reach = np.abs(ALONG) * rod(alpha)[1] * 1.05
     span = np.array([LENGTH * 1.05, SIDE, SIDE]) + reach + 3 * h
@@ -62,9 +62,10 @@ def scene(cells: int, alpha: float) -> tuple[mpm.Simulation, mpm.surface.Probes]
 
 
 def run(cells: int, steps: int, alpha: float, taken: int | None = None) -> tuple[np.ndarray, mpm.Result, dict]:
-    """Return the tip displacement (3,), m, the result and the costs of a run.
+    """Return the tip displacement (3,), in m, the result and the costs of a run.
 
-    steps: number of steps to the full load; taken: number of these steps that are computed, None for all.
+    steps: number of steps to the full load.
+    taken: number of these steps that are computed; None means all.
     """
     simulation, tip = scene(cells, alpha)
     result = simulation.run((taken or steps) / steps, 1 / steps, probes=tip)
@@ -86,7 +87,7 @@ def run(cells: int, steps: int, alpha: float, taken: int | None = None) -> tuple
 
 
 def surface(simulation: mpm.Simulation) -> tuple[np.ndarray, np.ndarray]:
-    """Return the faces (k, 4, 3), m, of the body's domains, and the axial stretch of each."""
+    """Return the k outer faces (k, 4, 3) of the body, in m, and the axial stretch (k,) at each face."""
     (corners, F), (body,) = common.whole(simulation, "corners", "F"), simulation.bodies
     bits, faces, stretch = corner_bits(3), [], []
     for axis in range(3):

@@ -2,21 +2,22 @@
 """Expansion of a cylindrical cavity in clay and in sand, on a grid of squares.
 
 The body is a quarter of a ring, with initial radius a0 of the cavity and outer radius b = 5 a0.  In each step the wall
-moves by a fifth of a cell, in undrained soil by a tenth.  Such small steps are needed because laws with history are
-first-order accurate in the step.  With eight cells and steps of a fifth of a cell, a radial solution in the same
-steps, without a grid, also has an error: pore pressures in normally consolidated clay are 1.5 % too low at a = 1.1 a0.
+moves by a fifth of a cell in drained soil, and by a tenth of a cell in undrained soil.  Such small steps are needed
+because laws with history are first-order accurate in the step.  A radial solution without a grid has such errors too.
+In steps of a0 / 40, its pore pressures in normally consolidated clay are 1.5 % too low at a = 1.1 a0.
 
-1. Undrained: saturated Modified Cam Clay at two overconsolidation ratios, expanded so fast that no water flows.  The
-   initial pressure acts on the outer boundary.  In incompressible soil the exact motion is known: a point moves from
-   radius R to r, r^2 - a^2 = R^2 - a0^2, as the cavity grows to radius a.
+1. A cavity expands in saturated Modified Cam Clay of two overconsolidation ratios, so fast that no water flows.  The
+   initial pressure acts on the outer boundary.  In incompressible soil the exact motion is known.  As the cavity grows
+   to radius a, a point moves from radius R to r, with `r^2 - a^2 = R^2 - a0^2`.
 2. Then the wall is fixed, the clay drains at the outer boundary, and excess pressures dissipate.
-3. Drained: a well in Modified Cam Clay (Chen and Abousleiman 2013) and cavities in Mohr-Coulomb sand, phi = 30
-   degrees, without and with associated dilation (Yu and Houlsby 1991).  These solutions are for infinite soil.  The
-   outer boundary of the ring therefore follows a radial solution (`mpm_dolfinx.verification.cavity`).
+3. Drained cavities are a well in Modified Cam Clay (Chen and Abousleiman 2013), and cavities in Mohr-Coulomb sand with
+   phi = 30 degrees, without and with associated dilation (Yu and Houlsby 1991).  The published solutions are for
+   infinite soil.  The outer boundary of the ring therefore follows a radial solution
+   (`mpm_dolfinx.verification.cavity`).
 
 Pressures are divided by p_0.  Errors are relative errors of the cavity pressure, and in undrained clay also of the pore
-pressure at the wall.  They refer to the radii `MARKS` in undrained clay, and to the radii with published pressures in
-drained soil.
+pressure at the wall.  Errors are evaluated at the radii `MARKS` in undrained clay, and at the radii with published
+pressures in drained soil.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ SAND = mpm.MohrCoulomb(bulk=G * 2.6 / 1.2, shear=G, friction=30.0, dilation=0.0,
 
 
 def well() -> mpm.ModifiedCamClay:
-    """Return the clay of Chen and Abousleiman, with lambda and kappa for ln(specific volume) and Kirchhoff stresses."""
+    """Return the clay of Chen and Abousleiman; lambda and kappa refer to ln(specific volume) and Kirchhoff stress."""
     lambda_, kappa = (index / 2.064 / (1 - index / 2.064) for index in (0.15, 0.03))
     stress = (-P0, -P0, -1.6 * P0)
     clay = mpm.ModifiedCamClay(M=1.2, lambda_=lambda_, kappa=kappa, shear=43.02 * P0, initial_stress=stress)
@@ -55,8 +56,10 @@ def well() -> mpm.ModifiedCamClay:
 class Drained:
     """A drained cavity in infinite soil.
 
-    soil, state: the soil and its initial state variables; known: published pressure divided by p_0, for each radius;
-    reach: outer radius of the radial solution.  Radii are divided by the initial radius of the cavity.
+    soil, state: the soil and its initial state variables.
+    known: published pressure divided by p_0, for each radius.
+    reach: outer radius of the radial solution.
+    Radii are divided by the initial radius of the cavity.
     """
 
     soil: mpm.Skeleton
@@ -75,15 +78,17 @@ SHOWN = {"well": "Modified Cam Clay", "sand-0": "Mohr–Coulomb, ψ = 0", "sand-
 
 
 def ray(X: np.ndarray) -> np.ndarray:
-    """Return the direction outwards (n, 2) of reference positions (n, 2) in the box that becomes the ring."""
+    """Return the outward direction (n, 2) at reference positions (n, 2) in the box that becomes the ring."""
     angle = X[:, 1:] * np.pi / (2 * (OUTER - 1))
     return np.concatenate([np.cos(angle), np.sin(angle)], axis=1)
 
 
 def ring(cells: int, soil: mpm.Skeleton, widest: float, outside: Callable | None = None, **scene) -> mpm.Simulation:
-    """Return a quarter of the ring, with a number of cells over the radius of the cavity; this radius is 1 + t, m.
+    """Return a quarter of the ring, with `cells` cells over the initial radius of the cavity.
 
-    outside: displacement of the outer boundary, m, as a function of time; widest: the largest radius of the cavity.
+    The radius of the cavity is 1 + t, in m.
+    widest: largest radius of the cavity, in m.
+    outside: displacement of the outer boundary, in m, as a function of time.
     """
     h = 1 / cells
     size = int(np.ceil(np.sqrt(OUTER**2 + widest**2 - 1) / h)) + 2
@@ -103,7 +108,7 @@ def ring(cells: int, soil: mpm.Skeleton, widest: float, outside: Callable | None
 
 
 def widen(s: mpm.Simulation, cells: int, radius: float, push: float) -> float:
-    """Widen the cavity to a radius, m, by a fraction of a cell per step; return its total pressure divided by p_0."""
+    """Widen the cavity to a radius, m, by `push` cells in a step; return the cavity pressure divided by p_0."""
     steps = max(1, int(np.ceil((radius - 1 - s.t) * cells / push - 1e-6)))
     s.run(radius - 1, (radius - 1 - s.t) / steps, progress=False)
     return pressure(s, radius)
@@ -134,9 +139,11 @@ def drained(name: str, cells: int) -> dict[float, tuple[float, float]]:
 class Undrained:
     """Results of an undrained expansion and of the consolidation after it.
 
-    total: for each radius, the computed and the exact cavity pressure minus p_0; water: for each radius, the computed
-    and the exact pore pressure at the wall; profiles: (time after the expansion, s, radii of the points, m, pore
-    pressures).  All pressures are divided by p_0.  balance: error of the fluid balance.
+    total: for each radius, the computed and the exact cavity pressure minus p_0.
+    water: for each radius, the computed and the exact pore pressure at the wall.
+    profiles: (time after the expansion, in s, radii of the points, in m, pore pressures).
+    balance: error of the fluid balance.
+    All pressures are divided by p_0.
     """
 
     total: dict[float, tuple[float, float]]
@@ -146,14 +153,14 @@ class Undrained:
 
 
 def at_wall(s: mpm.Simulation, radius: float, h: float) -> float:
-    """Return the pore pressure at the wall divided by p_0, extrapolated from two cells, linear in ln r."""
+    """Return the pore pressure at the wall divided by p_0, extrapolated from two cells linearly in ln r."""
     r = np.linalg.norm(s.points.x, axis=1)
     near = r < radius + 2 * h
     return float(np.polyfit(np.log(r[near] / radius), s.points.pressure[near] / P0, 1)[-1])
 
 
 def push(OCR: float, cells: int) -> Undrained:
-    """Widen the cavity in clay fast to the last of `MARKS`, then let the clay drain."""
+    """Widen the cavity in undrained clay to the last radius in `MARKS`, then let the clay drain."""
     soil = replace(CLAY, OCR=OCR, bulk=None)
     water = {"fluid": mpm.Fluid(), "conditions": [mpm.Pressure("right", P0), mpm.Drained("right")]}
     widest = MARKS[-1]

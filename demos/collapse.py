@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: MIT
 """Columns of dry sand collapse: run-out and height against published experiments, and energies.
 
-Columns of width L and height a L, a = 0.5, 1, 4 and 8, stand against a smooth wall on a rough floor.  Their right side
-is released suddenly.  Lube et al. (2005) measured sand, sugar and rice in a channel, with angles of repose near 31
+Columns of width L and height a L stand against a smooth wall on a rough floor, with a = 0.5, 1, 4 and 8.  Their right
+side is released suddenly.  Lube et al. (2005) measured sand, sugar and rice in a channel, with angles of repose near 31
 degrees.  In these experiments the front moves by 1.2 a L for a < 1.8, and by 1.9 a^(2/3) L for a > 2.8.
 
-The sand follows the Mohr-Coulomb law without dilation.  In simple shear its shear strength is sin phi times the normal
-stress (Davis 1968), so sin phi = tan 31 degrees.  In fast flow the friction coefficient grows by 0.93 I, with the
-inertial number I (Jop, Forterre and Pouliquen 2006).  For a grain size d = L/100 this is equivalent to a viscosity of
-0.93 d sqrt(p rho_s).  rho_s is the density of the grains, and p the pressure in the middle of a heap of half the
-height.  With a constant viscosity, run-outs are as accurate as with a local viscosity (Ionescu et al. 2015).  Without
-viscosity, shear localises in single cells and dissipates energy numerically.  The front is the point at which the depth
-of the sand is one grain.
+The sand follows the Mohr-Coulomb law without dilation.  In simple shear its strength is sin(phi) times the normal
+stress (Davis 1968), so sin(phi) = tan(31 degrees).  In fast flow the friction coefficient grows by 0.93 I, with the
+inertial number I (Jop, Forterre and Pouliquen 2006).  This increase is equivalent to a viscosity of
+`0.93 d sqrt(p rho_s)`, with the grain size d = L/100 and the grain density rho_s.  The pressure p is that in the middle
+of a heap half as high as the column.  With a constant viscosity, run-outs are as accurate as with a local viscosity
+(Ionescu et al. 2015).  Without viscosity, shear localises in single cells and dissipates energy numerically.  The front
+is the point at which the depth of the sand is one grain.
 
 Sources: Lube, Huppert, Sparks and Freundt (2005), Phys. Rev. E 72, 041301, as in Lagree, Staron and Popinet (2011),
 J. Fluid Mech. 686, 378.
@@ -39,9 +39,10 @@ STEPS = 50  # in the time sqrt(H/g)
 class Heap(NamedTuple):
     """Results for a column, run_out and height in m.
 
-    lost: largest error of the energy balance; left: final kinetic energy; both divided by the work of the weight.
-    before, after: corners of the domains, m; profiles: middles of vertical strips, m, and depths of sand in the strips,
-    m.
+    lost: largest error of the energy balance, divided by the work of the weight.
+    left: final kinetic energy, divided by the work of the weight.
+    before, after: corners of the domains, in m.
+    profiles: middles of vertical strips, and depths of sand in these strips, in m.
     """
 
     run_out: float
@@ -55,14 +56,15 @@ class Heap(NamedTuple):
 
 
 def published(aspect: float) -> float:
-    """Return the run-out of Lube et al., divided by the width; linear between the ranges of their two laws."""
+    """Return the run-out by Lube et al., divided by the width; between their two laws it is interpolated."""
     return float(np.interp(aspect, (1.8, 2.8), (0, 1)) * (1.9 * aspect ** (2 / 3) - 1.2 * aspect) + 1.2 * aspect)
 
 
 def column(aspect: float, cells: int, grain: float = GRAIN, renewal: bool = False) -> mpm.Simulation:
-    """Return a column at rest, 1 m wide, with a number of cells over the width; grain: grain size, m.
+    """Return a column at rest, 1 m wide, with `cells` cells over the width.
 
-    renewal: whether long particle domains are replaced by new ones.
+    grain: grain size, in m; zero means no viscosity.
+    renewal: whether long particle domains are replaced by new domains.
     """
     h, reach = 1 / cells, np.ceil(1.4 * published(aspect) + 2.5)
     grid = mpm.Grid([0, 0], [reach, aspect + 2 * h], [round(reach * cells), round(aspect * cells) + 2])
@@ -88,7 +90,7 @@ def column(aspect: float, cells: int, grain: float = GRAIN, renewal: bool = Fals
 
 
 def depths(s: mpm.Simulation, h: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the middles of strips h wide, m, and the depth of sand in them, m."""
+    """Return the middles of vertical strips of width h, and the depths of sand in these strips; all in m."""
     low, high = (end(s.points.corners[:, :, 0], axis=1) for end in (np.min, np.max))
     edges = np.arange(0, s.grid.upper[0] + h / 2, h)
     share = np.clip((edges - low[:, None]) / (high - low)[:, None], 0, 1)

@@ -44,7 +44,8 @@ class Parser(argparse.ArgumentParser):
     def parse_args(self, args: Sequence[str] | None = None, namespace=None) -> argparse.Namespace:
         """Return the options, with the run time of the demo (s or min, as text) in `takes`.
 
-        The time is that in the table Gallery of README.md; None if the table has no row with the same options.
+        The run time is taken from the table Gallery of README.md. It is None if the table has no row with these
+        options.
         """
         args = sys.argv[1:] if args is None else list(args)
         o = super().parse_args(args, namespace)
@@ -158,7 +159,7 @@ def weight(unit_weight: float) -> Callable:
 
 
 def viscous(viscosity: float) -> Callable:
-    """Return a term for `terms=`: the viscous stress 2 eta D, eta in Pa s, with strain rate D = sym grad u / dt."""
+    """Return a term for `terms=`: the viscous stress `2 eta D` with eta in Pa s and `D = sym(grad(u)) / dt`."""
 
     def viscous(points, u, dt):
         strain = ufl.sym(points.grad(u))

@@ -2,28 +2,29 @@
 """A cone penetrometer is pushed from the surface into weightless clay, and the pore pressures then dissipate.
 
 The cone has a tip angle of 60 degrees and a roughness of 0.3: its adhesion is 0.3 s_u.  The shaft behind the cone is a
-second tool, which is smooth.  The force on the cone alone is therefore known.  The scene is axisymmetric.  The clay is
-undrained and follows Tresca's law with the strength s_u, or with --mises von Mises's law with this strength in pure
-shear.  Its shear modulus is G = 100 s_u.  The resistance is compared with that of a deep cone in clay with Tresca's law
-and equal initial stresses in all directions (Lu, Randolph, Hu and Bugarski 2004, Geotechnique 54),
+second tool, which is smooth.  The force on the cone is therefore known separately.  The scene is axisymmetric.  The
+clay is undrained and follows Tresca's law with the strength s_u.  With --mises it follows von Mises's law with this
+strength in pure shear.  The shear modulus of the clay is G = 100 s_u.  The resistance is compared with that of a deep
+cone in clay with Tresca's law and equal initial stresses in all directions (Lu, Randolph, Hu and Bugarski 2004,
+Geotechnique 54),
 
     N_c = F / (pi R^2 s_u) = 3.4 + 1.6 ln(G / s_u) + 1.3 alpha,
 
 with the radius R of the shaft and the roughness alpha.
 
 Domains of clay that become longer than a cell are replaced by new domains (renewal).  Without renewal the run ends at a
-depth of two radii.  The shaft and the surface of the clay lie in the middle of cells.  Along a grid line the surface
-would cross cells several times, and renewal does not refill such cells.  The edge between cone and shaft is rounded by
-a cell.
+depth of two radii.  The shaft and the surface of the clay lie in the middle of cells.  A surface along a grid line
+would cross the same cells several times, and renewal does not refill such cells.  The edge between cone and shaft
+has a radius of one cell.
 
-Saturated ("wet") clay is pushed so fast that it is undrained.  Then the cone stops, and the excess pressure at the edge
-between cone and shaft dissipates.  The remaining fraction is compared with the curve of Teh and Houlsby (1991,
-Geotechnique 41), a function of T* = c_v t / (R^2 sqrt(G / s_u)).  That curve is for a deep cone.  Near the surface
-pressures dissipate faster: half of the pressure has dissipated at T* = 0.03 with the tip three radii deep, and at T* =
-0.08 with the tip five radii deep.
+The cone is pushed so fast into saturated ("wet") clay that the clay is undrained.  Then the cone stops, and the excess
+pressure at the edge between cone and shaft dissipates.  The fraction of this pressure that remains is compared with the
+curve of Teh and Houlsby (1991, Geotechnique 41) as a function of `T* = c_v t / (R^2 sqrt(G / s_u))`.  This curve is for
+a deep cone.  Near the surface pressures dissipate faster: half of the pressure has dissipated at T* = 0.03 with the tip
+three radii deep, and at T* = 0.08 with the tip five radii deep.
 
-With --follow the cone is pushed once more into undrained clay, on grid lines that follow it.  The small cells then
-surround only the cone, and move with it.  Both runs start with the same points.
+With --follow the cone is pushed once more into undrained clay, on grid lines that follow the cone.  The small cells
+then surround only the cone, and move with it.  Both runs start with the same points.
 """
 
 from __future__ import annotations
@@ -63,10 +64,13 @@ def published() -> float:
 
 @dataclass
 class Push:
-    """Results of each step: depth divided by R; N, force on the cone divided by pi R^2 s_u.
+    """Results of a push into undrained clay.
 
-    frame: final corners (n, 4, 2), m, a field (n,), and the outline of the cone (k, 2), m; seeded: number of points at
-    the start; cells: number of grid cells, and of equal small cells in the same grid.
+    depth: depth of the tip after each step, divided by R.
+    N: force on the cone after each step, divided by pi R^2 s_u.
+    frame: final corners (n, 4, 2) of the domains, in m, a field (n,), and the outline (k, 2) of the cone, in m.
+    seeded: number of points at the start.
+    cells: number of grid cells, and number of cells if all were as small as the smallest.
     """
 
     depth: list[float] = field(default_factory=list)
@@ -86,10 +90,12 @@ def scene(
     fluid: mpm.Fluid | None,
     follow: bool = False,
 ):
-    """Return a simulation of the cone on the surface of the clay, and half of its outline (k, 2), m.
+    """Return a simulation of the cone on the surface of the clay, and half of the cone's outline (k, 2), in m.
 
-    cells: number of cells over the radius R, minus one half; depth: greatest depth of the cone, m; speed: velocity of
-    the cone, m/s, until the time `end`, s; follow: whether grid lines follow the cone.
+    cells: number of cells over the radius R, minus one half.
+    depth: greatest depth of the cone, in m.
+    speed: velocity of the cone, in m/s, until the time `end`, in s.
+    follow: whether grid lines follow the cone.
     """
     h = R / (cells + 0.5)
     low, fine = -(np.ceil(depth / h) + 2 * cells + 0.5) * h, np.ceil(FINE / h) * h
@@ -146,7 +152,7 @@ class Dissipation:
     """Excess pressure at the edge between cone and shaft, divided by s_u.
 
     rest: fraction of this pressure that remains at the times T* of `TIMES`.
-    frame, when the cone stops: corners (n, 4, 2), m, excess pressures divided by s_u (n,), and outline of the cone, m.
+    frame: corners (n, 4, 2), in m, excess pressures (n,) divided by s_u, and outline of the cone, in m, when it stops.
     """
 
     N: float = 0.0
@@ -229,11 +235,12 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def following(o: Namespace, clay: mpm.Skeleton, fixed: Push) -> dict[str, float]:
-    """Push the cone on grid lines that follow it; print and return its resistance and its cells, relative to others.
+    """Push the cone on grid lines that follow it; print and return relative resistances and numbers of cells.
 
-    load, last: relative difference of the mean of N over the second half of the way, and of the final N, from the run
-    on fixed lines.  cells: number of cells, divided by that of equal small cells in the same grid.  fixed: number of
-    cells, divided by that of the grid with fixed lines.
+    load: relative difference of the mean N in the second half of the push from its mean with fixed grid lines.
+    last: relative difference of the final N from the final N with fixed grid lines.
+    cells: number of cells, divided by the number if all cells were as small as the smallest.
+    fixed: number of cells, divided by the number with fixed grid lines.
     """
     run, halfway = push(o.cells, o.depth * R, clay, follow=True), o.depth / 2
     mean, beside = (np.interp(WAY * o.depth, each.depth, each.N).mean() for each in (run, fixed))

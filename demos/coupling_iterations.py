@@ -1,18 +1,18 @@
 # SPDX-License-Identifier: MIT
-"""Iterations of the coupling between displacement and pore pressure, from drained to undrained.
+"""Numbers of iterations that couple displacement and pore pressure, from drained to undrained steps.
 
 The linear systems of Newton's first step are solved to a relative true residual of 1e-8.  Scenes are a cantilever (the
 poroelastic beam, undeformed and bent) and a footing on a column.  Only the product of conductivity and step length
 matters.  This product ranges from 1e-23 m (1e-14 m/s, 1e-9 s) to 1e11 m (1e2 m/s, 1e9 s).  The bulk modulus of the
 water ranges from 1e4 Pa to infinity.
 
-Three schemes are compared.  The first is the package's: conjugate gradients on the Schur complement S = C + B K^-1 B^T.
-C is the matrix of storage and flow, K the stiffness matrix, and B the coupling matrix.  The preconditioner is the
-filtered fixed-stress operator C + beta (V - 3/4 L), with the cell volumes V and a five-point Laplacian L.  The second
-scheme has the plain operator, C + beta V, as preconditioner.  The third scheme is the plain fixed-stress (Richardson)
-iteration, with beta = 0.5, 0.75 and 1 times alpha²/K_dr (Biot's coefficient alpha, drained bulk modulus K_dr).  With
-beta = 1/K_w (K_w: bulk modulus of the water) this iteration diverges.  An iteration consists of one solve of the
-storage and one solve of the momentum.
+Three schemes are compared.  The first scheme, used by the package, is conjugate gradients on the Schur complement
+`S = C + B K^-1 B^T`.  C is the matrix of storage and flow, K is the stiffness matrix, and B is the coupling matrix.
+The preconditioner is the filtered fixed-stress operator C + beta (V - 3/4 L), with the cell volumes V and a five-point
+Laplacian L.  The second scheme uses the plain operator C + beta V as preconditioner.  The third scheme is the plain
+fixed-stress (Richardson) iteration, with beta = 0.5, 0.75 and 1 times alpha²/K_dr.  Here alpha is Biot's coefficient,
+and K_dr is the drained bulk modulus.  With beta = 1/K_w this iteration diverges, where K_w is the bulk modulus of the
+water.  An iteration consists of one solve of the storage and one solve of the momentum.
 
 Undrained Q1/DG0 elements have checkerboard modes of the pressure.  Only the damping of pressure jumps (`storage.py`)
 limits these modes, and thereby also the number of iterations.  The second picture shows the pressure with and without
@@ -48,7 +48,7 @@ SCHEMES = {
     "fixed stress, 1": ("richardson", 1.0, 0.0),
     "fixed stress, 1/K_w": ("richardson", None, 0.0),
 }
-"""Krylov method; beta divided by alpha^2/K_dr (None: beta = 1/K_w); factor of the filter L."""
+"""For each scheme: Krylov method, beta divided by alpha^2/K_dr (None for beta = 1/K_w), and factor of the filter L."""
 MOST = 200  # iterations after which a scheme counts as divergent
 RAMP_STEP = 0.02  # s: all systems have the load increment of this time, for any dt
 CLEAR = 0.1  # m from the corners of the clamp, where the pressure is singular
@@ -196,7 +196,7 @@ def worst(counts: list[Count]) -> float:
 
 
 def cells(s: mpm.Simulation) -> NDArray[np.float64]:
-    """Return the pressure of the cells (nx, ny), Pa; nan in empty cells and near the corners of the clamp."""
+    """Return the pressure of the cells (nx, ny), in Pa; nan in empty cells and near the corners of the clamp."""
     p = np.full(s.grid.shape.prod(), np.nan)
     body = s.bodies[0]
     corners = [[0, body.lower[:, 1].min()], [0, (body.lower + body.spacing)[:, 1].max()]]
@@ -285,7 +285,7 @@ def tabulate(path: Path, rows: list[list[str]]) -> None:
 
 
 def draw(o: Namespace, counts: list[Count]) -> None:
-    """Draw iterations against k dt: panels are scenes, colours schemes, line styles cell sizes."""
+    """Draw iterations against k dt: a panel per scene, a colour per scheme, a line style per cell size."""
     fig, ((*axes, side),) = common.figure(1, len(SCENES) + 1, (16, 4.6))
     styles = dict(zip(o.h, ("-", "--", ":", "-."), strict=False))
     for ax, scene in zip(axes, SCENES, strict=True):

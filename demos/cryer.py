@@ -4,11 +4,12 @@
 A saturated sphere is loaded suddenly by a constant normal traction p0, and its surface is drained.  The outer shell
 drains first, shrinks and compresses the core.  The pressure at the centre rises by nearly a third above p0 before it
 falls (Cryer 1963).  Uncoupled theories of consolidation cannot show this rise.  Fluid and grains are incompressible,
-nu = 0.25.  One octant is computed: a lattice of boxes, mapped smoothly into the sphere.  With --axisymmetric, a quarter
-of a disc is computed.
+and nu is 0.25.  One octant is computed: a lattice of boxes, mapped smoothly into the sphere.  With --axisymmetric, a
+quarter of a disc is computed.
 
-Errors of the pressure at the centre, with the reduced time T = c_v t / R² (coefficient of consolidation c_v, radius R):
-`peak` is the relative error of the largest pressure; `curve` is the largest error from T = 0.02 on, divided by p0.
+Errors are given for the pressure at the centre. `peak` is the relative error of the largest pressure. `curve` is the
+largest error from T = 0.02 on, divided by p0. The reduced time is `T = c_v t / R²`, with the coefficient of
+consolidation c_v and the radius R.
 """
 
 from __future__ import annotations
@@ -34,20 +35,20 @@ OUTER = ("right", "back", "top")  # sides of the lattice that become the surface
 
 
 def ball(x: np.ndarray) -> np.ndarray:
-    """Map positions (n, 3), m, from the cube [-`CUBE`, `CUBE`]^3 to the ball; planes of symmetry do not move."""
+    """Map positions (n, 3), in m, from the cube [-`CUBE`, `CUBE`]^3 to the ball; planes of symmetry do not move."""
     a = x / CUBE
     b, c = np.roll(a, -1, axis=1) ** 2, np.roll(a, -2, axis=1) ** 2
     return RADIUS * a * np.sqrt(1 - b / 2 - c / 2 + b * c / 3)
 
 
 def disc(x: np.ndarray) -> np.ndarray:
-    """Map positions (n, 2), m, from the square [-`SQUARE`, `SQUARE`]^2 to the disc."""
+    """Map positions (n, 2), in m, from the square [-`SQUARE`, `SQUARE`]^2 to the disc."""
     a = x / SQUARE
     return RADIUS * a * np.sqrt(1 - a[:, ::-1] ** 2 / 2)
 
 
 def scene(cells: int, axisymmetric: bool = False, grid: mpm.Grid | None = None) -> mpm.Simulation:
-    """Return the octant, or the quarter disc, with `cells` cells over the radius, or on another grid."""
+    """Return the octant, or the quarter disc, on `grid` or else with `cells` cells over the radius."""
     h = RADIUS / cells
     if axisymmetric:
         grid = grid or mpm.Grid([0] * 2, [RADIUS + h] * 2, [cells + 1] * 2, axisymmetric=True)
@@ -130,7 +131,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def report(out: Outcome, found: dict[str, float]) -> None:
-    """Print the pressure at the centre and the exact one."""
+    """Print the computed and the exact pressure at the centre."""
     shown = np.unique(np.linspace(0, len(out.T) - 1, 13).astype(int))
     rows = ([f"{x:.4f}" for x in (out.T[k], out.pressure[k], exact(out.T[k]))] for k in shown)
     common.table([["T", "p/p0", "exact"], *rows])
@@ -140,7 +141,7 @@ def report(out: Outcome, found: dict[str, float]) -> None:
 
 
 def draw(o: Namespace, out: Outcome) -> None:
-    """Draw the pressure at the centre and the exact one."""
+    """Draw the computed and the exact pressure at the centre."""
     fig, ((ax,),) = common.figure(1, 1, (7, 4.5))
     T = np.linspace(1e-3, out.T[-1], 400)
     ax.plot(T, exact(T), color="black", lw=1, label="Cryer (1963)")

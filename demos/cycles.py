@@ -8,10 +8,10 @@ would accumulate stress with every grid line that they cross, as points of stand
 A block is stretched between two fixed sides and then rotated by 360 degrees.  Its final stresses must equal the
 stresses before the rotation.
 
-The undrained beam has singular edges at the clamp.  Near these edges the stress grows as r^(x - 1), with cos(pi x / 2)
-= x, x = 0.595 (Williams 1952).  r is the distance from an edge.  The rms stress within a few cells of the edges
-decreases as h^x with the cell size h, and so does the residual stress.  Results are given for the whole beam, far from
-the clamp, near the clamp, and with springs instead of the clamp.
+The undrained beam has singular edges at the clamp.  At a distance r from an edge the stress grows as `r^(x - 1)`, where
+x = 0.595 is the root of `cos(pi x / 2) = x` (Williams 1952).  The rms stress within a few cells of the edges decreases
+with the cell size h as h^x.  The residual stress decreases in the same way.  Results are given for the whole beam, far
+from the clamp, near the clamp, and with springs instead of the clamp.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def conditions(o: Namespace) -> dict:
 
 
 def rms(simulation: mpm.Simulation, away: float = 0.0) -> float:
-    """Return the rms stress of the points, Pa; points nearer to the wall than `away`, m, count with zero stress."""
+    """Return the rms stress of the points, Pa; the stress of points within `away`, m, of the wall counts as zero."""
     stress, volume = simulation.effective_stress(), simulation.points.volume0
     counts = simulation.points.reference.mean(axis=1)[:, 0] > away
     squares = (volume * counts * (stress**2).sum(axis=(1, 2))).sum()
@@ -72,15 +72,16 @@ def cycle(
     Parameters
     ----------
     h, load
-        Cell size, m; largest load, Pa.
+        Cell size, in m, and largest load, in Pa.
     cycles, steps
-        Number of cycles; number of steps in a cycle, even.
+        Number of cycles, and number of steps in a cycle, which is even.
     quadrature
         Quadrature rule, see `mpm.Numerics`.
     material
         Material of the body; by default the material of the beam.
     seed
-        Function that returns the body, with the arguments grid, lower and upper corner, points per cell and direction.
+        Function that returns the body. Its arguments are the grid, the lower and the upper corner, and the number of
+        points per cell and direction.
     fluid
         Pore fluid; the beam is undrained.
     springs
@@ -89,10 +90,13 @@ def cycle(
 
     Returns
     -------
-    left: rms stress after each cycle, divided by the rms stress at the first peak; away: the same without points
-    near the wall; times, tips (m): time and tip deflection of each step; lost: work of the load in each cycle, divided
-    by the work up to the first peak; volume: volume change of the beam minus that of its water; balance: error of the
-    fluid balance.
+    left: rms stress after each cycle, divided by the rms stress at the first peak.
+    away: rms stress after each cycle without points near the wall, divided by the rms stress of all points at that
+    peak.
+    times, tips: time, in s, and tip deflection, in m, of each step.
+    lost: work of the load in each cycle, divided by the work up to the first peak.
+    volume: volume change of the beam minus the volume change of its water, divided by the volume of the beam.
+    balance: error of the fluid balance.
     """
     o = options(h, load, quadrature)
     cells = np.rint(beam.BOX / h).astype(int)

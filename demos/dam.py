@@ -1,21 +1,21 @@
 # SPDX-License-Identifier: MIT
 """Seepage with a free surface through a dam of unsaturated soil, while the level of the reservoir falls.
 
-A dam of 6 m with slopes of 1:2 stands on an impervious base.  At first the water table is at the level of the
+A dam 6 m high with slopes of 1:2 stands on an impervious base.  At first the water table is at the level of the
 reservoir, 5 m.  Then the downstream slope becomes permeable, and the flow becomes steady.  After that the
-level of the reservoir falls by 2 m in five days, and the free surface, p = 0, follows as the soil drains.  Above the
-free surface water flows under suction (`mpm.VanGenuchten`).  The water of the reservoir loads the slope on its side.
-Above this water, both slopes are seepage faces.
+level of the reservoir falls by 2 m in five days, and the free surface (p = 0) falls as the soil drains.  Above the free
+surface, water flows under suction (`mpm.VanGenuchten`).  The water of the reservoir loads the upstream slope.  The
+upstream slope above the reservoir and the downstream slope are seepage faces.
 
 Checks:
 
-* `flow`: ratio of the outflow of a rectangular dam to the exact outflow.  The dam is 9.6 m wide, with 10 m and 2 m of
-  water at its sides.  Above these levels the suction at the sides is hydrostatic.  Without suction the exact flow is
-  Dupuit's and Charny's k (H1^2 - H2^2) / (2 L), with the water levels H1 and H2 and the width L.  With suction,
+* `flow`: ratio of the outflow of a rectangular dam to the exact outflow.  The rectangular dam is 9.6 m wide, with 10 m
+  and 2 m of water at its sides.  Above these levels the suction at the sides is hydrostatic.  Without suction the exact
+  flow is `k (H1^2 - H2^2) / (2 L)` (Dupuit, Charny), with the water levels H1 and H2 and the width L.  With suction,
   Kirchhoff's potential (the integral of k_r over the head) replaces the head;
 * `steady`: ratio of the inflow of the dam to its outflow, before the reservoir falls;
-* `drained`: ratio of the outflow of a column to that of finite elements on cells of a quarter of the size.  The free
-  surface in the column falls from 8 m towards 2 m.
+* `drained`: ratio of the outflow of a column to the outflow by finite elements on cells of a quarter of the size.  The
+  free surface in the column falls from 8 m towards 2 m.
 """
 
 from __future__ import annotations
@@ -50,8 +50,8 @@ FALLS, SEEN = 5.0, (5.0, 15.0, 40.0)  # days: duration of the fall; times since 
 class Dam:
     """Flows, corners and pressures of the dam, in steady flow and at each time of `SEEN`.
 
-    flows: outflows through both slopes (2,), m^2/s.  frames: corners (n, 4, 2), m, and pressures (n,), Pa, of the
-    domains.
+    flows: outflows (2,) through both slopes, in m^2/s.
+    frames: corners (n, 4, 2), in m, and pressures (n,), in Pa, of the domains.
     """
 
     flows: list[np.ndarray] = field(default_factory=list)
@@ -140,7 +140,8 @@ def rectangular(cells: int) -> float:
 def driving(level: float, top: float) -> float:
     """Return the integral of Kirchhoff's potential over a hydrostatic side, m^2.
 
-    level: height of the water, m.  top: height of the dam, m.
+    level: height of the water, in m.
+    top: height of the dam, in m.
     """
     law, suction = LOAM.retention, np.linspace(0, top - level, 100001)
     filled = (1 + (suction * WEIGHT / law.entry) ** law.n) ** (1 / law.n - 1)
@@ -151,9 +152,9 @@ def driving(level: float, top: float) -> float:
 
 
 def drained(cells: int, days: float = 100.0) -> tuple[float, float]:
-    """Return the outflow, m, of a column of 10 m: by `cells` cells, and by finite elements on four times as many cells.
+    """Return the outflow, m, of a column of 10 m: with `cells` cells, and by four times as many finite elements.
 
-    Initially the free surface is at 8 m; then the head at the base is 2 m.
+    Initially the free surface is at 8 m. Then the head at the base is lowered to 2 m.
     """
     high, head, h = 8.0, 2.0, 10.0 / cells
     grid = mpm.Grid([0, 0], [h, 10.0 + h], [1, cells + 1])
@@ -221,8 +222,8 @@ def draw(o: Namespace, dam: Dam) -> None:
             ax.tricontour(*corners.mean(axis=1).T, p, levels=[0.0], colors=color, linewidths=1.5)
             ax.plot([0, 1 + SLOPE * level], [level, level], color=f"C{k}", label=f"{day:g}")
             ax.set(aspect="equal", xlim=(0, BASE + 2), ylim=(0, HEIGHT + 0.5), xlabel="x (m)", ylabel="y (m)")
-    axes[0, 0].set_title("steady seepage through the dam; white: its free surface, p = 0")
-    axes[1, 0].set_title("free surfaces as the reservoir falls by 2 m in 5 days")
+    axes[0, 0].set_title("Steady seepage; white: free surface, p = 0")
+    axes[1, 0].set_title("Free surface while the reservoir falls by 2 m in 5 days")
     axes[1, 0].legend(title="days", fontsize=9, loc="upper right")
     common.save(fig, o.out / "dam.png")
 

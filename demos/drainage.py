@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: MIT
-"""Liakopoulos's column: saturated sand drains at its foot under gravity; suction contracts the sand, and it settles.
+"""Liakopoulos's column: saturated sand drains at its foot under gravity, and settles under suction.
 
-In a column of 1 m, p = 0 everywhere at first, as in uniform downward flow.  Then no water enters at the top, and the
-column drains at its foot.  Its retention curve is user-defined.  The effective stress uses chi p, with chi the
+A column of 1 m initially has p = 0 everywhere, as in uniform downward flow.  Then no water enters at the top, and the
+column drains at its foot.  Its retention curve is user-defined.  The effective stress contains chi p, where chi is the
 saturation.  The reference is a converged solution with 400 finite volumes, for small strain.  Source: Liakopoulos
 (1965), with the constants of Lewis and Schrefler (1998).
 
-Errors at 5, 10, 30 and 120 minutes: the largest pressure error at five heights, divided by the suction at the highest
-of them; the relative error of the settlement; the relative error of the outflow at the foot.  On one process.
+Three errors are given at 5, 10, 30 and 120 minutes.  The pressure error is the largest error at five heights, divided
+by the suction at the highest of these.  The others are the relative errors of the settlement and of the outflow at the
+foot.  The demo runs on one process.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ CONVERGED = {
     30: ((-631.67, -1582.23, -3205.4, -4983.1, -6211.2), 1.15932e-3, 1.57255e-6),
     120: ((-906.99, -2267.84, -4542.4, -6847.5, -8264.9), 1.55827e-3, 3.33066e-7),
 }
-"""Converged values by time, min: pressures at the heights, Pa, settlement, m, and outflow at the foot, m/s."""
+"""Converged values by time (min): pressures (Pa) at the five heights, settlement (m), and outflow (m/s) at the foot."""
 
 
 class Sand:
@@ -91,13 +92,13 @@ def draw(o: Namespace, curves: list, settlement: list[float]) -> None:
     for i, (minutes, p, z) in enumerate(curves):
         left.plot(p / 1e3, z, color=f"C{i}", lw=1.2, label=f"{minutes} min")
         left.plot(np.array(CONVERGED[minutes][0]) / 1e3, HEIGHTS, "o", ms=4, color=f"C{i}")
-    left.set(xlabel="pore pressure, kPa", ylabel="height, m", title="Pore pressure; dots: converged")
+    left.set(xlabel="pore pressure (kPa)", ylabel="height (m)", title="Pore pressure; dots: converged")
     left.legend()
     minutes = np.array(list(CONVERGED))
     exact = 1e3 * np.array([values[1] for values in CONVERGED.values()])
     right.plot(minutes, exact * (1 + np.array(settlement)), "x-", lw=1, label="material points")
     right.plot(minutes, exact, "o", ms=4, mfc="none", color="black", label="converged")
-    right.set(xlabel="time, min", ylabel="settlement, mm", xscale="log", title="Settlement of the top")
+    right.set(xlabel="time (min)", ylabel="settlement (mm)", xscale="log", title="Settlement of the top")
     right.invert_yaxis()
     right.legend()
     for ax in (left, right):

@@ -6,10 +6,10 @@ built every 90 days.  After four lifts the clay consolidates for ten years.  Eac
 (`mpm.polygon`, by gmsh).  A lift is placed on the settled ground and filled up to its design level, so it is thicker
 than 1 m.  Pressures are in excess of the hydrostatic pressure of the sea, and weights are buoyant.  The weight of the
 lifts is a term in UFL; the clay is in equilibrium with its own weight from the start.  The surface below a lift is no
-longer drained; the lift is drained at its slope and crest.  On one process.
+longer drained; the lift is drained at its slope and crest.  The demo runs on one process.
 
 Check: at the end the lowest points of the clay carry the weight of all lifts.  `carried` is the integral of the
-effective stress at these points, divided by this weight; it is 1 in equilibrium.
+effective stress over these points, divided by the weight of all lifts.  In equilibrium it is 1.
 """
 
 from __future__ import annotations
@@ -68,8 +68,8 @@ def lift(grid: mpm.Grid, k: int):
 class Bund:
     """Histories: times (s), settlements of axis and toe (m), excess pressures (Pa) in the middle of the clay.
 
-    frames: sections at some times: title, corners (n, 4, 2), m, and excess pressures (n,), Pa.  carried: fraction of
-    the lifts' weight that the lowest points carry at the end.
+    frames: title, corners (n, 4, 2), in m, and excess pressures (n,), in Pa, of sections at some times.
+    carried: fraction of the lifts' weight that the lowest points carry at the end.
     """
 
     t: list[float] = field(default_factory=list)
@@ -149,7 +149,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, bund: Bund) -> None:
-    """Draw the section after the last lift and at the end, and settlements and excess pressure in time."""
+    """Draw the section after the last lift and at the end, and settlements and excess pressures against time."""
     fig, axes = common.figure(2, 2, (13, 6.4))
     most = max(np.quantile(np.abs(p), 0.995) for _, _, p in bund.frames) / 1e3
     for ax, (title, corners, excess) in zip(axes[0], bund.frames, strict=True):

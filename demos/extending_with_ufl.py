@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: MIT
 """Your own physics in a few lines of UFL: ten columns with exact solutions.
 
-In each example, a column of 1 m between smooth walls stands on a floor (plane strain).  Each example adds one feature:
-a stored energy, fibres with a direction at each point, one of two conductivities that depend on the deformation, an
-elastic foundation, a source of fluid, a law with its own state variable (damage), plastic flow, an implicit stress, or
-a return mapping in numpy.  The parameter names of a user function select its arguments.  `materials/skeleton.py` and
-`materials/user_functions.py` of the package list them.
+In each example, a column of 1 m between smooth walls stands on a floor (plane strain).  Each example adds one feature.
+Seven features concern the skeleton: a stored energy, fibres with a direction at each point, an elastic foundation, a
+law with its own state variable (damage), plastic flow, an implicit stress, and a return mapping in numpy.  Three
+features concern the fluid: two conductivities that depend on the deformation, and a source.  The parameter names of a
+user function select its arguments.  `materials/skeleton.py` and `materials/user_functions.py` of the package list them.
 
 The error is the largest difference from the exact solution, divided by the largest exact value.  With 20 cells it is
-8e-4 for the energy and 6e-4 for the fibres (these layers are stretched in a single step), 3e-3 for both conductivities,
-6e-4 for the foundation and 5e-4 for the source.  These errors decrease with the cell size.  The error of the stress
-with damage is 1e-5, because the penalty of the prescribed displacement lets the top move a little.  Plastic flow has an
-error of 1e-11; the implicit stress and the return mapping have errors of 1e-15.
+8e-4 for the energy and 6e-4 for the fibres, because their layers are stretched in a single step.  It is 3e-3 for both
+conductivities, 6e-4 for the foundation and 5e-4 for the source.  These errors decrease with the cell size.  The error
+of the stress with damage is 1e-5, because the penalty of the prescribed displacement lets the top move a little.
+The error of plastic flow is 1e-11.  The errors of the implicit stress and of the return mapping are 1e-15.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ def settlement(s: mpm.Simulation, stretches: np.ndarray) -> tuple:
 
 
 class SaintVenantKirchhoff(mpm.Skeleton):
-    """psi = lambda/2 (tr E)^2 + G E:E with Green's strain E = (F^T F - I)/2."""
+    """Law with the energy `psi = lambda/2 (tr E)^2 + G E:E`, with Green's strain `E = (F^T F - I)/2`."""
 
     @staticmethod
     def energy(F, bulk, shear):
@@ -120,7 +120,7 @@ def energy(cells: int) -> Example:
 
 @dataclass(frozen=True)
 class Fibrous(mpm.NeoHookean):
-    """Neo-Hookean matrix with fibres of direction a, which add the energy c/4 (I_4 - 1)^2 with I_4 = |F a|^2."""
+    """Neo-Hookean matrix with fibres of direction a. They add the energy `c/4 (I_4 - 1)^2` with `I_4 = |F a|^2`."""
 
     fibre: float = 0.0  # c, Pa
     direction: mpm.Field = (1.0, 0.0)
@@ -228,7 +228,10 @@ def well(cells: int) -> Example:
 
 @dataclass(frozen=True)
 class Damaged(mpm.NeoHookean):
-    """Neo-Hookean with damage D: energy (1 - D) psi, D = 1 - exp(-m / 0.5), with m the largest |ln J| so far."""
+    """Neo-Hookean law with the energy `(1 - D) psi`.
+
+    The damage is `D = 1 - exp(-m / 0.5)`, where m is the largest |ln J| so far.
+    """
 
     state: ClassVar = {"damage": 0.0}
 
@@ -287,7 +290,7 @@ def plasticity(cells: int) -> Example:
 
 @dataclass(frozen=True)
 class Hardening(mpm.Skeleton):
-    """The pressure is K y; Newton's method solves y + a y^3 = ln J (a: `power`), with exact tangent."""
+    """Law with the pressure `K y`. Newton's method with exact tangent solves `y + a y^3 = ln J` for y; a is `power`."""
 
     power: mpm.Field = 100.0
 

@@ -7,14 +7,14 @@ one of these outcomes:
 * converged: the error is below the bound of the family.  The reference is an exact solution, a solution with finite
   elements, or the same scene with a moderate setting.  The residuals of momentum and fluid, and the error of the fluid
   balance, are below 1e-8;
-* recovered: converged, but some steps were cut;
+* recovered: the run has converged, but some steps were cut;
 * refused: the run ends with an error that gives the reason, as it must in a scene without equilibrium;
 * warned: the error is above the bound, and the package has issued a warning;
 * wrong, nan or hung: a defect, which the exit status reports.
 
 An error is divided by the largest exact value, unless the docstring of its family defines the error otherwise.  The
-condition number refers to the last tangent of the momentum balance, scaled to a unit diagonal.  Unexpected
-exceptions also count as wrong.  On one process.
+condition number refers to the last tangent of the momentum balance, scaled to a unit diagonal.  Unexpected exceptions
+also count as wrong.  The demo runs on one process.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ OUTCOMES = ("converged", "recovered", "refused", "warned", "wrong", "nan", "hung
 
 @dataclass
 class Row:
-    """Outcome of a case; largest residual and fluid balance error of all steps, and total numbers of iterations."""
+    """Outcome of a case: largest residual and largest error of the fluid balance, total numbers of iterations."""
 
     family: str
     setting: str
@@ -76,7 +76,7 @@ def hang(*_) -> None:
 
 
 def judge(row: Row, make: Make, bound: float, rtol: float | None = None) -> Row:
-    """Run a case and fill in its row; with `rtol`, adaptive steps are at most as long as the steps of the scene."""
+    """Run a case and fill in its row. With `rtol`, steps are adaptive, and not longer than the scene's steps."""
     signal.signal(signal.SIGPROF, hang)
     signal.setitimer(signal.ITIMER_PROF, LIMIT)
     began, result = time.process_time(), mpm.Result()

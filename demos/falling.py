@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: MIT
 """A box slides, a ball rolls and a second ball bounces down an incline, compared with the motion of rigid bodies.
 
-The rough incline, mu = 0.3, has an angle of b = 30 degrees to the grid.  A rigid box slides by (sin b - mu cos b) g
-t^2 / 2 in the time t.  A rigid disc rolls by sin b g t^2 / 3, if mu > tan b / 3.  Another disc falls on the incline
-from a height of its own radius.  After the impact it bounces and rotates.  Box and discs are stiff rubber, and touch
-the incline only, not each other.  The final energy is the work of gravity, minus the energy that friction and elastic
-waves dissipate.  Needs gmsh.
+The incline has an angle of b = 30 degrees to the grid, and the friction coefficient mu = 0.3.  In the time t a rigid
+box slides by `g t^2 (sin(b) - mu cos(b)) / 2`.  A rigid disc rolls by `g t^2 sin(b) / 3`, if mu > tan(b) / 3.  Another
+disc falls on the incline from a height of its own radius.  After the impact it bounces and rotates.  Box and discs are
+stiff rubber, and touch the incline only, not each other.  The final energy is the work of gravity, minus the energy
+that friction and elastic waves dissipate.  The demo needs gmsh.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def scene(cells: int) -> tuple[mpm.Simulation, list[np.ndarray]]:
 def fall(s: mpm.Simulation, parts: list[np.ndarray], dt: float) -> tuple[mpm.Result, np.ndarray, list]:
     """Release the bodies; return the result, rows (times, 7), and corners of the domains, m, at some times.
 
-    Each row has the time, s, and the positions (x, y), m, of three centres of mass.
+    Each row has the time, s, and the positions (x, y), in m, of three centres of mass.
     """
     mass = s.scene.materials.density(s.points) * s.points.volume0 * s.points.J
     rows, shapes = [], []
@@ -104,7 +104,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, result: mpm.Result, t, way, above, shapes, rigid) -> None:
-    """Draw the bodies at some times, their distances compared with rigid bodies, and the energies."""
+    """Draw the bodies at some times, the distances that they and rigid bodies move, and the energies."""
     fig, ((scene_, ways, energy),) = common.figure(1, 3, (15, 4.2))
     for k, corners in enumerate(shapes):
         shade = 0.25 + 0.75 * k / max(1, len(shapes) - 1)
@@ -117,7 +117,7 @@ def draw(o: Namespace, result: mpm.Result, t, way, above, shapes, rigid) -> None
         if a is not None:
             ways.plot(t[::8], a * t[::8] ** 2 / 2, "o", ms=3, color=f"C{k}", label="rigid")
     ways.plot(t, above + DROP, "--", lw=1, color="C2", label="its height above the incline")
-    ways.set(xlabel="time (s)", ylabel="way along the incline (m)", title="Ways", ylim=(0, None))
+    ways.set(xlabel="time (s)", ylabel="distance along the incline (m)", title="Distance", ylim=(0, None))
     e = result.energies
     for name, label in (("external", "work of the weight"), ("kinetic",) * 2, ("friction",) * 2, ("elastic",) * 2):
         energy.plot(result.t, e[name], lw=1, label=label)

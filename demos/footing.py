@@ -1,54 +1,58 @@
 # SPDX-License-Identifier: MIT
 """A strip footing is pushed into saturated soil, to a depth of its width, at three rates.
 
-B is the width of the footing, which is rough and rigid.  By symmetry half of it is computed, as a prescribed
-displacement on a part of the soil's top.  The soil is a weightless layer 2.5 B thick on rough rock.  It follows Drucker
-and Prager's law with cohesion c, and drains at its free top.  V = v B / c_v is the dimensionless velocity
-of the footing, with its velocity v and the coefficient of consolidation c_v.
+B is the width of the footing, which is rough and rigid.  By symmetry half of the footing is computed.  This half is a
+prescribed displacement on a part of the soil's top.  The soil is a weightless layer 2.5 B thick on rough rock.  It
+follows Drucker and Prager's law with cohesion c, and drains at its free top.  The dimensionless velocity of the footing
+is V = v B / c_v, with the velocity v and the coefficient of consolidation c_v.
 
 A smooth, impervious wall bounds the soil at 8 B from the middle of the footing.  With a wall at 16 B, loads change by
 less than 1 % at any depth and rate; the demo shows this on coarser cells.  With a wall at 4 B, drained loads are up to
-8 % too large while the soil yields below the footing, before the limit load.  The thickness of the layer matters.  In
+8 % too large before the limit load, while the soil below the footing yields.  The thickness of the layer matters.  In
 plane strain the settlement increases with the logarithm of this thickness, without bound.  With a layer 5 B thick,
 loads are 11 % smaller at a settlement of 0.1 B, and 3 % smaller at 0.5 B.
 
-Bearing capacity (Prandtl 1921): q = (2 + pi) s_u without friction; with friction and associated flow q = c N_c, N_c =
-(exp(pi tan phi) tan^2(45 deg + phi/2) - 1) / tan phi.  Limit loads are computed with very stiff soil, which flows
-before the geometry changes, on --cells cells over the width and on about twice as many.
+Without friction the bearing capacity is `q = (2 + pi) s_u` (Prandtl 1921).  With friction and associated flow it is
+`q = c N_c`, with `N_c = (exp(pi tan(phi)) tan^2(45 deg + phi/2) - 1) / tan(phi)`.  Limit loads are computed with very
+stiff soil, which flows before the geometry changes.  The footing has --cells cells over its width, and about twice as
+many in a second run.
 
 In the deep push the soil does not dilate.  Its undrained strength is s_u = xi c, with the coefficient xi of the
 cohesion in the yield function.  A footing at depth D carries (1 + 0.27 sqrt(D/B)) times the undrained load of a footing
 at the surface (fit to bounds of limit analysis, Salgado et al. 2004). The drained capacity at the surface lies between
 the capacity for the reduced friction of Davis (1968) and c N_c.
 
-The undrained limit load converges from below, with order 1.5: its error is -5.9, -2.4, -0.85 % with 5, 9, 17 cells. The
-outermost node of the footing also carries the half cell outside this node.  With an odd number of cells the effective
-width is therefore the true width.  With 4, 8, 16 cells this node lies at the edge of the footing, and the effective
-width is larger by half a cell on each side.
+The undrained limit load converges from below, with order 1.5: its error is -5.9 % with 5 cells, -2.4 % with 9 cells and
+-0.85 % with 17 cells. The outermost node of the footing also carries the half cell outside this node.  With an odd
+number of cells the effective width is therefore the true width.  With 4, 8, 16 cells this node lies at the edge of the
+footing, and the effective width exceeds the true width by half a cell on each side.
 
-In associated flow the dilation of each point is proportional to its shear, but a cell has one mean dilatation.  The
-load would therefore increase without limit (de Borst and Groen 1995); in this demo the error of the load would be +4.4
-and +3.4 % with 9 and 17 cells.  In fully yielding cells, laws therefore use half of the deviation of the gradient from
-its mean.  This reduces the error to -0.5, +0.5, +0.9 % with 5, 9, 17 cells.
+In associated flow the dilation of each point is proportional to its shear, but with F-bar a cell has a single
+dilatation.  The load would therefore increase without limit (de Borst and Groen 1995).  In this demo the error of the
+load would be +4.4 % with 9 cells and +3.4 % with 17 cells.  In fully yielding cells, laws therefore use half of the
+deviation of the gradient from its mean.  This reduces the error to -0.5 % with 5 cells, +0.5 % with 9 cells and +0.9 %
+with 17 cells.
 
 The limit load of a rough circular footing on Tresca's soil, in axisymmetry, is 6.05 s_u (Cox, Eason and Hopkins 1961).
 
-With --graded, cells are fine in a region of 2 B x 0.75 B below the footing.  Outside this region, cells become longer
-by a tenth from one to the next, up to eight times the smallest length.  The 20 B x 10 B of soil then have hardly more
-cells than 4 B x 2.5 B with fine cells only.
+With --graded, cells are fine in a region of 2 B x 0.75 B below the footing.  Outside this region, the length of cells
+increases by a tenth from cell to cell, up to eight times the smallest length.  The 20 B x 10 B of soil then have hardly
+more cells than 4 B x 2.5 B with fine cells only.
 
 With --square, square and circular footings, rough and smooth, are pushed into Tresca's soil, on graded cells.  The
 footings are tools: below a smooth prescribed displacement, faces of the soil would move outward and enlarge the
 footing.  A quarter of the square is computed in 3D, also on several processes.  N_c is the limit load, divided by area
-and c.  Bounds for a rough square are 5.52 and 6.22 (Salgado et al. 2004), for a smooth one 2 + pi and 5.71 (Shield and
-Drucker 1955).  Circles are computed in axisymmetry, with about twice as many cells over the width.  Exact values of N_c
-are 6.05 for rough circles (Cox, Eason and Hopkins 1961), and 5.69 for smooth circles (Shield 1955).
+and c.  Its bounds for a rough square are 5.52 and 6.22 (Salgado et al. 2004).  The bounds for a smooth square are 2 +
+pi and 5.71 (Shield and Drucker 1955).  Circles are computed in axisymmetry, with about twice as many cells over the
+width.  Exact values of N_c are 6.05 for rough circles (Cox, Eason and Hopkins 1961), and 5.69 for smooth circles
+(Shield 1955).
 
 With non-associated flow the solution is not unique.  Shear bands are one cell wide and change their position between
 steps, more often on finer cells (Rudnicki and Rice 1975).  On fine grids many steps are therefore cut.  The option
 --viscosity adds a viscous stress, small compared with the cohesion, which makes the solution unique (Needleman 1988).
 With --explicit-friction, friction follows from the mean stress at the start of each step (Krabbenhoft et al. 2012).
-Flow is then associated within a step.  On 9 cells this changes the load by 0.8 % in 4 steps, and by 0.3 % in 16.
+Flow is then associated within a step.  With 9 cells over the width, this changes the load by 0.8 % in a run of 4 steps,
+and by 0.3 % in a run of 16 steps.
 """
 
 from __future__ import annotations
@@ -117,17 +121,18 @@ SURFACE = {  # limit loads divided by B c; Davis: reduced friction phi*, tan phi
 
 
 def embedded(depth):
-    """Return the undrained limit load, divided by B c, of a base at the depth `depth` (divided by B)."""
+    """Return the undrained limit load, divided by B c, of a footing at a depth of `depth` times B."""
     return SURFACE["undrained"] * (1 + 0.27 * np.sqrt(depth))
 
 
 @dataclass(frozen=True, kw_only=True)
 class ExplicitFriction(mpm.DruckerPrager):
-    """Drucker-Prager soil with the friction of the mean stress at the start of each step.
+    """Drucker-Prager soil whose friction follows from the mean stress at the start of each step.
 
     Within a step, the friction angle equals the dilation angle, so flow is associated.  The strength at zero mean
-    stress contains the rest of the friction.  Source: Krabbenhoft, Karim, Lyamin and Sloan (2012).  Further state
-    variables: `mean`, the mean Kirchhoff stress, Pa, and `strength`, that of the last step, Pa.
+    stress contains the rest of the friction.  Source: Krabbenhoft, Karim, Lyamin and Sloan (2012).  Two state variables
+    are added: `mean`, the mean Kirchhoff stress, Pa, and `strength`, the strength at zero mean stress in the last step,
+    Pa.
     """
 
     state: ClassVar = mpm.DruckerPrager.state | {"mean": 0.0, "strength": 0.0}
@@ -138,13 +143,13 @@ class ExplicitFriction(mpm.DruckerPrager):
 
     @staticmethod
     def kirchhoff(F, bulk, shear, eta, xi, eta_flow, cohesion, plastic, hardened, mean, strength, dt):
-        """Return the Kirchhoff stress (3, 3), Pa, as UFL."""
+        """Return the Kirchhoff stress (3, 3), in Pa, as UFL."""
         now = ExplicitFriction.present(eta, xi, eta_flow, cohesion, mean, strength, dt)
         return mpm.DruckerPrager.kirchhoff(F, bulk, shear, eta_flow, 1.0, eta_flow, now, 0.0, plastic, hardened)
 
     @staticmethod
     def update(F, bulk, shear, eta, xi, eta_flow, cohesion, plastic, hardened, mean, strength, dt):
-        """Return the state at the end of the step: UFL by name."""
+        """Return the state variables at the end of the step, as UFL by name."""
         now = ExplicitFriction.present(eta, xi, eta_flow, cohesion, mean, strength, dt)
         law = F, bulk, shear, eta_flow, 1.0, eta_flow, now, 0.0, plastic, hardened
         stress = ufl.tr(mpm.DruckerPrager.kirchhoff(*law)) / 3
@@ -152,7 +157,7 @@ class ExplicitFriction(mpm.DruckerPrager):
 
     @staticmethod
     def present(eta, xi, eta_flow, cohesion, mean, strength, dt):
-        """Return the strength at zero mean stress, Pa; for dt = 0, that of the last step."""
+        """Return the strength at zero mean stress, Pa; for dt = 0 it is the strength of the last step."""
         return ufl.conditional(ufl.gt(dt, 0), ufl.max_value(xi * cohesion - (eta - eta_flow) * mean, 0), strength)
 
 
@@ -160,8 +165,9 @@ class ExplicitFriction(mpm.DruckerPrager):
 class Frame:
     """State of footing and soil at one time of a push.
 
-    t: time divided by the duration of the push.  settlement: divided by B.  corners (n, 4, 2), m, and pore pressure
-    (n,), Pa, of the domains.  top (k, 2): positions of the soil's surface, from the middle outward, m.
+    t: time divided by the duration of the push; settlement: settlement of the footing, divided by B.
+    corners (n, 4, 2), pressure (n,): corners, in m, and pore pressures, in Pa, of the domains.
+    top (k, 2): positions of the soil's surface, in m, from the middle outward.
     """
 
     t: float
@@ -175,8 +181,10 @@ class Frame:
 class Push:
     """Results of a push.
 
-    settlement, load: settlement divided by B, and load divided by area and c, after each step.  frames: states at some
-    times.  pushed: index of the last step of the push; later steps are consolidation.  results: results of all runs.
+    settlement, load: settlement divided by B, and load divided by area and c, after each step.
+    frames: states at some times.
+    pushed: index of the last step of the push; later steps are consolidation.
+    results: results of all runs.
     Heights are measured from the initial surface of the soil.
     """
 
@@ -211,11 +219,15 @@ def push(
 ) -> Push:
     """Push the footing.
 
-    soil, cells: soil, and number of cells over the footing's width, odd; depth: depth of the push, divided by B; rate:
-    V = v B / c_v, None for a scene without water; box: width and height of the computed half of the soil, divided by B;
-    rest: time of consolidation after the push, divided by B²/c_v; steps: number of equal steps of the push, by default
-    so many that a step moves the footing by `STEP` cells; circular: whether the footing is a disc of diameter B instead
-    of a strip; method: time integration, see `Numerics`; graded: whether cells become larger away from the footing.
+    cells: number of cells over the footing's width, odd.
+    depth: depth of the push, divided by B.
+    rate: velocity V = v B / c_v, or None for a scene without water.
+    box: width and height of the computed half of the soil, divided by B.
+    rest: time of consolidation after the push, divided by B²/c_v.
+    steps: number of equal steps of the push; by default a step moves the footing by `STEP` cells.
+    circular: whether the footing is a disc of diameter B instead of a strip.
+    method: time integration, see `Numerics`.
+    graded: whether cells become larger away from the footing.
     """
     h = WIDTH / cells
     columns, rows, air = (round(size * cells) for size in (*box, 0.25 + 0.5 * depth))
@@ -261,8 +273,9 @@ def limit_load(
 ) -> Push:
     """Push the footing into very stiff soil; return the push, with loads divided by the theoretical limit load.
 
-    how: key of `LIMITS_OF`.  box, graded: see `push`; by default the box in `LIMITS_OF`, with equal cells.  steps: how
-    many of the 40 steps to take, if undrained.
+    how: key of `LIMITS_OF`.
+    box, graded: see `push`; by default the box in `LIMITS_OF`, with equal cells.
+    steps: number of steps to take out of 40, if undrained.
     """
     soil, (depth, own) = replace(SOIL, bulk=STIFF * SOIL.bulk, shear=STIFF * SOIL.shear), LIMITS_OF[how]
     box = box or own
@@ -282,7 +295,8 @@ def limit_load(
 def bearing(shape: str, roughness: str, cells: int) -> dict[str, float]:
     """Push a square (a quarter, in 3D) or a circle (in axisymmetry) to its limit load; print and return the results.
 
-    shape, roughness: keys of `KNOWN`.  Returns N_c, its distance to the bounds (0 between them), and the costs.
+    shape, roughness: keys of `KNOWN`.  The results are N_c, its distance to the bounds (0 between the bounds), and
+    costs.
     """
     began, h, flat = time.process_time(), WIDTH / cells, 2 if shape == "square" else 1
     wide, deep = (round(edge * cells) * h for edge in SOLID["near"])
@@ -370,7 +384,7 @@ def main(argv: list[str] | None = None) -> dict:
 def of_many_sizes(cells: int, folder: Path) -> dict:
     """Print and draw the undrained limit load on graded cells in a large box, and on equal cells in a small box.
 
-    Returns, for both boxes, the load, the number of points, and the processor time, s; and ratios of these.
+    Returns the load, the number of points and the processor time, s, for both boxes, and their ratios.
     """
     out, runs = {}, {}
     for how, box in FAR.items():
@@ -428,7 +442,8 @@ def effort(
 ) -> dict:
     """Push at the intermediate rate in equal steps; print and return load, numbers of steps, and processor time.
 
-    width: width of half the soil, divided by B.  viscosity: see `viscous`.  explicit: see `ExplicitFriction`.
+    width: width of the computed half of the soil, divided by B.
+    viscosity: see `viscous`; explicit: see `ExplicitFriction`.
     """
     began, rate = time.process_time(), RATES["intermediate"]
     soil = ExplicitFriction(**OF_SOIL) if explicit else viscous(viscosity, depth * WIDTH**2 / (CV * rate))
@@ -496,7 +511,7 @@ def report(runs: dict[str, Push]) -> dict:
 
 
 def view(ax, pair: tuple[Frame, Frame], limits: tuple[float, float]):
-    """Draw the footing, and pore pressures, divided by c, of two frames as left and right half of the soil.
+    """Draw the footing, and the pore pressures (divided by c) of two frames as left and right half of the soil.
 
     White gaps at the edge of the footing are due to inverted domains that were replaced.
     """

@@ -5,14 +5,14 @@ The scene is in plane strain, and only half of the gel is computed, by symmetry.
 on a smooth base, and drains at its side, far from the cylinder.  The cylinder moves down in the first step and is then
 held.
 
-* Initially no water has flowed, and the gel is incompressible.  The pressure under the cylinder is Hertz's,
+* Initially no water has flowed, and the gel is incompressible.  By Hertz's theory the pressure under the cylinder is
 
       p = p_0 sqrt(1 - x^2 / a^2),    a = 2 sqrt(F R / (pi E*)),    p_0 = sqrt(F E* / (pi R)),
 
   at a distance x from the middle, with the half-width a of the contact, the radius R of the cylinder, and E* = 4 G of
   the undrained gel.  For a layer of finite height, these equations hold with the computed force F per length.
-* Finally the pore pressure has dissipated, and the contact is Hertz's with E* = E / (1 - nu^2) of the drained gel.  The
-  force equals that on a dry gel, which the demo also computes.
+* Finally the pore pressure has dissipated.  Hertz's theory then holds with `E* = E / (1 - nu^2)` of the drained gel.
+  The force must equal the force on a dry gel, which the demo also computes.
 """
 
 from __future__ import annotations
@@ -37,9 +37,10 @@ TIMES = np.geomspace(1e-4, 10, 21)  # times at which the force is recorded, divi
 
 @dataclass
 class Contact:
-    """Contact at one time: force, N/m, and positions (k,), m, and pressures (k,), Pa, of points at the gel's surface.
+    """Contact at one time; force, in N/m.
 
-    most, half: largest pressure, Pa, and half-width, m, of the ellipse fitted to these pressures.
+    x, p (k,): positions, in m, and pressures, in Pa, of points at the gel's surface.
+    most, half: largest pressure, in Pa, and half-width, in m, of the ellipse fitted to these pressures.
     """
 
     force: float
@@ -89,9 +90,11 @@ def scene(cells: int, wet: bool) -> mpm.Simulation:
 class Pressed:
     """Results of a run.
 
-    contacts: initial contact and, if wet, final contact.  forces: N/m, initially and at `TIMES`.  frame: initial
-    corners, pore pressures, and shape of the cylinder.  balance: largest error of the fluid balance.  cuts: number of
-    cut steps.
+    contacts: initial contact and, if wet, final contact.
+    forces: forces, in N/m, initially and at `TIMES`.
+    frame: initial corners, pore pressures, and shape of the cylinder.
+    balance: largest error of the fluid balance.
+    cuts: number of cut steps.
     """
 
     contacts: list[Contact]
@@ -149,18 +152,25 @@ def draw(o: Namespace, wet: Pressed, contacts: tuple[Contact, Contact]) -> None:
     domains = common.domains(left, corners, p / 1e3, cmap="viridis")
     common.domains(left, tool, facecolor="0.8", edgecolor="0.8")
     fig.colorbar(domains, ax=left, label="pore pressure (kPa)", shrink=0.8)
-    left.set(aspect="equal", xlim=(0, SIZE), ylim=(0, SIZE + 0.25), title="at once", xlabel="x (m)", ylabel="y (m)")
-    named = zip(("at once", "drained"), contacts, (UNDRAINED, DRAINED), strict=True)
+    left.set(
+        aspect="equal",
+        xlim=(0, SIZE),
+        ylim=(0, SIZE + 0.25),
+        title="Just after the indentation",
+        xlabel="x (m)",
+        ylabel="y (m)",
+    )
+    named = zip(("undrained", "drained"), contacts, (UNDRAINED, DRAINED), strict=True)
     for k, (name, seen, stiff) in enumerate(named):
         half = 2 * np.sqrt(seen.force * RADIUS / (np.pi * stiff))
         most = np.sqrt(seen.force * stiff / (np.pi * RADIUS))
         x = np.linspace(0, half, 200)
         middle.plot(x, most * np.sqrt(1 - (x / half) ** 2) / 1e3, color=f"C{k}", lw=1, label=f"Hertz, {name}")
         middle.plot(seen.x, seen.p / 1e3, "o", color=f"C{k}", mfc="none", ms=4, label=name)
-    middle.set(title="under the cylinder", xlabel="x (m)", ylabel="contact pressure (kPa)")
+    middle.set(title="Contact pressure", xlabel="x (m)", ylabel="contact pressure (kPa)")
     right.semilogx(TIMES, np.array(wet.forces[1:]) / 1e3, "o-", ms=3, label="wet gel")
     right.axhline(contacts[1].force / 1e3, color="C1", ls="--", label="dry gel")
-    right.set(title="force on the cylinder", xlabel="t c_v / (5 m)² (-)", ylabel="force (kN/m)", ylim=(0, None))
+    right.set(title="Force on the cylinder", xlabel="t c_v / (5 m)² (-)", ylabel="force (kN/m)", ylim=(0, None))
     for ax in (middle, right):
         ax.legend(fontsize=9)
         ax.grid(alpha=0.3)

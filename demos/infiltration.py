@@ -3,13 +3,13 @@
 
 The first scene is rain on exponential soil (`Gardner`) above a water table.  At t = 0 the rain increases from a tenth
 to nine tenths of the conductivity.  Heads are compared with the series of Srivastava and Yeh (1991).  The second scene
-is a wetting front in dry soil (`VanGenuchten`), the second case of Celia, Bouloutas and Zarba (1990).  The front is
-compared with a converged solution of Richards' equation, and with finite elements (Q1/DG0) on the same cells in the
-same steps.
+is a wetting front in dry soil (`VanGenuchten`), which is the second case of Celia, Bouloutas and Zarba (1990).  The
+front is compared with a converged solution of Richards' equation, and with finite elements (Q1/DG0) on the same cells
+in the same steps.
 
-Errors for the rain, at 1, 6 and 12 h: the largest error of the head, divided by the largest head.  Errors for the
-front, at 6 and 12 h: of the depth at which the head is -5 m, and of the infiltrated water; both with material points
-and with finite elements.  On one process.
+The error for the rain, at 1, 6 and 12 h, is the largest error of the head, divided by the largest head.  The errors for
+the front, at 6 and 12 h, are the errors of the depth at which the head is -5 m, and of the infiltrated water.  They are
+given for material points and for finite elements.  The demo runs on one process.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ STIFF = {"bulk": 1e10, "shear": 5e9}  # Pa: soil that hardly deforms
 ALPHA, K = 5.0, 1e-5  # 1/m, m/s, of the exponential soil
 HOURS = (1, 6, 12)
 FRONT = {6: (0.2544, 0.017406), 12: (0.375096, 0.026335)}
-"""By hour: depth at which the head is -5 m, and infiltrated water, m; by 1600 finite volumes, extrapolated."""
+"""By hour: depth, m, at which the head is -5 m, and infiltrated water, m; extrapolated from 1600 finite volumes."""
 DRY = {
     "soil": mpm.LinearElastic(
         **STIFF,
@@ -38,7 +38,7 @@ DRY = {
     "pressure": -10 * WEIGHT,
     "sides": [mpm.Drained("bottom", pressure=-10 * WEIGHT), mpm.Drained("top", pressure=-0.75 * WEIGHT)],
 }
-"""The column of the front."""
+"""Arguments of `column` for the front."""
 
 
 def column(cells: int, soil: mpm.Skeleton, pressure, sides) -> mpm.Simulation:
@@ -51,7 +51,7 @@ def column(cells: int, soil: mpm.Skeleton, pressure, sides) -> mpm.Simulation:
 
 
 def series(z: np.ndarray, t: float, before: float = 0.1, after: float = 0.9) -> np.ndarray:
-    """Return the exact heads, m, at heights z, m, and time t, s, from the roots of tan(l L) + 2 l = 0."""
+    """Return the exact heads, m, at heights z, m, and time t, s, from the roots l of `tan(l L) + 2 l = 0`."""
     Z, L, T = ALPHA * z, ALPHA, ALPHA * K * t / 0.35
     low = (np.arange(1, 200) - 0.5) * np.pi / L
     high = np.arange(1, 200) * np.pi / L
@@ -84,7 +84,7 @@ def rain(cells: int, dt: float) -> tuple[list, list[float], bool]:
 
 
 def front(cells: int, dt: float) -> tuple[list, list[float], list[float], bool]:
-    """Return depths and heads, m, at 6 and 12 h, errors of front, m, and water, and whether the run converged."""
+    """Return depths and heads, m, at 6 and 12 h, errors of front (m) and water, and whether the run converged."""
     s = column(cells, **DRY)
     start = s.cells().water.sum()
     found, places, waters = [], [], []
@@ -99,7 +99,7 @@ def front(cells: int, dt: float) -> tuple[list, list[float], list[float], bool]:
 
 
 def by_elements(cells: int, dt: float) -> tuple[list[float], list[float]]:
-    """Return the errors of front, m, and water (relative) at 6 and 12 h, for `cells` finite elements."""
+    """Return the errors of front (m) and water (relative) at 6 and 12 h, for `cells` finite elements."""
     walls, pull = {"left": "x", "right": "x", "bottom": "y"}, lambda t: (0, -9.81)
     scene = {"conditions": DRY["sides"], "pressure": DRY["pressure"], "walls": walls, "gravity": pull}
     size = [0, 0], [1 / cells, 1], [1, cells]
@@ -147,12 +147,12 @@ def draw(o: Namespace, heads: list, depths: list) -> None:
     for i, (hour, (heights, head)) in enumerate(zip(HOURS, heads, strict=True)):
         left.plot(series(z, 3600 * hour), z, color="black", lw=1, label=None if i else "exact")
         left.plot(head, heights, "o", ms=3, label=f"{hour} h")
-    left.set(xlabel="head, m", ylabel="height above the water table, m", title="rain on exponential soil")
+    left.set(xlabel="head (m)", ylabel="height above the water table (m)", title="Rain on exponential soil")
     for hour, (depth, head) in zip(FRONT, depths, strict=True):
         (line,) = right.plot(head, depth, "o-", ms=3, lw=1, label=f"{hour} h")
         right.axhline(FRONT[hour][0], color=line.get_color(), lw=0.8, ls="--")
     right.axvline(-5, color="black", lw=0.8, ls=":")
-    right.set(xlabel="head, m", ylabel="depth, m", title="front into dry soil; dashed: converged place of −5 m")
+    right.set(xlabel="head (m)", ylabel="depth (m)", title="Front into dry soil; dashed: converged position of −5 m")
     right.set_ylim(0.6, 0)
     for ax in (left, right):
         ax.legend(frameon=False)

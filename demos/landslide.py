@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 """A slope at rest loses strength, slides and comes to rest: speed, energies, and run-out with and without inertia.
 
-A slope of 2:1, 10 m high, stands on 5 m of the same Mohr-Coulomb soil, phi = 20 degrees, c / (gamma H) = 0.05.  It
-settles under its weight without inertia, and its factor of safety is 1.4.  Then its strength is suddenly divided by
-1.6.
+A slope of 2:1, H = 10 m high, stands on a layer of 5 m.  Both are Mohr-Coulomb soil, with the friction angle phi = 20
+degrees and the cohesion c = 0.05 gamma H (unit weight gamma).  The slope settles under its weight without inertia; its
+factor of safety is 1.4.  Then its strength is suddenly divided by 1.6.
 
 With inertia the slope accelerates until its shape is stable, and then moves on until friction stops it.  Without
 inertia, as in the demo `slope`, a viscous stress controls the motion from one equilibrium to the next.  The slope then
@@ -27,7 +27,7 @@ BALANCE = 0.01  # allowed error of the energy balance, relative to the work of t
 
 
 def slope(cells: int) -> mpm.Simulation:
-    """Return the slope at rest, with a number of cells over its height."""
+    """Return the slope at rest, with `cells` cells over its height."""
     grid, bodies = still.shape(cells)
     soil = mpm.MohrCoulomb(
         bulk=still.YOUNG / (3 - 6 * still.POISSON),

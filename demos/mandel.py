@@ -1,18 +1,19 @@
 # SPDX-License-Identifier: MIT
 """Mandel's slab is compressed between rigid plates; the pore pressure in its middle rises before it decreases.
 
-A saturated slab between rigid, smooth, impervious plates takes a force in the first step.  Its free sides drain and
-soften first, so the plates load the middle more.  The pressure in the middle therefore rises above its initial value p0
-= force / (2a).  This Mandel-Cryer effect needs a two-way coupling.  By symmetry a quarter is computed, a = 1 m wide and
-1 m high, in plane strain, nu = 0.2, water and grains incompressible.  The mean strain is 1e-5, so small-strain theory
-is accurate.  T = c t / a² is the reduced time, c = kappa (K + 4G/3).  Displacements are linear in y, so few cells over
-the height suffice.  Source: Mandel (1953); Abousleiman et al. (1996), Géotechnique 46.  On one process.
+A saturated slab between rigid, smooth, impervious plates carries a force from the first step on.  Its free sides drain
+and soften first, so the plates load the middle more.  The pressure in the middle therefore rises above its initial
+value p0 = force / (2a).  This Mandel-Cryer effect needs a two-way coupling.  By symmetry a quarter of the slab is
+computed, a = 1 m wide and 1 m high, in plane strain.  Poisson's ratio is 0.2, and water and grains are incompressible.
+The mean strain is 1e-5, so small-strain theory is accurate.  The reduced time is `T = c t / a²`, with
+`c = kappa (K + 4G/3)`.  Displacements are linear in y, so few cells over the height suffice.  Source: Mandel (1953);
+Abousleiman et al. (1996), Géotechnique 46.  The demo runs on one process.
 
 Errors:
 
 * `p_0.01` to `p_1`: largest value of |p - exact| a / force at the centroids of all cells, at T = 0.01, 0.1, 0.5 and 1;
 * `p_max`: relative error of the highest pressure in the innermost cell, which occurs at T = 0.07;
-* `p_rise`, a stricter measure: relative error of the difference between this highest pressure and p0;
+* `p_rise`, a stricter measure: relative error of the difference between the highest pressure and p0;
 * `settlement`: largest relative error of the plate's settlement at T = 0.01, 0.1, 0.5 and 1.
 
 Most of the error is spatial, and decreases with the square of the cell size.
@@ -40,9 +41,11 @@ EXACT = Mandel(WIDTH, HEIGHT, SOIL.bulk, SHEAR, SOIL.conductivity / WATER.unit_w
 
 @dataclass
 class Outcome:
-    """Results of a run, with an entry for each step: T; x, m, and p, Pa, of the cells (columns, rows); settlements, m.
+    """Results of a run, with an entry for each step.
 
-    The settlements refer to eleven positions on the top, from the middle to the side.
+    time: reduced time T.
+    x, p (columns, rows): positions, in m, and pressures, in Pa, of the cells.
+    settlement: settlements, in m, of eleven positions on the top, from the middle to the side.
     """
 
     time: list[float] = field(default_factory=list)

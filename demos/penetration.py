@@ -2,28 +2,28 @@
 """A T-bar, which is a rigid cylinder, is pushed through clay, normal to its axis and deep below the surface.
 
 The clay is undrained, and follows von Mises's law with the plane-strain strength s_u.  F is the force per length of the
-bar, D the diameter.  The bar starts inside the clay and is pushed until the clay flows all around it.  Then the
+bar, and D is its diameter.  The bar starts inside the clay and is pushed until the clay flows all around it.  Then the
 resistance of the bar is that of Randolph and Houlsby (1984) for an adhesion alpha s_u on its surface,
 
     N = F / (s_u D) = pi + 2 asin(alpha) + 4 cos(pi/4 - asin(alpha)/2) (sqrt(2) + sin(pi/4 - asin(alpha)/2)).
 
-The clay is a block, eight diameters wide and high, between smooth walls; half of it is computed.  A pressure on its top
-keeps the gap behind the bar closed.  The clay settles under this pressure, and therefore first loads the bar downwards.
-In a narrower block the resistance is lower.  With four diameters, N of a rough bar is 10.9 and 10.8 with 8 and 16 cells
-over the diameter.
+The clay is a block, eight diameters wide and high, between smooth walls; half of the block is computed.  A pressure on
+the top keeps the gap behind the bar closed.  The clay settles under this pressure, and therefore first loads the bar
+downwards.  In a narrower block the resistance is lower.  In a block four diameters wide, N of a rough bar is 10.9 with
+8 cells over the diameter, and 10.8 with 16 cells.
 
-Clay ahead of the bar flows around it and stretches exponentially, by about e^4 over a diameter.  After each quarter of
-a diameter, new points are therefore seeded around the bar, with the present stresses (remeshing and interpolation: Hu
-and Randolph 1998, Int. J. Numer. Anal. Meth. Geomech. 22).  Stress is the only memory of this clay.  After each new
-seeding, N is lower for one or two steps.  Errors refer to the mean of N over the end of each quarter, and `spread` is
-the range of N there, divided by this mean.
+Clay ahead of the bar flows around the bar and stretches exponentially, by a factor of about e^4 for each diameter of
+depth.  After each quarter of a diameter, new points are therefore seeded around the bar, with the present stresses
+(remeshing and interpolation: Hu and Randolph 1998, Int. J. Numer. Anal. Meth. Geomech. 22).  Stress is the only state
+variable of this clay.  After each new seeding, N is lower for one or two steps.  Errors refer to the mean of N in the
+last steps of each quarter.  `spread` is the range of N in these steps, divided by this mean.
 
 Saturated ("wet") clay is also computed: a smooth bar is pushed through it by one diameter, at three rates V = v D /
 c_v.  The water on top has the pressure that loads the clay, so the clay starts without effective stress.  Wet clay is
 seeded only once.  Domains longer than a cell are replaced by new domains (renewal).
 
-With --follow the bar is pushed once more, on grid lines that follow it.  Small cells then move with the bar, and the
-larger cells widen behind the bar and narrow ahead of the bar.  The number of cells does not change.
+With --follow the bar is pushed once more, on grid lines that follow the bar.  Small cells then move with the bar, and
+the larger cells widen behind the bar and narrow ahead of the bar.  The number of cells does not change.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def exact(alpha: float) -> float:
 def clay(cells: int, y: float = 0.0, follow: mpm.Tool | None = None) -> tuple:
     """Return the grid, half of the block around a bar at the height y, m, and the region of the block's top.
 
-    cells: number of cells over the diameter.  follow: the bar, if grid lines follow it.
+    cells: number of cells over the diameter; follow: the bar if grid lines follow it, or None.
     """
     h = D / cells
     n = round(HALF * cells)
@@ -92,13 +92,14 @@ def clay(cells: int, y: float = 0.0, follow: mpm.Tool | None = None) -> tuple:
 
 @dataclass
 class Push:
-    """Results of each step: depth divided by D; N, resistance divided by s_u D; excess pressure divided by s_u.
+    """Results of a push.
 
-    steady: whether this step counts in the error of N.
-
-    frame: final corners (n, 4, 2), m, a field (n,), and the shape of the bar (k, 4, 2), m.  The field is the
-    displacement of the points since the clay was seeded, divided by that of the bar.  In wet clay the field is the
-    excess pressure, divided by s_u.  lines: final grid lines along both axes, m.
+    depth, N, excess: depth divided by D, resistance divided by s_u D, and excess pressure divided by s_u in each step.
+    steady: whether a step counts in the error of N.
+    frame: final corners (n, 4, 2), in m, a field (n,), and the shape of the bar (k, 4, 2), in m.  The field is the
+    displacement of the points since the clay was seeded, divided by the displacement of the bar.  In wet clay the field
+    is the excess pressure divided by s_u.
+    lines: final grid lines along both axes, in m.
     """
 
     depth: list[float] = field(default_factory=list)
@@ -126,7 +127,7 @@ def push(alpha: float, cells: int, depth: float, follow: bool = False) -> Push:
 def leg(out: Push, stress: Callable | None, alpha: float, cells: int, y: float, way: float, follow: bool) -> Callable:
     """Push a bar down by `way` D from the height y D, append the results to `out`, and return the final stresses.
 
-    stress: initial stresses, see `kept`; None: the clay is first loaded by the pressure on its top.
+    stress: initial stresses, see `kept`. With None, the clay is first loaded by the pressure on its top.
     """
     begin, gone = 1.0 if stress is None else 0.0, max(out.depth, default=0.0)
     soil = mpm.DruckerPrager(bulk=50 * SHEAR, shear=SHEAR, friction=0.0, dilation=0.0, cohesion=STRENGTH)
@@ -153,7 +154,7 @@ def leg(out: Push, stress: Callable | None, alpha: float, cells: int, y: float, 
 
 
 def kept(simulation: mpm.Simulation) -> Callable:
-    """Return a function of positions x (n, 2), m, that returns the effective stress (n, 3, 3), Pa.
+    """Return a function that returns the effective stress (n, 3, 3), in Pa, at positions x (n, 2), in m.
 
     The stress is interpolated between the points, and reduced to the strength where it exceeds the strength.
     """
@@ -283,8 +284,8 @@ def draw(o: Namespace, runs: dict[float, Push], wet: dict[str, Push]) -> None:
     most = max(np.abs(run.frame[1]).max() for run in wet.values())
     for ax, (name, run) in zip(axes[1, 1:], wet.items(), strict=True):
         show(ax, run, "excess pore pressure / s_u (-)", f"{name}, V = v D / c_v = {RATES[name]:g}", (-most, most))
-    axes[0, 3].set(ylabel="F / (s_u D) (-)", title="wet clay, smooth bar, at three rates V", ylim=(0, None))
-    axes[1, 0].set(ylabel="excess pore pressure / s_u (-)", title="wet clay, ahead of the bar")
+    axes[0, 3].set(ylabel="F / (s_u D) (-)", title="Saturated clay, smooth bar, three rates V", ylim=(0, None))
+    axes[1, 0].set(ylabel="excess pore pressure / s_u (-)", title="Saturated clay, ahead of the bar")
     for ax in (axes[0, 0], axes[0, 3], axes[1, 0]):
         ax.set_xlabel("depth / D (-)")
         ax.legend(fontsize=9)

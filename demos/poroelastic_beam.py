@@ -3,10 +3,10 @@
 
 A beam of 1 m x 0.3 m, clamped at x = 0, carries a dead load on its top from x = 0.05 m on.  The load increases linearly
 until the end of the ramp (--ramp), and then remains constant.  The ends of the beam are permeable, and its long sides
-are no-flow.  The beam is in plane strain, or equivalently 0.1 m deep between smooth walls (--dim 3).  At first the pore
-water carries a part of the load.  The beam drains and sags by a third of its length.  Two other solutions are drawn.
-One is Euler-Bernoulli's small-strain beam without water.  The other (--reference) solves the same finite-strain Biot
-problem with body-fitted Taylor-Hood elements, in steps of a quarter of --dt.
+are impervious.  The beam is in plane strain, or equivalently 0.1 m deep between smooth walls (--dim 3).  At first the
+pore water carries a part of the load.  The beam drains and sags by a third of its length.  Two other solutions are
+drawn.  One is Euler-Bernoulli's small-strain beam without water.  The other (--reference) solves the same finite-strain
+Biot problem with body-fitted Taylor-Hood elements, in steps of a quarter of --dt.
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ def scene(o: Namespace) -> tuple[mpm.Simulation, float]:
     """Return the simulation, and the height of the beam's lower side on the grid, m."""
     cells = np.rint(BOX / o.h).astype(int)
     h = BOX / cells
-    # a larger box reaches as far below the beam as above it, by whole cells: the beam lies on the grid as before
+    # a larger box adds whole cells below and above the beam, so the beam lies on the grid as before
     lower = np.array([0, -((o.box_scale - 1) * cells[1] // 2) * h[1]])
     upper, cells = lower + o.box_scale * BOX, o.box_scale * cells
     bottom = (round(0.5 * BOX[1] / o.h) + o.offset) * h[1]
@@ -167,7 +167,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def reference(o: Namespace, result: mpm.Result, axis: np.ndarray) -> mpm.Result:
-    """Return the finite element result at the times of `result`, for positions `axis` (n, 2), m, on the beam's axis."""
+    """Return the finite element result at the times of `result`, for positions `axis` (n, 2) on the beam's axis."""
     fem = BiotFEM(mpm.Grid([0, 0], [LENGTH, HEIGHT], REFERENCE_CELLS), material(o), **physics(o))
     found = fem.run(o.t_end, o.dt / 4, probes=axis, progress=True)
     at = [int(np.argmin(np.abs(found.t - t))) for t in result.t]

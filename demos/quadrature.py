@@ -2,9 +2,9 @@
 """Exact integration over particle domains: tip deflection of the drained beam for different numbers of load steps.
 
 The beam of `poroelastic_beam.py` without water takes its whole load in n equal steps.  The material is elastic, so the
-deflection must not depend on n.  This is true with integration over the exact pieces of the domains.  With integration
-at the points, as in standard MPM, the deflection has an additional error with every cell that a point crosses.  The
-finite element reference takes the load in ten steps.
+deflection must not depend on n.  If the exact pieces of the domains are integrated, the deflection is independent of n.
+With integration at the points, as in standard MPM, every cell that a point crosses adds to the error.  The finite
+element reference takes the load in ten steps.
 """
 
 from __future__ import annotations

@@ -1,26 +1,29 @@
 # SPDX-License-Identifier: MIT
 """Rain on slopes that suction stabilises: factors of safety against time, and a bank that slides.
 
-A slope of b = 35 degrees is much longer than deep, so the problem is one-dimensional, normal to the slope.  A column
-stands on a water table 5 m below the surface, under the component of gravity normal to the slope.  The column starts at
-rest.  Then vertical rain of nine tenths of the conductivity falls until the flow is steady.  At a vertical depth d the
-factor of safety is
+A slope of b = 35 degrees is much longer than deep, so the problem is one-dimensional, normal to the slope.  The
+computed column reaches from the surface to a water table at a depth of 5 m.  Only the component of gravity normal to
+the slope acts on it.  The column starts at rest.  Then vertical rain of nine tenths of the conductivity falls until the
+flow is steady.  At a vertical depth d the factor of safety is
 
     FS = tan phi / tan b + 2 c / (gamma d sin 2b) + chi s (tan b + cot b) tan phi / (gamma d)
 
 with friction angle phi, cohesion c, Bishop's suction stress chi s and a constant unit weight gamma.  At rest and in
-steady flow the suction s of exponential soil is known exactly: exp(-alpha s / gamma_w) = q / k + (1 - q / k) exp(-alpha
-z cos^2 b), where alpha is Gardner's constant, gamma_w the unit weight of water, q the rain, k the conductivity, and z
+steady flow the suction s of exponential soil is known exactly:
+
+    exp(-alpha s / gamma_w) = q / k + (1 - q / k) exp(-alpha z cos(b)^2).
+
+Here alpha is Gardner's constant, gamma_w is the unit weight of water, q is the rain, k is the conductivity, and z is
 the height above the water table.
 
-Source: Lu and Godt (2008) for vertical flow; here the component of gravity normal to the slope replaces gravity.
-Errors: the largest relative error of FS at depths of 1, 2, 3 and 5 m, at rest and in steady flow.
+Source: Lu and Godt (2008) for vertical flow. In this demo the component of gravity normal to the slope replaces
+gravity. Errors: the largest relative error of FS at depths of 1, 2, 3 and 5 m, at rest and in steady flow.
 
-With `--slope 10` rain falls on a bank of soil, 5 m high and inclined at 60 degrees, on rough rock.  Suction and a
-cohesion that falls to a tenth with slip stabilise the bank.  The suction decreases until equilibrium is impossible.
-With inertia the bank then slides, runs out over the rock and comes to rest.  An animation shows failure and slide.
-Checks: balances of energy and water.  With 6 cells over its height, the bank fails after 1.7 h and runs out by 3.2 m;
-with 10 cells, after 1.5 h and by 2.7 m.  On one process.
+With `--slope 10` rain falls on a bank of soil, 5 m high and inclined at 60 degrees, on rough rock.  Suction and
+cohesion stabilise the bank; the cohesion decreases to a tenth with slip.  The suction decreases until equilibrium is
+impossible.  With inertia the bank then slides, runs out over the rock and comes to rest.  An animation shows failure
+and slide.  Checks: balances of energy and water.  With 6 cells over its height, the bank fails after 1.7 h and runs out
+by 3.2 m.  With 10 cells it fails after 1.5 h and runs out by 2.7 m.  The demo runs on one process.
 """
 
 from __future__ import annotations
@@ -68,7 +71,7 @@ def column(cells: int) -> mpm.Simulation:
 
 
 class Shot(NamedTuple):
-    """State of the bank: time, s, corners of the domains, m, their saturations, and the largest speed, m/s."""
+    """State of the bank: time, s, corners, m, and saturations of the domains, and the largest speed, m/s."""
 
     t: float
     corners: np.ndarray
@@ -196,13 +199,13 @@ def animate(path: Path, film: list[Shot], rained: int) -> None:
 
 
 def exact(depth: np.ndarray, share: float) -> np.ndarray:
-    """Return the exact factors of safety (n,) at depths (n,), m; share: rain divided by the conductivity."""
+    """Return the exact factors of safety (n,) at depths (n,), in m; share: rain divided by the conductivity."""
     filled = share + (1 - share) * np.exp(-ALPHA * (TABLE - depth) * np.cos(SLOPE) ** 2)
     return safety(depth, -filled * np.log(filled) / ALPHA * WATER)
 
 
 def safety(depth: np.ndarray, suction_stress: np.ndarray) -> np.ndarray:
-    """Return the factors of safety (n,) at depths (n,), m, from the suction stresses chi s (n,), Pa."""
+    """Return the factors of safety (n,) at depths (n,), in m, for suction stresses chi s (n,), in Pa."""
     angles = np.tan(SLOPE) + 1 / np.tan(SLOPE)
     held = 2 * COHESION / (UNIT * depth * np.sin(2 * SLOPE)) + np.tan(FRICTION) / np.tan(SLOPE)
     return held + suction_stress / (UNIT * depth) * angles * np.tan(FRICTION)
@@ -272,8 +275,8 @@ def draw(o: Namespace, curves: list) -> None:
     for share in (0.0, 0.9):
         right.plot(exact(depth, share), depth, "k--", lw=0.9, label="exact" if share else None)
     right.axvline(1, color="grey", lw=0.8)
-    left.set(xlabel="head, m", ylabel="depth, m", title="Suction fades from above", ylim=(TABLE, 0))
-    right.set(xlabel="factor of safety", title="and with it the strength", ylim=(TABLE, 0), xlim=(0.9, 1.5))
+    left.set(xlabel="head (m)", ylabel="depth (m)", title="Suction", ylim=(TABLE, 0))
+    right.set(xlabel="factor of safety", title="Factor of safety", ylim=(TABLE, 0), xlim=(0.9, 1.5))
     for ax in (left, right):
         ax.grid(alpha=0.3)
         ax.legend()

@@ -1,20 +1,21 @@
 # SPDX-License-Identifier: MIT
 """Active and passive pressure on a rigid retaining wall that tilts about its toe, away from the sand or into it.
 
-The sand carries a surcharge q and is weightless; phi = psi = 30 degrees.  It lies on a rough floor, and the friction
-angle of the wall is delta.  The wall tilts until a wedge of the sand flows.  The normal pressure on the wall is then K
-q, if c cot(phi) is added both to this pressure and to q, which removes the effect of cohesion, with
+The weightless sand lies on a rough floor and carries a surcharge q.  Its friction and dilation angles phi and psi are
+30 degrees, and the friction angle of the wall is delta.  The wall tilts until a wedge of the sand flows.  The effect of
+cohesion is removed by adding c cot(phi) to the surcharge q and to the normal pressure on the wall.  This pressure is
+then K q, with
 
     K = (1 ± sin(phi) cos(w)) / (1 ∓ sin(phi)) exp(± w tan(phi)),    w = asin(sin(delta) / sin(phi)) ± delta,
 
 where the upper sign is for passive pressure.  The flowing sand consists of a zone at the wall, a fan about the crest of
-the wall, and Rankine's zone (Prandtl, Sokolovskii).  Without friction, delta = 0, this is Rankine's K = (1 ± sin(phi))
-/ (1 ∓ sin(phi)).  Coulomb's solution is the critical wedge with a plane slip surface.
+the wall, and Rankine's zone (Prandtl, Sokolovskii).  Without wall friction (delta = 0), this is Rankine's
+`K = (1 ± sin(phi)) / (1 ∓ sin(phi))`.  Coulomb's solution is the critical wedge with a plane slip surface.
 
 The moment about the toe, which is work-conjugate to the rotation, also gives K.  A tilting wall opens no gap at its
-toe.  A translating wall opens a gap at its toe, and no force acts there: without the lowest of ten cells, the active
-thrust is a tenth too small.  The sand is stiff, so that it flows at a small tilt.  At two and a half times this tilt,
-the active thrust is 2.5 to 3 % larger.
+toe.  A translating wall opens a gap at its toe, in which no force acts.  Without the force on the lowest of ten cells,
+the active thrust is a tenth too small.  The sand is stiff, so that it flows at a small tilt.  At two and a half times
+this tilt, the active thrust is 2.5 to 3 % larger.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ def exact(delta: float, way: int) -> float:
 
 
 def coulomb(delta: float, way: int) -> float:
-    """Return K of Coulomb's wedge, for the same parameters."""
+    """Return K of Coulomb's wedge; parameters: see `exact`."""
     (p, d), angle = np.radians([PHI, delta]), np.radians(np.linspace(5, 85, 8001))
     K = np.cos(d) / np.tan(angle) * np.tan(angle + way * p)
     K /= np.cos(d) - way * np.sin(d) * np.tan(angle + way * p)
@@ -52,7 +53,7 @@ def coulomb(delta: float, way: int) -> float:
 
 
 def slip_line(delta: float, way: int) -> np.ndarray:
-    """Return the edge (n, 2), m, of the yielding sand, from the toe to the surface."""
+    """Return the edge (n, 2), in m, of the yielding sand, from the toe to the surface."""
     p, d = np.radians([PHI, delta])
     fan, rankine = (np.arcsin(np.sin(d) / np.sin(p)) + way * d) / 2, np.pi / 4 - way * p / 2
     at_wall, apex = np.pi / 2 - rankine - fan, np.pi / 2 - way * p
@@ -64,7 +65,7 @@ def slip_line(delta: float, way: int) -> np.ndarray:
 
 @dataclass
 class Tilted:
-    """Results of a run: tilts (n,), rad, and K (n,) from the thrust and from the moment.
+    """Results of a run: tilts (n,), in rad, and K (n,) from the thrust and from the moment.
 
     frame: final corners of the domains, m, plastic shear strains, and shape of the wall.
     """

@@ -11,22 +11,22 @@ and compiler.  If the demo itself is started by mpirun, all runs share its proce
 so far.
 
 The exponent of a part is the slope of log(time) against log(points), fitted by least squares to the larger half of the
-sizes.  `kB a point` is the slope of the memory against the points, fitted to all sizes by least squares of relative
-errors.  Runs on several processes also print the load balance (`imbalance`: largest number of pieces of a process
-divided by the mean) and the messages of a step on the process with the most.  `exchange` are the messages of the
-package (pieces, corners, points).  `solvers` are the messages that PETSc counts in set-up and solution of its Krylov
-solvers.  Messages of MUMPS and of dolfinx are not counted.
+sizes.  `kB a point` is the slope of the memory against the number of points, fitted to all sizes by least squares of
+relative errors.  Runs on several processes also print the load balance (`imbalance`: largest number of pieces of a
+process divided by the mean) and the messages of a step on the process with the most messages.  `exchange` are the
+messages of the package (pieces, corners, points).  `solvers` are the messages that PETSc counts in set-up and solution
+of its Krylov solvers.  Messages of MUMPS and of dolfinx are not counted.
 
 With runs on one and on several processes, a cost model is fitted to the seconds of a step of n points on P processes,
 
     T = e + a n / P + b H + c log2 P,
 
-where the terms are a fixed cost, the work for the points (in a measured run, times its imbalance), the work for points
-at faces between processes, and a cost of messages that does not depend on their size.  The coefficients, all >= 0, are
-fitted by least squares of relative errors.  H is the number of points along the faces that a process shares with
-others, for a cube that is halved repeatedly.  If a run has more processes than the machine has processors, its message
-counts are used, but not its times.  In 2D the model excludes the solvers: the cost of factorisations is not
-proportional to n / P.
+where e is a fixed cost.  The term a n / P is the work for the points; in a measured run it is multiplied by the
+imbalance.  The term b H is the work for points at faces between processes.  The last term is a cost of messages that
+does not depend on their size.  The coefficients, all >= 0, are fitted by least squares of relative errors.  H is the
+number of points along the faces that a process shares with others, for a cube that is halved repeatedly.  If a run has
+more processes than the machine has processors, its message counts are used, but not its times.  In 2D the model
+excludes the solvers: the cost of factorisations is not proportional to n / P.
 """
 
 from __future__ import annotations
@@ -142,7 +142,7 @@ def measure(dim: int, points: float) -> dict:
 
 
 def held(root: object, buffers: bool = True) -> tuple[dict[str, int], set[int]]:
-    """Return the bytes of all arrays that an object reaches on this process, by kind; and the lengths of their axes.
+    """Return two results for the arrays that an object refers to on this process: bytes by kind, lengths of axes.
 
     Shared memory counts once.  Arrays in files that are mapped into memory have the kind "files"; their axes are left
     out.
@@ -226,7 +226,7 @@ def terms(dim: int, n: float, processes: int, imbalance: float = 1.0) -> list[fl
 
 
 def modelled(row: dict) -> float:
-    """Return the time of a step, s, to which the cost model is fitted: in 2D without the solvers."""
+    """Return the time of a step, s, to which the cost model is fitted; in 2D it excludes the solvers."""
     return row["step"] - (sum(row[part] for part in SOLVERS) if row["dim"] == 2 else 0.0)
 
 

@@ -4,14 +4,16 @@
 A dry column, 50 m high, has E = 10 kPa, nu = 0 and a density of 80 kg/m³.  The column stands between smooth walls.
 Gravity, increased to 10 m/s² in equal steps, compresses the column to 24.06 m.  The soil at its foot is compressed to
 0.3 of its initial height, so points cross many cells.  The first Piola-Kirchhoff stress at the reference height Y
-carries the weight above, P = -rho0 g (l0 - Y).  In a column of constant width this stress equals Cauchy's stress.  With
-Hencky's law, the stretch follows from Lambert's W function.  Source: the column of AMPLE (Coombs & Augarde 2020,
-doi:10.1016/j.advengsoft.2019.102748), here with a hundredth of its stiffness.  On one process.
+carries the weight above: `P = -rho0 g (l0 - Y)`, with the initial density rho0 and the initial height l0.  In a column
+of constant width this stress equals Cauchy's stress.  With Hencky's law, the stretch follows from Lambert's W function.
+Source: the column of AMPLE (Coombs & Augarde 2020, doi:10.1016/j.advengsoft.2019.102748), here with a hundredth of its
+stiffness.  The demo runs on one process.
 
 Errors: `stress` is the mean of |sigma - exact(Y)| / (rho0 g l0) over the points, weighted by volume; `height` is the
-relative error of the column's height.  With 16 and 64 cells over the initial height, the published stress errors of
-GIMP are 3.7e-3 and 4.4e-4; here they are 3.4e-4 and 6.4e-6.  `--quadrature point` integrates at the points instead of
-over the pieces of their domains; its error is about 8 % with any number of cells.
+relative error of the column's height.  With 16 cells over the initial height, `stress` is 3.4e-4; the published error
+of GIMP is 3.7e-3.  With 64 cells, `stress` is 6.4e-6; the published error of GIMP is 4.4e-4.  `--quadrature point`
+integrates at the points instead of over the pieces of their domains. The error is then about 8 % with any number of
+cells.
 """
 
 from __future__ import annotations
@@ -32,7 +34,7 @@ FOAM = mpm.Hencky(bulk=EXACT.bulk, shear=EXACT.shear, porosity=POROSITY, grain_d
 
 @dataclass
 class Outcome:
-    """The column at rest: heights (n,), m, initially (Y) and now (y), stress (n,), Pa, and initial volumes (n,)."""
+    """The column at rest: initial (Y) and present (y) heights (n,), in m, stress (n,), in Pa, initial volumes (n,)."""
 
     Y: np.ndarray
     y: np.ndarray

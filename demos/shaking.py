@@ -1,16 +1,17 @@
 # SPDX-License-Identifier: MIT
 """A shear wave from the ground enters a soft layer: amplification at the surface against the exact solution.
 
-A layer of 10 m, c_s = 100 m/s, lies on ground with c_s = 300 m/s.  The computed ground ends at an absorbing base, 5 m
-below the layer.  A shear pulse enters through this base, and reflections from layer and surface leave through it.  The
-sides have no vertical displacement, as in an infinite layer. The reference is the motion of a free surface of the
-ground without the layer; this motion is twice the incoming wave.  The spectrum of the surface motion, divided by that
-of the reference motion, is
+Shear waves have a velocity of 100 m/s in a layer of 10 m, and of 300 m/s in the ground below the layer.  The computed
+ground ends at an absorbing base, 5 m below the layer.  A shear pulse enters through this base, and reflections from
+layer and surface leave through it.  The sides have no vertical displacement, as in an infinite layer. The reference is
+the motion of the ground's free surface without a layer, which is twice the incoming wave.  The spectrum of the surface
+motion, divided by the spectrum of the reference motion, is
 
     1 / |cos(w H / c) + i a sin(w H / c)|,        a = rho c / (rho_g c_g),
 
-with wave velocity c and density rho of the layer, and c_g and rho_g of the ground.  The energy balance includes the
-work of the incoming wave and of the absorbing base.
+with the angular frequency w, the thickness H, the wave velocity c and the density rho of the layer.  The wave velocity
+and the density of the ground are c_g and rho_g.  The energy balance includes the work of the incoming wave and of the
+absorbing base.
 """
 
 from __future__ import annotations

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: MIT
 """Factor of safety of a slope, and run-out after a larger loss of strength.
 
-A slope of 2:1, 10 m high, stands on 5 m of the same Mohr-Coulomb soil, phi = 20 degrees, c / (gamma H) = 0.05, without
-dilation.
+A slope of 2:1, H = 10 m high, stands on a layer of 5 m. Both are Mohr-Coulomb soil without dilation, with the friction
+angle phi = 20 degrees and the cohesion c = 0.05 gamma H (unit weight gamma).
 
 1. Factor of safety: the largest divisor of c and tan(phi) for which the slope is stable.  `mpm.factor_of_safety`
-   reduces the strength of the slope at rest, and checks whether the overstress, a viscous stress, decays.  The best
-   log-spiral mechanism gives 1.368, finite elements 1.4 (Griffiths and Lane 1999).
-2. Run-out: the strength is suddenly divided by 1.6, in viscous soil.  The slope slides until its new
+   reduces the strength of the slope at rest, and checks whether the viscous stress decays.  The best log-spiral
+   mechanism gives 1.368, and finite elements give 1.4 (Griffiths and Lane 1999).
+2. Run-out: the strength of viscous soil is suddenly divided by 1.6.  The slope slides until its new
    shape is just stable.  The factor of safety of this shape differs from one by less than 0.1.
 """
 

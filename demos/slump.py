@@ -1,30 +1,31 @@
 # SPDX-License-Identifier: MIT
 """A submarine bank loses its strength and slumps: large plastic deformation with pore pressures.
 
-A bank of saturated soil with a vertical side stands on a rough floor under water.  Half of it is computed, 10 m high
-and 10 m long; x = 0 is a plane of symmetry.  Pressures are in excess of the hydrostatic pressure outside.  The weight
-is buoyant, gamma' = (1 - n) (rho_s - rho_w) g with the porosity n and the densities of grains and water, and is a term
-in UFL.  Inertia is neglected.  On one process.
+A bank of saturated soil with a vertical side stands on a rough floor under water.  The computed half is 10 m high and
+10 m long; x = 0 is a plane of symmetry.  Pressures are in excess of the hydrostatic pressure outside.  The weight is a
+term in UFL.  The buoyant unit weight is `gamma' = (1 - n) (rho_s - rho_w) g`, with the porosity n and the densities
+rho_s of the grains and rho_w of the water.  Inertia is neglected.  The demo runs on one process.
 
 1. Critical strength.  Without friction and drainage, the strength c is reduced by 1 % in each step.  A vertical side of
    height H is stable while gamma' H / c < 3.78 (limit analysis: between 3.76 and 3.79, Pastor, Thai and Francescato
    2000; critical slip circle: 3.83, Fellenius 1927).  The bank has failed when its crest settles 20 times as much in a
    step as in the first steps.  With a factor of 10 or 40 instead of 20, the result changes by 1 %.  With 10 cells over
-   the height the bank fails at gamma' H / c = 3.93, which is 3.9 % too large; with 20 cells at 3.85, 1.9 % too large.
-   This error is of first order in the cell size, and the extrapolated value is 3.78.
+   the height the bank fails at gamma' H / c = 3.93, which is 3.9 % too large. With 20 cells it fails at 3.85, which is
+   1.9 % too large. This error is of first order in the cell size, and the extrapolated value is 3.78.
 2. Run-out.  The consolidated bank, with friction, loses its cohesion within T = 10 minutes, far faster than it drains.
    The bank slumps, and its crest is carried along by the flowing soil.  In front of the initial toe, the water carries
-   more than half of the weight.  At rest the bank is twice as long as before; then the excess pressure drains.  The
-   final inclination of the slope is 23.5 degrees, and 29.3 degrees in its steepest part of length H / 3.  The friction
-   angle is 25 degrees; a Drucker-Prager cone without dilation mobilises only 24.2 degrees, arcsine of the cone's slope.
-   The remaining cohesion, a hundredth of gamma' H, makes the slope slightly steeper.  Twice the number of cells or
-   steps, or half the viscosity, changes run-out and height by less than 2 %.
+   more than half of the soil's weight.  At rest the bank is twice as long as before; then the excess pressure drains.
+   The final inclination of the slope is 23.5 degrees, and 29.3 degrees in its steepest part of length H / 3.  The
+   friction angle is 25 degrees.  Without dilation a Drucker-Prager cone mobilises only 24.2 degrees, the arcsine of the
+   cone's slope.  The remaining cohesion, a hundredth of gamma' H, makes the slope slightly steeper.  Twice the number
+   of cells or steps, or half the viscosity, changes run-out and height by less than 2 %.
 
 The cohesion is a function of position, so the points carry it (`points.data["cohesion"]`).  A function in `observe`
-reduces it after each step.  A step that does not converge is cut, and repeated with the same strength.  The shorter
+reduces it after each step.  A step that does not converge is cut, and repeated with unchanged strength.  The shorter
 step converges because a viscous stress of 2 eta times the strain rate, also a term in UFL, limits the velocity of the
-bank.  eta / T is a hundredth of gamma' H; part 1 has no viscosity.  A mesh could not represent this deformation,
-because the vertical side of the bank finally lies on the floor, and plastic strains are several hundred per cent.
+bank.  The ratio eta / T is a hundredth of gamma' H.  Part 1 has no viscosity.  A mesh could not represent this
+deformation, because the vertical side of the bank finally lies on the floor, and plastic strains are several hundred
+per cent.
 """
 
 from __future__ import annotations
@@ -52,7 +53,7 @@ CV = CONDUCTIVITY / mpm.Fluid().unit_weight * (2 + 4 / 3) * SHEAR  # m²/s
 
 
 def bank(cells: int, length: float, room: float, friction: float, cohesion: float, conductivity: float, **scene):
-    """Return the consolidated bank with a probe on its crest; cells: cells over its height; room: free floor, m."""
+    """Return the consolidated bank, `cells` cells high, with a probe on its crest; room: length of free floor, m."""
     h = HEIGHT / cells
     grid = mpm.Grid([0, 0], [length + room, HEIGHT + h], [round((length + room) / h), cells + 1])
     body = mpm.box(grid, [0, 0], [length, HEIGHT])
@@ -80,8 +81,8 @@ def bank(cells: int, length: float, room: float, friction: float, cohesion: floa
 class Failure:
     """Stability numbers gamma' H / c (n,), and settlement rates (n,) of the crest.
 
-    A rate is the settlement in a step, divided by its mean in the first five steps.  critical: the stability number at
-    which the bank fails.
+    A rate is the settlement in a step, divided by the mean settlement in the first five steps.
+    critical: stability number at which the bank fails.
     """
 
     cells: int
@@ -113,8 +114,10 @@ def fail(cells: int, start: float = 3.0, ratio: float = 0.99) -> Failure:
 class Frame:
     """State of the bank at one time, s.
 
-    corners of the domains, m; surface: positions (k, 2) from the crown to the toe, m; excess pore pressure, Pa; plastic
-    strain; volume, m²; cohesion, Pa.
+    corners: corners of the domains, in m.
+    surface (k, 2): positions from the crown to the toe, in m.
+    pressure, strain: excess pore pressures, in Pa, and plastic strains of the points.
+    volume, cohesion: volume of the bank, in m², and its cohesion, in Pa.
     """
 
     t: float

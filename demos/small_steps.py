@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: MIT
 """As the time step tends to zero, the error tends to the spatial error, for columns at rest and in motion.
 
-Terzaghi's column (demo `terzaghi`) consolidates to T_v = c_v t / height² = 0.1 in 1, 10, ..., 10 000 equal steps, 0.1
-to 1e-5 of the time of consolidation.  The error is the root mean square of (p - exact) / p0 at the centroids of all
-cells.  The error of time integration decreases with the step.  The remaining error must be the spatial error.  It is
-known, because the semi-discrete equations have an exact solution in time.  The remaining error must not depend on the
-number of steps.  If pressures were averaged to points and back in every step, they would diffuse.  Three columns are
-computed:
+Terzaghi's column (demo `terzaghi`) consolidates until the reduced time `T_v = c_v t / height²` is 0.1.  It takes 1, 10,
+..., 10 000 equal steps, of 0.1 to 1e-5 of the consolidation time.  The error is the root mean square of (p - exact) /
+p0 at the centroids of all cells.  The error of time integration decreases with the step.  The remaining error must be
+the spatial error.  The spatial error is known, because the semi-discrete equations have an exact solution in time.  The
+remaining error must not depend on the number of steps.  If pressures were averaged to points and back in every step,
+they would diffuse.  Three columns are computed:
 
 * column at rest on the grid;
 * moving column: during consolidation the base moves down by half the height, through half of all cells;
@@ -21,7 +21,7 @@ error, and of second order in the cell size.
 The overshoot, the largest p / p0 - 1 in all steps, is zero for the column at rest, with steps of any length.  In one
 dimension, the scheme therefore has no smallest time step.  In more dimensions, small steps cause checkerboard modes of
 the pressure, unless the jumps of the pressure are damped (`storage.py`).  The demo shows these modes in the first step
-after a strip load on a layer in a rough box, with and without damping.  On one process.
+after a strip load on a layer in a rough box, with and without damping.  The demo runs on one process.
 """
 
 from __future__ import annotations

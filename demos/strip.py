@@ -2,19 +2,20 @@
 """Large consolidation under a strip load: a layer settles by an eighth of its height, and its porosity decreases.
 
 A layer between smooth walls, on a smooth, impervious base, carries a dead load q on a fifth of its drained surface.
-Half of the layer is computed, as wide as high; x = 0 is the plane of symmetry.  The soil is elastic (Hencky, nu = 0)
-with porosity 0.6.  Its conductivity k0 10^(5 (J - 1)) decreases as pores close.  Grains and water are incompressible.
-T = k0 E t/(gamma_w H²) is the reduced time, and the load increases until T = 0.01.  Source: Carter, Small and Booker
-(1977), as in Abaqus' benchmark 1.14.3.  With q = E/2 (--load 0.5) the pores under the strip close at T = 0.37, and the
-law, which has no stiffness of the grains, fails.  The package reports this, and the demo shows the results up to this
-time.
+Half of the layer is computed, which is as wide as high; x = 0 is the plane of symmetry.  The soil is elastic (Hencky,
+nu = 0) with porosity 0.6.  Its conductivity `k0 10^(5 (J - 1))` decreases as pores close.  Grains and water are
+incompressible.  The reduced time is `T = k0 E t / (gamma_w H²)`, and the load increases until T = 0.01.  Source:
+Carter, Small and Booker (1977), as in Abaqus' benchmark 1.14.3.  With q = E/2 (--load 0.5) the pores under the strip
+close at T = 0.37, and the law, which has no stiffness of the grains, fails.  The package reports this, and the demo
+shows the results up to this time.
 
-The references for q/E = 0.25 are results of Taylor-Hood elements, extrapolated in time, and in h from 20, 40 and 80
-cells. The extrapolated settlements differ from the settlements on 40 cells by 0.6 % at T = 0.01, and by 0.2 % at T =
-0.1.  Errors: `settlement` is the largest error of the displacement of the strip's middle from T = 0.1 on, and `at_once`
-its error at T = 0.01.  `edge` and `beside` are the largest errors at two other places from T = 0.1 on: the strip's
-edge, where the load jumps, and the far end of the drained surface.  All errors are relative to the displacement of the
-middle.  --reference also runs Taylor-Hood elements on the same cells. On one process.
+The references for q/E = 0.25 are results of Taylor-Hood elements.  They are extrapolated in time, and in the cell size
+from 20, 40 and 80 cells. The extrapolated settlements differ from the settlements on 40 cells by 0.6 % at T = 0.01, and
+by 0.2 % at T = 0.1.  Errors: `settlement` is the largest error of the displacement of the strip's middle from T = 0.1
+on, and `at_once` is the error of this displacement at T = 0.01.  `edge` is the largest error from T = 0.1 on at the
+strip's edge, where the load jumps.  `beside` is the largest error from T = 0.1 on at the far end of the drained
+surface.  All errors are relative to the displacement of the middle.  --reference also runs Taylor-Hood elements on the
+same cells.  The demo runs on one process.
 """
 
 from __future__ import annotations
@@ -66,7 +67,7 @@ def conditions(load: float) -> dict:
 def times(a_decade: int) -> NDArray[np.float64]:
     """Return the times T at which steps end.
 
-    a_decade: number of steps in which T grows tenfold after `RAMP`; two thirds of this number end at `RAMP` or before.
+    a_decade: number of steps in which T grows tenfold after `RAMP`; two thirds as many steps end at or before `RAMP`.
     """
     ramp = RAMP * np.linspace(0, 1, 1 + 2 * a_decade // 3)[1:]
     return np.append(ramp, RAMP * 10 ** (np.arange(1, 5 * a_decade // 2 + 1) / a_decade))
@@ -76,7 +77,8 @@ def times(a_decade: int) -> NDArray[np.float64]:
 class Outcome:
     """Histories: reduced times T, and upward displacements of `PLACES` divided by `HEIGHT`.
 
-    frames: T, corners, pressures divided by E, and porosities of the points.  why: reason if the run ended early.
+    frames: T, corners, pressures divided by E, and porosities of the points.
+    why: reason if the run ended early.
     """
 
     T: list[float] = field(default_factory=list)

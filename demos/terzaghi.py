@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: MIT
 """Terzaghi's consolidation: a saturated layer is loaded suddenly and drains at its top.
 
-A column of 1 m between smooth walls, impervious at its foot, takes a load p0 in the first step.  Initially the
+A column of 1 m between smooth walls, impervious at its foot, carries a load p0 from the first step on.  Initially the
 incompressible pore water carries the whole load, p = p0.  As water drains, the load is transferred to the skeleton:
-dp/dt = c_v d²p/dz², c_v = kappa (K + 4G/3).  The load strains the skeleton by 1e-5, so small-strain theory is accurate.
-T_v = c_v t / height² is the reduced time.  Source: Terzaghi (1923); series in Verruijt, Theory and Problems of
-Poroelasticity (2016).  On one process.
+`dp/dt = c_v d²p/dz²`, with `c_v = kappa (K + 4G/3)`.  The load strains the skeleton by 1e-5, so small-strain theory is
+accurate.  The reduced time is `T_v = c_v t / height²`.  Source: Terzaghi (1923); series in Verruijt, Theory and
+Problems of Poroelasticity (2016).  The demo runs on one process.
 
 Errors: the largest |p - exact| / p0 at the centroids of all cells, at T_v = 0.1, 0.5 and 1, and the relative error of
 the `settlement` at T_v = 0.5.  Steps are equal, or adaptive with --rtol.

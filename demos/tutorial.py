@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """The method step by step: first one particle domain, cut by the grid, and at the end a consolidating column.
 
-Readers need to know FEniCSx, but not this package.  Each part prints its result and ends with an assertion.  On one
-process.
+Readers need to know FEniCSx, but not this package.  Each part prints its result and ends with an assertion.  The demo
+runs on one process.
 """
 
 from __future__ import annotations

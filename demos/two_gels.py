@@ -2,12 +2,12 @@
 """Two gels are pressed together, slide along each other with friction, and separate.
 
 Each of two half-discs is a group of bodies with its own displacements.  The lower gel is fixed, and the upper gel
-follows a prescribed path.  While the gels are apart no force acts between them, however narrow the gap.  As the upper
-gel passes over the top of the lower one, the contact surface inclines.  The ratio of horizontal to vertical force is
-then less than the friction coefficient.
+follows a prescribed path.  While the gels are apart, no force acts between them, however narrow the gap is.  As the
+upper gel passes over the top of the lower gel, the contact surface inclines.  The ratio of horizontal to vertical force
+is then less than the friction coefficient.
 
 A second scene is the contact of a curved and a flat elastic body.  Largest pressure and half-width are compared with
-Hertz's solution for the computed force.  Both errors are due to the small number of cells over the half-width.
+Hertz's solution for the computed force.  The errors of both are due to the small number of cells over the half-width.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def _round(x: np.ndarray) -> np.ndarray:
 
 
 def path(t: float) -> tuple[float, float]:
-    """Return the displacement (x, y), m, of the upper gel, which moves down, then sideways, then up."""
+    """Return the displacement (x, y), in m, of the upper gel, which moves down, then sideways, then up."""
     down = -DOWN * min(t / TIMES[0], 1) - GAP * min(t / TIMES[0], 1)
     along = ALONG * np.clip((t - TIMES[0]) / (TIMES[1] - TIMES[0]), 0, 1)
     return along, down + UP * np.clip((t - TIMES[1]) / (TIMES[2] - TIMES[1]), 0, 1)
@@ -131,7 +131,7 @@ def draw(out: Path, shown: list, t: np.ndarray, force: np.ndarray) -> None:
         t, np.where((t > TIMES[0]) & (force[:, 1] > 0), rigid, np.nan), "k--", label="rigid gels that slide"
     )
     axes[2, 1].set(xlabel="time (s)", ylabel="force along / force up (-)")
-    axes[2, 1].set_title(f"friction {FRICTION} on a contact that inclines more and more", fontsize=10)
+    axes[2, 1].set_title(f"Friction {FRICTION}, inclination of the contact grows", fontsize=10)
     for ax in axes[2]:
         ax.grid(alpha=0.3)
         ax.legend(fontsize=8)

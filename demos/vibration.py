@@ -2,14 +2,15 @@
 """Vibration of a beam and of a bar: frequencies and energy loss against exact values.
 
 1. A clamped beam, 1 x 0.3 m, in plane strain, receives a transverse and an axial impulse, so small that small-strain
-   theory is accurate.  The reference of the first bending frequency is 3.24419 Hz, by spectral elements that are graded
-   towards the corners of the clamp.  The first axial frequency is exactly c / (4 L) = 17.67767 Hz, with the axial
-   wave velocity c and the length L.  The computed frequencies are fitted to the motion of the tip over three periods.
-2. A free bar of length L has the law P = E (F - 1), with the first Piola-Kirchhoff stress P.  It vibrates with strains
-   of A = 5 % and moves over fifty cells in 25 periods.  In the exact solution the ends oscillate about the uniform
-   motion by (A L / pi) sin(pi c t / L), without loss of energy.  In each step dt, SDIRK2 itself loses the fraction
-   gamma^4 y^4 / (1 + gamma^2 y^2)^2 of the energy.  Here y = omega dt, with the angular frequency omega.  The remaining
-   loss is due to grid resets.
+   theory is accurate.  The reference of the first bending frequency is 3.24419 Hz; it is computed with spectral
+   elements that are graded towards the corners of the clamp.  The first axial frequency is exactly c / (4 L) = 17.67767
+   Hz, with the axial wave velocity c and the length L.  The computed frequencies are fitted to the motion of the tip
+   over three periods.
+2. A free bar of length L has the law `P = E (F - 1)`, with the first Piola-Kirchhoff stress P.  It vibrates with
+   strains of A = 5 % and moves over fifty cells in 25 periods.  In the exact solution the ends oscillate about the
+   uniform motion by `(A L / pi) sin(pi c t / L)`, without loss of energy.  In each step dt, SDIRK2 itself loses the
+   fraction `gamma^4 y^4 / (1 + gamma^2 y^2)^2` of the energy.  Here y is omega dt, with the angular frequency omega,
+   and gamma is the coefficient of SDIRK2.  The remaining loss is due to grid resets.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ LOST = 0.02  # allowed energy loss of the bar in 25 periods of 40 steps
 
 
 class Bar(mpm.LinearElastic):
-    """Law with P = E (F - 1) along each axis, so waves of any amplitude keep their shape."""
+    """Law with `P = E (F - 1)` along each axis, so that waves of any amplitude keep their shape."""
 
     @staticmethod
     def energy(F, bulk, shear):
@@ -128,7 +129,9 @@ def draw(o: Namespace, beams: dict, bar: dict[str, np.ndarray], own: np.ndarray)
     t = np.linspace(0, 3, 400)
     tip.plot(t, np.sin(2 * np.pi * t), color="black", lw=1, label="sine of the exact frequency", zorder=0)
     tip.set(
-        xlabel="time / exact period", ylabel="deflection of the tip / its largest", title="Beam that is struck across"
+        xlabel="time / exact period",
+        ylabel="deflection of the tip / its largest",
+        title="Beam after a transverse impulse",
     )
     last = bar["t"] > o.periods - min(3, o.periods)
     fine = np.linspace(bar["t"][last][0], o.periods, 400)

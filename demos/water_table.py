@@ -10,9 +10,9 @@ The second scene is a levee of 3 m with slopes of 1:2 on an impervious base.  Th
 days, is constant for two days, and falls again in two days.  The soil of the levee retains water under suction, so
 water that infiltrates late also drains late.
 
-Errors after 2, 3, 4 and 8 hours: the largest error of the height of the water table at six positions, m.  A further
-error is the relative error of the final outflow into the ditch.  `balance` is the error of the slab's water balance,
-divided by the volume of rain.  On one process.
+The errors after 2, 3, 4 and 8 hours are the largest errors, in m, of the height of the water table at six positions.  A
+further error is the relative error of the final outflow into the ditch.  `balance` is the error of the slab's water
+balance, divided by the volume of rain.  The demo runs on one process.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ CONVERGED = {
     4: (1.1005, 1.0426, 0.9378, 0.8528, 0.7834, 0.7210),
     8: (1.2187, 1.1601, 1.0531, 0.9557, 0.8642, 0.7720),
 }
-"""By hour: heights of the water table at the positions, m."""
+"""By hour: heights, m, of the water table at the six positions."""
 FLOW = 653.1e-4 / HOUR  # m²/s into the ditch after 8 hours
 LEVEE, CREST, SLOPE, FLOOD = 3.0, 2.0, 2.0, 2.5  # m, m, slope: run divided by rise, m
 SEEN = (2.0, 4.0, 6.0, 8.0)  # days
@@ -154,14 +154,14 @@ def draw(o: Namespace, curves: list, frames: list) -> None:
         first.plot(x, z, lw=1.4, color=f"C{i}", label=f"{hours:g} h")
         if hours:
             first.plot(PLACES, CONVERGED[hours], "o", ms=4, mfc="none", color=f"C{i}")
-    first.set(xlabel="x, m", ylabel="height, m", title="Water table under rain on 0 ... 0.5 m; circles: converged")
+    first.set(xlabel="x (m)", ylabel="height (m)", title="Water table under rain on x < 0.5 m; circles: converged")
     first.legend(ncols=5, fontsize=8)
     first.grid(alpha=0.3)
     for ax, (days, corners, pressure) in zip(others, frames, strict=True):
         patches = common.domains(ax, corners, pressure / 1e3, clim=(-20, 20), cmap="RdBu")
         ax.axhline(level(days * DAY), color="C0", lw=1)
         ax.set(title=f"Levee, day {days:g}", xlim=(0, corners[:, :, 0].max()), ylim=(0, LEVEE + 0.2))
-    fig.colorbar(patches, ax=others, label="pore pressure, kPa", shrink=0.8)
+    fig.colorbar(patches, ax=others, label="pore pressure (kPa)", shrink=0.8)
     common.save(fig, o.out / "water_table.png")
 
 

@@ -1,18 +1,18 @@
 # SPDX-License-Identifier: MIT
 """Waves in soil columns, dry and saturated, against exact solutions.
 
-1. A sudden load q acts on a dry column of height L = 10 m.  The base either reflects the wave, if rigid, or absorbs the
-   wave.  With the wave velocity c and the density rho, the stress on the base is zero until L / c.  Then it is 2 q on a
-   rigid base, until 3 L / c, and q on an absorbing base.  Behind the front the velocity of the soil is q / (rho c).
-   Stresses oscillate behind a front, so their means are compared.
+1. A sudden load q acts on a dry column of height L = 10 m.  The base is rigid and reflects the wave, or it absorbs the
+   wave.  The stress on the base is zero until the time L / c, with the wave velocity c.  Then the stress is 2 q on a
+   rigid base (until 3 L / c), and q on an absorbing base.  Behind the front the velocity of the soil is q / (rho c),
+   with the density rho.  Stresses oscillate behind a front, so their means are compared.
 2. A slow or a fast harmonic load acts on a saturated column of 10 m, drained at its top (Zienkiewicz, Chang and Bettess
    1980).  The complex amplitudes of settlement and pore pressures in the steady oscillation are compared.  In the slow
    case, water drains only from a layer of 0.3 m below the top.
-3. The same column, with incompressible water and grains and k = 0.01 m/s, takes a sudden load (after de Boer, Ehlers
-   and Liu 1993).  Until a wave returns from the base, the settlement of the top at the time t is q / (M a^(1/2))
-   int_0^t exp(-r s) I_0(r s) ds.  Here r = b / (2 a), I_0 is the modified Bessel function, a = n_s (rho_s - rho_w) / M
-   and b = g rho_w / (k M).  M is the oedometric modulus, n_s the volume fraction of the grains, rho_s and rho_w are the
-   densities of grains and water.
+3. The same column, with incompressible water and grains and k = 0.01 m/s, carries a sudden load (after de Boer, Ehlers
+   and Liu 1993).  Until a wave returns from the base, the settlement of the top at the time t is
+   `q / (M a^(1/2)) int_0^t exp(-r s) I_0(r s) ds`.  Here `r = b / (2 a)`, I_0 is the modified Bessel function,
+   `a = n_s (rho_s - rho_w) / M` and `b = g rho_w / (k M)`.  M is the oedometric modulus, and n_s is the volume fraction
+   of the grains.  The density of the grains is rho_s, and the density of the water is rho_w.
 
 The equations are the u-p form: water accelerates with the grains.  In the saturated columns each cell is 1.05 times as
 high as the cell above, so that cells resolve the layer that drains.
@@ -48,7 +48,7 @@ def column(
 ) -> tuple[mpm.Simulation, np.ndarray]:
     """Return a column, one cell wide, with an empty cell of the grid below its base, and its middle line.
 
-    growth: height of a cell divided by that of the cell above.  The middle line is returned as its base and top, m.
+    growth: height of a cell divided by the height of the cell above.  The middle line is given by its base and top, m.
     """
     h = growth ** np.arange(cells)[::-1]
     h *= LENGTH / h.sum()
@@ -62,7 +62,7 @@ def column(
 def sudden(cells: int, base: str) -> dict[str, np.ndarray]:
     """Return times divided by L / c, stress on the base divided by q, and velocity of the top divided by q / (rho c).
 
-    The stress on a rigid base is computed from the reaction, that on an absorbing base from the velocity.
+    The stress on a rigid base is computed from the reaction, and the stress on an absorbing base from the velocity.
     """
     soil, h = SOIL(grain_density=GRAINS), LENGTH / cells
     c = np.sqrt(MODULUS / ((1 - POROSITY) * GRAINS))
@@ -119,7 +119,7 @@ def hard_exact(t: np.ndarray) -> np.ndarray:
 
 
 def hard(cells: int, steps: int, growth: float = GROWTH) -> dict[str, np.ndarray]:
-    """Return times, s, and settlements, computed and exact, m, of the top of a saturated column under a sudden load."""
+    """Return times, s, and computed and exact settlements, m, of the top of a saturated column under a sudden load."""
     soil = mpm.LinearElastic(
         bulk=HARD["young"] / 1.2,
         shear=HARD["young"] / 2.6,
@@ -190,7 +190,7 @@ def draw(o: Namespace, dry: dict, swings: dict, loaded: dict[str, np.ndarray]) -
         label = f"$\\Pi_1$ = {SWINGS[name][0]:g}, $\\Pi_2$ = {SWINGS[name][1]:g}"
         depth.plot(np.abs(p), at, "o", ms=5, label=label)
     depth.set(
-        xlabel="amplitude of pore pressure / load", ylabel="depth (m)", title="Load that swings, saturated column"
+        xlabel="amplitude of pore pressure / load", ylabel="depth (m)", title="Oscillating load, saturated column"
     )
     depth.invert_yaxis()
     top.plot(1e3 * loaded["t"], 1e3 * loaded["exact"], color="black", lw=1, label="exact")

@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: MIT
-"""Implicit, iteratively coupled material point / finite volume poromechanics on FEniCSx.
+"""Poromechanics on FEniCSx with material points and finite volumes, implicit and iteratively coupled.
 
 A `Simulation` contains a `Grid`, bodies (`box`, `shape`, `mapped`, `from_mesh`, `polygon`), and materials: `Hencky`,
 `NeoHookean`, `LinearElastic`, `DruckerPrager`, `SofteningDruckerPrager`, `MohrCoulomb`, `ModifiedCamClay`,
 `BarcelonaBasic`, or your own `Skeleton`.  It has a `Fluid`, and conditions on the sides of the bodies: `Traction`,
 `Pressure`, `Displacement`, `RigidPlate`, `Drained`, `Inflow`, `water`.  A rigid `Tool` has the shape `HalfSpace`,
-`Ball`, `Convex` or `Cone`.  `run` returns a `Result` with records of `probes`.  A `Writer` writes results to files,
-which `one_file` joins; `resume` continues a run from a `Checkpoint`.  `stage` changes the scene between two runs.
-`factor_of_safety` reduces the strength until failure.  For terms in UFL see `mpm_dolfinx.materials.user_functions`.
+`Ball`, `Convex` or `Cone`.  `run` returns a `Result` with records of `probes`.  A `Writer` writes results to files;
+`one_file` joins these files.  `resume` continues a run from a `Checkpoint`.  `stage` changes the scene between two
+runs.  `factor_of_safety` reduces the strength until failure.  For terms in UFL see
+`mpm_dolfinx.materials.user_functions`.
 
 Units are SI, or other consistent units, see `Fluid`.  Stress is positive in tension, pore pressure in compression.  In
 plane strain, forces refer to a thickness of 1 m.  In axisymmetry (`Grid`), forces refer to the full circumference.

@@ -47,7 +47,7 @@ def _version(package: str) -> str:
 
 
 def number(name: str, text: str) -> float | list[float]:
-    """Return the number in a text, or several numbers separated by commas as a list."""
+    """Return the number in a text, or a list of numbers if commas separate several numbers."""
     try:
         values = [float(part) for part in text.split(",")]
     except ValueError:
@@ -56,7 +56,7 @@ def number(name: str, text: str) -> float | list[float]:
 
 
 def law_of(name: str) -> type[mpm_dolfinx.Skeleton]:
-    """Return a law of the package by its name, or a user-defined law by file.py:name."""
+    """Return the law of the package with this name, or a user-defined law for a name file.py:name."""
     file, _, own = name.rpartition(":")
     if not file:
         found = getattr(mpm_dolfinx, name, None)
@@ -92,7 +92,7 @@ def constants_of(law: type[mpm_dolfinx.Skeleton], texts: Sequence[str]) -> dict[
 
 
 def run_element_test(o: argparse.Namespace) -> None:
-    """Compute a laboratory test of a law, print a table of the results and draw them."""
+    """Compute a laboratory test of a law, print the results as a table, and draw them."""
     if o.draw and not Path(o.draw).parent.is_dir():
         raise ValueError(f"--draw {o.draw}: there is no folder {Path(o.draw).parent}")
     law, strain = law_of(o.law), number("strain", o.strain)
@@ -115,7 +115,7 @@ def main(argv: list[str] | None = None) -> None:
     lab.add_argument("law", help="name of the law, such as ModifiedCamClay, or file.py:name")
     lab.add_argument("test", help=", ".join(mpm_dolfinx.ElementTest.KINDS))
     lab.add_argument("strain", help="axial (compression positive) or shear strain; commas separate turning points")
-    lab.add_argument("constants", nargs="*", metavar="name=value", help="constant of the law; a vector has commas")
+    lab.add_argument("constants", nargs="*", metavar="name=value", help="constant, such as bulk=2e6; vectors: a,b,c")
     lab.add_argument("--steps", type=int, default=100, help="number of steps to each turning point (100)")
     lab.add_argument("--confinement", type=float, default=0.0, help="initial isotropic effective stress, Pa (0)")
     lab.add_argument("--suction", type=float, default=0.0, help="initial suction, Pa (0)")

@@ -7,7 +7,7 @@ import numpy as np
 
 import mpm_dolfinx as mpm
 
-grid = mpm.Grid([0, 0], [1.3, 1.2], [13, 12])
+grid = mpm.Grid([0, 0], [1.3, 1.2], [13, 12], axisymmetric="axisymmetric" in sys.argv)
 bodies = [mpm.box(grid, [0.13, 0], [1.17, 0.43]), mpm.box(grid, [0.33, 0.44], [0.87, 0.9], per_cell=3)]
 bodies.append(mpm.box(grid, [0.95, 0.43], [1.11, 0.6]))
 soil = mpm.Hencky(bulk=4e6 / 3, shear=1e6, conductivity=1e-5)

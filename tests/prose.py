@@ -29,7 +29,9 @@ PRIVATE = set(
     "met meets passed here there went back lost due wanted asked".split()
 )
 """Verbs, participles and adverbs that name values in place of a noun of the field."""
-ENTRY = re.compile(r"^( *)(\S(?:.{0,90}[^.:\s])?)\n\1 {4}(?=\S)|^( *)(?=\w[\w, ]* : )", re.M)
+ENTRY = re.compile(
+    r"^( *)(\S(?:.{0,90}[^.:\s])?)\n\1 {4}(?=\S)|^( *)(?=\w[\w, ]* : |`?[\w/]+`? \([^)\n]*\)[^:\n]{0,20}: )", re.M
+)
 """A name of a list of parameters, and its text below or after a colon."""
 SHORTEST = 4
 """Words of the shortest sentence that is drawn."""

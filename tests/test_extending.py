@@ -368,7 +368,7 @@ class Fibres(mpm.NeoHookean):
 
 CASES = {
     "sum over two sizes": (lambda: column(fluid=False, material=Fibres(1, 1)), "Fibres.*must be"),
-    "no law": (lambda: column(fluid=False, material=NoLaw(1, 1)), "NoLaw: has neither, must define energy or"),
+    "no law": (lambda: column(fluid=False, material=NoLaw(1, 1)), "NoLaw: defines neither of energy and kirchhoff"),
     "unknown parameter": (lambda: column(fluid=False, material=Unknown(1, 1)), "'stiffness' of its functions, must"),
     "reserved name": (lambda: column(fluid=False, material=Taken(1, 1)), "the name 'weight' is taken"),
     "field of the wrong shape": (

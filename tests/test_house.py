@@ -16,7 +16,7 @@ CEILINGS = {
     "assignments of three and more values": 19,
     "changes of hidden state": 0,
     "files that name a condition's class, most": 6,
-    "lines of the package": 38763,
+    "lines of the package": 38780,
 }
 
 WAYS = {"rooms of a traction": 13, "rooms of an initial pressure": 15, "homes of the pressure": 4}

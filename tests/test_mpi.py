@@ -37,14 +37,15 @@ SLOW = [
     pytest.param(f"mpi_{name}.py", count, marks=pytest.mark.slow)
     for name, count in (("wetting", (3,)), ("rain", (2, 3, 4)), ("tied", (2, 3)), ("following_3d", (2,)))
 ]
+SLOW.append(pytest.param("mpi_contact.py axisymmetric", (2, 3), marks=pytest.mark.slow))
 
 
 @pytest.mark.parametrize("scene, several", SCENES + SLOW)
 def test_the_state_is_the_same_on_several_processes(scene, several, tmp_path):
-    states = []
+    states, (script, *options) = [], scene.split()
     for processes in (1, *several):
         file = tmp_path / f"{processes}.npz"
-        mpirun(processes, scene, str(file))
+        mpirun(processes, script, str(file), *options)
         states.append(np.load(file))
         assert len(states[-1]["counts"]) == processes and states[-1]["balance"] <= 1e-8
     one, *others = states

@@ -273,7 +273,7 @@ def test_a_writer_made_before_the_run_was_resumed_harms_nothing(tmp_path):
     with pytest.raises(ValueError, match=r"writer: made at t = 0 s, but the run starts at t = 0\.04 s; must"):
         other.run(0.06, 0.02, observe=early, after=after)
     assert list(index(tmp_path / "points.pvd")) == list(table(tmp_path / "history.csv")["t"]) == [0.0, 0.02, 0.04]
-    both = r"its columns are t, .*, p_max, the columns of the run t, .*, p_max, x_0, y_0, ux_0, uy_0, p_0;"
+    both = r"its columns are t, .*, p_max, the columns of the run are t, .*, p_max, x_0, y_0, ux_0, uy_0, p_0;"
     with pytest.raises(ValueError, match=both):
         other.run(0.08, 0.02, probes=probe, observe=mpm.Writer(other, tmp_path))
     with pytest.raises(ValueError, match="every = 0, must be an integer >= 1"):

@@ -239,7 +239,7 @@ CASES = {
     "probe in a body that has gone": (
         lambda: run_two(mpm.probes([BODY, UPPER], [[0.1, 0.55]]), remove=[1]),
         "probe at [0.1  0.55]",
-        "in body 1",
+        "body 1 is absent",
     ),
     "probes of a body alone": (lambda: mpm.probes(BODY, [[0.1, 0.3]]), "probes: bodies", "Body"),
     # ---- files

@@ -113,7 +113,7 @@ def test_a_terminal_shows_each_trial(monkeypatch, caplog):
 @pytest.mark.parametrize(
     ("make", "options", "message"),
     [
-        (lambda: block([SOFT], load=1e4), {}, "no material has a strength, one must have friction and cohesion"),
+        (lambda: block([SOFT], load=1e4), {}, "no material has a strength; one must have friction and cohesion"),
         (at_rest, {"rtol": 0}, r"rtol = 0, must be in \[1e-4, 0.5\]"),
         (at_rest, {"steps": 3}, "steps = 3, must be an integer >= 8"),
         (at_rest, {"dt": -1}, "dt = -1, must be > 0 and finite"),
@@ -132,7 +132,7 @@ def test_a_terminal_shows_each_trial(monkeypatch, caplog):
                 material=mpm.ModifiedCamClay(M=1, lambda_=0.1, kappa=0.02, shear=1e6, initial_stress=(-1e5,) * 3),
             ),
             {},
-            "strength of ModifiedCamClay cannot be divided, must be a law with friction",
+            "strength of ModifiedCamClay cannot be divided; the law must have friction",
         ),
     ],
 )

@@ -321,7 +321,7 @@ def test_saturated_scenes_have_nothing_of_retention():
 
 def test_a_specific_yield_does_not_go_with_it():
     law = mpm.Gardner(1e3)
-    with pytest.raises(ValueError, match=r"retention and a specific yield 0\.1, must be only one of them"):
+    with pytest.raises(ValueError, match=r"has retention and a specific yield 0\.1, must have only one of them"):
         mpm.Hencky(1e6, 1e6, conductivity_law=mpm.unsaturated(1e3, specific_yield=0.1), retention=law)
 
 

@@ -9,11 +9,10 @@ from contextlib import redirect_stderr, redirect_stdout
 from functools import partial
 from io import StringIO
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mpi4py import MPI
 
-import meshio
 import numpy as np
 from dolfinx import mesh as dolfinx_mesh
 from numpy.typing import NDArray
@@ -21,11 +20,13 @@ from numpy.typing import NDArray
 from mpm_dolfinx.base import _compat
 from mpm_dolfinx.base.tolerances import NEAR
 from mpm_dolfinx.base.validation import instance, line, line_of, path
-from mpm_dolfinx.bodies import mesh_readers
 from mpm_dolfinx.bodies.mesh_cells import AS_LATTICE, KINDS, SECOND_ORDER, SIDES_OF, distinct, edges
 from mpm_dolfinx.bodies.meshes import Mesh, MeshBody, seeded
 from mpm_dolfinx.grid.grid import FACES, Grid, begin_with
 from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
+
+if TYPE_CHECKING:  # meshio takes long to import, so functions import it
+    import meshio
 
 TAGS = ("gmsh:physical", "medit:ref", "cell_tags", "MaterialIDs", "attribute", "material", "nastran:ref", "su2:tag")
 TAGS += ("avsucd:material", "ugrid:ref", "netgen:index", "tetgen:ref", "cell_markers", "CellEntityIds")
@@ -82,6 +83,8 @@ def from_mesh(
     OSError
         On several processes: a temporary file cannot be written.
     """
+    import meshio
+
     begin_with("body: grid", grid)
     name, names = "mesh", _numbers(names)
     if isinstance(mesh, (str, os.PathLike)):
@@ -100,6 +103,8 @@ def from_mesh(
 
 def _file(file: Path) -> meshio.Mesh:
     """Return the mesh of a file.  An error message includes the output of meshio."""
+    from mpm_dolfinx.bodies import mesh_readers
+
     output = StringIO()
     try:
         with redirect_stdout(output), redirect_stderr(output):
@@ -113,6 +118,8 @@ def _file(file: Path) -> meshio.Mesh:
 
 def _of_meshio(grid: Grid, mesh: meshio.Mesh | Path, names: Mapping[str, int], tags: str | None, name: str) -> Mesh:
     """Convert a meshio mesh, or a file.  `tags` is the name of the cell data with the tags of parts and sides."""
+    from mpm_dolfinx.bodies import mesh_readers
+
     if isinstance(mesh, Path):
         mesh = _file(mesh)
     mesh_readers.check_systems(mesh)

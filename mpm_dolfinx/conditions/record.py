@@ -6,8 +6,8 @@ from __future__ import annotations
 import os
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
-from scipy.interpolate import PPoly
 
 from mpm_dolfinx.base.validation import flag, line, numbers, on_disk, path
 
@@ -84,14 +84,14 @@ class Record:
         """Return the acceleration (d,), m/s^2, at time t (s)."""
         return self._within(self._of[0], t) * (t <= self.end)
 
-    def _within(self, value: PPoly, t: float) -> NDArray[np.float64]:
+    def _within(self, value: scipy.interpolate.PPoly, t: float) -> NDArray[np.float64]:
         """Return a quantity (d,) at time t along the direction: zero before the record, the last value after it."""
         return self.direction * (float(value(min(t, self.end))) if t >= value.x[0] else 0.0)
 
 
-def _linear(t: NDArray[np.float64], values: NDArray[np.float64]) -> PPoly:
+def _linear(t: NDArray[np.float64], values: NDArray[np.float64]) -> scipy.interpolate.PPoly:
     """Return the piecewise linear interpolant of values (n,) at times t (n,), s."""
-    return PPoly(np.stack([np.diff(values) / np.diff(t), values[:-1]]), t)
+    return scipy.interpolate.PPoly(np.stack([np.diff(values) / np.diff(t), values[:-1]]), t)
 
 
 def _read(record: str | os.PathLike) -> NDArray[np.float64]:

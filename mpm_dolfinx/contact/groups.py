@@ -112,8 +112,6 @@ def grouped(
     """
     if not contacts:
         return grid
-    if grid.axisymmetric:
-        raise ValueError("contacts: not available in axisymmetry, must be absent")
     if quadrature == "point":
         raise ValueError("quadrature = 'point', must be 'domain' with contacts")
     for name, value in other.items():

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Warnings about coarse resolution: overlapping domains, mixed cells of contrasting stiffness, thin bodies."""
+"""Warnings about coarse resolution: overlapping domains, cells with contrasts of stiffness, and thin bodies."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
 from mpm_dolfinx.points.material_points import body_of
 
 FULL = 1.2
-"""Largest filling of a cell without a warning; intact domains reach 1.08 when a footing sinks by half its width."""
+"""Largest filling of a cell without a warning.  Intact domains reach 1.08 when a footing sinks by half its width."""
 
 
 def warn_overfilled(cut: CutDomains, bodies: Sequence[Body]) -> Callable[..., Any] | None:
-    """Warn about the fullest cell and its bodies if domains overlap; return the next check, None after a warning."""
+    """Warn about the fullest cell if domains overlap.  Return the next check, or None after a warning."""
     grid, points = cut.grid, cut.points
     volume = cut.to_cells(points.volume0 * points.J) * cut.pieces_to_cells(cut.pieces.fraction)
     fill = sum_by(cut.cells, cut.plane(volume)[0], grid.num_owned)[cut.cells] / grid.volumes(cut.cells)
@@ -49,7 +49,7 @@ def warn_overfilled(cut: CutDomains, bodies: Sequence[Body]) -> Callable[..., An
 
 
 def bodies_in(cut: CutDomains, bodies: Sequence[Body], cell: int) -> tuple[list[int], NDArray[np.float64]]:
-    """Return the bodies in the cell with this lexicographic number, and its midpoint (d,), m; all processes call it."""
+    """Return the bodies in a cell, and the cell's midpoint (d,), in m.  All processes must call this."""
     grid, ids = cut.grid, cut.points.id[cut.pieces.point[cut.pieces.cell == cell]]
     own = body_of(ids, np.cumsum([0, *map(len, bodies)]))
     found = sorted({int(i) for rows in grid.comm.allgather(own) for i in rows})
@@ -57,22 +57,23 @@ def bodies_in(cut: CutDomains, bodies: Sequence[Body], cell: int) -> tuple[list[
 
 
 LOSS = 0.03
-"""A warning is issued if a soft material loses more than this fraction of its deformation in mixed cells."""
+"""A warning is issued if a soft material loses more than this fraction of its deformation in cells with stiffer ones.
+"""
 AGAIN = 2.0
-"""Factor by which the lost fraction must grow before the next warning, because moving interfaces change it."""
+"""Factor by which the lost fraction must grow before the next warning.  Moving interfaces change the lost fraction."""
 FINE = 0.1
-"""Smallest lost fraction of a cell's deformation that counts; stiffness contrasts below 2.1 lose less."""
+"""Smallest lost fraction of a cell's deformation that counts.  Cells with stiffness contrasts below 2.1 lose less."""
 
 
 def warn_smeared(
     cut: CutDomains, bodies: Sequence[Body], materials: SceneMaterials, least: float = LOSS
 ) -> Callable[..., Any]:
-    """Warn about the soft material that loses most deformation in cells shared with stiffer materials.
+    """Warn about the soft material that loses the largest fraction of its deformation in cells with stiffer materials.
 
     Parameters
     ----------
     least
-        Smallest lost fraction, in [0, 1], of which the function warns.
+        Smallest lost fraction, in [0, 1], for which the function warns.
 
     Returns
     -------
@@ -108,11 +109,11 @@ def warn_smeared(
 
 
 def _losses(cut: CutDomains, volume: NDArray[np.float64], modulus: NDArray[np.float64]) -> tuple[NDArray, ...]:
-    """Return for owned cells (n,): loss times volume, m^d; ratio of moduli; index of a piece of the softest material.
+    """Return three arrays (n,) for owned cells: loss times volume (m^d), ratio of moduli, and softest piece.
 
-    With moduli M and volume fractions s in a cell, layers in series have the compliance sum (s / M).  Equal strain in
-    the cell gives 1 / sum (s M) instead.  The loss is the difference of both compliances, divided by the largest 1 / M.
-    For two moduli of ratio r < 1, the loss is at most (1 - sqrt(r))^2 of the cell.
+    With moduli M and volume fractions s in a cell, layers in series have the compliance `sum (s / M)`.  Equal strain in
+    the cell gives the compliance `1 / sum (s M)` instead.  The loss is the difference of both compliances, divided by
+    the largest `1 / M`.  For two moduli of ratio r < 1, the loss is at most `(1 - sqrt(r))^2`.
     """
     n, order = cut.grid.num_owned, np.argsort(-modulus, kind="stable")
     softest, hardest = (np.zeros(n, dtype=np.int64) for _ in range(2))
@@ -135,12 +136,12 @@ SLENDER_WET = 2  # length divided by thickness from which on a wet body counts a
 
 
 def warn_thin(grid: Grid, bodies: Sequence[Body], walls: Mapping[str, str], wet: bool) -> None:
-    """Warn about each slender body that can bend, with one point per cell and too few over its thickness.
+    """Warn about each slender body that can bend, and has one point per cell and too few points over its thickness.
 
-    The increment of stress is constant in a cut domain, so n points over the thickness give 1 - 1/n^2 of the bending
-    stiffness in a single step, and more in several steps (`domain_slopes`).  A body with one point over its thickness
-    carries no moment, and creeps from step to step, because only the increment of a step resists.  Saturated bodies
-    (`wet`) lose more stiffness, as measurements show, and continue to creep.
+    The increment of stress is constant in a cut domain.  In a single step, n points over the thickness therefore give
+    `1 - 1/n^2` of the bending stiffness.  In several steps they give more (`domain_slopes`).  A body with one point
+    over its thickness carries no moment.  It creeps from step to step, because only the stress increment of a step
+    resists bending.  Measurements show that saturated bodies (`wet`) lose more stiffness, and continue to creep.
     """
     few, slender = (FEW_WET, SLENDER_WET) if wet else (FEW, SLENDER)
     for i, body in enumerate(bodies):
@@ -158,11 +159,11 @@ def warn_thin(grid: Grid, bodies: Sequence[Body], walls: Mapping[str, str], wet:
 
 
 def check_stiff(grid: Grid, bodies: Sequence[Body]) -> None:
-    """Raise ValueError for bodies in 3D with one domain in each cell, which ends at grid lines along two axes.
+    """Raise ValueError for 3D bodies with one domain in each cell, if domains end at grid lines along two axes.
 
-    Displacements that alternate from node to node along both axes then have no mean gradient in any piece, and thus no
-    stiffness, however they vary along the third axis.  In 2D a single such field remains for each component; walls
-    prevent it.
+    Displacements that alternate from node to node along both axes then have no mean gradient in any piece.  They thus
+    have no stiffness, however they vary along the third axis.  In 2D each component has a single field of this kind,
+    and walls prevent this field.
     """
     for i, body in enumerate(bodies if grid.dim == 3 else ()):
         low, between = np.array([[np.inf], [-np.inf]]) * np.ones(grid.dim)  # of domains; the highest end inside a cell
@@ -185,7 +186,7 @@ def check_stiff(grid: Grid, bodies: Sequence[Body]) -> None:
 
 
 def _edge(grid: Grid, body: Body, axis: int) -> float:
-    """Return the edge length, m, along an axis of the cells in which a body lies; the mean for unequal cells."""
+    """Return the edge length (m) along an axis of the cells in which a body lies, or the mean for unequal cells."""
     if grid.even:
         return grid.h[axis]
     low, high = body.bounds
@@ -193,7 +194,7 @@ def _edge(grid: Grid, body: Body, axis: int) -> float:
 
 
 def _bends(grid: Grid, bodies: Sequence[Body], i: int, axis: int, walls: Mapping[str, str], slender: float) -> bool:
-    """Return whether a body is thin along an axis, with no wall or other body at its two sides normal to the axis."""
+    """Return whether a body is thin along an axis, without walls or other bodies at both sides normal to this axis."""
     body = bodies[i]
     size = body.bounds[1] - body.bounds[0]
     if size.max() < slender * size[axis]:

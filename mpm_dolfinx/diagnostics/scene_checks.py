@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Check that all parts on the grid are constrained: free rigid-body modes make the tangent singular."""
+"""Check that all connected parts are constrained, because free rigid-body modes make the tangent singular."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def check_held(
     holds: Sequence[tuple[NDArray[np.int32], NDArray[np.int64] | None, NDArray[np.float64], NDArray[np.float64]]],
     each: bool,
 ) -> None:
-    """Raise an error if a part of the scene can move as a rigid body.
+    """Raise an error if a connected part of the bodies can move as a rigid body.
 
     Parameters
     ----------
@@ -30,15 +30,17 @@ def check_held(
     free : (nodes, d)
         Whether no wall fixes a displacement component.
     holds
-        Constraints by prescribed displacements, tools and contact: cells (m,), lexicographic cells of the other part
-        (m,) or None, positions (m, d), m, and directions (m, d).  A constrained part constrains the other part.
+        Constraints by prescribed displacements, tools and contact.  Each has cells (n,), lexicographic cells (n,) of
+        the other part or None, positions (n, d) in m, and directions (n, d).  A constrained part constrains the other
+        part.
     each
         Whether to check each connected part, not only all parts together.
 
     Raises
     ------
     ValueError
-        A part can move as a rigid body.  The message gives its place, and its number of free rigid-body modes.
+        If a part can move as a rigid body.  The message gives the place and the number of free rigid-body modes of the
+        part.
     """
     grid = active.grid
     part, count = active.parts_of_cells if each else (active.contains.astype(np.int64), 1)
@@ -87,7 +89,7 @@ def check_held(
 
 
 def _extents(active: ActiveSet, part: NDArray[np.int64], count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the centres (count, d), m, and the largest edges (count,), m, of the bounding boxes of parts."""
+    """Return the centres (count, d) and the largest edges (count,) of the bounding boxes of parts, both in m."""
     grid = active.grid
     low, high = np.full((2, count, grid.dim), np.inf)  # `high` has a negative sign
     for sign, ends in ((1, low), (-1, high)):

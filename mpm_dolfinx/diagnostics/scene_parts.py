@@ -53,7 +53,7 @@ def check_options(
 
 
 def check_axisymmetry(grid: Grid, bodies: Sequence[Body], quadrature: str) -> None:
-    """Raise an error for point quadrature on grids that exclude it.  Warn about narrow holes around the axis."""
+    """Raise an error for point quadrature on grids that do not support it.  Warn about narrow holes around the axis."""
     if quadrature == "point" and (grid.axisymmetric or grid.follow is not None):  # fine cells would become empty
         raise ValueError("quadrature = 'point', must be 'domain' in axisymmetry, and on grid lines that follow")
     if not grid.has_axis:
@@ -93,7 +93,7 @@ def initial_velocity(grid: Grid, quadrature: str, inertia: bool | Moving | None)
 
 
 def _functions_of(terms):
-    """Return the functions of terms in bodies and on sides; an invalid list is returned unchanged."""
+    """Return the functions of terms in bodies and on sides.  An invalid list is returned unchanged."""
     if isinstance(terms, str) or not isinstance(terms, Sequence):
         return terms
     return [term.term if isinstance(term, OnSide) else term for term in terms]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Reactions of sides at rest, applied as tractions from the time when a body is released."""
+"""Reactions of sides at rest, which act as tractions after a body is released."""
 
 from __future__ import annotations
 
@@ -27,15 +27,18 @@ def balancing_tractions(
     forces: NDArray[np.float64],
     held: NDArray[np.bool_],
 ) -> dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]:
-    """Return for each side at rest the ids (m,) of its points, and tractions (m, d), Pa, that replace its reactions.
+    """Return for each side at rest the ids (n,) of its points, and tractions (n, d), Pa, that replace its reactions.
 
-    Tractions are forces per reference area, computed from the stresses.  On a connected part, resultants and
-    moments of tractions and of reactions may differ.  Rigid-body fields of tractions remove this difference.
+    Tractions are forces per reference area, computed from the stresses.  On a connected part, the resultant and the
+    moment of the tractions may differ from the resultant and the moment of the reactions.  Rigid-body fields of
+    tractions remove these differences.
 
-    cut, points: cut particle domains, and material points; stresses, surfaces: total stresses (faces, k, k), Pa, on the
-    sides, and the sides, both by name of the side; parts: connected parts of the bodies; forces (nodes, d), N:
-    reactions of the sides at the owned nodes of this process, zero at other nodes; held (nodes, d): which displacement
-    components remain fixed.
+    cut, points: cut particle domains, and material points.
+    stresses: total stresses (faces, k, k), Pa, on the sides, by name of the side.
+    surfaces: the sides, by name.
+    parts: connected parts of the bodies.
+    forces (nodes, d), N: reactions of the sides at the owned nodes of this process, zero at other nodes.
+    held (nodes, d): which displacement components remain fixed.
     """
     grid, d = cut.grid, cut.grid.dim
     patches = cut.surfaces(list(surfaces.values()))

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Energies of bodies with inertia, and the work of forces on them.
 
-The work of forces f in a step is dt sum b_i f_i . v_i over its substeps, with the weights b_i of the time integration.
-The work of loads, less the work of stresses, viscous resistance and friction, is the work of all forces.  Without
-renewal, this sum minus the change of kinetic energy is the numerical dissipation of the method and of grid resets.
+The work of forces f in a step is `dt sum b_i f_i . v_i` over its substeps, with the weights b_i of the time
+integration. The work of all forces is the work of loads minus the work of stresses, viscous resistance and friction.
+Without renewal, the work of all forces minus the change of kinetic energy is the numerical dissipation of method and
+grid resets.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 
 
 def stored(materials: SceneMaterials, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
-    """Return the kinetic and elastic energies, J, of points; all processes call it together."""
+    """Return the kinetic and elastic energies, J, of points; all processes must call it."""
     mass = materials.present_density(points) * points.volume0 * points.J
     v, L = points.data[VELOCITY], velocity_gradients(points)
     moments = spreads(points.corners, materials.grid.axisymmetric)
@@ -51,8 +52,9 @@ def after(
 ) -> dict[str, NDArray[np.float64]]:
     """Return the energies, J, after a step, from the energies before the step.
 
-    kinetic: kinetic energy of free tools, J; seconds: time weights of the substeps, s; powers: powers of the substeps
-    on this process, W, see `MomentumProblem.powers`.
+    kinetic: kinetic energy of free tools, J.
+    seconds: time weights of the substeps, s.
+    powers: powers of the substeps on this process, in W, see `MomentumProblem.powers`.
     """
     counted = seconds[-len(powers) :] @ np.array([list(of.values()) for of in powers])
     work = zip(powers[0], over_all(materials.grid.comm, counted), strict=True)

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Quiet boundaries with the traction t = t_0 - Z (v - 2 v_in) and the impedance Z = rho c_p n n + rho c_s (I - n n).
+"""Quiet boundaries that absorb waves.
 
-t_0 is the constant traction at rest, v the velocity of the side, and v_in the velocity of an incoming wave.  n is the
-normal, rho the density; c_p and c_s are the speeds of compression and shear waves (Lysmer and Kuhlemeyer 1969; incoming
-waves: Joyner and Chen 1975).  Impedances use small-strain moduli of undrained soil.
+The traction is `t = t_0 - Z (v - 2 v_in)`, with the impedance `Z = rho c_p n n + rho c_s (I - n n)`.  t_0 is the
+constant traction at rest.  v is the velocity of the side, and v_in is the velocity of an incoming wave.  n is the
+normal, rho is the density, and c_p and c_s are the speeds of compression and shear waves (Lysmer and Kuhlemeyer 1969;
+incoming waves: Joyner and Chen 1975).  Impedances use small-strain moduli of undrained soil.
 """
 
 from __future__ import annotations
@@ -32,8 +33,10 @@ def traction_name(name: str) -> str:
 
 
 class QuietForms:
-    """Forms at points on quiet sides.  Fields are two impedances, kg/m^2/s: the tangential, and the normal minus the
-    tangential one.  The field `force` is the constant traction at rest plus that of incoming waves, Pa.
+    """Forms at points on quiet sides.
+
+    The field `across` is the tangential impedance, kg/m^2/s.  The field `along` is the normal impedance minus the
+    tangential impedance.  The field `force` is the constant traction at rest plus the traction of incoming waves, Pa.
     """
 
     def __init__(self, grid: Grid, u: fem.Function, velocity: Velocity):
@@ -56,7 +59,8 @@ class QuietSides(Acting):
     Raises
     ------
     ValueError
-        Two quiet sides share a part of a face, or a displacement or a wall of the grid fixes all components of a face.
+        Two quiet sides share a part of a face, or prescribed displacements or walls of the grid fix all displacement
+        components on a face.
     """
 
     conditions, title = (Quiet,), "quiet sides"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Renewal of particle domains with inertia: masses that keep centres of mass, velocities that keep momenta."""
+"""Renewal of particle domains with inertia.  New masses keep centres of mass, new velocities keep momenta."""
 
 from __future__ import annotations
 
@@ -32,8 +32,9 @@ class Momenta(NamedTuple):
     ) -> Momenta:
         """Return the momenta of `count` groups.
 
-        piece, group (m,), mass (m,), kg: index in `pieces`, group and mass of each piece; v (n, 2), m/s, L (n, 2, 2),
-        1/s: velocities and velocity gradients of the domains.
+        piece, group (k,): index in `pieces` and group of each of k pieces.
+        mass (k,), kg: mass of each piece.
+        v (n, 2), m/s, L (n, 2, 2), 1/s: velocities and velocity gradients of n domains.
         """
         of, x = pieces.point[piece], pieces.x[piece]
         second = pieces.second[piece]
@@ -51,11 +52,13 @@ class Momenta(NamedTuple):
 def velocities(
     work: RefilledCells, corners: NDArray, x: NDArray, group: NDArray, masses: tuple[NDArray, NDArray]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return velocities and their gradients in new domains: corrected means of the old affine fields over the overlap.
+    """Return the velocities of new domains, and their gradients: corrected means of the old domains' affine fields.
 
-    The correction is a rigid motion of each group of domains; it restores momentum and angular momentum of the group.
+    The means are over the overlap with the old domains.  The correction is a rigid motion of each group of domains,
+    which restores the momentum and the angular momentum of the group.
 
-    corners (n, 4, 2), x (n, 2), m, group (n,): corners, place, group of new domains; masses: of old and new points, kg.
+    corners (n, 4, 2), m, x (n, 2), m, group (n,): corners, position and group of each new domain.
+    masses: masses of the old points and of the new points, kg.
     """
     points = work.points
     n, count = len(x), int(group.max()) + 1
@@ -77,10 +80,13 @@ def velocities(
 
 
 def centred(work: RefilledCells, group: NDArray, x: NDArray, mass: NDArray, old: NDArray) -> NDArray[np.float64]:
-    """Return masses (n,), kg, of new domains at x (n, 2), m, changed within each cell so that its centre of mass stays.
+    """Return masses (n,), kg, of new domains at x (n, 2), m, with which each renewed cell keeps its centre of mass.
 
-    group (n,): group of each new domain; old (points,): masses of the old domains.  A mass changes by at most half;
-    if this limit applies, the centre moves.  Outside the renewed cells a group is one domain, and its mass stays.
+    Each renewed cell is a group.  Each domain outside these cells is a group of its own, and keeps its mass.  A mass
+    changes by at most half.  If this limit applies, the centre of mass moves.
+
+    group (n,): group of each new domain.
+    old (points,): masses of the old domains.
     """
     cells, inside = int(work.chosen.sum()), group < work.chosen.sum()
     received = _received(work, old)
@@ -99,13 +105,13 @@ def centred(work: RefilledCells, group: NDArray, x: NDArray, mass: NDArray, old:
 
 
 def _received(work: RefilledCells, mass: NDArray[np.float64]) -> tuple[NDArray, NDArray, NDArray]:
-    """Return the pieces of removed domains, their groups, and their masses (m,), from the masses of the points."""
+    """Return the pieces of removed domains, their groups, and their masses (k,), from the masses of the points."""
     piece, groups, share = work.into
     return piece, groups, share * mass[work.pieces.point[piece]]
 
 
 def _centre(group: NDArray, mass: NDArray, values: NDArray, count: int) -> tuple[NDArray, NDArray]:
-    """Return the mass (count,) of each group, and the mean (count, k) of values (m, k) in it, weighted by mass."""
+    """Return the mass (count,) of each group, and the mass-weighted mean (count, k) of values (n, k) in the group."""
     whole = np.bincount(group, mass, count)
     columns = [np.bincount(group, mass * column, count) for column in values.T]
     return whole, np.stack(columns, axis=1) / np.where(whole > 0, whole, 1.0)[:, None]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Interfaces between unsaturated soils of different conductivity: faces between cells, and cells with several soils.
+"""Fluxes through faces between cells of different unsaturated soil, and through faces of cells with several soils.
 
 `series` computes the fluxes through these faces.  All other faces have two-point fluxes in UFL.
 """
@@ -25,7 +25,7 @@ from mpm_dolfinx.forms.unknowns import Unknowns, with_ghosts
 
 
 class Borders:
-    """Faces between cells of different soil, as of the last grid reset.
+    """Faces between cells of different soil, and faces of cells with several soils, at the last grid reset.
 
     Parameters
     ----------
@@ -34,7 +34,7 @@ class Borders:
     cells : (m,)
         Cell of each piece.
     soils : (m, k)
-        Numbers that identify the soil of each piece: equal rows have the same conductivity.
+        Numbers that identify the soil of each piece.  Pieces with equal rows have equal conductivities.
     law : (m,)
         Index of the retention curve of each piece.
     facets
@@ -66,7 +66,7 @@ class Borders:
         first, other = grid.facet_cells[facets].T
         differ = (known[first] != known[other]).any(axis=1) | (known[first, 0] > 0)
         self.facets, self.uniform = facets[differ], facets[~differ]
-        """Facets of this process between cells of different soil, and all other facets."""
+        """Two arrays of facets of this process: facets between cells of different soil, and all other facets."""
         offset = grid.midpoints[grid.facet_cells[self.facets]]
         offset = offset[:, 1] - offset[:, 0]
         self._axis = np.abs(offset).argmax(axis=1)
@@ -81,9 +81,10 @@ class Borders:
     ) -> BorderFaces:
         """Return the faces with their current conductivities.
 
-        laws: relative conductivities as functions of pressure, see `Laws`; contents: material in the cells; flow:
-        conductivities of the filled owned cells; places (c, d), m: vectors from the midpoints of local cells to their
-        pressure positions; moved (c, d), m: displacements of the cells in the step.
+        `laws`: relative conductivities as functions of pressure, see `Laws`.  `contents`: material in the cells.
+        `flow`: conductivities of the filled owned cells.
+        `places` (c, d), m: vectors from the midpoints of local cells to the pressure positions of these cells.
+        `moved` (c, d), m: displacements of the cells in the step.
         """
         grid, d = self.grid, self.grid.dim
         paths, slots = flow.mobility.paths, 1
@@ -133,7 +134,7 @@ class Borders:
         outer: NDArray[np.float64],
         drop: NDArray[np.float64],
     ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]]:
-        """Yield indices (k,) of faces at owned mixed cells, and results of `Relative.through_sides` for these."""
+        """Yield indices (k,) of faces at owned mixed cells, and results of `Relative.through_sides` for these faces."""
         rows = np.flatnonzero(self.mixed[cells] >= 0)
         if not len(rows):
             return
@@ -149,7 +150,7 @@ class Borders:
         yield rows, *np.divide(found, across, out=np.zeros_like(found), where=across > 0)
 
     def _from_others(self, paths: Paths) -> Paths:
-        """Return the paths of all cells at these faces; owners send the paths of ghosts."""
+        """Return the flow paths in all cells at these faces.  The paths in ghost cells come from their owners."""
         if self.grid.comm.size == 1:
             return paths
         columns = [values.reshape(len(self._cells), np.prod(values.shape[1:])) for values in paths]
@@ -176,7 +177,7 @@ class BorderFaces:
     bulk: float  # bulk modulus of the fluid, Pa
 
     def flows(self, p: NDArray[np.float64], force: NDArray[np.float64] | None) -> BorderFlows:
-        """Return fluxes at pressures p (2, m), Pa, on both sides.  `force` (c, d), N/m^3: inertia force in cells."""
+        """Return the fluxes at pressures p (2, m), in Pa.  `force` (c, d), N/m^3: inertia force in local cells."""
         weight = (
             self.weight
             if force is None
@@ -198,12 +199,12 @@ class BorderFlows:
     slopes: list[NDArray[np.float64]]  # d flux / dp[0] and -d flux / dp[1] (m,), m^d/(Pa s)
 
     def add_fluxes(self, out: NDArray[np.float64]) -> None:
-        """Add the fluxes to the outflows of the local cells (c,), m^d/s."""
+        """Add the fluxes to the outflows `out` (c,) of the local cells, in m^d/s."""
         for cells, sign in zip(self.pair, (1, -1), strict=True):
             np.add.at(out, cells, sign * self.flux)
 
     def add_slopes(self, A: PETSc.Mat, unknowns: Unknowns) -> None:
-        """Add the derivatives of the outflows to a matrix, without final assembly."""
+        """Add the derivatives of the outflows with respect to the pressures to a matrix, without final assembly."""
         if not len(self.flux):
             return
         number = unknowns.map.indices[self.pair]

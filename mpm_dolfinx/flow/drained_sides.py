@@ -1,15 +1,16 @@
 # SPDX-License-Identifier: MIT
 """Flow through the sides of bodies: drained sides, seepage faces, rain, prescribed inflows.
 
-The outflow of a cell through a face is either prescribed, or computed as T r [p - p_out + rho_w g . (x_out - x)].  Here
-p is the pressure at the centroid x of the cell's material, and p_out the pressure outside at the face, x_out.  T is A
-kappa / d.  A is the area of the face, kappa the mobility (conductivity / unit weight), and d the distance from x to
-the face.  r is the density of the fluid divided by the density at zero pressure.  At a seepage face, fluid can only
-leave.  A primal-dual active-set method (Hintermueller, Ito and Kunisch 2002) opens faces with outflow and closes the
-others: at the start of the substep and after each solution (`SideFeeds.settle`).  Infiltration is the rain, but at most
-the inflow at the pressure of the pond.  Evaporation is at most the outflow at the driest pressure.  A pond of volume V
-supplies V / dt in a step in addition to the rain, uniformly over its side.  Infiltration, ponding and run-off add up to
-the rain within rounding.
+The outflow of a cell through a face is prescribed, or it is `T r [p - p_out + rho_w g . (x_out - x)]`.  Here p is the
+pressure at the centroid x of the cell's material.  The outside pressure p_out applies at the centroid x_out of the
+face.  T is `A kappa / d` with the area A of the face, the mobility kappa, and the distance d from x to the face.  The
+mobility is the conductivity divided by the unit weight of the fluid.  The factor r is the density of the fluid divided
+by the density at zero pressure.  At a seepage face, fluid can only leave.  A primal-dual active-set method
+(Hintermueller, Ito and Kunisch 2002) opens faces with outflow and closes all other faces.  The method is applied at the
+start of the substep and after each solution (`SideFeeds.settle`).  Infiltration is the rain, but at most the inflow at
+the pressure of the pond.  Evaporation is at most the outflow at the driest pressure.  In addition to the rain, a pond
+of volume V supplies the inflow `V / dt` in a step of length dt, uniformly over its side.  Infiltration, ponding and
+run-off add up to the rain within rounding.
 """
 
 from __future__ import annotations
@@ -37,9 +38,9 @@ from mpm_dolfinx.parallel.exchange import over_all, together
 THICK = np.sqrt(2)
 """Area of the largest plane section of a cube, divided by the area of a face.  Source: exact bound (Ball 1986).
 
-Let a convex body of volume V in a cell of edge length h lie on one side of a plane.  The distance from its centroid to
-the plane is at least V / ((d + 1) THICK h^(d-1)).  A face closer to the centroid of the cell's material, or behind it,
-bounds only a part of the material.  Such a face must not drain the whole cell.
+Let a convex body of volume V in a cell of edge length h lie on one side of a plane.  The distance from the body's
+centroid to the plane is at least `V / ((d + 1) THICK h^(d-1))`.  A face bounds only a part of the cell's material if it
+is closer than this to the material's centroid, or behind the centroid.  Such a face must not drain the whole cell.
 """
 
 
@@ -56,7 +57,7 @@ class DrainedSides(Feeding):
     Raises
     ------
     ValueError
-        A condition on a side without points, or two conditions on the same part of a face.
+        If a condition is on a side without points, or two conditions are on the same part of a face.
     """
 
     conditions, title = (Drained, Inflow, Rain), "open sides"
@@ -88,7 +89,7 @@ class DrainedSides(Feeding):
         return {name: np.array(value) for name, rain in zip(self._names, self._rains, strict=True) if rain}
 
     def empty(self) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return zero volumes of outflow, run-off and ponds before the first step; an empty dictionary without rain."""
+        """Return zeros as the volumes of outflow, run-off and ponds before the first step, or {} without rain."""
         if not any(self._rains):
             return {}
         return {"flowed": self.unknown(0.0), "ran_off": self.dry(0.0), "ponded": self.dry(0.0)}
@@ -144,11 +145,11 @@ class OpenFaces:
     offset: NDArray[np.float64]  # vector from the centroid of the cell's material to the face (m, d), m
 
     def outflow(self, fluid: Fluid) -> NDArray[np.float64]:
-        """Return the outflow through each face (m,), m^d/s, as if all faces were open in both directions."""
+        """Return the outflow (m,) through each face, in m^d/s, as if all faces were open in both directions."""
         return self.conductance * fluid.pi[self.at] - self.inflow
 
     def open_by(self, fluid: Fluid) -> NDArray[np.float64]:
-        """Return the outflow through each face (m,) per unit of the cell's mass potential, m^d/(Pa s)."""
+        """Return the outflow (m,) through each face per unit of the cell's mass potential, in m^d/(Pa s)."""
         return self.conductance
 
     derivative = open_by
@@ -156,14 +157,15 @@ class OpenFaces:
     def nonorthogonal(
         self, fluid: Fluid, difference: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64] | float, NDArray[np.float64] | float]:
-        """Return the non-orthogonal correction; `difference` (m,), Pa, corrects the cell pressure at each face.
+        """Return the non-orthogonal correction: a flow (m^d/s) and a fraction of the two-point flux.
 
-        The correction consists of a flow, m^d/s, and of a fraction of the two-point flux; both are added to this flux.
+        Both are added to the two-point flux.
+        `difference` (m,), Pa: correction of the cell pressure at each face.
         """
         return np.where(self.seeps, 0.0, self.open_by(fluid) * difference * fluid.density[self.at]), 0.0
 
     def driven(self, fluid: Fluid) -> NDArray[np.float64]:
-        """Return the outflow through each face (m,), m^d/s, caused by inertia forces on the fluid."""
+        """Return the outflow (m,) through each face due to inertia forces on the fluid, in m^d/s."""
         along = np.einsum("md,md->m", fluid.force[self.at], self.offset)
         return np.where(self.seeps, 0.0, self.open_by(fluid) * along)
 
@@ -180,13 +182,13 @@ class UnsaturatedFaces(OpenFaces):
     drop: NDArray[np.float64]  # hydrostatic pressure drop from the centroid to the face (m,), Pa
 
     def outflow(self, fluid: Fluid) -> NDArray[np.float64]:
-        """Return the outflow through each face (m,), m^d/s, as if all faces were open in both directions."""
+        """Return the outflow (m,) through each face, in m^d/s, as if all faces were open in both directions."""
         return self.open_by(fluid) * (fluid.pi[self.at] - self.outer) - self.inflow
 
     def nonorthogonal(
         self, fluid: Fluid, correction: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64] | float, NDArray[np.float64] | float]:
-        """Return the non-orthogonal correction: zero flow, and a fraction of the two-point flux in [-1, 1].
+        """Return the non-orthogonal correction: zero flow, and a fraction in [-1, 1] of the two-point flux.
 
         Conductivities change by orders of magnitude in a step, so the correction must be proportional to the flux.
         The limits -1 and 1 keep the correction from emptying the soil.
@@ -196,24 +198,25 @@ class UnsaturatedFaces(OpenFaces):
         return 0.0, np.where(self.seeps, 0.0, share)
 
     def open_by(self, fluid: Fluid) -> NDArray[np.float64]:
-        """Return the outflow through each face (m,) per unit of the difference of mass potentials, m^d/(Pa s)."""
+        """Return the outflow (m,) through each face per unit difference of mass potentials, in m^d/(Pa s)."""
         return self.conductance * self._through(fluid)[0]
 
     def derivative(self, fluid: Fluid) -> NDArray[np.float64]:
-        """Return the derivative of the outflow with respect to the pressure of the cell, >= 0, m^d/(Pa s)."""
+        """Return the derivative (>= 0) of the outflow with respect to the pressure of the cell, in m^d/(Pa s)."""
         return self.conductance * self._through(fluid)[1]
 
     def _through(self, fluid: Fluid) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return k_r of the faces (m,), and d[k_r (p - outside + drop)]/dp (m,) with the cell pressure p."""
+        """Return two arrays (m,): k_r of the faces, and `d[k_r (p - outside + drop)]/dp` with the cell pressure p."""
         return self.relative.through_sides(self.cells, self.normal, fluid.p[self.at], self.outside, self.drop)
 
 
 @dataclass(frozen=True)
 class RainedFaces(OpenFaces):
-    """Faces on open sides; at least one of the faces has rain.
+    """Faces on open sides, at least one of which has rain.
 
-    With rain, the outflow is minus the rain, within two limits: the outflow at the pond's pressure, and the outflow at
-    the driest pressure.  The first limit includes seepage, so `seeps` is False at faces with rain.
+    Through a face with rain, the outflow is minus the rain.  This outflow is at least the outflow at the pond's
+    pressure, and at most the outflow at the driest pressure.  The lower limit includes seepage, so `seeps` is False at
+    faces with rain.
     """
 
     rain: NDArray[np.float64]  # rain (m,), m^d/s; nan for faces without rain
@@ -221,7 +224,7 @@ class RainedFaces(OpenFaces):
     dry: OpenFaces  # these faces with the driest pressure outside
 
     def outflow(self, fluid: Fluid) -> NDArray[np.float64]:
-        """Return the outflow through each face (m,), m^d/s."""
+        """Return the outflow (m,) through each face, in m^d/s."""
         ponded = self.pond.outflow(fluid)
         return np.where(
             np.isnan(self.rain), ponded, np.minimum(np.maximum(-self.rain, ponded), self.dry.outflow(fluid))
@@ -236,15 +239,15 @@ class RainedFaces(OpenFaces):
         )
 
     def driven(self, fluid: Fluid) -> NDArray[np.float64]:
-        """Return the outflow through each face (m,), m^d/s, caused by inertia forces; zero on faces with rain."""
+        """Return the outflow (m,) through each face due to inertia forces, in m^d/s.  It is zero on faces with rain."""
         return np.where(np.isnan(self.rain), super().driven(fluid), 0.0)
 
     def open_by(self, fluid: Fluid) -> NDArray[np.float64]:
-        """Return the outflow through each face (m,) per unit of the difference of mass potentials, m^d/(Pa s)."""
+        """Return the outflow (m,) through each face per unit difference of mass potentials, in m^d/(Pa s)."""
         return self.pond.open_by(fluid)
 
     def derivative(self, fluid: Fluid) -> NDArray[np.float64]:
-        """Return the derivative of the outflow with respect to the pressure of the cell, m^d/(Pa s)."""
+        """Return the derivative of the outflow with respect to the pressure of the cell, in m^d/(Pa s)."""
         out = np.where(self.rain <= -self.dry.outflow(fluid), self.dry.derivative(fluid), 0.0)
         return np.where(self.rain < -self.pond.outflow(fluid), out, self.pond.derivative(fluid))
 
@@ -252,8 +255,8 @@ class RainedFaces(OpenFaces):
 class SideFeeds(Feeds):
     """Flow through open sides in a substep.
 
-    sides: faces of the open sides; wet: data of the substep; names: names of the conditions; ponds: largest pond
-    depths, m, or None without rain.  `OpenSides.number` are indices in `names` and `ponds`.
+    `sides`: faces of the open sides; `sides.number` are indices in `names` and `ponds`.  `wet`: data of the substep.
+    `names`: names of the conditions.  `ponds`, m: largest depth of the pond of each condition, or None without rain.
     """
 
     def __init__(self, sides: OpenSides, wet: Wet, names: tuple[str, ...], ponds: tuple[float | None, ...]):
@@ -272,9 +275,10 @@ class SideFeeds(Feeds):
     def _pond(
         self, sides: OpenSides, ponds: tuple[float | None, ...], dt: float
     ) -> tuple[OpenSides, NDArray[np.float64]]:
-        """Return the sides with the pressures and supply (in a time dt, s) of ponds; and the ponds' capacities, m^d.
+        """Return the open sides with the effect of the present ponds, and the largest volumes of the ponds, in m^d.
 
-        `ponds` are the largest depths of the ponds, m.
+        The rain of the returned sides includes the inflow that the ponds supply.
+        `ponds`, m: largest depth of each pond.  `dt`, s: time in which a pond supplies its whole volume.
         """
         depth, number = np.array([depth or 0.0 for depth in ponds]), sides.number
         size = np.linalg.norm(sides.area, axis=1)
@@ -287,7 +291,7 @@ class SideFeeds(Feeds):
 
     @property
     def _ponded(self) -> NDArray[np.float64]:
-        """Volume of the pond of each condition at the start of the step, m^d."""
+        """Volume (m^d) of the pond of each condition at the start of the step."""
         volumes = self._before.get("ponded", {})
         return np.array([float(volumes.get(name, 0.0)) for name in self._names])
 
@@ -312,12 +316,12 @@ class SideFeeds(Feeds):
         return UnsaturatedFaces(at, conductance, sides.given, self._seeps, offset, *rest)
 
     def begin(self, at: OpenFaces, fluid: Fluid, difference: NDArray[np.float64]) -> None:
-        """See `Feeds`.  Seepage faces open if their two-point flux (without non-orthogonal correction) is no inflow."""
+        """See `Feeds`.  Seepage faces open unless their flux (without non-orthogonal correction) is an inflow."""
         self._flows = at.outflow(fluid) >= 0
         self._nonorthogonal, self._share = at.nonorthogonal(fluid, difference)
 
     def leaving(self, at: OpenFaces, fluid: Fluid) -> Leaving:
-        """Return the outflow of the cells.  The non-orthogonal correction is computed at the start of the substep."""
+        """Return the outflow of the cells, with the non-orthogonal correction from the start of the substep."""
         flux = self._through(at, fluid)
         if fluid.force is not None:
             flux = flux + at.driven(fluid)
@@ -330,19 +334,19 @@ class SideFeeds(Feeds):
         return sum_by(at.at, self._if_open(at, (1 + self._share) * at.derivative(fluid)), len(fluid.pi))
 
     def settle(self, at: OpenFaces, fluid: Fluid) -> int:
-        """Update the active set: seepage faces with outflow become open, others closed; return the count of changes."""
+        """Open all seepage faces with outflow, close all others, and return the number of changes on this process."""
         flows = at.outflow(fluid) > 0
         changes = int(np.count_nonzero((flows != self._flows) & at.seeps))
         self._flows = flows
         return changes
 
     def outflows(self, at: OpenFaces, fluid: Fluid) -> dict[str, NDArray[np.float64]]:
-        """Return the outflow through the sides of each condition, m^d/s, by name of the condition."""
+        """Return the outflow (m^d/s) through the sides of each condition, by name of the condition."""
         sums = over_all(self._comm, sum_by(self.sides.number, self._through(at, fluid), len(self._names)))
         return {name: np.array(sums[i]) for i, name in enumerate(self._names)}
 
     def run_off(self, at: OpenFaces, fluid: Fluid) -> dict[str, NDArray[np.float64]]:
-        """Return the run-off by name of the condition, m^d/s: rain that neither infiltrates nor fills the pond."""
+        """Return the run-off (m^d/s), rain that neither infiltrates nor fills a pond, by name of the condition."""
         if not any(self._rains):
             return {}
         excess = np.maximum(self._fallen, 0.0) + np.minimum(self._through(at, fluid), 0.0)  # nan without rain
@@ -351,7 +355,7 @@ class SideFeeds(Feeds):
         return {name: np.array(runs[i]) for i, name in enumerate(self._names) if self._rains[i]}
 
     def passing(self, at: OpenFaces, fluid: Fluid) -> dict[str, NDArray[np.float64]]:
-        """Return for each condition two rates (2,), m^d/s: the outflow through its sides, and the rain on them."""
+        """Return two rates (2,) (m^d/s) for each condition: outflow through its sides, and rain on these sides."""
         if not any(self._rains):
             return {}
         both = np.stack([self._through(at, fluid), np.nan_to_num(self._fallen)])
@@ -361,7 +365,7 @@ class SideFeeds(Feeds):
     def volumes(
         self, rates: Sequence[Mapping[str, NDArray[np.float64]]], seconds: Sequence[float]
     ) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return the volumes of outflow, run-off and ponded water, m^d."""
+        """Return the volumes of outflow, run-off and ponded water, in m^d."""
         if not any(self._rains):
             return {}
         flowed, rained = np.einsum("s,snk->kn", seconds, [[of[name] for name in self._names] for of in rates])
@@ -382,5 +386,5 @@ class SideFeeds(Feeds):
         return np.where(self._flows | ~at.seeps, values, 0.0) if self.settles else values
 
     def _through(self, at: OpenFaces, fluid: Fluid) -> NDArray[np.float64]:
-        """Return the outflow through each face (m,), m^d/s."""
+        """Return the outflow (m,) through each face, in m^d/s."""
         return self._if_open(at, (1 + self._share) * at.outflow(fluid)) + self._nonorthogonal

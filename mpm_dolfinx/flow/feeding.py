@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Interface of the conditions on the pore fluid: drained sides, inflows, rain, sources.
 
-The method `feeding(setting)` of a condition returns a `Feeding`, which is created once in a stage and holds the faces.
+The method `feeding(setting)` of a condition returns a `Feeding`, which has the faces and is created once in a stage.
 `Feeding.placed` returns the `Feeds` of a substep.  At each assembly of the residual, `Feeds` add flow rates to the
 outflow of the cells.  `conditions/acting.py` has the corresponding interface for the momentum balance.
 """
@@ -46,7 +46,7 @@ class Fluid(NamedTuple):
 
 
 class Leaving(NamedTuple):
-    """Outflow from the n active owned cells by a condition, m^d/s."""
+    """Outflow (m^d/s) from the n active owned cells due to a condition."""
 
     cells: NDArray[np.float64]  # outflow (n,)
     turnover: NDArray[np.float64] | float = 0.0  # sum of absolute flows, the scale of rounding errors
@@ -68,41 +68,41 @@ class Feeds:
     """Faces with an outside pressure or a prescribed flux."""
 
     def conducting(self, flow: Conduction) -> Any:
-        """Return data that depend on conductivities and motion of the cells; stored until one of these changes."""
+        """Return data that depend on conductivities and motion of cells.  They are reused until these change."""
 
     def begin(self, at: Any, fluid: Fluid, difference: NDArray[np.float64]) -> None:
-        """Start a substep.  `difference` (m,), Pa, corrects cell pressures at `sides`, see `nonorthogonal`."""
+        """Start a substep.  `difference` (m,), Pa: correction of cell pressures at `sides`, see `nonorthogonal`."""
 
     def leaving(self, at: Any, fluid: Fluid) -> Leaving:
         """Return the outflow from the cells."""
         raise NotImplementedError
 
     def slope(self, at: Any, fluid: Fluid) -> NDArray[np.float64] | float:
-        """Return the derivative (n,) of the outflow with respect to the pressure of the cell, m^d/(Pa s)."""
+        """Return the derivative (n,) of the outflow with respect to the pressure of the cell, in m^d/(Pa s)."""
         return 0.0
 
     def settle(self, at: Any, fluid: Fluid) -> int:
-        """Update the active set; return the number of changes on this process."""
+        """Update the active set, and return the number of changes on this process."""
         return 0
 
     def outflows(self, at: Any, fluid: Fluid) -> dict[str, NDArray[np.float64]]:
-        """Return the outflow from the bodies through each condition, m^d/s, by name; all processes must call this."""
+        """Return the outflow from the bodies (m^d/s) through each condition, by name.  All processes must call this."""
         return {}
 
     def run_off(self, at: Any, fluid: Fluid) -> dict[str, NDArray[np.float64]]:
-        """Return the run-off, m^d/s, by name of the condition; all processes must call this."""
+        """Return the run-off, in m^d/s, by name of the condition.  All processes must call this."""
         return {}
 
     def passing(self, at: Any, fluid: Fluid) -> Mapping[str, NDArray[np.float64]]:
-        """Return the rates of a substep from which `volumes` are computed; all processes must call this."""
+        """Return the rates of a substep that determine `volumes`.  All processes must call this."""
         return {}
 
     def volumes(
         self, rates: Sequence[Mapping[str, NDArray[np.float64]]], seconds: Sequence[float]
     ) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return volumes since the conditions began, m^d, by quantity and condition, after a step.
+        """Return the volumes since the conditions began, in m^d, by quantity and condition.
 
-        `rates` are the results of `passing` in the substeps, `seconds` the time weights of the substeps, s.
+        `rates`: results of `passing` in the substeps of the last step.  `seconds`, s: time weights of these substeps.
         """
         return {}
 
@@ -135,11 +135,11 @@ class Feeding:
         return np.empty(0, dtype=np.int64)
 
     def unknown(self, value: float) -> dict[str, NDArray[np.float64]]:
-        """Return the result of `Feeds.outflows` before the first step: all are equal to `value`."""
+        """Return the outflows before the first step, see `Feeds.outflows`.  All are equal to `value`."""
         return {}
 
     def dry(self, value: float) -> dict[str, NDArray[np.float64]]:
-        """Return the result of `Feeds.run_off` before the first step: all are equal to `value`."""
+        """Return the run-offs before the first step, see `Feeds.run_off`.  All are equal to `value`."""
         return {}
 
     def empty(self) -> dict[str, dict[str, NDArray[np.float64]]]:

@@ -2,10 +2,10 @@
 """Two-point fluxes of the pore fluid through the covered parts of cell faces, and damping of pressure jumps.
 
 The material in the cells enters the forms through coefficients, which are set at each grid reset.  In a moving body the
-fluxes through the deformed cells are pulled back to the start of the step.  kappa is the mobility of a cell
-(conductivity / unit weight).  With F = I + grad u at the centroid of the cell's material, and J = det F, kappa becomes
-J F^-1 kappa F^-T. `drained_sides` computes fluxes through open sides; `StorageProblem` in `storage` adds up both kinds
-of fluxes.
+fluxes through the deformed cells are pulled back to the start of the step.  The mobility kappa of a cell (conductivity
+/ unit weight) becomes `J F^-1 kappa F^-T`.  Here F is `I + grad u` at the centroid of the cell's material, and J is
+`det F`.  `drained_sides` computes the fluxes through open sides.  `StorageProblem` in `storage` adds these to the
+fluxes between cells.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ class Conduction:
         return along if hoop is None else along * hoop[:, None]
 
     def across(self, at: NDArray[np.int64], normal: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the mobilities (m,) of cells `at` along normals n (m, d), pulled back: n . J F^-1 kappa F^-T n."""
+        """Return the pulled-back mobilities `n . J F^-1 kappa F^-T n` (m,) of cells `at` along normals n (m, d)."""
         kappa, share = self.mobility.mean[at], self.mobility.share
         if share is not None:
             kappa = kappa * (share[at] * normal**2).sum(axis=1)
@@ -91,16 +91,17 @@ class Conduction:
         return across if hoop is None else across * hoop[at]
 
     def distance_ratio(self, at: NDArray[np.int64], normal: NDArray, offset: NDArray) -> NDArray[np.float64]:
-        """Return distances of faces from centroids (m,), divided by distances from pressure positions (see `layers`).
+        """Return the ratio (m,) of two distances of each face: from the centroid, and from the pressure position.
 
-        `normal` (m, d) are normals of the faces; `offset` (m, d), m, are vectors from the centroids to the faces.
+        See `layers` for pressure positions.
+        `normal` (m, d): normals of the faces.  `offset` (m, d), m: vectors from the centroids to the faces.
         """
         distance = (offset * normal).sum(axis=1)
         shifted = distance - (self.mobility.shift[at] * normal).sum(axis=1)
         return np.divide(distance, shifted, out=np.ones(len(distance)), where=shifted > 0)
 
     def deformed(self, at: NDArray[np.int64], vector: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return vectors (m, d), m, in cells `at` after the deformation F of the cells."""
+        """Return the images (m, d) of vectors in cells `at` under the deformation gradients of these cells."""
         return vector if self.motion is None else (self.motion.F[at] @ vector[:, :, None])[:, :, 0]
 
 
@@ -135,10 +136,10 @@ class OpenSides:
         return self.area / np.sqrt(np.add.reduce(self.area**2, axis=1, keepdims=True))
 
     def driven(self, at: NDArray[np.int64], flow: Conduction) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the outflow (m,) per unit of the cell's mass potential, m^d/(Pa s), and the inflow (m,), m^d/s.
+        """Return two arrays (m,): outflow per unit of the cell's mass potential (m^d/(Pa s)), and inflow (m^d/s).
 
-        The inflow is prescribed, or caused by the outside pressure and gravity.  `at` (m,) are the indices of the cells
-        among the filled cells.
+        The inflow is prescribed, or caused by the outside pressure and gravity.
+        `at` (m,): indices of the cells among the filled cells.
         """
         shape = self.shape
         if flow.mobility.shift is not None:
@@ -147,16 +148,17 @@ class OpenSides:
         return conductance, self.given + conductance * self.outer(at, flow)
 
     def outer(self, at: NDArray[np.int64], flow: Conduction) -> NDArray[np.float64]:
-        """Return the mass potentials (m,), Pa, at the outside pressures less the hydrostatic drops from centroids."""
+        """Return the mass potentials (m,), in Pa, at outside pressures minus hydrostatic drops from centroids."""
         outer = self.pressure if flow.weight is None else self.pressure - flow.deformed(at, self.offset) @ flow.weight
         return mass_potential(outer, flow.bulk)
 
     def ahead(self, at: NDArray[np.int64], p: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return pressure differences, Pa, and slopes, Pa/m, to drained sides (n, d, 2, 2), by axis and end of a cell.
+        """Return pressure differences (Pa) and slopes (Pa/m) from cells to drained sides, as an array (n, d, 2, 2).
 
-        The last index is 0 for the difference, 1 for the slope.  Both are nan where there is no drained side.
+        The indices are: cell, axis, end of the cell along this axis, and 0 for the difference or 1 for the slope.  Ends
+        without a drained side have nan for both.
 
-        at (m,): index of the cell of each face among the filled cells; p (n,), Pa: pressures of the filled cells.
+        `at` (m,): index of the cell of each face among the filled cells.  `p` (n,), Pa: pressures of the filled cells.
         """
         out = np.full((len(p), self.normal.shape[1], 2, 2), np.nan)
         distance = np.add.reduce(self.offset * self.normal, axis=1)
@@ -196,9 +198,10 @@ class PieceContents:
 
 
 class CellContents(Keyed):
-    """Material in the cells, as of the last grid reset.  Arrays over local cells are valid in active cells.
+    """Material in the cells, at the last grid reset.  Arrays over local cells have valid values in active cells only.
 
-    forms: forms; this class sets their coefficients.  pieces: contributions of the pieces; filled: owned active cells.
+    `forms`: forms whose coefficients this class sets.  `pieces`: contributions of the pieces.
+    `filled`: owned active cells.
     """
 
     def __init__(self, forms: FluxForms, pieces: PieceContents, filled: NDArray[np.int64]):
@@ -209,14 +212,14 @@ class CellContents(Keyed):
         self._slot = forms.active.slot
         self._slot[filled] = np.arange(len(filled))
         self.weight, self.area = pieces.weight, pieces.area
-        """Volumes (m,) of the pieces, m^d; and sizes (m,): these volumes, or in axisymmetry areas of sections, m^2."""
+        """Volumes (m,) of the pieces, in m^d.  In axisymmetry `area` has the areas of their sections, in m^2."""
         self._at, d = self._slot[pieces.cells], grid.dim
         rows = [self.weight, self.area, self.weight * pieces.fixed_stress], (self.area[:, None] * pieces.x).T
         sums = self.total(np.concatenate([*rows, pieces.faces.reshape(len(self.area), 2 * d).T]))
         self.volume, area, self.fixed_stress = sums[:3]
-        """Volumes (n,) of the material in filled cells, m^d; and mean fixed-stress coefficients times these volumes."""
+        """Volumes (n,) of the material in filled cells, in m^d.  `fixed_stress` has mean coefficients times volumes."""
         self.fill = np.minimum(area / grid.volumes(filled), 1.0)
-        """Volume fractions of material in the filled cells (n,)."""
+        """Volume fractions (n,) of material in the filled cells."""
         shapes = (forms.centroid, forms.lower_face, forms.upper_face)
         self._damped, self._damping = forms.damping, pieces.damping
         forms.fixed_stress.x.array[filled] = self.fixed_stress
@@ -233,7 +236,7 @@ class CellContents(Keyed):
         self.centroid, self.open = forms.active.centroid, forms.active.opening
         self.centroid[active] = centroid[active]
         self.open[active, :, 0], self.open[active, :, 1] = lower[active], upper[active]
-        """Vectors (c, d), m, from cell midpoints to centroids of material; open fractions (c, d, 2) of faces."""
+        """Vectors (c, d), in m, from cell midpoints to centroids.  `open`: open fractions (c, d, 2) of faces."""
 
     def total(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the sums (..., n) of values (..., m) over the pieces of each filled cell."""
@@ -248,10 +251,10 @@ class CellContents(Keyed):
     def set_damping(
         self, share: NDArray[np.float64] | float = 1.0, less: NDArray[np.float64] | float = 0.0
     ) -> NDArray[np.float64]:
-        """Set the strength tau of the damping of elastic soil in the filled cells; return tau (n,), 1/Pa.
+        """Set the damping strength tau (n,) of elastic soil in the filled cells, and return tau, in 1/Pa.
 
-        `share` (n,) multiplies tau.  `less` (n,), 1/Pa, is the storage due to changes of saturation, which is
-        subtracted.
+        `share` (n,): factor of tau.
+        `less` (n,), 1/Pa: storage due to changes of saturation, which is subtracted from `share * tau`.
         """
         tau, values = self._damped.x, np.maximum(share * self.mean(self._damping) - less, 0.0)
         tau.array[self.filled] = values
@@ -259,15 +262,15 @@ class CellContents(Keyed):
         return values
 
     def mean(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the means (n,), weighted by volume, of values (m,) of the pieces in each filled cell."""
+        """Return the volume-weighted mean (n,) of the values (m,) of the pieces in each filled cell."""
         return self.total(self.weight * values) / self.volume
 
     def nodal(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return nodal values u (nodes, d) at the nodes of the filled cells, as an array (n, d, 2^d)."""
+        """Return an array (n, d, 2^d) with the values of u (nodes, d) at the nodes of each filled cell."""
         return u[self._nodes].transpose(0, 2, 1)
 
     def motion(self, nodal: NDArray[np.float64], rests: NDArray[np.int64] | None = None) -> CellMotion:
-        """Return the motion of filled cells at centroids, from displacements `nodal`, m; cells `rests` do not move."""
+        """Return the motion of filled cells at centroids from displacements `nodal` (m).  Cells `rests` do not move."""
         hoop, d = None, self.grid.dim
         at_centroids = nodal @ self._shapes
         F, moved = self._unit + at_centroids[:, :, :d], at_centroids[:, :, d].copy()
@@ -299,15 +302,15 @@ class FluxForms:
     active
         Active part of the grid.
     weight : (d,), N/m^3
-        Unit weight of the pore fluid rho_w g, as UFL; None without gravity.
+        Unit weight rho_w g of the pore fluid, as UFL, or None without gravity.
     flows
-        Whether any material is permeable; if not, there are no fluxes.
+        Whether any material is permeable.  Otherwise there are no fluxes.
     pressure
         Pore pressure of the cells (DG0), Pa.
     bulk
         Bulk modulus of the fluid, Pa.
     inertial : (d,), N/m^3
-        Inertia force on the pore fluid, as UFL; None without inertia.
+        Inertia force on the pore fluid, as UFL, or None without inertia.
     relative
         Relative conductivities in unsaturated soil, see `unsaturated`, or None.
     """
@@ -337,7 +340,7 @@ class FluxForms:
         h0, h1, across = across_faces(grid, n0)
 
         def opening(side, sign):
-            """Open fraction (covered by material) of the face along sign * n0, in axisymmetry times `Grid.around`."""
+            """Open fraction of the face in direction `sign * n0`, in axisymmetry multiplied by `Grid.around`."""
             lower, upper = self.lower_face(side), self.upper_face(side)
             return sum(
                 ufl.conditional(ufl.gt(sign * n0[a], 0.5), upper[a], 0.0)
@@ -399,7 +402,7 @@ class FluxForms:
             if relative is not None:
 
                 def by_k(k):
-                    """Return dT / dk_r of a law, without squares of conductivities, which would underflow."""
+                    """Return `dT / dk_r` of a law without squares of conductivities, which would underflow."""
                     return share * (
                         d0 * (k1 / resistance) ** 2 * ufl.diff(k0, k) + d1 * (k0 / resistance) ** 2 * ufl.diff(k1, k)
                     )
@@ -420,10 +423,10 @@ class FluxForms:
         active: NDArray[np.int64],
         density: NDArray[np.float64],
     ) -> NDArray[np.float64]:
-        """Return the outflow of the local cells, m^d/s, through `facets`, caused by slopes in `cells`.
+        """Return the outflow of the local cells through `facets` due to slopes in `cells`, in m^d/s.
 
-        `slope` (n, d), Pa/m: see `Gradients`.  `active` (c,) are the active local cells; `density` (c,) is the
-        density of their fluid, divided by the density at zero pressure.
+        `slope` (n, d), Pa/m: see `Gradients`.  `active` (c,): active local cells.
+        `density` (c,): density of the fluid in the active local cells, divided by the density at zero pressure.
         """
         self.density.x.array[active] = density
         self._sum.x.array[active] = 0.0
@@ -435,7 +438,7 @@ class FluxForms:
         return sum_ghosts(self._sum)
 
     def set_conduction(self, contents: CellContents, flow: Conduction) -> NDArray[np.float64]:
-        """Set the coefficients for conductivities of filled owned cells; return mobilities (n, d) along the axes."""
+        """Set the coefficients for the conductivities of cells.  Return the mobilities (n, d) along the axes."""
         d = self.grid.dim
         filled = contents.filled
         shift = flow.mobility.shift

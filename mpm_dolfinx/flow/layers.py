@@ -1,17 +1,18 @@
 # SPDX-License-Identifier: MIT
 """Mobility of cells with several conductivities, from lines through the cell along each axis.
 
-Soils along a line are in series; lines are in parallel.  The mobility along an axis is the mean, over the lines, of the
-harmonic mean along each line (Cardwell and Parsons 1945).  This mobility is exact for any number of layers parallel to
-the grid, for flow along and across them.  Inclined layers must be at least a cell thick.  Only then a seam of low
-conductivity blocks all lines of some cell, and a drain contains complete lines.
+Soils along a line are in series, and lines are in parallel.  The mobility of a line is the harmonic mean of the
+mobilities along it.  The mobility of a cell along an axis is the arithmetic mean over the lines along this axis
+(Cardwell and Parsons 1945).  This mobility is exact for flow along and across any number of layers parallel to the
+grid.  Inclined layers must be at least a cell thick.  Only then does a seam of low conductivity block all lines of some
+cell, and only then does a drain contain complete lines.
 
-A cell's pressure refers to its pressure position: there steady flow along a line has the line's mean pressure.  Let R
-be the resistance of the line, and let s increase from 0 to 1 along the line.  The resistance from this position to the
-lower end is int (1 - s) dR, to the upper end int s dR.  The sum of these resistances is exact for lines through several
-cells.  For layers inclined by more than `INCLINED` the position moves to the more conductive end.  Without this shift a
-drain would be interrupted between rows of cells.  The shape of a piece is approximated by the bounding box of its
-domain in the cell.
+The pressure of a cell refers to one position in the cell, the pressure position.  Steady flow along a line has the mean
+pressure of the line at this position.  Let R be the resistance of the line, and let s increase from 0 to 1 along the
+line.  The resistance from the pressure position to the lower end is `int (1 - s) dR`, and to the upper end `int s dR`.
+For a line through several cells, the sum of these resistances is exact.  If layers are inclined by more than
+`INCLINED`, the pressure position moves to the more conductive end.  Without this shift a drain would be interrupted
+between rows of cells.  The shape of a piece is approximated by the bounding box of its domain in the cell.
 
 A conductivity that depends on deformation varies even in cells without layers, see `graded`.
 """
@@ -32,9 +33,9 @@ from mpm_dolfinx.grid.grid import ranges, sum_by
 from mpm_dolfinx.parallel.exchange import over_all
 
 INCLINED = 0.01
-"""If layers are steeper than this slope against the grid, the pressure position of a cell moves to the more conductive
-end.  Halving this value changes the result of scene "slope" in tests/plateaus.py by 4.1e-04 (relative), doubling it by
-5.0e-05, and finer cells by 3.4e-03.
+"""If the slope of layers relative to the grid is larger than this value, the pressure position of a cell moves to the
+more conductive end.  Halving this value changes the result of scene "slope" in tests/plateaus.py by 4.1e-04 (relative),
+doubling it by 5.0e-05, and finer cells by 3.4e-03.
 """
 PAIRS = 2**16
 """Number of pairs of pieces that are processed together."""
@@ -42,7 +43,7 @@ PAIRS = 2**16
 
 @dataclass(frozen=True)
 class Lines:
-    """Lines along an axis through the centroids of pieces; arrays over pairs of a line and a piece that it crosses."""
+    """Lines along an axis through centroids of pieces.  Arrays are over pairs of a line and a crossed piece."""
 
     line: NDArray[np.int64]  # index, among pieces of mixed cells, of the piece through whose centroid the line runs
     piece: NDArray[np.int64]  # index of the crossed piece
@@ -57,7 +58,7 @@ class MixedCells:
     Parameters
     ----------
     rows
-        Indices of the pieces (m,) in mixed cells, ordered by cell.
+        Indices (m,) of the pieces in mixed cells, ordered by cell.
     cells
         Cells (m,) of the pieces.
     low, high
@@ -69,7 +70,7 @@ class MixedCells:
     contents
         Material in the cells.
     soils
-        Numbers (m, k) that identify the soils: pieces with equal rows have the same conductivity.
+        Numbers (m, k) that identify the soils.  Pieces with equal rows have equal conductivities.
     """
 
     def __init__(self, rows, cells, low, high, x, volume, contents: CellContents, soils):
@@ -97,9 +98,11 @@ class MixedCells:
             self._lines.append(Lines(line, piece, length, before, total))
 
     def _crossed(self, rows: slice, first, count, low, high) -> list[tuple[NDArray, NDArray, NDArray]]:
-        """Return for each axis three arrays (line, crossed piece, weight), for lines through the pieces `rows`.
+        """Return for each axis three arrays over pairs of a line and a crossed piece: line, piece, and weight.
 
-        Weights are < 1 on borders of pieces.  `first`, `count` (m,): first piece and number of pieces in the cell.
+        The lines run through the centroids of the pieces `rows`.  Weights are < 1 if the line runs along the border of
+        the piece.
+        `first`, `count` (m,): first piece and number of pieces in the cell of each piece.
         """
         line, piece = ranges(first[rows], count[rows])
         line += rows.start
@@ -129,11 +132,12 @@ class MixedCells:
         share: NDArray[np.float64] | None,
         now: NDArray[np.float64] | None = None,
     ) -> Mobility:
-        """Return the mobility of filled cells.  kappa: mobilities of pieces; mean (n,): their cell means, m^2/(Pa s).
+        """Return the mobility of filled cells.
 
-        `share` (n, d): mobility along each axis divided by `mean`; values of mixed cells are set in place.  `now`
-        are the mobilities of all pieces at their pressures, in unsaturated soil.  If `now` is given, only inclined
-        layers shift the position of the cell pressure away from the centroid.
+        With `now`, only inclined layers shift the pressure position of a cell away from the centroid.
+        `kappa`, m^2/(Pa s): mobilities of all pieces.  `mean` (n,), m^2/(Pa s): means of `kappa` in the filled cells.
+        `share` (n, d): mobility along each axis divided by `mean`; values of mixed cells are set in place.
+        `now`, m^2/(Pa s): in unsaturated soil, mobilities of all pieces at their pressures.
         """
         along, off = self._along(kappa[self._rows])
         if now is not None:
@@ -145,10 +149,11 @@ class MixedCells:
         return Mobility(mean, share, shift)
 
     def _along(self, kappa: NDArray[np.float64], mean: float = 1.0) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return, for mixed cells (n, d), mobilities along the axes, and shifts of the pressure position in cell sizes.
+        """Return two arrays (n, d) for mixed cells: mobilities along the axes, and shifts of the pressure position.
 
-        `kappa` are mobilities of pieces.  If `mean` = 1, shifts lead to the position of mean pressure.  If `mean` = 0,
-        only inclined layers cause shifts.
+        The shifts are divided by the cell sizes.
+        `kappa`: mobilities of the pieces.
+        `mean`: 1 for shifts to the position of mean pressure, 0 for shifts due to inclined layers only.
         """
         n, d = len(self._filled), self._x.shape[1]
         mobility = np.zeros((n, d))
@@ -174,9 +179,10 @@ class MixedCells:
     ) -> Paths:
         """Return the flow paths (n, d, 2, ...) of the mixed cells, see `Paths`.
 
-        kappa (m,), m^2/(Pa s): mobilities of all pieces at saturation; law (m,): indices of their retention curves,
-        < `laws`; shift (n, d), m: vectors from the centroids of filled cells to their pressure positions; None if
-        all are zero.
+        `kappa` (m,), m^2/(Pa s): mobilities of all pieces at saturation.
+        `law` (m,): index of the retention curve of each piece, < `laws`.
+        `shift` (n, d), m: vectors from the centroids of filled cells to their pressure positions, or None if all are
+        zero.
         """
         kappa, law = kappa[self._rows], law[self._rows]
         place = 0.5 + self._middle + (0.0 if shift is None else shift[self._filled] / self._h)
@@ -186,7 +192,7 @@ class MixedCells:
         return Paths(*(np.stack(parts, axis=1).reshape(*shape, parts[0].shape[1]) for parts in padded))
 
     def _path(self, axis: int, end: int, kappa, law, laws: int, place: NDArray[np.float64]) -> Paths:
-        """Return the paths (n, ...) from positions (n,) in the cells along an axis to one end of the cell."""
+        """Return the paths (n, ...) along an axis from the position `place` (n,) in each cell to one of its ends."""
         n, lines = len(place), self._lines[axis]
         middle = (2 * end - 1) * (self._x[lines.piece, axis] - place[self._at[lines.line]])
         length = np.clip(middle + lines.length / 2, 0.0, lines.length)  # of the part between position and end
@@ -227,7 +233,7 @@ class MixedCells:
         return out._replace(parallel=parallel)
 
     def _sharper(self, kappa: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return for each cell (n,) the contribution of inclined layers to the factor that multiplies shifts."""
+        """Return the contribution (n,) of inclined layers to the factor that multiplies the shift in each cell."""
         n = len(self._filled)
 
         def total(values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -246,14 +252,14 @@ class MixedCells:
 def graded(
     contents: CellContents, offset: NDArray[np.float64], kappa: NDArray[np.float64], mean: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the mobility along each axis (n, d), divided by `mean`, for a mobility that varies gradually in a cell.
+    """Return the mobilities (n, d) along the axes, divided by `mean`, of cells in which the mobility varies gradually.
 
-    Pieces conduct in series along the mobility's gradient, and in parallel across it.  If the gradient is not along
-    an axis, the arithmetic minus the harmonic mean is distributed over the axes, in proportion to the variance that a
-    linear variation along each axis explains.
+    Pieces conduct in series along the gradient of the mobility, and in parallel across this gradient.  If the gradient
+    is not along an axis, the difference between arithmetic and harmonic mean is distributed over the axes.  The share
+    of an axis is proportional to the variance that a linear variation along this axis explains.
 
-    offset, kappa: positions (m, d) of the pieces relative to the midpoints of cells, m, and mobilities (m,), m^2/(Pa
-    s); mean: mean mobility of the filled cells (n,).
+    `offset` (m, d), m: positions of the pieces relative to the midpoints of cells.
+    `kappa` (m,), m^2/(Pa s): mobilities of the pieces.  `mean` (n,), m^2/(Pa s): mean mobilities of the filled cells.
     """
     with np.errstate(divide="ignore"):
         series = 1 / contents.mean(1 / kappa)
@@ -271,9 +277,9 @@ def graded(
 
 
 def mixed_cells(cut: CutDomains, soils: NDArray[np.float64], contents: CellContents) -> MixedCells | None:
-    """Return the owned cells with pieces of different conductivity; None if no process has such cells.
+    """Return the owned cells with pieces of different conductivity, or None if no process has such cells.
 
-    `soils` (m, k) identify the soils: pieces with equal rows have the same conductivity.
+    `soils` (m, k): numbers that identify the soil of each piece.  Pieces with equal rows have equal conductivities.
     """
     grid = cut.grid
     cells = cut.cells

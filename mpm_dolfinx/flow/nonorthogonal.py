@@ -2,17 +2,17 @@
 """Non-orthogonal correction of fluxes between cells and through open sides.
 
 The two-point flux takes the difference of two cell pressures as the pressure difference across the face.  In bodies
-inclined to the grid, the centroids of both cells also differ by a vector t along the face, up to half a cell.  The
-resulting error does not decrease with the cell size.  With G, the pressure gradient minus the unit weight of the fluid
-in each cell, the corrected flux is (other symbols: see `storage`)
+inclined to the grid, however, the two centroids are also offset along the face, by a vector t of up to half a cell
+size.  The offset causes an error that does not decrease with the cell size.  Let G be the pressure gradient in a cell
+minus the unit weight of the fluid.  The corrected flux is (see `storage` for other symbols)
 
     Q = T [p+ - p- + rho_w g . (x- - x+) - (G+ + G-)/2 . t].
 
-At an open side, p - p_out is replaced by p - p_out + G . t.  Here t is the vector along the side, from the foot of the
-perpendicular through the centroid to the centre of the face.  The gradients are a least-squares fit to the pressures of
-neighbours and drained sides, and to zero flow across no-flow sides.  The area vector of a no-flow side is the one that
-closes the surface of the material in the cell.  The fit is exact for linear pressures.  Gradients are limited: the
-corrected pressures at faces stay between the pressures of the neighbours.
+At an open side, `p - p_out` is replaced by `p - p_out + G . t`.  Here t is the vector along the side, from the foot of
+the perpendicular through the centroid to the centre of the face.  The gradients are fitted by least squares to the
+pressures of neighbouring cells and drained sides, and to zero flow across no-flow sides.  The area vector of a no-flow
+side is the one that closes the surface of the material in the cell.  The fit is exact for linear pressures.  Gradients
+are limited so that the corrected pressures at faces stay between the pressures of the neighbours.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from mpm_dolfinx.forms.point_forms import FacetSum
 from mpm_dolfinx.grid.grid import Grid, sum_by
 
 ALONG = 1e-4
-"""Offset of two centroids along a face, divided by the cell size, up to which fluxes need no correction."""
+"""Fluxes need no correction if two centroids are offset along a face by at most this value times the cell size."""
 NEAREST = 0.1
 """Lower bound of distances in the weights of the least-squares fit, divided by the cell size.  Halving this value
 changes the result of scene "slope" in tests/plateaus.py by 3.0e-08 (relative), doubling it by 1.2e-06, and
@@ -52,9 +52,11 @@ def nonorthogonal_facets(contents: CellContents, facets: NDArray[np.int32]) -> N
 
 
 class Gradients:
-    """Pressure gradients minus unit weight, in cells with a centroid that is offset along a face or an open side.
+    """Pressure gradients minus unit weight of the fluid, in cells whose centroid is offset along a face or an open
+    side.
 
-    The object is valid for one cut of the domains.  contents: material in the cells; sides: open sides of the bodies.
+    The object is valid for one cut of the domains.
+    `contents`: material in the cells.  `sides`: open sides of the bodies.
     """
 
     def __init__(self, contents: CellContents, sides: OpenSides):
@@ -104,7 +106,7 @@ class Gradients:
 
     @cached_property
     def _units(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Gradients, 1/m, for a unit pressure difference to one neighbour (n, 2 d, d), and to one side (m, d)."""
+        """Gradients (1/m) for a unit pressure difference: to one neighbour (n, 2 d, d), and to one side (m, d)."""
         known, d = self._known, self._separation.shape[2]
         at, sealed = self._at[known], self._sealed(self._contents, self._sides)[self.rows]
         size = np.linalg.norm(self._sides.area, axis=1)[self._faces[known]]
@@ -126,10 +128,10 @@ class Gradients:
     def __call__(
         self, p: NDArray[np.float64], outer: NDArray[np.float64], weight: NDArray[np.float64] | None
     ) -> NDArray[np.float64]:
-        """Return the gradients (rows, d), Pa/m: pressure gradient minus unit weight of the fluid.
+        """Return the pressure gradients minus the unit weight of the fluid (rows, d), in Pa/m.
 
-        p (c,), Pa: pressures of all local cells; outer (m,), Pa: pressures outside the open sides; weight (d,), N/m^3:
-        unit weight of the fluid; None without gravity.
+        `p` (c,), Pa: pressures of all local cells.  `outer` (m,), Pa: pressures outside the open sides.
+        `weight` (d,), N/m^3: unit weight of the fluid, or None without gravity.
         """
         of_cells, of_sides = self._units
         own, at = p[self._own], self._at[self._known]
@@ -153,7 +155,7 @@ class Gradients:
         return out * share[:, None]
 
     def through_sides(self, slope: NDArray[np.float64], count: int) -> NDArray[np.float64]:
-        """Return the correction of the cell pressure at each open face (count,), Pa."""
+        """Return the correction (count,) of the cell pressure at each open face, in Pa."""
         out = np.zeros(count)
         out[self._faces] = np.einsum("md,md->m", self._tangential, slope[self._at])
         return out
@@ -170,10 +172,10 @@ class NonorthogonalFlow(NamedTuple):
     weight: NDArray[np.float64] | None  # unit weight of the fluid (d,), N/m^3; None without gravity
 
     def __call__(self, p: NDArray[np.float64], bulk: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the additional outflow (n,), m^d/s, from filled cells to others, and corrections (m,), Pa, at sides.
+        """Return two arrays: added outflows (n,) from filled cells to other cells, and corrections (m,) of pressures.
 
-        The corrections apply to the cell pressure at open sides.  `p` (c,), Pa, are the pressures of the local cells;
-        `bulk`, Pa, is the bulk modulus of the fluid.
+        The outflows are in m^d/s.  The corrections (Pa) apply to the cell pressures at open sides.
+        `p` (c,), Pa: pressures of the local cells.  `bulk`, Pa: bulk modulus of the fluid.
         """
         slope = self.gradients(p, self.sides.pressure, self.weight)
         through = self.gradients.through_sides(slope, len(self.sides.cells))
@@ -186,7 +188,7 @@ class NonorthogonalFlow(NamedTuple):
 
 
 def off_middle(sides: OpenSides, grid: Grid) -> NDArray[np.bool_]:
-    """Return for each face (m,) whether its condition's faces in the cell are, on average, offset along the face."""
+    """Return for each face (m,) whether the faces of its condition in its cell have a mean offset along the side."""
     faces, at = np.unique(sides.number * grid.num_local + sides.cells, return_inverse=True)
     size, off = np.sqrt(np.add.reduce(sides.area**2, axis=1)), _along(sides) / grid.sizes(sides.cells)
     mean = sum_by(at, (size[:, None] * off).T, len(faces)) / sum_by(at, size, len(faces))
@@ -194,5 +196,5 @@ def off_middle(sides: OpenSides, grid: Grid) -> NDArray[np.bool_]:
 
 
 def _along(sides: OpenSides) -> NDArray[np.float64]:
-    """Return vectors (m, d), m, along faces: from the foot of the perpendicular through the centroid to the centre."""
+    """Return vectors (m, d) along faces, from the foot of the perpendicular through the centroid to the centre."""
     return sides.offset - np.add.reduce(sides.offset * sides.normal, axis=1, keepdims=True) * sides.normal

@@ -5,7 +5,7 @@
 
 with the weight w of a cell and axis, and the edge length h of the cell along the axis.  p_+- are the pressures of the
 neighbours, and d_+- the distances between centroids of the material.  A cell has a term along an axis if both faces
-across this axis are open.  For a pressure that alternates from cell to cell, the damping coefficient is 16 w; damping
+across this axis are open.  For a pressure that alternates from cell to cell, the damping coefficient is 16 w.  Damping
 of pressure jumps with the weight w would give 4 w.  A uniform gradient is not damped, even at the sides of the body, so
 steep pressures are not smeared.  The sum of H p over the cells is zero, so damping conserves fluid.
 """
@@ -30,10 +30,12 @@ def second_differences(
 ) -> PETSc.Mat:
     """Return the matrix H.  The pattern depends on the active cells only.
 
-    unknowns: pressure unknowns of the active cells; grid: background grid; strength (n, d), m^d/Pa, for each owned
-    active cell and axis: coefficient, >= 0, of a damping of jumps with the same effect on alternating pressures;
-    centroid (c, d), m: centroids of the material in the local cells, relative to the midpoints of the cells; opening
-    (c, d, 2): open fractions of the lower and upper faces of the local cells, in axisymmetry times `Grid.around`.
+    `unknowns`: pressure unknowns of the active cells.  `grid`: background grid.
+    `strength` (n, d), m^d/Pa: coefficient, >= 0, of each owned active cell and axis.  A damping of jumps with this
+    coefficient has the same effect on alternating pressures.
+    `centroid` (c, d), m: centroids of the material in the local cells, relative to the midpoints of the cells.
+    `opening` (c, d, 2): open fractions of the lower and upper faces of the local cells, in axisymmetry times
+    `Grid.around`.
     """
     own = unknowns.owned
     number = unknowns.map.indices

@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: MIT
 """Fluxes between two cells through unsaturated soils in series.
 
-The soils between the pressure positions of two cells lie in series.  The pressures at the interfaces of soils are local
-unknowns of each face.  Newton's method finds these pressures from the continuity of the flux, and condensation
-eliminates them.  Each soil conducts like a pair of cells that contain only this soil (`fitted`).  Steady flow through
-layers with exponential k_r is therefore exact for any position of the layers.
+The pressure of a cell refers to one position in the cell, the pressure position (see `layers`).  The soils between the
+pressure positions of two cells lie in series.  The pressures at the interfaces of soils are local unknowns of each
+face.  Newton's method finds these pressures from the continuity of the flux, and condensation eliminates them.  Each
+soil conducts like a pair of cells that contain only this soil (`fitted`).  Steady flow through layers with exponential
+k_r is therefore exact for any position of the layers.
 
 Lines through a cell (see `layers`) conduct in parallel if they cross a single soil up to the face.  All lines that
-cross several soils are replaced by one line.  This line crosses the same soils in the same sequence, each over
-its mean fraction of the replaced lines.
+cross several soils are replaced by one line.  This line crosses the same soils in the same sequence.  Its length in
+each soil is the mean over the replaced lines.
 """
 
 from __future__ import annotations
@@ -28,10 +29,11 @@ MOST = 2200  # largest number of iterations.  Source: exact bound, twice the hal
 
 
 class Paths(NamedTuple):
-    """Flow paths from the pressure positions of n cells to their faces; arrays (n, d, 2, ...) by axis and end.
+    """Flow paths from the pressure positions of n cells to their faces.
 
-    Lines that cross a single soil conduct in parallel.  `parallel` has one entry for each of l retention curves; the
-    first is for soil without a curve.  The other lines are replaced by one line with s soils in series.
+    The arrays (n, d, 2, ...) have the indices cell, axis and end of the cell.  Lines that cross a single soil conduct
+    in parallel.  `parallel` has one entry for each of l retention curves; entry 0 is for soil without a curve.  The
+    other lines are replaced by one line with s soils in series.
     """
 
     parallel: NDArray[np.float64]  # mobility of single-soil lines, times their fraction of all lines (l,), m^2/(Pa s)
@@ -40,11 +42,11 @@ class Paths(NamedTuple):
     resistance: NDArray[np.float64]  # length divided by mobility and by the fraction of lines (s,), Pa s/m^2
 
     def at(self, *index) -> Paths:
-        """Return the paths for an index that applies to all arrays."""
+        """Return the paths at an index of all arrays."""
         return Paths(*(values[index] for values in self))
 
     def everywhere(self, dim: int) -> Paths:
-        """Return the paths (n, ...), repeated for both ends of all axes (n, d, 2, ...)."""
+        """Repeat the paths (n, ...) for both ends of all axes, and return the result (n, d, 2, ...)."""
         parts = ((np.repeat(values, 2 * dim, axis=0), values.shape) for values in self)
         return Paths(*(many.reshape(shape[0], dim, 2, shape[1]) for many, shape in parts))
 
@@ -63,7 +65,7 @@ class Paths(NamedTuple):
 
 
 class Through(NamedTuple):
-    """Conductances of m faces between two pressures."""
+    """Conductances of m faces for the pressures on both sides."""
 
     conductance: NDArray[np.float64]  # conductances (m,), m/(Pa s)
     slopes: tuple[NDArray[np.float64], NDArray[np.float64]]  # d flux / dp[0] and -d flux / dp[1]
@@ -77,7 +79,10 @@ def none(count: int, laws: int, slots: int) -> Paths:
 
 
 class _Links(NamedTuple):
-    """Segments of soil along the flow path through a face.  Each one connects two nodes (positions with a pressure)."""
+    """Segments of soil along the flow path through a face.
+
+    Each segment connects two nodes (positions with a pressure).
+    """
 
     face: NDArray[np.int64]  # index of the face
     low: NDArray[np.int64]  # first node
@@ -104,11 +109,12 @@ def through(
     lengths: Sequence[NDArray[np.float64]],
     drops: Sequence[NDArray[np.float64]],
 ) -> Through:
-    """Return the conductances of faces between two pressures.
+    """Return the conductances of m faces for the pressures on both sides.
 
-    laws: relative conductivities as functions of pressure; p: pressures on both sides (m,), Pa; paths: paths of one or
-    two cells (m, ...), from their pressure positions to the face; lengths: lengths of these paths (m,), m; drops:
-    pressure drops (m,) caused by the fluid's weight along each path, from the first side to the second, Pa.
+    `laws`: relative conductivities as functions of pressure.  `p` (m,), Pa: pressures on both sides, as two arrays.
+    `paths` (m, ...): paths of one or two cells, from their pressure positions to the face.
+    `lengths` (m,), m: lengths of the paths.
+    `drops` (m,), Pa: pressure drops caused by the fluid's weight along each path, from the first to the second side.
     """
     counts = [np.maximum((path.law >= 0).sum(axis=1), 1) for path in paths]
     kinds, kind = np.unique(np.stack(counts, axis=1), axis=0, return_inverse=True)
@@ -121,7 +127,7 @@ def through(
 
 
 class _Chain:
-    """Faces with the same numbers of soils in series.  Each interface between soils is a node with a pressure."""
+    """Faces with equal numbers of soils in series.  Each interface between soils is a node with a pressure."""
 
     def __init__(self, laws: Laws, paths: Sequence[Paths], count: Sequence[int], p, lengths, drops):
         self._laws, self._p = laws, p
@@ -149,7 +155,7 @@ class _Chain:
         self._difference = self._hydrostatic[:, -1] - p[1]
 
     def solved(self) -> NDArray[np.float64]:
-        """Return (3, m): the conductance between both ends, and the two slopes of `Through`."""
+        """Return an array (3, m): the conductance between both ends of the path, and the two slopes of `Through`."""
         links, difference = self._links, self._difference[:, None]
         inner = slice(1, -1)
         scale = np.full(self._hydrostatic.shape, np.inf)
@@ -182,7 +188,7 @@ class _Chain:
         raise NotConverged("soils in series: no solution for the pressure at their interface")
 
     def _flows(self, p: NDArray[np.float64]) -> _Flows:
-        """Return the flows at node pressures p (m, nodes), Pa."""
+        """Return the flows at the node pressures p (m, nodes), in Pa."""
         links = self._links
         ends = p[links.face, links.low], p[links.face, links.high]
         k, slopes = self._laws.between(links.law, ends, links.drop)
@@ -192,13 +198,13 @@ class _Chain:
         return _Flows(c * k, c * own, c * other, c * k * difference, rounding)
 
     def _chain(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the values (m, nodes - 1) of the segments in series, from the values of all segments."""
+        """Select the values (m, nodes - 1) of the segments in series from the values of all segments."""
         starts = np.cumsum([0, *(count + 1 for count in self._counts)])
         number = [i for first, count in zip(starts, self._counts, strict=False) for i in range(first, first + count)]
         return np.stack([values[self._parts[i] : self._parts[i + 1]] for i in number], axis=1)
 
     def _step(self, flows: _Flows) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Return steps of Newton's method (m, nodes - 2), and which nodes have continuous flux within rounding."""
+        """Return two arrays (m, nodes - 2): Newton steps (Pa), and whether the flux is continuous within rounding."""
         links, shape = self._links, self._hydrostatic.shape
 
         def at(node: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -218,7 +224,7 @@ class _Chain:
         return x, balanced
 
     def _condensed(self, flows: _Flows) -> NDArray[np.float64]:
-        """Return the result of `solved` (3, m), from the flows through all segments of a face."""
+        """Return the result (3, m) of `solved` from the flows through all segments of the faces."""
         out, part = None, 0
         rows = np.stack(flows[:3])
         for count in self._counts:
@@ -233,7 +239,7 @@ class _Chain:
 
 
 def _series(first: NDArray[np.float64] | None, second: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return conductance and slopes (3, m) of two segments in series; those of `second` if `first` is None."""
+    """Return the conductance and slopes (3, m) of two segments in series, or of `second` if `first` is None."""
     if first is None:
         return second
     (k, own, other), (after, owns, others) = first, second

@@ -52,11 +52,11 @@ class Sources(Feeding):
         self.linear = not self._slopes
 
     def gain(self, pieces: PointData) -> NDArray[np.float64]:
-        """Return the inflow into each filled cell at p, m^d/s, as a local array."""
+        """Return the inflow (m^d/s) into each filled cell at p, as an array over local cells."""
         return self._sum(self._forms, pieces)
 
     def slope(self, pieces: PointData) -> NDArray[np.float64]:
-        """Return the derivative of `gain` with respect to the pressure of the cell, m^d/(Pa s), as a local array."""
+        """Return the derivative (m^d/(Pa s)) of `gain` with respect to cell pressures, as an array over local cells."""
         return self._sum(self._slopes, pieces)
 
     def _sum(self, forms: Sequence[PointForm], pieces: PointData) -> NDArray[np.float64]:

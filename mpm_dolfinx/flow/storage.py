@@ -6,29 +6,30 @@
     int r [zeta(J_Delta, p) - zeta_n] dV_n  +  int sum_faces Q dt  =  0,      d zeta = alpha dJ + S J dp,
     Q = T r [p+ - p- + rho_w g . (x- - x+)],   T = A / (d+ / kappa+ + d- / kappa-),   kappa = k / (rho_w g).
 
-(With div u instead of J_Delta, rotations would cause volume changes.)  r = exp(p / K_w) is the fluid density divided by
-the density rho_w at zero pressure.  In the storage term, r is taken at the pressure (p_n + p) / 2; on a face, r is the
-logarithmic mean over both cells.  Then r [p+ - p-] is the jump of the mass potential (`fluid_content`), and the mass
-that leaves a cell enters the neighbour.  The residual is the left side divided by the r of storage; the tangent
-neglects that r of a face differs from the r of storage.  A is the exact area of the body on the face, k the
-conductivity.  x+- are the centroids of the material in both cells, and d+- their distances from the face.  `layers`
-defines kappa and d of mixed cells.  Distances from centroids give an error of 0.2 % for any filling; half of the cell
-size as distance would give up to 12 %. `nonorthogonal` corrects fluxes if the two centroids are offset along the face.
-The sum over all cells is the fluid balance of the bodies.  `fluid_content` defines the change of the content, and
+With div u instead of J_Delta, rotations would cause volume changes.  The factor `r = exp(p / K_w)` is the fluid density
+divided by the density rho_w at zero pressure.  In the storage term, r is taken at the pressure `(p_n + p) / 2`.  On a
+face, r is the logarithmic mean over both cells.  With this mean, `r [p+ - p-]` is the jump of the mass potential
+(`fluid_content`), and the mass that leaves a cell enters the neighbour.  The residual is the left side of the balance,
+divided by the r of the storage term.  The tangent neglects the difference between the r of a face and the r of the
+storage term.  A is the exact area of the body on the face, and k is the conductivity.  The points x+- are the centroids
+of the material in both cells, and d+- are their distances from the face.  `layers` defines kappa and d of mixed cells.
+With distances from centroids, the error is 0.2 % for any filling of the cells.  With half of the cell size as distance,
+the error would be up to 12 %.  `nonorthogonal` corrects fluxes if the two centroids are offset along the face.  The sum
+of the balances of all cells is the fluid balance of the bodies.  `fluid_content` defines the change of the content, and
 `time_integration` the integral over a substep.
 
 The volumes of domains drift from their fluid content, for three reasons: corners do not follow u alone, points move to
-other cells, and pressure jumps are damped (see below).  Points carry the difference, a volume defect (`owed`).  The
-next steps correct fractions of this defect (`defect`), at a constant rate over the step.
+other cells, and pressure jumps are damped (see below).  Each point stores the difference as a volume defect (`owed`).
+The next steps correct fractions of this defect (`defect`), at a constant rate over the step.
 
 If no fluid flows within a step, Q1 displacements with DG0 pressures violate the inf-sup condition: pressures that
 alternate from cell to cell have no effect.  Therefore jumps of the pressure increment of the step are stabilised by the
-term max(0, tau d - dt kappa / d) A [p - p_n].  Here tau is the strength of the stabilisation, 1/Pa, and d = d+ + d-.
-In this term dt, s, is the step times the coefficient of Q(u, p) in `time_integration`: 1 or gamma.  The term raises the
-coefficient dt kappa A / d of a face to tau d A if this is larger.  The term is conservative, and zero in steady states.
-For elastic soil, tau is a quarter of Silvester and Kechkar's patch value (Camargo, White and Borja 2021).  Soil in
-plastic flow needs a tau up to a hundred times larger.  The increase of tau acts on second differences only
-(`second_differences`), because damping of jumps would smear steep pressures.
+term `max(0, tau d - dt kappa / d) A [p - p_n]`.  Here tau (1/Pa) is the strength of the stabilisation, and `d = d+ +
+d-`.  In this term, dt (s) is the length of the step times the coefficient of Q(u, p) in `time_integration`, which is 1
+or gamma.  The term raises the coefficient `dt kappa A / d` of a face to `tau d A` if `tau d A` is larger.  The term
+conserves fluid, and it is zero in steady states.  For elastic soil, tau is a quarter of Silvester and Kechkar's patch
+value (Camargo, White and Borja 2021).  Soil in plastic flow needs a tau up to a hundred times larger.  The increase of
+tau acts on second differences only (`second_differences`), because damping of jumps would smear steep pressures.
 """
 
 from __future__ import annotations
@@ -63,9 +64,9 @@ from mpm_dolfinx.points.parts import OfParts, Parts
 from mpm_dolfinx.pores.retention import logarithm, restrained
 
 FILTER = 0.75
-"""Fraction of beta V (fixed-stress coefficient times volume) that the filtered fixed-stress operator leaves out for
-checkerboard modes, in [0, 1].  Halving this value changes the result of scene "beam" in tests/plateaus.py by 5.2e-11
-(relative), doubling it by 1.3e-10, and finer cells by 1.5e-02.
+"""Fraction, in [0, 1], of `beta V` that the filtered fixed-stress operator omits for checkerboard modes.  Here beta is
+the fixed-stress coefficient, and V is the volume.  Halving this value changes the result of scene "beam" in
+tests/plateaus.py by 5.2e-11 (relative), doubling it by 1.3e-10, and finer cells by 1.5e-02.
 """
 
 
@@ -87,8 +88,9 @@ class StorageForms:
     Parameters
     ----------
     pieces
-        Quadrature points with the fields `biot`, `storage` and `storage_at_one`, 1/Pa, see `change_of_content`.  With a
-        specific yield also `drainage`: specific yield and suction, Pa, see `skeleton.unsaturated`.
+        Quadrature points with the fields `biot`, `storage` (1/Pa) and `storage_at_one` (1/Pa), see `change_of_content`.
+        With a specific yield they also have the field `drainage`: specific yield and suction (Pa), see
+        `skeleton.unsaturated`.
     displacement
         Increment of the displacement since the start of the step.
     pressure
@@ -98,14 +100,15 @@ class StorageForms:
     materials
         Materials and fluid of the scene.  With retention curves, pieces have the fields `retention`, `lever`, `pores`.
     weight : (d,), N/m^3
-        Unit weight of the pore fluid rho_w g, as UFL; None without gravity.
+        Unit weight rho_w g of the pore fluid, as UFL, or None without gravity.
     symmetric
-        Whether to use alpha as the derivative of the content with respect to J_Delta.  The Jacobian is then symmetric.
-        The neglected term is of the order of (p - p_n) / K_w; Newton's method converges as fast as with this term.
+        Whether to use alpha as the derivative of the content with respect to J_Delta.  If True, the Jacobian is
+        symmetric.  The neglected term is of the order of `(p - p_n) / K_w`.  Newton's method converges as fast without
+        this term.
     feeding
         Sources and open sides of all stages.
     inertial : (d,), N/m^3
-        Inertia force on the pore fluid, -rho_w a, as UFL; None without inertia.
+        Inertia force `-rho_w a` on the pore fluid, as UFL, or None without inertia.
     """
 
     def __init__(
@@ -127,7 +130,7 @@ class StorageForms:
         retentions, laws = materials.retentions, materials.conductivity_laws
         Q = self.p.function_space
         self.conductivity = None
-        """Evaluation of the conductivity laws; None if there are none."""
+        """Evaluation of the conductivity laws, or None without such laws."""
         if laws:
             self.conductivity = ConductivityAtPieces(materials.materials, laws, pieces, displacement, self.p_before)
         self._work = fem.Function(Q)
@@ -162,32 +165,33 @@ class StorageForms:
         """Sources and open sides of all stages."""
 
     def change(self, data: PointData) -> NDArray[np.float64]:
-        """Return the change of the fluid volume in filled cells since the start of the step, m^d, as a local array."""
+        """Return an array over local cells: change (m^d) of the fluid volume in filled cells since the step's start."""
         b = self._sums
         b[data.places.filled] = 0.0
         self._change.assemble_vector(b, data)
         return b
 
     def derivatives(self, data: PointData) -> list[NDArray[np.float64]]:
-        """Return derivatives of `change`: d/dp (filled cells,), m^d/Pa, and d/du with nodal displacements u.
+        """Return the derivatives of `change` with respect to p, and with respect to the nodal displacements u.
 
-        The derivatives d/du are one or two arrays (filled cells, n), m^(d-1).  The first, for the momentum
-        balance, differentiates alpha dJ_Delta; the second, if not `symmetric`, differentiates the content.
+        The derivative d/dp is an array (filled cells,), in m^d/Pa.  The derivatives d/du are one or two arrays (filled
+        cells, n), in m^(d-1).  The first array is for the momentum balance, and differentiates `alpha dJ_Delta`.  The
+        second array exists unless `symmetric` is set, and differentiates the content.
         """
         sums, count = self._derivatives(data), self.grid.dim * 2**self.grid.dim
         return [sums[:, 0], *[sums[:, start : start + count] for start in range(1, sums.shape[1], count)]]
 
     def drained(self, data: PointData) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the storage (n,) of filled cells due to their saturation S, m^d/Pa, and int S d(chi p)/dp dV, m^d."""
+        """Return two arrays (n,): storage of cells due to saturation (m^d/Pa), and `int S d(chi p)/dp dV` (m^d)."""
         capacity, coupled = self._capacity(data).T
         return capacity, coupled
 
     def driven(
         self, assembled: FacetSum, active: NDArray[np.int64], force: NDArray[np.float64] | None
     ) -> NDArray[np.float64]:
-        """Return the outflow of active cells to other cells (c,), m^d/s, caused by p and by the fluid's weight.
+        """Return the outflow (c,) of active cells to other cells, in m^d/s, caused by p and by the fluid's weight.
 
-        `force` (c, d), N/m^3, is the inertia force on the fluid in the local cells, or None.
+        `force` (c, d), N/m^3: inertia force on the fluid in the local cells, or None.
         """
         relative, borders = self.fluxes.relative, None
         if relative is not None:
@@ -211,7 +215,7 @@ class Outflow:
 
 @dataclass(frozen=True)
 class Rates:
-    """Outflow rates of the owned cells, m^d/s; after `integrated`, outflow volumes, m^d."""
+    """Outflow rates of the owned cells, in m^d/s.  The result of `integrated` has outflow volumes instead, in m^d."""
 
     cells: NDArray[np.float64]  # outflow of each cell minus its sources
     net: NDArray[np.float64]  # outflow from the bodies minus sources
@@ -219,7 +223,7 @@ class Rates:
     gain: NDArray[np.float64]  # absolute value of sources
 
     def integrated(self, seconds: float) -> Rates:
-        """Return the outflow volumes in a time, s."""
+        """Return the outflow volumes in the time `seconds`."""
         return Rates(seconds * self.cells, seconds * self.net, seconds * self.turnover, seconds * self.gain)
 
 
@@ -231,7 +235,7 @@ class StorageSystem:
     forms
         Compiled forms, with the material in the cells.
     cells, facets
-        Active local cells, ghosts included, and the faces between two of them.
+        Active local cells including ghosts, and the faces between two of these cells.
     momentum
         Unknowns of the displacement.
     parts
@@ -267,11 +271,11 @@ class StorageSystem:
 
     @property
     def gravity(self) -> FacetSum | None:
-        """Form of the fluxes due to p and the fluid's weight between cells of one soil; None without weight."""
+        """Form of fluxes between cells of one soil, due to p and weight.  None in saturated soil without weight."""
         return (self._uniform or self._over_uniform())[1]
 
     def _over_uniform(self) -> tuple[FacetSum | None, FacetSum | None]:
-        """Return two forms over the faces between cells of the same soil: the matrix of the fluxes, and `gravity`."""
+        """Return two forms over the faces between cells of one soil: the form of the flux matrix, and `gravity`."""
         fluxes, facets = self._forms.fluxes, self._facets
         facets = facets if fluxes.relative is None else fluxes.relative.uniform(facets)
         return tuple(form and form.on(facets) for form in (fluxes.flux, fluxes.gravity))
@@ -282,13 +286,13 @@ class StorageSystem:
         return places, places[:0]
 
     def change_by(self, u: PETSc.Vec, out: PETSc.Vec, *slopes: FluxSlope) -> None:
-        """Set `out` to the residual's change, m^d, due to u: change of content and, with `slopes`, of fluxes."""
+        """Set `out` to the change (m^d) of the residual due to u: by content and, with `slopes`, by fluxes."""
         self.B.mult(u, out)
         for slope in slopes:
             out.array_w[:] += slope(u)
 
     def between(self, pi: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the outflow to other cells, m^d/s, caused by differences of the mass potentials pi (n,), Pa."""
+        """Return the outflow to other cells, in m^d/s, caused by differences of the mass potentials pi (n,), in Pa."""
         self._potentials.array_w[:] = pi
         return (self.T * self._potentials).array_r
 
@@ -321,7 +325,7 @@ class StorageSystem:
         return Outflow([one.conducting(flow) for one in feeds], total, mobility, nonorthogonal)
 
     def assemble_fluxes(self, force: NDArray[np.float64] | None = None) -> None:
-        """Assemble the flux matrix between cells (in unsaturated soil at p).  `force`: see `StorageForms.driven`."""
+        """Assemble the matrix of fluxes (in unsaturated soil at p).  `force`: see `StorageForms.driven`."""
         zero(self.T)
         relative, borders = self._forms.fluxes.relative, None
         if relative is not None:
@@ -335,7 +339,7 @@ class StorageSystem:
 
 @dataclass(frozen=True)
 class StorageResidual:
-    """Residual of the fluid balance of each cell, m^d, and sums over each connected part (parts,), m^d."""
+    """Residual of the fluid balance of each cell, and sums (parts,) over each connected part, all in m^d."""
 
     vector: PETSc.Vec
     exchanged: NDArray[np.float64]  # sum of absolute changes of content and of sources
@@ -361,19 +365,19 @@ class StorageProblem:
     feeds
         Sources and open sides.
     flow
-        Function that assembles the outflow at (u, p); its argument tells whether a substep starts.
+        Function that assembles the outflow at (u, p).  Its argument states whether a substep starts.
     dt
-        Time weight of the rate at (u, p), s.
+        Time weight, s, of the rate at (u, p).
     before
         Outflow volumes from the rate of the previous substep.
     softness : (m,)
-        Softness of the pieces, see `SoftnessAtPoints`; 1 if no law can yield.
+        Softness of the pieces, see `SoftnessAtPoints`.  It is 1 if no law can yield.
     defect : (n,), m^d
         Part of the volume defect in the active owned cells that is corrected by the end of the substep.
     inertial
-        Function that returns the inertia forces on the pore fluid (n, d), N/m^3, in the active owned cells, or None.
+        Function that returns the inertia forces (n, d), in N/m^3, on the fluid in the active owned cells, or None.
     scale
-        Suctions (n,), Pa, at which the pores of the active owned cells drain, or None.
+        Suctions (n,), Pa, at which the pores of the active owned cells drain, or None in saturated scenes.
     """
 
     def __init__(
@@ -415,7 +419,7 @@ class StorageProblem:
         """Whether jumps of the pressure are damped in any cell."""
         self._softer = self._damping_of_soft_soil(tau, softest, outflow.mobility) if flows else None
         self._correction = self._begin(outflow)
-        """Non-orthogonal correction of the fluxes at the start of the substep, m^d/s.  The tangent omits this
+        """Non-orthogonal correction (m^d/s) of the fluxes at the start of the substep.  The tangent omits this
         correction.
         """
         if self.damped:
@@ -427,7 +431,7 @@ class StorageProblem:
     def _damping_of_soft_soil(
         self, tau: NDArray[np.float64], softest: NDArray[np.float64], mobility: NDArray[np.float64]
     ) -> PETSc.Mat:
-        """Return the matrix of additional damping in cells of softness (n,); tau (n,), 1/Pa, is for elastic soil."""
+        """Return the matrix of additional damping in soft cells.  `tau` (n,), 1/Pa: strength for elastic soil."""
         contents, grid = self._contents, self.forms.grid
         flow = self.dt * mobility / grid.sizes(contents.filled) ** 2
         more = np.maximum((softest * tau)[:, None] - flow, 0) - np.maximum(tau[:, None] - flow, 0)
@@ -447,17 +451,17 @@ class StorageProblem:
         return np.exp((p[owned] + p_n[owned]) / (2 * self.forms.bulk))
 
     def outflows(self) -> dict[str, NDArray[np.float64]]:
-        """Return the outflow from the bodies at (u, p), m^d/s, through each condition, by name."""
+        """Return the outflow (m^d/s) from the bodies through each condition at (u, p), by name."""
         fluid, both = self._fluid, zip(self._feeds, self._flow(False).at, strict=True)
         return {name: values for one, at in both for name, values in one.outflows(at, fluid).items()}
 
     def run_off(self) -> dict[str, NDArray[np.float64]]:
-        """Return the run-off, m^d/s, by name of the condition."""
+        """Return the run-off, in m^d/s, by name of the condition."""
         fluid, both = self._fluid, zip(self._feeds, self._flow(False).at, strict=True)
         return {name: values for one, at in both for name, values in one.run_off(at, fluid).items()}
 
     def passing(self) -> list[Mapping[str, NDArray[np.float64]]]:
-        """Return the rates of a converged substep from which `volumes` are computed."""
+        """Return the rates of a converged substep that determine `volumes`."""
         fluid, both = self._fluid, zip(self._feeds, self._flow(False).at, strict=True)
         return [one.passing(at, fluid) for one, at in both]
 
@@ -477,15 +481,15 @@ class StorageProblem:
 
     @property
     def fill(self) -> NDArray[np.float64]:
-        """Volume fraction of material in each cell, by which errors and changes of its pressure are weighted."""
+        """Volume fraction of material in each cell, the weight of errors and changes of the cell's pressure."""
         return self._contents.fill
 
     def sealed(self, volumes: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the pressure rise (n,), Pa, if cells at fixed stress kept the fluid volumes, m^d, that they lost."""
+        """Return the pressure rises (Pa) of cells at fixed stress that keep their lost fluid `volumes` (m^d)."""
         return volumes / (self.forms.derivatives(self.data)[0] + self._contents.fixed_stress)
 
     def filling(self, error: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return errors (n,) of the water content due to pressure errors (n,), Pa, and the content's changes (n,)."""
+        """Return errors (n,) of the water content by pressure errors (Pa), and changes (n,) of this content."""
         capacity, _ = self.forms.drained(self.data)
         change = self.forms.change(self.data)[self.system.unknowns.owned]
         share = self.fill / self._contents.volume
@@ -498,7 +502,7 @@ class StorageProblem:
         return float(whole / area)
 
     def _begin(self, outflow: Outflow) -> NDArray[np.float64] | float:
-        """Start the substep for all conditions; return the non-orthogonal correction of fluxes between cells, m^d/s."""
+        """Start the substep.  Return the non-orthogonal correction (m^d/s) of fluxes between cells."""
         p, fluid = self._p[0], self._fluid
         sides = [0 if one.sides is None else len(one.sides.cells) for one in self._feeds]
         between, difference = 0.0, np.zeros(sum(sides))
@@ -512,23 +516,24 @@ class StorageProblem:
 
     @property
     def accuracy(self) -> float:
-        """Largest relative tolerance of linear solves.  Dry cells store little fluid, so errors there must be small."""
+        """Largest relative tolerance of linear solves.  Dry cells store little fluid, so their errors must be small."""
         return SAME if self.forms.retains else 1.0
 
     def restrained(
         self, dp: NDArray[np.float64], previous: NDArray[np.float64] | float
     ) -> tuple[NDArray[np.float64], NDArray[np.float64] | float]:
-        """Return the limited pressure decreases (n,), Pa, and the resulting changes (n,) of the suction's logarithm.
+        """Return two arrays (n,): limited pressure decreases (Pa), and the resulting changes of the suction's
+        logarithm.
 
-        `dp` (n,), Pa, are the decreases by Newton's method.  `previous` (n,) is the change of the logarithm in the
-        previous iteration.
+        `dp` (n,), Pa: pressure decreases in the Newton step.
+        `previous` (n,): change of the suction's logarithm in the previous iteration.
         """
         p = self._p[0][self.system.unknowns.owned]
         dp = restrained(p, dp, self._scale, previous)
         return dp, logarithm(p - dp, self._scale) - logarithm(p, self._scale)
 
     def settle(self) -> bool:
-        """Update the active sets for the flow at (u, p); return whether any set has changed.
+        """Update the active sets for the flow at (u, p), and return whether any set has changed.
 
         Newton's method solves for (u, p) with fixed active sets, and then updates the sets.
         """
@@ -542,10 +547,11 @@ class StorageProblem:
         self._flow(False)
 
     def flux_slope(self, u: fem.Function, unknowns: Unknowns, dofs: NDArray[np.int64]) -> FluxSlope:
-        """Return a function from changes of displacements (a vector), m, to changes of outflow volumes (n,), m^d.
+        """Return a function that maps a change of displacements to the changes (n,) of outflow volumes, in m^d.
 
-        The function uses a matrix-free finite difference (Knoll and Keyes 2004) of the conductivity laws and of the
-        geometry of the fluxes.  The caller then resets the fluxes with `set_fluxes`.  `dofs` are the active dofs of u.
+        The function computes a matrix-free finite difference (Knoll and Keyes 2004) of the conductivity laws and of the
+        geometry of the fluxes.  Its caller must then reset the fluxes with `set_fluxes`.
+        `dofs`: active dofs of u.
         """
         h = self.forms.grid.least
         base, density = self._rates(self._flow(False)).cells, self._density
@@ -615,19 +621,21 @@ class StorageProblem:
         return out
 
     def net_inflow(self, rates: Rates) -> NDArray[np.float64]:
-        """Return the net inflow (n,), m^d, into the filled owned cells in the step by fluxes and sources.
+        """Return the net inflow (n,) into each filled owned cell in the step by fluxes and sources, in m^d.
 
-        Volumes refer to the density at mid-step, as in `change`.  `rates` are the rates at the end of the substep.
+        Volumes refer to the density at mid-step, as in `change`.
+        `rates`: rates at the end of the substep.
         """
         return (-self.dt * rates.cells - self._before.cells) / self._density
 
     def assemble_tangent(
         self, data: PointData | None = None, of_suction: Sequence[tuple[NDArray, NDArray]] = ()
     ) -> None:
-        """Assemble the derivatives C = d/dp and B = d/du of the residual at (u, p), for the problem's pieces or `data`.
+        """Assemble the derivatives `C = d/dp` and `B = d/du` of the residual at (u, p).
 
-        If a law depends on suction, `of_suction` has pairs of cells (c,) and of derivatives (c, n), m^(d-1),
-        of their nodal forces with respect to p.
+        `data`: quadrature points of the pieces, by default the points of the problem.
+        `of_suction`: for laws that depend on suction, cells (c,) and derivatives (c, n), m^(d-1), of their nodal forces
+        with respect to p.
         """
         forms = self.forms
         system = self.system
@@ -653,17 +661,17 @@ class StorageProblem:
         _add_diagonal(system.C, capacity + self.dt * slope)
 
     def assemble_preconditioner(self, factor: float, share: float) -> PETSc.Mat:
-        """Return the fixed-stress operator C + factor (beta V - share L) for the current C.
+        """Return the fixed-stress operator `C + factor (beta V - share L)` for the current C.
 
         Parameters
         ----------
         factor
             Multiple of beta, >= 0.
         share
-            Weight of the filter L, in [0, 1]; 0 gives the fixed-stress operator.  With the stiffness K, B K^-1 B^T
-            equals beta V for a smooth pressure, and zero for a checkerboard.  It equals beta V / 2 (at nu = 0) for a
-            pressure that alternates along one axis.  beta V - L gives the same values, with L = sum over faces of
-            min(beta V+, beta V-) / (4 d) [p][q].
+            Weight of the filter L, in [0, 1].  The weight 0 gives the fixed-stress operator.  With the stiffness K, `B
+            K^-1 B^T` equals `beta V` for a smooth pressure, and zero for a checkerboard.  For a pressure that
+            alternates along one axis, it equals `beta V / 2` at nu = 0.  The matrix `beta V - L` gives these three
+            values.  L is the sum of `min(beta V+, beta V-) / (4 d) [p][q]` over the faces.
         """
         system = self.system
         system.C.copy(system.P, structure=PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
@@ -673,7 +681,7 @@ class StorageProblem:
 
 
 def _add_diagonal(A: PETSc.Mat, values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Add values to the diagonal of a matrix; return the new diagonal."""
+    """Add values to the diagonal of a matrix, and return the new diagonal."""
     d = A.getDiagonal()
     d.array_w[:] += values
     A.setDiagonal(d)

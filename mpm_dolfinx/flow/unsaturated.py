@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Fluxes in unsaturated soil: conductivities of faces from the pressures on both sides.
 
-The relative conductivity k_r of a face is the mean of k_r over all pressures between the values on both sides
+The relative conductivity k_r of a face is the mean of k_r over all pressures between the pressures on both sides
 (`retention.Conductance`).  With the value of the wetter side, a wetting front would move too fast.  With gravity the
 mean is modified (`fitted`), so that steady flow with exponential k_r is exact.  See `series` for mixed cells.
 """
@@ -49,16 +49,17 @@ def fitted(p: Sequence, tables: Sequence[Sequence], drop, scale, of: Functions) 
     """Return the relative conductivity k_r between the two sides of a face, with derivatives.
 
     k is the mean of k_r over the pressures between both sides.  x is the jump of k_r divided by k.  y is x times
-    `drop`, divided by the pressure jump.  With s(z) = sinh(z / 2) / (z / 2), the result is k s(x + y) / (s(x) s(y)).
-    It is exact for steady flow with an exponential k_r (Baker 1995), and never exceeds the value of the wetter side.
-    Without gravity it is k (Kirchhoff 1894).  For nearly equal pressures, k is the mean of the values on both sides.
+    `drop`, divided by the pressure jump.  With `s(z) = sinh(z / 2) / (z / 2)`, the result is `k s(x + y) / (s(x)
+    s(y))`.  The result is exact for steady flow with an exponential k_r (Baker 1995), and never exceeds the k_r of the
+    wetter side.  Without gravity the result is k (Kirchhoff 1894).  For nearly equal pressures, k is the mean of the
+    values on both sides.
 
     Parameters
     ----------
     p
         Pressures on both sides, Pa.
     tables
-        Values on both sides: integral of k_r, Pa; k_r; derivative of k_r, 1/Pa; see `retention.Conductance`.
+        Three values on each side: integral of k_r (Pa), k_r, derivative of k_r (1/Pa), see `retention.Conductance`.
     drop
         Pressure drop caused by the weight of the fluid from the first side to the second, Pa.
     scale
@@ -87,7 +88,7 @@ def fitted(p: Sequence, tables: Sequence[Sequence], drop, scale, of: Functions) 
 
 
 def _log_sinhc(z, of: Functions) -> tuple[Any, Any]:
-    """Return ln(sinh(z / 2) / (z / 2)), and its derivative with respect to z."""
+    """Return `ln(sinh(z / 2) / (z / 2))` and the derivative of this function with respect to z."""
     small = of.less(abs(z), SECOND)
     half = of.where(small, 1.0, z / 2)
     size = abs(half)
@@ -96,7 +97,7 @@ def _log_sinhc(z, of: Functions) -> tuple[Any, Any]:
 
 
 class Laws:
-    """Relative conductivities as functions of pressure, by index of the retention curve; 0: soil without a curve."""
+    """Relative conductivities as functions of pressure.  Index 0 is soil without a retention curve."""
 
     def __init__(self, grid: Grid, laws: Sequence):
         self.conductances = [Conductance(grid, law) for law in laws]
@@ -106,7 +107,7 @@ class Laws:
     def between(
         self, law: NDArray[np.int64], p: Sequence[NDArray[np.float64]], drop: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return k_r (m,) of curves `law` (m,) between two pressures (m,), Pa, and derivatives (2, m), see `fitted`."""
+        """Return k_r (m,) of curves `law` (m,) between pressures p (Pa), and its derivatives (2, m), see `fitted`."""
         k, slopes = np.ones(len(law)), np.zeros((2, len(law)))
         for number, one in enumerate(self.conductances, 1):
             rows = np.flatnonzero(law == number)
@@ -130,7 +131,8 @@ class Relative:
     Attributes
     ----------
     shares
-        DG0: fractions of a cell's mobility at k_r = 1 due to soil without a retention curve, and to soil of each curve.
+        Fractions (DG0) of a cell's mobility at k_r = 1: due to soil without a retention curve, and due to soil of each
+        curve.
     """
 
     def __init__(self, grid: Grid, retentions: Retentions):
@@ -157,10 +159,10 @@ class Relative:
         return self.shares(side)[0] + sum(self.shares(side)[1 + i] * k for i, k in enumerate(means))
 
     def set_pressures(self, p: NDArray[np.float64], force: NDArray[np.float64] | None = None) -> Any:
-        """Set the coefficients of forms for pressures p of the local cells (c,), Pa.
+        """Set the coefficients of forms for the pressures of the local cells.
 
-        Return the fluxes through faces between cells of different soil, see `borders`; None if there are no such faces.
-        `force` (c, d), N/m^3, is the inertia force on the fluid.
+        Return the fluxes through faces between cells of different soil (see `borders`), or None without such faces.
+        `p` (c,), Pa: pressures of the local cells.  `force` (c, d), N/m^3: inertia force on the fluid.
         """
         self._tables.x.array[:] = np.concatenate([law(p) for law in self._laws.conductances], axis=1).ravel()
         if (faces := self._borders.value) is None:
@@ -174,7 +176,7 @@ class Relative:
         return facets if faces is None else faces.borders.uniform
 
     def at(self, cells: NDArray[np.int64], p: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return k_r (m,) of owned cells at pressures (m,), Pa."""
+        """Return k_r (m,) of owned cells at the pressures p (m,), in Pa."""
         k = np.stack([np.ones(len(p)), *(law(p)[:, 1] for law in self._laws.conductances)], axis=1)
         return (self.shares.x.array.reshape(-1, self.count)[cells] * k).sum(axis=1)
 
@@ -186,10 +188,11 @@ class Relative:
         outer: NDArray[np.float64],
         drop: NDArray[np.float64],
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return k_r between cells and sides, and d[k_r (p - outer + drop)]/dp, both (m,).
+        """Return two arrays (m,): k_r between cells and sides, and `d[k_r (p - outer + drop)]/dp`.
 
-        Pressures (m,), Pa: p in owned cells, `outer` outside, and `drop`, the drop from the centroid to the face that
-        the weight of the fluid causes.  `normal` (m, d): normals of the sides.
+        `cells` (m,): owned cells.  `normal` (m, d): normals of the sides.
+        `p` (m,), Pa: pressures in the cells.  `outer` (m,), Pa: pressures outside.
+        `drop` (m,), Pa: pressure drop from the centroid to the face caused by the weight of the fluid.
         """
         shares = self.shares.x.array.reshape(-1, self.count)[cells]
         k, derivative = shares[:, 0].copy(), shares[:, 0].copy()

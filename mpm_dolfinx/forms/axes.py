@@ -7,12 +7,12 @@ import ufl
 
 
 def block(T):
-    """Return a UFL tensor (3, 3) whose out-of-plane shear components are explicit zeros; `planar` recognises these."""
+    """Return a UFL tensor (3, 3) with explicit zeros as out-of-plane shear components, for which `planar` looks."""
     return ufl.as_matrix([[T[0, 0], T[0, 1], 0], [T[1, 0], T[1, 1], 0], [0, 0, T[2, 2]]])
 
 
 def planar(F) -> bool:
-    """Return whether the third axis of a UFL deformation gradient is principal: it is (2, 2), or a `block`."""
+    """Return whether the third axis of a UFL deformation gradient F is principal: F is (2, 2), or a `block`."""
     if isinstance(F, ufl.classes.Variable):
         F = F.ufl_operands[0]
     if F.ufl_shape == (2, 2):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Nodal forces and element matrices of Q1 vectors.  Sums over the points of each cell precede insertion."""
+"""Nodal forces and element matrices of Q1 vectors, summed over the points of each cell before insertion."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from mpm_dolfinx.grid.grid import Grid, sum_by
 
 
 def shape_gradients(points: FormPoints) -> list:
-    """Return the gradients of the Q1 shape functions at the point, as UFL; in 3D their means over the piece."""
+    """Return the gradients of the Q1 shape functions at the points, as UFL; in 3D, their means over each piece."""
     grid, xi = points.grid, points.offset
     h = grid.edge_in_forms()
     out = []
@@ -47,7 +47,7 @@ def shape_hoops(points: FormPoints) -> list:
 
 
 def along_shapes(T, points: FormPoints) -> list:
-    """Return T : grad v at the points, as UFL; v is the shape function of each node along each axis."""
+    """Return T : grad v at the points, as UFL, with v the shape function of each node along each axis."""
     gradients, d = shape_gradients(points), points.grid.dim
     if not points.grid.axisymmetric:
         return [ufl.dot(T, g)[i] for g in gradients for i in range(d)]
@@ -59,7 +59,7 @@ def along_shapes(T, points: FormPoints) -> list:
 
 
 def element_dofs(grid: Grid, cells: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Return the unrolled local dofs (cells, n) of Q1 vectors in these cells."""
+    """Return the local dofs (cells, n) of Q1 vectors in these cells, with one dof for each component."""
     dofs = grid.cell_nodes[cells][:, :, None] * grid.dim + np.arange(grid.dim, dtype=grid.cell_nodes.dtype)
     return dofs.reshape(len(cells), dofs.shape[1] * grid.dim)
 
@@ -72,14 +72,14 @@ def insert(A: PETSc.Mat, grid: Grid, cells: NDArray[np.int32], matrices: NDArray
 
 
 def insert_rows(A: PETSc.Mat, grid: Grid, cells: NDArray[np.int32], rows: NDArray[np.float64]) -> None:
-    """Add `rows` (cells, n) to `A`, without final assembly; `A` has a row for each cell, a column for each Q1 dof."""
+    """Add `rows` (cells, n) to `A`, without final assembly.  `A` has a row for each cell, a column for each dof."""
     if len(cells):
         dofs = element_dofs(grid, cells).astype(PETSc.IntType)
         A.setValuesLocalRCV(cells[:, None].astype(PETSc.IntType), dofs, rows[:, None], addv=True)
 
 
 def _entries(count: int, symmetric: bool) -> tuple[NDArray, NDArray, NDArray]:
-    """Return row and column of each stored entry of a matrix; and for each entry the index of its stored value."""
+    """Return row and column of each stored entry of a matrix, and for each entry the index of its stored value."""
     rows, columns = np.triu_indices(count) if symmetric else np.divmod(np.arange(count**2), count)
     place = np.empty((count, count), dtype=np.int64)
     if symmetric:
@@ -104,7 +104,7 @@ class ElementForces:
 
 
 class Beside(NamedTuple):
-    """Further integrals over each cell, computed together with an element matrix, because kernels share terms."""
+    """Further integrals over each cell.  One kernel computes them and an element matrix, which have common terms."""
 
     # UFL tensors T[i, k] (d, d), contracted like the tangent A: with grad v, or grad v F, for each dof of v
     along: Sequence[ufl.core.expr.Expr] = ()
@@ -117,9 +117,9 @@ NOTHING = Beside()
 class ElementMatrices:
     """The bilinear form grad v : A : grad u of Q1 vectors, summed over the points of each cell before insertion.
 
-    Inserting a matrix for every point costs twice as much as computing it.  The entries of the element matrix are A
-    contracted with the gradients of the shape functions at the point.  Through DG0 test functions, the assembler sums
-    these entries over the points of a cell.  Each element matrix is then inserted once.
+    Insertion of a matrix for every point costs twice as much as its computation.  The entries of the element matrix are
+    A, contracted with the gradients of the shape functions at the point.  Through DG0 test functions, the assembler
+    sums these entries over the points of a cell.  Each element matrix is then inserted once.
 
     Parameters
     ----------
@@ -128,7 +128,7 @@ class ElementMatrices:
     points
         Points of the forms.
     symmetric
-        Whether A[i, k, j, l] = A[j, l, i, k]; if so, only half of the entries are computed.
+        Whether A[i, k, j, l] = A[j, l, i, k].  If so, only half of the entries are computed.
     beside
         Further integrals.
     """
@@ -177,17 +177,17 @@ def _of_hoops(tangent, gradients: list, hoops: list, row: tuple[int, int], colum
 class StackedElementMatrices:
     """The bilinear form (grad v F) : A : (grad u F) of Q1 vectors: kernels evaluate A, BLAS contracts it.
 
-    In 3D, cells contain many points, so contraction by BLAS is faster.  The gradients of the shape functions,
-    multiplied by F, are stacked for the n points of a cell.  The element matrix is then the product of an 8 x 3n and a
-    3n x 72 matrix.  Each batch consists of cells with about the same number of points.
+    In 3D, cells contain many points, so that contraction by BLAS is faster than in the kernel.  The gradients of the
+    shape functions, multiplied by F, are stacked for the n points of a cell.  The element matrix is then the product of
+    an 8 x 3n and a 3n x 72 matrix.  Each batch consists of cells with about the same number of points.
 
-    Run time per point for Hencky's law and 20 points per cell: 4.2 us, of which the kernel takes 2.3, the products 1.4,
-    and the insertion 0.4.  If 24 x 24 entries were inserted for each point, the time would be 13.8 us.  With the 300
-    sums of `ElementMatrices` the time would be 4.8 us, and the kernel would compile in 13 s.  The kernel of this class
-    compiles in 7 s.  If the points in each octant of a cell are merged (8 points), Newton's method does not converge
-    for a bending beam.
+    The run time per point is 4.2 us for Hencky's law and 20 points per cell: 2.3 us for the kernel, 1.4 us for the
+    products, and 0.4 us for the insertion.  If 24 x 24 entries were inserted for each point, the time would be 13.8 us.
+    With the 300 sums of `ElementMatrices` the time would be 4.8 us, and the kernel would compile in 13 s.  The kernel
+    of this class compiles in 7 s.  If the points in each octant of a cell are merged (8 points), Newton's method does
+    not converge for a bending beam.
 
-    Parameters: see `ElementMatrices`; the points have the field F (d, d).
+    Parameters: see `ElementMatrices`.  The points must have the field F (d, d).
     """
 
     def __init__(
@@ -238,7 +238,7 @@ class StackedElementMatrices:
 def batches(places: Places) -> list[tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]]:
     """Return batches of cells with similar numbers of points: cells (c,), points (c, most), padding (c, most).
 
-    Cells and points are indices in `Places.filled` and in `Places.cells`.  Padding is True after a cell's last point.
+    Cells are indices in `Places.filled`, points in `Places.cells`.  Padding is True after a cell's last point.
     """
     cells = places.cells
     filled = places.filled

@@ -21,10 +21,11 @@ from mpm_dolfinx.base import _compat
 class Unknowns:
     """Numbering of a subset of the degrees of freedom of a function's space.
 
-    function: any function of the space, with ghosts.  dofs: unrolled local degrees of freedom that are
-    unknowns, ghosts included; at: positions (entities, d), m, of the nodes or cells of this process, and whether their
-    rows of matrices may have entries in columns of other processes.  If it is None, the space computes all positions at
-    each request, and all rows may have such entries.
+    function: any function of the space, with ghosts.
+    dofs: unrolled local degrees of freedom that are unknowns, ghosts included.
+    at: positions (entities, d), m, of the nodes or cells of this process, and whether their rows of matrices may have
+    entries in columns of other processes.  If `at` is None, the space computes all positions at each request, and all
+    rows may have entries in columns of other processes.
     """
 
     def __init__(self, function: fem.Function, dofs: NDArray[np.int64], at: tuple[NDArray, NDArray] | None = None):
@@ -57,17 +58,17 @@ class Unknowns:
 
     @property
     def nodes(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Node and component of each entry of a vector."""
+        """Node and component of each entry of a vector of unknowns."""
         return np.divmod(self.owned, self.dim)
 
     @property
     def positions(self) -> NDArray[np.float64]:
-        """Position (n, d), m, of the node or cell of each entry of a vector."""
+        """Positions (n, d), in m, of the nodes or cells of the entries of a vector."""
         x = self._space.tabulate_dof_coordinates() if self._x is None else self._x
         return x[self.owned // self.dim, : self._space.mesh.geometry.dim]
 
     def gather_owned(self, values: NDArray[np.float64]) -> PETSc.Vec:
-        """Return a new vector with these entries on this process."""
+        """Return a new vector that has these values on this process."""
         v = self.vector()
         v.array_w[:] = values
         return v
@@ -82,7 +83,7 @@ class Unknowns:
         return v
 
     def gather(self, values: NDArray[np.float64], out: PETSc.Vec) -> PETSc.Vec:
-        """Copy the entries for the unknowns from a local array over the whole grid into a vector."""
+        """Copy the values of the unknowns from a local array over the whole grid into a vector; return the vector."""
         out.array_w[:] = values[self.owned]
         return out
 
@@ -116,8 +117,8 @@ def collect_garbage(comm: MPI.Intracomm) -> None:
     """Free the PETSc objects that Python has released on all processes; all processes must call this function.
 
     On several processes PETSc keeps released objects, because the order of release may differ between processes.
-    Versions of PETSc before 3.20 or so also keep the objects of a single process.  Without this call a run keeps the
-    matrices of all its steps.
+    Versions of PETSc before 3.20 or so also keep the objects of a single process.  Without calls of this function, a
+    run keeps the matrices of all its steps.
     """
     PETSc.garbage_cleanup(comm)
     PETSc.garbage_cleanup(PETSc.COMM_SELF)
@@ -131,7 +132,7 @@ def sum_ghosts(function: fem.Function) -> NDArray[np.float64]:
 
 
 def with_ghosts(space, rows: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return rows (c, k) for the local dofs of a scalar space, after an update of ghosts from their owners."""
+    """Return rows (n, k) of the n local dofs of a scalar space, after an update of ghosts from their owners."""
     if space.mesh.comm.size == 1:
         return rows
     carrier, out = fem.Function(space), np.empty_like(rows)

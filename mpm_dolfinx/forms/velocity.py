@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 
 
 class Velocity:
-    """Velocity (u - past) / own at the end of a substep.  For backward Euler past = 0, and own is the step length.
+    """Velocity `(u - past) / own` at the end of a substep.  For backward Euler past = 0, and own is the step length.
 
-    u: displacement increment of the step, m; own, s: time weight of the rate in the substep; past, m: part of u that
-    is due to the rate of the previous substep.
+    u, m: displacement increment of the step.
+    own, s: time weight of the rate in the substep.
+    past, m: part of u that is due to the rate of the previous substep.
     """
 
     def __init__(self, u: fem.Function):
@@ -24,7 +25,7 @@ class Velocity:
 
     @property
     def nodal(self) -> NDArray[np.float64]:
-        """Nodal values (unknowns,), a local array, m/s."""
+        """Nodal velocities (unknowns,), in m/s, as a local array."""
         return (self._u.x.array - self._past.x.array) / float(self._own.value)
 
     def among(self, form: ufl.Form) -> bool:
@@ -32,6 +33,6 @@ class Velocity:
         return self._past in form.coefficients()
 
     def set(self, own: float, past: float, dofs: NDArray[np.int64]) -> None:
-        """Set `own`, s; set the field `past` at the active dofs to the argument `past` times the current u."""
+        """Set `own`, s, and set the field `past` at the active dofs to the argument `past` times the current u."""
         self._own.value = own
         self._past.x.array[dofs] = past * self._u.x.array[dofs]

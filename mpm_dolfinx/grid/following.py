@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import brentq
 
 from mpm_dolfinx.base.tolerances import SAME
 from mpm_dolfinx.base.validation import asked, called, check_names, line
@@ -100,6 +100,6 @@ def _filled(width: NDArray[np.float64], length: float, more: float, least: float
     if total < len(width) * least * (1 - SAME):
         allowed = f"must be at least {len(width) * least:.3g} m for the {len(width)} cells between them"
         raise ValueError(f"{what}, which leaves {total:.3g} m between the small cells and a side, {allowed}")
-    factor = brentq(lambda f: float((width * f**power).sum() - total), 0.0, 1 + total / width[0])
+    factor = scipy.optimize.brentq(lambda f: float((width * f**power).sum() - total), 0.0, 1 + total / width[0])
     out = width * factor**power
     return out * (total / out.sum())

@@ -844,7 +844,7 @@ class GridOfGroups(Grid):
     """
 
     def __init__(self, grid: Grid, group: NDArray[np.int64], starts: NDArray[np.int64]):
-        super().__init__(**grid.given, comm=grid.comm)
+        super().__init__(**grid.given, comm=grid.comm, axisymmetric=grid.axisymmetric)
         self._group, self._starts = group, starts
         self._copies = int(group.max()) + 1
         if self.dim * self.copies * self.nodes > MOST:

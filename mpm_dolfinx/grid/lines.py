@@ -6,8 +6,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import brentq
 
 from mpm_dolfinx.base.tolerances import EPSILON, SAME
 from mpm_dolfinx.base.validation import line, numbers
@@ -147,7 +147,7 @@ def _growing(gap: float, size: float, ratio: float, largest: float) -> NDArray[n
         most = gap / size + 1
         if edges(most, n).sum() < gap:
             continue
-        growth = brentq(lambda g, n=n: edges(g, n).sum() - gap, 0.0, most)
+        growth = scipy.optimize.brentq(lambda g, n=n: edges(g, n).sum() - gap, 0.0, most)
         if best is None or abs(np.log(growth)) < abs(np.log(best[0])):
             best = growth, n
     out = edges(*best)

@@ -2,7 +2,8 @@
 """Checkpoints: files from which an interrupted run is resumed, on any number of processes.
 
 A checkpoint is a numpy archive of the state between two steps (`State`), with a description that identifies the scene.
-Points are ordered by id, whatever processes write them.  Each process writes and reads an equal share of the points.
+The points are in the order of their ids, for any number of processes.  Each process writes and reads an equal share of
+the points.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ FORMAT, VERSION = "mpm_dolfinx checkpoint", 15  # Source: the format of the file
 FOREIGN = "not a checkpoint of mpm_dolfinx, must be one"
 ZIP = b"PK\3\4"  # first bytes of a numpy archive
 POINTS, PIECES = "points/id", "pieces/id"
-# arrays by rows, by the beginning of their names: the array that numbers the rows
+# beginning of the names of arrays that are stored by rows: name of the array that numbers these rows
 NUMBERED = {"points/": POINTS, "stay/": POINTS, "trend/rates": POINTS, "pieces/": PIECES}
 NUMBERED |= {f"{name}/": f"{name}/node" for name in NODAL}
 LEAVE = ("pressure", "slope", "bounds")  # fields of pieces that are not stored if all points keep their pieces
@@ -53,13 +54,13 @@ NOTE = {"t": float, "resets": int, "begins": bool, "scene": dict, "result": dict
 
 @dataclass
 class Checkpoint:
-    """Saves a run at intervals and at the end, if passed as `checkpoint` to `Simulation.run`.
+    """Saves the state of a run at intervals and at its end, if passed as `checkpoint` to `Simulation.run`.
 
     Parameters
     ----------
     file
-        The file to be written, for `resume`, in a folder of all processes.  A new file replaces the old one when it is
-        complete.
+        Path of the checkpoint, in a folder to which all processes have access.  A new checkpoint replaces the old one
+        when the new one is complete.
     every
         Number of output intervals between two checkpoints, >= 1.
     seconds
@@ -70,7 +71,7 @@ class Checkpoint:
     ValueError
         An argument is out of range.
     OSError
-        The file cannot be written; raised during the run.  The previous checkpoint remains intact.
+        The file cannot be written.  The run raises this error, and the previous checkpoint remains intact.
     """
 
     file: str | os.PathLike
@@ -96,7 +97,7 @@ class Checkpoint:
 
 
 def save(simulation: Simulation, file: Path) -> None:
-    """Write the state of a simulation between two steps of a run to a file."""
+    """Write the state of a simulation to a file, between two steps of a run."""
     comm = simulation.grid.comm
     start = time.perf_counter()
     state = simulation.state
@@ -115,16 +116,17 @@ def save(simulation: Simulation, file: Path) -> None:
 
 
 def resume(simulation: Simulation, file: str | os.PathLike) -> Result:
-    """Restore a simulation from a checkpoint; return the result so far, from which `run(after=...)` continues.
+    """Restore a simulation from a checkpoint, and return its result, from which `run(after=...)` continues.
 
     Parameters
     ----------
     simulation
-        The scene of the checkpoint, on any number of processes.  First call `stage`, to bring the scene to the stage of
-        the checkpoint.  Grid, bodies, materials with their fields and laws, and fluid must be as in the file.  Loads,
-        boundary conditions, terms and sources may differ.  Data that observers have collected are not in the file.
+        The scene of the checkpoint, on any number of processes.  If the run has several stages, first call `stage` to
+        bring the scene to the stage of the checkpoint.  Grid, bodies, fluid, and materials with their fields and laws
+        must be as in the file.  Loads, boundary conditions, terms and sources may differ.  The file does not contain
+        data that observers have collected.
     file
-        The checkpoint.
+        Path of the checkpoint.
 
     Raises
     ------
@@ -148,7 +150,7 @@ def resume(simulation: Simulation, file: str | os.PathLike) -> Result:
             arrays |= read(comm, file, rows, together(comm, lambda: _ranges(comm, file, rows)))
     count = rows[POINTS].shape[0]
     state = together(comm, lambda: _state(file, arrays, note, simulation, count))
-    # on as many processes, the same distribution gives the same bits
+    # on the number of processes of the file, its distribution gives bit-identical results
     if len(boxes) == comm.size > 1 and (boxes != simulation.grid.partition.boxes).any():
         distribute_by(simulation, boxes)
     nodal = {name: simulation.grid.from_rows(*of) for name in NODAL if (of := getattr(state, name)) is not None}
@@ -163,7 +165,7 @@ def _scalars(result: Result) -> dict[str, Any]:
 
 
 def _arrays(state: State) -> dict[str, NDArray]:
-    """Return all arrays of a state by name, with slashes for nested dictionaries."""
+    """Return all arrays of a state by name.  Slashes in a name separate the keys of nested dictionaries."""
     named = {"points": vars(state.points), "outcome": state.outcome}
     named["result"] = {name: state.result.rows.column(name) for name in COLUMNS}
     for i, outcome in enumerate(state.result.rows.outcomes):
@@ -185,7 +187,7 @@ def _arrays(state: State) -> dict[str, NDArray]:
 
 
 def _state(file: Path, arrays: dict[str, NDArray], note: dict[str, Any], simulation: Simulation, count: int) -> State:
-    """Return a state with this process's share of the points in a file, which has `count` points.
+    """Return a state that contains this process's share of the `count` points in a file.
 
     Nodal fields of the state are pairs of nodes and values.  Raise ValueError if the file does not fit the simulation.
     """
@@ -201,7 +203,7 @@ def _state(file: Path, arrays: dict[str, NDArray], note: dict[str, Any], simulat
             in_cut = of_stay.pop("keeps", None)
             stay = Stay(_points(_part(of_stay, "points/"), now.points), in_cut)
             if in_cut is not None and (in_cut.dtype != bool or in_cut.shape != points.id.shape):
-                raise ValueError(f"stay/keeps: {in_cut.dtype} of shape {in_cut.shape}")
+                raise ValueError(f"stay/keeps: {in_cut.dtype} of shape {in_cut.shape}, must be a bool for each point")
             if not np.array_equal(stay.points.id, points.id):
                 raise ValueError("stay/points/id: points differ from the points of the bodies")
         if wet:
@@ -210,7 +212,7 @@ def _state(file: Path, arrays: dict[str, NDArray], note: dict[str, Any], simulat
             leaves = dict.fromkeys(LEAVE) if stay is not None and stay.keeps is None else {}
             pieces = PiecePressures(**own, **leaves)
             if (pieces.of_cell is None or pieces.start is None) != (stay is None):
-                raise ValueError("pieces/of_cell, pieces/start: must both be given with stay/, and only then")
+                raise ValueError("pieces/of_cell, pieces/start: must both be given if stay/ is given, and only then")
         of_trend = _part(arrays, "trend/")
         trend = Trend(**of_trend) if of_trend else None
         if trend is not None:
@@ -254,7 +256,7 @@ def _outcomes(arrays: dict[str, NDArray], count: int) -> list[dict[str, dict[str
 
 
 def _like(outcome: dict[str, dict[str, NDArray]], now: Outcome) -> dict[str, dict[str, NDArray]]:
-    """Return the stored results of the current conditions; conditions without stored results are unchanged.
+    """Return the stored results of the current conditions; other conditions keep their present results.
 
     Raise ValueError if shapes differ, or if the motion of a tool is not finite.
     """
@@ -268,14 +270,14 @@ def _like(outcome: dict[str, dict[str, NDArray]], now: Outcome) -> dict[str, dic
             if quantity == "energy":
                 continue
             if value.shape != now[quantity][name].shape or value.dtype != np.float64:
-                raise ValueError(f"outcome/{quantity}/{name}: {value.dtype} of shape {value.shape}")
+                raise ValueError(f"outcome/{quantity}/{name}: wrong type or shape ({value.dtype}, {value.shape})")
             if quantity in ("tool_travel", *MOTIONS) and not np.isfinite(value).all():
                 raise ValueError(f"outcome/{quantity}/{name} is not finite")
     return found
 
 
 def _nested(arrays: dict[str, NDArray]) -> dict[str, Any]:
-    """Return arrays with slashes in their names as nested dictionaries."""
+    """Return nested dictionaries of the arrays.  Slashes in the name of an array separate the keys."""
     out: dict[str, Any] = {}
     for name, value in arrays.items():
         *folders, last = name.split("/")
@@ -296,16 +298,19 @@ def _points(arrays: dict[str, NDArray], like: MaterialPoints) -> MaterialPoints:
     for name, rows in {**arrays, **data}.items():
         kind = kinds[name]
         if rows.dtype != kind.dtype or rows.shape != (len(points), *kind.shape[1:]) or not np.isfinite(rows).all():
-            raise ValueError(f"points/{name}: {rows.dtype} of shape {rows.shape}, or not finite")
+            raise ValueError(f"points/{name}: wrong type or shape ({rows.dtype}, {rows.shape}), or not finite")
     if set(data) != set(like.data):
-        raise ValueError(f"points/data: {', '.join(data)}")
+        raise ValueError(f"points/data: {', '.join(data)}, must be the data of the points")
     return points
 
 
 def _check_ids(points: MaterialPoints, simulation: Simulation, count: int) -> None:
-    """Raise ValueError if points of a file with `count` points in all do not belong to the present bodies.
+    """Raise ValueError if the points of a file do not belong to the present bodies.
 
-    Renewed and divided points replace seeded points; their ids are at least the number of seeded points.
+    count: number of points in the file, on all processes.
+
+    New points after renewal or division replace seeded points.  The ids of new points are at least the number of seeded
+    points.
     """
     lengths, present = np.array([len(body) for body in simulation.bodies]), np.asarray(simulation.state.stage.present)
     starts = np.concatenate([[0], lengths.cumsum()])
@@ -316,7 +321,7 @@ def _check_ids(points: MaterialPoints, simulation: Simulation, count: int) -> No
 
 
 def _partition(file: Path, given: list, grid: Grid) -> NDArray[np.int64]:
-    """Return the boxes (ranks, 2, d) of the processes that have written a file; raise ValueError for others."""
+    """Return the boxes (ranks, 2, d) of the processes that have written a file; raise ValueError for invalid boxes."""
     with _complete(file):
         boxes = np.array(given, dtype=np.int64).reshape(-1, 2, grid.dim)
         grid.check_boxes(boxes)
@@ -324,7 +329,7 @@ def _partition(file: Path, given: list, grid: Grid) -> NDArray[np.int64]:
 
 
 def _nodal_rows(simulation: Simulation, name: str, nodal: NDArray[np.float64] | None) -> dict[str, NDArray]:
-    """Return this process's share of all nodes with non-zero values; an empty dictionary if `nodal` is None."""
+    """Return this process's share of the nodes with non-zero values, and these values; nothing if `nodal` is None."""
     if nodal is None:
         return {}
     grid, owned = simulation.grid, simulation.scene.momentum.u.function_space.dofmap.index_map.size_local
@@ -338,31 +343,31 @@ def _nodal_rows(simulation: Simulation, name: str, nodal: NDArray[np.float64] | 
 
 
 def _check_lines(arrays: dict[str, NDArray], grid: Grid) -> None:
-    """Raise ValueError for arrays that are not lines of this grid, whose lines must follow a tool or function."""
+    """Raise ValueError if the arrays are not lines of this grid, or if its lines do not follow anything."""
     shapes = {letter: x.shape for letter, x in zip("xyz", grid.lines, strict=False)}
     if grid.follow is None or {name: x.shape for name, x in arrays.items()} != shapes:
-        raise ValueError("lines: not the lines of the grid")
+        raise ValueError("lines: these are not lines of the grid")
     for letter, low, high in zip(shapes, grid.low, grid.high, strict=True):
         x = arrays[letter]
         if x.dtype != np.float64 or not (np.diff(x) > 0).all() or x[0] != low or x[-1] != high:
-            raise ValueError("lines: not ascending between the sides of the grid")
+            raise ValueError("lines: must ascend from one side of the grid to the opposite side")
 
 
 def _nodal(name: str, arrays: dict[str, NDArray], grid: Grid) -> tuple[NDArray, NDArray] | None:
-    """Return nodes and their values from stored arrays, None without arrays; raise ValueError for invalid ones."""
+    """Return nodes and their values from stored arrays, or None without arrays; raise ValueError for invalid arrays."""
     if not arrays:
         return None
     node, values = arrays.pop("node"), arrays.pop("values")
     right = node.dtype == np.int64 and values.dtype == np.float64 and values.shape == (len(node), grid.dim)
     if arrays or not right or not np.isfinite(values).all():
-        raise ValueError(f"{name}: not nodal values on the grid, or not finite")
+        raise ValueError(f"{name}: must be finite nodal values on the grid")
     if len(node) and not 0 <= node[0] <= node[-1] < grid.copies * grid.nodes:
-        raise ValueError(f"{name}: node indices out of range of the grid")
+        raise ValueError(f"{name}: the grid has no nodes with these indices")
     return node, values
 
 
 def _check_trend(trend: Trend, points: MaterialPoints, wet: bool) -> None:
-    """Raise ValueError for a `Trend`, the motion in the last steps, that does not belong to the points."""
+    """Raise ValueError if a `Trend` (the motion in the last steps) does not belong to the points."""
     (n, d), k = points.x.shape, len(trend.lengths)
     right = k in (1, 2, 3) and trend.lengths.shape == (k,) and trend.rates.shape == (n, k, d * (1 + d) + wet)
     numbers_only = all(v.dtype == np.float64 and np.isfinite(v).all() for v in vars(trend).values())
@@ -371,18 +376,18 @@ def _check_trend(trend: Trend, points: MaterialPoints, wet: bool) -> None:
 
 
 def _check_pieces(arrays: dict[str, NDArray], ids: NDArray[np.int64], dim: int) -> None:
-    """Raise ValueError for arrays that do not describe pieces of the points with these ids."""
+    """Raise ValueError if the arrays do not describe the pieces of the points with these ids."""
     shapes, count = {"x": (dim,), "slope": (dim,), "bounds": (2,)}, len(arrays["id"])
     for name, rows in arrays.items():
         kind = np.int64 if name in ("id", "cell") else np.float64
         if rows.dtype != kind or rows.shape != (count, *shapes.get(name, ())) or not np.isfinite(rows).all():
-            raise ValueError(f"pieces/{name}: {rows.dtype} of shape {rows.shape}, or not finite")
+            raise ValueError(f"pieces/{name}: wrong type or shape ({rows.dtype}, {rows.shape}), or not finite")
     if not np.array_equal(np.unique(arrays["id"]), ids):
         raise ValueError("pieces/id: points differ from the points of the bodies")
 
 
 def _named(prefix: str, values: dict) -> dict[str, NDArray]:
-    """Return the arrays of nested dictionaries by name, with slashes between the keys."""
+    """Return the arrays of nested dictionaries.  The name of an array has slashes between the keys."""
     out = {}
     for name, value in values.items():
         out |= _named(f"{prefix}{name}/", value) if isinstance(value, Mapping) else {prefix + name: value}
@@ -390,13 +395,13 @@ def _named(prefix: str, values: dict) -> dict[str, NDArray]:
 
 
 def _part(arrays: dict[str, NDArray], prefix: str) -> dict[str, NDArray]:
-    """Remove the arrays whose names begin with a prefix; return these, without the prefix in their names."""
+    """Remove the arrays whose names begin with a prefix, and return them under names without the prefix."""
     return {name.removeprefix(prefix): arrays.pop(name) for name in list(arrays) if name.startswith(prefix)}
 
 
 @contextmanager
 def _complete(file: Path) -> Iterator[None]:
-    """Context manager for reading a checkpoint: errors become a ValueError with the text that the file is damaged."""
+    """Context manager that replaces errors in reading by a ValueError, which says that the checkpoint is damaged."""
     try:
         yield
     except (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError, BadZipFile) as error:
@@ -404,14 +409,17 @@ def _complete(file: Path) -> Iterator[None]:
 
 
 def _numbered(name: str) -> str | None:
-    """Return the name of the array that numbers the rows of an array; None for arrays that are not by rows."""
+    """Return the name of the array that numbers the rows of an array, or None if the array is not stored by rows."""
     return next((numbers for start, numbers in NUMBERED.items() if name.startswith(start)), None)
 
 
 def _ranges(comm: MPI.Intracomm, file: Path, of: dict[str, Member]) -> dict[str, tuple[int, int]]:
-    """Return first row and last row plus one, on this process, of arrays by rows; pieces are with their points.
+    """Return the first row, and the last row plus one, that this process reads of each array that is stored by rows.
 
-    Raise ValueError if arrays with the same numbers differ in length, or if numbers do not ascend.
+    A process reads the pieces of its points.
+
+    Raise ValueError if the length of an array differs from that of the array that numbers its rows.  Raise
+    ValueError if these numbers do not ascend.
     """
     out = {}
     for name in dict.fromkeys(map(_numbered, of)):
@@ -420,16 +428,16 @@ def _ranges(comm: MPI.Intracomm, file: Path, of: dict[str, Member]) -> dict[str,
             first, last = (_before(file, of, row) for row in out[POINTS])
         numbers = some_rows(file, of[name], first, min(last + 1, of[name].shape[0]))
         if (np.diff(numbers) < (name != PIECES)).any():
-            raise ValueError(f"{name}: does not ascend")
+            raise ValueError(f"{name}: numbers of rows must ascend")
         out[name] = first, last
     for name, member in of.items():
         if member.shape[0] != of[_numbered(name)].shape[0]:
-            raise ValueError(f"{name}: array of shape {member.shape}")
+            raise ValueError(f"{name}: array of shape {member.shape}, must have a row for each number")
     return {name: out[_numbered(name)] for name in of}
 
 
 def _before(file: Path, of: dict[str, Member], row: int) -> int:
-    """Return the number of pieces of the points before row `row`."""
+    """Return the number of pieces that belong to points before row `row`."""
     points, pieces = of[POINTS], of[PIECES]
     if row == points.shape[0]:
         return pieces.shape[0]
@@ -438,7 +446,7 @@ def _before(file: Path, of: dict[str, Member], row: int) -> int:
 
 
 def _read(file: Path) -> tuple[dict[str, NDArray], dict[str, Member], dict[str, Any]]:
-    """Return the arrays of a checkpoint file that are not by rows, all others as members, and the metadata."""
+    """Return the arrays of a checkpoint that are not stored by rows, the other arrays as members, and the metadata."""
     with open(file, "rb") as f:
         begin = f.read(4)
     what = "is cut short or damaged, must be a whole checkpoint" if begin == ZIP else FOREIGN

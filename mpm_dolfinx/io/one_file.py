@@ -7,27 +7,29 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
 from xml.etree.ElementTree import SubElement
 
 from mpi4py import MPI
 
-import meshio
 import numpy as np
-from meshio.xdmf import TimeSeriesWriter
 
 from mpm_dolfinx.base.validation import line_of, path
 from mpm_dolfinx.io.units import FIELDS
 from mpm_dolfinx.io.writer import Series
 
+if TYPE_CHECKING:  # meshio takes long to import, so functions import it
+    import meshio
+
 
 def one_file(folder: str | os.PathLike) -> Path:
     """Write the points in the folder of a `Writer` as one time series: `points.xdmf` and `points.h5`.
 
-    ParaView, VTK and meshio's `xdmf.TimeSeriesReader` read these files.  dolfinx reads the particle domains of one
-    output time as a mesh, the third for example with `XDMFFile.read_mesh(name="2", xpath="/Xdmf/Domain/Grid")`.  Each
-    output time has separate domains, so bodies may be added or removed between two times.  `<Information>` in
-    points.xdmf describes the fields and their units.  The files of the `Writer` remain.  A call during a run writes the
-    output times so far; call the function again at the end.
+    ParaView, VTK and meshio (xdmf.TimeSeriesReader) read these files.  dolfinx reads the particle domains of one
+    output time as a mesh.  For example, `XDMFFile.read_mesh(name="2", xpath="/Xdmf/Domain/Grid")` reads the third time.
+    Each output time has separate domains, so bodies may be added or removed between two times.  The
+    elements `<Information>` in points.xdmf describe the fields and their units.  The files of the `Writer` remain.  A
+    call during a run writes the output times so far; call the function again at the end of the run.
 
     Parameters
     ----------
@@ -46,6 +48,8 @@ def one_file(folder: str | os.PathLike) -> Path:
     OSError
         The folder is not writable, or the disk is full.
     """
+    import meshio
+
     folder = path("one_file: folder", folder)
     if not (folder / "points.pvd").exists():
         raise ValueError(f"one_file: folder = {folder}: has no points.pvd, must be the folder of a Writer")
@@ -55,8 +59,8 @@ def one_file(folder: str | os.PathLike) -> Path:
         which = "Debian's (apt install python3-h5py) or, with conda's dolfinx, conda-forge's"
         raise ValueError(f"one_file: h5py: {line_of(error)}; must be {which}") from error
     entries = Series(MPI.COMM_SELF, folder / "points.pvd", np.inf).entries
-    with TemporaryDirectory(dir=folder) as part:  # the old files stay until the new ones are complete
-        writer = TimeSeriesWriter(Path(part) / "points.xdmf")
+    with TemporaryDirectory(dir=folder) as part:  # the old files remain until the new files are complete
+        writer = meshio.xdmf.TimeSeriesWriter(Path(part) / "points.xdmf")
         writer.h5_filename = "points.h5"  # meshio's default is in the working directory
         with h5py.File(Path(part) / "points.h5", "w") as writer.h5_file:
             for name, meaning in FIELDS["points.pvd: the domains of the material points"].items():
@@ -71,6 +75,8 @@ def one_file(folder: str | os.PathLike) -> Path:
 
 def joined(pieces: Sequence[meshio.Mesh]) -> meshio.Mesh:
     """Return the domains in the files of all processes as one mesh of unconnected cells, ordered by id."""
+    import meshio
+
     if len(pieces) == 1:
         return pieces[0]
     order = np.argsort(np.concatenate([piece.cell_data["id"][0] for piece in pieces]))
@@ -81,8 +87,8 @@ def joined(pieces: Sequence[meshio.Mesh]) -> meshio.Mesh:
     return meshio.Mesh(corners.reshape(-1, 3), [(pieces[0].cells[0].type, cells)], cell_data=data)
 
 
-def _add(writer: TimeSeriesWriter, number: int, t: float, mesh: meshio.Mesh) -> None:
-    """Add a mesh and its fields.  meshio's `write_data` allows only one mesh for all times."""
+def _add(writer: meshio.xdmf.TimeSeriesWriter, number: int, t: float, mesh: meshio.Mesh) -> None:
+    """Add a mesh and its fields at time t.  meshio's `write_data` allows only one mesh for all times."""
     grid = SubElement(writer.collection, "Grid", Name=str(number), GridType="Uniform")
     SubElement(grid, "Time", Value=repr(t))
     writer.points(grid, mesh.points)

@@ -19,14 +19,14 @@ from mpm_dolfinx.simulation.simulation import Simulation
 def plot(simulation: Simulation, field: str = "pressure", ax=None, *, bar: bool = True, label: str = "", **style):
     """Draw the particle domains, coloured by a field; return the axes of matplotlib.
 
-    All processes must call this function.  The first process draws, the others return None.
+    All processes must call this function.  The first process draws the picture; the other processes return None.
 
     Parameters
     ----------
     simulation
         A scene in plane strain or axisymmetry.
     field
-        "pressure", "displacement" (its magnitude), "displacement_x", "stress_xx", "effective_stress_xy",
+        "pressure", "displacement" (the magnitude), "displacement_x", "stress_xx", "effective_stress_xy",
         "mean_effective_stress", "deviatoric_stress", "porosity", "J", in unsaturated soil "saturation" and "suction",
         or any other scalar in `points.pvd` and `points.data`.
     ax
@@ -41,14 +41,14 @@ def plot(simulation: Simulation, field: str = "pressure", ax=None, *, bar: bool 
     Raises
     ------
     ValueError
-        The scene is in 3D, or the field is unknown; the message lists the fields of the points.
+        The scene is in 3D.  The field is unknown; the message lists the fields of the points.
     ImportError
         matplotlib is not installed.
     """
     instance("plot: simulation", simulation, Simulation)
     flag("plot: bar", bar)
     if simulation.grid.dim == 3:
-        raise ValueError("plot: a scene in 3D, must be in plane strain or axisymmetry; `Writer` writes it for ParaView")
+        raise ValueError("plot: a scene in 3D, must be in plane strain or axisymmetry; for ParaView use `Writer`")
     values, points, comm = _values(simulation, field), simulation.points, simulation.grid.comm
     send = to_root(comm, len(points)).send
     corners, values = send(points.corners), send(values)

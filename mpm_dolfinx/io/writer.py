@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Files of a run: material points and grid for ParaView, histories as a table.
 
-Every output is a separate file.  A new index of these files replaces the old index only when it is complete.  All
-output written before the end of a run can therefore be read, however the run ends.
+Every output time has separate files.  A new index of these files replaces the old index only when the new index is
+complete.  All output of a run can therefore be read, even if the run fails.
 """
 
 from __future__ import annotations
@@ -15,13 +15,12 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 from weakref import WeakValueDictionary, finalize
 from xml.etree import ElementTree
 
 from mpi4py import MPI
 
-import meshio
 import numpy as np
 from dolfinx import fem, io
 from numpy.typing import NDArray
@@ -36,6 +35,9 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.simulation.simulation import Simulation
 from mpm_dolfinx.stepping.result import Result
 
+if TYPE_CHECKING:  # meshio takes long to import, so functions import it
+    import meshio
+
 VTK_CELLS = {2: ("quad", [0, 1, 3, 2]), 3: ("hexahedron", [0, 1, 3, 2, 4, 5, 7, 6])}
 """VTK's cell type of a particle domain, and the order of the domain's corners in VTK."""
 WRITABLE = "in a writable folder with free space; `after=simulation.result` continues the run"
@@ -47,22 +49,22 @@ class Writer:
 
     The folder receives
 
-    * `points.pvd`: the particle domains as solid cells, in a file for each process with points.  Fields are
+    * `points.pvd`: the particle domains as solid cells, in one file for each process that has points.  Fields are
       displacement, pore pressure, F, J, all data of the points, and the results of `Simulation.point_fields`: stresses,
       p', q, porosity;
     * `history.csv`: one row for each output time, with counts and errors of `Result`, smallest and largest pressure,
       quantities at probes, forces of prescribed displacements and tools, and outflows.  Forces and outflows are nan
       before the first step of a stage;
-    * `fields.txt`: meaning and unit of each of these fields;
+    * `fields.txt`: meaning and unit of each field in these files;
     * with tools, `tools.pvd`: the parts of the grid cells inside the tools, with the forces of the tools;
     * with `grid=True`, `grid.pvd`: the fields of the cells (`Simulation.cells`) by components, zero in empty cells.
 
     ParaView and VTK read all files; meshio reads the points.
 
-    If the folder has output from before the current time, the new run continues this output.  A writer created after
-    `resume` therefore leaves the same files as a run without interruption.
+    If the folder has output from before the current time, the new run continues this output.  After `resume`, the
+    files of a new writer are therefore equal to the files of an uninterrupted run.
 
-    A writer locks its folder against other processes until `close`, the end of its context, or its deletion.
+    Until `close`, the end of its context, or its deletion, a writer locks its folder against other processes.
 
     Parameters
     ----------
@@ -79,9 +81,10 @@ class Writer:
     ------
     ValueError
         An argument has the wrong type.  Files in the folder were not written by a writer, or have other columns.  The
-        run is of another simulation, or starts at another time.  The writer is closed.
+        run belongs to a simulation other than `simulation`, or starts at a time other than that of the writer.  The
+        writer is closed.
     OSError
-        The folder is not writable, or the disk is full.  To continue: `simulation.run(..., after=simulation.result)`.
+        The folder is not writable, or the disk is full.  `simulation.run(..., after=simulation.result)` then continues.
     """
 
     def __init__(self, simulation: Simulation, folder: str | os.PathLike, *, every: int = 1, grid: bool = False):
@@ -120,11 +123,11 @@ class Writer:
         self._lock = Lock.of(folder)
 
     def __call__(self, simulation: Simulation) -> None:
-        """Write a row of the histories and, every `every` output intervals, the current state."""
+        """Write a row of the histories, and after each `every` output intervals also the current state."""
         if self.closed:
-            raise ValueError(f"writer: {self._points.file.parent} is closed, must be open while the run goes on")
+            raise ValueError(f"writer: {self._points.file.parent} is closed, must be open during a run")
         if simulation is not self._simulation:
-            raise ValueError("writer: made for another simulation, must be made for the simulation that runs")
+            raise ValueError("writer: made for another simulation, must be made for the simulation of this run")
         with on_disk(f"{self._points.file.parent}: writer at t = {simulation.t:g} s", WRITABLE):
             self._write(simulation)
 
@@ -185,7 +188,7 @@ class Writer:
 
 
 def fields_of_points(simulation: Simulation) -> dict[str, NDArray[np.float64]]:
-    """Return porosity, saturation, components and invariants of stresses (n,) of this process's points, by name."""
+    """Return fields (n,) of this process's points by name: porosity, saturation, stress components and invariants."""
     fields, wet = simulation.point_fields(), simulation.scene.fluid is not None
     drains = simulation.scene.materials.retentions is not None
     out = {name: getattr(fields, name) for name in ("porosity", "saturation")[: 1 + drains]}
@@ -223,7 +226,7 @@ class Lock:
 
     @classmethod
     def of(cls, folder: Path) -> Lock:
-        """Return the lock of a folder, which is created if necessary; raise ValueError if another process holds it."""
+        """Return the lock of a folder, which is created if necessary; raise ValueError if another process locks it."""
         folder.mkdir(parents=True, exist_ok=True)
         folder = folder.resolve()
         lock = cls._held.get(folder)
@@ -242,8 +245,9 @@ def _row(result: Result) -> dict[str, float]:
 def solid(points: MaterialPoints, displacement: NDArray[np.float64], wet: bool) -> meshio.Mesh:
     """Return the particle domains as unconnected cells, with all fields of the material points.
 
-    points: all material points; displacement (n, d), m: displacements of the points; wet: whether the points have a
-    pore pressure.
+    points: all material points
+    displacement (n, d), m: displacements of the points
+    wet: whether the points have a pore pressure
     """
     fields = {"id": points.id, "material": points.material, "displacement": displacement, "J": points.J, "F": points.F}
     if wet:
@@ -252,7 +256,9 @@ def solid(points: MaterialPoints, displacement: NDArray[np.float64], wet: bool) 
 
 
 def _cells(corners: NDArray[np.float64], fields: dict[str, NDArray]) -> meshio.Mesh:
-    """Return unconnected cells with corners (n, 2^d, d), m, and their fields (n, ...)."""
+    """Return a mesh of n unconnected cells with corners (n, 2^d, d), in m, and with fields (n, ...)."""
+    import meshio
+
     kind, order = VTK_CELLS[corners.shape[2]]
     data = {label: [column] for name, rows in fields.items() for label, column in _columns(name, rows)}
     nodes = corners[:, order].reshape(-1, corners.shape[2])
@@ -265,7 +271,7 @@ def _padded(vectors: NDArray) -> NDArray:
 
 
 def _columns(name: str, rows: NDArray) -> Iterator[tuple[str, NDArray]]:
-    """Yield names and values of the fields in VTK's form, for a field of scalars, vectors or tensors (n, ...)."""
+    """Yield names and values of the VTK fields that represent a field (n, ...) of scalars, vectors or tensors."""
     if rows.shape[1:] == (2, 2):  # not padded to 3 x 3, because the out-of-plane components are unknown
         for i, j in np.ndindex(2, 2):
             yield f"{name}_{'xy'[i]}{'xy'[j]}", rows[:, i, j]
@@ -319,7 +325,7 @@ def _ends(file: Path) -> bool:
 
 @contextmanager
 def replacing(file: Path) -> Iterator[Path]:
-    """Provide a temporary path for writing.  The complete file then replaces `file`, once it is on the disk."""
+    """Context manager for a new file at a temporary path.  When this file is on the disk, it replaces `file`."""
     part = file.with_name(file.name + ".part")
     yield part
     with open(part, "rb") as f:
@@ -329,7 +335,7 @@ def replacing(file: Path) -> Iterator[Path]:
 
 @contextmanager
 def _ours(file: Path) -> Iterator[None]:
-    """Context manager for reading a file: errors become a ValueError with the text that no `Writer` wrote the file."""
+    """Context manager that replaces errors in reading by a ValueError, which says that no `Writer` wrote the file."""
     try:
         yield
     except (ElementTree.ParseError, KeyError, TypeError, ValueError) as error:
@@ -337,7 +343,7 @@ def _ours(file: Path) -> Iterator[None]:
 
 
 def kept(entries: Sequence[tuple[float, Any]], t: float) -> list[tuple[float, Any]]:
-    """Return the earlier entries (time, ...) that a run from time t continues; none if it is a new run."""
+    """Return the entries (time, ...) up to time t, which a run from t continues; none for a new run."""
     out = [entry for entry in entries if entry[0] <= t]
     return out if any(entry[0] < t for entry in out) else []
 
@@ -360,7 +366,7 @@ class Series:
         return self.folder / f"{len(self.entries):06d}"
 
     def pieces(self, counts: Sequence[int]) -> dict[int, Path]:
-        """Return the paths of the next files by rank, for the ranks with points; counts: number of points of each."""
+        """Return the path of the next file for each rank with points; counts: number of points of each rank."""
         names = {rank: f"{self.next.name}_p{rank}.vtu" for rank, count in enumerate(counts) if count}
         names = names if len(counts) > 1 else {0: f"{self.next.name}.vtu"}
         return {rank: self.folder / name for rank, name in names.items()}
@@ -413,7 +419,7 @@ class Table:
             return [(float(row["t"]), row) for row in csv.DictReader(whole)]
 
     def start(self, first: dict[str, float]) -> None:
-        """Write the rows of earlier times, or a first row if there are none."""
+        """Write the rows of earlier times, or the row `first` without earlier rows."""
         rows = [row for _, row in self._rows] or [first]
         self.columns = list(rows[0])
         self._check(first)
@@ -425,7 +431,7 @@ class Table:
         at_root(self.comm, write)
 
     def add(self, row: dict[str, float]) -> None:
-        """Add a row.  If it has new columns, the file is written again, with nan in these columns of earlier rows."""
+        """Add a row.  If the row has new columns, the file is written again, with nan in these columns of old rows."""
         self._check(row)
         new = [name for name in row if name not in self.columns]
         self.columns.extend(new)
@@ -442,7 +448,7 @@ class Table:
     def _check(self, row: dict[str, float]) -> None:
         row_names, known = ([name for name in names if not name.startswith(self._own)] for names in (row, self.columns))
         if row_names != known:
-            both = f"{', '.join(known)}, the columns of the run {', '.join(row_names)}"
+            both = f"{', '.join(known)}, the columns of the run are {', '.join(row_names)}"
             raise ValueError(f"{self.file}: its columns are {both}; must be equal, or use another folder")
 
     def _append(self, file: Path, rows: Sequence[dict], mode: str) -> None:

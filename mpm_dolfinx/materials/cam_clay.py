@@ -7,21 +7,22 @@ elastic volume strain e_v and deviatoric strain e (tension positive), P = -tr(ta
     P = P_0 exp(-e_v / kappa),   dev tau = 2G e,
     f = Q^2 / M^2 + P (P - P_c) <= 0,   dP_c / P_c = -de_v^p / (lambda - kappa),
 
-and flow is associated.  M is the slope of the critical state line, and P_c the size of the yield surface.  P_0 is the
-pressure at F = I, and e_v^p the plastic volume strain.  P and P_c follow the bilogarithmic law: ln v (v: specific
-volume) is linear in ln P, with the slope lambda in first loading, kappa in unloading.  The stress at the end of a step
-follows implicitly from the trial stresses P_t and Q_t, and from P_c,n at the start.  Let kappa a be the plastic
-compaction, and let h follow from the plastic multiplier: 6G dgamma / M^2 = exp(h) - 1.  With w = (Q_t / (M P_t))^2,
+and flow is associated.  M is the slope of the critical state line.  P_c is the size of the yield surface.  P_0 is the
+pressure at F = I.  e_v^p is the plastic volume strain.  P and P_c follow the bilogarithmic law: the logarithm of the
+specific volume v is linear in ln P.  The slope is lambda in first loading and kappa in unloading.  The stress at the
+end of a step follows implicitly from the trial stresses P_t and Q_t, and from the size P_c,n at the start of the step.
+The plastic compaction defines a, as compaction / kappa.  The plastic multiplier dgamma defines h:
+6G dgamma / M^2 = exp(h) - 1.  With w = (Q_t / (M P_t))^2,
 
     P = P_t exp(-a),   Q = Q_t exp(-h),   P_c = P_c,n exp(rho a),   rho = kappa / (lambda - kappa),
     (6G kappa / M^2) a = (exp(h) - 1) (2P - P_c).
 
-The local unknown is d = 2 (h - a).  The stress ratio at the end follows from d: Q / (M P) = sqrt(w) exp(-d/2).  On the
-yield surface a = (ln(P_t / P_c,n) + ln(1 + w exp(-d))) / (1 + rho).  The equation for d is smooth and monotone, even at
-isotropic stresses and at the critical state (a = 0).
+The local unknown is d = 2 (h - a).  It determines the stress ratio at the end of the step,
+Q / (M P) = sqrt(w) exp(-d/2).  On the yield surface a = (ln(P_t / P_c,n) + ln(1 + w exp(-d))) / (1 + rho).  The
+equation for d is smooth and monotone, even at isotropic stresses and at the critical state (a = 0).
 
 If M^2 P_c > 6G (lambda - kappa), soil on the dry side of the critical state softens faster than it unloads elastically.
-Then the stress jumps, or the equation has no solution and the time step is reduced.
+Then the stress jumps, or the equation for d has no solution.  Without a solution, the time step is reduced.
 """
 
 from __future__ import annotations
@@ -78,11 +79,11 @@ class ModifiedCamClay(Skeleton):
     M
         Slope of the critical state line Q = M P, -, > 0.
     lambda_, kappa
-        Slopes of ln v against ln P, -, 0 < kappa < lambda_: lambda_ in first loading, kappa in unloading.  P is a
-        Kirchhoff stress.  A slope C of v against the logarithm of the Cauchy stress corresponds to C / (v - C).
+        Slopes of ln v against ln P, -, 0 < kappa < lambda_.  lambda_ applies to first loading, kappa to unloading.  P
+        is a Kirchhoff stress.  A slope C of v against the logarithm of the Cauchy stress corresponds to C / (v - C).
     initial_stress : (3,), Pa
-        Normal effective stresses at F = I, tension positive, mean < 0.  The last one is out of plane in 2D, and
-        circumferential in axisymmetry.  These stresses must be in equilibrium with the loads.
+        Normal effective stresses at F = I, tension positive.  Their mean must be < 0.  The last stress is out of plane
+        in 2D, and circumferential in axisymmetry.  These stresses must be in equilibrium with the loads.
     OCR
         Overconsolidation ratio, -, >= 1: initial P_c, divided by P_c of the yield surface through the initial stress.
     shear
@@ -90,8 +91,9 @@ class ModifiedCamClay(Skeleton):
     bulk
         Must not be given: the bulk modulus at the start is P_0 / kappa.
 
-    Other parameters: see `Skeleton`, all by name.  State variables in `points.data`: `plastic`, the inverse plastic
-    metric C_p^-1 (3, 3), and `consolidated`, ln(P_c / initial P_c).  Source: Borja and Tamagnini (1998).
+    Other parameters: see `Skeleton`.  All parameters are passed by name.  State variables in `points.data`: `plastic`
+    is the inverse plastic metric C_p^-1 (3, 3), and `consolidated` is ln(P_c / initial P_c).  Source: Borja and
+    Tamagnini (1998).
 
     Raises
     ------
@@ -149,7 +151,7 @@ class ModifiedCamClay(Skeleton):
 
     @property
     def prestretch(self):
-        """Isochoric principal elastic stretches at F = I (3,)."""
+        """Isochoric principal elastic stretches (3,) at F = I."""
         return np.exp(self._deviator / (2 * np.asarray(self.shear)[..., None]))
 
     @property
@@ -167,7 +169,7 @@ class ModifiedCamClay(Skeleton):
 
     @staticmethod
     def residual(trial, shear, M, lambda_, kappa, pressure, yield_pressure, consolidated, steeper):
-        """Return the residual of the equation for d, which is the flow rule on the yield surface."""
+        """Return the residual of the flow rule on the yield surface, which is the equation for d."""
         to = _Return(trial, shear, M, lambda_, kappa, pressure, yield_pressure, consolidated, steeper)
         c, P = 6 * shear * kappa / M**2, to.trial_pressure * ufl.exp(-to.compaction)
         rule = (c * to.compaction - (ufl.exp(to.flow) - 1) * (1 - to.steepness) * P) / (c + P)
@@ -241,10 +243,10 @@ class BarcelonaBasic(ModifiedCamClay):
         P_c / P_r = (P_c0 / P_r)^((lambda(0) - kappa) / (lambda(s) - kappa)),
         lambda(s) = lambda(0) [(1 - r) exp(-beta s) + r],   dP_c0 / P_c0 = -de_v^p / (lambda(0) - kappa),
 
-    This is the loading-collapse curve of the Barcelona Basic Model; P_c0 is the size in saturated soil.  At constant
-    suction the law is Modified Cam Clay with lambda(s), and in saturated soil with lambda(0).  Bishop's stress alone
-    determines the strength due to suction and the swelling on wetting.  The suction is evaluated at the end of a
-    substep.  Suction has no effect on the yield surface if P_c0 is below P_r.
+    This is the loading-collapse curve of the Barcelona Basic Model.  P_c0 is the size of the yield surface in saturated
+    soil.  At constant suction the law is Modified Cam Clay with lambda(s), and in saturated soil with lambda(0).
+    Bishop's stress alone determines the strength due to suction and the swelling on wetting.  The suction is evaluated
+    at the end of a substep.  Suction has no effect on the yield surface if P_c0 is below P_r.
 
     Parameters
     ----------
@@ -259,7 +261,7 @@ class BarcelonaBasic(ModifiedCamClay):
     beta
         Rate of decrease of lambda with suction, 1/Pa, >= 0.
     reference
-        Stress P_r, Pa, > 0; if P_c0 < P_r, P_c does not depend on suction.  Usually 0.01 to 0.5 times the initial P_c0.
+        Stress P_r, Pa, > 0, usually 0.01 to 0.5 times the initial P_c0.  If P_c0 < P_r, P_c does not depend on suction.
 
     Other parameters: see `ModifiedCamClay`.  A scene with fluid requires `retention`.  State variables: `plastic`,
     `consolidated` = ln(P_c0 / initial P_c0), `suction` and `suction_at_start`, Pa.  Source: Alonso, Gens and Josa
@@ -304,8 +306,12 @@ class BarcelonaBasic(ModifiedCamClay):
 class _Return:
     """Return to the yield surface for a given d, see the module's docstring.
 
-    compaction, flow: a and h; steepness: w exp(-d), the squared Q / (M P) at the end; trial_pressure: P_t, Pa.
-    rho: ln(P_c / P_c,n) / a; yields: whether the trial stress is outside the yield surface.
+    compaction: a.
+    flow: h.
+    steepness: w exp(-d), the square of Q / (M P) at the end of the step.
+    trial_pressure: P_t, Pa.
+    rho: ln(P_c / P_c,n) / a.
+    yields: whether the trial stress is outside the yield surface.
     """
 
     def __init__(self, trial, shear, M, lambda_, kappa, pressure, yield_pressure, consolidated, steeper):

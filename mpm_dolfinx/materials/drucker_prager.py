@@ -7,9 +7,9 @@ The return to the yield surface
 
     f = sqrt(J_2) + eta p - xi c <= 0,   p = tr(tau)/3 (tension positive),  c = c_0 + H kappa,
 
-has the closed form of small strain, on the cone or at its apex (de Souza Neto, Peric and Owen 2008, 8.3 and 14.6).
-`MATCHES` gives eta and xi; kappa is the accumulated plastic strain.  The consistent tangent is UFL's derivative of the
-stress.
+has the closed form of small-strain plasticity, both on the cone and at its apex (de Souza Neto, Peric and Owen 2008,
+8.3 and 14.6).  `MATCHES` gives eta and xi; kappa is the accumulated plastic strain.  The consistent tangent is UFL's
+derivative of the stress.
 """
 
 from __future__ import annotations
@@ -56,12 +56,14 @@ class DruckerPrager(Frictional):
         Linear hardening modulus H, Pa, >= 0: c = c_0 + H kappa.  kappa is the accumulated plastic strain (work
         conjugate to c, if flow is associated).
     match
-        Stress states in which the cone coincides with Mohr and Coulomb's: "plane strain" (equal collapse load, exact
-        for associated flow), triaxial "compression" (outer cone) or triaxial "extension" (inner cone).  In axisymmetry
-        no cone coincides everywhere: a circular footing on von Mises's soil bears 10 % less than on Tresca's.
+        Stress states in which the cone coincides with Mohr and Coulomb's yield surface: "plane strain" (equal collapse
+        load, exact for associated flow), triaxial "compression" (outer cone) or triaxial "extension" (inner cone).  In
+        axisymmetry no cone coincides in all stress states.  A circular footing therefore bears 10 % less on von Mises's
+        soil than on Tresca's.
 
-    Other parameters: see `Skeleton`, all by name.  State variables in `points.data`: `plastic`, the inverse plastic
-    metric C_p^-1 (3, 3), and `hardened`, kappa.  Source: de Souza Neto, Peric and Owen (2008), 8.3 and 14.6.
+    Other parameters: see `Skeleton`.  All parameters are passed by name.  State variables in `points.data`: `plastic`
+    is the inverse plastic metric C_p^-1 (3, 3), and `hardened` is kappa.  Source: de Souza Neto, Peric and Owen (2008),
+    8.3 and 14.6.
 
     Raises
     ------
@@ -134,8 +136,11 @@ def returned(trial: Trial, bulk, shear, eta, xi, eta_flow, cohesion, hardening, 
 
     Returns
     -------
-    p: mean stress, Pa, > 0 in tension; ratio: factor from the trial to the final deviatoric stress; yields: whether the
-    trial stress is outside the yield surface; apex: 1 for return to the apex, else 0; hardened: increment of hardening.
+    p: mean stress, Pa, > 0 in tension.
+    ratio: final deviatoric stress divided by the trial one.
+    hardened: increment of the accumulated plastic strain.
+    yields: whether the trial stress is outside the yield surface.
+    apex: 1 if the stress returns to the apex, else 0.
     """
     p = bulk * trial.volumetric
     q = shear * ufl.sqrt(2 * ufl.inner(trial.deviatoric, trial.deviatoric) + LEAST)  # sqrt(J_2)

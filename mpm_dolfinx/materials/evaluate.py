@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Evaluation of laws: stresses and new state at the material points, conductivities in pieces of particle domains."""
+"""Evaluation of laws: stresses and new state at material points, and conductivities in pieces of particle domains."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ class LawAtPoints:
     def data(
         self, points: MaterialPoints, rows: NDArray[np.int64], values: dict[str, NDArray[np.float64]]
     ) -> PointData:
-        """Return form data at the points with indices `rows`; values: F, parameters, state (n, ...) of all points."""
+        """Return form data at the points `rows`; values: F, parameters and state (n, ...) of all points, by name."""
         x = points.x[rows]
         cells = self.grid.locals[self.grid.number(self.grid.index_from_base(x))]
         inputs = {name: values[name][rows] for name in ("F", *self._shapes)}
@@ -124,7 +124,7 @@ class LawAtPoints:
         return None if across is None else PointExpression(across, self.points)
 
     def stress_3d(self, data: PointData) -> NDArray[np.float64]:
-        """Return the effective Cauchy stress (n, 3, 3), Pa; nan out of plane if the law does not define it."""
+        """Return the effective Cauchy stress (n, 3, 3), Pa.  It is nan out of plane if the law does not define it."""
         if self._stretches == 3:
             return self.stress(data)
         out = np.zeros((len(data.cells), 3, 3))
@@ -142,7 +142,7 @@ class LawAtPoints:
             return PointExpression(ufl.as_vector(parts), self.points), {name: shapes[name] for name in new}
 
     def new_state(self, data: PointData, dt: float) -> list[tuple[str, NDArray[np.float64]]]:
-        """Return name and values (n, ...) of each updated state variable; data have F after a step of dt, s."""
+        """Return name and values (n, ...) of each updated state variable.  data contain F after a step of dt, s."""
         if self.law.update is None:
             return []
         expression, shapes = self._update
@@ -184,9 +184,9 @@ def knows_space(grid: Grid, m: Skeleton) -> bool:
 def by_scene(
     grid: Grid, cell_size: float | None = None, law: type[Skeleton] | None = None, points: FormPoints | None = None
 ) -> dict[str, Any]:
-    """Return the arguments `BY_SCENE` of laws, time and cell size, as UFL; the caller sets the time.
+    """Return the arguments `BY_SCENE` of laws as UFL: the time, which the caller sets, and the cell size.
 
-    points: integration points of the law; on a grid of several cell sizes each of them stores the size of its cell.
+    points: integration points of the law.  On a grid with several cell sizes, each point stores the size of its cell.
     """
     if points is not None and not grid.even and cell_size is None and "cell_size" in law.by_scene:
         sizes = points.follow("cell_size", (), lambda data: grid.volumes(data.cells)[:, None] ** (1 / grid.dim))
@@ -196,7 +196,7 @@ def by_scene(
 
 
 def mean_size(grid: Grid) -> float:
-    """Return the edge length, m, of a square or cube with the volume of a cell; if cells differ, of the largest one."""
+    """Return the edge length, m, of a square or cube with the volume of the largest cell."""
     h = grid.h if grid.even else [w.max() for w in grid.widths]
     return float(np.prod(h) ** (1 / grid.dim))
 
@@ -211,16 +211,16 @@ finer cells by 3.0e-02.
 class SoftnessAtPoints:
     """Softness of yielding points: ratio of elastic to tangent shear modulus along the strain of the last step.
 
-    Volume strains that alternate from cell to cell grow with the strain.  They cause alternating pressures, equal to
-    the volume strain divided by the damping coefficient tau, 1/Pa.  In plastic flow the strain grows at constant
-    stress.  tau must then grow with the softness, else the alternating pressures reach the soil's strength.
+    Volume strains that alternate from cell to cell grow with the strain.  They cause alternating pressures.  The
+    pressures are these volume strains divided by the damping coefficient tau, 1/Pa.  In plastic flow the strain grows
+    at constant stress.  tau must then grow with the softness, else the alternating pressures reach the soil's strength.
 
     The strain of a step is e = dev sym dF F^-1.  With the Kirchhoff stress T(s) at F - (1 - s) dF, the tangent shear
-    modulus is G_t = (dT/ds) : e / (2 e : e) at s = 1.  The softness of the previous step is used.  A value from the
-    current iterate would prevent convergence of Newton's method, or make the result depend on the iterates.
+    modulus is G_t = (dT/ds) : e / (2 e : e) at s = 1.  The forms use the softness of the previous step.  The softness
+    of the current iterate would prevent convergence of Newton's method, or make the result depend on the iterates.
 
-    At rest the strain is a rounding error, of random direction.  G_t is therefore a weighted mean: the modulus of the
-    step has the weight e : e, the old modulus the weight `NEAR`^4.  A step at rest thus does not change the softness.
+    At rest the strain is a rounding error with a random direction.  G_t is therefore a weighted mean.  The modulus of
+    the step has the weight e : e, and the old modulus has the weight `NEAR`^4.  A step at rest thus keeps the softness.
 
     grid, law, shapes, stretches: see `LawAtPoints`.
     """
@@ -247,7 +247,9 @@ class SoftnessAtPoints:
     def __call__(self, at: PointData, dF: NDArray, shear: NDArray, dt: float, before: NDArray) -> NDArray[np.float64]:
         """Return the softness (n,), in [1, `MOST`], of points whose data `at` contain F, parameters and state.
 
-        dF (n, d, d): change of F in a step of dt, s; shear (n,): elastic shear modulus, Pa; before (n,): old softness.
+        dF (n, d, d): change of F in a step of dt, s.
+        shear (n,), Pa: elastic shear modulus.
+        before (n,): softness before the step.
         """
         self._by_scene["dt"].value = dt
         fields = {name: at[name] for name in ("F", *self._shapes)}
@@ -269,7 +271,7 @@ class ConductivityAtPieces:
     laws
         Distinct conductivity laws of the materials.
     pieces
-        Integration points of the pieces; if there is a law, with the fields F, position, conductivity and porosity0.
+        Integration points of the pieces.  With `laws` they have the fields F, position, conductivity and porosity0.
     displacement
         Increment of the displacement since the start of the step.
     pressure
@@ -308,12 +310,12 @@ class ConductivityAtPieces:
         )
 
     def evaluate(self, data: PointData, material: NDArray[np.int32], begins: bool) -> NDArray[np.float64]:
-        """Return the conductivities (m,), m/s, of pieces with material indices (m,), at the present displacement.
+        """Return the conductivities (n,), m/s, of pieces at the present displacement; material (n,): their materials.
 
         Raises
         ------
         ValueError, NotConverged
-            A conductivity is negative or not finite: ValueError at the start of a step, NotConverged at an iterate.
+            A conductivity is negative or not finite.  This is a ValueError at the start of a step, else NotConverged.
         """
         out = data["conductivity"][:, 0].copy()
         for law, k in self._laws.items():

@@ -43,9 +43,9 @@ changes the result of scene "soil" in tests/plateaus.py by 6.6e-05 (relative), d
 by 3.0e-02.
 """
 STIFFEST = 100.0
-"""Upper limit of (alpha^2 / S) / (lambda + 2G), the stiffness of the pore fluid relative to the skeleton's (S: storage
-coefficient), which limits rounding errors.  Halving this value changes the result of scene "soil" in tests/plateaus.py
-by 1.2e-07 (relative), doubling it by 1.0e-07, and finer cells by 3.0e-02.
+"""Upper limit of (alpha^2 / S) / (lambda + 2G), the ratio of the pore fluid's stiffness to the skeleton's stiffness.  S
+is the storage coefficient.  The limit keeps rounding errors small.  Halving this value changes the result of scene
+"soil" in tests/plateaus.py by 1.2e-07 (relative), doubling it by 1.0e-07, and finer cells by 3.0e-02.
 """
 
 
@@ -130,7 +130,7 @@ class SceneMaterials:
             for i, m in zip(self._used, used, strict=True)
             if m.conductivity_law
         }
-        """Sampled values of parameter fields and of laws of flow, by which a checkpoint recognises the scene."""
+        """Checksums of fields, and sampled values of laws of flow.  They show whether a checkpoint fits the scene."""
         for i, m in zip(self._used, used, strict=True):
             if m.retention is not None:
                 self.checksums[f"retention of material {i}"] = drained(m.retention)
@@ -160,24 +160,24 @@ class SceneMaterials:
                     shapes = {name: self.shapes[name] for name in _takes(law)}
                     self._softness[number] = SoftnessAtPoints(grid, law, shapes, self._stretches_of(law))
         self.seeded = replace(points, data=seeded)
-        """The material points with their initial data: parameters that are functions of position, and state."""
+        """The material points with their initial data: the state, and parameters that are functions of position."""
         self._at_points = [
             LawAtPoints(grid, law, {name: self.shapes[name] for name in _takes(law)}, self._stretches_of(law))
             for law in self.laws
         ]
 
     def seeds_no_more(self) -> None:
-        """Delete the seeded points after all bodies are in the state; names and shapes of their data remain."""
+        """Delete the seeded points when all bodies are in the scene.  Names and shapes of the points' data remain."""
         self.seeded = self.seeded.of(np.empty(0, dtype=np.int64))
 
     def check_cells(self) -> None:
-        """Raise ValueError if cells are too large for a softening law; called when the cells are made or have moved."""
+        """Raise ValueError if cells are too large for a softening law.  Called after the cells are created or moved."""
         size = mean_size(self.grid)
         together(self.grid.comm, lambda: [m.check_cells(size) for m in self._evaluated])
 
     @property
     def across(self) -> bool:
-        """Whether some laws in plane strain use an out-of-plane stretch, given by the mean dilatation."""
+        """Whether laws in plane strain use an out-of-plane stretch, which F-bar determines."""
         return self.stretches > self.grid.stretches
 
     def _stretches_of(self, law: type[Skeleton]) -> int:
@@ -189,11 +189,11 @@ class SceneMaterials:
         law = type(m)
         if (law.energy is None) == (law.kirchhoff is None):
             which = "neither" if law.energy is None else "both"
-            raise ValueError(f"{law.__name__}: has {which}, must define energy or kirchhoff")
+            raise ValueError(f"{law.__name__}: defines {which} of energy and kirchhoff, must define one of them")
         given = (law.residual is not None) + (law.solution is not None)
         if given != bool(law.unknowns):
             has = f"{'' if law.unknowns else 'no '}unknowns and {given} of residual and solution"
-            raise ValueError(f"{law.__name__}: has {has}, must have one of the two if it has unknowns, else none")
+            raise ValueError(f"{law.__name__}: has {has}; with unknowns it must have one of the two, else none")
         own, others = (*constants_of(m), *law.state), {*constants_of(m), *law.state, *BY_SCENE, "F", "trial"}
         if clashes := [name for name in own if name in BY_SCENE] + [name for name in law.unknowns if name in others]:
             raise ValueError(f"{law.__name__}: the name {clashes[0]!r} is taken; {WHAT_IS_NAMED} must have others")
@@ -250,11 +250,11 @@ class SceneMaterials:
         return np.array([self.laws.index(law) for law, *_ in self._parts])[self.part_of(points)]
 
     def locking(self, points: MaterialPoints) -> NDArray[np.bool_]:
-        """Return for each point (n,) whether Q1 cells would lock."""
+        """Return for each point (n,) whether Q1 cells with its material would lock."""
         return np.array([locks for _, locks, _ in self._parts])[self.part_of(points)]
 
     def stretched(self, points: MaterialPoints) -> NDArray[np.bool_]:
-        """Return for each point (n,) whether its law uses the out-of-plane stretch given by the mean dilatation."""
+        """Return for each point (n,) whether its law uses the out-of-plane stretch of F-bar."""
         return self.across & self.locking(points) & self.knows_across(points)
 
     def knows_across(self, points: MaterialPoints) -> NDArray[np.bool_]:
@@ -264,8 +264,8 @@ class SceneMaterials:
     def conducting(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return two numbers (n, 2) for each point: its conductivity, m/s, and the index of its conductivity law.
 
-        Points with the same two numbers have the same conductivity.  If the law depends on position, each point has its
-        own index.  The fractional part of the index denotes the retention curve.
+        Points with equal pairs of numbers have equal conductivities.  If the law depends on position, each point has
+        its own index.  The fractional part of the index denotes the retention curve.
         """
         laws, known = [m.conductivity_law for m in self.materials], self.conductivity_laws
         law = np.array([known.index(law) if law in known else -1 for law in laws])[points.material]
@@ -283,7 +283,7 @@ class SceneMaterials:
     def saturation(
         self, points: MaterialPoints, p: NDArray[np.float64], of: NDArray[np.int64] | slice = slice(None)
     ) -> tuple[NDArray[np.float64], ...]:
-        """Return saturation, dS/dp (1/Pa), Bishop's chi and relative permeability at p (m,), Pa, of the points `of`."""
+        """Return saturation, dS/dp (1/Pa), chi and relative permeability, each (k,), at p (k,), Pa, of points `of`."""
         return self.saturations(self.retention_rows(points)[of], p)
 
     @cached_property
@@ -298,7 +298,7 @@ class SceneMaterials:
         return SaturationAt(self.grid, self.retentions)
 
     def saturations(self, rows: NDArray[np.float64], p: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
-        """Return the results of `saturation` at pressures p (m,), Pa; rows (m, width): the field `retention`."""
+        """Return the results of `saturation` at pressures p (k,), Pa.  rows (k, width): the field `retention`."""
         return self._saturation(rows, p)
 
     def retention_scale(self, points: MaterialPoints) -> NDArray[np.float64]:
@@ -307,7 +307,7 @@ class SceneMaterials:
         return np.array(scales)[points.material]
 
     def pore_stress(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return alpha chi p (n,), Pa, at the points: the total stress is the effective stress minus this pressure."""
+        """Return alpha chi p (n,), Pa, at the points: the effective stress minus the total stress."""
         pressure = self.table(points, lambda m: m.biot) * points.pressure
         return pressure if self.retentions is None else pressure * self.saturation(points, points.pressure)[2]
 
@@ -334,7 +334,7 @@ class SceneMaterials:
         return out
 
     def changed(self, what: str, points: MaterialPoints, named: Collection[str]) -> MaterialPoints:
-        """Return the points after a change of the fields `named`; fields that depend on `named` are updated.
+        """Return the points after a change of the fields `named`.  Fields that depend on these fields are updated.
 
         Raises
         ------
@@ -356,14 +356,14 @@ class SceneMaterials:
         return replace(points, data=data)
 
     def _at(self, points: MaterialPoints, i: int, rows: NDArray[np.int64]) -> Skeleton:
-        """Return a material with its constants as arrays over points `rows`; a uniform material is not changed."""
+        """Return a material with its constants as arrays over points `rows`.  Uniform materials do not change."""
         if not self._fields[i]:
             return self.materials[i]
         values = {name: points.data[name][rows] for name in self._fields[i]}
         return _expanded(self.materials[i], values, len(rows))
 
     def parameters(self, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
-        """Return each parameter at the points (n, ...), zero where the law of a point does not have it."""
+        """Return each parameter (n, ...) at the points.  A parameter is zero at points whose law does not have it."""
         out = {name: np.zeros((len(points), *s)) for name, s in self.shapes.items() if name not in self.state_names}
         for i in self._used:
             rows = (points.material == i).nonzero()[0]
@@ -418,12 +418,12 @@ class SceneMaterials:
         )
 
     def density(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the density of soil with saturated pores at the points (n,), kg/m^3."""
+        """Return the density (n,), kg/m^3, of the points' soil with saturated pores."""
         n, wet = self.porosity(points), self.fluid.density if self.fluid else 0.0
         return (1 - n) * self.table(points, lambda m: m.grain_density) + n * wet
 
     def present_density(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the density of soil with the pore water that it contains, at the points (n,), kg/m^3."""
+        """Return the density (n,), kg/m^3, of the points' soil with its present pore water."""
         density = self.density(points)
         if self.retentions is None:
             return density
@@ -433,7 +433,7 @@ class SceneMaterials:
     def confined_modulus(self, points: MaterialPoints, most: float = STIFFEST) -> NDArray[np.float64]:
         """Return the undrained confined modulus (n,), Pa: lambda + 2G + alpha^2 / S.
 
-        alpha^2 / S is limited to `most` (lambda + 2G).
+        alpha^2 / S is limited to `most` times (lambda + 2G).
         """
         modulus = self.table(points, lambda m: m.oedometric)
         if self.fluid is None:
@@ -468,14 +468,14 @@ class SceneMaterials:
         return np.array([not m.state for m in self.materials])[points.material]
 
     def soil_rows(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return constants (n, c) that are equal at points of the same soil, even if initial stresses differ."""
+        """Return constants (n, c) that are equal at points of one soil, even if their initial stresses differ."""
         fields = [points.data[name] for name in self.field_names if name != "seeded_stretch"]
         fields = [rows.reshape(len(rows), int(np.prod(rows.shape[1:]))) for rows in fields]
         return np.column_stack([points.material, *fields])
 
     @property
     def dilates(self) -> bool:
-        """Whether the plastic flow of any soil may change its volume; the same on all processes."""
+        """Whether the plastic flow of any soil may change its volume.  All processes return the same value."""
         used = [self.materials[i] for i in self._used]
         return any(m.dilates and (callable(m.dilation) or np.any(m.dilation)) for m in used)
 
@@ -503,7 +503,8 @@ class SceneMaterials:
     def stored(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return the elastic energy of the skeleton (n,) per reference volume, Pa; all processes must call it.
 
-        For laws without an energy, this is Hencky's energy with constant moduli if `elastic_hencky`, else zero.
+        Laws with `elastic_hencky` but without an energy have Hencky's energy with constant moduli.  Other laws without
+        an energy have zero.
         """
         out = np.zeros(len(points))
         bulk, shear = (self.table(points, lambda m, name=name: getattr(m, name)) for name in ("bulk", "shear"))
@@ -524,7 +525,7 @@ class SceneMaterials:
     def updated_state(
         self, points: MaterialPoints, before: MaterialPoints, dt: float
     ) -> dict[str, NDArray[np.float64]]:
-        """Return the point data after a step of dt, s.  `points` have the new F and the old state, `before` the old F.
+        """Return the point data after a step of dt, s; points have the new F and the old state, before have the old F.
 
         Raises
         ------
@@ -564,7 +565,7 @@ class SceneMaterials:
 
 
 def _known(name: str, value) -> NDArray[np.float64]:
-    """Return a parameter or state of a law as an array; infinity is allowed, NaN raises ValueError."""
+    """Return a parameter or state variable of a law as an array.  Infinity is allowed; NaN raises ValueError."""
     out = numbers(name, value, None, allowed="numbers", test=np.isreal)
     if np.isnan(out).any():
         raise ValueError(f"{name} = nan, must be numbers")
@@ -594,11 +595,14 @@ def _by_place(m: Skeleton) -> list[str]:
 
 
 def _evaluated(grid: Grid, m: Skeleton, X: NDArray[np.float64], ids: NDArray[np.int64]) -> tuple[Skeleton, Skeleton]:
-    """Return a material at its points of this process, and at its first point of all processes, as arrays.
+    """Return a material twice, with arrays of its constants: at this process's points, and at the first point of all.
 
-    A process without points of the material has the values at the first point.
+    The first point has the lowest id on all processes.  A process without points of the material uses the constants at
+    the first point in both.
 
-    X (n, d), m, and ids (n,): reference positions and ids of the points of this process.
+    X (n, d), m: reference positions of this process's points with the material.
+    ids (n,): ids of these points.
+
     """
     names = _by_place(m)
 
@@ -617,7 +621,7 @@ def _evaluated(grid: Grid, m: Skeleton, X: NDArray[np.float64], ids: NDArray[np.
 
 
 def _check_local(all_points: Skeleton, half: Skeleton, names: Sequence[str]) -> None:
-    """Raise ValueError if fields at every other point differ without the points between them."""
+    """Raise ValueError if the fields at every other point change when they are evaluated without the points between."""
     for name in names:
         value, alone = getattr(all_points, name)[::2], getattr(half, name)
         if np.abs(value - alone).max() > SAME * np.abs(value).max():
@@ -626,7 +630,7 @@ def _check_local(all_points: Skeleton, half: Skeleton, names: Sequence[str]) -> 
 
 
 def _places(bodies: Sequence[Body], material: int, ids: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return the reference positions (n, d), m, of points (n,) with a material; ids: ascending."""
+    """Return the reference positions (n, d), in m, of the points with a material.  ids (n,): their ids, ascending."""
     starts = np.cumsum([0, *map(len, bodies)])
     at = ids.searchsorted(starts)
     each = zip(bodies, starts[:-1], pairwise(at), strict=True)
@@ -635,14 +639,14 @@ def _places(bodies: Sequence[Body], material: int, ids: NDArray[np.int64]) -> ND
 
 
 def _ends(grid: Grid, values: Sequence) -> tuple[float, float]:
-    """Return the least and the largest of some numbers and arrays, over all processes."""
+    """Return the least and the largest number in some numbers and arrays, over all processes."""
     flat = np.concatenate([np.ravel(one) for one in values])
     least, most = over_all(grid.comm, np.array([flat.min(), -flat.max()]), MPI.MIN)
     return float(least), -float(most)
 
 
 def _checksum(grid: Grid, ids: NDArray[np.int64], rows: NDArray[np.float64], total: int) -> int:
-    """Return the checksum of rows (n, ...) of the points of all processes, in the order of ids, all below `total`."""
+    """Return the checksum of all processes' rows (n, ...), in the order of ids (n,); total: number above all ids."""
     exchange, checksum = Exchange(grid.comm, (ids * grid.comm.size // total).astype(np.int32)), 0
     content = exchange.send(rows)[exchange.send(ids).argsort()].tobytes()
     for rank in range(grid.comm.size):
@@ -651,7 +655,7 @@ def _checksum(grid: Grid, ids: NDArray[np.int64], rows: NDArray[np.float64], tot
 
 
 def _expanded(m: Skeleton, values: dict[str, NDArray[np.float64]], n: int) -> Skeleton:
-    """Return a copy of a material with values (n, ...) of some fields, and its other constants repeated n times."""
+    """Return a copy of a material.  Some fields have the values (n, ...); other constants are repeated n times."""
     out = copy(m)
     for name in constants_of(m):
         value = getattr(m, name)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Common parameters of frictional soil: angles of friction and dilation, cohesion."""
+"""Common parameters of frictional soil: angles of friction and dilation, and cohesion."""
 
 from __future__ import annotations
 
@@ -22,8 +22,10 @@ class Frictional(Skeleton):
 
     Parameters
     ----------
-    friction, dilation
-        Angles phi and psi, degrees, in [0, 90) and [0, friction].
+    friction
+        Friction angle phi, degrees, in [0, 90).
+    dilation
+        Dilation angle psi, degrees, in [0, friction].
     cohesion
         Cohesion, Pa, >= 0.
 

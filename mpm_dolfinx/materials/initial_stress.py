@@ -24,7 +24,7 @@ from mpm_dolfinx.materials.trial import PLANE, SPACE
 from mpm_dolfinx.parallel.exchange import Exchange, first, over_all, together
 from mpm_dolfinx.points.material_points import MaterialPoints, unstretched
 
-EXACT, CLOSE = 1e-13, SAME  # errors relative to the largest initial stress, to end Newton's method, to accept a result
+EXACT, CLOSE = 1e-13, SAME  # errors relative to the largest initial stress: one ends Newton's method, one is accepted
 MOST = 30  # largest number of Newton iterations
 LARGEST = 0.2  # limit to the change of a strain component in one iteration
 
@@ -33,10 +33,12 @@ LARGEST = 0.2  # limit to the change of a strain component in one iteration
 class K0:
     """Initial effective stress of soil under its own weight, with the coefficient K0 of earth pressure at rest.
 
-    The vertical effective stress is the overburden of soil and fluid plus the surcharge, minus the Biot coefficient
-    times the pore pressure (times chi in unsaturated soil).  The horizontal effective stresses, in axisymmetry radial
-    and circumferential, are K0 times the vertical one.  The stresses are exact for level ground with level layers.
-    Other stresses are balanced, without motion of the points.  Changes of more than 5 %, as on slopes, cause a warning.
+    The vertical effective stress is the overburden of soil and fluid plus the surcharge, minus the pore stress alpha
+    chi p (Biot coefficient alpha, Bishop's chi, pore pressure p).  In saturated soil chi is 1.  The horizontal
+    effective stresses are K0 times the vertical one.  In axisymmetry these are the radial and the circumferential
+    stress.  The stresses are exact for level ground with level layers.  In other ground they are balanced, without
+    motion of the points.  If balancing changes a stress by more than 5 % of the largest initial stress, as on slopes, a
+    warning is given.
 
     Parameters
     ----------
@@ -90,7 +92,7 @@ def hydrostatic(level: float, unit_weight: float | None = None) -> Callable[[NDA
 
 @dataclass(frozen=True)
 class OfWater:
-    """A water pressure with a unit weight, N/m^3; by default that of the scene's fluid, or 9810 outside a scene."""
+    """A water pressure with a unit weight, N/m^3: by default the fluid's unit weight, or 9810 outside a scene."""
 
     @property
     def unit_weight(self) -> float:
@@ -111,7 +113,7 @@ class Hydrostatic(OfWater):
 
 
 def by_body(given, bodies: Sequence[Body], later: Sequence[int]) -> dict[int, InitialStress]:
-    """Return the initial stress of each body; a single given stress applies to all bodies present at the start."""
+    """Return the initial stress of each body.  A single initial stress applies to all bodies present at the start."""
     allowed = "a K0, a function of x, or a dict of these, {index of a body: ...}"
     if given is None:
         return {}
@@ -126,7 +128,9 @@ def by_body(given, bodies: Sequence[Body], later: Sequence[int]) -> dict[int, In
 class InitialStresses:
     """Initial stresses of the bodies of a scene.
 
-    bodies: all bodies; given: result of `by_body`; pressure: initial pore pressure, Pa, a number or a function of x.
+    bodies: all bodies.
+    given: result of `by_body`.
+    pressure: initial pore pressure, Pa, a number or a function of x.
     """
 
     def __init__(self, bodies: Sequence[Body], given: Mapping[int, InitialStress], pressure: float | Callable):
@@ -141,7 +145,7 @@ class InitialStresses:
         Parameters
         ----------
         present
-            Whether each body is present, for the overburden.
+            Whether each body is present.  The overburden contains present bodies only.
         gravity : (d,), m/s^2
             Acceleration of gravity, or None.
         """
@@ -163,7 +167,7 @@ class InitialStresses:
         return stressed(materials, points, rows, target)
 
     def _at(self, stress: InitialStress, body: int, points: MaterialPoints, above: list[NDArray]) -> NDArray:
-        """Return the effective stress (n, 3, 3), Pa, of points of a body; above: results of `_above` there."""
+        """Return the effective stress (n, 3, 3), Pa, of points of a body.  above: results of `_above` for them."""
         n, d = points.x.shape
         if not isinstance(stress, K0):
             name = f"initial_stress of body {body}: {line(stress)}"
@@ -186,7 +190,7 @@ class InitialStresses:
         return normal[:, :, None] * np.eye(3)
 
     def _above(self, materials: SceneMaterials, points: MaterialPoints, present, gravity) -> list[NDArray]:
-        """Return three arrays (n,) for K0: overburden, Pa; surface height, m; result of `pore_stress`, Pa."""
+        """Return three arrays (n,) for K0: overburden, Pa; surface height, m; and pore stress alpha chi p, Pa."""
         if not any(isinstance(stress, K0) for stress in self.given.values()):
             return [points.pressure] * 3
         if gravity is None or np.any(gravity[:-1]) or not gravity[-1] <= 0:
@@ -211,8 +215,8 @@ def _in_columns(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return corners and unit weights of all domains above and below domains of this process, in the order of ids.
 
-    ids (n,), corners (n, 2^d, d), m, unit_weight (n,), N/m^3: domains of this process, present in the scene; above
-    (k, 2^d, d), m: corners of the domains whose columns this process needs.
+    ids (n,), corners (n, 2^d, d), m, unit_weight (n,), N/m^3: values of this process's domains in the scene.
+    above (k, 2^d, d), m: corners of the domains whose columns this process needs.
     """
     ends = [above[..., :-1].min(axis=(0, 1), initial=np.inf), above[..., :-1].max(axis=(0, 1), initial=-np.inf)]
     low, high = corners[..., :-1].min(axis=1), corners[..., :-1].max(axis=1)
@@ -228,12 +232,13 @@ def stressed(
 ) -> MaterialPoints:
     """Return the points with target stresses (n, 3, 3), Pa, at the chosen points (n,); all processes must call it.
 
-    In Modified Cam Clay the initial stress is a parameter.  In other laws elastic strains cause it, `_ElasticStrains`.
+    In Modified Cam Clay the initial stress is a parameter.  In other laws elastic strains cause the initial stress, see
+    `_ElasticStrains`.
 
     Raises
     ------
     ValueError
-        A stress is outside the yield surface; the message states the first such position.
+        A stress is outside the yield surface.  The message states the first position with such a stress.
     """
     comm = materials.grid.comm
     rows = np.flatnonzero(chosen)
@@ -301,7 +306,7 @@ class _ElasticStrains:
         return self.of(elastic)
 
     def residual(self, strain: NDArray[np.float64]) -> tuple[MaterialPoints, NDArray[np.float64]]:
-        """Return the points with elastic strains (n, k), and their stresses minus the target stresses (n, k), Pa."""
+        """Return the points with elastic strains (n, k), and their excess (n, k), Pa, over the target stresses."""
         tensor = np.zeros((len(strain), 3, 3))
         for value, (i, j) in zip(strain.T, self.components, strict=True):
             tensor[:, i, j] = tensor[:, j, i] = value
@@ -349,7 +354,7 @@ class _ElasticStrains:
 
 
 def strained(materials: SceneMaterials, points: MaterialPoints, moved: MaterialPoints) -> MaterialPoints:
-    """Return points with the elastic strains of `moved`, the same points after deformation; positions do not change."""
+    """Return the points, at their positions, with the elastic strains of `moved`, the points after deformation."""
     law = materials.law_of(points)
     own = {name: points.data[name] for name in MaterialPoints.INTERNAL if name in points.data}
     data = {**moved.data, **own}
@@ -390,7 +395,7 @@ def _prestretch(m) -> NDArray[np.float64]:
 
 
 def _no_constants(points: MaterialPoints, target: NDArray[np.float64], given: NDArray[np.bool_]) -> str:
-    """Return an error message for stresses (n, 3, 3), Pa, that Modified Cam Clay excludes, or an empty string."""
+    """Return an error message if Modified Cam Clay does not allow a stress (n, 3, 3), Pa, else an empty string."""
     shear = np.abs(target - np.diagonal(target, axis1=1, axis2=2)[:, :, None] * np.eye(3)).max(axis=(1, 2), initial=0.0)
     invalid = given & ((shear > 0) | ~(np.trace(target, axis1=1, axis2=2) < 0))
     what = "must have no shear and a compressive mean for ModifiedCamClay"

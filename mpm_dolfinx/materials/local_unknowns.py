@@ -6,11 +6,11 @@ to round-off.  The forms contain
 
     y = y* + Y (z(F) - z*),     Y = -(df/dy)^-1 df/dz  at the solution (y*, z*),
 
-which has the value and, with respect to F, the derivative of the solution.  UFL's derivative of a stress with respect
-to F, including its dependence through y, is then the consistent tangent, without unrolled iterations.  y*, z* and Y are
-coefficients at the points.  If the stress is not differentiated, y* alone is used.  If the law has an energy, the
-tangent is its second derivative.  The expression for y then has a second-order term, whose coefficients also follow
-from f = 0.  A law in numpy returns y(z) and dy/dz.
+At the solution, this y has the right value and the right derivative with respect to F.  UFL's derivative of a stress
+with respect to F includes the dependence through y.  It is therefore the consistent tangent, although the forms contain
+no iterations.  y*, z* and Y are coefficients at the points.  If the stress is not differentiated, y* is used in place
+of y.  If the law has an energy, the tangent is the second derivative of the energy.  The expression for y then has a
+second-order term, whose coefficients also follow from f = 0.  A law in numpy returns y(z) and dy/dz.
 """
 
 from __future__ import annotations
@@ -70,8 +70,8 @@ class LocalUnknowns:
     values
         The unknowns by name, as UFL that depends on F, and `trial`.
     known
-        Like `values`, but independent of F, for expressions that are not differentiated with respect to F.  Their
-        kernels need not compute trial values.  For laws with an energy, `known` equals `values`.
+        Like `values`, but independent of F, for expressions that are not differentiated with respect to F.  The kernels
+        of such expressions need not compute trial values.  For laws with an energy, `known` equals `values`.
     """
 
     def __init__(self, law: type[Skeleton], points: FormPoints, F, values: Mapping[str, object]):
@@ -105,12 +105,12 @@ class LocalUnknowns:
     def solve(self, data: PointData, derive: bool = True) -> Given:
         """Return values that forms of the points are given: unknowns at their present F; all processes must call it.
 
-        derive: whether to differentiate with respect to the trial values too; `values` needs this, `known` does not.
+        derive: whether to differentiate by the trial values too.  `values` needs these derivatives; `known` does not.
 
         Raises
         ------
         NotConverged
-            A point has no solution; the message states the first such point.
+            The equations of a point have no solution.  The message states the first point without a solution.
         """
         trial = self._trial.evaluate(data)
         key = data.key, trial, float(self._dt.value)
@@ -201,7 +201,7 @@ class _Equations:
         return Solved(y, trial, derive)
 
     def _refuse(self, data: PointData, failed: NDArray[np.int64], why: str) -> None:
-        """Raise NotConverged on all processes if a point of any process has failed; the message states the first."""
+        """Raise NotConverged on all processes if any point has failed.  The message states the first failed point."""
         messages = [f"{self._law.__name__}{why} at {data.x[i] + data.points.grid.base}" for i in failed[:1]]
         if message := first(self._grid.comm, "".join(messages)):
             raise NotConverged(message)
@@ -240,7 +240,8 @@ class _Equations:
         Raises
         ------
         ValueError
-            The result is no dict of pairs with names and shapes of the unknowns, or lists a trial value not in `trial`.
+            The result is not a dict of pairs with the unknowns' names and shapes, or a derivative is with respect to a
+            name that is not in `trial`.
         """
         instance(f"{self._title}: its result", found, dict)
         for of, pair in found.items():
@@ -262,13 +263,16 @@ class _Equations:
         return out
 
     def _slope(self, of: str, by: str, given, n: int) -> NDArray[np.float64]:
-        """Return the derivative (n, ..., ...) of an unknown with respect to a trial value; given: array or function."""
+        """Return the derivative (n, ..., ...) of an unknown by a trial value; given: array or callable."""
         what = f"{self._title}: derivative of {of} with respect to {by}"
         value = asked(what, "a function without arguments that gives it", given) if callable(given) else given
         return _real(what, value, (n, *self._unknowns[of], *self._trial[by]))
 
     def _slopes_of(self, of: str, given: Mapping[str, object], n: int) -> NDArray[np.float64]:
-        """Return the derivatives (n, m, k) of one unknown; given: the derivative for each name of a trial value."""
+        """Return the derivatives (n, m, k) of one unknown with m components with respect to all k trial components.
+
+        given: derivatives by name of the trial value; missing derivatives are zero.
+        """
         m, parts = _size(self._unknowns[of]), []
         for by, shape in self._trial.items():
             slope = self._slope(of, by, given[by], n) if by in given else np.zeros((n, m, _size(shape)))
@@ -282,7 +286,7 @@ def _along(by_y, by_z, Y, m: int, i: tuple[int, ...], j: int):
 
 
 def _real(name: str, value, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    """Return a value as an array of real numbers; raise ValueError if its shape or type is another."""
+    """Return a value as an array of real numbers; raise ValueError for a wrong shape or type."""
     try:
         value = np.asarray(value)
     except ValueError as error:  # rows of different lengths
@@ -297,7 +301,8 @@ def _real(name: str, value, shape: tuple[int, ...]) -> NDArray[np.float64]:
 def _newton(system, y: NDArray[np.float64]) -> NDArray[np.int64]:
     """Solve f(y) = 0 at all points, in place, by Newton's method with a line search; return indices of failed points.
 
-    system: function of point indices (r,) and their y (r, m); it stores these y, and returns f, df/dy and norms of f.
+    system: function of r point indices and of the y (r, m) of these points.  It stores y, and returns f, df/dy and
+    norms of f.
     """
     rows, failed = np.arange(len(y)), np.zeros(len(y), dtype=bool)
     f, slope, norm = system(rows, y)
@@ -323,7 +328,7 @@ def _newton(system, y: NDArray[np.float64]) -> NDArray[np.int64]:
         on = ~failed[rows]
         rows, f, slope = (values[on] for values in (rows, f, slope))
         norm = new[on]
-    failed[rows] = True  # after so many iterations
+    failed[rows] = True  # not solved by `MOST` iterations
     return np.flatnonzero(failed)
 
 
@@ -353,7 +358,7 @@ def _size(shape: tuple[int, ...]) -> int:
 
 
 def _named(shapes: Mapping[str, tuple[int, ...]], vector) -> dict:
-    """Return tensors of the given shapes, whose components are consecutive in a UFL vector."""
+    """Return tensors of the given shapes, by name.  The components of a tensor are consecutive in a UFL vector."""
     out, start = {}, 0
     for name, shape in shapes.items():
         index = np.arange(start, start + _size(shape)).reshape(shape)

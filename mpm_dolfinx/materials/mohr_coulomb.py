@@ -4,14 +4,15 @@
 Plasticity is multiplicative, in principal logarithmic strains, with Hencky's elasticity.  For principal Kirchhoff
 stresses t_1 >= t_2 >= t_3, tension positive,
 
-    f_ij = (1 + sin phi) t_i - (1 - sin phi) t_j - 2 c cos phi <= 0  for all i, j,    t_i <= T,
+    f_ij = (1 + sin phi) t_i - (1 - sin phi) t_j - 2 c cos phi <= 0  for all i, j,    t_i <= T.
 
-flow is along (1 + sin psi) e_i - (1 - sin psi) e_j, and at the cut-off T along e_i.  e_i are principal directions; phi,
-psi, c and T are constants of `MohrCoulomb`.  The return mapping keeps the order of the principal values.  The return
-therefore ends on one of ten faces, edges and vertices, see `_Return` (de Souza Neto, Peric and Owen 2008, 8.2, without
-the cut-off).  On each of them the final stress is linear in the trial stress.  A final stress is valid if it is
-admissible, the order is kept, and all plastic multipliers are >= 0.  Of the ten final stresses, the one with the least
-violation is used; this violation is a rounding error.  Derivatives, in numpy, are exact even for equal eigenvalues.
+The direction of flow is (1 + sin psi) e_i - (1 - sin psi) e_j on a face f_ij, and e_i at the cut-off T.  e_i are
+principal directions; phi, psi, c and T are constants of `MohrCoulomb`.  The return mapping keeps the order of the
+principal stresses.  Its result therefore lies on one of ten faces, edges and vertices, see `_Return`.  On each face,
+edge or vertex the final stress is linear in the trial stress (de Souza Neto, Peric and Owen 2008, 8.2, without the
+cut-off).  A final stress is valid if it is admissible, the order is kept, and all plastic multipliers are >= 0.  The
+return mapping uses the one of the ten final stresses with the smallest violation, which is a rounding error.
+Derivatives are computed in numpy, and are exact even for equal eigenvalues.
 """
 
 from __future__ import annotations
@@ -43,15 +44,15 @@ class MohrCoulomb(Frictional):
     friction
         Friction angle phi, degrees, in [0, 90); 0 is Tresca's law, with the undrained strength `cohesion`.
     dilation
-        Dilation angle psi, degrees, in [0, friction].  If it equals `friction`, flow is associated, with a symmetric
-        tangent.  Soil in tension at the apex dilates for any psi.
+        Dilation angle psi, degrees, in [0, friction].  If it equals `friction`, flow is associated and the tangent is
+        symmetric.  Soil in tension at the apex dilates for any psi.
     cohesion
         Cohesion c, Pa, >= 0.  If it is zero, points without mean pressure have no stiffness.
     tension
         Tensile strength T, Pa, >= 0: upper limit of the principal stresses, by default the apex stress c cot phi.
 
-    Other parameters: see `Skeleton`, all by name.  State variable in `points.data`: `plastic`, the inverse plastic
-    metric C_p^-1 (3, 3).
+    Other parameters: see `Skeleton`.  All parameters are passed by name.  The state variable in `points.data` is
+    `plastic`, the inverse plastic metric C_p^-1 (3, 3).
 
     Raises
     ------
@@ -98,7 +99,7 @@ class MohrCoulomb(Frictional):
 
     @staticmethod
     def solution(trial, bulk, shear, sine, sine_flow, strength, cutoff):
-        """Return, with derivatives, the final stress components, Pa, and a flag: 1 in plastic flow, else 0."""
+        """Return the final stress components, Pa, their derivatives, and a flag: 1 in plastic flow, else 0."""
         x, axes = eigen(trial["b"])
         with np.errstate(invalid="ignore", divide="ignore"):  # in a diverging iterate, which is rejected later
             e = np.log(x) / 2
@@ -129,9 +130,9 @@ class MohrCoulomb(Frictional):
 
 
 def _returned(e: NDArray, bulk: NDArray, shear: NDArray, sine: NDArray, sine_flow: NDArray, *limits: NDArray) -> tuple:
-    """Return principal Kirchhoff stresses (n, 3), Pa, their derivatives d/de (n, 3, 3), and flags (n,) of plastic flow.
+    """Return principal Kirchhoff stresses (n, 3), Pa, their derivatives (n, 3, 3) by e, and flags (n,) of plastic flow.
 
-    e (n, 3): principal trial strains, the largest first; the other arguments are parameters (n,) of the law.
+    e (n, 3): principal trial strains, in descending order.  The other arguments are parameters (n,) of the law.
     """
     elastic = (bulk - 2 * shear / 3)[:, None, None] * np.ones((3, 3)) + 2 * shear[:, None, None] * np.eye(3)
     t, slopes = np.einsum("nij,nj->ni", elastic, e), elastic
@@ -140,7 +141,7 @@ def _returned(e: NDArray, bulk: NDArray, shear: NDArray, sine: NDArray, sine_flo
         parameters = elastic, bulk, shear, sine, sine_flow, *limits
 
         trial, rows = t.copy(), np.flatnonzero(flows)
-        for few in (FACE, EDGES, ALL):  # the main face is valid for most points, an edge for most others
+        for few in (FACE, EDGES, ALL):  # most stresses return to the main face, most others to an edge
             at = _Return(trial[rows], *(v[rows] for v in parameters))
             ends, of_trial, violation = at.end(few)
             accepted = violation <= NEAR**2 * shear[rows] if few is not ALL else slice(None)
@@ -152,7 +153,7 @@ def _returned(e: NDArray, bulk: NDArray, shear: NDArray, sine: NDArray, sine_flo
 
 
 class _Surface:
-    """Yield surface for ordered principal stresses; p, q, k, T (n,): 1 + sin phi, 1 - sin phi, 2 c cos phi, T."""
+    """Yield surface for ordered principal stresses, with p = 1 + sin phi, q = 1 - sin phi, k = 2 c cos phi, and T."""
 
     def __init__(self, sine: NDArray, strength: NDArray, cutoff: NDArray):
         self.p = 1 + sine
@@ -161,12 +162,12 @@ class _Surface:
         self.T = cutoff
 
     def outside(self, t: NDArray) -> NDArray:
-        """Return the largest value (n,), Pa, of the yield functions at stresses t (n, 3); > 0 outside the surface."""
+        """Return the largest yield function (n,), Pa, at stresses t (n, 3).  It is > 0 outside the yield surface."""
         return np.maximum(self.p * t[:, 0] - self.q * t[:, 2] - self.k, t[:, 0] - self.T)
 
 
 class _Return:
-    """Return mapping of ordered trial stresses t (n, 3), Pa, outside the yield surface."""
+    """Return mapping of principal trial stresses t (n, 3), Pa, in descending order, outside the yield surface."""
 
     def __init__(self, t, elastic, bulk, shear, sine, sine_flow, strength, cutoff):
         self._trial = t
@@ -191,9 +192,9 @@ class _Return:
         )
 
     def end(self, few: slice) -> tuple[NDArray, NDArray, NDArray]:
-        """Return final stresses (n, 3), Pa, their derivatives with respect to t (n, 3, 3), and `_violation` (n,), Pa.
+        """Return final stresses (n, 3), Pa, their derivatives (n, 3, 3) by t, and their `_violation` (n,), Pa.
 
-        few: the slice of `_faces` on which stresses may end; `ALL` includes the vertices.
+        few: slice of `_faces` with the possible faces and edges of the final stress; `ALL` includes the vertices too.
         """
         with np.errstate(all="ignore"):  # vertices at infinity
             ends = [self._on(faces) for faces in self._faces[few]]
@@ -227,7 +228,7 @@ class _Return:
         return t, slopes, self._violation(t, multipliers.T)
 
     def _at(self, t: NDArray, conditions: Callable) -> tuple[NDArray, NDArray, NDArray]:
-        """Return stresses t at a vertex, zero derivatives and the violation; conditions: function like `_in_apex`."""
+        """Return stresses t at a vertex, zero derivatives and the violation.  conditions: function like `_in_apex`."""
         drop = self._trial - t
         mean = drop.mean(axis=1)
         plastic = drop / (2 * self._G)[:, None] + (mean / (3 * self._K) - mean / (2 * self._G))[:, None]

@@ -3,7 +3,7 @@
 
 A law is evaluated at F F_i.  F is relative to the seeded state, and F_i is an initial stretch at each point.  The soil
 responds as if loading had caused its initial stress.  Volumes, porosities and conductivities refer to the seeded state.
-F_i is (3, 3), also in plane strain.  Laws with the state `plastic` use C_p^-1 in place of F_i.
+F_i is (3, 3), also in plane strain.  Laws with the state variable `plastic` use C_p^-1 in place of F_i.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from mpm_dolfinx.forms.axes import block, embedded, planar
 from mpm_dolfinx.materials.skeleton import Field, Skeleton
 
 AT_REST = " at rest"
-"""Suffix of the names of seeded values of state variables; a point has yielded if its state differs from them."""
+"""Suffix of the names of state variables at seeding.  A point has yielded if its state differs from that at seeding."""
 
 
 def stressed(m: Skeleton, knows_space: bool) -> Skeleton:
-    """Return a material in which the initial stress, or the strain that causes it, is a point field that is set later.
+    """Return a material with a point field, set later, for its initial stress or for the strain that causes it.
 
-    knows_space: whether the material's law accepts F (3, 3).
+    knows_space: whether the material's law accepts F (3, 3)
     """
     if "initial_stress" in (names := [f.name for f in fields(m)]):
         own = m.initial_stress if callable(m.initial_stress) else _everywhere(m.initial_stress)

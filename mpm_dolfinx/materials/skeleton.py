@@ -25,20 +25,22 @@ from mpm_dolfinx.pores.retention import check_retention
 Field = float | Sequence[float] | Callable[[NDArray[np.float64]], ArrayLike]
 """A constant (number or vector), or a function of the reference positions X (n, d), m, that returns (n, ...).
 
-X are points of one process.  Several processes refuse values that depend on the other positions, as a mean does.
+X are the points of one process.  On several processes, values that depend on other positions, like a mean, raise
+ValueError.
 """
 
 BY_SCENE = ("dt", "cell_size")
 """Arguments that laws receive from the scene: time since the start of the step, s; mean edge length of a cell, m."""
 
 DRIED = ("suction", "suction_at_start")
-"""States that the scene sets: the suction max(-p, 0), Pa, at the end of a substep, and at seeding."""
+"""State variables that the scene sets: the suction max(-p, 0), Pa, at the end of a substep and at seeding."""
 
 LOCKING = 0.43
-"""Poisson's ratio above which cells use the mean dilatation, which doubles the run time of a step.
+"""Poisson's ratio nu above which cells use F-bar.  F-bar doubles the run time of a step.
 
-Errors of the drained beam's tip deflection without and with mean dilatation, h = 0.015 m: -0.02 and +0.22 % (nu = 0.3),
--0.44 and +0.21 % (0.45), -2.0 and +0.21 % (0.49), -10.3 and -0.02 % (0.499).  For h = 0.06 m: -56, -0.4 % (0.499).
+Errors of the drained beam's tip deflection with h = 0.015 m, without F-bar: -0.02 % at nu = 0.3, -0.44 % at nu = 0.45,
+-2.0 % at nu = 0.49, -10.3 % at nu = 0.499.  Errors with F-bar: +0.22 % at nu = 0.3, +0.21 % at nu = 0.45 and 0.49,
+-0.02 % at nu = 0.499.  With h = 0.06 m and nu = 0.499: -56 % without F-bar, -0.4 % with F-bar.
 """
 
 SEPARATION = 1e-4
@@ -73,23 +75,26 @@ class Skeleton:
         the cell at the start of the substep, Pa).
     retention
         Retention curve and relative permeability: `VanGenuchten`, `Gardner`, `BrooksCorey` or a user-defined object,
-        see `retention`; keyword only.  With None the pores stay saturated.
+        see `retention`.  It is passed by name.  With None the pores stay saturated.
 
-    A law adds its parameters as fields of the dataclass and defines one of the static methods below.  Their arguments
-    may be F, and fields, properties and state of the law.  F is (d, d), in axisymmetry (3, 3) with the circumferential
-    stretch last, see `axes`.  In plane strain F is (3, 3), with the out-of-plane stretch last, in two cases: if Q1
-    cells would lock, and for soil with an initial stress.  If the law rejects this shape, F is (2, 2).
+    A law adds its parameters as fields of the dataclass and defines one of the static methods below.  Arguments of a
+    method may be F, and the law's fields, properties and state variables.  F is (d, d).  In axisymmetry F is (3, 3),
+    with the circumferential stretch last, see `axes`.  In plane strain F is (3, 3), with the out-of-plane stretch last,
+    in two cases: if Q1 cells would lock, and for soil with an initial stress.  If the law does not accept this, F is
+    (2, 2).
 
     energy
         Stored energy psi per reference volume, Pa.  Stress and tangent are UFL's derivatives.
     kirchhoff
         Kirchhoff stress tau = J sigma', Pa, (d, d) or (3, 3), of a law without an energy.  UFL gives the tangent.
 
-    The history variables are the law's `state`: initial values by name.  `update` (F, ...) -> {name: UFL} computes them
-    at the points after every converged step.  If a new value is not finite, the time step is reduced.
+    The law's `state` contains the initial values of the history variables, by name.  `update` (F, ...) -> {name: UFL}
+    computes new values at the points after every converged step.  If a new value is not finite, the time step is
+    reduced.
 
-    A law whose stress has no closed formula has local `unknowns`: initial values of their iteration, by name.  Unknowns
-    are arguments of `kirchhoff` and `update`.  Scale unknowns and residuals to values of about one:
+    A law whose stress has no closed formula has local unknowns.  `unknowns` contains the initial values of the unknowns
+    in their iteration, by name.  Unknowns are arguments of `kirchhoff` and `update`.  Scale unknowns and residuals to
+    values of about one:
 
     residual
         Function of the law's fields, state, unknowns and `trial`.  It returns a dict: UFL of the unknown's shape for
@@ -97,28 +102,30 @@ class Skeleton:
     solution
         Alternative to residual, in numpy: function of arrays (n, ...) of the law's fields, state and `trial`.  It
         returns a dict.  Each unknown has a pair: its values (n, ...), and a dict of its derivatives (n, ..., ...) by
-        name of the trial value.  This suits return mappings with many cases, and existing codes.  Usual unknowns are
-        stress and new state.  A derivative may be a function without arguments, called when a tangent is assembled.  A
-        missing derivative is zero.  If there is no solution, return NaN or infinity; the time step is then reduced.  If
-        `energy` is not stationary in the unknowns, second derivatives are missing: Newton's method is slow.
+        name of the trial value.  `solution` suits return mappings with many cases, and existing codes.  The unknowns
+        are then usually the stress and the new state.  A derivative may be a function without arguments, called when a
+        tangent is assembled.  A missing derivative is zero.  If there is no solution, return NaN or infinity; the time
+        step is then reduced.  If `energy` is not stationary in the unknowns, Newton's method is slow, because second
+        derivatives are missing.
     trial
-        Function (F, ...) -> {name: UFL}.  Residuals depend on F through these trial values only; without `trial` they
-        have F itself as argument.  Values other than UFL are passed to `kirchhoff` and `update` only, in `trial`.
+        Function (F, ...) -> {name: UFL}.  Residuals depend on F through these trial values only.  In a law without
+        `trial`, residuals have F itself as argument.  `kirchhoff` and `update` also receive values other than UFL.
 
     All these functions may have the argument `dt`, the time since the start of the step, s, for rate-dependent laws.
-    Evaluated with the new state and dt = 0, a law must return the same stress as at the end of the step.  The argument
-    `cell_size`, the mean edge length of a cell, m, can make softening independent of the grid.
+    With the new state and dt = 0, a law must return the stress at the end of the step.  The argument `cell_size` is the
+    mean edge length of a cell, m.  It can make softening independent of the grid.
 
-    A law that depends on suction has the state `suction`: 0.0, and optionally `suction_at_start`: 0.0.  The scene sets
-    max(-p, 0), Pa: the first at the end of a substep, the second at seeding.  Laws with unknowns use it in `trial`.
+    A law that depends on suction has the state variable `suction`, and optionally `suction_at_start`, both initially
+    0.0.  The scene sets `suction` to max(-p, 0), Pa, at the end of each substep, and `suction_at_start` to this value
+    at seeding.  Laws with local unknowns use `suction` in `trial`.
 
     For every law, bulk and shear also scale the ghost penalty, the fixed-stress coefficient and the pressure damping.
 
     Raises
     ------
     ValueError
-        A constant is out of its range.  The scene raises it for fields out of range, conflicting names or shapes, and
-        functions that raise errors or do not return UFL of the required shape.
+        A constant is out of its range.  The scene raises ValueError for fields out of range, for conflicting names or
+        shapes, and for functions that raise errors or do not return UFL of the required shape.
 
     Examples
     --------
@@ -153,7 +160,7 @@ class Skeleton:
     dilates: ClassVar[bool] = False
     """Whether the law has an angle of `dilation`."""
     elastic_hencky: ClassVar[bool] = False
-    """Whether stresses follow from elastic strains by Hencky's law; they then determine the elastic energy."""
+    """Whether stresses follow from elastic strains by Hencky's law.  The stresses then determine the elastic energy."""
     linear: ClassVar[bool] = False
     """Whether the stress is linear in F; a factorisation is then reused until active cells or step size change."""
     state: ClassVar[Mapping[str, ArrayLike]] = {}
@@ -197,7 +204,7 @@ class Skeleton:
         drains = getattr(self.conductivity_law, "specific_yield", 0.0)
         if drains and self.retention is not None:
             raise ValueError(
-                f"{type(self).__name__}: retention and a specific yield {drains:g}, must be only one of them"
+                f"{type(self).__name__}: has retention and a specific yield {drains:g}, must have only one of them"
             )
         _check(self, "porosity", lambda v: v >= drains, f">= the specific yield {drains:g}")
         if not callable(self.porosity):
@@ -240,19 +247,19 @@ class Skeleton:
 
     @classmethod
     def kirchhoff_in_plane(cls, F, values: Mapping[str, object]):
-        """Return the Kirchhoff stress of a law without an energy, Pa, in the shape of F, as UFL."""
+        """Return the Kirchhoff stress, Pa, of a law without an energy, as UFL in the shape of F."""
         d = F.ufl_shape[0]
         tau = cls._kirchhoff(F, values, (d, d))
         return ufl.as_matrix([[tau[a, b] for b in range(d)] for a in range(d)])
 
     @classmethod
     def _kirchhoff(cls, F, values: Mapping[str, object], shape: tuple[int, int]):
-        """Return the Kirchhoff stress, `shape` or (3, 3), Pa, as UFL; it depends on F, or on local unknowns."""
+        """Return the Kirchhoff stress, Pa, as UFL of shape `shape` or (3, 3); it depends on F, or on local unknowns."""
         return expression(cls.kirchhoff, [shape, (3, 3)], "" if cls.unknowns else "F", F=F, **values)
 
     @classmethod
     def out_of_plane(cls, F, values: Mapping[str, object]):
-        """Return the out-of-plane effective Cauchy stress in plane strain, Pa, as UFL; None if the law has none.
+        """Return the out-of-plane effective Cauchy stress, Pa, in plane strain as UFL, or None if it is not defined.
 
         F: deformation gradient (2, 2), a UFL variable; values: UFL values of the parameters and of the state.
         """
@@ -279,7 +286,7 @@ class Skeleton:
 
     @property
     def nearly_incompressible(self) -> bool:
-        """Whether Q1 cells would lock; they then use the mean dilatation of each cell (`mean_dilatation`)."""
+        """Whether Q1 cells would lock.  Such cells use F-bar, see `mean_dilatation`."""
         return self.poisson > LOCKING
 
     @property
@@ -288,12 +295,13 @@ class Skeleton:
         return self.bulk + 4 / 3 * self.shear
 
     def pressure_damping(self) -> float:
-        """Return the damping coefficient tau, 1/Pa: 1/4, or 1/2 for laws with a state, of the macroelement's value.
+        """Return the damping coefficient tau, 1/Pa: a fraction of the value for macroelements.
 
-        For macroelements of 2 x 2 cells this value is 3 alpha^2 / (8 (lambda + 3G)).  A quarter of it gives better
-        conditioning and smears less (Silvester and Kechkar 1990; Camargo, White and Borja 2021).  The value for 2 x 2 x
-        2 cells is up to 56 % smaller.  It would not damp pressures that alternate along two axes only, like
-        checkerboards in plane strain.  Only pressure increments are damped; oscillations due to first yield remain.
+        The fraction is 1/4, or 1/2 for laws with a state.  For macroelements of 2 x 2 cells the value is 3 alpha^2 / (8
+        (lambda + 3G)).  A quarter of this value gives better conditioning and smears less (Silvester and Kechkar 1990;
+        Camargo, White and Borja 2021).  The value for 2 x 2 x 2 cells is up to 56 % smaller.  The smaller value would
+        not damp pressures that alternate along two axes only, like checkerboards in plane strain.  tau damps pressure
+        increments only; oscillations due to first yield remain.
         """
         lam = self.bulk - 2 * self.shear / 3
         return (0.5 if self.state else 0.25) * self.biot**2 * 3 / (8 * (lam + 3 * self.shear))
@@ -304,7 +312,7 @@ class Skeleton:
 
 
 def constants_of(material: Skeleton) -> list[str]:
-    """Return the names of a material's constants, which may vary with position."""
+    """Return the names of a material's constants.  The constants may vary with position."""
     return [f.name for f in fields(material) if f.name not in ("conductivity_law", "retention")]
 
 
@@ -316,7 +324,7 @@ def check_given(obj, allowed: Mapping[str, str]) -> None:
 
 
 def _check(obj, name: str, test: Callable, allowed: str) -> None:
-    """Raise ValueError for a constant, or the first value of an array, that fails a test; functions are not tested."""
+    """Raise ValueError if a constant, or a value of an array, fails a test.  Functions are not tested."""
     value = getattr(obj, name)
     if callable(value):
         return
@@ -333,9 +341,9 @@ def _check(obj, name: str, test: Callable, allowed: str) -> None:
 class Hencky(Skeleton):
     """Hencky's law: psi = lambda/2 (ln J)^2 + G sum_i (ln lambda_i)^2, with the principal stretches lambda_i.
 
-    In 2D: plane strain.  Source: Hencky (1928).  A small constant under a square root keeps the derivatives of equal
-    eigenvalues of C = F^T F finite.  Only the deviatoric part contains this constant, with zero derivative at F = I.
-    The stress at F = I is therefore exactly zero.  Parameters as for `Skeleton`.
+    2D means plane strain.  Source: Hencky (1928).  A small constant under a square root keeps the derivatives of equal
+    eigenvalues of C = F^T F finite.  Only the deviatoric part of psi contains this constant.  The derivative of this
+    part is zero at F = I, so that the stress at F = I is exactly zero.  Parameters as for `Skeleton`.
     """
 
     @staticmethod
@@ -354,7 +362,7 @@ class Hencky(Skeleton):
 
 
 def _deviatoric(F):
-    """Return sum l_i^2 - (sum l_i)^2 / 3 of the logarithmic stretches l_i of F, with axis 3 principal, as UFL."""
+    """Return `sum l_i^2 - (sum l_i)^2 / 3` as UFL, with the logarithmic stretches l_i of F.  Axis 3 is principal."""
     whole = F.T * F
     C = ufl.as_matrix([[whole[i, j] for j in (0, 1)] for i in (0, 1)])
     return _stretch_difference(C) ** 2 / 2 + (ufl.ln(ufl.det(C)) / 2 - ufl.ln(whole[2, 2])) ** 2 / 6
@@ -372,7 +380,7 @@ def _stretch_difference(C):
 
 
 def _eigenvalues(C, separation: float = SEPARATION):
-    """Return the eigenvalues of a symmetric 2x2 or 3x3 tensor as UFL; separation: least distance of two eigenvalues."""
+    """Return the eigenvalues of a symmetric 2x2 or 3x3 tensor as UFL.  separation: least distance of two of them."""
     if C.ufl_shape[0] == 2:
         mean = (C[0, 0] + C[1, 1]) / 2
         radius = ufl.sqrt((C[0, 0] - C[1, 1]) ** 2 + 4 * C[0, 1] ** 2 + separation**2) / 2
@@ -388,7 +396,7 @@ def _eigenvalues(C, separation: float = SEPARATION):
 class NeoHookean(Skeleton):
     """Compressible neo-Hookean law: psi = G/2 (F:F - d - 2 ln J) + lambda/2 (ln J)^2.
 
-    In 2D: plane strain.  Source: Simo and Pister (1984).  Parameters as for `Skeleton`.
+    2D means plane strain.  Source: Simo and Pister (1984).  Parameters as for `Skeleton`.
     """
 
     @staticmethod
@@ -401,7 +409,7 @@ class NeoHookean(Skeleton):
 
 @dataclass(frozen=True)
 class LinearElastic(Skeleton):
-    """Linear elasticity of small strain: psi = lambda/2 (tr eps)^2 + G eps:eps, eps = sym F - I.
+    """Linear elasticity of small strain: psi = lambda/2 (tr eps)^2 + G eps:eps with eps = sym F - I.
 
     The law is not objective; use it for small rotations only.  Parameters as for `Skeleton`.
     """
@@ -431,7 +439,7 @@ def kozeny_carman(conductivity, porosity, porosity0):
 
 
 def filled(p, suction):
-    """Return the saturation of drainable pores at a pressure p, Pa: a cubic, 0 at -`suction` and 1 at `suction`."""
+    """Return the saturation of drainable pores at a pressure p, Pa: a cubic from 0 at -`suction` to 1 at `suction`."""
     x = ufl.max_value(0.0, ufl.min_value(1.0, (1 + p / suction) / 2))
     return x**2 * (3 - 2 * x)
 
@@ -442,9 +450,9 @@ class unsaturated:
 
     The conductivity falls from k at p = `suction` to `least` * k at p = -`suction`, by a smooth cubic (Bathe and
     Khoshgoftaar 1979).  The drainable porosity empties along the same cubic; other pores stay full.  The soil's weight
-    is that with all pores full.  The law uses the pressure at the start of each substep.  Steady flow therefore needs
+    is computed with full pores.  The law uses the pressure at the start of each substep.  Steady flow therefore needs
     steps of about h^2 / c_v, with the cell size h and the coefficient of consolidation c_v.  In such a step a free
-    surface crosses less than a cell.
+    surface moves by less than a cell.
 
     Parameters
     ----------
@@ -453,7 +461,8 @@ class unsaturated:
     least
         Conductivity of drained soil, divided by that of saturated soil, in (0, 1).
     specific_yield
-        Drainable porosity, in [0, 1), at most the porosity.  Use 0 for steady flow only: a free surface falls at once.
+        Drainable porosity, in [0, 1), at most the porosity.  Use 0 for steady flow only: with 0, a free surface falls
+        at once.
     """
 
     suction: float
@@ -480,11 +489,12 @@ class Fluid:
     bulk
         Bulk modulus K_w, Pa, > 0; infinite for an incompressible fluid.
     density
-        Density rho_w at zero pressure, kg/m^3, > 0, used for the weight; flowing fluid has rho_w exp(p / K_w).
+        Density rho_w at zero pressure, kg/m^3, > 0.  Weights are computed with rho_w.  Flowing fluid has the density
+        rho_w exp(p / K_w).
     gravity
-        Acceleration g that defines hydraulic conductivities, m/s^2, > 0.  By default the scene's gravity if it is a
-        constant vector other than zero, else 9.81.  With units other than m and s, this argument is required in scenes
-        without gravity, or with gravity as a function of time.
+        Acceleration g that defines hydraulic conductivities, m/s^2, > 0.  By default it is the scene's gravity if this
+        is a constant vector other than zero, else 9.81.  With units other than m and s, this argument is required in
+        scenes without gravity, or with gravity as a function of time.
 
     Raises
     ------

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: MIT
-"""Drucker and Prager's law with cohesion that decreases with slip, and a viscosity.
+"""Drucker and Prager's law with a viscosity, and with a cohesion that decreases with slip.
 
 Softening localises in shear bands one cell wide.  If the cohesion depended on strain, the dissipated work would
-decrease with the cell size.  The cohesion therefore depends on the slip gamma h of a band, with the plastic shear
-strain gamma and the cell size h (crack band: Bazant and Oh 1983; Pietruszczak and Mroz 1981),
+decrease with the cell size.  The cohesion therefore depends on the slip gamma h of a band.  gamma is the plastic shear
+strain, h is the cell size (crack band: Bazant and Oh 1983; Pietruszczak and Mroz 1981),
 
     c = c_0 - (c_0 - c_r) min(1, gamma h / s),
 
-so that softening along a band dissipates (c_0 - c_r) s / 2 per area, on any grid.  The viscosity is Perzyna's, f = eta
-dgamma/dt, with the yield function f.  This law is linear and integrated implicitly, and has no effect in slow loading.
+so that softening along a band dissipates the work (c_0 - c_r) s / 2 per area, on any grid.  Perzyna's viscosity is
+f = eta dgamma/dt, with the yield function f.  It is linear, integrated implicitly, and without effect in slow loading.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ GIVEN = {"residual": "in [0, cohesion] Pa", "slip": "> 0 m"}
 
 @dataclass(frozen=True, kw_only=True)
 class SofteningDruckerPrager(DruckerPrager):
-    """Drucker-Prager soil with a cohesion that decreases with slip, and a viscosity.
+    """Drucker-Prager soil with a viscosity, and with a cohesion that decreases with slip.
 
     Parameters
     ----------
@@ -42,9 +42,9 @@ class SofteningDruckerPrager(DruckerPrager):
     viscosity
         Viscosity eta of Perzyna's law f = eta dgamma/dt, Pa s, >= 0, with the yield function f of `DruckerPrager`.
 
-    Other parameters: see `DruckerPrager`, without hardening.  State variables: `plastic`, the inverse plastic metric
-    C_p^-1 (3, 3), and `hardened`, xi gamma, with the coefficient xi of the cohesion in the yield function and the
-    plastic shear strain gamma.  Soil in tension at the apex of the cone has the residual cohesion.
+    Other parameters: see `DruckerPrager`, without hardening.  State variables: `plastic` is the inverse plastic metric
+    C_p^-1 (3, 3), and `hardened` is xi gamma.  xi is the coefficient of the cohesion in the yield function, gamma is
+    the plastic shear strain.  Soil in tension at the apex of the cone has the residual cohesion.
 
     Raises
     ------

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Trial elastic strain of multiplicative plasticity, and isotropic functions, in UFL and in numpy.
 
-In UFL, isotropic functions of a tensor are Newton's interpolation polynomials at its eigenvalues.  They are exact for
-smooth functions of each eigenvalue.  They remain smooth at equal eigenvalues, because `_eigenvalues` separates them.
-If the principal values have kinks and depend on all three eigenvalues, `Coaxial` gives exact derivatives in numpy.
+In UFL, isotropic functions of a tensor are Newton's interpolation polynomials at its eigenvalues.  The polynomials are
+exact for smooth functions of each eigenvalue.  They remain smooth at equal eigenvalues, because `_eigenvalues`
+separates equal eigenvalues.  If the principal values have kinks and depend on all three eigenvalues, `Coaxial` gives
+exact derivatives in numpy.
 """
 
 from __future__ import annotations
@@ -49,8 +50,9 @@ class Isotropic:
 class Trial:
     """Trial elastic strain for a deformation gradient, in UFL.
 
-    F: deformation gradient (d, d); plastic: C_p^-1 (3, 3); prestretch: principal elastic stretches (3,) at F = I, or
-    None.
+    F: deformation gradient (d, d).
+    plastic: C_p^-1 (3, 3).
+    prestretch: principal elastic stretches (3,) at F = I, or None if all are 1.
     """
 
     def __init__(self, F, plastic, prestretch=None):
@@ -77,7 +79,7 @@ def symmetric(values):
 
 
 def eigen(b: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return eigenvalues (n, 3) and axes (n, 3, 3), as columns, of tensors with components b (n, 4) or (n, 6)."""
+    """Return eigenvalues (n, 3) and axes (n, 3, 3) of tensors with components b (n, 4) or (n, 6).  Axes are columns."""
     n = len(b)
     if b.shape[1] == len(SPACE):
         full = np.empty((n, 3, 3))
@@ -101,8 +103,9 @@ def eigen(b: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float
 class Coaxial:
     """Tensors coaxial with given tensors.
 
-    x (n, 3), axes (n, 3, 3): eigenvalues and axes of the given tensors, see `eigen`; y (n, 3): principal values of the
-    coaxial tensors; plane: whether tensors have the components in `PLANE`, for plane strain and axisymmetry.
+    x (n, 3), axes (n, 3, 3): eigenvalues and axes of the given tensors, see `eigen`.
+    y (n, 3): principal values of the coaxial tensors.
+    plane: whether the given tensors have the components in `PLANE`, as in plane strain and axisymmetry.
     """
 
     def __init__(self, x: NDArray[np.float64], axes: NDArray[np.float64], y: NDArray[np.float64], plane: bool):
@@ -125,10 +128,10 @@ class Coaxial:
         return out
 
     def tangent(self, slopes: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return derivatives (n, 6, 4 or 6) of `values` with respect to the given components; slopes (n, 3, 3): dy/dx.
+        """Return derivatives (n, 6, 4 or 6) of `values` by the given tensors' components.  slopes (n, 3, 3): dy/dx.
 
-        In principal axes, off the diagonal, dy_ij = (y_i - y_j) / (x_i - x_j) dx_ij.  For x_i = x_j the limit is
-        (dy_i/dx_i - dy_i/dx_j) dx_ij, because an isotropic function has y_i = y_j there.
+        In principal axes, off-diagonal derivatives follow from dy_ij = (y_i - y_j) / (x_i - x_j) dx_ij.  For x_i = x_j
+        the limit is (dy_i/dx_i - dy_i/dx_j) dx_ij, because an isotropic function has y_i = y_j there.
         """
         x = self._x
         y = self._y

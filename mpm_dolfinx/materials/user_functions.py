@@ -2,19 +2,20 @@
 """User-defined functions that return UFL.
 
 The name of an argument determines its value.  Laws and conductivities belong to materials: see `skeleton.Skeleton`.
-`Simulation` takes terms of the balances, integrated over the configuration at the start of the step.  Arguments:
+`Simulation` takes terms of the balances, integrated over the configuration at the start of the step.  Their arguments:
 
 points
     Quadrature points.  `points.dx` is their measure, which adds up to the volumes of the material points.
     `points.value(f)` and `points.grad(f)` are the value and gradient of f = u or v; the gradient is (3, 3) in
     axisymmetry, with f_r / r.  `points.F` is the deformation gradient at the start of the step, in the shape of grad u,
     with the volume ratio as determinant.  `points.position` and `points.displacement` are values at the start of the
-    step; displacements count from the start of the run, or from a stage that set them to zero.  Other names: fields of
-    materials that are functions of position, and the laws' state.
+    step; displacements count from the start of the run, or from a stage that set them to zero.  Other attributes are
+    parameters that are functions of position, and the laws' state variables.
 t
-    Time at which the balances hold, s, a UFL constant: the end of the step or of its first substep.
+    Time at which the balances hold, s, as a UFL constant.  It is the end of the step or of its first substep.
 
-A function in `terms` is added to the balance of momentum, int P : grad v dV - loads + term = 0:
+A function in `terms` is added to the balance of momentum, `int P : grad v dV - loads + term = 0`.  It may also have
+these arguments:
 
 u
     Increment of the displacement in the step, m; Q1.
@@ -24,14 +25,15 @@ v
 velocity
     Velocity, m/s, from the scheme of time integration, for viscous resistance.
 dt
-    Time since the start of the step, s, a UFL constant; u / dt is the mean velocity.
+    Time since the start of the step, s, as a UFL constant; `u / dt` is the mean velocity.
 
 The tangent of a term with v is assumed to be unsymmetric.
 
-The function of a `Source` returns the inflow as a volume rate of fluid at zero pressure, m^d/s:
+The function of a `Source` returns the inflow as a volume rate of fluid at zero pressure, m^d/s.  It may also have
+these arguments:
 
 q
-    Test function, constant in the cells: the source is s * q * points.dx with s in 1/s.
+    Test function, constant in the cells.  The source is `s * q * points.dx` with s in 1/s.
 p
     Pore pressure, Pa, constant in the cells.
 """
@@ -74,7 +76,8 @@ def expression(function: Callable, shapes: Sequence[tuple[int, ...]], of: str = 
     Raises
     ------
     ValueError
-        As in `call`; or the result is no UFL, has another shape, or does not depend on the argument `of`.
+        The function raises an error as in `call`, or its result is not UFL, has a wrong shape, or does not depend on
+        the argument `of`.
     """
     value = call(function, **available)
     allowed = f"UFL of shape {' or '.join(map(str, shapes))}{f' that depends on {of}' if of else ''}"
@@ -106,12 +109,12 @@ def _check_parts(what: str, out: ufl.core.expr.Expr) -> None:
 
 
 def named(what: str, given, shapes: Mapping[str, tuple[int, ...]], some: bool = False) -> dict:
-    """Return the dict from a user-defined function as UFL with the given shapes; some: whether names may be missing.
+    """Return the dict from a user-defined function as UFL with the given shapes.  some: whether names may be missing.
 
     Raises
     ------
     ValueError
-        The result is no dict of UFL with these names and shapes, or all values are constant.
+        The result is not a dict of UFL with these names and shapes, or all values are constant.
     """
     instance(f"{what}: its result", given, dict)
     allowed, out = f"{'some of ' if some else ''}the names and shapes {dict(shapes)}", {}
@@ -119,7 +122,7 @@ def named(what: str, given, shapes: Mapping[str, tuple[int, ...]], some: bool = 
         try:
             out[name] = ufl.as_ufl(value)
         except Exception as error:  # UFL has several kinds
-            raise ValueError(f"{what}: {name} = {line(value)}, must be UFL, of {allowed}") from error
+            raise ValueError(f"{what}: {name} = {line(value)}, must be UFL; the dict must have {allowed}") from error
         _check_parts(f"{what}: {name}", out[name])
     found = {name: value.ufl_shape for name, value in out.items()}
     if not found or found.items() - shapes.items() or not (some or len(found) == len(shapes)):
@@ -135,7 +138,7 @@ def form(kind: str, function: Callable, **available) -> ufl.Form:
     Raises
     ------
     ValueError
-        As in `call`; or the result is no form, or has integrals over the grid.
+        The function raises an error as in `call`, or its result is not a form, or has integrals over the grid.
     """
     out, dx = call(function, **available), available["points"].dx
     allowed = "a form with points.dx"
@@ -154,7 +157,7 @@ def term_of(term: Callable, unknown: ufl.Coefficient, test: ufl.Argument, **avai
     Raises
     ------
     ValueError
-        As in `form`; or the term depends on neither the unknown nor v.
+        The term raises an error as in `form`, or depends on neither the unknown nor v.
     """
     out = form("terms", term, **available)
     if out.arguments():
@@ -177,7 +180,7 @@ def compiling(what: str, allowed: str) -> Iterator[None]:
 
 
 def _is_ours(error: Exception) -> bool:
-    """Return whether this package raised an error; its message then names the object."""
+    """Return whether this package raised an error.  The error's message then names the object."""
     frames = error.__traceback__
     while frames.tb_next is not None:
         frames = frames.tb_next

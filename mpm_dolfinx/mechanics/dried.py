@@ -2,7 +2,7 @@
 """Derivatives of nodal forces with respect to the cells' pressures, through laws that depend on suction.
 
 The stress of a law that depends on suction depends on the pressure twice: through the law, and through the term chi p
-of Bishop's stress. In cells with mean dilatation, the mean stress pi depends on the pressure too.
+of Bishop's stress. In cells with F-bar, the mean stress pi depends on the pressure too.
 """
 
 from __future__ import annotations
@@ -20,12 +20,13 @@ from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
 
 
 def suction_sums(points: FormPoints, F, slopes: Sequence, locks: bool) -> CellSums | None:
-    """Return the sums that `OfSuction` needs, over the pieces of one part in each cell; None if it needs no sums.
+    """Return the sums over one part's pieces in each cell that `OfSuction` needs, or None if it needs no sums.
 
-    points: integration points of the pieces; locks: whether their law uses the mean dilatation; F: deformation gradient
-    (d, d), a UFL variable; slopes: UFL derivatives of stresses with respect to the pressure, empty for laws without
-    suction.  The stresses are the first Piola-Kirchhoff stress (d, d) and, with mean dilatation, the mean stress pi
-    conjugate to theta.
+    points: integration points of the pieces.
+    F: deformation gradient (d, d), a UFL variable.
+    slopes: UFL derivatives of two stresses with respect to the pressure, empty for laws without suction.  The stresses
+    are the first Piola-Kirchhoff stress (d, d) and, with F-bar, the mean stress pi conjugate to theta.
+    locks: whether the law of the pieces uses F-bar.
     """
     share = 1 / ufl.det(points.F)
     tensors = [share * ufl.diff(ufl.det(F), F)] if locks else []
@@ -37,8 +38,9 @@ def suction_sums(points: FormPoints, F, slopes: Sequence, locks: bool) -> CellSu
 class OfSuction:
     """Derivatives of the nodal forces with respect to the cells' pressures, for laws that depend on suction.
 
-    dim: number of axes; dilatation: mean dilatation of cells, None if no cell would lock; sums: results of
-    `suction_sums`, one for each part of the points (`SceneMaterials.parts`).
+    dim: number of axes.
+    dilatation: volume ratios of cells for F-bar, or None if no cell would lock.
+    sums: results of `suction_sums`, one for each part of the points (`SceneMaterials.parts`).
     """
 
     def __init__(self, dim: int, dilatation: MeanDilatation | None, sums: Sequence[CellSums | None]):
@@ -48,7 +50,7 @@ class OfSuction:
         self._free = {number: of for number, of in found.items() if number not in self._locked}
 
     def rows(self, data: QuadratureData, given: Sequence[Given]) -> list[tuple[NDArray[np.int32], NDArray[np.float64]]]:
-        """Return pairs: cells (c,), and derivatives (c, n), m^(d-1), of their nodal forces with respect to pressure.
+        """Return pairs of cells (c,) and derivatives (c, n), m^(d-1), of their nodal forces by their pressures.
 
         given: values that the forms of each part are given.
         """
@@ -64,5 +66,5 @@ class OfSuction:
 
 
 def _padded(values: NDArray[np.float64], width: int) -> NDArray[np.float64]:
-    """Return values (m, n), padded with zeros to rows of the given width."""
+    """Return values (k, n) padded with zeros, in rows of the given width."""
     return np.pad(values, ((0, 0), (0, width - values.shape[1])))

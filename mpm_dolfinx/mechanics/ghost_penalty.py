@@ -1,19 +1,21 @@
 # SPDX-License-Identifier: MIT
 """Ghost penalty: nearly empty cells follow the deformation of fuller neighbours (Burman 2010, Coombs 2023).
 
-The term gamma s 2G h/3 int [d_n u].[d_n v] dS acts on the displacement increment u of the step. gamma is `GHOST`, and s
-is the strength of a face (see below). G is the shear modulus, h the cell size, and [d_n u] the jump of the normal
-derivative.  Nearly empty cells then hardly affect conditioning and accuracy.  The penalty resists each step's increment
-like a viscosity, so it must not act on load-bearing cells:
+The term `gamma s 2G h/3 int [d_n u].[d_n v] dS` acts on the displacement increment u of the step.  gamma is `GHOST`,
+and s is the strength of a face (see below).  G is the shear modulus, h is the cell size, and [d_n u] is the jump of the
+normal derivative.  Nearly empty cells then hardly affect conditioning and accuracy.  The penalty resists each step's
+increment like a viscosity, so it must not act on load-bearing cells:
 
-* The strength s of a face falls from 1 to 0 while the emptier cell's filling rises from 0 to `RATIO` times the fuller
-  cell's.  A second factor of s is the squared ratio of the fuller cell's filling to the largest filling of the emptier
-  cell's neighbours.  A penalty between equally filled cells would resist kinks of a body.
-* The scale is the shear modulus. With lambda + 2G, nearly empty cells of nearly incompressible bodies would copy the
-  stretch of the full neighbour, against their own volume constraint.  In flowing soil the scale is less than 2G.
+* The strength s of a face has two factors.  The first factor falls from 1 to 0 while the emptier cell's filling rises
+  from 0 to `RATIO` times the fuller cell's filling.  The second factor is the squared ratio of the fuller cell's
+  filling to the largest filling of the emptier cell's neighbours.  A penalty between equally filled cells would resist
+  kinks of a body.
+* The factor 2G contains the shear modulus only.  With lambda + 2G, nearly empty cells of nearly incompressible bodies
+  would copy the stretch of the full neighbour, against their own volume constraint.  In flowing soil the factor is less
+  than 2G.
 
-With integration at the material points, any cell may hold too few points for its nodes. Then all faces of cells that
-are not full have a penalty of strength 0.2.
+With integration at the material points, any cell may hold too few points for its nodes.  All faces of cells that are
+not full therefore have a penalty of strength 0.2.
 """
 
 from __future__ import annotations
@@ -42,22 +44,22 @@ RATIO = 0.3
 result of scene "soil" in tests/plateaus.py by 1.3e-03 (relative), doubling it by 5.9e-04, and finer cells by 3.0e-02.
 """
 SPARSE, FULL = 0.2, 0.9
-"""Penalty with integration at points: its strength, and the volume fraction of the fullest cells with this penalty."""
+"""Strength of the penalty with integration at points, and volume fraction of the fullest cells with this penalty."""
 
 
 def stiffness(material: Skeleton) -> NDArray[np.float64]:
     """Return the modulus that scales the penalty, Pa: 2G, reduced for nearly incompressible laws with a state.
 
-    In nearly empty cells of flowing soil the volume constraint opposes the penalty. With 2G, ten times the penalty
-    raises a footing's limit load by 0.004 % at nu = 0.3, by 0.3 % at 0.49 and by 0.75 % at 0.499. At low nu the penalty
-    is not reduced: a smaller penalty makes Newton's method fail in frictional soil at deep penetration.
+    In nearly empty cells of flowing soil the volume constraint opposes the penalty. With the modulus 2G, a penalty ten
+    times as large raises a footing's limit load by 0.004 % at nu = 0.3, by 0.3 % at nu = 0.49, and by 0.75 % at nu =
+    0.499.  At low nu the penalty is not reduced, else Newton's method fails in frictional soil at deep penetration.
     """
     share = np.minimum(1.0, 4 * material.shear / material.oedometric) ** 2 if material.state else 1.0
     return 2 * np.maximum(YIELDING, share) * material.shear
 
 
 def kinks(grid: Grid, V: fem.FunctionSpace, strength: ufl.core.expr.Expr, power: int) -> FacetForm:
-    """Return the form int strength h^power [d_n u].[d_n v] dS over faces; h: mean cell size normal to the face, m."""
+    """Return the form `int strength h^power [d_n u].[d_n v] dS` over faces; h, m: mean cell size normal to the face."""
     n = ufl.FacetNormal(grid.mesh)("+")
     *_, across = across_faces(grid, n)
     dS = ufl.Measure("dS", domain=grid.mesh, subdomain_id=_compat.SUBDOMAIN, metadata={"quadrature_degree": 2})
@@ -115,8 +117,10 @@ class GhostPenalty:
     ) -> NDArray[np.int64]:
         """Set the volume fractions and moduli of the cells `own` (n,), owned cells that contain material.
 
-        Return all active local cells, ascending.  volume (n,), m^d: volume of the material in each cell; moduli: two
-        arrays (n,), `modulus` times this volume and `shear` times this volume. `fill` must be zero before the call.
+        Return all active local cells, ascending.  `fill` must be zero before the call.
+
+        volume (n,), m^d: volume of the material in each cell.
+        moduli: two arrays (n,), `modulus` times volume and `shear` times volume.
         """
         grid, fill = self.grid, self.fill.x.array
         fill[own] = volume / grid.volumes(own)
@@ -131,7 +135,7 @@ class GhostPenalty:
         return np.concatenate([own, ghosts])
 
     def on(self, facets: NDArray[np.int32], at_walls: NDArray[np.int32]) -> Loads:
-        """Return the penalty on faces of this process; at_walls: the faces whose cells have nodes that walls fix."""
+        """Return the penalty on faces of this process.  at_walls: faces of cells with nodes that walls fix."""
         return GhostLoads(self.form.on(facets), self.form.on(at_walls))
 
     def facets(self, facets: NDArray[np.int32]) -> NDArray[np.int32]:
@@ -141,7 +145,7 @@ class GhostPenalty:
 
 
 class GhostLoads(Loads):
-    """Ghost penalty on all inner faces of partly filled cells, and on the faces among them at walls of the grid."""
+    """Ghost penalty on all inner faces of partly filled cells, with a separate sum over the faces at walls."""
 
     def __init__(self, everywhere: FacetSum, at_walls: FacetSum):
         self._everywhere, self._at_walls = everywhere, at_walls

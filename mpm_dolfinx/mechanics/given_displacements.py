@@ -2,7 +2,8 @@
 """Prescribed displacements of sides, by penalties on cell means and weaker penalties at points; see `held_cells`.
 
 If a side lags behind its prescribed displacement, each component in each cell gets a multiplier, by the method of
-multipliers (Hestenes 1969).  Multipliers remove the lag of the means, unless the cells cannot follow the side.
+multipliers (Hestenes 1969).  The multipliers make the cell means reach the prescribed displacements, unless the cells
+cannot follow the side.
 """
 
 from __future__ import annotations
@@ -102,7 +103,7 @@ class GivenDisplacements(Acting):
     def check_start(self, place: Place) -> None:
         """Warn, once for each condition, if its side must jump at the start of a stage with inertia.
 
-        A gap is a jump if it strains the cell at the side by more than the stress there, divided by the modulus.
+        A gap is a jump if the strain that it causes in the cell exceeds the cell's stress divided by the modulus.
         """
         if not (place.inertia and place.dt):
             return
@@ -144,7 +145,7 @@ class GivenDisplacements(Acting):
         return HoldLoads(self, forms, data, held, row, own, place)
 
     def _held_points(self, place: Place, ends: Sequence[float]) -> HeldPoints:
-        """Return the integration points on sides, each on the process of its constraint, see `inner_cells`.
+        """Return the integration points on sides.  A point is on the process of its constraint, see `inner_cells`.
 
         ends: start and end of the step, s; empty if the displacement is zero.
         """
@@ -184,7 +185,7 @@ class GivenDisplacements(Acting):
         return HeldPoints(number.astype(np.int64), cell, *own, x, *np.split(values[:, 7:], [d, 3 * d, 4 * d], axis=1))
 
     def _check_meeting(self, t: float) -> None:
-        """Raise ValueError if prescribed displacements differ where two sides meet: the stress would be infinite."""
+        """Raise ValueError if displacements differ where two sides meet, because the stress there would be infinite."""
         for one, other, axes, X in self._meeting:
             jump = np.abs(self._given(one, t, X) - self._given(other, t, X))[:, axes].max(axis=1)
             if jump.max(initial=0.0) > NEAR * self._grid.least:
@@ -242,8 +243,11 @@ class GivenDisplacements(Acting):
     ) -> NDArray[np.float64]:
         """Return corners (n, 2^d, d), m, of the particle domains `ids`; domains at a held side are replaced by prisms.
 
-        tracked, m: tracked corners; volume (n,): domain volumes, in axisymmetry areas of their sections.  A prism
-        has this volume, and keeps the tracked corners on the held face: the penalty would pull a moved face back.
+        A prism has the volume of its domain.  It keeps the tracked corners on the held face, because the penalty would
+        pull a moved face back.
+
+        tracked, m: tracked corners.
+        volume (n,): volumes of the domains, in axisymmetry areas of their sections.
         """
         index = np.arange(2**self._grid.dim)
         for _, faces, _ in self._holds:
@@ -261,10 +265,13 @@ class GivenDisplacements(Acting):
 class HoldLoads(Loads):
     """Prescribed displacements in a substep.
 
-    acting: the prescribed displacements of the stage; forms, data: forms, and their points, one for each prescribed
-    component, with stiffness, direction and gap; held: geometry and stiffness of all penalties; row (m,): index in
-    `held` of each prescribed component; share (m, 2^d): fraction of each component's force on each node, without the
-    fraction that walls of the grid bear; place: time and cut domains of the substep.
+    acting: the prescribed displacements of the stage.
+    forms: forms of the penalties.
+    data: points of the forms, one for each of k prescribed components, with stiffness, direction and gap.
+    held: geometry and stiffness of all penalties.
+    row (k,): index in `held` of each component.
+    share (k, 2^d): fraction of each component's force on each node, without the fraction that walls of the grid bear.
+    place: time and cut domains of the substep.
     """
 
     stiff = True
@@ -295,9 +302,9 @@ class HoldLoads(Loads):
     def augment(self, at: At) -> bool:
         """Add the penalty forces on cell means to the multipliers of the means, on sides that lag behind.
 
-        A whole body, for example with sealed water, may resist the side's motion more stiffly than a single cell.  The
-        updates end if the side's mean gap no longer falls by half: the cells cannot follow the side any further.  The
-        mean is over the faces of each connected part of the bodies.
+        A whole body, for example undrained soil, may resist the side's motion more stiffly than a single cell.  The
+        updates end if the side's mean gap no longer falls by half, because the cells then cannot follow the side any
+        further.  The mean gap is computed over the faces of each connected part of the bodies.
         """
         if not self._place.dt:
             return False
@@ -316,7 +323,7 @@ class HoldLoads(Loads):
         return bool(more.any())
 
     def reached(self, at: At) -> NDArray[np.bool_]:
-        """Return whether each component (m,) lags at u by at most 1 / sqrt(`HOLD`) of its prescribed increment."""
+        """Return whether each component (k,) lags at u by at most `1 / sqrt(HOLD)` of its prescribed increment."""
         return np.abs(self._asked - self._along(at.nodal)) * np.sqrt(HOLD) <= np.abs(self._asked)
 
     def pulls(self, b: NDArray[np.float64]) -> None:
@@ -329,18 +336,18 @@ class HoldLoads(Loads):
             self._forms.hold.assemble_matrix(A, self.data)
 
     def moved(self, u: fem.Function) -> Loads:
-        """Return the same penalties with gaps reduced by a displacement u."""
+        """Return these penalties with gaps reduced by a displacement u."""
         out = copy(self)
         out.data = self.data.having(gap=self.data["gap"][:, 0] - self._along(u.x.array.reshape(-1, self._d)))
         return out
 
     def _along(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the displacement (m,), m, along each prescribed component, at nodal values u (nodes, d), m."""
+        """Return the displacement (k,), m, along each prescribed component, at nodal displacements u (nodes, d), m."""
         at_nodes = u[self.data.points.grid.cell_nodes[self.data.cells]]
         return np.einsum("mk,mkd,md->m", self.held.shape[self.row], at_nodes, self.data["direction"])
 
     def pull(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the force (m,), N, along each prescribed component, at nodal values u (nodes, d), m."""
+        """Return the force (k,), N, along each prescribed component, at nodal displacements u (nodes, d), m."""
         return self.data["stiffness"][:, 0] * (self.data["gap"][:, 0] - self._along(u))
 
     def pulling(self, at: At, v: NDArray[np.float64]) -> float:
@@ -348,16 +355,16 @@ class HoldLoads(Loads):
         return float(self.pull(at.nodal) @ self._along(v.reshape(-1, self._d)))
 
     def counted(self, at: At) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """See `Loads`: penalty forces on walls."""
+        """Return the penalty forces on walls, see `Loads.counted`."""
         dofs = (
             self._d * self.data.points.grid.cell_nodes[self.data.cells] + self.data["direction"].argmax(axis=1)[:, None]
         )
         return dofs.ravel(), (self.share * self.pull(at.nodal)[:, None]).ravel()
 
     def guess(self, parts: Parts, nodal: NDArray[np.float64]) -> NDArray[np.float64] | None:
-        """Return an initial guess of u; None if the conditions rotate no connected part of the bodies.
+        """Return an initial guess of u, or None if the conditions rotate no connected part of the bodies.
 
-        Parts that the conditions rotate get the rigid motion nearest to prescribed displacements; others get `nodal`.
+        Rotated parts get the rigid motion nearest to the prescribed displacements.  Other parts get `nodal`.
         """
         grid = self.data.points.grid
         if grid.axisymmetric:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Prescribed displacements of sides in cells: a stiff penalty on the mean, a weak one on deviations from the mean.
+"""Prescribed displacements of sides in cells: a stiff penalty on the mean, a weak penalty on deviations from it.
 
 A Q1 field has too few nodal displacements in a cell to satisfy constraints at many points of a side. A stiff penalty at
 each point would lock sides that are curved or inclined to the grid. The weak penalty controls the modes with zero mean
@@ -68,16 +68,18 @@ def inner_cells(
     cell: NDArray[np.int32],
     normal: NDArray[np.float64],
 ) -> NDArray[np.int64]:
-    """Return for each point of the sides the local cell (n,) whose constraint contains this point.
+    """Return for each of n points on sides the local cell (n,) whose constraint contains this point.
 
     After deformation, a side along a grid line is slightly wavy, so some points of the side lie in nearly empty cells
-    beyond the line.  Constraints there would contradict the constraints of inner cells: only a large motion of nodes
-    beyond the line, which nothing resists, could satisfy both.  The constraints of the inner cells therefore contain
-    these points too (aggregation; Badia, Verdugo and Martin 2018).
+    beyond the line.  Constraints in these cells would contradict the constraints of inner cells.  Only a large motion
+    of the nodes beyond the line could satisfy both, and nothing resists this motion.  The constraints of the inner
+    cells therefore contain these points too (aggregation; Badia, Verdugo and Martin 2018).
 
-    fill (cells,): volume fraction; sides: for each condition its prescribed components, and the extent (d,), m, of its
-    prescribed positions.  For each point: index of its condition, `number` (n,); its owned `cell` (n,); its outward
-    area vector, `normal` (n, d).
+    fill (cells,): volume fractions.
+    sides: for each condition, the prescribed components, and the extent (d,), m, of the prescribed positions.
+    number (n,): index of each point's condition.
+    cell (n,): owned cell of each point.
+    normal (n, d): outward area vector of each point.
     """
     inner = cell.astype(np.int64)
     for k, (axes, extent) in enumerate(sides):
@@ -108,14 +110,14 @@ class HeldCells:
     number, cell
         Index of the condition, and cell, of each penalty.
     x, shape, moments
-        Position, m, shape functions, and products of offsets from the cell's midpoint, m^2 and m^3, of each penalty.
-        For a penalty on a mean, the values are means over its points.
+        For each penalty: position, m, shape functions, and products of offsets from the cell's midpoint, m^2 and m^3.
+        A penalty on a mean has the means of these values over its points.
     stiffness
-        Stiffness of each penalty and component, N/m.  The stiffness on a mean, normal to a side parallel to the grid,
+        Stiffness of each penalty and component, N/m.  On means, the stiffness normal to a side parallel to the grid
         follows from the confined modulus.
     limit : (2, k, d)
-        Largest plausible force of each of k penalties on means, N: first for the skeleton, then for undrained soil.
-        The latter applies if the side is at its prescribed position.  Larger forces are numerical artefacts.
+        Largest plausible force, N, of each of k penalties on means.  limit[0] is for the skeleton.  limit[1] is for
+        undrained soil, and applies if the side is at its prescribed position.  Larger forces are numerical artefacts.
     way
         Increment (d,) of the prescribed displacement in the step, m, for each penalty.
     """
@@ -174,15 +176,17 @@ class HeldCells:
         """Return the penalties on one component, with their stiffness, gap and distribution of the force to nodes.
 
         Where a side ends at a wall, its penalties omit nodes that the wall fixes. Otherwise the free nodes of the cell
-        would compensate for the fixed ones, with an oscillation along the side. The prescribed displacement is also
-        extrapolated to the wall. If the result exceeds half of the mean over the cell, at the start or the end of the
-        step, the displacement must vary over the cell. The penalty is then omitted if others hold a free node there.
+        would compensate for the fixed nodes, with an oscillation along the side.  The prescribed displacement is also
+        extrapolated to the wall.  If the extrapolated value exceeds half of the cell's mean, at the start or the end of
+        the step, the displacement must vary over the cell.  The penalty is then omitted if other penalties of the
+        condition hold a free node of the cell.
 
-        given (conditions,): whether each prescribes component `axis`; free (nodes,): whether no wall fixes the node.
+        given (conditions,): whether each condition prescribes component `axis`.
+        free (nodes,): whether no wall fixes the node.
 
-        Return indices of the penalties (k,), their stiffness (k,), N/m, gaps (k,), m, and fractions (k, 2^d) of the
-        force on each node, without the wall's part.  Also return the index of a penalty that must move but has fixed
-        nodes only, or -1.
+        Return four arrays: indices (k,) of the penalties; their stiffness (k,), N/m; their gaps (k,), m; and fractions
+        (k, 2^d) of the force on each node, without the wall's part.  Also return the index of a penalty that must move
+        but has fixed nodes only, or -1 without such a penalty.
         """
         grid, chosen = self.grid, np.flatnonzero(given[self.number])
         nodes, x, gap, N = (v[chosen] for v in (grid.cell_nodes[self.cell], self.x, self._gap[:, axis], self.shape))
@@ -208,9 +212,11 @@ class HeldCells:
     def _held_beside(
         self, number: NDArray[np.int64], nodes: NDArray[np.int32], N: NDArray[np.float64], stuck: NDArray[np.bool_]
     ) -> NDArray[np.bool_]:
-        """Return which penalties (k,) at a wall have a free node that the same condition also holds away from walls.
+        """Return which penalties (k,) at a wall have a free node that their condition also holds away from walls.
 
-        number (k,): index of the condition; nodes, N (k, 2^d): nodes, shape functions; stuck (k, 2^d): nodes at a wall.
+        number (k,): index of the condition.
+        nodes, N (k, 2^d): nodes, and values of their shape functions.
+        stuck (k, 2^d): whether each node is at a wall.
         """
         grid = self.grid
         at_wall = stuck.any(axis=1)
@@ -227,14 +233,17 @@ class HeldCells:
     def beyond(
         self, row: NDArray, axis: NDArray, force: NDArray, reached: NDArray[np.bool_], told: Collection[int]
     ) -> list[tuple[int, NDArray[np.float64]]]:
-        """Return conditions with forces beyond their limits: index of each, and position (d,), m, of its worst force.
+        """Return for each condition with forces beyond their limits its index, and the worst force's position (d,), m.
 
         A Q1 field cannot always have the prescribed means in two neighbouring cells, as at a side on a grid line. The
-        penalties then push the side to and fro. Only the sum of the penalty forces at a node acts on the body and
-        counts in the reaction. A force thus counts as too large only if the sums at its nodes exceed their limits too.
+        forces of these penalties then oppose each other.  Only the sum of the penalty forces at a node acts on the body
+        and counts in the reaction. A force thus counts as too large only if the sums at its nodes exceed their limits
+        too.
 
-        For each of k prescribed components: row: index of the penalty; axis, force: its axis and force, N; reached:
-        whether it is at its position.  told: indices of conditions that have been reported already and are excluded.
+        row (k,): index of the penalty of each of k prescribed components.
+        axis (k,), force (k,), N: axis and force of each component.
+        reached (k,): whether each component is at its prescribed position.
+        told: indices of conditions that have been reported already; they are excluded.
         """
         grid = self.grid
         comm = grid.comm

@@ -1,28 +1,28 @@
 # SPDX-License-Identifier: MIT
 """Inertia: consistent mass, velocities of material points and nodes, and accelerations in the substeps.
 
-A substep of a step of length dt balances rho a with a = (u - u^) / (g dt)^2. The inertial predictor (no forces) is
+In a substep of a step of length dt, the forces balance rho a, with a = (u - u^) / (g dt)^2.  The predictor u^ is
 
     u^ = b dt v_1 + g dt (v_n + b dt a_1),      v = v_n + dt (b a_1 + g a).
 
-The weight g multiplies the rate of the substep, and b the rate of the previous substep (`time_integration`).  u^ is the
-displacement that would occur without forces.  Both u and u^ are measured from the start of the step, where the velocity
-is v_n.  v_1 and a_1 are velocity and acceleration of the previous substep.  Only velocities are carried from step to
-step.  In each step SDIRK2 dissipates the fraction GAMMA^4 (omega dt)^4 = 0.0074 (omega dt)^4 of the energy of an
-oscillation of angular frequency omega.  This dissipation damps modes that the step cannot resolve.
+The weight g multiplies the rate of the substep.  The weight b multiplies the rate of the previous substep
+(`time_integration`).  u^ is the displacement that would occur without forces.  Both u and u^ are measured from the
+start of the step, where the velocity is v_n.  v_1 and a_1 are velocity and acceleration of the previous substep.  Only
+velocities are carried from step to step.  In each step SDIRK2 dissipates the fraction GAMMA^4 (omega dt)^4 = 0.0074
+(omega dt)^4 of the energy of an oscillation of angular frequency omega.  This dissipation damps unresolved modes.
 
-The mass is integrated over the pieces of the particle domains, with masses m_k and second moments S_k about their
-centroids x_k,
+The mass is integrated over the pieces of the particle domains.  Piece k has the mass m_k, the centroid x_k, and the
+second moments S_k about x_k:
 
     (M + G) v_n = sum m_k [N(x_k) v(x_k) + grad N . (L S_k)],    M = sum m_k [N N^T + grad N S_k grad N^T],
 
-with the shape functions N and the velocity gradient L. The ghost mass G = c rho h^3 int [[d_n N]] [[d_n N]] dS acts on
-faces of cells that are not full. Here c is `GHOST_MASS`, h the cell size, and [[d_n N]] the jump of the normal
-derivative. For an affine field G v_n vanishes, and M v_n is the right side. The transfer to the grid and back therefore
-conserves linear and angular momentum to rounding. A material point carries v and F', the rate of F; the velocity in its
-domain is v + F' F^-1 (x - x_p). Increments of v and F' come from the grid (Brackbill and Ruppel 1986; consistent mass:
-Burgess, Sulsky and Brackbill 1992). The first substep of SDIRK2 is a midpoint rule; `chord` corrects this rule's error
-for rotations.
+with the shape functions N and the velocity gradient L.  The ghost mass `G = c rho h^3 int [[d_n N]] [[d_n N]] dS` acts
+on faces of cells that are not full.  Here c is `GHOST_MASS`, h is the cell size, and [[d_n N]] is the jump of the
+normal derivative.  For an affine velocity field, G v_n vanishes, and M v_n equals the right side.  The transfer to the
+grid and back therefore conserves linear and angular momentum to rounding.  A material point carries v and F', the rate
+of F.  The velocity in its domain is v + F' F^-1 (x - x_p).  Increments of v and F' come from the grid (Brackbill and
+Ruppel 1986; consistent mass: Burgess, Sulsky and Brackbill 1992). The first substep of SDIRK2 is a midpoint rule;
+`chord` corrects this rule's error for rotations.
 """
 
 from __future__ import annotations
@@ -51,13 +51,13 @@ from mpm_dolfinx.points.cutting import spreads
 from mpm_dolfinx.points.material_points import MaterialPoints, middle
 
 GHOST_MASS = 0.02
-"""Strength c of the ghost mass. With 0.002 or 0.2 a rotating block has the same energy (`tests/test_inertia.py`)."""
+"""Strength c of the ghost mass.  A rotating block has equal energies for 0.002 and 0.2 (`tests/test_inertia.py`)."""
 RELAXES = 2.0
-"""Relaxation rate of point velocities towards grid velocities, for each cell size by which domain corners move.
+"""Relaxation rate of point velocities towards grid velocities, for domain corners that move by one cell size.
 
 Relaxation removes velocity modes of the points that the nodes cannot represent. In a test, a vibrating bar of 20 cells
-moves across 50 cells, with 40 steps a period. After 25 periods the velocity error is 1.7, 1.2, 1.2 and 1.2 % for rates
-of 0, 0.1, 2 and 10. The energy loss is 1.58, 1.60, 1.60 and 1.67 %.
+moves across 50 cells, with 40 steps a period. After 25 periods the velocity error is 1.7 % for a rate of 0, and 1.2 %
+for rates of 0.1, 2 and 10. The energy loss is 1.58 % for a rate of 0, 1.60 % for 0.1 and 2, and 1.67 % for 10.
 """
 
 VELOCITY, RATE = "velocity", "F_rate"
@@ -89,7 +89,7 @@ def moving(
     Raises
     ------
     ValueError
-        The velocity has another shape, or is not finite.
+        The velocity has a wrong shape, or is not finite.
     """
     n, corners, d = points.corners.shape
     places = (points.corners + base).reshape(-1, d)
@@ -124,10 +124,10 @@ def product(A: NDArray[np.float64], B: NDArray[np.float64]) -> NDArray[np.float6
 
 
 def chord(G: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the increment F~ - 1 at which a midpoint rule evaluates laws, and the rotation of their stress.
+    """Return the increment F~ - 1 at which a midpoint rule evaluates laws, and the rotation of the laws' stress.
 
-    The rule moves F from F_n to F_n + 2 D, with the midpoint F = F_n + D.  The mean of C = F^T F at both ends is F^T F
-    + D^T D.  Laws are evaluated at
+    The rule moves F from F_n to F_n + 2 D, with the midpoint F = F_n + D.  The mean of C = F^T F over both ends of the
+    step is F^T F + D^T D, with the midpoint's F on the right side.  Laws are evaluated at
 
         F~ = F + F^-T D^T D / 2,     F~^T F~ = F^T F + D^T D + O(D^4),     P = F F~^-1 P(F~).
 
@@ -144,7 +144,7 @@ def chord(G: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float
 class InertiaForms:
     """Compiled forms of mass and momentum, and the midpoint rule's coefficients in the forms of stresses and fluxes.
 
-    points: all integration points; of_laws: the integration points of each law; u: displacement increment, m.
+    points: all integration points; of_laws: the integration points of each law; u, m: displacement increment.
     """
 
     def __init__(self, points: FormPoints, of_laws: Sequence[FormPoints], u: fem.Function):
@@ -179,12 +179,12 @@ class InertiaForms:
             self._flight.x.array[:] = inertia.flight
 
     def at(self, cells: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return accelerations (n, d), m/s^2, at u, at places in cells (n,); values (n, 2^d): shape functions there."""
+        """Return accelerations (n, d), m/s^2, at u, at a place in each of n cells; values: shape functions there."""
         nodal = self._rate.value * (self._u.x.array - self._flight.x.array).reshape(-1, self.grid.dim)
         return np.einsum("nk,nkd->nd", values, nodal[self.grid.cell_nodes[cells]])
 
     def _seen(self, chords: Latest[tuple[NDArray, NDArray]], which: int, data: PointData) -> NDArray[np.float64]:
-        """Return arrays (n, d^2) at the present u: gradients for the laws, or rotations of their stress; see `chord`.
+        """Return arrays (n, d^2) at the present u: gradients for laws, or rotations of the laws' stress; see `chord`.
 
         chords: the last result, shared by all forms at the same u; which: 0 for gradients, 1 for rotations.
         """
@@ -204,9 +204,11 @@ class InertiaForms:
     ) -> Mass:
         """Return the mass of the bodies on the grid.
 
-        cut: the cut particle domains; mass (n,), kg: masses of the points; fill (cells,): volume fraction of the local
-        cells; facets: faces between two active cells, at least one not full; unknowns, held: unknown displacements, and
-        displacements that grid boundary conditions fix.
+        cut: the cut particle domains.
+        mass (n,), kg: masses of the points.
+        fill (cells,): volume fractions of the local cells.
+        facets: faces between two active cells, at least one of them not full.
+        unknowns, held: unknown displacements, and displacements that grid boundary conditions fix.
         """
         grid = self.grid
         rows = cut.pieces_to_cells(cut.pieces.fraction * mass[cut.pieces.point])
@@ -230,9 +232,12 @@ class InertiaForms:
 class Mass:
     """Mass of the bodies on the grid, constant until the next reset of the grid.
 
-    forms: compiled forms; cut: the cut particle domains; pieces: their integration points, with masses, kg, as weights;
-    unknowns: unknown displacements; M, held: mass matrices, kg, with the rows of the unknowns, and with the rows of
-    displacements that walls of the grid fix.
+    forms: compiled forms.
+    cut: the cut particle domains.
+    pieces: integration points of their pieces, with masses, kg, as weights.
+    unknowns: unknown displacements.
+    M: mass matrix, kg, with the rows of the unknowns.
+    held: mass matrix, kg, with the rows of displacements that walls of the grid fix.
     """
 
     def __init__(
@@ -262,11 +267,12 @@ class Mass:
     def carried(
         self, points: MaterialPoints, velocities: tuple[PETSc.Vec, PETSc.Vec], moved: NDArray[np.float64]
     ) -> dict[str, NDArray[np.float64]]:
-        """Return the point data `VELOCITY` and `RATE`, velocities and rates of F, after a step.
+        """Return the point data `VELOCITY` and `RATE` after a step.
 
-        points: material points at the start of the step; velocities: velocities of the unknowns at the start and the
-        end of the step, m/s; moved (n,): largest displacement of a corner, in cell sizes, in the connected part of the
-        point; 0 if the point keeps its pieces.
+        points: material points at the start of the step.
+        velocities: velocities, m/s, of the unknowns at the start and at the end of the step.
+        moved (n,): largest displacement of a corner, in cell sizes, in the connected part of the point.  It is 0 if the
+        point keeps its pieces.
         """
         start, end = velocities
         out = {name: points.data[name] + more for name, more in self._at_points(points, end - start).items()}
@@ -286,7 +292,7 @@ class Mass:
 
     @cached_property
     def _off(self) -> NDArray[np.float64]:
-        """Vectors (m, d), m, from the centroids of the particle domains to the centroids of their pieces."""
+        """Vectors (pieces, d), in m, from the centroids of the particle domains to the centroids of their pieces."""
         pieces = self._cut.pieces
         return pieces.x - self._cut.mean(pieces.x)[pieces.point]
 
@@ -307,7 +313,7 @@ class Mass:
 
 
 def velocity_gradients(points: MaterialPoints) -> NDArray[np.float64]:
-    """Return the velocity gradients (n, d, d), 1/s, of the points; in axisymmetry the components in the plane."""
+    """Return the velocity gradients (n, d, d), 1/s, of the points.  In axisymmetry these are in-plane components."""
     d = points.x.shape[1]
     return product(points.data[RATE], inverses(points.F[:, :d, :d]))
 
@@ -315,8 +321,9 @@ def velocity_gradients(points: MaterialPoints) -> NDArray[np.float64]:
 class Inertia(Loads):
     """Inertia forces in a substep.
 
-    mass: mass of the bodies on the grid; flight, m: inertial predictor, the displacement without forces; rate, 1/s^2:
-    acceleration, divided by (displacement - flight).
+    mass: mass of the bodies on the grid.
+    flight, m: inertial predictor, the displacement without forces.
+    rate, 1/s^2: acceleration divided by (displacement - flight).
     """
 
     holding = True
@@ -326,7 +333,7 @@ class Inertia(Loads):
 
     @cached_property
     def flight(self) -> NDArray[np.float64]:
-        """The inertial predictor: displacement without forces in this substep, m; a local array."""
+        """The inertial predictor, m, as a local array: displacement without forces in this substep."""
         return self._mass.local(self._flight)
 
     def acceleration(self, at: At) -> PETSc.Vec:
@@ -370,7 +377,7 @@ class Flight(NamedTuple):
     acceleration: PETSc.Vec | None = None  # acceleration in the last substep, m/s^2
 
     def free(self, own: float, before: float) -> PETSc.Vec:
-        """Return the predictor of the next substep, m; own, before: weights, s, of its rate and the previous rate."""
+        """Return the predictor, m, of the next substep; own, before: weights, s, of its rate and the previous rate."""
         flight = self.start * own
         if self.acceleration is not None:
             flight += self.velocity * before + self.acceleration * (own * before)

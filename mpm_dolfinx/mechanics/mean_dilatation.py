@@ -6,18 +6,19 @@ Four volume constraints per cell suppress the bending modes of a Q1 quadrilatera
 
     Fbar = (theta J_n / det F)^(1/3) F,     theta = sum w det(Delta) / sum w   over the locking pieces of the cell.
 
-Here w is the volume of a piece, Delta = I + grad u the gradient of the step, F = Delta F_n, and J_n = det F_n. The
-scaling acts along all three axes: in plane strain the points store an out-of-plane stretch, as in a slice of the body.
-The material decides whether cells would lock (`Skeleton.nearly_incompressible`). In a cell of several materials, only
-the materials that would lock use Fbar. With the law's energy psi and Psi = psi(Fbar) / J_n, the energy sum w Psi has
-the derivative
+Here w is the volume of a piece.  Delta = I + grad u is the deformation gradient of the step, with F = Delta F_n and
+J_n = det F_n.  The scaling acts along all three axes: in plane strain the points store an out-of-plane stretch, as in a
+slice of the body.  The material decides whether cells would lock (`Skeleton.nearly_incompressible`). In a cell of
+several materials, only the materials that would lock use Fbar. With the law's energy psi and Psi = psi(Fbar) / J_n, the
+energy sum w Psi has the derivative
 
     sum w [dPsi/dF : dF + pi d(det Delta)],   pi = (sum w dPsi/dtheta) / (sum w).
 
-At fixed theta and pi, the residual has the additional term with pi, and its tangent is symmetric. The derivatives with
-respect to theta and pi add a matrix of rank two in each cell (Simo, Taylor and Pister 1985). Coombs et al. (2018) used
-incremental F-bar in the material point method. For a law without an energy, P(Fbar) : dFbar replaces dPsi. The points
-store Fbar.  The next step starts from a J_n computed from the particle domains in the cell (`cell_ratios`).
+The residual has the additional term with pi.  The tangent of the residual at fixed theta and pi is symmetric.  The
+derivatives with respect to theta and pi add a matrix of rank two in each cell (Simo, Taylor and Pister 1985). Coombs et
+al. (2018) used incremental F-bar in the material point method. For a law without an energy, P(Fbar) : dFbar replaces
+dPsi. The points store Fbar.  The next step starts from a J_n computed from the particle domains in the cell
+(`cell_ratios`).
 """
 
 from __future__ import annotations
@@ -46,14 +47,14 @@ STRESS = "stress of the law"
 
 
 class SumsOfPart(NamedTuple):
-    """Sums in each cell over one part of the scene's integration points, for theta and pi: see `MeanDilatation`."""
+    """Sums for theta and pi, in each cell, over one part of the scene's integration points: see `MeanDilatation`."""
 
     ratio: CellSums
     stress: PointExpression  # components of the stress P, and its derivative with respect to theta
 
 
 class FBar:
-    """F-bar modification of laws, with each cell's volume ratio theta of the step and conjugate mean stress pi.
+    """F-bar modification of laws, with the step's volume ratio theta and the conjugate mean stress pi of each cell.
 
     grid: background grid; symmetric: whether the tangents of all laws are symmetric.
     """
@@ -106,9 +107,9 @@ class FBar:
 
         Returns
         -------
-        The first Piola-Kirchhoff stress, Pa, as UFL of F, theta and pi, for the residual.  The derivative of this
-        stress with respect to F (d, d, d, d), Pa, for the tangent.  Further UFL integrands of the tangent (`Beside`),
-        to be summed over each cell.  Kernels that sum theta and pi over each cell, for `MeanDilatation`.
+        The first Piola-Kirchhoff stress, Pa, as UFL of F, theta and pi, for the residual.  The derivative (d, d, d, d),
+        Pa, of this stress with respect to F, for the tangent.  Further UFL integrands of the tangent (`Beside`), for
+        sums over each cell.  Kernels that sum theta and pi over each cell, for `MeanDilatation`.
         """
         J_n, J = ufl.det(points.F), ufl.det(F)
         P, slope = self.stresses(law, F, Fbar, known)
@@ -138,7 +139,7 @@ class FBar:
 
             dtau = s C : dF + (theta dtau/dtheta) (dtheta / theta - F^-T : dF),   C = dtau/dFbar,
 
-        for F (d, d) and the same components of s F. In 3D this would take two minutes to compile.
+        for F (d, d) and the (d, d) components of s F. In 3D this formula would take two minutes to compile.
         """
         P, slope = self.stresses(law, F, Fbar, values)
         if law.kirchhoff is None or self.grid.dim == 3:
@@ -169,8 +170,10 @@ class FBar:
 class MeanDilatation:
     """The volume ratio theta of the step in each cell, and its work-conjugate mean stress pi, for F-bar.
 
-    fbar: the fields theta and pi; parts: sums of the parts in which cells would lock, by index of the part, see
-    `QuadratureData`; dt: time since the start of the step, s; suction: pressures by which stresses change, or None.
+    fbar: the fields theta and pi.
+    parts: sums over each part in which cells would lock, by index of the part, see `QuadratureData`.
+    dt: time since the start of the step, s.
+    suction: pressures on which stresses depend, or None.
     """
 
     def __init__(self, fbar: FBar, parts: Mapping[int, SumsOfPart], dt: fem.Constant, suction: fem.Function | None):
@@ -230,7 +233,7 @@ class MeanDilatation:
     def assemble_matrix(self, A: PETSc.Mat, data: QuadratureData, sums: Sequence[NDArray[np.float64]]) -> None:
         """Add the contribution of theta and pi to the tangent; the caller finalises the matrix.
 
-        sums: for each part, the integrals (cells, quantities) over each cell of `Beside` from `FBar.forms`.
+        sums: for each part, the integrals (cells, quantities) of `Beside` from `FBar.forms` over each cell.
         """
         count, volume = 2**self._grid.dim * self._grid.dim, self._volume_of(data)
         b, c, *other, e = np.split(
@@ -246,7 +249,7 @@ class MeanDilatation:
         insert(A, self._grid, self._cells(data).filled, matrices)
 
     def average(self, delta: NDArray[np.float64], data: QuadratureData, motion: tuple) -> None:
-        """Scale the gradients Delta (m, d, d) of the pieces to the cell's ratio theta where F-bar is used; see `at`."""
+        """Scale the gradients Delta (n, d, d) of pieces with F-bar to their cells' volume ratios; motion: see `at`."""
         self._set_ratios(data, motion)
         for number in self.numbers:
             rows = data.rows[number]
@@ -265,7 +268,7 @@ class MeanDilatation:
         return tuple(part.key for part in self._parts(data))
 
     def _volume_of(self, data: QuadratureData) -> NDArray[np.float64]:
-        """Return the volumes (cells, 1), m^d, of the pieces that use F-bar."""
+        """Return for each filled cell the total volume (cells, 1), m^d, of its pieces that use F-bar."""
         key = self._key(data)
 
         def volumes() -> NDArray[np.float64]:
@@ -282,7 +285,7 @@ def _dev(tau, F):
 
 
 class Cells:
-    """Cells that contain any of several parts; filled: these cells; where: indices of each part's cells in `filled`."""
+    """Cells with pieces of any part.  filled: these cells; where: indices of each part's cells in `filled`."""
 
     def __init__(self, of_parts: Sequence[NDArray[np.int32]]):
         self.filled = np.unique(np.concatenate(of_parts))

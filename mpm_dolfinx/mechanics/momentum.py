@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: MIT
 """Balance of momentum: Q1 displacements on the grid, integrated over the pieces of particle domains in cells.
 
-The displacement increment of the step is u, Delta = I + grad u, F = Delta F_n, J_n = det F_n, J_Delta = det Delta. The
-residual is the derivative of
+u is the displacement increment of the step.  It defines Delta = I + grad u, F = Delta F_n, J_n = det F_n and
+J_Delta = det Delta.  The residual is the derivative of
 
     int [psi(F) / J_n - alpha p J_Delta] dV_n  -  work of the loads,
 
-that is int (P' - alpha p J_Delta Delta^-T) : grad v dV_n = int rho g . v dV_n + tractions.  psi is the energy of the
-skeleton, alpha Biot's coefficient, and p the pore pressure. P' is the first Piola-Kirchhoff effective stress relative
-to the start of the step.  A law may define the stress instead of psi.
+that is, `int (P' - alpha p J_Delta Delta^-T) : grad v dV_n = int rho g . v dV_n + tractions`.  psi is the energy of the
+skeleton, alpha is Biot's coefficient, and p is the pore pressure. P' is the first Piola-Kirchhoff effective stress
+relative to the start of the step.  A law may define the stress instead of psi.
 """
 
 from __future__ import annotations
@@ -66,11 +66,11 @@ class MomentumForms:
         All integration points.
     laws
         Classes of the skeletons' laws, each with its integration points and whether it uses F-bar, see
-        `MeanDilatation`. The points have F, the law's parameters and state and, with fluid, `biot`.
+        `MeanDilatation`. The points have F, and the law's parameters and state.  With fluid they also have `biot`.
     pressure
         DG0 pore pressure, None without fluid.
     gravity : (d,), m/s^2
-        Acceleration, a UFL constant; the integration points then have `density`, kg/m^3, at the start of the step.
+        Acceleration, as a UFL constant, or None.  With gravity the integration points have `density`, kg/m^3.
     materials
         Materials of the scene, and its fluid. With retention curves the points also have `retention`, `lever`, `pores`.
     at_points
@@ -78,7 +78,7 @@ class MomentumForms:
     terms
         User-defined terms, see `user_functions`.
     t, dt : s
-        Time at the end of the substep, and time since the start of the step, UFL constants.
+        Time at the end of the substep, and time since the start of the step, as UFL constants.
     inertia
         Whether bodies may have inertia.
     """
@@ -127,7 +127,7 @@ class MomentumForms:
         self.linear = not locked and all(law.linear for law, *_ in laws)
         """Whether the tangent of the laws depends only on the positions of the points."""
         self.elastic = not any(law.state for law, *_ in laws)
-        """Whether no law has a state; only then does the tangent of one substep suit the next."""
+        """Whether no law has a state.  Only then may the next substep reuse a tangent."""
         self.ghost = GhostPenalty(grid, V, at_points)
         kept = [self.ghost.fill.x.array], [f.x.array for f in (self.u, *rooms)]
         self.active = Active(grid, pressure is not None, *kept)
@@ -187,7 +187,7 @@ class MomentumForms:
         return FormsOfPart(residual, StackedElementMatrices(A, points, symmetric, beside), local, means, sums)
 
     def of_suction(self, data: QuadratureData) -> list[tuple[NDArray[np.int32], NDArray[np.float64]]]:
-        """Return derivatives of nodal forces with respect to cell pressures through suction: `OfSuction.rows`."""
+        """Return derivatives of nodal forces with respect to cell pressures through suction, see `OfSuction.rows`."""
         return [] if self._of_suction is None else self._of_suction.rows(data, self._given(data, derive=True))
 
     def set_contents(self, own: NDArray[np.int64], *contents: NDArray[np.float64]) -> ActiveSet:
@@ -198,7 +198,7 @@ class MomentumForms:
         return self.active.now
 
     def summed(self, room: int, adders: Sequence[Callable[[NDArray[np.float64]], None]]) -> NDArray[np.float64]:
-        """Return the nodal forces that `adders` add, summed over processes, a local array; room: index of a buffer."""
+        """Return the nodal forces of `adders`, summed over processes, as a local array.  room: index of a buffer."""
         carrier, out = self._rooms[room]
         out[self.active.now.dofs] = 0.0
         for add in adders:
@@ -211,7 +211,7 @@ class MomentumForms:
         return self.u.x.array.reshape(-1, self.grid.dim)
 
     def internal(self, data: QuadratureData, loads: Sequence[Loads] = ()) -> NDArray[np.float64]:
-        """Return the nodal forces of the stresses at u and of `Loads.takes_up`, N, a local array."""
+        """Return the nodal forces, N, of the stresses at u and of `Loads.takes_up`, as a local array."""
 
         given = self._nothing or self._given(data)
 
@@ -257,7 +257,7 @@ class MomentumForms:
         return [{**a, **b} for a, b in zip(given, solve(derive), strict=True)] if derive else given
 
     def at_nodes(self, cells: NDArray[np.int32], values: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
-        """Return nodal sums (k, nodes) of k quantities of cells: values (cells, 2^d) at their nodes, or (cells, 1)."""
+        """Return nodal sums (k, nodes) of k quantities; values: for each, an array (cells, 2^d), or (cells, 1)."""
         (shared, values_at), nodes = self._rooms[0], self.active.now.nodes
         at = nodes.searchsorted(self.grid.cell_nodes[cells])
         of_nodes = np.array([of + np.zeros(at.shape) for of in values])
@@ -278,7 +278,7 @@ class MomentumForms:
         return Parts(count, of - 1, nodes)
 
     def active_nodes(self, cells: NDArray[np.int32]) -> NDArray[np.bool_]:
-        """Return whether each local node belongs to an active cell of any process; cells: active cells of this one."""
+        """Return whether each local node belongs to an active cell of any process.  cells: own active cells."""
         nodes = np.zeros(len(self.grid.node_x), dtype=bool)
         nodes[self.grid.cell_nodes[cells]] = True
         if self.grid.comm.size == 1:
@@ -334,7 +334,7 @@ class MomentumSystem:
         self.rounding = self.unknowns.vector()
         """Rounding error of the residual at each unknown, N."""
         self.of_whole = self.unknowns.vector()
-        """For each unknown: norm, N, of a vector with its rounding error at all unknowns of its connected part."""
+        """For each unknown, the norm, N, of a vector over its connected part that has its rounding error throughout."""
         self.K = matrix(self.unknowns, self.unknowns, 3**d * d)
         self.residual, self.step = self.unknowns.vector(), self.unknowns.vector()
         held = active[~among(active, dofs)]
@@ -368,7 +368,7 @@ class MomentumSystem:
 
     @property
     def lines(self) -> tuple[NDArray[np.float64], ...] | None:
-        """Grid lines of a grid with many cell sizes, else None: see `multigrid_solver`."""
+        """Grid lines, or None on a grid of equal cells, see `multigrid_solver`."""
         grid = self._forms.grid
         return None if grid.even else grid.lines
 
@@ -408,10 +408,14 @@ class MomentumSystem:
 class MomentumProblem:
     """Balance of momentum of one step.
 
-    forms: compiled forms; system: vectors and matrices, with assembled penalties; data: integration points; loads: on
-    the bodies; tolerance: of the residual, relative to the forces; goes_on (unknowns,): displacements extrapolated from
-    the last step, m, a local array, None if unknown; held (unknowns,): forces that balance the initial stress where
-    loads do not, N, a local array, or None; yielded: whether any soil has yielded before this step.
+    forms: compiled forms.
+    system: vectors and matrices, with assembled penalties.
+    data: integration points.
+    loads: loads on the bodies.
+    tolerance: tolerance of the residual, relative to the forces.
+    goes_on (unknowns,), m: local array of displacements extrapolated from the last step, or None.
+    held (unknowns,), N: local array of forces that balance initial stresses where loads do not, or None.
+    yielded: whether any soil has yielded before this step.
     """
 
     def __init__(
@@ -453,7 +457,7 @@ class MomentumProblem:
         return At(self.system.unknowns, self.forms.u.x.array, self.system.parts)
 
     def settle(self, sticks: bool) -> bool:
-        """Update stick and slip at u; return whether any state changed; sticks: whether slip may change to stick."""
+        """Update stick and slip at u, and return whether either changed.  sticks: whether slip may change to stick."""
         return any([one.settle(self.at, sticks) for one in self.loads])
 
     def augment(self) -> bool:
@@ -463,7 +467,7 @@ class MomentumProblem:
     def guesses(self) -> list[NDArray[np.float64]]:
         """Return initial guesses of the displacements (active dofs,), m, for Newton's method.
 
-        Each of the loads may propose a guess, such as a rigid rotation.  Another guess extrapolates the last motion.
+        Each of the loads may propose a guess, such as a rigid rotation.  A further guess extrapolates the last motion.
         """
         found = [one.guess(self.system.parts, self.forms.nodal) for one in self.loads]
         found = [values.ravel() for values in (*found, self._goes_on) if values is not None]
@@ -474,12 +478,12 @@ class MomentumProblem:
         return np.where(self.system.unknowns.map.indices[self.forms.active.now.dofs] >= 0, values, 0.0)
 
     def assemble_residual(self) -> tuple[PETSc.Vec, float]:
-        """Return the out-of-balance nodal forces at u, N, and the norm, N, of the force scales of all parts."""
+        """Return the out-of-balance nodal forces (N) at u, and the norm (N) of the force scales of all parts."""
         r, scales = self.residual_of_parts()
         return r, float(np.linalg.norm(scales))
 
     def residual_of_parts(self) -> tuple[PETSc.Vec, NDArray[np.float64]]:
-        """Return the out-of-balance nodal forces at u, N, and the force scale (parts,), N, of each connected part."""
+        """Return the out-of-balance nodal forces (N) at u, and the force scales (parts,) of connected parts, in N."""
         forms, system = self.forms, self.system
         b, norms = self._unbalanced()
         system.held.gather(b, system.held_residual)  # without penalties; `wall_forces` adds their part on fixed nodes
@@ -497,11 +501,11 @@ class MomentumProblem:
         return r, np.maximum.reduce(norms)
 
     def unbalanced(self) -> NDArray[np.float64]:
-        """Return the out-of-balance nodal forces at u without penalties, N, a local array."""
+        """Return the out-of-balance nodal forces, N, at u without penalties, as a local array."""
         return self._unbalanced()[0].copy()
 
     def _unbalanced(self) -> tuple[NDArray[np.float64], list[NDArray[np.float64]]]:
-        """Return the result of `unbalanced`, and a list with the norms (parts,), N, of each of its force terms."""
+        """Return the result of `unbalanced`, and a list of the norms (parts,), N, of its force terms."""
         forms, system = self.forms, self.system
         b = forms.internal(self.data, self.loads)
         forces, external = b[system.touched], self._external
@@ -517,7 +521,7 @@ class MomentumProblem:
         return b, [*system.forces_of_parts([*terms, external])]
 
     def powers(self) -> dict[str, float]:
-        """Return the powers at u of stresses, viscous resistance, friction and external loads of this process, W."""
+        """Return the powers (W) of stresses, viscous resistance, friction and external loads at u on this process."""
         forms, unknowns = self.forms, self.system.unknowns
         v = np.where(unknowns.map.indices >= 0, forms.velocity.nodal, 0.0)  # fixed nodes have no velocity
         owned = forms.u.function_space.dofmap.index_map.size_local * forms.grid.dim
@@ -541,11 +545,13 @@ class MomentumProblem:
     def out_of_balance(
         self, r: PETSc.Vec, scales: NDArray[np.float64], first: bool
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return two relative residuals of each connected part; r: residuals, N; scales (parts,): force scales, N.
+        """Return two relative residuals of each connected part.
 
-        For the first, the rounding error at each node is subtracted from the residual.  With `first` it is not
-        subtracted, so that even a load below this error causes a solve.  For the second, the force scale at an
+        In the first residual, the rounding error at each node is subtracted.  With `first` this error is not
+        subtracted, so that even a load below the error causes a solve.  In the second residual, the force scale at an
         unknown is at least `of_whole` divided by the tolerance.  A residual within rounding then counts as converged.
+
+        r: residuals, N; scales (parts,), N: force scales.
         """
         system, parts = self.system, self.system.of_parts
         both = np.zeros((2, system.unknowns.size))
@@ -578,7 +584,7 @@ class MomentumProblem:
         return out
 
     def of_suction(self, data: QuadratureData | None = None) -> list[tuple[NDArray, NDArray]]:
-        """Return derivatives of nodal forces with respect to cell pressures, through suction: `OfSuction.rows`."""
+        """Return derivatives of nodal forces with respect to cell pressures through suction, see `OfSuction.rows`."""
         return self.forms.of_suction(data or self.data)
 
     def assemble_tangent(
@@ -586,7 +592,8 @@ class MomentumProblem:
     ) -> PETSc.Mat:
         """Return the tangent at u, regularised by a fraction of the elastic shear stiffness.
 
-        data: integration points, by default the problem's; firmness: fraction, one number or one per connected part.
+        data: integration points, by default the problem's.
+        firmness: the fraction, one number or one for each connected part.
         """
         K = self.system.K
         # the first sum gives K its full sparsity pattern, because PETSc does not always notice a later change

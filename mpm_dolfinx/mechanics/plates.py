@@ -132,7 +132,7 @@ class PlateLoads(Loads):
 
 
 def _check_flat(plate: RigidPlate, faces: Surface) -> None:
-    """Raise ValueError unless the faces are one flat, connected side; else parts of a plate would move separately."""
+    """Raise ValueError unless the faces are one flat, connected side; separate parts of a plate would move apart."""
     corners, axis = faces.places(), facing(faces)[0]
     tangential = np.arange(corners.shape[2]) != axis
     low = corners.min(axis=1)[:, tangential]

@@ -23,7 +23,7 @@ from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.material_points import ACROSS, MaterialPoints, in_plane, in_space
 
 STIFF_DRY = 50
-"""In dry bodies: weight of a cell's corner-based volume ratio J_n (`cell_ratios`), in units of G / (lambda + 2G).
+"""Weight in dry bodies of a cell's corner-based volume ratio J_n (`cell_ratios`), in units of G / (lambda + 2G).
 
 The weight is at most 1; the incremental volume ratio of the points has the remaining weight. With nu = 0.4999 and a
 weight of 1, the stress change at a reset of the grid would exceed the stresses in the bodies.
@@ -31,17 +31,18 @@ weight of 1, the stress change at a reset of the grid would exceed the stresses 
 STIFF_WET = 8
 """Value of (lambda + 2G) / G above which the corner-based ratio loses weight in wet bodies.
 
-The weight is 1 at nu = 0.43, and 0 at 0.47.  The difference between corner-based ratio and Q1 field expels water from
-skeletons above this value in every step of any length.  With a weight of 1, the extreme pressures of a beam with eight
-cells across its depth have errors of 43 % at nu = 0.49.  At 0.499 they are six to thirty times too large, and adaptive
-steps never grow.
+The weight is 1 at nu = 0.43, and 0 at nu = 0.47.  In skeletons above this value, the difference between corner-based
+ratio and Q1 field expels water in every step, however short.  With a weight of 1, the extreme pressures of a beam with
+eight cells across its depth have errors of 43 % at nu = 0.49.  At nu = 0.499 the pressures are six to thirty times too
+large, and adaptive steps never grow.
 """
 SHARE = 0.5
 """Fraction of the gradient's deviation from its cell mean that laws use in cells of flowing, dilatant soil.
 
 Dilatant flow has a volume strain rate of sin psi times its shear rate. This condition at four points over-constrains a
-Q1 cell, even with F-bar. With the full deviation, the load of a footing (phi = psi = 20 degrees, 9 and 17 cells) is 4.4
-and 3.4 % too large, and still rises. With one point per cell the load is 6.6 and 3.2 % too small, and constant.
+Q1 cell, even with F-bar. With the full deviation, the load of a footing (phi = psi = 20 degrees) is 4.4 % too large
+with 9 cells and 3.4 % with 17 cells, and still rises.  With one point per cell, the load is constant, but 6.6 % too
+small with 9 cells and 3.2 % with 17 cells.
 """
 
 
@@ -63,7 +64,7 @@ class QuadratureData:
     of_points: PointData  # like `pieces`, but volumes and F are not scaled for F-bar; for user-defined terms
 
     def increments(self, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return I + grad u (m, d, d) at the positions where laws use it, of displacements `nodal` (nodes, d), m."""
+        """Return I + grad u (n, d, d) at the positions where laws use it.  nodal (nodes, d), m: displacements u."""
         n, d = self.pieces.x.shape
         out, nodes = np.empty((n, d, d)), self.pieces.points.grid.cell_nodes
         for rows, part in zip(self.rows, self.parts, strict=True):
@@ -80,7 +81,7 @@ class PiecePlaces:
 
     pieces: Places  # of all pieces
     parts: tuple[tuple[NDArray[np.int64], Places], ...]  # indices and positions of the pieces of each part
-    lever: NDArray[np.float64] | None = None  # vectors (m, d), m, to the pieces from the centroid of their cell's soil
+    lever: NDArray[np.float64] | None = None  # vectors (n, d), in m, to pieces from the centroid of their cell's soil
 
 
 class QuadraturePoints:
@@ -89,7 +90,7 @@ class QuadraturePoints:
     Parameters
     ----------
     scene, bodies
-        The materials of the scene with its fluid, and all its bodies.
+        The materials of the scene with their pore fluid, and all bodies of the scene.
     weighs
         Whether the scene has gravity.
     extended
@@ -149,7 +150,7 @@ class QuadraturePoints:
         return PiecePlaces(pieces, tuple(parts))
 
     def _law_places(self, cut: CutDomains, pieces: Places) -> Places:
-        """Return the positions at which laws use the gradient; they are shifted in flowing, dilatant soil (`SHARE`)."""
+        """Return the positions at which laws use grad u.  In flowing, dilatant soil these are shifted (`SHARE`)."""
         if not self.materials.dilates or self._grid.axisymmetric:
             return pieces
         flows = cut.to_cells(self.materials.dilating(cut.points))
@@ -245,13 +246,13 @@ class QuadraturePoints:
         return {name: cut.pieces_to_cells(values) for name, values in fields.items()}
 
     def rows(self, cut: CutDomains, points: MaterialPoints, value: Callable[[Skeleton], float]) -> NDArray[np.float64]:
-        """Return a material constant at the integration points (m,)."""
+        """Return the values (n,) of a material constant at the integration points."""
         return cut.to_cells(self.materials.table(points, value))
 
     def mobility(
         self, cut: CutDomains, law: ConductivityAtPieces | None, data: PointData, begins: bool
     ) -> NDArray[np.float64]:
-        """Return the mobility k / (rho_w g) at the integration points (m,), m^2/(Pa s), at the present displacement."""
+        """Return mobilities k / (rho_w g) (n,), m^2/(Pa s), at the integration points, at the present displacement."""
         if law is None:
             return self.rows(cut, cut.points, lambda m: m.conductivity) / self._fluid.unit_weight
         return law.evaluate(data, cut.to_cells(cut.points.material), begins) / self._fluid.unit_weight
@@ -261,13 +262,13 @@ class QuadraturePoints:
         return self.materials.present_density(points) * points.volume0 * points.J
 
     def conducting(self, cut: CutDomains) -> NDArray[np.float64]:
-        """Return two numbers (m, 2) of each integration point: both are equal at points with equal conductivity."""
+        """Return two numbers (n, 2) for each integration point.  Points with equal pairs have equal conductivities."""
         return cut.to_cells(self.materials.conducting(cut.points))
 
     def fixed_stress(self, cut: CutDomains, points: MaterialPoints, of_fluid: bool) -> NDArray[np.float64]:
-        """Return beta (m,), 1/Pa, at the integration points, for the fixed-stress operator C + f beta V (f: `Scheme`).
+        """Return beta (n,), 1/Pa, at the integration points, for the fixed-stress operator C + f beta V (f: `Scheme`).
 
-        of_fluid: whether to return 1/K_w instead of beta; the iteration then converges for stiff skeletons only.
+        of_fluid: whether to return 1/K_w in place of beta; the iteration then converges for stiff skeletons only.
         """
         if of_fluid:
             return np.full(len(cut.cells), 1 / self._fluid.bulk)

@@ -34,15 +34,15 @@ def rigid_motion(
     comm
         The processes; all must call the function.
     holds
-        Penalties of prescribed displacements: direction; gap along it, m; stiffness, the weight in the fit.
+        Penalties of prescribed displacements, with direction, gap along it, m, and stiffness, the weight in the fit.
     x : (n, d), m
         The positions.
-    counts : (m,)
+    counts : (k,)
         Whether each penalty is used.
 
     Returns
     -------
-    The displacements; None if they are a pure translation, or if a translation fits nearly as well.
+    The displacements, or None if they are a pure translation, or if a translation fits nearly as well.
     """
     d = x.shape[1]
     e = holds["direction"]
@@ -77,9 +77,9 @@ def rigid_motion(
 def turned(
     comm: MPI.Intracomm, weight: NDArray[np.float64], x: NDArray[np.float64], to: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the rotation (d, d) nearest to a motion of weighted positions from x to `to`, m (Kabsch 1976).
+    """Return the rotation (d, d) nearest to a motion of weighted positions from x to `to` (n, d), m (Kabsch 1976).
 
-    x, to (n, d); the result is the identity for a negligible rotation or a poor fit. All processes must call it.
+    The result is the identity for a negligible rotation or a poor fit.  All processes must call this function.
     """
     d = x.shape[1]
     sums = over_all(comm, np.concatenate([[weight.sum()], weight @ x, weight @ to]))

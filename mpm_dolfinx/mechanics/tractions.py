@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: MIT
 """Loads on sides of the bodies in their present position: dead tractions, and pressures that follow the surface.
 
-The virtual work of a traction t, force per reference area, is int t . v dA on the reference faces. The virtual work of
-a pressure is -int p n . v da on the present area. The tangent of this term is symmetric except for a contribution p/2
-(v x du) . dx of the surface's edges dx. This contribution vanishes where two surfaces of equal pressure meet. It also
-vanishes on a wall that fixes the normal component of v and du, because v, du and the edge lie in the wall.
+A traction t is a force per reference area.  Its virtual work is `int t . v dA` on the reference faces.  The virtual
+work of a pressure is `-int p n . v da` on the present area.  The tangent of the pressure's work is symmetric, except
+for a contribution `p/2 (v x du) . dx` of the surface's edges dx.  This contribution vanishes where two surfaces of
+equal pressure meet. It also vanishes on a wall that fixes the normal component of v and du, because v, du and the edge
+lie in the wall.
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ class SideLoads(Acting):
         return [faces for _, faces in self._loads]
 
     def forces(self, place: Place) -> tuple[Places, NDArray[np.float64]]:
-        """Return integration points in owned cells, and the forces (n, d), N, at them."""
+        """Return integration points in owned cells, and the forces (n, d), N, at these points."""
         grid, patches = self._grid, place.cut.surfaces(self.surfaces)
         travel, places = self._placed(place.cut.key, lambda: owners(grid, patches), grid.comm)
         both = [(load, p) for (load, _), p in zip(self._loads, patches, strict=True)]
@@ -110,14 +111,14 @@ class DeadLoads(Loads):
 
 
 def owners(grid: Grid, patches: Sequence[Patches]) -> tuple[Exchange, Places]:
-    """Return the exchange of patch data with the processes that own the cells, and the positions there."""
+    """Return the exchange that sends patch data to the owners of their cells, and the positions after this exchange."""
     cell, x = (np.concatenate([getattr(p, name) for p in patches]) for name in ("cell", "x"))
     travel = Exchange(grid.comm, grid.owner(cell))
     return travel, Places(grid, grid.locals[travel.send(cell)], travel.send(x))
 
 
 class PressureForms:
-    """Forms of the nodal forces of pressures, and of minus their derivative; push: force on the area at the start."""
+    """Forms of the nodal forces of pressures, and of their negative derivative; push: force on the initial area."""
 
     def __init__(self, grid: Grid, u: fem.Function):
         self.points = p = FormPoints(grid, push=(grid.dim,))
@@ -167,7 +168,7 @@ class PressureLoads(Loads):
         self._forms.work.assemble_vector(b, self._data)
 
     def tangent(self, K: PETSc.Mat) -> None:
-        """Add the tangent, due to rotation and stretch of the surface."""
+        """Add the tangent, which is due to rotation and stretch of the surface."""
         self._forms.slope.assemble_matrix(K, self._data)
 
 

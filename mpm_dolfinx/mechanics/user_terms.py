@@ -43,7 +43,7 @@ class OwnTerms:
     forms
         Forms of the scene's conditions, with u and the velocity of the bodies.
     t, dt : s
-        Time at the end of the substep, and time since the start of the step, UFL constants.
+        Time at the end of the substep, and time since the start of the step, as UFL constants.
     """
 
     def __init__(
@@ -52,7 +52,7 @@ class OwnTerms:
         self.symmetric = True
         self.holding = False
         self.rates = False
-        """symmetric: all tangents are symmetric; holding: a term depends on u; rates: a term depends on velocity."""
+        """Whether all tangents are `symmetric`, and whether a term depends on u (`holding`) or velocity (`rates`)."""
         u = forms.u
         more = {"t": t, "dt": dt, "velocity": forms.velocity.value}
         v, du = ufl.TestFunction(u.function_space), ufl.TrialFunction(u.function_space)

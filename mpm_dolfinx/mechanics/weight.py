@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Weight of the bodies, int rho g . v dV, and of the pore fluid that flows into dilating pores in the step."""
+"""Weight of the bodies, `int rho g . v dV`, and of the pore fluid that flows into dilating pores in the step."""
 
 from __future__ import annotations
 

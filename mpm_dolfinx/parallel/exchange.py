@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Exchange of array rows between processes, and of the answers to these rows.
+"""Transfer of array rows to other processes, and of the answers back.
 
 A row is the data of one piece of a particle domain, of one corner or of one loaded point.  The row is sent to the
 process that owns its cell and assembles the integrals of the cell.  A single process copies nothing.
@@ -23,7 +23,7 @@ T = TypeVar("T")
 
 @dataclass
 class Traffic:
-    """Total numbers of transfers, non-empty messages and bytes that this process has sent to others."""
+    """Total numbers of transfers, non-empty messages and bytes that this process has sent to other processes."""
 
     transfers: int = 0
     messages: int = 0
@@ -35,14 +35,14 @@ traffic = Traffic()
 
 @cache
 def _lasting(handle: int) -> PETSc.Vec:
-    """Return an object that keeps PETSc's duplicate of a communicator; making a duplicate needs all processes."""
+    """Return an object that keeps PETSc's duplicate of a communicator.  All processes must take part in duplication."""
     return PETSc.Vec().create(MPI.Comm.f2py(handle))
 
 
 class Exchange:
     """A fixed assignment of array rows to processes, which can be used for several transfers.
 
-    comm: processes of the exchange; destination (n,): rank of the process that receives each row.
+    `comm`: processes of the exchange.  `destination` (n,): rank of the process that receives each row.
     """
 
     def __init__(self, comm: MPI.Intracomm, destination: NDArray[np.int32]):
@@ -69,7 +69,7 @@ class Exchange:
         return self._transfer(rows, 1, self._sf.reduceBegin, self._sf.reduceEnd)
 
     def back(self, rows: NDArray) -> NDArray:
-        """Send back one answer for each received row; return the answers to this process, in the order of its rows."""
+        """Send back one answer for each received row.  Return the answers to own rows, in the order of the rows."""
         if self.comm.size == 1:
             return rows
         return self._transfer(rows, 0, self._sf.bcastBegin, self._sf.bcastEnd)
@@ -90,7 +90,7 @@ class Exchange:
 
 
 def over_all(comm: MPI.Intracomm, value: T, op: MPI.Op = MPI.SUM) -> T:
-    """Return the sum over all processes of a value, or another reduction `op`; arrays are reduced entry by entry."""
+    """Return the sum of a value over all processes, or another reduction `op`.  Arrays are reduced entry by entry."""
     if comm.size == 1:
         return value
     if not isinstance(value, np.ndarray):
@@ -106,9 +106,9 @@ def to_root(comm: MPI.Intracomm, rows: int) -> Exchange:
 
 
 def evenly(comm: MPI.Intracomm, numbers: NDArray[np.int64]) -> NDArray[np.int32]:
-    """Return ranks (n,) for ascending numbers (n,) >= 0, which differ on all processes, so that all lie in order.
+    """Return ranks (n,) for ascending numbers (n,) >= 0.  All numbers of all processes differ.
 
-    The ranks get equal shares of all numbers: the smallest numbers go to rank 0, and so on.
+    The ranks get equal shares of all numbers, in ascending order: the smallest numbers go to rank 0, and so on.
     """
     below = over_all(comm, len(numbers)) * np.arange(1, comm.size) // comm.size
     low, high = np.zeros_like(below), np.full_like(below, over_all(comm, int(numbers.max(initial=0)), MPI.MAX) + 1)
@@ -125,7 +125,7 @@ def first(comm: MPI.Intracomm, message: str) -> str:
 
 
 def together(comm: MPI.Intracomm, action: Callable[[], T]) -> T:
-    """Return the result of an action on this process; if it raises on any process, all raise the first error."""
+    """Return the result of an action on this process.  If it fails on any process, all raise the first error."""
     if comm.size == 1:
         return action()
     value = error = None
@@ -140,7 +140,7 @@ def together(comm: MPI.Intracomm, action: Callable[[], T]) -> T:
 
 
 def at_root(comm: MPI.Intracomm, action: Callable[[], T]) -> T:
-    """Return on every process the result of `action` on rank 0; if `action` raises, all processes raise its error."""
+    """Return on every process the result of `action` on rank 0.  If `action` raises, all processes raise its error."""
     return comm.bcast(together(comm, lambda: action() if comm.rank == 0 else None))
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Messages of the package, given once for all processes: log lines and warnings."""
+"""Messages of the package: log lines and warnings, given once for all processes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ WITHIN = {"mpm_dolfinx", "contextlib", "functools"}
 
 
 class ResultWarning(UserWarning):
-    """Base of all warnings of the package: a result may be misleading."""
+    """Base of all warnings of the package.  A result may be misleading."""
 
 
 class ResolutionWarning(ResultWarning):
@@ -30,19 +30,19 @@ class ConditionWarning(ResultWarning):
 
 
 def set_log_level(level: int | str) -> None:
-    """Show log lines of runs at and above a level, such as "INFO" for reduced steps and checkpoints.
+    """Show log lines at or above a level.  The level "INFO", for example, shows reduced steps and checkpoints.
 
     Lines go to stderr, unless `logging` already has handlers.
 
     Parameters
     ----------
     level
-        A level of `logging`, by name or number; "WARNING" is the default.
+        A level of `logging`, by name or number.  The default level is "WARNING".
 
     Raises
     ------
     ValueError
-        The level is unknown.
+        If the level is unknown.
     """
     try:
         logger.setLevel(level)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Numpy archives (.npz) in one file, whose arrays several processes write and read together, by rows.
+"""Numpy archives (.npz), of which several processes write and read the arrays together, by rows.
 
-Each process writes its rows at their place in the file, and reads an equal share of all rows.  No process holds an
+Each process writes its rows at their places in the file, and reads an equal share of all rows.  No process holds an
 array of all rows.  Neither the file nor the reader depends on the number of processes that wrote the file.
 """
 
@@ -30,7 +30,7 @@ ONE = 1 << 31  # Source: definition of the same order of the powers
 
 
 class Member(NamedTuple):
-    """An array in an archive: where its entries start in the file, and what identifies them."""
+    """An array in an archive: the start of its entries in the file, and data that identify the entries."""
 
     dtype: np.dtype
     shape: tuple[int, ...]
@@ -40,12 +40,13 @@ class Member(NamedTuple):
 
 
 def write(comm: MPI.Intracomm, file: Path, arrays: Mapping[str, NDArray], rows: Mapping[str, NDArray]) -> int:
-    """Write an archive; return its size, bytes.  It replaces `file` once it is complete on the disk.
+    """Write an archive, and return its size in bytes.  The archive replaces `file` once it is complete on the disk.
 
     If a process cannot write, all processes raise its error.
 
-    arrays: on rank 0, arrays by name; rows: rows of this process (n, ...) of further arrays by name, in the order of
-    the ranks.
+    `arrays`: on rank 0, arrays by name.
+    `rows` (n, ...): rows of this process of further arrays, by name.  The rows of all processes are in the order of the
+    ranks.
     """
     part = file.with_name(file.name + ".part")
     rows = {name: np.ascontiguousarray(of) for name, of in rows.items()}
@@ -98,7 +99,7 @@ def write(comm: MPI.Intracomm, file: Path, arrays: Mapping[str, NDArray], rows: 
 
 
 def members(file: Path, names: Iterable[str]) -> dict[str, Member]:
-    """Return the arrays with these names in an archive; raise ValueError for compressed or incomplete arrays."""
+    """Return the arrays with these names in an archive.  Raise ValueError for compressed or incomplete arrays."""
     out = {}
     with open(file, "rb") as f, ZipFile(f) as archive:
         for name in names:
@@ -113,7 +114,7 @@ def members(file: Path, names: Iterable[str]) -> dict[str, Member]:
             head = zlib.crc32(f.read(length))
             whole = info.file_size == length + int(np.prod(shape)) * dtype.itemsize
             if info.compress_type != ZIP_STORED or by_columns or not shape or not whole:
-                raise ValueError(f"{name}: compressed, by columns, or incomplete")
+                raise ValueError(f"{name}: is compressed, in column-major order, or incomplete")
             out[name] = Member(dtype, shape, start + length, head, info.CRC)
     return out
 
@@ -128,10 +129,13 @@ def some_rows(file: Path, member: Member, first: int, last: int) -> NDArray:
 def read(
     comm: MPI.Intracomm, file: Path, of: Mapping[str, Member], ranges: Mapping[str, tuple[int, int]]
 ) -> dict[str, NDArray]:
-    """Return rows of arrays in an archive; raise ValueError on all processes if the bytes differ from their checksums.
+    """Return the rows of arrays in an archive that this process reads.
 
-    of: the arrays by name; ranges: first row and last row plus one on this process, by name.  The processes read all
-    rows, in the order of the ranks.
+    Raise ValueError on all processes if the bytes of an array differ from its checksum.
+
+    `of`: the arrays by name.
+    `ranges`: by name, first row of this process, and last row plus one.  The processes read all rows, in the order of
+    the ranks.
     """
     rows = together(comm, lambda: {name: some_rows(file, of[name], *ranges[name]) for name in of})
     sums = comm.gather([(zlib.crc32(found), found.nbytes) for found in rows.values()])
@@ -158,7 +162,7 @@ def _row_bytes(dtype: np.dtype, shape: tuple[int, ...]) -> int:
 
 
 def _joined(crc: int, parts: Iterable[tuple[int, int]]) -> int:
-    """Return the checksum of bytes with checksum `crc`, followed by parts with the given checksums and lengths."""
+    """Return the checksum of bytes with checksum `crc` and more parts.  `parts`: checksum and length of each."""
     for more, length in parts:
         for k in range(length.bit_length()):
             crc = _product(_power(k), crc) if length >> k & 1 else crc
@@ -168,7 +172,7 @@ def _joined(crc: int, parts: Iterable[tuple[int, int]]) -> int:
 
 @cache
 def _power(k: int) -> int:
-    """Return x^(8 2^k) modulo the polynomial of the checksum: the factor of 2^k more bytes."""
+    """Return `x^(8 2^k)` modulo the polynomial of the checksum.  Multiplication by this factor appends 2^k bytes."""
     return _product(_power(k - 1), _power(k - 1)) if k else ONE >> 8
 
 

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Cell pressures from the pore water of the pieces of particle domains, in unsaturated soil.
 
-A piece has storage s (m^d/Pa) and pore volume n (m^d).  Its fluid content minus that at zero pressure is
-c(p) = s pi(p) + n (S(p) - 1) rho(p), with pi = K_w (exp(p / K_w) - 1) and rho = exp(p / K_w).  In a
-piece away from its cell's centroid the pressure is p + o, with an offset o.  S depends on the soil of the piece.
+A piece has the storage s, in m^d/Pa, and the pore volume n, in m^d.  Relative to zero pressure, its fluid content is
+`c(p) = s pi(p) + n (S(p) - 1) rho(p)`, with `pi = K_w (exp(p / K_w) - 1)` and `rho = exp(p / K_w)`.  In a piece away
+from its cell's centroid, the pressure is p + o with an offset o.  The saturation S depends on the soil of the piece.
 """
 
 from __future__ import annotations
@@ -20,42 +20,43 @@ from mpm_dolfinx.base.tolerances import EPSILON
 from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.pores.retention import logarithm, pressure_at
 
-MOST = 2200  # Source: exact bound, twice the halvings of a bracket of doubles (IEEE 754)
+MOST = 2200  # Source: exact bound, twice the number of halvings of a bracket of doubles (IEEE 754)
 
 
 @dataclass(frozen=True)
 class PoreWater:
-    """Water storage of m pieces of particle domains in n cells."""
+    """Water storage of k pieces of particle domains in n cells."""
 
-    # function of pressures (m,), Pa, that returns S, dS/dp (m,), 1/Pa, and possibly other values
+    # function of pressures (k,), Pa, that returns S (k,), dS/dp (k,), 1/Pa, and possibly other values
     saturation: Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], ...]]
-    slot: NDArray[np.int64]  # (m,) index, from 0, of each piece's cell
-    store: NDArray[np.float64]  # (m,) storage, m^d/Pa
-    pores: NDArray[np.float64]  # (m,) pore volume, m^d
+    slot: NDArray[np.int64]  # (k,) index, from 0, of each piece's cell
+    store: NDArray[np.float64]  # (k,) storage, m^d/Pa
+    pores: NDArray[np.float64]  # (k,) pore volume, m^d
     bulk: float  # fluid's bulk modulus, Pa
     scale: NDArray[np.float64]  # (n,) suction at which the pores of a cell drain, Pa
 
     def emptied(self, p: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return (S - 1) rho of the pieces, and its derivative with respect to p, 1/Pa, at pressures p (m,), Pa."""
+        """Return (S - 1) rho of the pieces at pressures p (k,), Pa, and the derivative with respect to p, 1/Pa."""
         return emptied(p, self.bulk, *self.saturation(p)[:2])
 
     def of_cells(self, p: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the fluid contents (n,), m^d, of the cells, for pressures p (m,), Pa, of their pieces."""
+        """Return the fluid contents (n,), m^d, of the cells, for pressures p (k,), Pa, of their pieces."""
         return self.sums(mass_potential(p, self.bulk), self.emptied(p)[0])
 
     def sums(self, pi: NDArray[np.float64], empty: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the fluid contents (n,), m^d, of the cells, for pi (m,), Pa, and (S - 1) rho (m,) of the pieces."""
+        """Return the cells' fluid contents (n,), m^d, for pi (k,), Pa, and `empty` = (S - 1) rho (k,) of the pieces."""
         return sum_by(self.slot, self.store * pi + self.pores * empty, len(self.scale))
 
     def level(
         self, content: NDArray[np.float64], p: NDArray[np.float64], offset: NDArray[np.float64] | float = 0.0
     ) -> NDArray[np.float64]:
-        """Return the pressures (n,), Pa, of cells with given fluid contents (n,), m^d.
+        """Return the pressures (n,), Pa, at which the cells have the fluid contents `content`.
 
         Newton's method is applied to the logarithm of the suction, within a bracket.
 
-        p (n,), Pa: initial values; they are returned if the cells then have the given contents. offset (m,), Pa:
-        pressures of the pieces minus pressures of their cells.
+        content (n,), m^d: the fluid contents.
+        p (n,), Pa: initial pressures, which are returned if they already give these contents.
+        offset (k,), Pa: pressures of the pieces minus pressures of their cells.
         """
         count, scale = len(p), self.scale
         rounding = 4 * EPSILON * sum_by(self.slot, self.pores, count)
@@ -87,6 +88,6 @@ class PoreWater:
 def emptied(
     p: NDArray[np.float64], bulk: float, S: NDArray[np.float64], slope: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return (S - 1) rho and its derivative, 1/Pa, for pressures p (m,), Pa, saturations S, and slope dS/dp, 1/Pa."""
+    """Return (S - 1) rho at pressures p (k,), Pa, and its derivative by p, 1/Pa; slope (k,): dS/dp, 1/Pa."""
     density = np.exp(p / bulk)
     return (S - 1) * density, (slope + (S - 1) / bulk) * density

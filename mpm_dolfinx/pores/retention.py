@@ -9,8 +9,8 @@ the relative permeability k_r as functions of p,
 with the porosity n, the saturated conductivity k and Biot's coefficient alpha (Richards 1931; Bishop 1959).  By default
 chi is the effective saturation S_e = (S - S_r) / (1 - S_r).
 
-A user-defined curve is any object with `saturation(p)` and `relative_permeability(p)`, which return UFL.  It may have
-`bishop(p)`, which returns chi; by default chi = S.  Constants of a law derived from `Retention` are data, not compiled.
+A user-defined curve is any object with the methods `saturation(p)` and `relative_permeability(p)`, which return UFL.  A
+method `bishop(p)` may return chi; without it, chi = S.  The constants of a derived `Retention` are data, not compiled.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ METHODS = ("saturation", "relative_permeability")
 class Retention:
     """Base of retention curves defined by an effective saturation S_e: S = S_r + (1 - S_r) S_e.
 
-    A derived law is a frozen dataclass of numbers.  It defines `effective(s)` and `conducts(s)`: S_e and k_r as UFL of
-    the suction s >= 0, Pa, both 1 at s = 0.  `bishop(p)` is S_e unless the law defines it.
+    A derived law is a frozen dataclass of numbers.  Its method `effective(s)` returns S_e, and `conducts(s)` returns
+    k_r, as UFL of the suction s >= 0, Pa.  Both must be 1 at s = 0.  `bishop(p)` returns S_e unless the law defines it.
 
     Parameters
     ----------
@@ -63,7 +63,7 @@ class Retention:
 
     @property
     def scale(self) -> float:
-        """Characteristic suction of saturation and permeability, Pa."""
+        """Characteristic suction of the saturation and the permeability, Pa."""
         return self.entry
 
     def bishop(self, p):
@@ -83,7 +83,7 @@ class Retention:
 class VanGenuchten(Retention):
     """Retention by van Genuchten (1980), permeability by Mualem (1976).
 
-    With x = s / entry, m = 1 - 1 / n:  S_e = (1 + x^n)^-m,  k_r = S_e^l [1 - x^(n-1) S_e]^2.
+    `S_e = (1 + x^n)^-m` and `k_r = S_e^l [1 - x^(n-1) S_e]^2`, with `x = s / entry` and `m = 1 - 1 / n`.
 
     Parameters
     ----------
@@ -96,8 +96,9 @@ class VanGenuchten(Retention):
     l
         Exponent for the connectivity of the pores, a number.
     air_entry
-        Suction below which all pores are saturated, Pa, >= 0 (Ippisch, Vogel and Bastian 2006).  If n < 2, zero air
-        entry gives the permeability an infinite slope at s = 0.  Usual: the pressure of a few centimetres of water.
+        Suction below which all pores are saturated, Pa, >= 0 (Ippisch, Vogel and Bastian 2006).  If n < 2 and
+        `air_entry` is zero, the permeability has an infinite slope at s = 0.  A usual value is the pressure of a few
+        centimetres of water.
     """
 
     n: float = 2.0
@@ -115,7 +116,7 @@ class VanGenuchten(Retention):
         return x ** (self.n - 1) * (1 + x**self.n) ** (1 / self.n - 1)
 
     def _least(self):
-        """Return `air_entry` divided by `entry`, kept above zero, because a power has no finite derivative at zero."""
+        """Return `air_entry / entry`, but at least `TINY`, because a power has no finite derivative at zero."""
         return ufl.max_value(self.air_entry / self.entry, TINY)
 
     def effective(self, s):
@@ -131,7 +132,7 @@ class VanGenuchten(Retention):
 
 @dataclass(frozen=True)
 class Gardner(Retention):
-    """Exponential retention and permeability: S_e = k_r = exp(-s / entry) (Gardner 1958; Srivastava and Yeh 1991).
+    """Exponential retention and permeability: `S_e = k_r = exp(-s / entry)` (Gardner 1958; Srivastava and Yeh 1991).
 
     Parameters
     ----------
@@ -150,7 +151,7 @@ class Gardner(Retention):
 
 @dataclass(frozen=True)
 class BrooksCorey(Retention):
-    """Retention and permeability by powers: S_e = (s / entry)^-index, k_r = S_e^(3 + 2 / index) (Brooks, Corey 1964).
+    """Powers of the suction: `S_e = (s / entry)^-index`, `k_r = S_e^(3 + 2 / index)` (Brooks and Corey 1964).
 
     Parameters
     ----------
@@ -186,7 +187,7 @@ def _number(law: Retention, name: str, test: Callable, allowed: str) -> None:
 def check_retention(what: str, law) -> None:
     """Raise ValueError if a retention curve is invalid.
 
-    S and k_r must be in [0, 1], 1 for p >= 0, and must not increase with the suction.
+    S and k_r must be in [0, 1], must be 1 for p >= 0, and must not increase with the suction.
     """
     missing = [name for name in METHODS if not callable(getattr(law, name, None))]
     if missing:
@@ -207,13 +208,13 @@ def check_retention(what: str, law) -> None:
 
 
 def sampled(law) -> list[float]:
-    """Return saturations and relative permeabilities of a law at some suctions, Pa, as its fingerprint."""
+    """Return a fingerprint of a law: saturations and relative permeabilities at some suctions, and the suctions, Pa."""
     suctions = scale_of(law) * np.exp2(np.arange(-2, 3))
     return [_value(getattr(law, name), -s) for name in METHODS for s in suctions] + suctions.tolist()
 
 
 def _value(function: Callable, p: float) -> float:
-    """Return the number, at a pressure p, Pa, of a function of p that returns UFL."""
+    """Return the value at a pressure p, Pa, of a function of p that returns UFL."""
     return float(apply_algebra_lowering(ufl.as_ufl(function(ufl.as_ufl(float(p)))))(()))
 
 
@@ -223,7 +224,7 @@ def chi_at(law, p: float) -> float:
 
 
 def _empty(function: Callable, suction: float) -> bool:
-    """Return whether a function of p is at most 0.5, or not a number, at a suction, Pa."""
+    """Return whether a function of p is at most 0.5 at a suction, Pa, or is not a number there."""
     try:
         return not _value(function, -suction) > 0.5
     except OverflowError:
@@ -231,9 +232,9 @@ def _empty(function: Callable, suction: float) -> bool:
 
 
 def scale_of(law) -> float:
-    """Return the characteristic suction of a law, Pa: its `scale`, or approximately the suction for S = 0.5.
+    """Return the characteristic suction of a law, Pa: its `scale`, or approximately the suction at which S = 0.5.
 
-    If S is always above 0.5, the suction for k_r = 0.5 is returned.
+    If S is always above 0.5, the suction at which k_r = 0.5 is returned.
     """
     if (scale := getattr(law, "scale", None)) is not None:
         return float(numbers(f"{line(law)}: scale", scale, test=lambda v: v > 0, allowed="> 0"))
@@ -252,11 +253,13 @@ def scale_of(law) -> float:
 class Retentions:
     """Retention curves of the materials, as UFL expressions of data at the integration points.
 
-    The points' field `retention` is a vector: the index of the law's class (1, 2, ...), then the law's constants.  The
-    index is 0 if the pores stay saturated.  Pieces also have the field `lever`: the vector to the piece from the
-    centroid of the material in its cell.  The piece's pressure is the cell's, plus the hydrostatic rise along `lever`.
+    The points' field `retention` is a vector.  Its first entry is the index of the law's class (1, 2, ...), or 0 if the
+    pores stay saturated.  The law's constants follow.  Pieces also have the field `lever`: the vector to the piece from
+    the centroid of the material in its cell.  The pressure of a piece is the cell's pressure plus the hydrostatic rise
+    along `lever`.
 
-    laws: distinct retention curves of the scene's materials; everywhere: whether every material has a retention curve;
+    laws: distinct retention curves of the scene's materials.
+    everywhere: whether every material has a retention curve.
     grid: background grid.
     """
 
@@ -283,11 +286,11 @@ class Retentions:
         return out
 
     def number(self, law) -> int:
-        """Return the index of a law among all laws (1, 2, ...); 0 for None."""
+        """Return the index of a law among all laws (1, 2, ...), or 0 for None."""
         return 0 if law is None else 1 + self.laws.index(law)
 
     def heads(self, lever: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return for each piece (m,) its pressure minus its cell's pressure, Pa; lever (m, d), m: see the class."""
+        """Return for each piece (n,) its pressure minus its cell's pressure, Pa.  lever (n, d), m: see the class."""
         return lever @ self.weight.value
 
     def at(self, p, points: FormPoints):
@@ -317,7 +320,7 @@ class Retentions:
 
 
 def _constants(law) -> list[str]:
-    """Return the names of a law's constants, which are data, not compiled into forms."""
+    """Return the names of a law's constants.  Forms contain the constants as data, not as compiled numbers."""
     return [f.name for f in fields(law)] if isinstance(law, Retention) else []
 
 
@@ -342,7 +345,7 @@ def _called(law, name: str, p):
     Raises
     ------
     ValueError
-        The method raises, or its result is no scalar.
+        The method raises an error, or its result is not a scalar.
     """
     what = f"{line(law)}: {name}"
     out = asked(what, "UFL of p", lambda: ufl.as_ufl(getattr(law, name)(p)))
@@ -367,21 +370,21 @@ class SaturationAt:
     def __call__(
         self, rows: NDArray[np.float64], p: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Return S, dS/dp (1/Pa), chi and k_r at pressures p (m,), Pa; rows (m, width): the field `retention`."""
+        """Return S, dS/dp (1/Pa), chi and k_r at pressures p (n,), Pa.  rows (n, width): the field `retention`."""
         data = anywhere(self._points, p=p, retention=rows)
         S, slope, chi, k = self._values.evaluate(data).T
         return S, slope, chi, k
 
 
 def anywhere(points: FormPoints, **fields: NDArray[np.float64]) -> PointData:
-    """Return points (m,) with the given fields (m, ...), all in one cell; their positions must not matter."""
+    """Return n points in one cell, with fields (n, ...).  The positions of the points must not matter."""
     count = len(next(iter(fields.values())))
     cells = np.zeros(count, dtype=np.int32)
     return points.at(cells, points.grid.midpoints[cells], np.ones(count), **fields)
 
 
 class Conductance:
-    """Integral of a law's relative permeability with respect to pressure, the potential of flow (Kirchhoff 1894).
+    """Potential of flow: integral of a law's relative permeability with respect to pressure (Kirchhoff 1894).
 
     The integral is tabulated against the logarithm of the suction, and interpolated with cubic Hermite polynomials.
 
@@ -406,7 +409,7 @@ class Conductance:
         self._edges = edges
 
     def __call__(self, p: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return three columns (n, 3) at pressures p (n,), Pa: integral, Pa; k_r; derivative dk_r/dp, 1/Pa."""
+        """Return three columns (n, 3) at pressures p (n,), Pa: the integral, Pa; k_r; and dk_r/dp, 1/Pa."""
         s = np.clip(-p, self._edges[0], self._edges[-1])
         z = (np.log(s) - self._low) / self._step
         i = np.minimum(z.astype(np.int64), ROWS - 2)
@@ -439,7 +442,7 @@ tests/plateaus.py by 8.2e-10 (relative), doubling it by 1.5e-09, and finer cells
 
 
 def logarithm(p: NDArray[np.float64], scale: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return a scaled pressure (n,), logarithmic for suctions above `scale`, Pa; `pressure_at` is the inverse."""
+    """Return scaled pressures (n,), logarithmic for suctions above `scale`, Pa.  `pressure_at` is the inverse."""
     return np.where(p < 0, np.arcsinh(p / scale), p / scale)
 
 
@@ -451,8 +454,8 @@ def pressure_at(y: NDArray[np.float64], scale: NDArray[np.float64]) -> NDArray[n
 FARTHEST = np.log(10)
 """Largest change of the suction's natural logarithm in a Newton step; without it, fronts in dry soil do not converge.
 
-If this change is at most 2, Celia's column takes 310 (25 cells) and 500 (100 cells) Newton steps in 28 time steps.  If
-it is at most 4, the column takes 330 and 920, and four time steps are reduced.
+With a limit of 2, Celia's column takes 310 Newton steps with 25 cells, and 500 with 100 cells, in 28 time steps.  With
+a limit of 4, it takes 330 Newton steps with 25 cells, and 920 with 100 cells, and four time steps are reduced.
 
 Halving this value changes the result of scene "dry" in tests/plateaus.py by 7.6e-10 (relative), doubling it by 9.8e-10,
 and finer cells by 6.6e-03.
@@ -467,13 +470,15 @@ def restrained(
 ) -> NDArray[np.float64]:
     """Return the pressure decreases (n,), Pa, of a Newton step after limitation.
 
-    A step across the characteristic suction ends there.  On each side of this suction the saturation is convex or
-    concave, so Newton's method converges (Wang and Tchelepi 2013).  The suction's logarithm changes by at most
-    `FARTHEST`.  If the direction of the change reverses, the change is at most half of the previous change, so that the
-    logarithm does not oscillate.
+    A step across the characteristic suction ends at this suction.  On each side of this suction the saturation is
+    convex or concave, so Newton's method converges (Wang and Tchelepi 2013).  The suction's logarithm changes by at
+    most `FARTHEST`.  If the direction of the change reverses, the change is at most half of the previous change, so
+    that the logarithm does not oscillate.
 
-    p (n,), Pa: pressures; dp (n,), Pa: decreases of these by Newton's method; scale (n,), Pa: characteristic suction;
-    previous (n,): change of the pressure's `logarithm` in the previous Newton step.
+    p (n,), Pa: pressures.
+    dp (n,), Pa: decreases of the pressures by Newton's method.
+    scale (n,), Pa: characteristic suctions.
+    previous (n,): changes of the pressures' `logarithm` in the previous Newton step.
     """
     new, limit = p - dp, -scale
     new = np.where((p - limit) * (new - limit) < 0, limit, new)

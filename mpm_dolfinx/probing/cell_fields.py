@@ -18,8 +18,8 @@ from mpm_dolfinx.stepping.state import State
 class CellFields:
     """Fields in the non-empty cells of this process; arrays for n cells.
 
-    The fields refer to the cells at the position of the grid for the next step.  The fields are second-order accurate
-    at `x`, not at the midpoint of the cell.  Means are volume averages over the material in the cell.
+    The cells are at the position that the grid has in the next step.  The fields are second-order accurate at `x`, not
+    at the midpoint of the cell.  Means are volume averages over the material in the cell.
 
     Attributes
     ----------
@@ -36,8 +36,8 @@ class CellFields:
     pressure : (n,), Pa
         Pore pressure, positive in compression; None without fluid.
     water : (n,), m^d
-        Pore fluid, as a volume at zero pressure: the content from porosity and pressure, minus its excess `owed` over
-        the true content (see `flow/storage.py`); None without fluid.
+        Volume of the pore fluid at zero pressure, or None without fluid. It is computed from porosity and pressure, and
+        corrected by the volume defect `owed` (see `flow/storage.py`).
     """
 
     cell: NDArray[np.int64]
@@ -62,7 +62,7 @@ def cell_fields(scene: Scene, state: State) -> CellFields:
     volume = sum_by(places.slots, weight, len(places.filled))
 
     def mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the means in the cells of values (m, ...) in the pieces."""
+        """Return the cell means of values (m, ...) of the pieces."""
         columns = values.reshape(len(values), -1).T
         sums = [sum_by(places.slots, weight * column, len(volume)) / volume for column in columns]
         return np.stack(sums, axis=1).reshape(len(volume), *values.shape[1:])

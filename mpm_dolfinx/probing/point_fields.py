@@ -14,19 +14,20 @@ from mpm_dolfinx.stepping.scene import Scene
 
 @dataclass(frozen=True)
 class PointFields:
-    """Fields of the n material points of this process; Cauchy stresses, tension positive.
+    """Fields of the n material points of this process. Stresses are Cauchy stresses, tension positive.
 
     Attributes
     ----------
     effective_stress, stress : (n, 3, 3), Pa
-        Effective and total stress.  In axisymmetry x is the radius, y the axis and zz the hoop stress.  In plane strain
-        zz acts out of plane; zz and the invariants are nan for user-defined laws without an out-of-plane stress.
+        Effective and total stress.  In axisymmetry x is radial, y is axial, and zz is the circumferential stress.  In
+        plane strain zz is the out-of-plane stress.  User-defined laws may not define this stress; zz and the invariants
+        are then nan.
     mean_effective_stress : (n,), Pa
-        p' = -tr(effective stress) / 3, positive in compression.
+        `p' = -tr(effective stress) / 3`, positive in compression.
     deviatoric_stress : (n,), Pa
-        q = sqrt(3/2 s : s) with the deviatoric stress s; in a triaxial test |axial stress - radial stress|.
+        `q = sqrt(3/2 s : s)`, with the deviatoric stress s. In a triaxial test q is |axial stress - radial stress|.
     porosity : (n,)
-        Present porosity, 1 - (1 - n_0) / J.
+        Present porosity, `1 - (1 - n_0) / J`, with the initial porosity n_0 and the volume ratio J.
     saturation : (n,)
         Degree of saturation of the pores; 0 without fluid.
     """

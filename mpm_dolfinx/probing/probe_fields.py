@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: MIT
 """Pore pressure and stress at probes, by a weighted fit to surrounding cells and material points (`local_fit`).
 
-The fit uses cells that open faces connect to the probe's cell, at most three cells away along each axis.  Their soil
-must have the conductivity and stiffness of the probe's soil.  At faces to cells outside the fit, the fit uses the face
-pressure of the two-point flux.  On drained sides the fit uses the prescribed pressure.  Heads are fitted instead of
-pressures, so hydrostatic states are exact.  The heads of the probe's cell, of its neighbours and of the cell's drained
-sides bound the result.  Towards an undrained side the bound is extrapolated with the slope of the adjacent cells.
+The fit uses cells that are connected to the probe's cell by open faces.  They are at most three cells away along each
+axis.  Cells with soil of another conductivity or stiffness are excluded.  At faces to cells outside the fit, the fit
+uses the face pressure of the two-point flux.  On drained sides the fit uses the prescribed pressure.  Heads are fitted
+instead of pressures, so hydrostatic states are exact.  The result is bounded by the heads of the probe's cell, of the
+neighbouring cells and of the drained sides in the probe's cell.  Towards an undrained side this bound is extrapolated
+with the gradient of the head in the adjacent cells.
 """
 
 from __future__ import annotations
@@ -28,11 +29,11 @@ from mpm_dolfinx.stepping.scene import Scene
 from mpm_dolfinx.stepping.state import State
 
 CELLS = int(RADIUS)
-"""Number of cells along each axis from a probe's cell to the last cell with a weight in `local_fit`."""
+"""Largest distance along each axis, in cells, from a probe's cell to a cell with a weight in `local_fit`."""
 
 
 def probe_pressures(scene: Scene, state: State, probes: Probes) -> NDArray[np.float64]:
-    """Return the pore pressures (m,), Pa, at probes; all processes must call it."""
+    """Return the pore pressures (n,), in Pa, at n probes; all processes must call it."""
     state = scene.followed(state)
     state = state if state.stays else state.at_owners(scene.grid)
     on_grid = scene.on_grid(state.as_cut)  # cached for the next step
@@ -42,11 +43,13 @@ def probe_pressures(scene: Scene, state: State, probes: Probes) -> NDArray[np.fl
 
 
 class _Lattice:
-    """Blocks of (2 `CELLS` + 1)^d cells around the cells of m probes.
+    """Blocks of (2 `CELLS` + 1)^d cells around the cells of n probes.
 
-    number (m, cells): lexicographic indices of the cells, -1 outside the grid; midpoint, size (m, cells, d), m.
-    middle: index of the probe's cell in its block; stride (d,): increment of this index along each axis.
-    neighbours: for each axis and end, indices in the block of cells with a neighbour there, and of these neighbours.
+    number (n, cells): lexicographic indices of the cells, -1 outside the grid.
+    midpoint, size (n, cells, d): midpoints and sizes of the cells, in m.
+    middle: index of the probe's cell in its block.
+    stride (d,): increment of an index in the block along each axis.
+    neighbours: two index arrays for each axis and end. They list the cells with a neighbour there, and the neighbours.
     """
 
     def __init__(self, grid: Grid, cell: NDArray[np.int64]):
@@ -71,10 +74,14 @@ class _Lattice:
 
 
 class _Around:
-    """Data of the cells around m probes, equal on every process; arrays (m, cells, ...).
+    """Data of the cells around n probes, equal on every process; arrays (n, cells, ...).
 
-    p: pressure, Pa; centroid, half (d,), m: vectors to the material's centroid from the probe and from the cell's
-    midpoint; open (d, 2): open fractions of faces; kappa, shift (d,): see `Mobility`; counts, reached: `_connected`.
+    p: pressures, in Pa.
+    centroid (d,): vectors, in m, from the probe to the centroids of the material in the cells.
+    half (d,): vectors, in m, from the midpoints of the cells to these centroids.
+    open (d, 2): open fractions of the faces.
+    kappa, shift (d,): see `Mobility`.
+    counts, reached: see `_connected`.
     """
 
     def __init__(self, scene: Scene, state: State, on_grid: OnGrid, probes: Probes):
@@ -104,10 +111,11 @@ class _Around:
         self._sides = open_sides([one.placed(wet) for one in state.stage.feeding], d)
 
     def _gathered(self, on_grid: OnGrid, p: NDArray[np.float64], soils: NDArray[np.float64]) -> tuple[NDArray, NDArray]:
-        """Return the local indices (m, cells) of owned cells, -1 for others, and the data of all cells.
+        """Return two arrays: local indices (n, cells) of filled owned cells, -1 for others, and data of all cells.
 
-        p: pressures of the filled owned cells, Pa; soils (k, 3): conductivity, index of law, material of each piece.
-        Data columns: 1 for filled cells, p, centroid, mobility, shift, `soils` (nan if not unique), open fractions.
+        p: pressures of the filled owned cells, in Pa.
+        soils (k, 3): conductivity, index of the conductivity law, and material of each piece.
+        Data columns: 1 for filled cells, p, `half`, `kappa`, `shift`, `soils` (nan if not unique), `open`.
         """
         grid = self._grid
         contents = self._contents
@@ -132,11 +140,12 @@ class _Around:
         return local, over_all(grid.comm, out)
 
     def _connected(self, same: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Return whether the fit uses each cell (m, cells), and whether open faces connect it to the probe's cell.
+        """Return two masks (n, cells): cells that the fit uses, and cells that open faces connect to the probe's cell.
 
-        The fit uses cells with only the probe's soil; if there are none, cells with only its material, else all filled.
+        The fit uses cells that contain only the probe's soil. If there are none, it uses cells that contain only the
+        probe's material. If there are none either, it uses all filled cells.
 
-        same (m, cells, 3): whether a cell has only the probe's conductivity, conductivity law, and material.
+        same (n, cells, 3): whether all soil in a cell has the probe's conductivity, conductivity law and material.
         """
         same = same & self._filled[:, :, None]
         levels = [same.all(axis=2), same[:, :, 2], self._filled]
@@ -154,12 +163,12 @@ class _Around:
         return reached & groups, reached
 
     def _opening(self, axis: int, end: int) -> NDArray[np.bool_]:
-        """Return whether each pair (m, n) of neighbours along an axis has an open face between its cells."""
+        """Return a mask (n, pairs) of neighbouring cells along an axis: whether their common face is open."""
         one, other = self._lattice.neighbours[axis, end]
         return (self._open[:, one, axis, end] > 0) & (self._open[:, other, axis, 1 - end] > 0)
 
     def pressures(self, weight: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the pressures (m,), Pa, at the probes; weight (d,): unit weight of the fluid, N/m^3."""
+        """Return the pressures (n,), in Pa, at the probes; weight (d,): weight of the fluid per volume, N/m^3."""
         comm, head = self._grid.comm, self._p - self._centroid @ weight
         base, (low, high) = head[:, self._lattice.middle], self._bounds(head)
         at, offset, value, share, own = self._drained(weight)
@@ -180,7 +189,7 @@ class _Around:
         return np.clip(base + above, low, high)
 
     def _bounds(self, head: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the lower and upper bound (m,) of the heads, Pa, from the cell and its neighbours; see the module."""
+        """Return a lower and an upper bound (n,), in Pa, of the head at each probe; see the module's docstring."""
         i = self._lattice.middle
         low, high = head[:, i].copy(), head[:, i].copy()
         for axis in range(self._grid.dim):
@@ -207,7 +216,7 @@ class _Around:
         return low, high
 
     def _outside_faces(self, head: NDArray[np.float64]) -> list[tuple[NDArray, ...]]:
-        """Return data of faces to cells outside the fit: probe index, offset, head by two-point flux, weight."""
+        """Return for faces to cells outside the fit: probe, vector from the probe, head of two-point flux, weight."""
         out = []
         for (axis, end), pair in self._lattice.neighbours.items():
             own_cells, other_cells = pair
@@ -228,9 +237,10 @@ class _Around:
         return out
 
     def _drained(self, weight: NDArray[np.float64]) -> tuple[NDArray, ...]:
-        """Return data of drained sides: probe index, offset, head, weight, and whether the side is in the probe's cell.
+        """Return for drained sides: probe, vector from the probe, head, weight, and whether in the probe's cell.
 
-        For each side of a cell, the fit uses the mean head over its faces; heads of single faces give false gradients.
+        For each side of a cell, the fit uses the mean head of all drained faces on this side. Heads of single faces
+        would give false gradients.
         """
         sides, d = self._sides, self._grid.dim
         probe, place = np.nonzero(self._counts & (self._local >= 0))
@@ -252,6 +262,6 @@ class _Around:
 
 
 def probe_stresses(scene: Scene, state: State, probes: Probes) -> NDArray[np.float64]:
-    """Return the effective stresses (m, 3, 3), Pa, at probes; all processes must call it."""
+    """Return the effective stresses (n, 3, 3), in Pa, at n probes; all processes must call it."""
     comm, sizes = scene.grid.comm, list(map(len, scene.bodies))
     return fitted_at(comm, sizes, state.points, probes.id, probes.xi, scene.materials.effective_stress_3d)

@@ -22,11 +22,11 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 
 @dataclass(frozen=True, eq=False)
 class Probes:
-    """m tracked material particles."""
+    """Tracked material particles, n in number."""
 
-    x0: NDArray[np.float64]  # (m, d) reference positions, m
-    id: NDArray[np.int64]  # (m,) identifier of each probe's particle domain
-    xi: NDArray[np.float64]  # (m, d) local coordinates in this domain
+    x0: NDArray[np.float64]  # (n, d) reference positions, in m
+    id: NDArray[np.int64]  # (n,) identifier of each probe's particle domain
+    xi: NDArray[np.float64]  # (n, d) local coordinates in this domain
     bodies: tuple[Body, ...] = ()  # all bodies of the scene
     stressed: bool = False  # whether stresses are recorded too
 
@@ -39,22 +39,22 @@ class Probes:
         absent = np.flatnonzero(~np.asarray(present)[body])
         if len(absent):
             first = absent[0]
-            raise ValueError(f"probe at {self.x0[first]}: in body {body[first]}, must be in a body that is present")
+            raise ValueError(f"probe at {self.x0[first]}: body {body[first]} is absent, must be present")
 
     def displacement(self, points: MaterialPoints, comm: MPI.Intracomm) -> NDArray[np.float64]:
-        """Return the displacements (m, d), m, of the probes on every process."""
+        """Return the displacements (n, d), in m, of all probes; every process gets the whole array."""
         known, at = points.find(self.id)
         return self._shared(comm, known, interpolate(points.corners[at] - points.origin[at], self.xi[known]))
 
     def position(self, points: MaterialPoints, comm: MPI.Intracomm) -> NDArray[np.float64]:
-        """Return the present positions (m, d), m, of the probes on every process."""
+        """Return the present positions (n, d), in m, of all probes; every process gets the whole array."""
         known, at = points.find(self.id)
         return self._shared(comm, known, interpolate(points.corners[at], self.xi[known]))
 
     def _shared(
         self, comm: MPI.Intracomm, known: NDArray[np.int64], values: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return the values (m, ...) of all probes on every process; known: indices of the probes on this process."""
+        """Return the values (n, ...) of all probes from values of the probes `known` on this process."""
         out = np.zeros((len(self.id), *values.shape[1:]))
         out[known] = values
         return over_all(comm, out)
@@ -77,7 +77,7 @@ def _same(a: Body, b: Body) -> bool:
 
 
 def positions(x0: ArrayLike, dim: int) -> NDArray[np.float64]:
-    """Return the reference positions of probes as an array (m, d), m."""
+    """Return the reference positions of n probes as an array (n, d), in m."""
     allowed = f"positions of {dim} finite coordinates"
     x = np.atleast_2d(numbers("probes: x0", x0, None, allowed=allowed))
     if x.shape[1:] != (dim,):
@@ -86,24 +86,27 @@ def positions(x0: ArrayLike, dim: int) -> NDArray[np.float64]:
 
 
 def probes(bodies: Sequence[Body], x0: ArrayLike, *, stress: bool = False) -> Probes:
-    """Return probes: material particles at which a run records results; the argument `probes` of `Simulation.run`.
+    """Return the material particles at which `Simulation.run` records results, for its argument `probes`.
 
-    A run records displacement and position, with fluid also the pore pressure, and on request the stress; see `Row`.
+    A run records their displacements and positions, see `Row`. In scenes with fluid it also records their pore
+    pressures, and on request their effective stresses.
 
     Parameters
     ----------
     bodies
         All bodies, in the order in which the scene lists them.
-    x0 : (m, d), m
-        Reference positions, before the map of `mapped`, inside or on the surface of the bodies.  A probe on a common
-        surface of two bodies belongs to the first; move the position slightly to select the other.
+    x0 : (n, d), m
+        Reference positions inside the bodies or on their surfaces, before the map of `mapped`.  A probe on a common
+        surface of two bodies belongs to the body that comes first in `bodies`.  To select the other body, move the
+        position slightly.
     stress
         Whether to record the effective stress too.
 
     Raises
     ------
     ValueError
-        A position is outside the bodies.  A run raises ValueError if the scene has other bodies, or a body is absent.
+        A position is outside the bodies.  `Simulation.run` raises ValueError if its scene has other bodies, or if the
+        body of a probe is absent.
     """
     all_of("probes: bodies", bodies, Body, 1)
     flag("probes: stress", stress)
@@ -120,7 +123,7 @@ def probes(bodies: Sequence[Body], x0: ArrayLike, *, stress: bool = False) -> Pr
 def _domains_at(
     bodies: Sequence[Body], x: NDArray[np.float64], rounded: float
 ) -> Iterator[tuple[int, NDArray[np.float64]]]:
-    """Yield, in order, the identifier of each point whose domain contains x (d,), m, and the local coordinates of x."""
+    """Yield the identifier of each point whose domain contains the position x (d,), and the local coordinates of x."""
     start = 0
     for body in bodies:
         for part in in_chunks(len(body)):
@@ -134,7 +137,10 @@ def _domains_at(
 
 
 def coordinates(corners: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the local coordinates (n, d), in [-1, 1], of a position x (d,), m, in domains with corners (n, 2^d, d)."""
+    """Return the local coordinates (n, d) of a position x (d,) in n domains with corners (n, 2^d, d).
+
+    Coordinates of positions inside a domain are in [-1, 1].
+    """
     signs, xi = 2 * corner_bits(len(x)) - 1, np.zeros((len(corners), len(x)))
     for _ in range(20):  # Newton's method; the first step is exact for parallelepipeds
         hats = 0.5 * (1 + signs * xi[:, None, :])

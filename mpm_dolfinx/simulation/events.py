@@ -10,8 +10,8 @@ from typing import Any, NamedTuple, Protocol
 from mpi4py import MPI
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.optimize import brentq
 
 from mpm_dolfinx.base.errors import Report, StepFailed
 from mpm_dolfinx.base.time_integration import Substep
@@ -22,20 +22,20 @@ from mpm_dolfinx.stepping.scene import Scene
 from mpm_dolfinx.stepping.state import State
 
 LOCATED = 1e-3
-"""Accuracy of the time of an event, relative to the step. Source: definition, the documented accuracy of `until`."""
+"""Accuracy of an event's time, relative to the length of the step.  Source: definition, as documented in `until`."""
 
 Event = Callable[[Any], float]
-"""A number or a boolean, as a function of the simulation."""
+"""A function of the simulation that returns a number or a boolean."""
 
 
 class Simulated(Protocol):
-    """A `Simulation`; `state` is replaced as a whole."""
+    """Interface of a `Simulation`. Its `state` is only replaced as a whole."""
 
     scene: Scene
     state: State
 
     def advanced(self, dt: float, *how: Sequence[Substep]) -> tuple[State, Report]:
-        """Return the state after a step of dt, s, and its report; how: substeps, if not the scene's."""
+        """Return the state after a step of dt, s, and its report; how: substeps, by default the scene's substeps."""
 
 
 class Step(NamedTuple):
@@ -64,12 +64,12 @@ class Events:
         Simulation at the start of the run.
     until
         One function of the simulation, or several. An event occurs when a returned number changes sign within a step,
-        or when a returned boolean becomes True.
+        or when a returned boolean changes.
 
     Raises
     ------
     ValueError
-        An entry is not a function, returns no number, or differs between processes.
+        An entry is not a function, returns no number, or returns different numbers on different processes.
     """
 
     def __init__(self, simulation: Simulated, until: Event | Sequence[Event] | None):
@@ -82,9 +82,10 @@ class Events:
     def within(self, step: Step, new: State) -> Found | None:
         """Return the first event within a step that ends in the state `new`, or None if there is no event.
 
-        Trial steps of other lengths start from `step.start`. Brent's method chooses the lengths for functions that
-        return numbers, bisection for booleans. The result is the first state found after the event, at most the
-        fraction `LOCATED` of the step later. Afterwards the simulation has the state `step.start`, even after an error.
+        Trial steps from `step.start` locate the event. Brent's method chooses their lengths for functions that return
+        numbers; booleans are located by bisection. The result is the first state found after the event, at most the
+        fraction `LOCATED` of the step later. Afterwards, even after an error, `state` of the simulation is
+        `step.start`.
         """
         if not self._until:
             return None
@@ -102,7 +103,7 @@ class Events:
             for k in range(len(self._until)):
                 end = min(dt for dt, values in tried.items() if _crossed(before, values).any())
                 if _crossed(before, tried[end])[k] and tried[end][k] != 0:
-                    brentq(lambda dt, k=k: self._at(step, dt, tried)[k], 0.0, end, xtol=LOCATED * step.dt)
+                    scipy.optimize.brentq(lambda dt, k=k: self._at(step, dt, tried)[k], 0, end, xtol=LOCATED * step.dt)
         except StepFailed as failed:
             what = "until: the search for an event within a step of %.3g s stopped, because a shorter step failed: %s"
             warn(self._simulation.scene.grid.comm, ResolutionWarning, what, step.dt, failed)
@@ -112,7 +113,7 @@ class Events:
         return Found(int(_crossed(before, tried[end]).argmax()), end, new, report)
 
     def _at(self, step: Step, dt: float, tried: dict[float, list[float]]) -> list[float]:
-        """Return the values at the end of a step of length dt, s, and store them in `tried`."""
+        """Return the functions' values at the end of a step of length dt, s, and store them in `tried`."""
         if dt not in tried:
             self._simulation.state = step.start
             new, _ = self._simulation.advanced(dt, *step.how)
@@ -121,7 +122,7 @@ class Events:
         return tried[dt]
 
     def _values(self) -> list[float]:
-        """Return the values of the functions, booleans as 1 or -1; an error of one process is raised on all."""
+        """Return the values of the functions, with booleans as 1 or -1. An error on one process is raised on all."""
         s, comm = self._simulation, self._simulation.scene.grid.comm
         out = by_user(comm, "until: a function", lambda: [_number(k, of(s)) for k, of in enumerate(self._until)])
         check_alike(comm, {f"until: function {k}": value for k, value in enumerate(out)})
@@ -139,7 +140,7 @@ def check_alike(comm: MPI.Intracomm, given: Mapping[str, Any]) -> None:
 
 
 def _crossed(before: Sequence[float], now: Sequence[float]) -> NDArray[np.bool_]:
-    """Return a mask of values with another sign than at the start of a step; a zero at the start is no event."""
+    """Return a mask of values with another sign than at the start of a step, where they are not zero."""
     sign = np.sign(before)
     return (sign != 0) & (np.sign(now) != sign)
 

@@ -53,26 +53,29 @@ class Simulation:
         components that they fix, such as {"left": "xy", "bottom": "y"}.
     conditions
         Conditions on the bodies, in any order: `Traction`, `Pressure`, `Displacement`, `RigidPlate`, `Drained` and
-        `Inflow` on their sides, rigid `Tool`s, and `Contact`s of groups of bodies. Other sides are free and sealed.
+        `Inflow` on their sides, rigid `Tool`s, and `Contact`s between groups of bodies. Sides without a condition are
+        free of traction and undrained.
     fluid
         Pore fluid; None for a dry scene.
     gravity : (d,) or callable t -> (d,), m/s^2
-        Acceleration of gravity; in axisymmetry along the axis.
+        Acceleration of gravity. In axisymmetry it is along the axis.
     pressure
-        Initial pore pressure, Pa: a number, or a function of positions x (n, d) such as `hydrostatic`; with fluid only.
+        Initial pore pressure, Pa: a number, or a function of positions x (n, d) such as `hydrostatic`. It requires a
+        fluid.
     initial_stress
-        Initial effective stress, tension positive: `K0`, a function of positions x (n, d) that returns normal stresses
-        (n, 3) or tensors (n, 3, 3), Pa, or one of these for some bodies, {index: ...}. Bodies that a stage adds start
-        without stress unless they are listed. At the start the stress is balanced with the loads, at the initial pore
-        pressures: under constant loads the first step then causes no displacement.
+        Initial effective stress, tension positive: `K0`, or a function of positions x (n, d). The function returns
+        normal stresses (n, 3) or tensors (n, 3, 3), Pa. A dictionary {index: ...} gives initial stresses to some bodies
+        only. Bodies that a stage adds start without stress unless the dictionary lists them. At the start the stress is
+        balanced with the loads and the initial pore pressures. Under constant loads the first step then causes no
+        displacement.
     terms
-        User-defined terms in UFL: functions for the balance of momentum, see `user_functions`; such functions on a
-        side, `OnSide`; and terms in the storage of fluid, `Source`.
+        User-defined terms in UFL. Functions are terms of the momentum balance, see `user_functions`; `OnSide` applies
+        such a function to a side. A `Source` is a term of the fluid balance.
     numerics
         Quadrature, coupling, tolerance and time integration, see `Numerics`.
     inertia
-        True: bodies have inertia, and need no walls; with an initial velocity: `Moving`. False: quasi-static; a later
-        stage may switch inertia on. None: quasi-static in all stages. Inertia excludes `quadrature="point"`.
+        True: bodies have inertia, and need no walls. `Moving`: they also have an initial velocity. False: quasi-static;
+        a later stage may switch inertia on. None: quasi-static in all stages. Inertia excludes `quadrature="point"`.
 
     Attributes
     ----------
@@ -190,39 +193,44 @@ class Simulation:
 
     @property
     def reactions(self) -> ByName[NDArray[np.float64]]:
-        """Force (d,) of each prescribed displacement on the bodies, by name, N (N/m in plane strain), in the last step.
+        """Force (d,), in N (N/m in plane strain), of each prescribed displacement on the bodies, by name.
 
-        In axisymmetry: force on the full circumference, radial component outward. Before a stage's first step: nan.
+        The force is that of the last step, and nan before a stage's first step. In axisymmetry it acts on the full
+        circumference, and its radial component is positive outwards.
         """
         return self.outcome("reactions")
 
     @property
     def wall_reactions(self) -> ByName[NDArray[np.float64]]:
-        """Force (d,), N (N/m in plane strain), of each wall of the grid on the bodies; zero for free components.
+        """Force (d,), in N (N/m in plane strain), of each wall of the grid on the bodies; zero for free components.
 
-        Where two walls fix a component, the wall normal to it has the whole force; if neither is normal, each has half.
+        Where two walls fix the same component, the wall normal to this component carries its whole force. If neither
+        wall is normal to the component, each wall carries half.
         """
         return self.outcome("wall_reactions")
 
     @property
     def outflows(self) -> ByName[NDArray[np.float64]]:
-        """Outflow through each drained side and each side with inflow, by name, m^3/s (m^2/s in plane strain)."""
+        """Outflow, in m^3/s (m^2/s in plane strain), through each drained side and each side with inflow, by name."""
         return self.outcome("outflows")
 
     @property
     def tool_forces(self) -> ByName[NDArray[np.float64]]:
-        """Forces, N, and moments, N m, (3,), in 3D (6,), of each `Tool` and `Contact` on the bodies, by name."""
+        """Force, in N, and moment, in N m, of each `Tool` and `Contact` on the bodies, by name.
+
+        Force and moment are one array: (3,) in 2D, (6,) in 3D.
+        """
         return self.outcome("tool_forces")
 
     @property
     def tool_travel(self) -> ByName[NDArray[np.float64]]:
-        """Displacement of each load-controlled `Tool`, without its prescribed displacement, by name, m."""
+        """Displacement, in m, of each load-controlled `Tool` in addition to its prescribed displacement, by name."""
         return self.outcome("tool_travel")
 
     def outcome(self, quantity: str) -> ByName[NDArray[np.float64]]:
-        """Return results of conditions, including user-defined conditions, at the end of the last step, by name.
+        """Return a quantity of all conditions at the end of the last step, by name of the condition.
 
-        The result is empty for quantities that no condition of the stage has.
+        User-defined conditions are included. The result is empty if no condition of the stage has the quantity.
 
         Raises
         ------
@@ -240,9 +248,10 @@ class Simulation:
         return self.state.stage.present
 
     def effective_stress(self) -> NDArray[np.float64]:
-        """Return the effective Cauchy stress (n, d, d), Pa, tension positive, at the material points.
+        """Return the effective Cauchy stress (n, d, d), in Pa, tension positive, at the material points.
 
-        In axisymmetry it is (n, 3, 3), in the radial, axial and hoop directions. All processes must call it.
+        In axisymmetry its shape is (n, 3, 3), in the radial, axial and circumferential directions. All processes must
+        call it.
         """
         return self.scene.materials.effective_stress(self.state.points)
 
@@ -270,29 +279,31 @@ class Simulation:
     ) -> None:
         """Begin a stage: add and remove bodies, and replace walls, conditions or gravity.
 
-        Stresses and pressures are unchanged. The next `run` finds the new equilibrium at once, or gradually under
-        varying loads.
+        The stage changes no stress and no pressure. The next `run` finds the new equilibrium: at once under constant
+        loads, gradually under varying loads.
 
         Parameters
         ----------
         walls, gravity
-            New walls and gravity, as for the scene; `gravity` only if the scene has gravity.
+            New walls and gravity, as for the scene. `gravity` requires a scene with gravity.
         inertia
-            Whether bodies have inertia from now on; only if the scene allows it. Bodies then start without velocity.
+            Whether bodies have inertia from now on, if the scene allows it. Bodies that get inertia start without
+            velocity.
         conditions
             All conditions from now on; by default the present ones. `[*simulation.conditions, more]` adds one. Every
             `Contact` remains in force, whether it is listed or not.
         add
-            Indices of bodies that are `Later`: a fill, without velocity and stress. A fill is placed on the present
-            surface of the bodies that it touched when seeded; the fill's opposite side remains where it was seeded.
+            Indices of bodies that are `Later`, such as a fill. They start without velocity, and without stress unless
+            `initial_stress` lists them. A fill is placed on the present surface of the bodies that it touched when it
+            was seeded. The opposite side of the fill remains where it was seeded.
         remove
-            Indices of bodies to be removed: an excavation.
+            Indices of bodies to be removed, such as an excavation.
         reset_displacement
-            Whether displacements are measured from the present positions. Conditions are not adapted: a remaining
-            `Displacement` of value d is then measured from there too, so it moves its side by d again.
+            Whether displacements are measured from the present positions from now on. The values of conditions are not
+            adapted: a `Displacement` of value d that remains in force moves its side by d again.
         fields
             New values for entries of `points.data`: rows (n, ...) for the points of this process, or one value for all.
-            Entries are constants of materials that vary with position, state of laws, or new data of the user.
+            Entries are material constants that vary with position, state variables of laws, or new data of the user.
 
         Raises
         ------
@@ -318,7 +329,7 @@ class Simulation:
         return report
 
     def advanced(self, dt: float, *how: tuple) -> tuple[State, Report]:
-        """Return the state after a step of dt, s, and its report; `state` is unchanged; how: substeps to be used."""
+        """Return the state after a step of dt, s, and its report, without changing `state`; how: its substeps."""
         numbers("dt", dt, test=lambda v: (0 < v) & (v < np.inf), allowed="> 0 and finite")
         try:
             return step(self.scene, self._state, dt, *how)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Length of the steps of a run: equal steps, or adaptive steps from their estimated error.
 
-The errors are estimated in `note_pressures` of `solve/newton.py`, in `filling` of `flow/storage.py` for the water
-content, and in `dynamics/motion_error.py`.
+`note_pressures` of `solve/newton.py` estimates the error of the pressures, and `filling` of `flow/storage.py` estimates
+the error of the water content. `dynamics/motion_error.py` estimates the error of the motion.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ from mpm_dolfinx.stepping.scene import Scene
 from mpm_dolfinx.stepping.state import StepControl
 
 MIN_CUT, MIN_CUT_BY_ERROR = 2.0**-10, 2.0**-30
-"""Smallest reduced step, divided by the nominal step: first of equal steps, then of adaptive steps.
+"""Smallest reduced step, divided by the nominal step: the first number for equal, the second for adaptive steps.
 
-Adaptive steps may grow by several powers of ten. At the onset of sliding they must shrink to its time scale.
+Adaptive steps may grow by several powers of ten. At the onset of sliding they must shrink to the slide's time scale.
 """
 FINEST = NEAR**2
-"""Smallest adaptive step divided by the time.  Without it, steps would become ever smaller at a singularity in time.
+"""Smallest adaptive step, divided by the time.  It stops the decrease of steps at a singularity in time.
 
-Source: epsilon, a smaller step changes less than four digits of the time.
+Source: epsilon, a smaller step changes only the last four digits of the time.
 """
 SAFETY, SHRINKS, GROWS, KEEPS = 0.9, 0.2, 5.0, 1.2
-"""Factor of the next adaptive step: `SAFETY` times a power of tolerance / error, from `SHRINKS` to `GROWS`.
+"""Factor of the next adaptive step: `SAFETY` times a power of (tolerance / error), between `SHRINKS` and `GROWS`.
 
 A factor from 1 to `KEEPS` counts as 1.  Source: Hairer, Norsett and Wanner (1993), eq. 4.13; for `KEEPS` Hairer and
 Wanner (1996), IV.8.
@@ -47,7 +47,7 @@ The stability function is never below -0.21, so an undetected jump overshoots by
 AGAIN = 2.0
 """A pressure jumps if its rate is more than `AGAIN` times the rate in the first substep of the previous step."""
 MOST = SAME / EPSILON
-"""Largest number of output intervals. Source: exact; with more intervals, `SAME` times a step is below rounding."""
+"""Largest number of output intervals. Source: exact; with more, `SAME` times an interval is below rounding."""
 RESOLVED = 10
 """Smallest ratio of `rtol` to the solver tolerance; below it, solver errors would hide the error of the step."""
 FIRST = 1e-3
@@ -64,7 +64,7 @@ class Adaptive:
         Tolerance, see `run`.
     first_step : s
         First trial step of a new run, > 0.  The default is 18 rtol times the diffusion time of a cell, but at least
-        0.001 and at most 1 times the first output interval.  With inertia it is at most the time in which a wave
+        0.001 and at most 1 times the first output interval.  With inertia it is also at most the time in which a wave
         crosses a cell.
     max_step : s
         Longest step, > 0.
@@ -92,12 +92,12 @@ class StepSize:
     Parameters
     ----------
     first : s
-        First step.
+        Length of the first step.
     longest : s
         Length of equal steps, or of the longest adaptive step.
     rtol
-        Tolerance of the pressure error, relative to the largest pressure change since the start of the run, or to the
-        undrained pressure change of the step if that is larger; None for equal steps.
+        Tolerance of the pressure error, or None for equal steps. It is relative to the larger of two changes: the
+        largest pressure change since the start of the run, and the undrained pressure change of the step.
     """
 
     first: float
@@ -115,7 +115,7 @@ class StepSize:
         return target - t <= slack
 
     def least(self, size: float, t: float) -> float:
-        """Return the smallest step, s, at time t, s; size: nominal step, s."""
+        """Return the smallest allowed step, s, at time t, s; size: nominal step, s."""
         return max(MIN_CUT_BY_ERROR * size, FINEST * abs(t)) if self.by_error else MIN_CUT * size
 
     def preferred(self, size: float) -> float:
@@ -131,7 +131,7 @@ class StepSize:
         return left if not left > (1 - SAME) * small else small
 
     def refused(self, size: float, report: Report, control: StepControl) -> float:
-        """Return the factor, < 1, that reduces a solved step so that it meets the error tolerance; 1 if it is accepted.
+        """Return the factor, < 1, by which a solved step must be shortened to meet the tolerance; 1 if it is accepted.
 
         After a jump of the loads one step overshoots by up to a fifth of the remaining change; two half steps do not.
         """
@@ -141,7 +141,7 @@ class StepSize:
         return 1.0 if self._excess(report, control) <= 1 else self._factor(report, control, 1.0)
 
     def next(self, size: float, report: Report, control: StepControl, failed: bool) -> float:
-        """Return the next trial step, s, after a completed one; failed: whether a longer step had not converged."""
+        """Return the next trial step, s, after a completed step; failed: whether a longer trial did not converge."""
         if not self.by_error:
             grows = report.easy and not self._rings(size, report, control)  # twice the step would be rejected
             return max(control.small, min(2 * size, self.longest)) if grows else control.small
@@ -153,7 +153,7 @@ class StepSize:
         return size * factor
 
     def cut(self, size: float, control: StepControl) -> StepControl:
-        """Return the step control with half the step, s, as the next trial, after a step that did not converge."""
+        """After a step that did not converge, return the step control with half of this step, s, as the next trial."""
         whole = size > (1 - SAME) * control.small
         waits = 2 * control.waits + 1 if whole and control.kept == 0 else control.waits
         return replace(control, small=size / 2, waits=waits, kept=1)
@@ -161,9 +161,9 @@ class StepSize:
     def grown(self, size: float, report: Report, control: StepControl, failed: bool) -> StepControl:
         """Return the step control with the next trial step after a completed step, s; failed: see `next`.
 
-        Equal steps grow at once after a reduction, until a newly grown step fails too. Then `waits`, the number
-        of steps before they grow again, becomes 1, 3, 7 and so on. It is halved when a newly grown step converges.
-        `kept` counts the steps since the last reduction or growth: 0 directly after growth.
+        Equal steps grow at once after a reduction, until a newly grown step fails too. Then `waits`, the number of
+        steps before they grow again, becomes 1, 3, 7 and so on. When a newly grown step converges, `waits` is halved.
+        `kept` counts the steps since the last reduction or growth; it is 0 directly after growth.
         """
         small, whole = self.next(size, report, control, failed), size > (1 - SAME) * control.small
         if self.by_error:
@@ -177,15 +177,15 @@ class StepSize:
     def _rings(self, size: float, report: Report, control: StepControl) -> bool:
         """Return whether a step may have overshot a jump of the loads.
 
-        A step leaves at most a fifth of a jump. A change that is equally sudden in successive steps is therefore no
-        jump. For example, an edge pushed into a body causes such changes, because the grid is reset in every step.
-        Changes that are rounding errors, compared with the changes of other bodies, are no jumps either.
+        A step completes at least four fifths of a jump. Equally sudden changes in successive steps are therefore no
+        jumps. For example, an edge pushed into a body causes a sudden change in every step, because the grid is reset.
+        Changes as small as the rounding errors of other bodies' changes are no jumps either.
         """
         excess = report.sudden - AGAIN * size * np.asarray(control.first)
         return bool((excess > np.maximum(RINGS * np.asarray(control.change), NEAR * max(control.change))).any())
 
     def _factor(self, report: Report, control: StepControl, power: float) -> float:
-        """Return the factor from the length of the solved step to the length of a step with the tolerated error."""
+        """Return the length of a step with the tolerated error, divided by the length of the solved step."""
         excess = self._excess(report, control)
         return min(GROWS, max(SHRINKS, SAFETY / excess**power if excess > 0 else GROWS))
 
@@ -193,8 +193,8 @@ class StepSize:
         """Return the largest ratio of error to tolerance in a step, among pressure, motion and water content.
 
         The tolerance of the pressure includes the undrained pressure change of the step, because freely draining
-        pressures follow the motion. The time error of such pressures affects no motion. Their error due to the grid,
-        some percent, does not fall with the step.
+        pressures follow the motion. The time error of such pressures affects no motion. The grid causes an error of
+        some percent in such pressures, and this error does not decrease with the step.
         """
         error, motion = report.moves
         motion = max(control.motion or 0.0, motion)
@@ -209,7 +209,7 @@ class StepSize:
 
 
 def measured(control: StepControl, report: Report) -> StepControl:
-    """Return the step control, updated with the largest changes of pressure, motion and water content so far."""
+    """Return the step control with the largest changes of pressure, motion and water content, including this step's."""
     change = np.maximum(np.maximum(control.change, report.change), NEAR * report.stress)
     start = control.start
     if report.extremes is not None:
@@ -275,12 +275,12 @@ class Times:
         return [start + k * dt for k in range(done + 1, count)] + [self.end] * (count > done)
 
     def next(self, t: float) -> float:
-        """Return the latest end, s, of steps towards the first output after time t, s: its time plus rounding."""
+        """Return the latest end, s, of steps towards the first output after time t, s: time of output plus rounding."""
         return max([*self.after(t)[:1], t]) + SAME * self.interval
 
 
 def diffusion_time(scene: Scene, points: MaterialPoints) -> float:
-    """Return the least time of diffusion through a cell, s: size squared, divided by c_v; 0 without conductivity."""
+    """Return the shortest time of diffusion through a cell, s: its size squared / c_v; 0 without conductivity."""
     if scene.fluid is None:
         return 0.0
     stored = scene.materials.table(points, lambda m: m.biot**2 / m.oedometric)
@@ -294,7 +294,7 @@ def diffusion_time(scene: Scene, points: MaterialPoints) -> float:
 
 
 def cell_time(scene: Scene, points: MaterialPoints) -> float:
-    """Return the least time for waves to cross a cell, s."""
+    """Return the shortest time, s, in which a wave crosses a cell."""
     density = scene.materials.density(points)
     at = density > 0
     grid = scene.grid

@@ -6,10 +6,10 @@ Lane 1999). Dilation is divided too, so that associated flow stays associated. S
 but a failure of the solver is no proof that the soil is too weak. Each trial therefore adds a viscous stress and
 follows the motion in time. The criterion is the overload: the ratio of viscous stress to shear stress in the moving
 soil. If a body comes to rest, the soil's strength bears the load, and the overload vanishes. In a slide the overload
-remains, equal to the missing strength, at any viscosity and cell size.
+remains. It equals the missing strength for any viscosity and cell size.
 
-Before the trials, soil with unlimited strength takes one step. Bodies in equilibrium keep their stresses in this step.
-Bodies that cannot stand, and were therefore not run, get elastic stresses in it.
+Before the trials, one step is computed with soil of unlimited strength. In this step bodies in equilibrium keep their
+stresses. Bodies that cannot stand, and were therefore not run, get elastic stresses.
 """
 
 from __future__ import annotations
@@ -45,19 +45,20 @@ if TYPE_CHECKING:
     from mpm_dolfinx.simulation.simulation import Simulation
 
 WIDER, WIDEST = 2**0.5, 16.1
-"""Ratio of successive trial factors, until bodies rest at one and slide at another; 1 / `WIDEST` <= F <= `WIDEST`."""
+"""Ratio of successive trial factors until bodies rest at one and slide at another; largest factor, largest inverse."""
 LACKS = 0.25
 """Largest overload, divided by `rtol`, of a trial that comes to rest.
 
-A trial that slides starts with an overload of 0.9 times the missing strength in a uniform block, 0.6 times in a slope.
-By its end the overload has halved. With values of 1/8 and 1/2 the slope's factor changes by 1.1 and 0.5 %.
+A trial that slides starts with an overload of 0.9 times the missing strength in a uniform block, and 0.6 times in a
+slope. By the end of the trial the overload has halved. The factor of the slope changes by 1.1 % if this number is 1/8,
+and by 0.5 % if it is 1/2.
 """
 STRAINS = 4.0
-"""Strain in a trial of a marginal slide, divided by the smaller of its overload and the elastic strain at yield.
+"""Strain of a marginal slide in a trial, divided by the smaller of its overload and the elastic strain at yield.
 
-Stresses of soil that begins to flow redistribute within a few times the strain at yield.  In soft soil such large
+When soil begins to yield, its stresses redistribute within a few times the strain at yield.  In soft soil such large
 strains would change the shape of the body; a larger viscosity limits them.  If this number is halved or doubled, the
-factor of a slope changes by 0.5 %; with twice the number of steps, by less than 0.1 %.
+factor of a slope changes by 0.5 %.  With twice the number of steps it changes by less than 0.1 %.
 """
 STRENGTHS = ("cohesion", "residual", "hardening", "tension", "friction", "dilation")
 ANGLES = ("friction", "dilation")
@@ -72,7 +73,8 @@ class Safety:
     bounds
         Largest factor of a trial that came to rest, and smallest factor of a trial that did not.
     overloads
-        Overload in each step (n,), by trial factor: work of the viscous stress, divided by that of the shear stress.
+        Overloads (n,) in the n steps of each trial, by trial factor. An overload is the work of the viscous stress in a
+        step, divided by the work of the shear stress.
     newton
         Number of Newton steps of all trials.
     """
@@ -98,20 +100,20 @@ def factor_of_safety(
     simulation
         Scene under its loads, which must be constant in time from now on.
     dt
-        Length of a step, s, > 0: long compared with viscous time scales of laws and terms. With flow of fluid `dt` is
-        required: short for undrained failure, long for drained failure.
+        Length of a step, s, > 0. It must be long compared with the viscous time scales of laws and terms. It is
+        required if fluid flows; choose it short for undrained failure, and long for drained failure.
     rtol
         Final relative difference of the bounds, in [1e-4, 0.5].
     steps
-        Largest number of steps in a trial, >= 8; bodies that move after these steps slide.
+        Largest number of steps in a trial, >= 8. Bodies that still move after these steps are said to slide.
     progress
         Whether to show a progress bar on a terminal.
 
     Raises
     ------
     ValueError
-        An argument is invalid; a soil has a strength that cannot be divided; bodies have no stress.  Bodies do not
-        slide with 1/16 of their strength, or do not come to rest with 16 times their strength.
+        An argument is invalid, the strength of a soil cannot be divided, or the bodies have no stress.  The bodies do
+        not slide with 1/16 of their strength, or do not come to rest with 16 times their strength.
     GaveUp
         A step of a trial does not converge, however short.
     """
@@ -175,7 +177,7 @@ class _Bar:
 
 
 def _bracket(rests: Callable[[float], bool]) -> tuple[float, float]:
-    """Return a factor at which bodies rest and a larger one at which they slide; the first trial is 1."""
+    """Return a factor at which bodies rest and a larger factor at which they slide; the first trial factor is 1."""
     known, wider = 1.0, WIDER if (begins := rests(1.0)) else 1 / WIDER
     while 1 / WIDEST <= (trial := known * wider) <= WIDEST:
         if rests(trial) != begins:
@@ -189,8 +191,8 @@ def _bracket(rests: Callable[[float], bool]) -> tuple[float, float]:
 def _ends(overloads: Sequence[float], steps: int, least: float) -> bool:
     """Return whether the overloads of the steps so far determine the result of a trial.
 
-    The overload falls ever more slowly. A body therefore slides if the last step's rate of decrease, continued, does
-    not bring it to rest in the remaining steps.
+    The overload decreases ever more slowly. If its last rate of decrease does not bring the bodies to rest in the
+    remaining steps, they slide.
     """
     *before, last = overloads
     rate = min(1.0, last / before[-1]) if before else 0.0
@@ -199,7 +201,7 @@ def _ends(overloads: Sequence[float], steps: int, least: float) -> bool:
 
 @dataclass
 class _Trial:
-    """A trial for the time loop; newton: list to which each time step appends its number of Newton steps."""
+    """A trial that the time loop runs; newton: list to which each time step appends its number of Newton steps."""
 
     scene: Scene
     state: State
@@ -223,9 +225,9 @@ class _Weakened:
         for m in scene.materials.materials:
             if m.state and not isinstance(m, Frictional):
                 what = f"factor_of_safety: strength of {type(m).__name__} cannot be divided"
-                raise ValueError(f"{what}, must be a law with friction and cohesion")
+                raise ValueError(f"{what}; the law must have friction and cohesion")
         if not any(isinstance(m, Frictional) for m in scene.materials.materials):
-            raise ValueError("factor_of_safety: no material has a strength, one must have friction and cohesion")
+            raise ValueError("factor_of_safety: no material has a strength; one must have friction and cohesion")
         if scene.grid.copies > 1:
             raise ValueError("factor_of_safety: the scene has contacts, must have none")
         initial = begin_stage(scene, simulation.state, {}, [], [], False, {})  # has no data of the old grid
@@ -256,7 +258,7 @@ class _Weakened:
         self._viscosity.value = steps / STRAINS * max(least * modulus, stress) * dt
 
     def overloads(self, factor: float, tell: Callable[[int, float], None]) -> NDArray[np.float64]:
-        """Return the overload of each step (n,) until the result is known; tell: function called after each step."""
+        """Return the overloads (n,) in n steps of a trial, until its result is known; tell: called after each step."""
         trial, out = self._trial(self._start, lambda name, value: _over(name, value, factor)), []
         while len(out) < self._steps and not (out and _ends(out, self._steps, self._least)):
             before = trial.state.points
@@ -266,14 +268,14 @@ class _Weakened:
         return np.array(out)
 
     def _unyielding(self, initial: State) -> State:
-        """Return the state after a step with soil whose strength exceeds its modulus: it does not yield."""
+        """Return the state after a step in which the soil cannot yield, because its strength exceeds its modulus."""
         moduli = self._scene.materials.table(initial.points, lambda m: m.oedometric)
         trial = self._trial(initial, lambda name, value: value if name in ANGLES else np.maximum(value, moduli))
         self._go_on(trial, "soil that cannot yield")
         return replace(trial.state, t=initial.t)
 
     def _trial(self, start: State, strength: Callable[[str, NDArray[np.float64]], NDArray[np.float64]]) -> _Trial:
-        """Return a trial from the state `start`; strength: function of a strength's name and values (n,)."""
+        """Return a trial from the state `start`; strength: function of the name and the values (n,) of a strength."""
         data = {name: strength(name, value) for name, value in self._strengths.items()}
         points = replace(start.points, data={**start.points.data, **data})
         return _Trial(self._scene, replace(start, points=points, velocity=None, result=None, control=None), self.newton)
@@ -308,7 +310,7 @@ def _deviator(tensors: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _mean_stress(scene: Scene, points: MaterialPoints) -> float:
-    """Return the volume mean of the norm of effective stress, Pa; ValueError if rounding alone may cause this mean."""
+    """Return the mean norm of the effective stress, Pa; raise ValueError if it may be a rounding error."""
     grid = scene.grid
     size = np.linalg.norm(scene.materials.effective_stress_3d(points), axis=(1, 2))
     moduli, volume = scene.materials.table(points, lambda m: m.oedometric), points.volume0 * points.J
@@ -321,7 +323,7 @@ def _mean_stress(scene: Scene, points: MaterialPoints) -> float:
 
 
 def _shear_modulus(scene: Scene, points: MaterialPoints) -> float:
-    """Return the harmonic mean of G, Pa, over the volume of soil with a strength, because soft soil flows first."""
+    """Return the harmonic mean of G, Pa, of soil with a strength; soft soil, which yields first, counts more."""
     softness = scene.materials.table(points, lambda m: 1 / m.shear if isinstance(m, Frictional) else 0 * m.shear)
     volume = points.volume0 * points.J
     total, whole_volume = over_all(scene.grid.comm, np.array([softness @ volume, (softness > 0) @ volume]))
@@ -349,7 +351,7 @@ def _constant(X: NDArray[np.float64], value: float) -> NDArray[np.float64]:
 
 
 def _strengths(scene: Scene, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
-    """Return the values (n,) of each strength at the points, by name; zero in materials without it."""
+    """Return the values (n,) of each strength at the points, by name; zero in materials without this strength."""
     out = {}
     for i, m in enumerate(scene.materials.materials):
         rows = np.flatnonzero(points.material == i)
@@ -360,5 +362,5 @@ def _strengths(scene: Scene, points: MaterialPoints) -> dict[str, NDArray[np.flo
 
 
 def _over(name: str, value: NDArray[np.float64], factor: float) -> NDArray[np.float64]:
-    """Return a strength divided by a factor, for angles by the tangent."""
+    """Return a strength divided by a factor; the factor divides the tangents of angles."""
     return np.degrees(np.arctan(np.tan(np.radians(value)) / factor)) if name in ANGLES else value / factor

@@ -71,12 +71,12 @@ def _storage(s: Scene, state: State) -> list[Part]:
     names = ("pore pressure", "fluxes between cells", "weight of the fluid", "open sides", "damping of pressure jumps")
     if storage is None:
         return [Part(name, False, "no fluid") for name in (*names, "pores that drain", "retention", "sources")]
-    still, f = "nothing conducts", storage.fluxes
+    still, f = "no conductivity", storage.fluxes
     return [
         Part(names[0], True, "finite volumes, coupled"),
         _either(names[1], f.flux, f"two-point, conductivities over {s.fluid.unit_weight:.6g} N/m^3", still),
         _either(names[2], f.gravity, "gravity", "no gravity" if f.flux else still),
-        _either(names[3], names[3] in count, f"{count.get(names[3])} drained or with inflow", "sealed"),
+        _either(names[3], names[3] in count, f"{count.get(names[3])} drained or with inflow", "no-flow sides only"),
         _either(names[4], f.damp.used, "little flow within a step", "enough flow within a step, so far"),
         _either("pores that drain", storage.drains, "as a free surface falls", "pores stay full"),
         _either("retention", storage.retains, _laws(s), "no suction drains pores"),
@@ -115,8 +115,8 @@ def table(scene: Scene, state: State) -> str:
 def imbalance(scene: Scene, state: State) -> dict[str, float]:
     """Return for points, pieces and active cells the largest number on a process, divided by the mean over processes.
 
-    The ratio 1 means perfect balance. Ratios of pieces and cells are also 1 before the first step. The time of a step
-    is proportional to the number of pieces. All processes must call it.
+    The ratio 1 means perfect balance. Before the first step, the ratios of pieces and cells are set to 1. The time of a
+    step is proportional to the number of pieces. All processes must call it.
     """
     comm, (on_grid, _) = scene.grid.comm, scene.last
     pieces = on_grid.data.pieces if on_grid else None

@@ -22,25 +22,26 @@ from mpm_dolfinx.stepping.step import set_up
 class Tangent:
     """Derivatives of the residuals with respect to displacements and pressures, for a step by backward Euler.
 
-    Forces change by `stiffness` du + `pressure` dp, N, and fluid contents by `content` du + `storage` dp, m^d, for du
-    (n,), m, and dp (m,), Pa; in plane strain per metre. Without fluid, `pressure` and the fields after it are None.
+    Let du (n,), in m, be changes of the displacements, and dp (k,), in Pa, changes of the pressures. Forces, in N (N/m
+    in plane strain), then change by `stiffness` du + `pressure` dp. Fluid contents, in m^d, change by `content` du +
+    `storage` dp. Without fluid, `pressure` and the fields after it are None.
 
     Parameters
     ----------
     stiffness : (n, n)
-        Stiffness, with ghost penalty and penalties of prescribed displacements and contacts; without fixed components
-        and without the inertia of bodies. Free tools move with the bodies, against their own inertia.
+        Stiffness, including the ghost penalty and the penalties of prescribed displacements and contacts. It excludes
+        fixed components and the inertia of bodies. Free tools move with the bodies; their inertia is included.
     nodes, components : (n,)
         Grid node and axis of each displacement.
     x : (n, d)
         Position of the node of each displacement, m.
-    pressure : (n, m)
+    pressure : (n, k)
         Derivative of forces with respect to pressures.
-    content : (m, n)
+    content : (k, n)
         Derivative of fluid contents with respect to displacements, without the derivative of the fluxes.
-    storage : (m, m)
+    storage : (k, k)
         Derivative of fluid contents with respect to pressures.
-    cells : (m,)
+    cells : (k,)
         Cell of each pressure.
     """
 

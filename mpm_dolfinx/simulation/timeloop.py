@@ -77,37 +77,38 @@ def run(
     t_end
         End time, s, > t (not a duration).
     dt
-        Step and output interval, s, > 0; limited to t_end - t. With `rtol`, `dt` is only the output interval. With
-        `rtol`, and neither `dt` nor `t_eval`, every step is an output.
+        Length of a step, and output interval, s, > 0; limited to t_end - t. With `rtol`, `dt` is only the output
+        interval. With `rtol`, but without `dt` and `t_eval`, every step is an output.
     rtol
-        Tolerance of adaptive steps, or this tolerance with limits of the steps: `Adaptive`. The estimated error of the
+        Tolerance of adaptive steps, or `Adaptive`: the tolerance with limits of the steps. The estimated error of the
         pore pressures stays below about `rtol` times the larger of two changes: the largest since the start of the run,
         and the undrained change of the step. `rtol` is at least ten times `tolerance`, and < 1. If no fluid flows, the
-        steps are the output intervals; a term or law that depends on velocity then raises ValueError: its error cannot
-        be estimated. With inertia the error of the motion is limited too, relative to the largest motion since the
-        start, see `motion_error`. In unsaturated soil the error of the water content is limited too, relative to its
-        largest change in a step so far. The estimate is a fraction of a first-order step's error, see
-        `solve.newton.ERROR`. The largest true error of a run was 0.7 to 5 times the largest estimate; the largest ratio
-        occurs directly after a jump of the load.
-    t_eval : (m,), s
+        steps are the output intervals. A term or law that depends on velocity then raises ValueError, because its error
+        cannot be estimated. With inertia the error of the motion is limited too, relative to the largest motion since
+        the start, see `motion_error`. In unsaturated soil the error of the water content is limited too, relative to
+        its largest change in a step so far. The estimate is a fraction of a first-order step's error, see
+        `solve.newton.ERROR`. The largest true error of a run was 0.7 to 5 times the largest estimate. The ratio is
+        largest directly after a jump of the load.
+    t_eval : (n,), s
         Output times, increasing, in (t, t_end]; t_end is always an output time. Steps end at output times.
     until
-        One function of the simulation, or several, that end the run before t_end. An event occurs when a returned
-        number changes sign within a step, or a returned boolean becomes True. A condition that holds at the start is no
-        event. Example of a number: `lambda s: -s.points.displacement[:, 1].min() - 0.1`. Trial steps locate the event:
-        the run ends at the first state found after it, at most a thousandth of the step later. This state is an output;
-        `Result.event` has the function's index and the time. All processes must return equal values. An event completes
-        the histories, as t_end does; a later run without `until` continues them.
+        One function of the simulation, or several, that end the run before t_end. An event occurs within a step when a
+        returned number changes its sign, or a returned boolean changes. A number that is zero at the start is no event.
+        Example of a number: `lambda s: -s.points.displacement[:, 1].min() - 0.1`. Trial steps locate the event.
+        The run ends at the first state found after the event, at most a thousandth of the step later. This state is an
+        output; `Result.event` has the function's index and the time. The functions must return equal values on all
+        processes. An event completes the histories, as t_end does; a later run without `until` continues them.
     probes
-        Material particles with recorded results.
+        Material particles at which results are recorded.
     observe
         Functions of the simulation, called at each output time, such as a `Writer`; `result` has the histories so far.
     checkpoint
-        Function called after all observers: a `Checkpoint`.
+        Function called after all observers, such as a `Checkpoint`.
     after
-        Histories to be continued, of a run with the same steps: from `resume`, or `result` of an interrupted run.
+        Histories that this run continues: the result of `resume`, or `result` of an interrupted run. `dt` must be the
+        same.
     energies
-        Whether to record energies of bodies with inertia, and work since the start of the run: `Result.energies`.
+        Whether to record the energies of bodies with inertia, and the work since the start, in `Result.energies`.
     progress
         Whether to show a progress bar on a terminal, and to warn of the first reduced step. The logger `mpm_dolfinx`
         reports the other reduced steps at level INFO.
@@ -121,7 +122,8 @@ def run(
     ValueError
         An argument is invalid, or a function of time returns an invalid value.
     GaveUp
-        A step failed, however short. The exception has the histories so far; `state` is the end of the last good step.
+        The shortest allowed step failed. The exception has the histories so far; `state` is the end of the last good
+        step.
     """
     comm = simulation.scene.grid.comm
     simulation.scene.check(simulation.state)
@@ -213,7 +215,7 @@ def _takes_nothing(function: Callable) -> bool:
 def _histories(
     simulation: Simulated, times: Times, rule: StepSize, probes: Probes | None, after: Result | None
 ) -> tuple[Result, StepControl]:
-    """Return new histories that start at the present state, or the histories to be continued, and the step control."""
+    """Return histories that start at the present state or that the run continues, and the step control."""
     state = simulation.state
     latest = simulation.state.result
     control = simulation.state.control
@@ -241,7 +243,7 @@ def _histories(
 
 
 def _counting(scene: Scene, state: State, energies: bool, goes_on: bool) -> State:
-    """Return the state with new energies, with the energies of the continued run, or without energies."""
+    """Return the state with energies that start now, with the energies of the continued run, or without energies."""
     if energies and not state.stage.inertia:
         raise ValueError("energies = True: bodies have no inertia, must be in a stage with inertia=True")
     if energies and goes_on and "energy" in state.outcome:
@@ -283,7 +285,7 @@ def _take_step(simulation: Simulated, rule: StepSize, target: float, verbose: bo
 def _accepted(
     rule: StepSize, start: State, size: float, new: State, report: Report, preferred: float | None = None
 ) -> State:
-    """Return the state after a step of length `size`, s, with its histories; preferred: nominal step, s."""
+    """Return the state after a step of length `size`, s, with updated histories; preferred: nominal step, s."""
     grown = measured(start.control, report)
     grown = rule.grown(size, report, grown, failed=size < (1 - SAME) * (preferred or size))
     grown = replace(grown, first=np.divide(report.first, size).tolist())
@@ -291,7 +293,9 @@ def _accepted(
 
 
 def _advance(simulation: Simulated, rule: StepSize, target: float, verbose: bool) -> tuple[Step, State]:
-    """Return a step towards the time `target`, s, and its end state; the step is reduced until it meets its tolerances.
+    """Return a step towards the time `target`, s, and the state at the end of the step.
+
+    The step is reduced until it meets its tolerances.
 
     verbose: whether to warn of the first reduced step of a run.
     """
@@ -354,7 +358,7 @@ def _by_euler(simulation: Simulated, dt: float, failed: StepFailed) -> tuple[Sta
 
 
 def _has_left(failed: StepFailed, rule: StepSize, size: float, state: State) -> bool:
-    """Return whether points leave the grid although the step is accurate, which shorter steps cannot prevent."""
+    """Return whether points leave the grid in an accurate step, so that shorter steps cannot prevent it."""
     if not isinstance(failed, LeftGrid) or failed.report is None:
         return False
     return rule.refused(size, failed.report, measured(state.control, failed.report)) == 1

@@ -1,24 +1,28 @@
 # SPDX-License-Identifier: MIT
-"""Direct linear solvers, used where they are faster than multigrid (`multigrid`): see `plan`.
+"""Direct linear solvers, which are used where they are faster than multigrid (`multigrid`), see `plan`.
 
 PETSc's own factors of displacement matrices, with a block for each node, take a third of the time of scalar factors.
-Times of the first factorisation, and of the next with the same pattern, with 44000 unknowns in 2D and minimum degree
-ordering, ms: blocks 110 and 60, scalar 430 and 150, MUMPS 260 and 155, UMFPACK 290 and 265, CHOLMOD 285 and 290. A
-solve takes 4 ms (MUMPS 15, CHOLMOD 9). Copying the entries into blocks takes a tenth of the factorisation. On two
-processes MUMPS factorises in the same time, and solves in 25 ms. On several processes, one of them therefore holds the
-factors of displacements, which many solves use. Another holds the factors of pressures, computed at the same time.
-When each of four processes computed both itself, they took 1.7 times as long: processes share the memory's bandwidth.
-In large scenes processes share factors by MUMPS (`Thresholds.mumps`). SuperLU_DIST is slower there: with 100100
-unknowns it takes 841 and 56 ms for factors of K and a solve (MUMPS 476 and 57); with 25500 unknowns 125 and 9 ms.
-MUMPS factorises K and the storage together in 385 ms there, four times as long as K alone.
+With 44000 unknowns in 2D and minimum degree ordering, the first factorisation takes 110 ms in blocks, 430 ms in
+scalars, 260 ms with MUMPS, 290 ms with UMFPACK and 285 ms with CHOLMOD. The next factorisation with the same sparsity
+pattern takes 60 ms in blocks, 150 ms in scalars, 155 ms with MUMPS, 265 ms with UMFPACK and 290 ms with CHOLMOD. A
+solve takes 4 ms in blocks, 15 ms with MUMPS, and 9 ms with CHOLMOD. Copying the entries into blocks takes a tenth of
+the factorisation. On two processes, MUMPS factorises in the same time as on one process, and a solve takes 25 ms. On
+several processes, one of them therefore holds the factors of displacements, which many solves use. Another process
+computes and holds the factors of pressures at the same time. When each of four processes computed both factors itself,
+this took 1.7 times as long, because processes share the bandwidth of the memory. In large scenes MUMPS distributes the
+factors over processes (`Thresholds.mumps`). SuperLU_DIST is slower. With 100100 unknowns, SuperLU_DIST takes 841 ms for
+the factors of K (MUMPS 476 ms), and 56 ms for a solve (MUMPS 57 ms). With 25500 unknowns, SuperLU_DIST takes 125 ms for
+the factors, and 9 ms for a solve. MUMPS then factorises K and the storage together in 385 ms, four times as long as K
+alone.
 
 Large bodies need nested dissection. With 504000 unknowns in 2D, a repeated factorisation ordered by grid lines
-(`dissection`) takes 3.0 s, and the factors have 4.6e7 entries. With PETSc's nested dissection these values are 5.1 s
-and 5.0e7, with minimum degree 6 to 12 s and 7.5e7; with MUMPS 6.2 s and 5.3e7. With a tenth of the unknowns the first
-three orderings take 80, 110 and 120 ms; with still fewer unknowns they take equal times.
+(`dissection`) takes 3.0 s, and the factors have 4.6e7 entries. PETSc's nested dissection takes 5.1 s, with 5.0e7
+entries. Minimum degree takes 6 to 12 s, with 7.5e7 entries. MUMPS takes 6.2 s, with 5.3e7 entries. With a tenth of the
+unknowns, ordering by grid lines takes 80 ms, PETSc's nested dissection 110 ms, and minimum degree 120 ms. With even
+fewer unknowns, these three orderings take equal times.
 
-The figures are for the reference BLAS; only MUMPS, UMFPACK and CHOLMOD use BLAS. With OpenBLAS, MUMPS takes 1/3 to 1/2
-of the time.
+The times are for the reference BLAS. Only MUMPS, UMFPACK and CHOLMOD use BLAS. With OpenBLAS, MUMPS takes 1/3 to 1/2 of
+the time.
 """
 
 from __future__ import annotations
@@ -37,10 +41,10 @@ from mpm_dolfinx.solve.petsc_options import set_defaults
 from mpm_dolfinx.solve.solver_choice import MUMPS, NODAL
 
 MOST = 500
-"""Largest number of iterations of a linear solve, and size of its Krylov space: there is no restart.
+"""Largest number of iterations of a linear solve. The Krylov space has the same size, so there is no restart.
 
-With PETSc's restarts after 30 iterations, FGMRES stagnates where the tangent of a footing is nearly singular: solves
-then end after 500 iterations, and take 50 without a restart. Vectors are allocated on demand.
+With PETSc's restarts after 30 iterations, FGMRES stagnates if the tangent of a footing is nearly singular. Solves then
+end after 500 iterations. Without a restart, they take 50 iterations. Vectors are allocated on demand.
 """
 TOLERABLE = (-3, -8, -10)  # PETSc's reasons: too many iterations, indefinite preconditioner, indefinite matrix
 
@@ -48,10 +52,11 @@ TOLERABLE = (-3, -8, -10)  # PETSc's reasons: too many iterations, indefinite pr
 def direct_solver(
     A: PETSc.Mat, name: str, symmetric: bool = True, gathered: bool = False, package: str | None = None
 ) -> PETSc.KSP:
-    """Return a solver that factorises A at the first solve, and after changes of A; if `symmetric`, as L D L^T.
+    """Return a solver that factorises A at the first solve and after changes of A.
 
-    gathered: whether only the last process holds the factors; this suits many solves with the same matrix.
-    package: package of the factorisation; None: PETSc on one process, MUMPS on several.
+    `symmetric`: whether the factors are L D L^T.
+    `gathered`: whether only the last process holds the factors, which suits many solves with the same matrix.
+    `package`: package of the factorisation, by default PETSc on one process, and MUMPS on several.
     """
     if symmetric:
         A.setOption(PETSc.Mat.Option.SYMMETRIC, True)
@@ -89,9 +94,9 @@ def renew(A: PETSc.Mat) -> None:
 
 
 def solved(ksp: PETSc.KSP, name: str) -> int:
-    """Return the number of iterations of a solver's last solve; raise NotConverged if it failed.
+    """Return the number of iterations of a solver's last solve. Raise NotConverged if this solve failed.
 
-    Results after the largest number of iterations, or with an indefinite tangent, are judged by the line search.
+    The line search judges results after the largest number of iterations, or with an indefinite tangent.
     """
     count, reason = ksp.getIterationNumber(), ksp.getConvergedReason()
     if reason < 0 and reason not in TOLERABLE:
@@ -106,7 +111,7 @@ def negative_pivots(solver: PETSc.KSP) -> int:
 
 
 def displacement_solver(A: PETSc.Mat, name: str, unknowns: Unknowns, how: str, symmetric: bool) -> PETSc.KSP:
-    """Return a direct solver for many solves with the same matrix A of displacements; how: see `plan`."""
+    """Return a direct solver for many solves with one matrix A of displacements. `how`: see `plan`."""
     if how != NODAL:
         return direct_solver(A, name, symmetric, package="mumps" if how == MUMPS else None)
     ksp = _preonly(A, name)
@@ -122,7 +127,7 @@ def _set_gathered(ksp: PETSc.KSP, A: PETSc.Mat, factors: NodalFactors | SingleFa
 
 
 def factorise(*preconditioners: PETSc.PC) -> None:
-    """Factorise all matrices at the same time if different processes hold their factors, else each when first used."""
+    """Factorise all matrices, at the same time if different processes hold their factors."""
     for pc in preconditioners:
         pc.setUp()
     for pc in preconditioners:
@@ -136,14 +141,14 @@ class Gathered:
     Parameters
     ----------
     x
-        A vector that the matrix can be multiplied with.
+        Vector with an entry for each column of the matrix.
     factors
         Factors of the whole matrix.
     rank
         Process that holds the factors.
 
-    `setUp` gathers a matrix. The factors are computed on demand, or by the function `factorise`: it first
-    gathers all matrices, so that the processes compute their factors at the same time.
+    `setUp` gathers a matrix. The factors are computed at the next solve, or by the function `factorise`. This function
+    gathers all matrices first, so that the processes compute their factors at the same time.
     """
 
     def __init__(self, x: PETSc.Vec, factors: NodalFactors | SingleFactors, rank: int):
@@ -222,8 +227,8 @@ class SingleFactors:
 class NodalFactors:
     """Factors of displacement matrices with a block for each node, on the first process, computed on demand.
 
-    unknowns: unknown displacements; components of a node are consecutive. symmetric: whether the factors are U^T D U;
-    else L U.
+    `unknowns`: unknown displacements, with consecutive components of each node.
+    `symmetric`: whether the factors are U^T D U instead of L U.
     """
 
     def __init__(self, unknowns: Unknowns, symmetric: bool):
@@ -253,7 +258,7 @@ class NodalFactors:
 
 
 def dissection(x: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return the nested-dissection order (n,) of nodes of a grid at positions x (n, d), m.
+    """Return the nested-dissection order (n,) of nodes of a grid at positions x (n, d), in m.
 
     The middle grid line halves a box of nodes. Nodes on this line come last. Each half is divided in the same way.
     """
@@ -271,7 +276,7 @@ def dissection(x: NDArray[np.float64]) -> NDArray[np.int64]:
 
 
 def _lines(x: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return the index (n,) of the grid line of each coordinate (n,); only lines with nodes are counted."""
+    """Return the index (n,) of the grid line of each coordinate (n,). Only lines with nodes are counted."""
     values, at = np.unique(x, return_inverse=True)
     return np.cumsum(np.diff(values, prepend=values[:1]) > SAME * (values[-1:] - values[:1]))[at]
 
@@ -282,7 +287,7 @@ class BlockFactors:
     Parameters
     ----------
     rows, columns
-        The pattern, in compressed rows.
+        The sparsity pattern, in compressed rows.
     block, axis
         Node and component of each unknown.
     x : (n, d)
@@ -290,7 +295,7 @@ class BlockFactors:
     dim
         Number of components of a node.
     symmetric
-        Whether the factors are U^T D U; else L U.
+        Whether the factors are U^T D U instead of L U.
     """
 
     def __init__(self, rows, columns, block, axis, x, dim: int, symmetric: bool):
@@ -327,7 +332,7 @@ class BlockFactors:
         self._b.set(0.0)
 
     def take(self, values: NDArray[np.float64]) -> None:
-        """Set the matrix to the given entries of the pattern."""
+        """Set the entries of the matrix to `values`, in the order of the pattern."""
         self._matrix.setValuesBlockedIJV(*self._pattern, np.concatenate([[0.0], values, [1.0]])[self._source])
         self._matrix.assemble()
 

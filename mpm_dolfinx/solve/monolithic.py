@@ -1,31 +1,35 @@
 # SPDX-License-Identifier: MIT
-"""Solver for both balances together, where a direct solver is too expensive: large bodies, in 2D still larger ones.
+"""Solver for both balances together, for bodies so large that a direct solver is too expensive.
 
     [ K  -B^T ] [du]   [R_u]
     [ B   C   ] [dp] = [R_p]
 
 K is the stiffness, C the storage and B the coupling of the balances (`newton`).  The solver is GMRES, preconditioned
-from the right with the upper block triangle. In this triangle the fixed-stress operator P = C + beta V replaces the
-Schur complement C + B K^-1 B^T, with the fixed-stress coefficient beta and the cell volumes V. One multigrid cycle
-approximates K^-1, another one P^-1.
+from the right with the upper block triangle. In this triangle the fixed-stress operator `P = C + beta V` replaces the
+Schur complement `C + B K^-1 B^T`.  Here beta is the fixed-stress coefficient, and V are the cell volumes.  One
+multigrid cycle approximates K^-1, and another cycle P^-1.  The bodies that need this solver are larger in 2D than in 3D
+(see `plan`).
 
-In 3D GMRES takes 7 to 12 iterations to 1e-3, each with one cycle on K.  Other methods are slower; they were tested
-with algebraic multigrid and Jacobi smoothing, where GMRES takes 10 to 15.  Conjugate gradients on the Schur complement
-took 3 iterations, but 35 to 60 cycles in their inner solves.  Flexible GMRES with inner solves to 0.1 or 0.01 took 12
-to 24 cycles.  MINRES with the diagonal blocks took 17 to 23 cycles, and left a residual five times as large.  In 2D
-GMRES takes 8 iterations to 1e-5, and 12 with algebraic multigrid on P.
+In 3D, GMRES takes 7 to 12 iterations to the tolerance 1e-3, each with one cycle on K.  Other methods are slower.  They
+were tested with algebraic multigrid and Jacobi smoothing, with which GMRES takes 10 to 15 iterations.  Conjugate
+gradients on the Schur complement took 3 iterations, but 35 to 60 cycles in their inner solves.  Flexible GMRES with
+inner solves to tolerances of 0.1 or 0.01 took 12 to 24 cycles.  MINRES with the diagonal blocks took 17 to 23 cycles,
+and left a residual five times as large.  In 2D, GMRES takes 8 iterations to the tolerance 1e-5, and 12 iterations with
+algebraic multigrid on P.
 
 At nu = 0.499 the cycle is inaccurate, and GMRES takes more than 100 iterations with 14^3 cells.  If a solve takes too
-many iterations (see `plan`), or is predicted to, factors of K replace the cycle.  They are kept until a solve with them
-takes too many iterations.  With factors of an earlier tangent a solve takes about 10 iterations, with new factors 4 to
-6.  A step takes 6.2 s with kept factors, 8.5 s with new factors for each tangent.  Four steps of yielding soil with
-12^3 cells take 33 s and 41 s.  MUMPS factorises 3190 unknowns in 0.2 s, 8610 in 1.4 s (PETSc in 3.4 s).  With factors,
-solves take up to 19 iterations (22 at nu = 0.49 with contrasts of 1e3).
+many iterations (see `plan`), or is predicted to take too many, factors of K replace the cycle.  These factors are kept
+until a solve with them takes too many iterations.  With factors of an earlier tangent, a solve takes about 10
+iterations.  With new factors, a solve takes 4 to 6 iterations.  A step takes 6.2 s with kept factors, and 8.5 s with
+new factors for each tangent.  Four steps of yielding soil with 12^3 cells take 33 s with kept factors, and 41 s with
+new factors.  MUMPS factorises 3190 unknowns in 0.2 s, and 8610 unknowns in 1.4 s.  PETSc takes 3.4 s for 8610 unknowns.
+With factors, solves take up to 19 iterations (22 at nu = 0.49 with stiffness contrasts of 1e3).
 
-In 2D yielding soil would take 20 to 500 iterations (footing, 41 cells, any smoother). Shear bands are one cell wide;
-coarse grids cannot represent them. With a viscosity of 0.05 GMRES takes 28 iterations, and 0.9 times as long as a
-direct solver on 41 cells, but 1.7 times as long on 81. If the volumetric stiffness of K is moved to the storage (p -> p
-+ k B u), K is conditioned as at nu = 0.3, but GMRES takes 500 iterations: alternating pressures are almost not stiff.
+In 2D yielding soil would take 20 to 500 iterations (footing, 41 cells, any smoother). Shear bands are one cell wide, so
+coarse grids cannot represent these bands.  With a viscosity of 0.05, GMRES takes 28 iterations.  Its time is then 0.9
+times that of a direct solver on 41 cells, but 1.7 times on 81 cells.  If the volumetric stiffness of K is moved to the
+storage (`p -> p + k B u`), K is conditioned as at nu = 0.3.  But GMRES takes 500 iterations, because alternating
+pressures have almost no stiffness.
 """
 
 from __future__ import annotations
@@ -45,13 +49,14 @@ from mpm_dolfinx.solve.factors import MOST, direct_solver, displacement_solver, 
 from mpm_dolfinx.solve.solver_choice import MUMPS, SolverPlan
 
 LEAST = 1e-4
-"""Smallest scale of the fluid residual, divided by the volume that the residual forces displace in a drained body.
+"""Smallest scale of the fluid residual, divided by the fluid volume that residual forces displace in a drained body.
 
-Sealed bodies exchange nearly no fluid. With a ratio of 5e5 between the two scales, rounding left 2e-5 of a residual.
+Undrained bodies exchange nearly no fluid.  If the fluid volume is 5e5 times the scale, rounding leaves 2e-5 of a
+residual.
 """
 
 IDLE = object()
-"""Replaces a context of PETSc after each solve; otherwise PETSc would keep all objects of the last solve."""
+"""Replaces a context of PETSc after each solve.  Otherwise PETSc would keep all objects of the last solve."""
 Scale = NDArray[np.float64] | float
 Inverses = tuple[PETSc.PC, PETSc.PC]
 """Preconditioners that approximate K^-1 and P^-1."""
@@ -103,7 +108,7 @@ class BlockOperator:
         self.join(u, p, y)
 
     def displaced(self) -> NDArray[np.float64]:
-        """Return the fluid volume that residual forces displace in each part (parts,), divided by their norm, m^d/N."""
+        """Return the fluid volumes (parts,) that unit residual forces displace, in m^d/N."""
         forces, (u, _, _, g) = self.momentum.residual, self.work
         self.inverses[0].apply(forces, u)
         self.storage.B.mult(u, g)
@@ -113,14 +118,14 @@ class BlockOperator:
 
     @staticmethod
     def part(x: PETSc.Vec, u: PETSc.Vec, p: PETSc.Vec, scale_u: Scale = 1.0, scale_p: Scale = 1.0) -> None:
-        """Set u and p to the displacement and pressure entries of x, scaled."""
+        """Set u to the displacement entries of x times `scale_u`, and p to the pressure entries times `scale_p`."""
         values = x.array_r
         np.multiply(values[: u.local_size], scale_u, out=u.array_w)
         np.multiply(values[u.local_size :], scale_p, out=p.array_w)
 
     @staticmethod
     def join(u: PETSc.Vec, p: PETSc.Vec, x: PETSc.Vec, scale_u: Scale = 1.0, scale_p: Scale = 1.0) -> None:
-        """Set the entries of x to u and p, scaled."""
+        """Set the displacement entries of x to u times `scale_u`, and the pressure entries to p times `scale_p`."""
         values = x.array_w
         np.multiply(u.array_r, scale_u, out=values[: u.local_size])
         np.multiply(p.array_r, scale_p, out=values[u.local_size :])
@@ -129,7 +134,8 @@ class BlockOperator:
 class BlockSolver:
     """GMRES for displacements and pressures together.
 
-    how: solver plan; momentum, storage: the matrices; cycles: preconditioners, a multigrid cycle on K and one on P.
+    `how`: solver plan.  `momentum`, `storage`: the matrices.
+    `cycles`: two preconditioners, a multigrid cycle on K and a multigrid cycle on P.
     """
 
     def __init__(self, how: SolverPlan, momentum: MomentumSystem, storage: StorageSystem, cycles: Inverses):
@@ -167,7 +173,7 @@ class BlockSolver:
         Parameters
         ----------
         scales : (parts,) and (parts,)
-            Scales of the residuals of momentum, N, and fluid, m^d, in each connected part.
+            Scales of the momentum residual (N) and of the fluid residual (m^d) in each connected part.
         rtol
             Tolerance relative to the norm of both scaled residuals, for each part.
         slopes
@@ -202,7 +208,7 @@ class BlockSolver:
         return count, factors
 
     def _iterate(self, inverses: Inverses, scale: tuple, slopes: tuple, rtol: float, most: int) -> int:
-        """Solve with given approximations of K^-1 and P^-1; return the number of iterations, at most `most`."""
+        """Solve with approximations of K^-1 and P^-1.  Return the number of iterations, at most `most`."""
         operator = BlockOperator(self._momentum, self._storage, inverses, self._work, scale, slopes)
         self._A.setPythonContext(operator)
         self._ksp.pc.setPythonContext(operator)
@@ -213,7 +219,7 @@ class BlockSolver:
         return solved(self._ksp, "momentum and storage")
 
     def _factorised(self) -> Inverses:
-        """Return factors of the present K, and in 2D of the present P, as preconditioners for later tangents too."""
+        """Return preconditioners for this and later tangents: factors of the present K, and in 2D also of P."""
         K, unknowns = self._momentum.K, self._momentum.unknowns
         solvers = [displacement_solver(K, "factors", unknowns, self._plan.fallback, self._plan.symmetric)]
         if unknowns.dim == 2:
@@ -226,7 +232,7 @@ class BlockSolver:
 
 
 def _foresight(many: int) -> Callable[[PETSc.KSP, int, float], None]:
-    """Return a monitor that ends a solve if its rate in the last `many` / 4 iterations predicts more than `many`."""
+    """Return a monitor that ends a solve if the last `many / 4` iterations predict more than `many` in all."""
     quarter = max(1, many // 4)
 
     def monitor(ksp: PETSc.KSP, count: int, norm: float) -> None:

@@ -2,12 +2,13 @@
 """Geometric multigrid on the background grid: coarse grids of twice the spacing, with interpolated matrices.
 
 A coarse unknown belongs to a node, or a cell, of a grid with half as many cells along each axis. Displacements are
-interpolated linearly along each axis between nodes, pressures between cell centres. Coarse matrices are Q^T A Q
+interpolated linearly along each axis between nodes, and pressures between cell centres. Coarse matrices are Q^T A Q
 (Galerkin) with the interpolation Q, so cut cells, penalties and laws need no special treatment.
 
-With 504000 displacements and 251000 pressures in 2D (10^6 points) both hierarchies of grids take 0.33 s, the coarse
-matrices of a tangent 0.1 s, a cycle 0.06 s. A step takes 2.6 s, but 7.6 s with factors (including ordering). A wet cube
-of 20^3 cells in shear, 16 Newton steps, takes 2.0 s; with smoothed aggregation (GAMG) 11.6 s in as many iterations.
+With 504000 displacements and 251000 pressures in 2D (10^6 points), both hierarchies of grids take 0.33 s. The coarse
+matrices of a tangent take 0.1 s, and a cycle takes 0.06 s. A step takes 2.6 s, but 7.6 s with factors (including
+ordering). A wet cube of 20^3 cells in shear takes 2.0 s for 16 Newton steps. With smoothed aggregation (GAMG) it takes
+11.6 s, with equally many iterations.
 """
 
 from __future__ import annotations
@@ -35,8 +36,9 @@ OPTIONS = {
 FIRMLY = {"mg_levels_ksp_type": "chebyshev", "mg_levels_ksp_max_it": "3"}
 """Smoother for nearly incompressible bodies where a direct solver cannot replace multigrid.
 
-Test: cube of 14^3 cells, layers with stiffnesses 1 : 1000, nu = 0.49. GMRES takes 126 iterations, 112 with GAMG; with
-the smoother of `OPTIONS` it fails. If a direct solver then replaces multigrid, the two smoothers are equally fast.
+The test is a cube of 14^3 cells with nu = 0.49, in layers with a stiffness ratio of 1000. GMRES takes 126 iterations
+with this smoother, and 112 iterations with GAMG. With the smoother of `OPTIONS`, GMRES fails. If a direct solver
+replaces multigrid after a failure, both smoothers are equally fast.
 """
 MAYBE, NOT, IS = range(3)  # see `_shared`
 NONE = np.iinfo(np.int64).max
@@ -64,9 +66,9 @@ def multigrid_solver(
         Prefix of the solver's PETSc options.
     places : (n, d + 1)
         Unknowns of this process: indices along the grid axes, and index of the component, all >= 0. Each component is
-        interpolated by itself.
+        interpolated separately.
     held : (m, d + 1)
-        Fixed degrees of freedom in cells of bodies, described like `places`; interpolated displacements vanish there.
+        Fixed degrees of freedom in cells of bodies, described like `places`. Interpolated displacements vanish there.
     nodal
         Whether the unknowns belong to nodes.
     coarsest
@@ -74,7 +76,7 @@ def multigrid_solver(
     firmly
         Whether to use the stronger smoother `FIRMLY`.
     lines : (n,) along each axis, m
-        Grid lines, for cells of many sizes: displacements are then interpolated by distance.
+        Grid lines, for cells of different sizes. Interpolation of displacements then uses the distances of nodes.
     """
     ksp = PETSc.KSP().create(A.comm)
     ksp.setType(PETSc.KSP.Type.GMRES)
@@ -100,7 +102,7 @@ def interpolations(
     coarsest: int,
     lines: Sequence[NDArray[np.float64]] | None = None,
 ) -> list[PETSc.Mat]:
-    """Return the interpolations from each coarse grid to the next finer grid, the finest first.
+    """Return the interpolations from each coarse grid to the next finer grid, beginning with the finest grid.
 
     comm: processes that share the unknowns; other parameters as in `multigrid_solver`.
     """
@@ -155,7 +157,7 @@ def interpolation(
 def _hats(
     places: NDArray[np.int64], nodal: bool, lines: Sequence[NDArray[np.float64]] | None = None
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-    """Return fine unknowns (m,), coarse places (m, d + 1) and weights (m,) of the entries of an interpolation."""
+    """Return three arrays for the m entries of an interpolation: fine unknown, coarse place (m, d + 1), and weight."""
     half, odd = np.divmod(places[:, :-1], 2)
     if nodal:
         share = 0.5
@@ -179,12 +181,13 @@ def _hats(
 def _shared(
     comm: MPI.Intracomm, keys: NDArray[np.int64], count: int, stated: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Return for each candidate its index (n,) as a coarse unknown, else `NONE`, and whether this process owns it (n,).
+    """Return two arrays (n,) for the candidates: index of the unknown or `NONE`, and whether this process owns it.
 
     The process of lowest rank with a candidate owns the unknown. Keys are distributed over processes to find owners.
 
-    keys (n,): coarse candidates of this process, ascending, below `count`; stated (n,): status of each candidate on
-    this process: `MAYBE`, `NOT` or `IS`; the largest value of all processes counts.
+    `keys` (n,): coarse candidates of this process, ascending, below `count`.
+    `stated` (n,): status `MAYBE`, `NOT` or `IS` of each candidate on this process. The largest value of all processes
+    counts.
     """
     ask = Exchange(comm, (keys * comm.size // count).astype(np.int32))
     distinct, who = np.unique(ask.send(keys), return_inverse=True)

@@ -1,22 +1,24 @@
 # SPDX-License-Identifier: MIT
 """Equations of a substep: balance of momentum and storage of fluid, coupled by u and p.
 
-Unconnected parts of the bodies balance independently. The residuals of each part are divided by its forces and its
-exchanged fluid volume. A line search sets its step length, whatever the state and stiffness of other parts.
+Unconnected parts of the bodies are in equilibrium independently of each other. In each part, the momentum residual is
+divided by the forces, and the fluid residual by the exchanged fluid volume. A line search sets the step length of each
+part, whatever the state and stiffness of other parts.
 
 A Newton step of the two problems reads
 
     [ K  -B^T ] [du]     [R_u]
     [ B   C   ] [dp] = - [R_p].
 
-K, B and C are derivatives of the residuals: R_u changes by K du - B^T dp, R_p by B du + C dp. `schur-cg` eliminates du,
-and solves with S = C + B K^-1 B^T by conjugate gradients. The preconditioner is the fixed-stress operator C + beta V,
-with cell volumes V and beta = 0.75 alpha^2 / K_dr (Biot's coefficient alpha, drained bulk modulus K_dr). This operator
-is filtered: beta V is smaller for pressures that alternate from cell to cell
-(`StorageProblem.assemble_preconditioner`). `schur-fgmres` does the same with the full, slightly unsymmetric Jacobian.
-`fixed-stress` is the Richardson iteration of the fixed-stress split: a storage solve with C + beta V at constant
-stress, and a momentum solve, alternate. Large bodies use multigrid, because a direct solver is too expensive.
-`schur-cg` and `schur-fgmres` then solve for both unknowns together, see `monolithic`.
+K, B and C are derivatives of the residuals: R_u changes by `K du - B^T dp`, and R_p by `B du + C dp`. `schur-cg`
+eliminates du, and solves for dp by conjugate gradients with the Schur complement `S = C + B K^-1 B^T`. The
+preconditioner is the fixed-stress operator `C + beta V`, with cell volumes V and `beta = 0.75 alpha^2 / K_dr`. Here
+alpha is Biot's coefficient, and K_dr is the drained bulk modulus. This operator is filtered: beta V is smaller for
+pressures that alternate from cell to cell (`StorageProblem.assemble_preconditioner`). `schur-fgmres` uses FGMRES and
+the full, slightly unsymmetric Jacobian instead. `fixed-stress` is the Richardson iteration of the fixed-stress split.
+Storage solves with `C + beta V` at constant stress alternate with momentum solves. Large bodies use multigrid, because
+a direct solver is too expensive. With multigrid, `schur-cg` and `schur-fgmres` solve for both unknowns together, see
+`monolithic`.
 """
 
 from __future__ import annotations
@@ -46,8 +48,8 @@ INNER = 1e-3  # momentum tolerance / storage error; it is small because unconver
 MOMENTUM_STEPS = 10
 REBALANCED = 6  # largest number of iterations if contacts change, divided by the number if they do not
 LOOSEST = 1e-2
-"""Largest residual after a linear solve, divided by the residual before it.  Halving this value changes the result of
-scene "soil" in tests/plateaus.py by 2.2e-11 (relative), doubling it by 6.0e-12, and finer cells by 3.0e-02.
+"""Largest ratio of the residual after a linear solve to the residual before this solve. Halving this value changes the
+result of scene "soil" in tests/plateaus.py by 2.2e-11 (relative), doubling it by 6.0e-12, and finer cells by 3.0e-02.
 """
 SOLVED = 0.05
 """Residual after the last linear solve, divided by the tolerance.  Halving this value changes the result of scene
@@ -55,20 +57,22 @@ SOLVED = 0.05
 """
 SETTLED = 1e-2  # residual below which slip of contacts may end; above it the contact area still changes
 ERROR = 1 / 20
-"""Assumed pressure error of a run, divided by e, the estimated error of a first-order step (`note_pressures`).
+"""Assumed pressure error of a run, divided by the estimated error e of a first-order step (`note_pressures`).
 
-For a mode with decay rate l, the stability function of sdirk2 gives an error of 0.081 dt |l| e in a step, at most 0.28
-e.  A pressure that follows a varying load has an error of at most 0.14 e.  With little decay the errors of steps add
-up, to 0.081 e.  Measured against steps an eighth as long, errors are 0.05 to 0.08 e if loads rise or oscillate, or the
-pressure prescribed on a drained side oscillates.  They are 0.01 to 0.04 e with an oscillating source, 0.01 to 0.05 e
-late in a consolidation, 0.17 e in a first step from zero load, 0.26 e after a jump, and in a run at most 5 e / 20.
+For a mode with decay rate l, the stability function of sdirk2 gives an error of `0.081 dt abs(l) e` in a step, at most
+0.28 e. A pressure that follows a varying load has an error of at most 0.14 e. With little decay, the errors of all
+steps add up to 0.081 e. Errors were measured against steps an eighth as long. They are 0.05 to 0.08 e if loads rise or
+oscillate, or if the prescribed pressure on a drained side oscillates. They are 0.01 to 0.04 e with an oscillating
+source, and 0.01 to 0.05 e late in a consolidation. The error is 0.17 e in a first step from zero load, and 0.26 e after
+a jump. In a run it is at most 5 e / 20.
 """
 SUDDEN = np.sqrt(2)
-"""If a pressure changes in the second substep by less than this multiple of its change in the first, sdirk2 overshoots.
+"""sdirk2 overshoots if the ratio of pressure changes in the second and the first substep is less than this value.
 
-With z = -(decay rate) dt, the stability function (1 + (1 - 2 gamma) z) / (1 - gamma z)^2 changes its sign at z = -1 -
-sqrt(2). At this z the two substeps change a pressure by -gamma z / (1 - gamma z) = sqrt(2) - 1 and 2 - sqrt(2). If
-pressures follow loads, the ratio is (1 - gamma) / gamma.  Source: exact, the ratio of these changes.
+With `z = -(decay rate) dt`, the stability function `(1 + (1 - 2 gamma) z) / (1 - gamma z)^2` changes its sign at `z =
+-1 - sqrt(2)`. At this z, a pressure changes by `-gamma z / (1 - gamma z) = sqrt(2) - 1` in the first substep, and by `2
+- sqrt(2)` in the second substep. If pressures follow loads, the ratio of these changes is `(1 - gamma) / gamma`.
+Source: exact, the ratio of these changes.
 """
 
 
@@ -89,7 +93,7 @@ class Errors:
 
     @cached_property
     def each(self) -> NDArray[np.float64]:
-        """The larger of the two residuals, for each part."""
+        """The larger of the two relative residuals, for each part."""
         return np.maximum(self.u, self.p)
 
     @cached_property
@@ -108,18 +112,18 @@ def solve_substep(
     report: Report,
     kept: Kept,
 ) -> Rates | None:
-    """Solve the equations of a substep for (u, p), stored in the forms' functions; return the rates of the storage.
+    """Solve the equations of a substep for the functions (u, p) of the forms. Return the outflow rates at the end.
 
     Parameters
     ----------
     solvers
         Linear solvers for the unknowns of the active cells.
     momentum, storage
-        The balances; storage is None without fluid.
+        The balances. `storage` is None without fluid.
     ahead
-        Function that returns (u, p), extrapolated from the last steps, at active dofs and cells; or None.
+        Function that extrapolates (u, p) at active dofs and cells from the last steps, or None.
     as_reset, key
-        See `OnGrid.as_reset`. Linear laws use the tangent at the reset while the key stays the same.
+        See `OnGrid.as_reset`. Linear laws use the tangent at the reset until `key` changes.
     report
         Report of the step, to which this function adds the counts of the substep.
     kept
@@ -128,7 +132,7 @@ def solve_substep(
     Raises
     ------
     NotConverged
-        Newton's method did not converge; the exception has the residual history.
+        If Newton's method did not converge. The exception has the residual history.
     """
     newton = Newton(solvers, momentum, storage, kept)
     in_turn = solvers.scheme.richardson and storage is not None
@@ -164,12 +168,14 @@ def note_pressures(
 ) -> None:
     """Store the pressure changes and the estimated pressure error of a step in the report.
 
-    The step and a first-order step differ by the fluid volume `seconds` times the change of rates between substeps. The
-    fixed-stress operator converts it into a pressure that is bounded for stiff modes, as in Hosea and Shampine (1996).
-    Cells are weighted by their filling. The error of the step is assumed to be `ERROR` times this pressure.
+    The fluid volumes after the step and after a first-order step differ by `seconds` times the change of rates between
+    substeps. The fixed-stress operator converts this difference into a pressure that is bounded for stiff modes, as in
+    Hosea and Shampine (1996). The error of the step is assumed to be `ERROR` times this pressure. Errors and changes in
+    a cell are weighted by the filling of the cell.
 
-    seconds: time weight, s, of the first substep's rates; dt: length of the step, s; of_bodies: `Motion.of_bodies`, a
-    function of active owned cells (n,) and values (k, n) that returns the largest values (k, bodies) in each body.
+    `seconds`, s: time weight of the rates of the first substep. `dt`, s: length of the step.
+    `of_bodies`: function of n active owned cells and values (k, n), which returns the largest values (k, bodies) in
+    each body; see `Motion.of_bodies`.
     """
     if storage is None or not report.newton:
         return
@@ -214,9 +220,10 @@ class Newton:
             self._vectors.append((storage.forms.p.x, active.cells))
 
     def newton(self, as_reset: AsReset, key: Hashable, serves: bool, ahead: Callable | None) -> Errors:
-        """Solve the balances by Newton's method; a tangent is kept while it converges, for linear laws over many steps.
+        """Solve the balances by Newton's method.
 
-        serves: whether the tangent of the previous substep may be reused; ahead: see `solve_substep`.
+        A tangent is reused while the iterations converge, and with linear laws over many steps.
+        `serves`: whether the tangent of the previous substep may be reused. `ahead`: see `solve_substep`.
         """
         errors, other = self._begin(ahead)
         fresh = self._linear or not serves
@@ -229,7 +236,7 @@ class Newton:
         return self._stable(self._iterations(errors, as_reset, key, fresh))
 
     def _iterations(self, errors: Errors, as_reset: AsReset, key: Hashable, fresh: bool) -> Errors:
-        """Iterate from the present (u, p) with the given errors; fresh: whether to start with a new tangent."""
+        """Iterate from the present (u, p). `errors`: errors at (u, p). `fresh`: whether to start with a new tangent."""
         elastic = self._momentum.forms.elastic
         tolerance = self._scheme.tolerance
         keep = self._solvers.plan.keep
@@ -263,9 +270,9 @@ class Newton:
         return found
 
     def _augmented(self, errors: Errors) -> Errors:
-        """Return the errors after contact updates, repeated until none changes or a residual exceeds the tolerance.
+        """Update contacts until no contact changes or a residual exceeds the tolerance. Return the errors.
 
-        Raise NotConverged after as many updates as Newton's method may take iterations.
+        Raise NotConverged if the updates are as many as the largest number of Newton iterations.
         """
         momentum = self._momentum
         count = 0
@@ -275,9 +282,10 @@ class Newton:
         return errors
 
     def _begin(self, ahead: Callable | None) -> tuple[Errors, list[NDArray[np.float64]] | None]:
-        """Return the errors at the chosen start, and the present (u, p) if another start was chosen, else None.
+        """Choose the start of Newton's method, and return the errors at this start.
 
-        `ahead` is chosen if the square of its residual is small; else each part starts at its guess of least residual.
+        The second result is the previous (u, p), or None if the start is the previous (u, p). The start is `ahead` if
+        the square of its residual is small. Otherwise each part starts at its guess of least residual.
         """
         start = self._iterate()
         if ahead is not None:
@@ -313,7 +321,7 @@ class Newton:
         return (errors, None) if at is start[0] and not guesses else (found, None if at is start[0] else start)
 
     def _iterate(self) -> list[NDArray[np.float64]]:
-        """Return a copy of the present (u, p), m and Pa, at active degrees of freedom and cells."""
+        """Return copies of the present u (m) at active degrees of freedom, and p (Pa) in active cells."""
         return [x.array[rows] for x, rows in self._vectors]
 
     @cached_property
@@ -329,11 +337,12 @@ class Newton:
             x.scatter_forward()
 
     def _stable(self, found: Errors) -> Errors:
-        """Return the errors; raise NotConverged at an unstable equilibrium: smaller steps find the path that leaves it.
+        """Return the errors. Raise NotConverged if the equilibrium is unstable.
 
-        The tangent of an unstable equilibrium has negative eigenvalues. Only dry bodies with symmetric, factorised
-        tangents are checked: water delays buckling. A tangent kept for a step shows an instability only in the next
-        step. If only soft springs resist a motion, a stable solution may seem unstable; one more Newton step decides.
+        Smaller steps find the path that leaves an unstable equilibrium. The tangent of an unstable equilibrium has
+        negative eigenvalues. Only dry bodies with symmetric, factorised tangents are checked, because water delays
+        buckling. A tangent kept for a step shows an instability only in the next step. If only soft springs resist a
+        motion, a stable solution may seem unstable. One more Newton step decides such cases.
         """
         plan = self._solvers.plan
         if not self.report.newton or self._storage is not None or not plan.symmetric or plan.iterative:
@@ -392,13 +401,13 @@ class Newton:
             raise NotConverged(f"no convergence in {count} iterations", self.report.history)
 
     def _errors(self, start: NDArray[np.float64] | None = None) -> Errors:
-        """Assemble both residuals; return the norms of each relative to its scale, and add them to the history.
+        """Assemble both residuals. Return the norm of each residual divided by its scale, and add both to the history.
 
-        start (parts,): forces at the start of the step, N. Forces at other iterates are not part of the scale: after a
-        diverging iterate every residual would seem small.
+        `start` (parts,), N: forces at the start of the step. Forces at earlier iterates are not part of the scale,
+        because after a diverging iterate every residual would seem small.
 
-        Residuals within round-off are returned as 0.  In the history their norms are divided by scales of at
-        least the round-off divided by the tolerance.
+        Residuals within round-off are returned as 0. In the history these residuals are divided by scales of at least
+        `round_off / tolerance`.
         """
         first = not self.report.history
         with _compat.Timer("residual"):
@@ -421,22 +430,22 @@ class Newton:
         return Errors(u, p, forces, exchanged, forces if start is None else start, fluid)
 
     def _linearise(self, firmness: NDArray[np.float64] | float = 0.0) -> None:
-        """Set the tangent at the present (u, p), not kept for other steps; firmness: see `LinearSolvers`."""
+        """Set the tangent at the present (u, p), for this step only. `firmness`: see `LinearSolvers.linearise`."""
         self._solvers.tangent.clear()
         self._solvers.linearise(self._momentum, self._storage, self._kept, firmness=firmness)
 
     def _linearise_as_reset(self, as_reset: AsReset) -> bool:
-        """Set the tangent at the state of the last reset of the grid, in this step or an earlier one."""
+        """Set the tangent at the last reset of the grid, which may belong to an earlier step."""
         with as_reset() as pieces:
             if self._storage is not None:
                 self._storage.set_fluxes()
             return self._solvers.linearise(self._momentum, self._storage, self._kept, pieces)
 
     def _direction(self, errors: Errors, slow: bool) -> int:
-        """Solve the linearised problem; return the number of coupling iterations.
+        """Solve the linearised problem, and return the number of coupling iterations.
 
-        slow: whether the storage's residual is the larger one and a new tangent has reduced it little.  The tangent
-        then also contains the derivative of fluxes with respect to displacements.
+        `slow`: whether a new tangent has hardly reduced the residual of the storage, and this is the larger residual.
+        The tangent then also contains the derivative of fluxes with respect to displacements.
         """
         # the next residual needs no more accuracy
         iterative, least = self._solvers.plan.iterative, self._solvers.plan.forcing
@@ -467,7 +476,7 @@ class Newton:
             return count
 
     def _line_search(self, before: Errors, elastic: bool) -> Errors:
-        """Move u and p against the direction; the line search sets the step length of each part; return the errors."""
+        """Move u and p against the Newton direction, with a line search in each part, and return the errors."""
         self.report.newton += 1
         of = self._momentum.system.of_parts
         moved = np.zeros(of.count)
@@ -496,7 +505,10 @@ class Newton:
                 return errors
 
     def _tried(self, before: Errors | None) -> tuple[Errors | None, NotConverged | None]:
-        """Return errors after a trial step, and None; if a law fails, infinite errors or None, and the exception."""
+        """Return the errors after a trial step, and None.
+
+        If a law fails, the errors are infinite (None without `before`), and the second result is the exception.
+        """
         try:
             return self._errors(before and before.start), None
         except NotConverged as failed:
@@ -507,9 +519,10 @@ class Newton:
             return replace(before, u=away, p=away), failed
 
     def _work(self) -> NDArray[np.float64]:
-        """Return the work (parts,), J, of both residuals along the direction.
+        """Return the work (parts,), in J, of both residuals along the Newton direction.
 
-        The coupling terms cancel in the sum. The work thus depends only on the diagonal blocks of the tangent.
+        The coupling terms cancel in the sum of the two works. The work thus depends only on the diagonal blocks of the
+        tangent.
         """
         system = self._momentum.system
         work = system.of_parts.sums(system.residual.array_r * self._solvers.du.array_r)
@@ -519,7 +532,7 @@ class Newton:
         return work + system.of_parts.sums(system.residual.array_r * self._solvers.dp.array_r)
 
     def _move(self, steps: NDArray[np.float64]) -> None:
-        """Move the parts by the given fractions (parts,) of the direction."""
+        """Add the fractions `steps` (parts,) of the Newton direction to u and p in each part."""
         system = self._momentum.system
         system.unknowns.add(self._momentum.forms.u, steps[system.of_parts.of], self._solvers.du)
         if self._storage is not None:
@@ -528,5 +541,5 @@ class Newton:
 
 
 def _ratio(part: float, whole: float) -> float:
-    """Return the ratio of `part` to `whole`, nan where it is not finite."""
+    """Return the ratio of `part` to `whole`, or nan if this ratio is not finite."""
     return part / whole if whole and np.isfinite(part) else np.nan

@@ -21,28 +21,30 @@ class Numerics:
     Parameters
     ----------
     quadrature
-        "domain": exact integration over cut particle domains. "point": at material points, as in standard MPM; boxes
-        only, no axisymmetry.
+        "domain" integrates exactly over cut particle domains. "point" integrates at material points, as in standard
+        MPM. It supports boxes only, and no axisymmetry.
     coupling
         Coupling scheme of the balances of momentum and fluid, one of `COUPLINGS`.
     tolerance
-        Tolerance of both residuals, relative to the forces and to the exchanged fluid volume, in (0, 1).
+        Tolerance, in (0, 1), of the momentum residual relative to the forces, and of the fluid residual relative to the
+        exchanged fluid volume.
     method
         Time integration: "sdirk2" (second order) or "backward-euler".
     renewal
-        Whether to replace particle domains of yielded soil that are longer than a cell, see `stepping/renewal.py`. It
-        requires quadrature "domain", yielding dry or saturated soil in 2D, no `Contact`, and in axisymmetry no inertia.
-        On a grid with `follow`, also whether to divide and merge elastic domains, see `stepping/division.py`. This
-        requires quadrature "domain", dry or saturated soil, no `Contact` and no inertia.
+        Whether to replace particle domains of yielded soil that are longer than a cell, see `stepping/renewal.py`.
+        Renewal requires quadrature "domain", yielding dry or saturated soil in 2D, no `Contact`, and in axisymmetry no
+        inertia. On a grid with `follow`, elastic domains are also divided and merged, see `stepping/division.py`.
+        Division and merging require quadrature "domain", dry or saturated soil, no `Contact` and no inertia.
     keep_volumes
-        Whether yielded domains keep the volumes of their points, see `domains/kept_volumes.py`; only with "domain".
+        Whether yielded domains keep the volumes of their points, see `domains/kept_volumes.py`. With "point" it has no
+        effect.
     petsc_options
         PETSc options for the solvers, see `Scheme`.
 
     Raises
     ------
     ValueError
-        An option is invalid; the message names the option and its allowed values.
+        If an option is invalid. The message names the option and its allowed values.
     """
 
     quadrature: str = "domain"

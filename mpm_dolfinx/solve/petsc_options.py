@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""PETSc options for the solvers; options of the user replace the defaults of the package.
+"""PETSc options for the solvers.  Options of the user replace the defaults of the package.
 
-A name begins with the prefix of a solver, as in {"momentum_ksp_type": "bcgs"}; on the command line "mpm_" precedes it.
+The name of an option begins with the prefix of a solver, as in {"momentum_ksp_type": "bcgs"}.  On the command line,
+"mpm_" precedes this name.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ def check(options: Mapping[str, Any]) -> None:
 
 @contextmanager
 def using(options: Mapping[str, Any], unread: set[str] | None = None) -> Iterator[None]:
-    """Set the user's PETSc options while solvers are created; remove from `unread` the options that solvers read."""
+    """Set the user's PETSc options while solvers are created.  Remove the options that solvers read from `unread`."""
     given, before = PETSc.Options(), {}
     for name, value in options.items():
         full = f"mpm_{name}"

@@ -17,7 +17,8 @@ COUPLINGS = {
     "fixed-stress-full": 1.0,
     "fixed-stress-fluid": None,
 }
-"""Coupling schemes, each with the factor f in the fixed-stress coefficient beta = f alpha^2 / K_dr; None: beta = 1/K_w.
+"""Coupling schemes, each with the factor f in the fixed-stress coefficient `beta = f alpha^2 / K_dr`. None means `beta
+= 1 / K_w`.
 """
 
 
@@ -30,17 +31,18 @@ class Scheme:
     coupling
         Name in `COUPLINGS`.
     tolerance
-        Tolerance of both residuals, relative to the forces and to the exchanged fluid volume, in (0, 1).
+        Tolerance, in (0, 1), of the momentum residual relative to the forces, and of the fluid residual relative to the
+        exchanged fluid volume.
     most_newton, most_coupling
-        Largest number of Newton steps, or coupling iterations of `fixed-stress`, in a step.
+        Largest numbers of Newton steps and of coupling iterations (with `fixed-stress`) in a step.
     petsc_options
-        PETSc options for the solvers, such as {"momentum_pc_factor_mat_ordering_type": "nd"}: names begin with one of
+        PETSc options for the solvers, such as {"momentum_pc_factor_mat_ordering_type": "nd"}. Names begin with one of
         `petsc_options.PREFIXES`. A warning lists options that no solver of the scene reads.
 
     Raises
     ------
     ValueError
-        A value is out of its range; the message names it.
+        If a value is out of its range. The message names the value.
     """
 
     coupling: str
@@ -67,5 +69,5 @@ class Scheme:
 
     @property
     def beta(self) -> float:
-        """Factor f in the fixed-stress coefficient beta, see `COUPLINGS`; 1 in the scheme with beta = 1/K_w."""
+        """Factor f in the fixed-stress coefficient, see `COUPLINGS`, or 1 in the scheme with `beta = 1 / K_w`."""
         return COUPLINGS[self.coupling] or 1.0

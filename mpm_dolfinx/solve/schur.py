@@ -4,12 +4,13 @@
     [ K  -B^T ] [du]     [R_u]
     [ B   C   ] [dp] = - [R_p]
 
-K, B and C: see `newton`. Elimination of du gives S = C + B K^-1 B^T. Conjugate gradients (or FGMRES) solve with S,
-preconditioned with the fixed-stress operator. For large bodies GMRES solves for both unknowns (`monolithic`).
+`newton` defines K, B and C. Elimination of du gives the Schur complement `S = C + B K^-1 B^T`. Systems with S are
+solved by conjugate gradients (or FGMRES), with the fixed-stress operator as preconditioner. For large bodies GMRES
+solves for both unknowns (`monolithic`).
 
-PETSc's PCFIELDSPLIT with the same two solvers (full Schur factorisation) takes equally many iterations, with the same
-digits, in 0.8 to 1 times the time of the present solves. But PCFIELDSPLIT needs a copy of -B^T for each tangent,
-and fixed-stress iterations would still need the blocks.
+PETSc's PCFIELDSPLIT (full Schur factorisation) with equal solvers takes equally many iterations, and its results have
+equal digits. It takes 0.8 to 1 times the time of the present solves. But PCFIELDSPLIT needs a copy of -B^T for each
+tangent, and fixed-stress iterations would still need separate blocks.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ from mpm_dolfinx.solve.solver_choice import AT_ONCE, MULTIGRID, MUMPS, SolverPla
 
 
 def planned(scheme: Scheme, momentum: MomentumSystem, storage: StorageSystem | None, symmetric: bool) -> SolverPlan:
-    """Return the solver plan for problems with these matrices; symmetric: whether K is symmetric."""
+    """Return the solver plan for problems with these matrices. `symmetric`: whether K is symmetric."""
     unknowns = momentum.unknowns
     return plan(
         unknowns.global_size,
@@ -56,10 +57,11 @@ def planned(scheme: Scheme, momentum: MomentumSystem, storage: StorageSystem | N
 
 @dataclass(frozen=True, eq=False)
 class SchurComplement:
-    """Matrix-free Schur complement S = C + B K^-1 B^T for PETSc's Krylov solvers.
+    """Matrix-free Schur complement `S = C + B K^-1 B^T` for PETSc's Krylov solvers.
 
-    storage: the matrices B and C; solve: solver for systems with K; f, v: work vectors for the forces B^T x and the
-    displacements K^-1 f; slopes: derivative of the fluxes with respect to displacements, if the tangent includes it.
+    `storage`: the matrices B and C. `solve`: solver for systems with K.
+    `f`, `v`: work vectors for the forces `B^T x` and the displacements `K^-1 f`.
+    `slopes`: derivative of the fluxes with respect to displacements, if the tangent includes this derivative.
     """
 
     storage: StorageSystem
@@ -81,10 +83,10 @@ class SchurComplement:
 
 @dataclass
 class Kept:
-    """Data that the tangents of a step share; each step starts without them.
+    """Data that the tangents of a step share. Each step starts without these data.
 
-    operator: whether the factors of the fixed-stress operator can be reused; factors: direct solvers that replace
-    multigrid, or None.
+    `operator`: whether the factors of the fixed-stress operator can be reused.
+    `factors`: direct solvers that replace multigrid, or None.
     """
 
     operator: bool = False
@@ -94,8 +96,8 @@ class Kept:
 class LinearSolvers:
     """Linear solvers for the matrices of one set of active cells.
 
-    how: solver plan, see `planned`; scheme: coupling scheme; momentum, storage: matrices and vectors of the balances;
-    storage is None without fluid.
+    `how`: solver plan, see `planned`. `scheme`: coupling scheme.
+    `momentum`, `storage`: matrices and vectors of the balances; `storage` is None without fluid.
     """
 
     def __init__(self, how: SolverPlan, scheme: Scheme, momentum: MomentumSystem, storage: StorageSystem | None):
@@ -107,14 +109,14 @@ class LinearSolvers:
         """Key of the tangent that the matrices keep over several steps."""
         self._solve_s = self._schur = self._block = None
         self.du, self._rhs = momentum.unknowns.vector(), momentum.unknowns.vector()
-        """Direction of the displacements, and a work vector for right-hand sides."""
+        """Newton direction of the displacements, and a work vector for right-hand sides."""
         self._unread = set(scheme.petsc_options)
         with using(scheme.petsc_options, self._unread):
             self.solve_u = self._momentum_solver()
             if storage is None:
                 return
             self.dp, self._g = storage.unknowns.vector(), storage.unknowns.vector()
-            """Direction of the pressures, and a work vector for right-hand sides."""
+            """Newton direction of the pressures, and a work vector for right-hand sides."""
             if how.route == AT_ONCE:
                 self._solve_s = multigrid_solver(storage.P, "storage", *storage.places(), False, how.coarsest)
                 self._block = BlockSolver(how, momentum, storage, (self.solve_u.pc, self._solve_s.pc))
@@ -149,7 +151,7 @@ class LinearSolvers:
 
     @property
     def schur(self) -> tuple[PETSc.Mat, PETSc.KSP]:
-        """The Schur complement and its preconditioned solver; ValueError for monolithic multigrid, which has none."""
+        """The Schur complement and its preconditioned solver. Raise ValueError for monolithic multigrid."""
         if self._schur is None:
             raise ValueError("solvers: monolithic multigrid has no Schur complement; direct solvers must be used")
         return self._schur, self._solve_s
@@ -164,8 +166,10 @@ class LinearSolvers:
     ) -> bool:
         """Assemble the tangents at (u, p), and factorise them.
 
-        kept: data that the tangents of the step share; data: integration points, by default the points of the problems;
-        firmness: fraction of the elastic shear stiffness to be added, one number or one for each connected part.
+        `kept`: data that the tangents of the step share.
+        `data`: integration points, by default the points of the problems.
+        `firmness`: fraction of the elastic shear stiffness that is added, as one number or as one for each connected
+        part.
         """
         kept = kept or Kept()
         with _compat.Timer("tangent"):
@@ -212,7 +216,7 @@ class LinearSolvers:
         exchanged: NDArray[np.float64] | None = None,
         slope: FluxSlope | None = None,
     ) -> int:
-        """Solve for (du, dp) with the present residuals; return the number of coupling iterations.
+        """Solve for (du, dp) with the present residuals, and return the number of coupling iterations.
 
         Parameters
         ----------
@@ -221,7 +225,7 @@ class LinearSolvers:
         rtol
             Relative tolerance, for each connected part.
         forces, exchanged : (parts,)
-            Scales of the residuals: forces, N, and exchanged fluid volume, m^d.
+            Scales of the residuals: forces (N) and exchanged fluid volume (m^d).
         slope
             Derivative of the fluxes with respect to displacements, if the tangent includes it.
         """
@@ -263,7 +267,7 @@ class LinearSolvers:
     ) -> None:
         """Solve iteratively for x with equal relative accuracy in all connected parts, whose scales may differ.
 
-        measured: function that converts b to the vector whose norm the solver computes; None: b itself.
+        `measured`: function that converts b to the vector whose norm the solver computes, or None for b itself.
         """
         if of.count <= 1:
             ksp.solve(b, x)
@@ -278,7 +282,7 @@ class LinearSolvers:
         x.array_w[:] *= scale
 
     def restrain(self, storage: StorageProblem, log_change: NDArray[np.float64] | float) -> NDArray[np.float64] | float:
-        """Limit the pressure decreases of the direction, see `restrained`, and update the direction's displacements."""
+        """Limit the pressure decreases of the Newton direction (see `restrained`), and update its displacements."""
         if not storage.forms.retains:
             return log_change
         dp, log_change = storage.restrained(self.dp.array_r, log_change)
@@ -290,13 +294,13 @@ class LinearSolvers:
         return log_change
 
     def _follow(self) -> None:
-        """Solve for the displacements that balance the direction of the pressures."""
+        """Solve the balance of momentum for the displacements of the Newton direction, with its pressures."""
         self._storage.B_momentum.multTranspose(self.dp, self._rhs)
         self._rhs.axpy(1.0, self._momentum.residual)
         self.solve_u.solve(self._rhs, self.du)
 
     def turn_round(self, parts: NDArray[np.bool_] | None = None) -> None:
-        """Reverse the direction in the parts of a mask (parts,), or in all parts."""
+        """Reverse the Newton direction in the parts of a mask (parts,), or in all parts."""
         directions = [(self.du, self._momentum)] + ([(self.dp, self._storage)] if self._storage is not None else [])
         for direction, system in directions:
             if parts is None or parts.all():
@@ -305,14 +309,14 @@ class LinearSolvers:
                 direction.array_w[:] *= np.where(parts, -1.0, 1.0)[system.of_parts.of]
 
     def condense(self, *slopes: FluxSlope) -> PETSc.Vec:
-        """Return the right-hand side R_p - B K^-1 R_u of the system with the Schur complement."""
+        """Return the right-hand side `R_p - B K^-1 R_u` of the system with the Schur complement."""
         self.solve_u.solve(self._momentum.residual, self.du)
         self._storage.change_by(self.du, self._g, *slopes)
         self._g.aypx(-1.0, self._storage.residual)
         return self._g
 
     def filtered(self, volumes: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the pressures P^-1 `volumes`, Pa, with the fixed-stress operator P; volumes of owned cells, m^d."""
+        """Return pressures `P^-1 volumes` (Pa) from volumes (m^d) of owned cells. P: fixed-stress operator."""
         self._g.array_w[:] = volumes
         self._solve_s.pc.apply(self._g, self.dp)
         return self.dp.array_r

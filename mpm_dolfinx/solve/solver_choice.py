@@ -18,27 +18,33 @@ ALONE, SCHUR, AT_ONCE, IN_TURN = "momentum alone", "Schur complement", "both at 
 
 @dataclass(frozen=True)
 class Thresholds:
-    """Thresholds between methods; `bash demos/run.sh calibrate` measures the times on both sides of each.
+    """Thresholds between methods. `bash demos/run.sh calibrate` measures times on both sides of each threshold.
 
     multigrid_3d
-        Number of unknown displacements in 3D from which multigrid is used. Five load steps of a square beam take, with
-        a direct solver and multigrid, s: 0.5 and 0.5 (1200 unknowns), 2.5 and 1.4 (2600), 8.2 and 2.1 (4900).
+        Number of unknown displacements in 3D from which multigrid is used. Five load steps of a square beam take 0.5 s
+        (1200 unknowns), 2.5 s (2600) and 8.2 s (4900) with a direct solver. They take 0.5 s (1200 unknowns), 1.4 s
+        (2600) and 2.1 s (4900) with multigrid.
     multigrid_2d
-        The same limit in wet 2D scenes without yield. In a step of the beam, direct solver and multigrid take, s: 0.06
-        and 0.05 (10400 unknowns), 0.19 and 0.14 (25500), 0.53 and 0.32 (51000), 2.3 and 1.0 (151000).
+        Number of unknown displacements in wet 2D scenes without yield from which multigrid is used. A step of the beam
+        takes 0.06 s (10400 unknowns), 0.19 s (25500), 0.53 s (51000) and 2.3 s (151000) with a direct solver. It takes
+        0.05 s (10400 unknowns), 0.14 s (25500), 0.32 s (51000) and 1.0 s (151000) with multigrid.
     mumps
-        Number of unknown displacements from which MUMPS computes the factors in wet scenes: of a K that is not
-        symmetric, and on several processes of all matrices. Processes then share the factors. Below this number one
-        process holds those of K, with 1.5e7 entries (0.12 GB) at the limit. Factors of K and a solve take on two
-        processes, ms: PETSc's on one of them 20 and 0.5, MUMPS 16 and 3.8 (5700 unknowns); 174 and 3.5, 98 and 15
-        (25500); 708 and 11, 306 and 37 (61400); 1481 and 18, 476 and 57 (100100). Without pressures, sharing thus
-        pays if a tangent serves less than 1, 7, 16 and 26 solves. A Newton step of a footing takes 15.
+        Number of unknown displacements from which MUMPS computes factors in wet scenes. MUMPS is used only if K is not
+        symmetric, or on several processes. The processes then share the factors. Below this number one process holds
+        the factors of K, which have 1.5e7 entries (0.12 GB) at the limit. On two processes, the factors of K take 20 ms
+        (5700 unknowns), 174 ms (25500), 708 ms (61400) and 1481 ms (100100) with PETSc on one of the processes. With
+        MUMPS they take 16 ms (5700 unknowns), 98 ms (25500), 306 ms (61400) and 476 ms (100100). A solve takes 0.5 ms
+        (5700 unknowns), 3.5 ms (25500), 11 ms (61400) and 18 ms (100100) with PETSc. With MUMPS it takes 3.8 ms (5700
+        unknowns), 15 ms (25500), 37 ms (61400) and 57 ms (100100). Without pressures, MUMPS thus pays if a tangent is
+        used for fewer solves than 1 (5700 unknowns), 7 (25500), 16 (61400) or 26 (100100). A Newton step of a footing
+        takes 15 solves.
     fallback_3d
         Largest number of unknown displacements in 3D for which a direct solver may replace multigrid. MUMPS takes 8 s
-        and 0.2 GB for this number, with unsymmetric K 15 s and 0.4 GB.
+        and 0.2 GB for this number, and 15 s and 0.4 GB with an unsymmetric K.
     many
-        If a solve takes more iterations, a direct solver replaces multigrid, or the next tangent renews the factors of
-        the fixed-stress operator.  Limits of 12, 25, 50 and 500 give equally many Newton steps (footing, 9 cells).
+        If a solve takes more iterations than this, a direct solver replaces multigrid, or the next tangent renews the
+        factors of the fixed-stress operator. Limits of 12, 25, 50 and 500 give equally many Newton steps (footing, 9
+        cells).
     coarsest
         Largest number of unknowns of multigrid's coarsest grid, which has a direct solver.
     """
@@ -77,21 +83,21 @@ class SolverPlan:
     route
         One of `ALONE`, `SCHUR`, `AT_ONCE`, `IN_TURN`.
     displacements, pressures
-        Solvers for K and for the fixed-stress operator; `pressures` is "" without fluid.
+        Solvers for K and for the fixed-stress operator. `pressures` is "" without fluid.
     krylov
-        PETSc's name of the iterative solver; "preonly" for a direct solver alone.
+        PETSc's name of the iterative solver, or "preonly" for a direct solver alone.
     fallback
-        Direct solver that replaces the multigrid cycle on K after many iterations; "" if there is none.
+        Direct solver that replaces the multigrid cycle on K after many iterations, or "" without such a solver.
     firmly
-        Whether multigrid uses a stronger smoother: for nearly incompressible bodies without a fallback.
+        Whether multigrid uses a stronger smoother, as for nearly incompressible bodies without a fallback.
     symmetric
         Whether K is symmetric.
     many, coarsest
         See `Thresholds`.
     forcing
-        Tightest relative tolerance of a linear solve; see `plan`.
+        Tightest relative tolerance of a linear solve, see `plan`.
     keep
-        Largest ratio of successive residuals for which the tangent is reused; see `plan`.
+        Largest ratio of successive residuals for which the tangent is reused, see `plan`.
     """
 
     route: str
@@ -137,11 +143,12 @@ def plan(
     """Return the solution method for a problem.
 
     The tangent is reused while a Newton step reduces the residual to less than 0.05 of its value, or 0.01 in wet 2D
-    scenes without yield. In 26 adaptive steps, the drained beam takes 205 Newton steps and 79 tangents with 0.05, 179
-    and 83 with 0.01, and 174 and 94 with 0.002. In 3D tangents cost more: a beam takes up to a fifth longer with 0.01.
+    scenes without yield. In 26 adaptive steps, the drained beam takes 205 Newton steps and 79 tangents with 0.05. It
+    takes 179 Newton steps and 83 tangents with 0.01, and 174 Newton steps and 94 tangents with 0.002. In 3D tangents
+    cost more, and a beam takes up to a fifth longer with 0.01.
 
     The relative tolerance of linear solves is at least 1e-5 with nonlinear laws, and 1e-3 with multigrid in 3D. With a
-    factorised stiffness an iteration is cheap, and a looser tolerance costs Newton steps: a footing on 21 cells
+    factorised stiffness, iterations are cheap, and a looser tolerance costs Newton steps. A footing on 21 cells
     (backward Euler) takes 299 Newton steps with 1e-5, and 370 with 1e-3.
 
     Parameters

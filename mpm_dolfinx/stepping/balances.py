@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Start of a step, and the two balances at the end of each substep."""
+"""Start of a step, and the balances of momentum and fluid at the end of each substep."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class Start(NamedTuple):
     renewed: int = 0  # number of renewed particle domains
 
     def begun(self, acting: Acting, earlier: Sequence[Any] | None) -> Acting:
-        """Return the loads at the beginning of a substep; earlier: data of the loads from the previous substep."""
+        """Return the loads at the beginning of a substep.  `earlier`: data of the loads in the previous substep."""
         if not self.state.stage.inertia:
             return acting
         shares = Shares(acting.substep.own * self.dt, acting.substep.before * self.dt, acting.gravity)
@@ -58,15 +58,16 @@ class Start(NamedTuple):
         return acting._replace(loads=[one.begun(shares, of) for one, of in zip(acting.loads, before, strict=True)])
 
     def carrying(self, flight: Flight | None) -> Callable[[NDArray[np.float64]], dict[str, NDArray[np.float64]]] | None:
-        """Return a function for the points' velocities after the step, see `Mass.carried`; None without inertia."""
+        """Return a function for the points' velocities after the step (see `Mass.carried`), or None without inertia."""
         if flight is None:
             return None
         return partial(self.matrices.mass.carried, self.state.points, (flight.start, flight.velocity))
 
     def moves(self, flights: Sequence[Flight | None], substep: Substep) -> tuple[float, float]:
-        """Return error and size of the motion in the step, see `motion_error`, if the run needs them, else 0.
+        """Return the error and the size of the motion in the step (see `motion_error`), or zeros if a run does not need
+        these.
 
-        flights: velocities after each substep; substep: the last substep.
+        `flights`: velocities after each substep.  `substep`: the last substep.
         """
         control = self.state.control
         if control is None or control.motion is None or len(flights) < 2:
@@ -76,7 +77,7 @@ class Start(NamedTuple):
 
 
 class Balances(NamedTuple):
-    """The two balances at the end of a substep; storage is None without fluid."""
+    """The balances of momentum and fluid at the end of a substep.  `storage` is None without fluid."""
 
     momentum: MomentumProblem
     storage: StorageProblem | None
@@ -84,7 +85,7 @@ class Balances(NamedTuple):
     ahead: Callable[[], list[NDArray[np.float64]]] | None = None  # see `Motion.ahead`; None without a trend
 
     def flown(self, flight: Flight | None, substep: Substep, dt: float) -> Flight | None:
-        """Return the velocities at the end of a solved substep; None without inertia; dt: length of the step, s."""
+        """Return the velocities at the end of a solved substep, or None without inertia.  `dt`: step length, s."""
         if self.inertia is None:
             return None
         acceleration = self.inertia.acceleration(self.momentum.at)
@@ -95,9 +96,9 @@ class Balances(NamedTuple):
         return self.storage.passing() if self.storage else []
 
     def outcome(self, state: State, passed: Sequence[Sequence[Mapping]], seconds: NDArray[np.float64]) -> Outcome:
-        """Return results of the conditions at the end of a step, by quantity and name, see `State`.
+        """Return the results of conditions at the end of a step, by quantity and name, see `State`.
 
-        passed: flow in each substep, see `passing`; seconds: time weights of the substeps, s.
+        `passed`: flow in each substep, see `passing`.  `seconds`, s: time weights of the substeps.
         """
         stage, out = state.stage, {quantity: {} for quantity in QUANTITIES} | self.momentum.outcome()
         out["wall_reactions"] = self.momentum.wall_forces(stage.conditions["walls"])
@@ -107,19 +108,19 @@ class Balances(NamedTuple):
         return out | (self.storage.volumes(passed, seconds[-len(passed) :]) if self.storage else {})
 
     def net_inflow(self, rates: Rates | None) -> NDArray[np.float64] | None:
-        """Return the net inflow into the cells in the step, see `StorageProblem.net_inflow`; None without fluid."""
+        """Return the net inflow into the cells in the step (see `StorageProblem.net_inflow`), or None without fluid."""
         return self.storage and self.storage.net_inflow(rates)
 
 
 def joined(loads: list[list[Loads]]) -> list[list[Loads]]:
-    """Return the loads of each substep, with the pattern of all substeps."""
+    """Return the loads of each substep.  The matrix pattern of their contacts covers the contacts of all substeps."""
     if not any(map(attrgetter("couples"), chain.from_iterable(loads))):
         return loads
     return [[one.joined(of) for one, of in zip(now, zip(*loads, strict=True), strict=True)] for now in loads]
 
 
 def at_rest(scene: Scene, state: State, loads: list[list[Loads]]) -> list[list[Loads]]:
-    """Return the loads of each substep; with `State.rest`, supports also react to the initial stress."""
+    """Return the loads of each substep.  With `State.rest`, supports also react to the initial stress."""
     if state.rest is None:
         return loads
     scene.momentum.u.x.array[:] = state.rest
@@ -127,7 +128,7 @@ def at_rest(scene: Scene, state: State, loads: list[list[Loads]]) -> list[list[L
 
 
 def left(loads: Sequence[Loads], at: At, before: MaterialPoints, after: MaterialPoints) -> MaterialPoints:
-    """Return the points after a step with data that loads store; raise an error if a load forbids their positions."""
+    """Return the points after a step, with data that loads store.  Raise an error if a load forbids their positions."""
     for one in loads:
         one.check_end(after, before)
     for one in loads:
@@ -136,7 +137,7 @@ def left(loads: Sequence[Loads], at: At, before: MaterialPoints, after: Material
 
 
 def flight_of(start: Start) -> Flight | None:
-    """Return the velocities of the unknowns at the start of a step; None without inertia."""
+    """Return the velocities of the unknowns at the start of a step, or None without inertia."""
     mass = start.matrices.mass
     if mass is None:
         return None
@@ -145,15 +146,15 @@ def flight_of(start: Start) -> Flight | None:
 
 
 def leads(scene: Scene, loads: Sequence[Loads]) -> bool:
-    """Return whether Newton's method may start from extrapolated motion: if laws yield, or in quasi-static contact."""
+    """Return whether Newton's method may start from extrapolated motion: with yield, or quasi-static contact."""
     momentum = scene.momentum
     return not momentum.elastic or (momentum.inertia is None and any([one.touches for one in loads]))
 
 
 def going_on(scene: Scene, start: Start, acting: Acting) -> NDArray[np.float64] | None:
-    """Return displacements (unknowns,), m, extrapolated from the previous substep or step.
+    """Return displacements (unknowns,), in m, extrapolated from the previous substep or step, as a local array.
 
-    The result is a local array; None if there is no previous motion, or if it is no good guess, see `leads`.
+    The result is None without previous motion, or if previous motion is a bad guess, see `leads`.
     """
     substep = acting.substep
     if substep.before > 0.0 and leads(scene, acting.loads):
@@ -175,7 +176,7 @@ def balances(
 ) -> Balances:
     """Return the balances at the end of a substep, at the present u and p.
 
-    before: rates of the previous substep; flight: present velocities, None without inertia.
+    `before`: rates of the previous substep.  `flight`: present velocities, or None without inertia.
     """
     substep = acting.substep
     on_grid = start.on_grid
@@ -209,6 +210,6 @@ def balances(
 
 
 def pushed_back(scene: Scene, on_grid: OnGrid) -> NDArray[np.float64]:
-    """Return the inertia forces (n, d), N/m^3, on the pore fluid in the filled owned cells, at u."""
+    """Return the inertia forces (n, d) on the pore fluid in the filled owned cells at u, in N/m^3."""
     contents = on_grid.contents
     return -scene.fluid.density * scene.momentum.inertia.at(contents.filled, contents.shape_values)

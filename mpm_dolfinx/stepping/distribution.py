@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 """New distribution of the cells among processes at a reset of the grid, after bodies have moved, arrived or left.
 
-The scene is created again on a grid with other owners; its forms are not compiled again.  The state is transferred as
-by a checkpoint: points and pieces move to the owners of their cells, nodal data to the nodes of each process, and the
-conditions of the stage find their faces again.
+The scene is created again on a grid with other owners, but its forms are not compiled again.  The state is transferred
+like that of a checkpoint.  Points and pieces move to the owners of their cells, and nodal data move to the nodes of
+each process.  The conditions of the stage find their faces again.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ from mpm_dolfinx.stepping.state import State
 
 
 class Distributed(Protocol):
-    """A simulation, or a copy of it; scene and state are replaced together."""
+    """A simulation or its copy.  Scene and state are replaced together."""
 
     scene: Scene
     state: State
 
 
 def distribute(simulation: Distributed) -> None:
-    """Distribute the cells anew before a step that resets the grid, if uneven numbers of points become more even.
+    """Distribute the cells anew before a step that resets the grid, if this makes the numbers of points more even.
 
-    Else points move to the owners of their cells; lines that follow move later, and the points with them.
+    Otherwise points move to the owners of their cells.  On a grid with `follow`, lines and points move later.
     """
     grid = simulation.scene.grid
     if grid.comm.size == 1 or (state := simulation.state).stays:
@@ -42,7 +42,7 @@ def distribute(simulation: Distributed) -> None:
 
 
 def distribute_by(simulation: Distributed, boxes: NDArray[np.int64]) -> bool:
-    """Distribute the cells by boxes (ranks, 2, d), see `Partition`; return whether the scene allows it."""
+    """Distribute the cells by boxes (ranks, 2, d) (see `Partition`).  Return whether the scene allows this."""
     new = simulation.scene.distributed(boxes)
     if new is not None:
         simulation.scene, simulation.state = new, new.adopted(simulation.state)

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: MIT
 """Division and merging of elastic particle domains where grid cells become finer or coarser.
 
-A domain is bisected along a local axis if both halves then extend over as many cells as the domain did at seeding. Two
-halves merge if the merged domain extends over as many cells as at seeding. Whole domains on the lattice of a box merge
-too, except at the surface. Domains remain if they yield, contain probes, or have a side whose displacement a condition
-needs.
+A domain is bisected along a local axis if each half then extends over as many cells as the whole domain at seeding. Two
+halves merge if the merged domain extends over as many cells as one domain at seeding. Whole domains on the lattice of a
+box merge too, except at the surface. Domains are not replaced if they yield, contain probes, or have a side whose
+displacement a condition needs.
 
-Corners of elastic domains determine F, so a division adds no error: both halves share the mapping of the domain. After
-merging, F follows from the outer corners. Mass, fluid, and the volume that the fluid has to fill are exact. The stretch
-of a domain counts as well, because it changes the number of cells.
+The corners of elastic domains determine F, so a division adds no error: both halves have the mapping of the whole
+domain. After merging, F follows from the outer corners. Mass, fluid, and the volume that the fluid has to fill are
+exact. Stretching of a domain may also cause a division, because it changes the number of cells.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from mpm_dolfinx.stepping.state import State
 class Division:
     """Division and merging of the particle domains in a scene.
 
-    faces, materials: faces of the bodies, and materials of the scene.
+    `faces`: faces of the bodies. `materials`: materials of the scene.
     """
 
     def __init__(self, faces: SeededFaces, materials: SceneMaterials):
@@ -41,7 +41,7 @@ class Division:
         self._domains = SeededDomains(faces.bodies)
 
     def divided(self, state: State) -> tuple[State, int]:
-        """Return the state with divided and merged domains, and their number; all processes must call it."""
+        """Return the state with divided and merged domains, and their number. All processes must call it."""
         now, seeded = self._domains.sizes(self._grid, state.points)
         some = _divides(now, seeded).any() or _merges(now, seeded).any()
         if not self._grid.comm.allreduce(int(some and state.stay is None)):
@@ -75,7 +75,7 @@ class Division:
         return np.concatenate(ids), np.concatenate([face for _, face in found])
 
     def _outside(self, points: MaterialPoints) -> NDArray[np.bool_]:
-        """Return a mask (n,) of points with a face on the surface of their body as seeded."""
+        """Return a mask (n,) of points with a face on the surface of the seeded body."""
         ids, faces = self._outer
         out = np.isin(points.id, ids)
         out[faces_of_parts(points, ids, faces)[1]] = True
@@ -86,7 +86,7 @@ class Division:
     ) -> tuple[State, int]:
         """Return the state with new points, and the number of old points.
 
-        into: see `with_defect`; rule: function that returns the pieces of the new points.
+        `into`: see `with_defect`. `rule`: function that returns the pieces of the new points.
         """
         new, ids = with_defect(new, old, into), old.id
         pieces = state.pieces
@@ -122,7 +122,7 @@ class Division:
     # ---- merging --------------------------------------------------------------------------------
 
     def _merging(self, state: State, axis: int) -> NDArray[np.bool_]:
-        """Return a mask (n,) of points whose domains are to be merged along a local axis, if there is another half."""
+        """Return a mask (n,) of points whose domains should merge along a local axis, if their other half exists."""
         now, seeded = self._domains.sizes(self._grid, state.points)
         wants = _merges(now, seeded)[:, axis]
         if self._grid.comm.allreduce(int(wants.any())):
@@ -132,9 +132,9 @@ class Division:
         return wants
 
     def _intervals(self, points: MaterialPoints, axis: int) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Return a row (n, k) for each part that is equal for two halves, and which points are upper halves (n,).
+        """Return keys (n, k) of the points, and whether each point (n,) is an upper half.
 
-        Domains that have no other half have rows with nan.
+        Two halves of a domain have equal keys. A domain that has no other half has a key with nan.
         """
         root, part = roots(points)
         place, size = self._domains.places(root), np.ptp(part, axis=2)
@@ -182,10 +182,10 @@ class Division:
 
 
 def _divides(now: NDArray[np.float64], seeded: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return whether halves of domains along each axis (n, d) extend over as many cells as the domains at seeding."""
+    """Return for each domain and axis (n, d) whether a half extends over as many cells as the domain at seeding."""
     return now >= 2 * seeded * (1 - SAME)
 
 
 def _merges(now: NDArray[np.float64], seeded: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return whether pairs of domains along each axis (n, d) extend over as many cells as one domain at seeding."""
+    """Return for each domain and axis (n, d) whether a pair extends over no more cells than one domain at seeding."""
     return 2 * now <= seeded * (1 + SAME)

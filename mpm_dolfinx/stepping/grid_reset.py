@@ -44,7 +44,7 @@ from mpm_dolfinx.stepping.stage import Stage
 from mpm_dolfinx.stepping.state import State
 
 AtPlaces = Callable[[NDArray[np.integer], NDArray[np.float64]], NDArray[np.float64]]
-"""Function that returns values (n,) at positions (n, d), m, in local cells (n,)."""
+"""Function of local cells (n,) and of positions (n, d), in m, in these cells. It returns values (n,)."""
 
 
 class OnGrid(Keyed):
@@ -55,7 +55,7 @@ class OnGrid(Keyed):
     quadrature
         Integration points of the scene.
     momentum, storage
-        Forms, whose coefficients are set from the material in the cells; `storage` is None without fluid.
+        Forms, whose coefficients are set from the material in the cells. `storage` is None without fluid.
     cut
         The cut particle domains.
     of_fluid
@@ -81,7 +81,7 @@ class OnGrid(Keyed):
         """Integration points at the reset of the grid."""
         pieces = self.data.pieces
         self.weight = weight = pieces["weight"][:, 0] * grid.volumes(pieces.cells)
-        """Volumes (m,) of the pieces, m^d."""
+        """Volumes (m,) of the pieces, in m^d."""
         area, x = cut.plane(weight)
         scales = stiffness, lambda m: m.shear if m.state else 0.0  # only yielding laws need regularisation
         moduli = [area * quadrature.rows(cut, points, scale) for scale in scales]
@@ -99,7 +99,7 @@ class OnGrid(Keyed):
         """Faces with a ghost penalty."""
         rows = quadrature.rows(cut, points, lambda m: m.oedometric) * grid.around(cut.x)
         self.stiffness = np.zeros(grid.num_local)
-        """Largest oedometric modulus in each local cell, Pa; in axisymmetry times the circumference, N/m."""
+        """Largest oedometric modulus (Pa) in each local cell, in axisymmetry times the circumference (N/m)."""
         order = rows.argsort(kind="stable")
         self.stiffness[cut.cells[order]] = rows[order]  # the largest value of a cell is assigned last
         self.contents = None
@@ -160,7 +160,7 @@ class OnGrid(Keyed):
         self._storage.p.x.array[self.cells] = p_n.array[self.cells]
 
     def pressures(self, state: State) -> NDArray[np.float64]:
-        """Return the pressures of the filled owned cells at the start of a step, Pa."""
+        """Return the pressures (Pa) of the filled owned cells at the start of a step."""
         if not state.stays:
             bulk = self._storage.bulk
             retentions, new = self._quadrature.materials.retentions, self.cut.pieces
@@ -178,10 +178,10 @@ class OnGrid(Keyed):
         return p[self.contents.filled]
 
     def _carried(self, state: State, pi: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the piece pressures (m,), Pa, for which the pieces contain the pore water of the points.
+        """Return the piece pressures (m,), in Pa, for which the pieces contain the pore water of the points.
 
-        The mass potentials pi (m,), Pa (`fluid_content`), preserve linear fields. A constant for each point, added to
-        the pressures of its pieces, then preserves the water.
+        Linear fields are preserved by the mass potentials pi (m,), in Pa (`fluid_content`). The water of each point is
+        then preserved by adding a constant to the pressures of its pieces.
         """
         materials = self._quadrature.materials
         points = self.cut.points
@@ -205,12 +205,12 @@ class OnGrid(Keyed):
         return self.cut.pieces_to_cells(there + more[pieces.point])
 
     def of_pieces(self, state: State, name: str, fresh: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the named data of the pieces: stored values where points keep their pieces, else `fresh` (m, ...)."""
+        """Return the data `name` (m, ...) of the pieces: stored values for pieces that points keep, else `fresh`."""
         return state.of_pieces(name, fresh, self.cut.pieces.point)
 
     @contextmanager
     def as_reset(self, state: State) -> Iterator[QuadratureData]:
-        """Yield the integration points at the last reset; within the context u is 0, and p is that at the reset."""
+        """Yield the integration points at the last reset. Until exit, u is 0, and p has its values at the reset."""
         at = [(self._u.x.array, self._momentum.active.now.dofs)]
         if self._storage is not None:
             at += [(f.x.array, self.cells) for f in (self._storage.p, self._storage.p_n)]
@@ -227,19 +227,20 @@ class OnGrid(Keyed):
                 values[rows] = before
 
     def pressures_of_pieces(self) -> NDArray[np.float64]:
-        """Return the pressures (m,), Pa, in the cells of the pieces at the start of a step."""
+        """Return the pressure in the cell of each piece (m,) at the start of a step, in Pa."""
         return self.cut.to_pieces(self._storage.p_n.x.array[self.cut.cells])
 
     def set_pressures(self, at_pieces: NDArray[np.float64]) -> None:
-        """Set the cell pressures at the start of a step from values (m,), Pa, in the pieces."""
+        """Set the cell pressures at the start of a step from the pressures (m,), in Pa, of the pieces."""
         p_n = self._storage.p_n.x
         p_n.array[self.cut.cells] = self.cut.pieces_to_cells(at_pieces)
         p_n.scatter_forward()
 
     def _means(self, at_pieces: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the means (cells,), in the filled owned cells, of the pieces' potentials (m,), Pa.
+        """Return the mean potentials (cells,) in the filled owned cells, from the potentials (m,) of the pieces.
 
-        The weight is the points' storage, so that their fluid is conserved; in cells without storage the volume.
+        Means are weighted by the storage of the points, so that fluid is conserved. In cells without storage, means are
+        weighted by volume.
         """
         contents, points = self.contents, self.cut.points
         pieces = self.cut.pieces
@@ -260,11 +261,11 @@ class OnGrid(Keyed):
     ) -> list[NDArray[np.float64]]:
         """Return pressures (m,), slopes (m, d) and bounds (m, 2) in the pieces, from the cells' pressures.
 
-        The mean of the pieces' mass potentials in a cell is the cell's potential. The mean is weighted by `store` (m,),
-        m^d/Pa, the storage of the pieces; in cells without storage by volume. t: time, s, of pressures on open sides.
+        In each cell, the mean of the mass potentials of the pieces is the potential of the cell. Means are weighted by
+        storage, or by volume in cells without storage. With `water`, the sum of pore water in a cell is conserved. With
+        gravity the reconstruction then acts on differences from the hydrostatic pressures `at_rest`.
 
-        With `water`, the sum of pore water in a cell is conserved. With gravity the reconstruction then acts on
-        differences from the hydrostatic pressures `at_rest`.
+        `store` (m,), m^d/Pa: storage of the pieces. `t`, s: time of the pressures on open sides.
         """
         pieces = self.data.pieces
         contents = self.contents
@@ -297,12 +298,12 @@ class OnGrid(Keyed):
         return [self.cut.to_pieces(rows) for rows in values]
 
     def softness(self, state: State) -> NDArray[np.float64] | float:
-        """Return the ratio of elastic to tangent shear modulus of the pieces (m,) at the start of the step."""
+        """Return the ratios (m,) of elastic to tangent shear modulus of the pieces at the start of the step."""
         data = state.points.data
         return self.cut.to_cells(data["softness"]) if "softness" in data else 1.0
 
     def due(self, state: State) -> NDArray[np.float64]:
-        """Return the correction of the volume defect in a step, m^d, in the filled owned cells."""
+        """Return the corrections (m^d) of the volume defects in the filled owned cells in a step."""
         cut, due = self.cut, state.points.volume0 * state.points.data["due"]
         share = cut.pieces_to_cells(cut.pieces.fraction * due[cut.pieces.point])
         return self.contents.total(self.data.pieces["biot"][:, 0] * share)
@@ -310,12 +311,13 @@ class OnGrid(Keyed):
     def pressures_up_to_surface(
         self, reconstruction: Reconstruction, stage: Stage, t: float, at_rest: AtPlaces | None = None
     ) -> NDArray[np.float64]:
-        """Return the pressures (m,), Pa, at the pieces' centroids; their volume mean in a cell is the cell's pressure.
+        """Return the pressures (m,) at the centroids of the pieces, in Pa.
 
-        The reconstruction acts on differences from hydrostatic pressures, which cause no flow through sealed sides. In
-        axisymmetry centroids and mean refer to the sections.
+        The volume mean of the pressures in a cell is the pressure of the cell. The reconstruction acts on differences
+        from hydrostatic pressures, which cause no flow through no-flow sides. In axisymmetry centroids and means refer
+        to the sections.
 
-        t: time, s, of the pressures on drained sides; at_rest: hydrostatic pressures, None without gravity.
+        `t`, s: time of the pressures on drained sides. `at_rest`: hydrostatic pressures, or None without gravity.
         """
         places, p = self._places.pieces, self._storage.p.x.array
         seen = self._cell_pressures(p, stage, t, at_rest=at_rest)
@@ -328,9 +330,10 @@ class OnGrid(Keyed):
     def _cell_pressures(
         self, p: NDArray[np.float64], stage: Stage, t: float, bulk: float = np.inf, at_rest: AtPlaces | None = None
     ) -> CellPressures:
-        """Return cell pressures p (cells,), Pa, as mass potentials, with the data from which slopes are computed.
+        """Return the cell pressures as mass potentials, with the data from which slopes are computed.
 
-        bulk: bulk modulus of the fluid, Pa; at_rest: hydrostatic pressures that are subtracted.
+        `p` (cells,), Pa: pressures of the local cells. `bulk`, Pa: bulk modulus of the fluid.
+        `at_rest`: hydrostatic pressures that are subtracted.
         """
         contents = self.contents
         wet = Wet(self.cut, self.cut.points, contents, t)
@@ -349,7 +352,7 @@ class OnGrid(Keyed):
         return CellPressures(contents.filled, seen, contents.centroid, contents.open, outer)
 
     def mobility(self, data: QuadratureData, begins: bool) -> Mobility:
-        """Return the mobility of the filled owned cells at u; begins: whether invalid values raise ValueError."""
+        """Return the mobility of the filled owned cells at u. `begins`: whether invalid values raise ValueError."""
         at_pieces = self._quadrature.mobility(self.cut, self._storage.conductivity, data.pieces, begins)
         mean, share = self.contents.mean(at_pieces), None
         if self._storage.conductivity is not None:
@@ -361,7 +364,7 @@ class OnGrid(Keyed):
     def _relative_mobility(
         self, full: NDArray[np.float64], mean: NDArray[np.float64], share: NDArray[np.float64] | None
     ) -> Mobility:
-        """Return the mobility of cells in unsaturated soil; full (m,): saturated mobility of pieces, m^2/(Pa s)."""
+        """Return the mobility of cells in unsaturated soil. `full` (m,), m^2/(Pa s): mobilities at saturation."""
         cut = self.cut
         law = cut.to_cells(self._quadrature.materials.retention_of(cut.points))
         count = self._storage.fluxes.relative.count
@@ -377,7 +380,7 @@ class OnGrid(Keyed):
         return replace(mobility, paths=self._mixed.paths(full, law, count, mobility.shift), **given)
 
     def pore_water(self, points: MaterialPoints) -> PoreWater | None:
-        """Return the pore water of the pieces in unsaturated soil, with the points' porosities; else None."""
+        """Return the pore water of the pieces with the porosities of the points, or None in saturated scenes."""
         materials, cut = self._quadrature.materials, self.cut
         if materials.retentions is None:
             return None
@@ -389,12 +392,12 @@ class OnGrid(Keyed):
 
     @property
     def heads(self) -> NDArray[np.float64]:
-        """Pressures of unsaturated pieces minus pressures of their cells (m,), Pa."""
+        """Differences (m,), in Pa, of the pressures of unsaturated pieces from the pressures of their cells."""
         return self._quadrature.materials.retentions.heads(self._places.lever)
 
     @cached_property
     def scale(self) -> NDArray[np.float64] | None:
-        """Suction at which pores drain in the filled owned cells, Pa, 1 if saturated; None in saturated scenes."""
+        """Suctions (Pa) at which filled owned cells drain (1 without retention curve), or None in saturated scenes."""
         if self._quadrature.materials.retentions is None:
             return None
         scale = np.full(len(self.contents.filled), np.inf)
@@ -403,25 +406,25 @@ class OnGrid(Keyed):
         return np.where(np.isinf(scale), 1.0, scale)
 
     def resting_mobility(self) -> Mobility:
-        """Return conductivities of filled owned cells in the reference configuration, m/s, in place of mobilities."""
+        """Return the conductivities (m/s) of filled owned cells in the reference configuration, as a `Mobility`."""
         at_pieces = self._quadrature.rows(self.cut, self.cut.points, lambda m: m.conductivity)
         mean = self.contents.mean(at_pieces)
         return Mobility(mean) if self._mixed is None else self._mixed.mobility(at_pieces, mean, None)
 
     def rests(self, state: State) -> NDArray[np.int64] | None:
-        """Return the filled owned cells in which all points keep their pieces; None if no point does."""
+        """Return the filled owned cells in which all points keep their pieces, or None if no point keeps its pieces."""
         if not state.stay:
             return None
         moves = self.cut.to_cells(~state.stay.keeps).astype(float)
         return (self.contents.total(moves) == 0).nonzero()[0]
 
     def valid(self, points: MaterialPoints, loads: Sequence[Loads]) -> NDArray[np.bool_]:
-        """Return a mask (n,) of points that keep their pieces: their part and parts in contact with it hardly move."""
+        """Return a mask (n,) of points whose connected part, and parts in contact with it, hardly move."""
         part, count = self.parts if self.cut.grid.copies == 1 else self._of_points(*self.parts_of_cells(loads))
         return self.cut.valid(points, part, count)[part]
 
     def parts_of_cells(self, loads: Sequence[Loads]) -> tuple[NDArray[np.int64], int]:
-        """Return the connected parts of cells, like `ActiveSet.parts_of_cells`; parts that may touch are one part."""
+        """Return the parts of cells, see `ActiveSet.parts_of_cells`. Parts that may touch count as one part."""
         if self.cut.grid.copies == 1:
             return self.active.parts_of_cells
         pairs = np.concatenate([one.within_reach() for one in loads])
@@ -436,7 +439,7 @@ class OnGrid(Keyed):
         return self._of_points(*self.active.parts_of_cells)
 
     def _of_points(self, part: NDArray[np.int64], count: int) -> tuple[NDArray[np.int64], int]:
-        """Return the index of each point's part (n,), from 0, and `count`; part: index of each cell's part, from 1."""
+        """Return the index (n,) of each point's part, from 0, and `count`. `part`: index for each cell, from 1."""
         out = np.zeros(len(self.cut.points), dtype=np.int64)
         out[self.cut.pieces.point] = self.cut.to_pieces(part[self.cut.cells] - 1)
         return out, count
@@ -454,7 +457,7 @@ class System:
     Parameters
     ----------
     momentum, storage
-        Compiled forms; storage is None without fluid.
+        Compiled forms. `storage` is None without fluid.
     scheme
         Coupling scheme.
     on_grid
@@ -505,7 +508,7 @@ class System:
 
 
 class Assembled(Keyed):
-    """Data that are kept while pieces and stage stay the same: penalties and fluxes, in the matrices of a system.
+    """Data that are reused until pieces or stage change: penalties and fluxes, in the matrices of a system.
 
     Parameters
     ----------
@@ -551,7 +554,7 @@ class Assembled(Keyed):
             self.mass = momentum.inertia.on(on_grid.cut, on_grid.masses, *faces, own.unknowns, own.held)
         self.momentum.set_rounding(self._rounding(momentum, loads))
         self.round_off = float(self.momentum.rounding.norm())
-        """Norm of the rounding error in the momentum's residual, N."""
+        """Norm (N) of the rounding error in the residual of the momentum."""
         self._off = None
         if self.storage is not None:
             self.storage.set_alternation()
@@ -565,9 +568,10 @@ class Assembled(Keyed):
         return self._system.solvers
 
     def _rounding(self, momentum: MomentumForms, loads: Sequence[Loads]) -> NDArray[np.float64]:
-        """Return the rounding error of the residual at the active local nodes (nodes,), N.
+        """Return the rounding errors (nodes,) of the residual at the active local nodes, in N.
 
-        It has two terms: one is proportional to the stiffness of the cells at a node, one to the penalties there.
+        A rounding error has two terms. One term is proportional to the stiffness of the cells at the node, and the
+        other term to the penalties at the node.
         """
         grid, on_grid = self._on_grid.cut.grid, self._on_grid
         cells, of_cells = on_grid.cells, np.zeros(grid.num_local)
@@ -581,12 +585,13 @@ class Assembled(Keyed):
     def flow(
         self, state: State, weight: NDArray[np.float64] | None, data: QuadratureData, t: float, dt: float
     ) -> tuple[list[Feeds], Callable[[bool], Outflow]]:
-        """Return the fluid conditions, and a function `outflow(begins)` for the fluxes at u; begins: see `mobility`.
+        """Return the fluid conditions, and a function `outflow(begins)` for the fluxes at u (begins: see `mobility`).
 
         Without a conductivity law, cells whose points all keep their pieces have the flux geometry of the last reset.
 
-        state: at the start of the step; weight (d,), N/m^3: unit weight of the fluid, with gravity; data: integration
-        points; t: time of the pressures and fluxes on open sides, s; dt: length of the step, s.
+        `state`: state at the start of the step.
+        `weight` (d,), N/m^3: unit weight of the fluid, or None without gravity. `data`: integration points.
+        `t`, s: time of the pressures and fluxes on open sides. `dt`, s: length of the step.
         """
         on_grid = self._on_grid
         contents = self._on_grid.contents
@@ -650,12 +655,12 @@ def assembled(
 ) -> Assembled:
     """Return the matrices for cut domains and a stage.
 
-    begins: whether every part of a body must have support; pairs: keys of the pattern of contacts.
+    `begins`: whether every connected part of a body must have supports. `pairs`: keys of the pattern of contacts.
 
     Raises
     ------
     ValueError
-        A body, or at the start of a stage a part of a body, has a free rigid-body mode.
+        If a body has a free rigid-body mode. At the start of a stage, also if a connected part of a body has one.
     """
     grid, free = on_grid.cut.grid, stage.free
     dofs = momentum.active.now.dofs[free[momentum.active.now.nodes].ravel()]

@@ -54,8 +54,9 @@ from mpm_dolfinx.stepping.step import set_up
 DEPTH, PATIENCE, LESS = 40, 16, 0.7
 """Anderson mixing of `DEPTH` iterations ends when `PATIENCE` successive residuals exceed `LESS` times the best one.
 
-Tests: a wet bank, elastic or frictional, and blocks on a rough base, one of them half supported. Depth and patience
-of 40 and 16, or 80 and 24, take equally many iterations and leave relative forces of 4e-5 to 3e-9, but 40 and 8 6e-3.
+The tests are a wet bank, elastic or frictional, and blocks on a rough base, one of which is half supported. Depth 40
+with patience 16 takes as many iterations as depth 80 with patience 24. Both leave relative forces of 4e-5 to 3e-9.
+Depth 40 with patience 8 leaves 6e-3.
 """
 REMARKABLE = 0.05
 """Largest change of stress by balancing without a warning, divided by the largest initial stress.
@@ -106,7 +107,7 @@ def begin_stage(
     reset_displacement: bool,
     fields: Mapping[str, ArrayLike],
 ) -> State:
-    """Return the state at the beginning of a stage, see `Simulation.stage`; named: new conditions."""
+    """Return the state at the beginning of a stage, see `Simulation.stage`. `named`: new conditions."""
     before = state.stage
     if "gravity" in named and scene.gravity is None:
         raise ValueError("gravity: the scene has none; for changes it must be created with gravity=(0, 0)")
@@ -177,9 +178,9 @@ def _released(
 ) -> tuple[State, dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]]:
     """Return the state on the grid of the next step, and tractions on quiet sides.
 
-    The tractions are a dict: for each name of point data, ids (n,) of points on a side, and tractions (n, d), Pa,
-    there. The stresses are in equilibrium with these tractions, the loads of the previous stage, and the remaining
-    supports. after: the new stage.
+    The tractions are a dict by name of point data. Its values are the ids (n,) of points on a side, and the tractions
+    (n, d), in Pa, at these points. The stresses are in equilibrium with these tractions, the loads of the previous
+    stage, and the remaining supports. `after`: the new stage.
     """
     start = set_up(scene, state, 0.0)
     state, momentum = start.state, scene.momentum
@@ -213,8 +214,9 @@ def _released(
 def _kept_at_rest(scene: Scene, state: State) -> State:
     """Return the state on the grid of the next step, with the forces `State.held` that keep its bodies at rest.
 
-    Bodies are in equilibrium under the loads of the present stage.  A reset of the grid leaves a small imbalance.
-    With contact there are no such forces, because contact removes penetrations that the last step has left.
+    Bodies are in equilibrium under the loads of the present stage.  A reset of the grid leaves a small imbalance, and
+    the forces balance it. With contact `State.held` is None, because contact removes penetrations that the last step
+    has left.
     """
     start, forms = set_up(scene, state, 0.0), scene.momentum
     state, system = start.state, start.matrices.momentum
@@ -233,7 +235,7 @@ def _kept_at_rest(scene: Scene, state: State) -> State:
 def _gripped(
     scene: Scene, after: Stage, points: MaterialPoints, before: MaterialPoints | None = None
 ) -> MaterialPoints:
-    """Return the points with the data that conditions store: initial values, or data of the same points `before`."""
+    """Return the points with the data that conditions store: initial values, or data of the points `before`."""
     kept = after.kept(len(points))
     if clashes := sorted(kept.keys() & scene.materials.seeded.data.keys()):
         raise ValueError(f"{clashes[0]!r}: points have data of this name, the condition must have another name")
@@ -258,7 +260,7 @@ def _holds_as(after: Stage, before: Stage) -> bool:
 
 
 def _check_weight(after: Stage, before: Stage | None, t: float) -> None:
-    """Raise ValueError if a stage with quiet sides changes the weight: the sides' tractions would not bear it."""
+    """Raise ValueError if a stage with quiet sides changes the weight, which their tractions would not bear."""
     quiet = after.of(Quiet)
     now = after.gravity_at(t) if quiet else None
     was = None if before is None else before.gravity_at(t)
@@ -298,7 +300,7 @@ def _warn_moved_on(scene: Scene, before: Stage, after: Stage) -> None:
 def _filled(
     scene: Scene, points: MaterialPoints, standing: Sequence[int], add: Sequence[int], gravity: NDArray | None
 ) -> tuple[MaterialPoints, MaterialPoints]:
-    """Return all points with added bodies, and the points of added bodies; bodies that touch others are added first."""
+    """Return all points, and the points of added bodies. Bodies that touch others are added first."""
     standing = list(standing)
     waiting = list(add)
     new = scene.materials.seeded.of(np.empty(0, np.int64))
@@ -320,7 +322,7 @@ def _filled(
 def _without_extra(
     scene: Scene, points: MaterialPoints, add: Sequence[int], fields: Mapping[str, ArrayLike]
 ) -> MaterialPoints:
-    """Return the points without data that added bodies lack; ValueError if `fields` does not give such data anew."""
+    """Return the points without data that added bodies lack. Raise ValueError if `fields` lacks these data."""
     extra = points.data.keys() - scene.materials.seeded.data.keys()
     for name in sorted(extra - fields.keys()):
         what = f"stage: add: body {add[0]}: its points have no {name!r}"
@@ -351,7 +353,7 @@ def _changed(scene: Scene, points: MaterialPoints, fields: Mapping[str, ArrayLik
 
 
 def pieces_at_start(scene: Scene, points: MaterialPoints) -> PiecePressures:
-    """Return the pressures of the pieces for a pressure field; cells have the field's values at their centroids."""
+    """Return the pressures of the pieces for a pressure field. Each cell has the value of the field at its centroid."""
     on_grid = scene.on_grid(points)
     grid = scene.grid
     pressure = scene.initial.pressure
@@ -381,15 +383,15 @@ def balanced(scene: Scene, state: State) -> State:
     """Return a state with stresses in equilibrium with the loads at its time and with its pore pressures.
 
     For points with the strain of a displacement w, a step of the momentum balance gives a further displacement u(w).
-    Points store only mean strains of their domains, so w + u(w) is not in equilibrium yet. The fixed-point iteration w
-    <- w + u(w) follows, with Anderson mixing (Walker and Ni 2011). Mean strains cannot balance all nodes; nodal forces
-    `State.held` balance the remainder. Support forces are evaluated at the displacement w, `State.rest`: sides then
-    stay where they were seeded, whatever displacement is prescribed at the start.
+    Points store only mean strains of their domains, so `w + u(w)` is not in equilibrium yet. The fixed-point iteration
+    `w <- w + u(w)` follows, with Anderson mixing (Walker and Ni 2011). Mean strains cannot balance all nodes. Nodal
+    forces `State.held` balance the remainder. Support forces are evaluated at the displacement w (`State.rest`). Sides
+    then stay at their seeded positions, whatever displacement is prescribed at the start.
 
     Raises
     ------
     ValueError
-        There is no equilibrium with these laws.
+        If there is no equilibrium with these laws.
     """
     forms, materials = scene.momentum, scene.materials
     try:
@@ -438,9 +440,10 @@ def balanced(scene: Scene, state: State) -> State:
 
 
 def _report(scene: Scene, seeded: State, points: MaterialPoints, count: int, left: float, touches: bool) -> None:
-    """Log the changes by balancing; raise ValueError for a large relative residual.
+    """Log the changes by balancing. Raise ValueError for a large relative residual.
 
-    touches: whether contact may act. It is detected only in the first step, so a large residual causes only a warning.
+    `touches`: whether contact may act. Contact is detected only in the first step, so a large residual then causes only
+    a warning.
     """
     materials, comm = scene.materials, scene.grid.comm
     if left > REMARKABLE and not touches:
@@ -457,12 +460,12 @@ def _report(scene: Scene, seeded: State, points: MaterialPoints, count: int, lef
 
 
 def _rest(scene: Scene, cells: NDArray[np.int32], w: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return w, a local array of nodal displacements, m, with zeros outside `cells`, the cells at supported sides."""
+    """Return the nodal displacements w (a local array, in m), with zeros outside the cells at supported sides."""
     return np.where(np.repeat(scene.momentum.active_nodes(cells), scene.grid.dim), w, 0.0)
 
 
 def _problem(scene: Scene, start: Start, state: State) -> MomentumProblem:
-    """Return the momentum balance with zero displacement and rates; the points include the strain found so far."""
+    """Return the momentum balance with zero displacement and rates, for points with the strain found so far."""
     matrices, data = start.matrices, start.on_grid.data_of(state)
     at = start.on_grid.cut, start.on_grid.fill, state.points, data
     place = Place(*at, state.t, 0.0, state.t, state.outcome)
@@ -482,7 +485,7 @@ def _as_reset(scene: Scene, start: Start) -> State:
 
 
 def _mixed(unknowns: Unknowns, seen: Sequence[tuple[NDArray, NDArray]]) -> NDArray[np.float64]:
-    """Return the next displacement of a fixed-point iteration; seen: earlier displacements and steps, local arrays."""
+    """Return the next displacement of a fixed-point iteration. `seen`: earlier displacements and steps."""
     (w, u), owned = seen[-1], unknowns.owned
     if len(seen) == 1:
         return w + u

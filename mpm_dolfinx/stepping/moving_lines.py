@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Grid lines that move with a body or tool; each reset computes them from the state, even in a resumed run."""
+"""Grid lines that move with a body or tool.  Each reset computes the lines from the state, even in a resumed run."""
 
 from __future__ import annotations
 
@@ -27,7 +27,8 @@ def with_lines(grid: Grid, state: State, left: Callable[[State], State]) -> Stat
     Parameters
     ----------
     left
-        Function that adds pressures of pieces to a state with kept pieces, for a reset; called before the grid moves.
+        Function that adds pressures of pieces to a state with kept pieces, for a reset.  It is called before the grid
+        moves.
     """
     grid.move(state.lines)
     before = grid.lines
@@ -49,7 +50,7 @@ def with_lines(grid: Grid, state: State, left: Callable[[State], State]) -> Stat
 
 
 def _wanted(grid: Grid, state: State, before: Sequence[NDArray[np.float64]]) -> Sequence[NDArray[np.float64]]:
-    """Return the coordinates (n,), m, of the grid lines along each axis for a state, relative to the base."""
+    """Return the coordinates (n,), in m, of the grid lines along each axis for a state, relative to the base."""
     if hasattr(grid.follow, "pose"):
         moved = state.stage.moved(grid, state.t, state.outcome)
         return before if moved is None else carried(grid.seeded, moved)
@@ -64,7 +65,7 @@ def _wanted(grid: Grid, state: State, before: Sequence[NDArray[np.float64]]) -> 
 
 
 def _of_all(grid: Grid, state: State) -> NDArray[np.float64]:
-    """Return the true positions (n, d), m, of the points of all processes, ordered by id."""
+    """Return the true positions (n, d), in m, of the points of all processes, ordered by id."""
     found = grid.comm.allgather((state.points.id, state.points.x))
     ids, x = (np.concatenate(values) for values in zip(*found, strict=True))
     return x[np.argsort(ids)] + grid.base

@@ -1,20 +1,20 @@
 # SPDX-License-Identifier: MIT
 """Renewal: replacement of distorted particle domains of flowing soil by new ones, at a reset of the grid.
 
-F of yielded soil is updated by increments, so domains serve for integration only. They may be replaced if the new
-domains fill the same region, with the same surface and contents. Cells with a piece of a domain longer than `LONGEST`
-are filled anew:
+F of yielded soil is updated by increments, so domains are used for integration only. Old domains may be replaced if new
+domains fill their region, and keep the surface and the contents of the region. Cells with a piece of a domain longer
+than `LONGEST` are filled anew:
 
 * A full cell is divided into four equal domains.
-* A cell that the surface crosses once is filled with quadrilaterals about the centroid of the filled part. The surface
-  there becomes `EDGES` edges, with the same ends, area and sharp corners; in axisymmetry with the same volume.
+* A cell that the surface crosses once is filled with quadrilaterals about the centroid of the filled part. `EDGES`
+edges replace the surface in the cell. Ends, sharp corners and area (in axisymmetry volume) do not change.
 
 Remainders of old domains outside these cells become domains. Masses, volumes and the mass of the fluid are exact in
 each cell, as are mass-weighted sums of other point data, such as the logarithm of the elastic left Cauchy-Green tensor.
-The other data are means over overlaps of old and new domains, shifted to the new centroids by fitted slopes, within the
-range of the old values. With inertia, the centre of mass, the momentum and the angular momentum of each cell are exact
-too. Cells are unchanged if they contain elastic soil, several bodies, several crossings of the surface, or domains
-on a side whose displacement a condition needs.
+Point data of a new domain are means over its overlaps with old domains. The means are shifted to the new centroid by
+fitted slopes, within the range of the old values. With inertia, the centre of mass, the momentum and the angular
+momentum of each cell are exact too. Cells are unchanged if they contain elastic soil, several bodies, several crossings
+of the surface, or domains on a side whose displacement a condition needs.
 """
 
 from __future__ import annotations
@@ -42,13 +42,13 @@ from mpm_dolfinx.points.material_points import ACROSS, MaterialPoints, body_of, 
 from mpm_dolfinx.stepping.state import State, Stay
 
 LONGEST = 1.0
-"""Largest length of a domain, in cell sizes; edges of longer domains would have to bend. Source: definition."""
+"""Largest length of a domain, in cell sizes. Edges of longer domains would have to bend. Source: definition."""
 
 
 class Renewal:
     """Renewal of the particle domains in a scene.
 
-    faces, materials: faces of the bodies, and materials of the scene.
+    `faces`: faces of the bodies. `materials`: materials of the scene.
     """
 
     def __init__(self, faces: SeededFaces, materials: SceneMaterials):
@@ -64,7 +64,7 @@ class Renewal:
         return misshapen(self._grid, points.corners, LONGEST)
 
     def flowed(self, points: MaterialPoints) -> NDArray[np.bool_]:
-        """Return a mask (n,) of points that yielded or were renewed; False for laws without the state `plastic`."""
+        """Return a mask (n,) of yielded or renewed points. It is False for laws without the state `plastic`."""
         if "plastic" not in points.data:
             return np.zeros(len(points), dtype=bool)
         known = np.array(["plastic" in law.state for law in self._materials.laws])[self._materials.law_of(points)]
@@ -78,7 +78,7 @@ class Renewal:
         return free if state.stay is None else free & ~state.stay.keeps
 
     def renewed(self, state: State) -> tuple[State, int]:
-        """Return the state with renewed domains, and the number of replaced domains; all processes must call it.
+        """Return the state with renewed domains, and the number of replaced domains. All processes must call it.
 
         After a renewal the first process has all points. A failure raises NotConverged on all processes.
         """
@@ -136,10 +136,11 @@ class Renewal:
     def _pressures(
         self, old: PiecePressures, points: MaterialPoints, work: RefilledCells, made: MaterialPoints, group: NDArray
     ) -> NDArray[np.float64]:
-        """Return the pressures (m,), Pa, of new domains, so that their cells contain the fluid of the old domains.
+        """Return the pressures (m,), in Pa, of new domains, so that their cells contain the fluid of the old domains.
 
-        group (m,): group of each new domain, see `RefilledCells`.  All domains of a group have one pressure: the mean
-        weighted by storage, or by volume if there is no storage.
+        All domains of a group have equal pressures: the mean of the old pressures, weighted by storage, or by volume
+        without storage.
+        `group` (m,): group of each new domain, see `RefilledCells`.
         """
         materials, pieces = self._materials, work.pieces
         bulk = materials.fluid.bulk
@@ -262,7 +263,7 @@ def _joined(points: MaterialPoints, made: MaterialPoints, kept: NDArray[np.bool_
 
 
 def _of_tensors(function: np.ufunc, b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return a function, such as np.log, of symmetric tensors b (n, 3, 3)."""
+    """Return the value of `function`, such as np.log, for symmetric tensors b (n, 3, 3)."""
     value, axes = np.linalg.eigh(b)
     return (axes * function(value)[:, None]) @ axes.swapaxes(1, 2)
 

@@ -34,7 +34,8 @@ class Result:
     steps, newton, coupling
         Numbers of steps, of Newton iterations and of coupling iterations so far.
     cuts, rejected
-        Numbers of reduced steps: without convergence; with a large error, or if equal, with a jump of pressure.
+        Numbers of reduced steps. `cuts` counts steps without convergence. `rejected` counts steps with a large error.
+        In runs with equal steps, `rejected` counts steps with a jump of pressure.
     rederived
         Number of inverted domains that were re-initialised from F.
     renewed
@@ -46,17 +47,17 @@ class Result:
     residual
         Largest relative residual of the momentum and fluid equations so far.
     wall, profile
-        Wall time, s, of the whole run, and of each part of the run on this process.
+        Wall times, s: of the whole run, and of each part of the run on this process.
     converged
         Whether the run has reached its end.
     event
-        Index in `until`, from 0, of the function that ended the run, and time of the event, s; None without an event.
+        Index in `until` (from 0) of the function that ended the run, and time (s) of this event. None without an event.
     points
         Number of material points at the end of the run.
     memory
-        Peak memory of all processes with libraries, MB.
+        Peak memory (MB) of all processes, including libraries.
     imbalance
-        For points, pieces and cells: largest number on a process, divided by the mean, see `summary.imbalance`.
+        Largest number of points, pieces and cells on a process, each divided by its mean, see `summary.imbalance`.
     """
 
     rows: Rows = field(default_factory=Rows, repr=False)
@@ -87,76 +88,77 @@ class Result:
 
     @property
     def t(self) -> NDArray[np.float64]:
-        """Output times (n,), s."""
+        """Output times (n,), in s."""
         return self.rows.column("t")
 
     @property
     def displacement(self) -> NDArray[np.float64]:
-        """Displacements (n, m, d) of the probes, m."""
+        """Displacements (n, probes, d) of the probes, in m."""
         return self.rows.column("displacement")
 
     @property
     def position(self) -> NDArray[np.float64]:
-        """Positions (n, m, d) of the probes, m."""
+        """Positions (n, probes, d) of the probes, in m."""
         return self.rows.column("position")
 
     @property
     def pressure(self) -> NDArray[np.float64]:
-        """Least and largest pore pressure (n, 2) of the material points, Pa; (n, 0) without fluid."""
+        """Smallest and largest pore pressure (n, 2) of the material points, in Pa, or (n, 0) without fluid."""
         return self.rows.column("pressure")
 
     @property
     def probe_pressure(self) -> NDArray[np.float64]:
-        """Pore pressures (n, m) at the probes, Pa; (n, 0) without fluid."""
+        """Pore pressures (n, probes) at the probes, in Pa. The shape is (n, 0) without fluid."""
         return self.rows.column("probe_pressure")
 
     @property
     def probe_stress(self) -> NDArray[np.float64]:
-        """Effective stresses (n, m, 3, 3) at the probes, Pa, tension positive; (n, 0, 3, 3) if not recorded."""
+        """Effective stresses (n, probes, 3, 3), in Pa, tension positive, or (n, 0, 3, 3) if not recorded."""
         return self.rows.column("probe_stress")
 
     @cached_property
     def reactions(self) -> ByName[NDArray[np.float64]]:
-        """Force (times, d), N, of each prescribed displacement on the bodies at the output times, by name."""
+        """Force (times, d), in N, of each prescribed displacement on the bodies at the output times, by name."""
         return self.outcome("reactions")
 
     @cached_property
     def wall_reactions(self) -> ByName[NDArray[np.float64]]:
-        """Force (times, d), N, of each wall of the grid on the bodies at the output times; see `Simulation`."""
+        """Force (times, d), in N, of each wall of the grid on the bodies at the output times, see `Simulation`."""
         return self.outcome("wall_reactions")
 
     @cached_property
     def outflows(self) -> ByName[NDArray[np.float64]]:
-        """Outflow (times,), m^3/s, through each open side at the output times, by name."""
+        """Outflow (times,), in m^3/s, through each open side at the output times, by name."""
         return self.outcome("outflows")
 
     @cached_property
     def tool_forces(self) -> ByName[NDArray[np.float64]]:
-        """Forces, N, and moments, N m, (times, 3), in 3D (times, 6), of each tool and contact on bodies, by name."""
+        """Forces (N) and moments (N m) (times, 3), in 3D (times, 6), of tools and contacts on bodies, by name."""
         return self.outcome("tool_forces")
 
     @cached_property
     def tool_travel(self) -> ByName[NDArray[np.float64]]:
-        """Displacement (times,), m, of each load-controlled tool, without its prescribed displacement, by name."""
+        """Displacement (times,), in m, of each load-controlled tool without its prescribed displacement, by name."""
         return self.outcome("tool_travel")
 
     @cached_property
     def energies(self) -> ByName[NDArray[np.float64]]:
-        """Energies and works (times,), J (J/m in plane strain), of a `run(energies=True)`, by name.
+        """Energies and works (times,), in J (J/m in plane strain), of a `run(energies=True)`, by name.
 
-        `kinetic`, `elastic` are energies of bodies and free tools; `elastic` is 0 for laws of unknown elastic energy.
-        Works since the start of the run: `external`, work of all loads; `viscous`, of quiet sides and user's terms;
-        `friction`, of slip at tools and between groups; `internal`, of the stresses. `dissipated` is `internal` minus
-        `elastic`; in wet bodies it includes the work of flow and storage of water. With `Numerics(renewal=True)`,
-        `renewal` is the kinetic and elastic energy that renewed domains have lost. `kinetic` + `elastic` + `dissipated`
-        + `viscous` + `friction` + `renewal` - `external` is constant, up to numerical dissipation.
+        `kinetic` and `elastic` are energies of bodies and free tools. `elastic` is 0 for laws of unknown elastic
+        energy. Works are summed from the start of the run. `external` is the work of all loads, and `viscous` that of
+        quiet sides and user's terms. `friction` is the work of slip at tools and between groups, and `internal` is the
+        work of the stresses. `dissipated` is `internal` minus `elastic`. In wet bodies `dissipated` includes the work
+        of flow and storage of water. With `Numerics(renewal=True)`, `renewal` is the kinetic and elastic energy that
+        renewed domains have lost. `kinetic` + `elastic` + `dissipated` + `viscous` + `friction` + `renewal` -
+        `external` is constant, up to numerical dissipation.
         """
         return self.outcome("energy")
 
     def outcome(self, quantity: str) -> ByName[NDArray[np.float64]]:
-        """Return the results (n, ...) of conditions at the output times, by name; quantity: such as "reactions".
+        """Return the results (n, ...) of conditions at the output times, by name.
 
-        Values are nan at times without the condition.
+        Values are nan at times without the condition. `quantity`: name of the results, such as "reactions".
         """
         rows = [outcome.get(quantity, {}) for outcome in self.rows.outcomes]
         like = {name: np.full_like(value, np.nan) for row in rows for name, value in row.items()}
@@ -165,15 +167,16 @@ class Result:
     def to_dataframe(self):
         """Return the histories as a pandas data frame, one row for each output time, with the columns of `history.csv`.
 
-        `attrs["units"]` of the frame contains the unit of each column. ImportError if pandas is not installed.
+        `attrs["units"]` of the frame contains the unit of each column. Raise ImportError if pandas is not installed.
         """
         return data_frame(self, {name: self.outcome(name) for name in OUTCOMES})
 
     def to_xarray(self):
         """Return the histories as an xarray data set, with units as attributes of its variables.
 
-        Dimensions are time, probe and axis; stresses at probes have row and column. Variables of conditions have the
-        conditions' names. The data set's attributes are the counts of the run. ImportError if xarray is not installed.
+        Dimensions are time, probe and axis. Stresses at probes have the dimensions row and column instead of axis.
+        Variables of conditions have the conditions' names. The data set's attributes are the counts of the run. Raise
+        ImportError if xarray is not installed.
         """
         counts = {name: getattr(self, name) for name in ("steps", "newton", "cuts", "balance", "residual", "wall")}
         return data_set(self, {name: self.outcome(name) for name in OUTCOMES}, counts)
@@ -197,7 +200,7 @@ class Result:
         )
 
     def shares(self) -> str:
-        """Return a table: time, s, of each part of the run, its fraction of the wall time; memory; imbalance."""
+        """Return a table: time (s) and share of the wall time of each part of the run, memory, and imbalance."""
         rows = [*self.profile.items(), ("rest", self.wall - sum(self.profile.values()))]
         lines = [f"{name:18} {s:8.2f} s {100 * s / max(self.wall, 1e-9):5.1f} %" for name, s in rows]
         if self.points:  # measured at the end of a run
@@ -210,7 +213,7 @@ class Result:
 
 
 class GaveUp(RuntimeError):
-    """Error that ends a run: a step fails, however short.
+    """Error that ends a run because a step fails, even if it is shortened.
 
     The simulation is in the state of the last good step. A new run may continue it with other conditions or steps.
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A compiled scene: grid, bodies, materials and forms, which are the same in all steps."""
+"""A compiled scene: grid, bodies, materials and forms that do not change between steps."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class When(NamedTuple):
 
 
 class Scene:
-    """A compiled scene, the same in all steps; data that differ between steps are in the `State`.
+    """A compiled scene, which does not change between steps.  Data that change are in the `State`.
 
     Parameters
     ----------
@@ -76,7 +76,7 @@ class Scene:
     initial
         Initial stresses of bodies, see `initial_stress.by_body`.
     velocity
-        Initial velocity, m/s, if bodies may have inertia, see `Simulation`; else None.
+        Initial velocity, m/s, if bodies may have inertia, see `Simulation`.  Otherwise None.
     """
 
     def __init__(
@@ -110,7 +110,7 @@ class Scene:
         self.materials = scene = SceneMaterials(grid, materials, bodies, seeded, fluid, bool(initial))
         self.gravity = fem.Constant(grid.mesh, np.zeros(grid.dim)) if weighs else None
         self.t, self.dt = fem.Constant(grid.mesh, 0.0), fem.Constant(grid.mesh, 1.0)
-        """Time at the end of the substep, and time since the start of the step, s, as constants of forms."""
+        """Two times (s) as constants of forms: at the end of the substep, and since the start of the step."""
         inside = [term for term in terms if not isinstance(term, OnSide)]
         self.pieces = QuadraturePoints(scene, bodies, weighs, bool(len(inside) + len(sources)))
         laws, p = self.pieces.laws, CellPressure(*(fem.Function(grid.cellwise()) for _ in range(3))) if fluid else None
@@ -141,7 +141,7 @@ class Scene:
 
     @property
     def flows(self) -> bool:
-        """Whether fluid flows, or sources add it."""
+        """Whether fluid flows, or sources add fluid."""
         return self.storage is not None and (self.materials.conducts or bool(self.storage.feeding))
 
     @cached_property
@@ -177,8 +177,9 @@ class Scene:
     ) -> MomentumProblem:
         """Return the balance of momentum at the end of a substep, with all coefficients of its forms set.
 
-        when: the substep; system, data, loads, options: see `MomentumProblem`; u (unknowns,), m: displacements at which
-        the iterations begin, a local array; None: the present displacements.
+        `when`: the substep.  `system`, `data`, `loads`, `options`: see `MomentumProblem`.
+        `u` (unknowns,), m: displacements at which the iterations begin, a local array, by default the present
+        displacements.
         """
         self.t.value, self.dt.value = when.t, when.since
         if when.gravity is not None:
@@ -193,11 +194,11 @@ class Scene:
 
     @cached_property
     def _warned(self) -> set[str]:
-        """Subjects of earlier warnings; they affect only the log."""
+        """Subjects of earlier warnings, which affect only the log."""
         return set()
 
     def look_at(self, gravity: Sequence[NDArray[np.float64] | None]) -> None:
-        """Warn, once, if the gravity of a step differs from the gravity that defines the conductivities."""
+        """Warn once if the gravity of a step differs from the gravity that defines the conductivities."""
         if self.fluid is None or not self.materials.conducts or gravity[0] is None or "gravity" in self._warned:
             return
         if strength := other_gravity(self.fluid, gravity):
@@ -207,19 +208,21 @@ class Scene:
             self._warned.add("gravity")
 
     def rests_at(self, stage: Stage, t: float) -> None:
-        """Set the fluid's unit weight, from which `Retentions` computes the pressure variation in unsaturated cells.
+        """Set the unit weight of the fluid, from which `Retentions` computes the pressure variation in unsaturated
+        cells.
 
-        t: time of the gravity of `stage`, s: the start of a step.  If gravity varies, each step resets the grid.
+        If gravity varies, each step resets the grid.
+        `t`, s: start of a step, at which the gravity of `stage` is evaluated.
         """
         if self.materials.retentions is not None:
             gravity = stage.gravity_at(t) if self.materials.conducts else None
             self.materials.retentions.weight.value = 0.0 if gravity is None else self.fluid.density * gravity
 
     def distributed(self, boxes: NDArray[np.int64]) -> Scene | None:
-        """Return an equal scene on a grid distributed by boxes (ranks, 2, d), see `Partition`.
+        """Return an equal scene on a grid distributed by boxes (ranks, 2, d) (see `Partition`), or None.
 
-        The result is None if a function of position, such as a random field, does not return the same values again, or
-        if terms may be defined on the present mesh.
+        It is None if a function of position, such as a random field, does not return the same values when called again.
+        It is also None if terms may be defined on the present mesh.
         """
         if self.extended:
             return None
@@ -235,7 +238,7 @@ class Scene:
         return out
 
     def adopted(self, state: State) -> State:
-        """Return the state of an equal scene with another distribution, as a state of this scene."""
+        """Convert the state of an equal scene with another distribution to a state of this scene."""
         before = state.stage
         given = {**before.conditions, "conditions": tuple(before.given.values())}
         nodal = {name: rows for name in NODAL if (rows := getattr(state, name)) is not None}
@@ -244,12 +247,12 @@ class Scene:
         return replace(state, stage=after, **nodal).at_owners(self.grid)
 
     def stage(self, conditions: Mapping[str, Any], present: Sequence[bool], later: Sequence[int]) -> Stage:
-        """Return a stage of the scene; conditions, present, later: see `stepping.stage.stage`."""
+        """Return a stage of the scene.  `conditions`, `present`, `later`: see `stepping.stage.stage`."""
         fed = self.storage.feeding if self.storage else ()
         return stage(self.bodies, self.materials, self.momentum, fed, conditions, present, later)
 
     def check(self, state: State) -> None:
-        """Raise ValueError for an object that is no state of this scene: its stage refers to other materials."""
+        """Raise ValueError for an object that is not a state of this scene, with the materials of this scene."""
         if not isinstance(state, State) or state.stage.materials is not self.materials:
             raise ValueError(f"state = {line(state)}, must be a state of this simulation")
 
@@ -270,7 +273,7 @@ class Scene:
         return self._on_grid((points.arrays, lines), make, grid.comm)
 
     def check_followed(self, first: Stage) -> None:
-        """Raise ValueError if grid lines follow a tool that is absent from the first stage: they would never move."""
+        """Raise ValueError if grid lines follow a tool that is absent from the first stage, and never move."""
         follow = self.grid.follow
         if hasattr(follow, "pose") and first.followed(self.grid) is None:
             raise ValueError(f"grid: follow = {line(follow)}, not in the first stage, must be one of its conditions")
@@ -285,7 +288,7 @@ class Scene:
 
     @cached_property
     def _replacing(self) -> Sequence[Callable[[State], tuple[State, int]]]:
-        """Functions that replace particle domains at a reset of the grid: by division and merging, and by renewal."""
+        """Functions that replace particle domains at a reset of the grid, by division and merging, or by renewal."""
         grid = self.grid
         if not self.numerics.renewal:
             return ()
@@ -313,7 +316,8 @@ class Scene:
         return [one for one, possible in both if possible]
 
     def for_reset(self, state: State, renew: bool) -> tuple[State, int]:
-        """Return a state for a reset of the grid, with points at their owners, and the number of renewed domains.
+        """Return a state for a reset of the grid, with points on the owners of their cells, and the number of renewed
+        domains.
 
         renew: whether renewal is allowed. A state in which all points keep their pieces is unchanged.
         """
@@ -341,8 +345,8 @@ class Scene:
     ) -> Assembled:
         """Return the matrices for a stage of the bodies on the grid.
 
-        now: present loads; as_cut: function that returns the loads at the positions at which domains were cut; begins:
-        whether all parts of the bodies must have supports.
+        `now`: present loads.  `as_cut`: function that returns the loads at the positions at which domains were cut.
+        `begins`: whether all parts of the bodies must have supports.
         """
 
         def make() -> Assembled:
@@ -358,7 +362,7 @@ class Scene:
 
     @cached_property
     def description(self) -> dict[str, Any]:
-        """Constants that define the scene, by name; they identify a checkpoint."""
+        """Constants that define the scene, by name.  A checkpoint is identified by these constants."""
         grid = self.grid
         out = {"grid cells": grid.shape.tolist(), "grid lower": grid.lower.tolist(), "grid upper": grid.upper.tolist()}
         if not grid.even:
@@ -386,7 +390,7 @@ class Scene:
 
     @property
     def last(self) -> tuple[OnGrid | None, Assembled | System | None]:
-        """The bodies as last cut by the grid, and the matrices of the last step, for inspection."""
+        """The bodies as cut at the last reset of the grid, and the matrices of the last step, for inspection."""
         return self._on_grid.value, self._assembled.value or self._systems.value
 
     def forget(self) -> None:

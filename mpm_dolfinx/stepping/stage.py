@@ -57,7 +57,7 @@ FED: tuple[type[Feeding], ...] = (DrainedSides,)
 
 
 def checked(conditions: Sequence[Condition]) -> Sequence[Condition]:
-    """Return the conditions; ValueError for an object that is not a condition."""
+    """Return the conditions.  Raise ValueError for an object that is not a condition."""
     if isinstance(conditions, Sequence) and any(isinstance(one, (OnSide, Source)) for one in conditions):
         raise ValueError("conditions: OnSide and Source are terms, must be given as terms=")
     if isinstance(conditions, Sequence) and not isinstance(conditions, (str, bytes)):
@@ -144,14 +144,14 @@ class Stage:
         return {name: one for name, one in self.named.items() if isinstance(one, kinds)}
 
     def followed(self, grid: Grid) -> str | None:
-        """Return the name of the tool that the lines of a grid follow; None if it is absent."""
+        """Return the name of the tool that the lines of a grid follow, or None if this tool is absent."""
         for name, one in self.of(Tool).items():
             if one is grid.follow or one.name == grid.follow.name is not None:
                 return name
         return None
 
     def moved(self, grid: Grid, t: float, outcome: Outcome) -> NDArray[np.float64] | None:
-        """Return the displacement (d,), m, at time t, s, of the tool that grid lines follow; None if it is absent."""
+        """Return the displacement (d,), in m, at time t (s) of the tool that grid lines follow, or None without it."""
         if (name := self.followed(grid)) is None:
             return None
         tool = self.given[name]
@@ -188,13 +188,13 @@ class Stage:
         return {data for one in self.acting for name, of in one.kept(0).items() if name in names for data in of}
 
     def same(self, before: Stage) -> set[str]:
-        """Return names of conditions that are the same object in both stages, or have a user's name in both."""
+        """Return the names of conditions that are one object in both stages, or have equal user-defined names."""
         shared = ((name, one) for name, one in self.given.items() if name in before.given)
         return {name for name, one in shared if one is before.given[name] or getattr(one, "name", None) == name}
 
     @property
     def lasting(self) -> list[Surface]:
-        """Faces whose displacement from the seeded position conditions need; their domains must not be replaced."""
+        """Faces for which conditions need displacements from seeded positions.  Domains there must not be replaced."""
         return [*(faces for _, faces, _ in self.held), *(faces for one in self.acting for faces in one.seeded)]
 
     @property
@@ -203,7 +203,7 @@ class Stage:
         return QUANTITIES + OF_RAIN + MOTIONS
 
     def unknown(self, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return results of conditions, by quantity and name, all equal to `value`, before the first step."""
+        """Return the results of conditions before the first step, by quantity and name.  All are equal to `value`."""
         d = self.free.shape[1]
         out = {quantity: {} for quantity in QUANTITIES}
         out["wall_reactions"] = {wall: np.full(d, value) for wall in SIDES[d]}
@@ -220,7 +220,7 @@ class Stage:
     def initial_outcome(
         self, before: Stage, outcome: Outcome, value: float
     ) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return the results of conditions at the beginning of the stage; for new conditions `value`."""
+        """Return the results of conditions at the beginning of the stage.  Results of new conditions are `value`."""
         same = {name for name, one in self.given.items() if before.given.get(name) is one}
         if self.conditions["walls"] == before.conditions["walls"]:
             same |= SIDES[self.free.shape[1]].keys()
@@ -230,14 +230,14 @@ class Stage:
         }
 
     def kinetic(self, outcome: Outcome) -> float:
-        """Return the kinetic energy, J, of free tools; outcome: results of conditions, with the tools' velocities."""
+        """Return the kinetic energy (J) of free tools.  `outcome`: results of conditions, with velocities of tools."""
         d, tools = self.free.shape[1], self.of(Tool)
         moving = [(tools[name].mass, v) for name, v in outcome.get("tool_velocity", {}).items() if name in tools]
         moving += [(tools[name].inertia(d), v) for name, v in outcome.get("tool_spin", {}).items() if name in tools]
         return sum(m / 2 * float((v**2).sum()) for m, v in moving)
 
     def gravity_at(self, t: float) -> NDArray[np.float64] | None:
-        """Return the acceleration of gravity (d,), m/s^2, at time t, s; None without gravity."""
+        """Return the acceleration of gravity (d,), in m/s^2, at time t (s), or None without gravity."""
         gravity = self.conditions["gravity"]
         name = f"gravity at t = {t:g} s"
         d = self.free.shape[1]
@@ -262,7 +262,7 @@ def stage(
     bodies, materials
         All bodies and materials of the scene.
     momentum, fed
-        Forms, with the loads that act in all stages, and terms in the balance of fluid that act in all stages.
+        Forms, with the loads of all stages, and terms that act in the balance of fluid in all stages.
     conditions
         walls, conditions, gravity and inertia: see `Simulation`.
     present
@@ -273,7 +273,7 @@ def stage(
     Raises
     ------
     ValueError
-        A condition is invalid; the message has its name, its value and the allowed values.
+        If a condition is invalid.  The message has its name, its value and the allowed values.
     """
     grid, fluid = materials.grid, materials.fluid
     given_by_name = named(checked(conditions["conditions"]))
@@ -320,7 +320,10 @@ def stage(
 
 
 def _check_inertia(by_name: Mapping[str, Any], inertia: bool) -> None:
-    """Raise ValueError for conditions that do not support inertia, or that require it in a quasi-static stage."""
+    """Raise ValueError in a stage with inertia for conditions that do not support inertia.
+
+    In a quasi-static stage, raise ValueError for conditions that require inertia.
+    """
     for name, one in by_name.items():
         if isinstance(one, Quiet) and not inertia:
             raise ValueError(f"{name}: bodies have no inertia, must be given with inertia=True")

@@ -45,11 +45,11 @@ class StepControl:
     change : (bodies,), Pa
         Largest pressure change of each body since the start of the run.
     first : (bodies,), Pa/s
-        `Report.first` of the last step, the pressure change in its first substep, divided by the length of the step.
+        `Report.first` of the last step: pressure change in its first substep, divided by the length of the step.
     start : (2, bodies), Pa
-        Smallest and largest cell pressures of each body at the start of the run; None before the first step.
+        Smallest and largest cell pressures of each body at the start of the run, or None before the first step.
     motion : J^(1/2)
-        Largest motion since the start of the run, see `motion_error`; None if unused.
+        Largest motion since the start of the run, see `motion_error`. None if it is not used.
     filled
         Largest change of the water content in a step since the start of the run.
     """
@@ -72,7 +72,7 @@ class Stay:
     points
         The material points at the reset of the grid.
     keeps : (n,)
-        Whether each point keeps its pieces, because its connected part hardly moves; None if all keep them.
+        Whether each point keeps its pieces, because its connected part hardly moves. None if all points keep them.
     """
 
     points: MaterialPoints
@@ -84,12 +84,12 @@ class Stay:
 
 @dataclass(frozen=True, eq=False)
 class Trend:
-    """Motion of the points in the last steps, three at most.
+    """Motion of the points in the last steps (at most three).
 
     lengths : (k,)
-        Lengths of the steps, s, the last one first.
+        Lengths (s) of the steps, beginning with the last step.
     rates : (n, k, d (1 + d)), with fluid (n, k, d (1 + d) + 1)
-        Mean rates of x, m/s, of F, 1/s, and with fluid of the pressure, Pa/s, in each of these steps.
+        Mean rates in each of these steps: of x (m/s), of F (1/s), and with fluid also of the pressure (Pa/s).
     """
 
     lengths: NDArray[np.float64]
@@ -99,10 +99,10 @@ class Trend:
         _freeze(vars(self))
 
     def over(self, seconds: float, implicit: bool = False, first: float = 0.0) -> NDArray[np.float64]:
-        """Return the changes (n, ...) in a time `seconds`, s, from the polynomial through the last states.
+        """Return the changes (n, ...) in a time `seconds` (s), from the polynomial through the last states.
 
-        implicit: whether the rate at the end of the time replaces its mean.  If `first` > 0, the implicit change in
-        a first substep of this length (s), times seconds / first, is subtracted.
+        `implicit`: whether the rate at the end of this time replaces the mean rate. If `first` > 0, the implicit change
+        in a first substep of this length (s), times `seconds / first`, is subtracted.
         """
         order, last = np.arange(1, len(self.lengths) + 1), self.lengths[0]
         ends, powers = -self.lengths.cumsum()[:, None] / last, (seconds / last) ** order * (order if implicit else 1)
@@ -119,7 +119,7 @@ NODAL = ("velocity", "held", "rest")
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class State:
-    """All data of a scene that one step passes to the next; immutable: each step returns a new state.
+    """All data of a scene that one step passes to the next. States are immutable: each step returns a new state.
 
     A checkpoint stores all of these data except two: the stage, which the script defines, and the watched points.
 
@@ -129,39 +129,41 @@ class State:
         Material points of this process, with positions relative to the grid's `base`. A state does not accept
         `Simulation.points`, which have true positions; `PlacedPoints.from_base` converts them.
     pieces
-        Pressures of the pieces of the particle domains, for the transfer to the next grid; None without fluid.
+        Pressures of the pieces of the particle domains, for the transfer to the next grid. None without fluid.
     stay
-        Points that keep their pieces; None if the next step resets the whole grid.
+        Points that keep their pieces, or None if the next step resets the whole grid.
     resets
         Number of resets of the grid.
     lines
-        Coordinates (n,), m, of grid lines by axis "x", "y", "z", at the last reset of a grid with moving lines,
-        relative to its `base`; None before a reset, and for other grids.
+        Coordinates (n,), m, of moving grid lines at the last reset of the grid, by axis "x", "y", "z". They are
+        relative to the `base` of the grid. None before a reset, and for grids whose lines do not move.
     outcome
-        Results of conditions at the end of the last step, by quantity and name; nan for new conditions before the first
-        step of a stage. `reactions` (d,), N: of prescribed displacements. `wall_reactions` (d,), N: of the grid's
-        walls. `outflows`, m^3/s (m^2/s in plane strain): through open sides, as volumes at zero pressure. `tool_forces`
-        (d + 1,), in 3D (6,): forces, N, and moments, N m, of tools and contacts on the bodies. `tool_travel`, m:
-        displacement of a load-controlled tool, added to a prescribed one. Other keys: user-defined conditions.
+        Results of conditions at the end of the last step, by quantity and name. They are nan for new conditions before
+        the first step of a stage. `reactions` (d,), N: forces of prescribed displacements on the bodies.
+        `wall_reactions` (d,), N: forces of the grid's walls on the bodies. `outflows`, m^3/s (m^2/s in plane strain):
+        flow through open sides, as volumes at zero pressure. `tool_forces` (d + 1,), in 3D (6,): forces (N) and moments
+        (N m) of tools and contacts on the bodies. `tool_travel`, m: displacement of a load-controlled tool in addition
+        to its prescribed displacement. Other keys belong to user-defined conditions.
     stage
         The present stage, with its conditions.
     begins
         Whether the stage has had no step so far.
     velocity : (unknowns,), m/s
-        Nodal velocities in the last step on this process, with ghosts: an initial guess for Newton's method with yield
-        or contact. None before the first step, and without yield or contact.
+        Nodal velocities in the last step on this process, with ghosts, for the initial guess of Newton's method with
+        yield or contact. None before the first step, and without yield or contact.
     trend
-        Motion in the last steps, an initial guess in elastic bodies; None in other scenes, and after bodies were added.
+        Motion in the last steps, for the initial guess in elastic bodies. None in other scenes, and after bodies were
+        added.
     held : (unknowns,), N
-        Nodal forces on this process, with ghosts, that balance an initial stress where loads do not, or a body at rest
-        when inertia begins. None without such forces, in other stages, and after a reset of the grid.
+        Nodal forces on this process, with ghosts. They balance an initial stress where loads do not, or keep a body at
+        rest when inertia begins. None without such forces, in other stages, and after a reset of the grid.
     rest : (unknowns,), m
         Nodal displacement on this process, with ghosts, for which prescribed displacements and plates balance an
         initial stress. None after a stage that changes these conditions, and after a reset of the grid.
     watched : (m,)
-        Ids of the points whose domains contain probes; renewal does not replace these domains.
+        Ids of the points whose domains contain probes. Renewal does not replace these domains.
     result, control
-        Histories of the last run, and its step control; None before the first run.
+        Histories and step control of the last run. None before the first run.
     """
 
     t: float
@@ -183,7 +185,7 @@ class State:
 
     def __post_init__(self):
         if isinstance(self.points, PlacedPoints):
-            raise ValueError("state: true positions of points, must be relative to the grid's base: points.from_base")
+            raise ValueError("state: points have true positions, must be relative to the grid's base: points.from_base")
         _freeze(vars(self))
 
     @property
@@ -193,13 +195,13 @@ class State:
 
     @property
     def as_cut(self) -> MaterialPoints:
-        """Points as they are cut: at the positions of the last reset if they keep their pieces, else at the present."""
+        """Points at the positions of their cut: at the last reset if they keep their pieces, else at present."""
         if self.stay is None:
             return self.points
         return self.stay.points if self.stay.keeps is None else self.stay.points.where(self.stay.keeps, self.points)
 
     def of_pieces(self, name: str, fresh: NDArray[np.float64], point: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the data `name` of the pieces (m, ...): stored where points keep their pieces, elsewhere `fresh`.
+        """Return the data `name` (m, ...) of the pieces: stored values for pieces that points keep, else `fresh`.
 
         point : (m,)
             Index of the point of each piece.
@@ -214,7 +216,7 @@ class State:
         return out
 
     def migrated(self, destination: NDArray[np.int32], comm: MPI.Intracomm) -> State:
-        """Return the state after every point has moved to the process destination (n,), with its pieces."""
+        """Return the state after every point has moved with its pieces to its process `destination` (n,)."""
         exchange = Exchange(comm, destination)
         pieces = self.pieces
         if pieces is not None:

@@ -19,7 +19,7 @@ from mpm_dolfinx.stepping.state import State
 
 
 def set_up(scene: Scene, state: State, dt: float, how: tuple = ()) -> Start:
-    """Return the start of a step of dt, s: the state on the grid, matrices, and the loads of the substeps."""
+    """Return the start of a step of length dt (s): the state on the grid, matrices, and the loads of the substeps."""
     scene.check(state)
     scene.rests_at(state.stage, state.t)
     collect_garbage(scene.grid.mesh.comm)
@@ -46,7 +46,7 @@ def set_up(scene: Scene, state: State, dt: float, how: tuple = ()) -> Start:
 
 
 def step(scene: Scene, state: State, dt: float, how: tuple = ()) -> tuple[State, Report]:
-    """Return the state after a step of dt, s, and its report; `state` is unchanged, even after an error."""
+    """Return the state after a step of length dt (s), and its report.  `state` is unchanged even after an error."""
     start = set_up(scene, state, dt, how)
     report, kept = Report(renewed=start.renewed), Kept()
     rates, passed = [], []

@@ -1,21 +1,22 @@
 # SPDX-License-Identifier: MIT
 """Reference solution: body-fitted, total-Lagrangian finite elements for Biot's equations at finite strain.
 
-With the total displacement u, F = I + grad u, J = det F and the pore pressure p (positive in compression), in the
-reference configuration of a box, from the state n at the start of a step:
+The unknowns are the total displacement u and the pore pressure p, positive in compression.  A step starts from state n.
+With F = I + grad u and J = det F, the equations in the reference configuration of a box are
 
     momentum   int [d psi/dF - alpha chi p dJ/dF] : grad v dV  =  int t . v dA + int m g . v dV
     storage    int rho [zeta(J, p) - zeta_n] q dV
                + int int kappa J F^-1 (F^-T grad pi - rho rho_w g) . grad q dV dt  =  0
 
-with tractions t (dead or pressures), the mass m of soil and fluid, kappa = k/(rho_w g), rho = exp((p + p_n)/(2 K_w)).
-`fluid_content` defines the content zeta and the mass potential pi.  In unsaturated soil, kappa is multiplied by k_r.
-There rho [zeta - zeta_n] becomes S rho [zeta - zeta_n] + (S - S_n) J_n n_n exp(p_n/K_w), with saturation S(p), porosity
-n_n.  In saturated pores chi = S = k_r = 1.  If cells have constant pressures, the two-point flux is kappa J
-|F^-T N|^2 (p+ - p-)/h, with the distance h of the cells' centres, and with the mean of k_r between their pressures. It
-is not consistent under shear.  In axisymmetry F contains the circumferential stretch, and integrals extend over the
-full circumference.  Materials, retention, user-defined terms and time integration have the same code as in the material
-point method: the two methods differ only in discretisation.
+Here t are tractions (dead loads or pressures), and m is the mass of soil and fluid.  The mobility is kappa =
+k/(rho_w g), and the relative density is rho = exp((p + p_n)/(2 K_w)).  `fluid_content` defines the content zeta and the
+mass potential pi.  In unsaturated soil, kappa is multiplied by k_r, and rho [zeta - zeta_n] is replaced by S rho
+[zeta - zeta_n] + (S - S_n) J_n n_n exp(p_n/K_w).  S(p) is the saturation, and n_n the porosity in state n.  Saturated
+pores have chi = S = k_r = 1.  If the pressure is constant in each cell, two-point fluxes kappa J |F^-T N|^2 (p+ - p-)/h
+are used.  Here h is the distance between the centres of the cells.  Two-point fluxes contain the mean of k_r between
+the two pressures.  They are not consistent under shear.  In axisymmetry F contains the circumferential stretch, and
+integrals extend over the full circumference.  Materials, retention, user-defined terms and time integration use the
+code of the material point method.  The two methods therefore differ only in discretisation.
 """
 
 from __future__ import annotations
@@ -65,9 +66,13 @@ CUT_DEGREE = 20  # quadrature degree on a partly loaded side, because an edge of
 class Space:
     """Space W of the unknowns w = (u, p/scale), or w = u without fluid, and functions in this space.
 
-    old: w at the start of the step; past: change of w due to the rate of the previous substep; b, f: residual and
-    loads.  same: copy of w that is not differentiated; u, p: displacement and pressure.  p_dofs: degrees of freedom of
-    the pressures; of_p: space of the pressures alone.
+    old: w at the start of the step
+    past: change of w due to the rate of the previous substep
+    b, f: residual and loads
+    same: copy of w that is not differentiated
+    u, p: displacement and pressure, parts of w
+    p_dofs: degrees of freedom of the pressures
+    of_p: space of the pressures alone
     """
 
     def __init__(self, grid: Grid, wet: bool, degree: int, pressure: tuple[str, int, tuple[int, ...]]):
@@ -97,31 +102,33 @@ class Forms(NamedTuple):
 
 
 class BiotFEM:
-    """Finite element model of a box and its state; without fluid, of the drained skeleton.
+    """Finite element model of a box, with its state; without fluid a model of the drained skeleton.
 
     Parameters
     ----------
     grid
         The body, a box: `Grid` with equal cells, whose forms the model owns.
     material, fluid
-        Skeleton without state, and pore fluid.  Steps may not converge for steep retention (n > 2.5, or an air entry).
+        Skeleton without state, and pore fluid.  Steps may not converge for steep retention curves (n > 2.5, or with
+        an air entry).
     walls
         Sides of the box, each with the displacement components that are zero there, such as {"left": "xy"}.
     conditions
         `Traction`, `Pressure`, `RigidPlate` and `Drained` on sides.  With "taylor-hood", `Drained` acts on facets that
-        lie wholly in its region.  Other sides are free and sealed.
+        lie wholly in its region.  All other sides are free of loads, and undrained.
     pressure : Pa
-        Initial pore pressure, or a function of positions x (n, d), m.  The initial effective stress is zero: loads or
-        strains must balance the pressure.
+        Initial pore pressure, or a function of positions x (n, d), in m.  The initial effective stress is zero, so
+        loads or strains must balance the initial pressure.
     gravity : callable t -> (d,), m/s^2
         Acceleration of gravity as a function of time.
     terms
-        User-defined terms as for `Simulation`, but not on sides: see `user_functions`, `Source`.  The argument q of a
-        `Source` is a test function of the elements for pressure.
+        User-defined terms as for `Simulation`, but no terms on sides; see `user_functions` and `Source`.  The argument
+        q of a `Source` is a test function of the elements for pressure.
     element
         "taylor-hood": Q2 displacement, Q1 pressure; "q1-dg0": Q1 displacement, cellwise pressure, two-point fluxes.
     numerics
-        Time integration, and tolerance of the residual relative to the loads, or to the first residual of a step.
+        Time integration, and tolerance of the residual.  The tolerance is relative to the loads, or to the first
+        residual of a step if this residual is larger.
     """
 
     def __init__(
@@ -154,14 +161,14 @@ class BiotFEM:
         functions("terms", terms)
         functions("sources", sources)
         if fluid is None and (drained or sources):
-            raise ValueError("conditions: drained sides or sources without fluid, must be given with fluid")
+            raise ValueError("conditions: drained sides and sources must be given with a fluid")
         if any(outlet.seepage for outlet in drained):
             raise ValueError("drained: seepage = True, must be False: the reference has no seepage faces")
         fields = (material.porosity, material.biot, material.grain_bulk)
         if material.state or material.unknowns or any(map(callable, fields)):
             raise ValueError(
                 f"{type(material).__name__}: the reference has no state and no local unknowns; only moduli, "
-                "conductivity and parameters of the law may be functions of position, others must be numbers"
+                "conductivity and parameters of the law may be functions of position, other data must be numbers"
             )
         self.grid = grid
         self.material, self.fluid = material, fluid
@@ -189,7 +196,7 @@ class BiotFEM:
         tractions = [*tractions, *(plate.traction(area, self._inward(plate.side)) for plate, area in self._plates)]
         for outlet in drained:
             if callable(outlet.pressure):
-                raise ValueError(f"{line(outlet)}: the reference's pressures must be numbers")
+                raise ValueError(f"{line(outlet)}: in the reference the pressure must be a number")
         outlets = drained if element == "q1-dg0" else None
         with compiling(f"{type(material).__name__}, terms, sources", "UFL, terms linear in v or energies of u"):
             self._forms = self._compile(tractions, outlets, gravity, terms, sources)
@@ -234,12 +241,12 @@ class BiotFEM:
         plane, near = (grid.low, grid.high)[end][axis], NEAR * grid.h
         low, high = np.maximum(low, grid.low) - near, np.minimum(high, grid.high) + near
         if not (low[axis] <= plane <= high[axis] and (low < high).all()):
-            raise ValueError(f"side {name!r}: the region {line(region)} must contain a part of it")
+            raise ValueError(f"side {name!r}: the region {line(region)} must contain a part of the side")
         low[axis], high[axis] = plane - near[axis], plane + near[axis]
         return low, high
 
     def _prescribe(self, space, value: float, name: str, region: Region | None = None):
-        """Return the boundary condition with a value for a scalar subspace, on facets of a side within a region."""
+        """Return the boundary condition that prescribes a value of a scalar subspace on a side within a region."""
         msh = self.grid.mesh
         d = self.grid.dim
         (low, high) = np.array(self._box(name, region))[:, :, None]
@@ -263,7 +270,7 @@ class BiotFEM:
         return (1 - 2 * end) * np.eye(self.grid.dim)[axis]
 
     def _area(self, condition: RigidPlate) -> float:
-        """Return the area of the part of a side on which a condition acts, m^(d-1)."""
+        """Return the area, in m^(d-1), of the part of a side on which a condition acts."""
         low, high = self._box(condition.side, condition.region)
         within = np.minimum(high, self.grid.high) - np.maximum(low, self.grid.low)
         area = float(np.delete(within, side(condition.side, self.grid.dim)[0]).prod())
@@ -281,7 +288,7 @@ class BiotFEM:
     def _compile(
         self, loads: Sequence, outlets: Sequence | None, gravity: Callable | None, terms: Sequence, sources: Sequence
     ) -> Forms:
-        """Compile loads, residual and tangent; with `outlets` (drained sides) pressures are constant in the cells."""
+        """Compile loads, residual and tangent.  With `outlets` (drained sides), cells have constant pressures."""
         dt, since, t = (self._constant(1.0) for _ in range(3))
         law = self.material
         space = self._space
@@ -340,7 +347,7 @@ class BiotFEM:
         return Forms(_compat.compiled(residual), _compat.compiled(tangent), flux, load, dt, since, t, given)
 
     def _grad(self, f):
-        """Return grad f as UFL; for a vector in axisymmetry (3, 3)."""
+        """Return grad f as UFL; in axisymmetry the gradient of a vector has the shape (3, 3)."""
         grad = ufl.grad(f)
         if not (self.grid.axisymmetric and f.ufl_shape):
             return grad
@@ -357,17 +364,20 @@ class BiotFEM:
         return ufl.as_matrix([[T[i, j] for j in (0, 1)] for i in (0, 1)]) if self.grid.axisymmetric else T
 
     def _begin(self, pressure: float | Callable, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the initial pressures (n,), Pa, at positions x (3, n), m, of the mesh."""
+        """Return the initial pressures (n,), in Pa, at positions x (3, n), in m, of the mesh."""
         n, places = x.shape[1], x[: self.grid.dim].T + self.grid.base
         values = pressure(places) if callable(pressure) else pressure
-        return np.broadcast_to(numbers("pressure", values, (), (n,), allowed="a number, or one for each place"), n)
+        return np.broadcast_to(numbers("pressure", values, (), (n,), allowed="a number, or one for each position"), n)
 
     def _held(self, J, p):
         """Return the volume of the pore fluid per reference volume, as UFL."""
         return self._pores.of("saturation", p) * (J - self._constant(1 - self.material.porosity))
 
     def _storage(self, F, u, J_n, p, p_n, q, dt: fem.Constant, outlets: Sequence[Drained] | None, pull):
-        """Return the change of content, times q, and the flux in a time dt, s, as UFL; pull: gravity, m/s^2."""
+        """Return two UFL expressions: the change of fluid content times q, and the flux in a time dt (s).
+
+        pull: acceleration of gravity, m/s^2
+        """
         law, J = self.material, ufl.det(F)
         # S is linear in the porosity; S_0 and S_1 are finite for infinite bulk moduli
         S_0, S_1 = (self.scale * law.storage(self.fluid.bulk, n) for n in (0.0, 1.0))
@@ -401,12 +411,15 @@ class BiotFEM:
 
     @property
     def _seen(self):
-        """Pressure that determines k_r, divided by `scale`, as UFL: with its derivative in the tangent, or without."""
+        """Pressure that determines k_r, divided by `scale`, as UFL.
+
+        The factor `_whole` selects whether the tangent contains the derivative of k_r.
+        """
         now, same = (ufl.split(f)[1] for f in (self._space.w, self._space.same))
         return self._whole * now + (1 - self._whole) * same
 
     def _two_point(self, kappa, F, inverse, p, q, outlets: Sequence[Drained], weight):
-        """Return the two-point flux between cells and to drained sides as UFL; weight: unit weight of the fluid."""
+        """Return the two-point flux between cells and to drained sides as UFL; weight: unit weight / `scale`."""
         compliance = self._constant(self.scale / self.fluid.bulk)
         pi = mass_potential_form(p, compliance)
         normal, h = ufl.FacetNormal(self.grid.mesh), self._constant(self.grid.h)
@@ -433,7 +446,7 @@ class BiotFEM:
     def _solver(self) -> PETSc.SNES:
         """Return Newton's method with full steps and a direct solver.
 
-        A line search is very slow where a slender body rotates, because linearised rotations stretch it.
+        A line search is very slow for a rotating slender body, because a linearised rotation stretches the body.
         """
         options, prefix = PETSc.Options(), "mpm_reference_"
         if not options.hasName(f"{prefix}snes_linesearch_type"):
@@ -476,7 +489,10 @@ class BiotFEM:
         return _compat.petsc_vec(out)
 
     def step(self, dt: float) -> tuple[int, float]:
-        """Advance by dt, s, > 0; return Newton iterations and relative residual.  `NotConverged` changes no state."""
+        """Advance by dt (s), > 0; return the number of Newton iterations, and the relative residual.
+
+        If `NotConverged` is raised, the state has not changed.
+        """
         numbers("dt", dt, test=lambda v: (0 < v) & (v < np.inf), allowed="> 0 and finite")
         newton, worst = 0, 0.0
         for substep in self._substeps:
@@ -487,12 +503,12 @@ class BiotFEM:
         return newton, worst
 
     def _acceleration(self, gravity: Callable[[float], ArrayLike], t: float) -> NDArray[np.float64]:
-        """Return the acceleration of gravity (d,), m/s^2, at time t, s."""
+        """Return the acceleration of gravity (d,), in m/s^2, at time t (s)."""
         d = self.grid.dim
         return numbers("gravity", gravity(t), (d,), allowed=f"{d} finite numbers")
 
     def _solve(self, substep: Substep, dt: float) -> tuple[int, float]:
-        """Solve one substep of a step of length dt, s; return the number of Newton iterations and the residual."""
+        """Solve one substep of a step of length dt (s); return the number of Newton iterations and the residual."""
         forms = self._forms
         space = self._space
         snes = self._snes
@@ -524,15 +540,16 @@ class BiotFEM:
         return len(norms) - 1, norms[-1] / scale
 
     def _free(self, x: PETSc.Vec) -> tuple[NDArray[np.float64], int]:
-        """Solve by SNES; return the norms of the residuals, and PETSc's reason for the end."""
+        """Solve by SNES; return the norms of the residuals, and PETSc's reason for ending."""
         self._snes.solve(None, x)
         return self._snes.getConvergenceHistory()[0], self._snes.reason
 
     def _restrained(self, x: PETSc.Vec) -> tuple[list[float], int]:
-        """Solve by single Newton steps with limited pressure changes, see `retention.restrained`; result: see `_free`.
+        """Solve by single Newton steps with limited pressure changes (`retention.restrained`); return as `_free` does.
 
-        The first tangent omits the derivative of k_r (Celia, Bouloutas and Zarba 1990), as do tangents after a limited
-        step and after an increase of the residual.  With gravity and dry soil this derivative can reverse the step.
+        The first tangent omits the derivative of k_r (Celia, Bouloutas and Zarba 1990).  Tangents after a limited step,
+        and after an increase of the residual, also omit this derivative.  In dry soil under gravity, it can reverse the
+        Newton step.
         """
         snes, of_p = self._snes, self._space.p_dofs
         of_p = of_p[of_p < x.getLocalSize()]
@@ -557,7 +574,7 @@ class BiotFEM:
         return [*norms, last], reason
 
     def _traction(self, load: Traction | Pressure, t: float) -> NDArray[np.float64] | float:
-        """Return the components (d,), Pa, of a traction at time t, s, or the value of a pressure, Pa."""
+        """Return the components (d,), in Pa, of a traction at time t (s), or the value, in Pa, of a pressure."""
         if isinstance(load, Pressure):
             return float(load.at(t))
         value = load.at(t, self.grid.dim)
@@ -576,11 +593,13 @@ class BiotFEM:
         return tuple(np.sqrt(self.grid.comm.allreduce(np.array([squares.sum() - storage, storage]))))
 
     def run(self, t_end: float, dt: float, *, probes: ArrayLike, progress: bool = False) -> Result:
-        """Advance to t_end, s, in equal steps dt, s; `GaveUp` has the histories up to the last good step.
+        """Advance to t_end (s) in equal steps dt (s).
+
+        If a step does not converge, `GaveUp` is raised with the histories up to the step before.
 
         Parameters
         ----------
-        probes : (m, d), m
+        probes : (n, d), m
             Reference positions in the body at which displacements are recorded.
         progress
             Whether to show a progress bar on a terminal.
@@ -591,7 +610,7 @@ class BiotFEM:
         x = positions(probes, self.grid.dim)
         out = np.flatnonzero(self.grid.outside(x - self.grid.base))
         if len(out):
-            raise ValueError(f"probe at {x[out[0]]}: outside the body, must be in it or on its surface")
+            raise ValueError(f"probe at {x[out[0]]}: outside the body, must be in the body or on its surface")
         result, start = Result(Rows([self._row(x)])), time.perf_counter()
         shown = {"disable": not progress or self.grid.comm.rank > 0 or None, "unit": "step", "desc": "finite elements"}
         for _ in tqdm(range(steps), **shown):
@@ -604,15 +623,15 @@ class BiotFEM:
         return replace(result, wall=time.perf_counter() - start, converged=True)
 
     def displacement(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the displacements (n, d), m, at reference positions x (n, d) in the body, on every process."""
+        """Return the displacements (n, d), in m, at reference positions x (n, d) in the body, on every process."""
         return self._at(self._space.u, x, self.grid.dim)
 
     def pressure(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the pore pressures (n,), Pa, at reference positions x (n, d) in the body, on every process."""
+        """Return the pore pressures (n,), in Pa, at reference positions x (n, d) in the body, on every process."""
         return self.scale * self._at(self._space.p, x, 1)[:, 0]
 
     def water(self) -> float:
-        """Return the present volume of the pore fluid, m^d, of all processes."""
+        """Return the present volume, in m^d, of the pore fluid on all processes."""
         u, p = ufl.split(self._space.w)
         dx = ufl.dx(domain=self.grid.mesh, metadata={"quadrature_degree": 2 * self._space.degree})
         held = _compat.compiled(self._around * self._held(ufl.det(self._deformation(u)), p) * dx)

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Expansion of cylindrical cavities in soil at finite strain, in one dimension: a reference for laws and scenes.
+"""One-dimensional expansion of cylindrical cavities in soil at finite strain, as a reference for laws and scenes.
 
-The initial radius of the cavity is 1. Initially the pressures at its wall and at the outer radius are equal.
+The initial radius of the cavity is 1. In the initial state, the pressures at the wall of the cavity and at the outer
+radius are equal.
 """
 
 from __future__ import annotations
@@ -25,7 +26,10 @@ CLOSE, MOST = 1e-10, 60  # largest relative residual, and largest number of Newt
 
 
 class _Rings:
-    """A law at n rings.  Stretches (n, 2): radial and hoop; state: values (n, ...) by name; `start`: initial state."""
+    """A law at n rings, with radial and circumferential stretches (n, 2).
+
+    A state contains values (n, ...) by name; `start` is the initial state.
+    """
 
     def __init__(self, material: Skeleton, count: int, state: Mapping[str, ArrayLike] | None = None):
         law = type(material)
@@ -42,25 +46,28 @@ class _Rings:
         return self._law.points.at(cells, self._law.grid.midpoints[cells], np.ones(len(F)), F=F, **inputs)
 
     def kirchhoff(self, stretches: NDArray[np.float64], state: State, repeat: int = 1) -> NDArray[np.float64]:
-        """Return the radial and hoop Kirchhoff stress (n, 2), Pa; the stretches are of `repeat` copies of all rings."""
+        """Return the radial and circumferential Kirchhoff stresses (n, 2), in Pa.
+
+        repeat: number of copies of all rings in the stretches (n, 2)
+        """
         stress = self._law.stress(self._data(stretches, state, repeat))
         return stress[:, [0, 1], [0, 1]] * stretches.prod(axis=1, keepdims=True)
 
     def nominal(self, stretches: NDArray[np.float64], state: State) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the nominal stresses (n, 2), Pa, and their derivatives with respect to the stretches (n, 2, 2)."""
+        """Return two arrays: the nominal stresses (n, 2), in Pa, and their derivatives (n, 2, 2) by the stretches."""
         nudges = SAME * np.array([[0, 0], [1, 0], [0, 1]])
         near = (stretches + nudges[:, None, :]).reshape(-1, 2)
         P = (self.kirchhoff(near, state, len(nudges)) / near).reshape(len(nudges), -1, 2)
         return P[0], (P[1:] - P[0]).transpose(1, 2, 0) / SAME
 
     def updated(self, stretches: NDArray[np.float64], state: State) -> State:
-        """Return the state at the end of a step with these stretches."""
+        """Return the state at the end of a step that ends with these stretches."""
         return state | dict(self._law.new_state(self._data(stretches, state), 0.0))
 
 
 @dataclass(frozen=True)
 class Cavity:
-    """A thick cylinder of soil in plane strain, with linear elements of one point each, under two pressures."""
+    """A thick cylinder of soil in plane strain under inner and outer pressure; linear elements have one point each."""
 
     rings: _Rings  # law
     R: NDArray[np.float64]  # initial radii of the nodes, m
@@ -70,7 +77,7 @@ class Cavity:
     pressure: float  # pressure at the cavity wall, Pa
 
     def widened(self, radius: float) -> Cavity:
-        """Return the cylinder after drained expansion of the cavity to a radius, m, in one step."""
+        """Return the cylinder after drained expansion of the cavity to a radius (in m) in one step."""
         n, r = len(self.R), self.r.copy()
         r += (radius - r[0]) * r[0] / r  # initial guess, the motion of incompressible soil
         r[0] = radius
@@ -101,7 +108,7 @@ class Cavity:
             while np.any(np.diff(r - length * step) <= 0):
                 length /= 2
             r = r - length * step
-        raise RuntimeError(f"cavity: no equilibrium at a radius of {radius:g}")
+        raise RuntimeError(f"cavity: no equilibrium was found at a radius of {radius:g}")
 
 
 def cavity(
@@ -114,11 +121,11 @@ def cavity(
     material
         The soil.
     outer
-        Outer radius, divided by the radius of the cavity; at least 100 for infinite soil.
+        Outer radius, divided by the radius of the cavity; at least 100 to represent infinite soil.
     elements
         Number of elements; their sizes form a geometric progression.
     state
-        Initial state variables of the law; by default as the material has them.
+        Initial state variables of the law; by default the state of the material.
     """
     R, rings = np.geomspace(1, outer, elements + 1), _Rings(material, elements, state)
     far = -float(rings.kirchhoff(np.ones((elements, 2)), rings.start)[-1, 0])
@@ -126,10 +133,12 @@ def cavity(
 
 
 def undrained(material: Skeleton, outer: float, radii: Sequence[float], rings: int = 2000) -> tuple[float, float]:
-    """Return the total radial stress at the outer radius minus that at the wall, and the effective one at the wall, Pa.
+    """Return two radial stresses, in Pa.
 
-    The radius of each element follows from constant volume, r^2 - a^2 = R^2 - 1.  radii: successive radii a of the
-    cavity, in small steps.
+    The first one is the total stress at the outer radius minus that at the wall.  The second one is the effective
+    stress at the wall.  The radius of each element follows from constant volume, r^2 - a^2 = R^2 - 1.
+
+    radii: successive radii a of the cavity, in small steps
     """
     edges = np.geomspace(1, outer, rings + 1)
     R, law = np.sqrt((edges[1:] ** 2 + edges[:-1] ** 2) / 2), _Rings(material, rings)

@@ -42,7 +42,8 @@ class ElementTest:
     F, stress : (n, 3, 3), -, Pa
         Deformation gradient, and effective Cauchy stress, tension positive.
     strain : (n,)
-        Prescribed quantity: logarithmic axial strain, compression positive; in shear F_xy; in wetting the suction, Pa.
+        Prescribed quantity: logarithmic axial strain, compression positive.  In shear it is F_xy, and in wetting it is
+        the suction, Pa.
     pressure : (n,), Pa
         Excess pore pressure; zero in drained tests.
     state
@@ -59,12 +60,12 @@ class ElementTest:
 
     @property
     def p(self) -> NDArray[np.float64]:
-        """Mean effective stress p' (n,), Pa, compression positive."""
+        """Mean effective stress p' (n,), in Pa, compression positive."""
         return -np.trace(self.stress, axis1=1, axis2=2) / 3
 
     @property
     def q(self) -> NDArray[np.float64]:
-        """Deviatoric stress q = sqrt(3/2) |dev stress| (n,), Pa."""
+        """Deviatoric stress q = sqrt(3/2) |dev stress| (n,), in Pa."""
         s = self.stress + self.p[:, None, None] * np.eye(3)
         return np.sqrt(1.5 * (s * s).sum(axis=(1, 2)))
 
@@ -74,7 +75,7 @@ class ElementTest:
         return -np.log(np.linalg.det(self.F))
 
     def draw(self, file: str | Path, title: str = "") -> None:
-        """Draw stress path, stress-strain curve, and volume strain or pore pressure, to an image file."""
+        """Draw the stress path, the stress-strain curve, and the volume strain or pore pressure, to an image file."""
         from matplotlib.figure import Figure
 
         fig = Figure(figsize=(12, 3.6), layout="constrained")
@@ -114,18 +115,20 @@ def element_test(
         constant normal stress, F_xx = F_zz = 1), "shear undrained" (simple shear at constant volume), "wetting
         isotropic" (constant net stresses), "wetting oedometer" (constant axial net stress, no lateral strain).
     strain
-        Final value, or successive turning points, of the prescribed quantity: logarithmic axial strain (in an isotropic
-        test, along all axes), compression positive; in shear F_xy; in wetting the suction, Pa, >= 0.
+        Final value, or successive turning points, of the prescribed quantity.  In shear this quantity is F_xy, and in
+        wetting the suction, Pa, >= 0.  In all other tests it is the logarithmic axial strain, compression positive.
+        In an isotropic test, all axes have this strain.
     steps
         Number of equal steps to each turning point.
     confinement
-        Isotropic effective stress before the test, Pa, >= 0, applied slowly and drained; 0: the law's initial stress.
+        Isotropic effective stress before the test, Pa, >= 0, applied slowly and drained.  If it is 0, the test starts
+        from the initial stress of the law.
     rate
         Strain rate, 1/s, > 0, for rate-dependent laws.
     cell_size
         Cell size, m, > 0, for laws that depend on it.
     suction
-        Initial suction, Pa, >= 0, for laws that depend on suction; constant in all tests except wetting.
+        Initial suction, Pa, >= 0, for laws that depend on suction.  It is constant in all tests except wetting.
 
     Raises
     ------
@@ -198,7 +201,7 @@ class _Point:
         self._bulk = float(material.bulk)
 
     def _data(self, F: NDArray[np.float64], state: dict[str, NDArray[np.float64]]):
-        """Return data of the point for forms, for several deformation gradients F (m, 3, 3) and one state."""
+        """Return the data of the point that forms need, for several deformation gradients F (m, 3, 3) and one state."""
         m, grid = len(F), self._law.grid
         inputs = {name: np.tile(v, (m, *[1] * v.ndim)) for name, v in (self._parameters | state).items()}
         cells = np.arange(m, dtype=np.int32) % 8
@@ -218,7 +221,7 @@ class _Point:
         return _At(np.eye(3), self._stress(np.eye(3)[None], self._rest)[0], 0.0, self._rest)
 
     def compressed(self, confinement: float) -> _At:
-        """Return the sample after loading in steps to an isotropic effective stress, Pa."""
+        """Return the sample after loading, in steps, to an isotropic effective stress (Pa)."""
         at = self.at_rest()
         first = -np.trace(at.stress) / 3
         for share in np.linspace(0, 1, 21)[1:]:
@@ -260,7 +263,7 @@ class _Point:
         return self._balanced(at, F, free, start.stress[[0, 1], [0, 1]], strain, dt)
 
     def _wetted(self, at: _At, start: _At, suction: float, free: Sequence, dt: float) -> _At:
-        """Return the sample at another suction, Pa, with constant net stress along the free components."""
+        """Return the sample at a new suction (Pa), with constant net stresses in the free components."""
         m = self._material
         effective, before = (m.biot * chi_at(m.retention, -s) * s for s in (suction, start.strain))
         goal = [start.stress[i] + before - effective for i in free]
@@ -270,7 +273,7 @@ class _Point:
     def _balanced(
         self, at: _At, F: NDArray[np.float64], free: Sequence, goal: ArrayLike, strain: float, dt: float
     ) -> _At:
-        """Return the sample after dt, s; the free components of F are found from prescribed Cauchy stresses, Pa."""
+        """Return the sample after dt (s).  The free components of F follow from prescribed Cauchy stresses (Pa)."""
         if not free:
             return self._updated(F, strain, at, dt)
         F, rows, columns = F.copy(), *np.array(free).T

@@ -2,9 +2,10 @@
 """Exact solutions for comparison: consolidation, columns, beams and rods.  The module needs no dolfinx.
 
 Stress is positive in tension, pore pressure in compression, as in the rest of the package.  The dimensionless time is
-T = c_v t / length².  The series of exponentials converges slowly for small T.  Below `SWITCH` a closed inverse of the
-Laplace transform is used, in which 1 replaces tanh X and coth X, X = sqrt(s).  Errors of both forms are
-at most of the order of erfc(1/sqrt(`SWITCH`)) < 2e-23, so both are exact to round-off.
+T = c_v t / length².  The series of exponentials converges slowly for small T.  For T < `SWITCH` a closed inverse
+of the Laplace transform is used.  In this transform, 1 replaces tanh X and coth X, with X = sqrt(s).  Errors of the
+series and of the closed inverse are at most of the order of erfc(1/sqrt(`SWITCH`)) < 2e-23.  Both are therefore exact
+to round-off.
 """
 
 from __future__ import annotations
@@ -53,18 +54,19 @@ def _series(amplitudes: Array, roots: Array, T: Array) -> Array:
 
 
 def _transient(k: complex, z: ArrayLike, T: Array) -> NDArray:
-    """Return the inverse of exp(-z X) / (X (X - k)), X = sqrt(s); Abramowitz & Stegun 29.3.90."""
+    """Return the inverse Laplace transform of exp(-z X) / (X (X - k)), X = sqrt(s); Abramowitz & Stegun 29.3.90."""
     return np.exp(-np.square(z) / (4 * T)) * erfcx(z / (2 * np.sqrt(T)) - k * np.sqrt(T))
 
 
 def terzaghi_pressure(z: ArrayLike, t: ArrayLike, height: float, cv: float, p0: float = 1.0) -> Array:
-    """Return the pore pressure of a layer that drains at one end and is sealed at the other.
+    """Return the pore pressure of a layer that drains at one end and is undrained at the other end.
 
     Parameters
     ----------
-    z : (...), m, in [0, height]; distance from the drained end, broadcasts with t
+    z : (...), m, in [0, height]; distance from the drained end; z and t are broadcast
     t : (...), s, > 0; time since the pressure was p0
-    height, cv : m and m²/s, > 0; length, and coefficient of consolidation kappa / (S + alpha²/(K + 4G/3))
+    height : m, > 0; length of the layer
+    cv : m²/s, > 0; coefficient of consolidation kappa / (S + alpha²/(K + 4G/3))
     p0 : Pa; pressure at t = 0+
 
     Returns (...), Pa. Source: Terzaghi (1923); series for all T: Verruijt, Theory and Problems of Poroelasticity.
@@ -95,19 +97,20 @@ def terzaghi_consolidation(t: ArrayLike, height: float, cv: float) -> Array:
 class Mandel:
     """Mandel's slab in plane strain, loaded from t = 0 by rigid smooth plates, free and drained at its lateral sides.
 
-    The model is a quarter of the slab: symmetry at x = 0 and at y = 0, the plate at y = b, the drained side at x = a.
+    The model is a quarter of the slab, with symmetry at x = 0 and y = 0.  The plate is at y = b, and the drained side
+    is at x = a.
 
     Parameters
     ----------
-    a, b : m, > 0; width and height of the quarter, half of the slab's width and height
-    bulk, shear : Pa, > 0; drained moduli K and G (K of three dimensions)
+    a, b : m, > 0; width and height of the quarter; each is half of that of the slab
+    bulk, shear : Pa, > 0; drained moduli K (in three dimensions) and G
     mobility : m²/(Pa s), > 0; kappa = permeability / viscosity = conductivity / (density of the fluid * g)
     storage : 1/Pa, >= 0; S at constant strain, n/K_w + (alpha - n)/K_s
     alpha : in (0, 1]; Biot's coefficient
     force : N/m; resultant on the plate of width a, per metre of depth, positive in compression
 
     Source: Mandel (1953), Géotechnique 3; Cheng & Detournay (1988), Int. J. Numer. Anal. Methods Geomech. 12;
-    Abousleiman et al. (1996), Géotechnique 46. Their (1 - nu)/(nu_u - nu) is written with K, G, alpha and S.
+    Abousleiman et al. (1996), Géotechnique 46. Their ratio (1 - nu)/(nu_u - nu) is here expressed by K, G, alpha and S.
     """
 
     a: float
@@ -151,7 +154,7 @@ class Mandel:
 
     @cached_property
     def roots(self) -> Array:
-        """The first positive roots of tan(r) = r (1 - nu)/(nu_u - nu), an array (`TERMS`,)."""
+        """The first `TERMS` positive roots of tan(r) = r (1 - nu)/(nu_u - nu)."""
         n = np.arange(TERMS) * np.pi
         r = n + np.pi / 2
         for _ in range(50):  # Newton's method is monotone for a convex function from its positive side
@@ -161,7 +164,9 @@ class Mandel:
     def pressure(self, x: ArrayLike, t: ArrayLike) -> Array:
         """Return the pore pressure, which is independent of y.
 
-        x (...): distances from the middle, m, in [0, a], broadcast with times t (...), s, > 0.
+        x (...), m, in [0, a]: distances from the middle; x and t are broadcast
+        t (...), s, > 0: times
+
         Returns (...), Pa; at t = 0+ the pressure is B (1 + nu_u) force / (3 a). Source: see the class.
         """
         return self._pressures(x, t)[0]
@@ -169,9 +174,13 @@ class Mandel:
     def displacement(self, x: ArrayLike, y: ArrayLike, t: ArrayLike) -> tuple[Array, Array]:
         """Return the displacement relative to the state without force.
 
-        x, y (...): positions, m, in [0, a] and [0, b]; each broadcasts with times t (...), s, > 0.
-        Returns (u_x, u_y), m; u_x is independent of y, u_y of x. Source: computed from the pressure and the force on
-        the plate, with zero total stress at the lateral side. It agrees with the papers cited for the class.
+        x (...), m, in [0, a]: positions; x and t are broadcast
+        y (...), m, in [0, b]: positions; y and t are broadcast
+        t (...), s, > 0: times
+
+        Returns (u_x, u_y), m; u_x is independent of y, and u_y is independent of x. Source: computed from the pressure
+        and the force on the plate, with zero total stress at the lateral side. The displacement agrees with the papers
+        cited for the class.
         """
         x, y = np.asarray(x, dtype=float), _within("y", y, self.b)
         plane = self.bulk + self.shear / 3  # lambda + G
@@ -181,7 +190,7 @@ class Mandel:
         return lateral / self._oedometric, strain * y
 
     def _pressures(self, x: ArrayLike, t: ArrayLike) -> Array:
-        """Return the pressure, Pa, and its integral from 0 to x, divided by a, Pa, as one array (2, ...)."""
+        """Return one array (2, ...), in Pa: the pressure, and the integral of the pressure from 0 to x divided by a."""
         _positive(t=t)
         xi, T = np.broadcast_arrays(_within("x", x, self.a) / self.a, self.cv * np.asarray(t, dtype=float) / self.a**2)
         p0 = self.skempton * (1 + self.nu_undrained) * self.force / (3 * self.a)
@@ -205,7 +214,8 @@ def cryer_pressure(t: ArrayLike, radius: float, cv: float, nu: float, p0: float 
     Parameters
     ----------
     t : (...), s, > 0; time
-    radius, cv : m and m²/s, > 0; radius, and kappa (K + 4G/3), because fluid and grains are incompressible
+    radius : m, > 0; radius of the sphere
+    cv : m²/s, > 0; coefficient of consolidation kappa (K + 4G/3), because fluid and grains are incompressible
     nu : in (-1, 0.5); drained Poisson ratio
     p0 : Pa; uniform pressure on the surface, equal to the pore pressure at t = 0+
 
@@ -219,7 +229,7 @@ def cryer_pressure(t: ArrayLike, radius: float, cv: float, nu: float, p0: float 
 
 
 def _cryer_short(mu: float, T: Array) -> Array:
-    """Return the inverse of (1 - 2 X exp(-X)) / (X² - mu X + mu), with poles at X = k and its conjugate."""
+    """Return the inverse Laplace transform of (1 - 2 X exp(-X)) / (X² - mu X + mu); poles are k and its conjugate."""
     k = (mu + 1j * np.sqrt(mu * (4 - mu))) / 2
     uniform = (k * _transient(k, 0, T)).imag / k.imag
     gauss = np.exp(-1 / (4 * T)) / np.sqrt(np.pi * T)
@@ -238,8 +248,8 @@ def _cryer_long(mu: float, T: Array) -> Array:
 class SelfWeightColumn:
     """Column of Hencky's material without lateral strain, standing at Y = 0 under its own weight.
 
-    Without lateral stretch, the Cauchy and the first Piola-Kirchhoff stress along the column are equal: tau divided by
-    the stretch.  They balance the weight above. For nu = 0 the modulus K + 4G/3 is Young's modulus.
+    Without lateral stretch, the Cauchy stress and the first Piola-Kirchhoff stress along the column are both
+    tau / stretch.  This stress balances the weight above. For nu = 0 the modulus K + 4G/3 is Young's modulus.
 
     Parameters
     ----------
@@ -248,7 +258,8 @@ class SelfWeightColumn:
     density : kg/m³, > 0; density without gravity
     gravity : m/s², > 0; downwards
 
-    Source: tau / stretch = -density gravity (l0 - Y), solved with W of Corless et al. (1996), Adv. Comput. Math. 5.
+    Source: tau / stretch = -density gravity (l0 - Y), solved with Lambert's W; Corless et al. (1996), Adv. Comput.
+    Math. 5.
     """
 
     l0: float
@@ -265,15 +276,21 @@ class SelfWeightColumn:
         return lambertw(-self.stress(Y) / (self.bulk + 4 / 3 * self.shear)).real
 
     def stress(self, Y: ArrayLike) -> Array:
-        """Return the vertical Cauchy stress (...), Pa, at heights Y (...), m, in [0, l0]; it bears the weight above."""
+        """Return the vertical Cauchy stress (...), in Pa, at reference heights Y (...), in m, from 0 to l0."""
         return -self.density * self.gravity * (self.l0 - _within("Y", Y, self.l0))
 
     def stretch(self, Y: ArrayLike) -> Array:
-        """Return the stretch (...), in (0, 1], at heights Y (...), m, in [0, l0]. Source: see the class."""
+        """Return the stretch (...), in (0, 1], at reference heights Y (...), in m, from 0 to l0.
+
+        Source: see the class.
+        """
         return np.exp(-self._shortening(Y))
 
     def position(self, Y: ArrayLike) -> Array:
-        """Return the heights (...), m, for reference heights Y (...), m, in [0, l0]. Source: integral of stretch."""
+        """Return the present heights (...), in m, at reference heights Y (...), in m, from 0 to l0.
+
+        Source: integral of the stretch.
+        """
         base, w = self._shortening(0.0), self._shortening(Y)
         return self.l0 * (base - w) * (1 + (base + w) / 2) / (base * np.exp(base))
 
@@ -286,8 +303,11 @@ class SelfWeightColumn:
 def elastica_tip(load_parameter: float) -> tuple[float, float]:
     """Return the tip displacement of an inextensible cantilever under a dead transverse load at its tip.
 
-    The load_parameter is P L²/(E I), in [0, 1e5].
-    Returns (shortening u/L, deflection v/L), to 1e-12 absolute. Source: Bisshopp & Drucker (1945), Q. Appl. Math. 3.
+    load_parameter, in [0, 1e5]: P L²/(E I)
+
+    Returns (shortening u/L, deflection v/L), with absolute errors of 1e-12.
+
+    Source: Bisshopp & Drucker (1945), Q. Appl. Math. 3.
     """
     _check(0 <= load_parameter <= 1e5, "load_parameter", load_parameter, "in [0, 1e5]")
     if load_parameter < EPSILON**0.25:
@@ -316,11 +336,16 @@ def shear_flexible_rod(
     Parameters
     ----------
     length : m, > 0
-    EA, GA, EI : N, N, N m² (per depth: N/m, N/m, N m), > 0, inf allowed for EA and GA; GA with shear correction factor
-    end_load, line_load : N and N/m; force at the end, and force per reference length
+    EA : N (per depth N/m), > 0, may be inf
+    GA : N (per depth N/m), > 0, may be inf; includes the shear correction factor
+    EI : N m² (per depth N m), > 0
+    end_load : N; force at the end
+    line_load : N/m; force per reference length
     points : number of equidistant points from end to end, >= 2, or reference arclengths (n,), m, in [0, length]
 
-    Returns (n, 2), m, by collocation with a residual of 1e-8. Source: Reissner (1972), ZAMP 23; Simo (1985), CMAME 49.
+    Returns positions (n, 2), in m, by collocation with a residual of 1e-8.
+
+    Source: Reissner (1972), ZAMP 23; Simo (1985), CMAME 49.
     """
     _positive(length=length, EA=EA, GA=GA, EI=EI)
     _check(np.isfinite([end_load, line_load]), "end_load, line_load", [end_load, line_load], "finite")
@@ -352,10 +377,15 @@ def _rod(loads: Array, axial: float, shear: float):
 
 
 def euler_bernoulli(x: ArrayLike, load: float, length: float, modulus: float, second_moment: float) -> NDArray:
-    """Return the deflection (n,), m, of a cantilever under a uniform load, at distances x (n,), m, from the clamp.
+    """Return the deflections (n,), in m, of a cantilever under a uniform load.
 
-    The deflection is w x^2 (6 L^2 - 4 L x + x^2) / (24 E I), with load w, N/m, of any sign.  Length L, m, Young's
-    modulus E, Pa, and second moment of area I, m^4, are > 0.
+    The deflection is w x^2 (6 L^2 - 4 L x + x^2) / (24 E I).
+
+    x (n,), m: distances from the clamp
+    load, N/m: w, of any sign
+    length, m, > 0: L
+    modulus, Pa, > 0: Young's modulus E
+    second_moment, m^4, > 0: second moment of area I
     """
     x = np.asarray(x, dtype=float)
     return load * x**2 * (6 * length**2 - 4 * length * x + x**2) / (24 * modulus * second_moment)  # Source: exact

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Unsaturated pores of the finite element reference, see `retention`; pressures are multiples of a unit."""
+"""Unsaturated pores of the finite element reference.  Pressures are relative to a unit; see also `retention`."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ class Pores:
     def between(self, p0, p1):
         """Return the mean of k_r between the pressures p0 and p1 as a UFL expression.
 
-        Integration points are equidistant on the scale of `retention.logarithm`. With points on the scale of the
-        pressure, all points between a wet cell and a very dry one would be dry.
+        The mean is a Gauss quadrature on the scale of `retention.logarithm`. On the scale of the pressure, all
+        integration points between a wet cell and a very dry cell would be dry.
         """
         if self.law is None:
             return 1.0
@@ -57,5 +57,5 @@ class Pores:
         return mean / total
 
     def reached(self, p: NDArray[np.float64], dp: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the limited decreases of pressures p (n,) in a Newton step; dp (n,): decreases by Newton's method."""
+        """Return the limited decreases (n,) of pressures p (n,) in a Newton step; dp (n,): decreases without limit."""
         return restrained(p, dp, self._scale)
