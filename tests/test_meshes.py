@@ -431,7 +431,7 @@ BAD = {
     "no mesh": (lambda: mpm.from_mesh(GRID, 3), "mesh = 3", "must be a Mesh"),
     "a cell that is not convex": (
         lambda: seed([*SQUARE[:2], (0.2, 0.2, 0), SQUARE[3]], [("quad", [[0, 1, 2, 3]])]),
-        "mesh: 1 cells are flat, turned inside out or not convex",
+        "mesh: 1 cells are flat, inverted or not convex",
         "[0.3 0.3]",
     ),
     "a cell that crosses itself": (lambda: seed(SQUARE, [("quad", [[0, 2, 1, 3]])]), "mesh: 1 cells", "must be convex"),
@@ -449,7 +449,7 @@ BAD = {
     ),
     "a surface in space": (
         lambda: seed([*SQUARE[:3], (0, 1, 0.5)], [("quad", [[0, 1, 2, 3]])]),
-        "mesh: a surface in space",
+        "mesh: cells have z from",
         "0.5",
     ),
     "cells of third order": (lambda: seed(SQUARE, [("triangle10", [[0, 1, 2] * 3 + [3]])]), "mesh: ", "'triangle10'"),
@@ -470,7 +470,7 @@ BAD = {
     ),
     "cells in one another": (
         lambda: seed([*SQUARE, *np.add(SQUARE, (0.9, 0.5, 0))], [("quad", [[0, 1, 2, 3], [4, 5, 6, 7]])]),
-        "mesh: 2 cells overlap, the first at [0.95 0.75]",
+        "mesh: 2 cells overlap, most deeply at [0.95 0.75]",
         "by 0.1 m",
     ),
     "a small cell in a large one": (

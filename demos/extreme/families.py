@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The families of `extreme_cases`: scenes with one extreme property each, exact solutions, and bounds of the errors."""
+"""The families of `extreme_cases`.  Scenes of a family have one extreme property, a reference, and an error bound."""
 
 from __future__ import annotations
 
@@ -35,9 +35,10 @@ from mpm_dolfinx.verification.exact import SelfWeightColumn
 
 @dataclass(frozen=True)
 class Family:
-    """Scenes with the same extreme property.
+    """Scenes that share one extreme property.
 
-    cases: generator of (setting, scene); bound: largest allowed error of a scene.
+    cases: generator of pairs (setting, scene)
+    bound: largest allowed error of a scene
     """
 
     cases: Callable[[], Iterator[tuple[str, Make]]]
@@ -48,7 +49,7 @@ FAMILIES: dict[str, Family] = {}
 
 
 def family(bound: float):
-    """Register a generator of (setting, scene) as a family."""
+    """Register a generator of pairs (setting, scene) as a family."""
 
     def register(cases):
         FAMILIES[cases.__name__.replace("_", "-")] = Family(cases, bound)
@@ -58,7 +59,7 @@ def family(bound: float):
 
 
 def decades(low: int, high: int, step: int = 1) -> list[float]:
-    """Return the powers of ten from 10^low to 10^high; step: increment of the exponent."""
+    """Return the powers of ten from 10^low to 10^high.  `step` is the increment of the exponent."""
     return [float(f"1e{n}") for n in range(low, high + 1, step)]
 
 
@@ -71,17 +72,18 @@ def conductivity():
 
 @family(0.02)
 def time_step():
-    """Terzaghi's layer, dt = 1e-9 to 1e9 s: mean error of the pressures, error of the settlement; exact."""
+    """Terzaghi's layer, dt = 1e-9 to 1e9 s: mean pressure and settlement against the exact solution."""
     water = {"fluid": INCOMPRESSIBLE, "conditions": [mpm.Drained("top")], "load": 1e-5 * M}
     for dt in decades(-9, 9):
         yield f"dt = {dt:.0e} s", column(partial(terzaghi, 0.05), (SOIL, 1.0), end=10 * dt, steps=10, **water)
 
 
 def terzaghi(h: float, s: mpm.Simulation, r: mpm.Result) -> float:
-    """Return the larger of two errors: mean of |p - exact| / load over the points, and error of the settlement.
+    """Return the larger of two errors: that of the pressures, and that of the settlement.
 
-    The error of the settlement is divided by the final settlement.  h: cell size, m.  The load is 1e-5 times the
-    oedometric modulus M.  The exact pressures are sums of modes, averaged over each cell.
+    The error of the pressures is the mean of |p - exact| over the points, divided by the load.  The load is 1e-5 times
+    the oedometric modulus M.  The exact pressures are sums of modes, averaged over each cell of size `h`, in m.  The
+    error of the settlement is divided by the final settlement.
     """
     m = (np.arange(20000) + 0.5) * np.pi
     left = np.exp(-(m**2) * s.t * SOIL.conductivity / INCOMPRESSIBLE.unit_weight * M)
@@ -101,7 +103,7 @@ def time_step_of_a_beam():
 
 @family(0.01)
 def fluid_bulk():
-    """Sealed, K_w = 1e4 Pa to infinity; column: exact pressure and settlement; beam: tip against finite elements."""
+    """No-flow column and beam, K_w = 1e4 Pa to infinity: column against exact values, beam against finite elements."""
     load = 1e-5 * M
     for bulk in [*decades(4, 12), inf]:
         p = load / (1 + SOIL.storage(bulk, SOIL.porosity) * M)
@@ -115,9 +117,9 @@ def fluid_bulk():
 
 @family(0.02)
 def combined():
-    """Beam, undrained or drained by extreme k and dt, three K_w, two nu: tip against finite elements of the limit.
+    """Beam near its undrained or drained limit, three K_w, two nu: tip against finite elements in this limit.
 
-    The undrained limit is a sealed beam, the drained limit a beam without water.
+    Extreme k and dt cause the limits.  The undrained limit is a no-flow beam, the drained limit a beam without water.
     """
     for bulk in (1e4, 2.2e9, inf):
         for nu in (0.0, 0.499):
@@ -128,7 +130,7 @@ def combined():
 
 
 def beside(beam: Beam, limit: Beam) -> Scene:
-    """Return the scene of `beam`; its reference is the finite element solution of `limit`."""
+    """Return the scene of `beam`.  Its reference is the finite element solution of `limit`."""
     return replace(beam(), error=lambda s, r: off(tip(r), limit.elements()))
 
 
@@ -156,7 +158,7 @@ DROP = 1e-2  # pressure difference, Pa, too small to move the layers
 
 @family(0.02)
 def contrast_of_conductivity():
-    """Steady flow through two layers, ratio of k 1e-8 to 1e8: exact pressures, relative to the pressure drop."""
+    """Steady flow through two layers, ratio of k 1e-8 to 1e8: pressures against exact pressures."""
     for name, cut in CUTS.items():
         for ratio in decades(-8, 8, 1 if cut == 0.5 else 2):
             layers = (SOIL, cut), (soil(conductivity=SOIL.conductivity * ratio), 1.0)
@@ -166,7 +168,7 @@ def contrast_of_conductivity():
 
 
 def series(cut: float, ratio: float, s: mpm.Simulation, r: mpm.Result) -> float:
-    """Return the largest error of the pressures, divided by the pressure drop; cut: height of the interface, m."""
+    """Return the largest error of the pressures, divided by the pressure drop.  `cut`, m: height of the interface."""
     cells = s.cells()
     y = cells.x[:, 1]
     lost = np.where(y < cut, y, cut + (y - cut) / ratio) / (cut + (1 - cut) / ratio)
@@ -175,7 +177,7 @@ def series(cut: float, ratio: float, s: mpm.Simulation, r: mpm.Result) -> float:
 
 @family(0.02)
 def contrast_of_stiffness():
-    """Two layers under large and tiny loads, ratio of E 1e-6 to 1e6: exact settlement."""
+    """Two layers under large and tiny loads, ratio of E 1e-6 to 1e6: settlement against the exact settlement."""
     for name, cut in CUTS.items():
         for ratio in decades(-6, 6, 1 if cut == 0.5 else 2):
             for strain in (1e-2, 1e-6, 1e-10) if ratio in (1e-6, 1e6) else (1e-2,):
@@ -196,7 +198,7 @@ def offset():
 
 @family(0.02)
 def rotation():
-    """Loaded square, rotated by 0 to 90 degrees: exact volume, pressure; mean pressure against a finer grid."""
+    """Loaded square, rotated by 0 to 90 degrees: against exact values if undrained, else against a finer grid."""
     K, S = SOIL.drained_modulus(2), SOIL.storage(WATER.bulk, SOIL.porosity)
     J = stretch(1e5 / (2 * K)) ** 2
     a = brentq(lambda a: 2 * K * log(a) / a - (1 - a * a) / (S * a) + 1e5, 0.5, 1)
@@ -212,13 +214,13 @@ DRAINING = {"cells": 24, "fluid": WATER, "end": 0.4, "steps": 16, "drained": ("l
 
 
 def held(s: mpm.Simulation) -> float:
-    """Return the mean pressure of the points, Pa, weighted by initial volumes."""
+    """Return the mean pressure, in Pa, of the points, weighted by initial volumes."""
     return float(s.points.volume0 @ s.points.pressure / s.points.volume0.sum())
 
 
 @cache
 def half_drained() -> float:
-    """Return the final mean pressure, Pa, on a fine grid, whose lines coincide with the sides of the square."""
+    """Return the final mean pressure, in Pa, on a fine grid whose lines coincide with the sides of the square."""
     scene = square(0, None, **{**DRAINING, "cells": 48})()
     scene.simulation.run(scene.end, scene.end / scene.steps, progress=False)
     return held(scene.simulation)
@@ -231,7 +233,7 @@ def draining_error(s: mpm.Simulation, r: mpm.Result) -> float:
 
 @family(0.02)
 def rotation_of_a_beam():
-    """Beam rotated by 5 to 90 degrees, with prescribed displacements at its end: tip against finite elements."""
+    """Beam rotated by 5 to 90 degrees, with a prescribed displacement at its end: tip against finite elements."""
     for angle in (5, 15, 30, 45, 60, 75, 90):
         yield f"{angle} degrees", Beam(soil(conductivity=1e-5), WATER, angle=angle, h=(0.025, 0.025))
 
@@ -247,7 +249,7 @@ def points_per_cell():
 
 @family(0.01)
 def filling():
-    """Outermost cells filled to 1e-10 to 0.5; beam: tip against finite elements; column: exact settlement."""
+    """Beam and column, outermost cells filled to 1e-10 to 0.5: tip against finite elements, exact settlement."""
     for f in (*decades(-10, -1), 0.5):
         yield f"beam, {f:.0e} of a cell", Beam(soil(conductivity=1e-5), WATER, offset=1 - f)
         top = 1 + 0.05 * f
@@ -276,7 +278,7 @@ def thin():
 
 
 def beside_q1(beam: Beam, cells: tuple[int, int]) -> Scene:
-    """Return the scene of the beam; the error of its tip is divided by the error of Q1 elements on `cells` cells."""
+    """Return the scene of the beam.  The error of its tip is divided by that of Q1 elements on `cells` cells."""
     scene = beam()
     bound = off(beam.elements("q1-dg0", cells), beam.elements())
     return replace(scene, error=lambda s, r: off(tip(r), beam.elements()) / bound)
@@ -284,7 +286,7 @@ def beside_q1(beam: Beam, cells: tuple[int, int]) -> Scene:
 
 @family(0.01)
 def weight():
-    """Column under its weight, dry (rho g H / E = 1e-6 to 10) or wet: exact height; beam: tip against elements."""
+    """Weight of a wet or dry column (rho g H / E = 1e-6 to 10): exact height.  Weight of a beam: tip against FEM."""
     density = (1 - SOIL.porosity) * SOIL.grain_density
     for ratio in decades(-6, 1):
         E = density * 10 / ratio
@@ -300,7 +302,7 @@ def weight():
 
 @family(0.01)
 def suction():
-    """Column, p = -10 to 0.5 times the modulus: exact settlement; refused if pores close or without equilibrium."""
+    """Column, p = -10 to 0.5 times the modulus: exact settlement, or refusal if pores close or without equilibrium."""
     for ratio in (*(-x for x in decades(-6, 1)), 0.01, 0.1, 0.3, 0.4, 0.5):
         a = stretch(-ratio) if ratio < exp(-1) else nan
 
@@ -327,7 +329,7 @@ def buckling():
 
 @family(0.01)
 def overload():
-    """Column under loads of -1 to 100 times the modulus: exact settlement; refused without equilibrium."""
+    """Column under loads of -1 to 100 times the modulus: exact settlement, or refusal without equilibrium."""
     for law in (mpm.Hencky, mpm.NeoHookean, mpm.LinearElastic):
         for ratio in (0.1, 1, 10, 100, -0.1, -0.3, -0.4, -1):
             error = pressed(soil(law=law), ratio * M)
@@ -337,7 +339,7 @@ def overload():
 
 
 def pressed(material, load: float) -> Error | None:
-    """Return the error of the settlement under a load, Pa; None if no stretch is in equilibrium with the load."""
+    """Return the error of the settlement under a load (Pa), or None if no stretch is in equilibrium with this load."""
 
     def excess(a):
         lam = material.bulk - 2 * material.shear / 3
@@ -364,8 +366,8 @@ def units():
 def rain():
     """Column under rain, k = 1e-12 to 1 m/s, alpha h = 1e-3 to 1e3: error against exact heads.
 
-    The rain increases from k / 20 to k / 2.  The soil stands on a water table.  alpha is the constant of Gardner's
-    law, 1/m, and h the cell size, m.
+    The rain increases from (k / 20) to (k / 2).  The soil stands on a water table.  Here alpha is the constant of
+    Gardner's law, in 1/m, and h the cell size, in m.
     """
     for k in [*decades(-12, 0, 4), 0.1]:
         for steep in decades(-3, 3):
@@ -373,7 +375,7 @@ def rain():
 
 
 def rained(k: float, steep: float) -> Scene:
-    """Return the column under rain of k / 2, until heads are steady; k: conductivity, m/s; steep: alpha h of `rain`."""
+    """Return the column under rain of (k / 2), with k in m/s, until heads are steady.  `steep`: alpha h of `rain`."""
 
     def steady(share: float, alpha: float, z: np.ndarray) -> np.ndarray:
         return np.log(share + (1 - share) * np.exp(-alpha * z)) / alpha
@@ -399,7 +401,7 @@ def evaporation():
 
 
 def dried(k: float, steep: float, driest: float = -1.5) -> Scene:
-    """Return the column with water at rest that dries at its top; driest: least pressure head there, m.
+    """Return the column with water at rest that dries at its top.  `driest`, m: lowest pressure head at the top.
 
     The potential evaporation is larger than the flow from the water table.
     """
@@ -431,8 +433,9 @@ def layered_rain():
 def rained_layers(ratio: float, steep: float, other: float, grid: str = "plane") -> Scene:
     """Return a column of two layers.
 
-    steep: alpha h of the lower layer, see `rain`; ratio, other: k and alpha of the upper layer, divided by those of the
-    lower layer; grid: see `kind` of `exponential`.
+    steep: alpha h of the lower layer, see `rain`
+    ratio, other: k and alpha of the upper layer, divided by those of the lower layer
+    grid: see `kind` of `exponential`
     """
     k, alpha, edge = [1e-6, 1e-6 * ratio], [10 * steep, 10 * steep * other], 0.53
     rain = min(k) / 2
@@ -459,7 +462,7 @@ def exponential(
     edge: float | None = None,
     kind: str = "plane",
 ) -> Scene:
-    """Return a column of 1 m and ten cells over a water table, of one or two exponential soils, with exact heads.
+    """Return a column of one or two exponential soils over a water table, 1 m and ten cells high, with exact heads.
 
     k: conductivity of each soil, m/s.  alpha: rate of its decrease with the suction head, 1/m.  sides: conditions.
     exact, start: functions of the height, m, that return the final and the initial head, m.  end: end time, s.
@@ -509,7 +512,8 @@ def ponding():
 def ponded(n: float, head: float, alpha: float) -> Scene:
     """Return a column of 1 m, ponded by 0.1 m of water until it is saturated, and drained at its base.
 
-    n, alpha: van Genuchten's parameters, -, 1/m; head: initial head, m.
+    n, alpha (1/m): van Genuchten's parameters
+    head (m): initial head
     """
     law = mpm.VanGenuchten(9810.0 / alpha, residual=0.1, n=n, air_entry=100.0)
     soil = mpm.LinearElastic(1e9, 5e8, porosity=0.4, conductivity=1e-5, retention=law)

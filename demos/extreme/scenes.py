@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The scenes of `extreme_cases`: a cantilever, a column, a square in a corner of the grid; on one process."""
+"""The scenes of `extreme_cases`, on one process: a cantilever, a column, and a square in a corner of the grid."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ Error = Callable[[mpm.Simulation, mpm.Result], float]
 
 @dataclass
 class Scene:
-    """A simulation to run until `end`, s, in equal steps.
+    """A simulation, which must be run until `end`, in s, in equal steps.
 
-    error: function of the simulation and its result that returns the error; None for a scene without equilibrium.
+    error: function of the simulation and its result that returns the error, or None for a scene without equilibrium
     """
 
     simulation: mpm.Simulation
@@ -47,12 +47,12 @@ Make = Callable[[], Scene]
 
 
 def off(measured, exact, scale: float | None = None) -> float:
-    """Return the largest difference, divided by `scale`, which is by default the largest exact value."""
+    """Return the largest difference, divided by `scale`.  By default the scale is the largest exact value."""
     return float(np.abs(np.subtract(measured, exact)).max() / (np.abs(exact).max() if scale is None else scale))
 
 
 def tip(result: mpm.Result) -> np.ndarray:
-    """Return the displacement (2,) of the first probe at the end."""
+    """Return the final displacement (2,), in m, of the first probe."""
     return result.displacement[-1][0]
 
 
@@ -62,7 +62,7 @@ def settled(exact: float) -> Error:
 
 
 def turned(x: np.ndarray, angle: float) -> np.ndarray:
-    """Return vectors (..., 2) rotated by an angle, degrees, counterclockwise."""
+    """Rotate vectors (..., 2) counterclockwise by an angle, in degrees."""
     c, s = cos(radians(angle)), sin(radians(angle))
     return x @ np.array([[c, s], [-s, c]])
 
@@ -76,7 +76,7 @@ def place(s: mpm.Simulation, corners: np.ndarray) -> None:
 
 @dataclass(frozen=True)
 class Beam:
-    """A cantilever, clamped at its left end; its tip displacement is compared with that of Taylor-Hood elements."""
+    """A cantilever, clamped at its left end.  The reference is the tip displacement with Taylor-Hood elements."""
 
     material: mpm.materials.Skeleton = SOIL
     fluid: mpm.Fluid | None = None
@@ -127,7 +127,7 @@ class Beam:
         return Scene(s, self.end, self.steps, lambda s, r: off(turned(tip(r), -self.angle), self.elements()), probes)
 
     def elements(self, element: str = "taylor-hood", cells: tuple[int, int] | None = None) -> np.ndarray:
-        """Return the displacement (2,), m, of the tip of the unrotated beam, computed with finite elements."""
+        """Return the displacement (2,), in m, of the tip of the unrotated beam, computed with finite elements."""
         steps = self.steps if self.fluid and self.drained else self.truth_steps
         seen = replace(self, steps=steps, h=(1, 1), offset=0, per_cell=0, angle=0, truth=cells or self.truth)
         return finite_elements(seen, element)
@@ -135,7 +135,7 @@ class Beam:
 
 @cache
 def finite_elements(beam: Beam, element: str) -> np.ndarray:
-    """Return the displacement (2,), m, of the tip of the beam on a mesh of `beam.truth` finite elements."""
+    """Return the displacement (2,), in m, of the beam's tip on a mesh of `beam.truth` finite elements."""
     fem = BiotFEM(
         mpm.Grid([0, 0], beam.size, beam.truth), beam.material, walls={"left": "xy"}, element=element, **beam.physics()
     )
@@ -145,8 +145,10 @@ def finite_elements(beam: Beam, element: str) -> np.ndarray:
 def column(error: Error | None, *layers, h=0.05, end=1.0, steps=1, per_cell=2, load=0.0, room=2, **physics) -> Make:
     """Return a function that makes a column, one cell wide, between smooth walls.
 
-    layers: (material, height of the top, m), from below.  h: cell size, m.  load: on the top, Pa.  room: number of
-    empty cells above the column.
+    layers: material and height of the top (m) of each layer, from below
+    h (m): cell size
+    load (Pa): load on the top of the column
+    room: number of empty cells above the column
     """
 
     def make() -> Scene:
@@ -172,14 +174,15 @@ def column(error: Error | None, *layers, h=0.05, end=1.0, steps=1, per_cell=2, l
 
 
 def stretch(ratio: float) -> float:
-    """Return the stretch a of a column with Hencky's law under a load q = ratio M, from M ln(a) / a = -q."""
+    """Return the stretch a of a column with Hencky's law under a load `q = ratio M`.  It solves `M ln(a) / a = -q`."""
     return float(np.exp(-lambertw(ratio).real))
 
 
 def square(angle: float, error: Error | None, cells: int = 12, end=1.0, steps=4, fluid=None, drained=()) -> Make:
-    """Return a function that makes a square of 0.6 m, under 1e5 Pa on all sides, in the corner between two walls.
+    """Return a function that makes a square of 0.6 m in the corner between two walls, under 1e5 Pa on all sides.
 
-    angle: rotation of the square, degrees.  drained: names of its drained sides.
+    angle (degrees): rotation of the square
+    drained: names of the drained sides of the square
     """
 
     def make() -> Scene:

@@ -11,7 +11,7 @@ SCRIPTS = ("tutorial", "short/consolidation", "short/footing", "short/own_law")
 
 
 def notebook(path: Path):
-    """Return a script as a notebook: its docstring, and comments that stand alone, become text."""
+    """Return a script as a notebook.  The docstring, and comments on lines of their own, become text."""
     text, code = parts(path)
     words = "\n".join(
         f"# {line}".rstrip() for line in [f"# {path.stem.replace('_', ' ').capitalize()}", "", *text.split("\n")]
@@ -20,7 +20,7 @@ def notebook(path: Path):
 
 
 def write(out: Path) -> list[Path]:
-    """Write all notebooks into a folder; return their files."""
+    """Write all notebooks into a folder, and return their files."""
     out.mkdir(parents=True, exist_ok=True)
     files = [out / f"{Path(name).name}.ipynb" for name in SCRIPTS]
     for name, file in zip(SCRIPTS, files, strict=True):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Lay the pages of the reference into a folder: `python demos/reference/pages.py FOLDER`.
+"""Copy the pages of the reference into a folder: `python demos/reference/pages.py FOLDER`.
 
 Pages, and the files that pages link to, keep their relative paths.  The tutorial and the short examples become pages.
 """
@@ -51,14 +51,14 @@ def documented(folder: Path) -> dict[str, str]:
 
 
 def names(folder: Path) -> str:
-    """Return a page of all public names, as links.  The page needs no server, unlike the search box."""
+    """Return a page with links to all public names.  Unlike the search box, the page needs no server."""
     found = documented(folder)
     rows = [f"* [`{name}`]({found[name]}.md#mpm_dolfinx.{name})" for name in sorted(found, key=str.lower)]
     return "# All names\n\n" + "\n".join(rows) + "\n"
 
 
 def lay(out: Path) -> None:
-    """Lay all pages into a folder, whose earlier contents are removed."""
+    """Copy all pages into a folder, after its earlier contents are removed."""
     shutil.rmtree(out, ignore_errors=True)
     for pattern in (*PAGES, *LINKED):
         for path in ROOT.glob(pattern):

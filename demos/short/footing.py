@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Bearing capacity of a strip footing on undrained clay; by symmetry half of the ground is computed."""
+"""Bearing capacity of a strip footing on undrained clay.  By symmetry, half of the ground is computed."""
 
 import mpm_dolfinx as mpm
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A rigid sphere indents a saturated gel; initial and drained force give Poisson's ratio of the gel."""
+"""A rigid sphere indents a saturated gel.  The initial and the drained force give Poisson's ratio of the gel."""
 
 import mpm_dolfinx as mpm
 

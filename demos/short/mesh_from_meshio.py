@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A body from a mesh of triangles, which meshio reads: a wedge of earth under its weight."""
+"""A body from a mesh of triangles that meshio reads: a wedge of earth under its weight."""
 
 import meshio
 import numpy as np

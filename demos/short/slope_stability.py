@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Factor of safety, by strength reduction, of a slope 10 m high, 2:1, with c = 7.8 kPa and phi = 20 degrees."""
+"""Factor of safety of a slope by strength reduction: 10 m high, 2:1, c = 7.8 kPa and phi = 20 degrees."""
 
 import mpm_dolfinx as mpm
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Resistance of a T-bar, a rough cylinder, in deep undrained clay; by symmetry half of it is computed."""
+"""Resistance of a T-bar, a rough cylinder, in deep undrained clay.  By symmetry, half of the scene is computed."""
 
 import numpy as np
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Wrappers of every function of dolfinx that differs between the supported releases (0.5.2 and 0.9 to 0.11).
 
-No other module of the package asks for the version.  Branches marked OLD serve release 0.5.  Remove a branch when no
+No other module of the package asks for the version.  Branches marked OLD are for release 0.5.  Remove a branch when no
 supported release needs it.
 """
 
@@ -49,7 +49,7 @@ def box_mesh(
     x : (m, d), m
         Positions of the nodes that this process contributes.  Nodes are numbered globally in the order of the ranks.
     ranks, offsets
-        Ranks that hold cell i, the owner first: `ranks[offsets[i] : offsets[i + 1]]`.
+        Ranks that hold each cell.  Cell i has `ranks[offsets[i] : offsets[i + 1]]`, the owner first.
     """
     kind = {4: "quadrilateral", 8: "hexahedron"}[cells.shape[1]]
     where = (ranks, offsets)
@@ -66,7 +66,7 @@ def box_mesh(
 
 
 def function_space(msh: mesh.Mesh, family: str, degree: int, shape: tuple[int, ...] = ()):
-    """Return the function space of a family ("DG", "Lagrange") and degree, with values of the given shape."""
+    """Return the function space of a family ("DG", "Lagrange"), a degree and a value shape."""
     if not OLD:
         return fem.functionspace(msh, (family, degree, shape) if shape else (family, degree))
     with compiler(msh.comm):
@@ -94,7 +94,7 @@ def mixed_space(msh: mesh.Mesh, parts: Sequence[tuple[str, int, tuple[int, ...]]
 
 
 def cell_dofs(V) -> NDArray[np.int32]:
-    """Return the blocked degrees of freedom (cells, n) of the cells, ghosts included."""
+    """Return the blocked degrees of freedom (cells, n) of all cells on this process, ghosts included."""
     dofs = V.dofmap.list
     return dofs.array.reshape(-1, V.dofmap.dof_layout.num_dofs) if OLD else np.asarray(dofs)
 
@@ -105,7 +105,7 @@ def petsc_vec(u: fem.Function) -> PETSc.Vec:
 
 
 def num_cells(msh: mesh.Mesh) -> tuple[int, int]:
-    """Return the numbers of owned cells and of all cells, ghosts included, on this process."""
+    """Return two numbers: of owned cells on this process, and of cells on this process, ghosts included."""
     index_map = msh.topology.index_map(msh.topology.dim)
     return index_map.size_local, index_map.size_local + index_map.num_ghosts
 
@@ -116,7 +116,7 @@ def cell_kind(msh: mesh.Mesh) -> str:
 
 
 def geometry_dofs(msh: mesh.Mesh) -> NDArray[np.int32]:
-    """Return the geometry nodes (cells, n) of the cells, ghosts included."""
+    """Return the geometry nodes (cells, n) of all cells on this process, ghosts included."""
     if OLD:
         return msh.geometry.dofmap.array.reshape(len(msh.geometry.dofmap), -1)
     return np.asarray(msh.geometry.dofmaps[0] if hasattr(msh.geometry, "dofmaps") else msh.geometry.dofmap)
@@ -132,7 +132,7 @@ seconds: Counter[str] = Counter()
 
 
 class Timer:
-    """Context that adds its wall time to an entry of `seconds`.  Timers of dolfinx 0.9 resolve only 10 ms."""
+    """Context that adds its wall time to an entry of `seconds`.  Timers of dolfinx 0.9 would resolve only 10 ms."""
 
     def __init__(self, part: str):
         self._part = part
@@ -148,13 +148,14 @@ class Timer:
 class CompiledForm:
     """A UFL form over cells or interior facets, compiled once and integrated over any list of entities.
 
-    A cell may occur several times in the list; the kernel is then called once for each entry.  Ghost cells are not
-    allowed, because dolfinx 0.5 silently skips them.  Release 0.5 needs mesh tags, later releases need entities.
+    A cell may occur several times in the list.  The kernel is called once for each entry.  Ghost cells are not allowed,
+    because dolfinx 0.5 silently skips them.  The list becomes mesh tags for release 0.5, and entities for later
+    releases.
 
     Parameters
     ----------
     form
-        Form of one integral type.  All integrals have the subdomain id `SUBDOMAIN`.
+        Form whose integrals are all of one type, and have the subdomain id `SUBDOMAIN`.
     """
 
     def __init__(self, form: ufl.Form):
@@ -182,7 +183,7 @@ class CompiledForm:
         return self._last if OLD else self._last._cpp_object
 
     def bind(self, entities: NDArray[np.int32]):
-        """Set the cells (repeats allowed) or interior facets of the integral, and return the form for them.
+        """Set the cells or interior facets of the integral, and return the form for them.  Cells may occur repeatedly.
 
         Later calls do not change the returned form.  `assemble_vector` and `assemble_matrix` accept it.
         """
@@ -218,25 +219,25 @@ class CompiledForm:
         return self.form
 
     def packed(self, form=None) -> dict:
-        """Return the coefficients as packed by dolfinx: arrays with one row for each entity."""
+        """Return the coefficients as dolfinx packs them.  Each array has one row for each entity."""
         form = form or self.form
         return cpp.fem.pack_coefficients(form)
 
     def assemble_vector(self, b: NDArray[np.float64], rows: NDArray[np.float64] | None = None, form=None) -> None:
-        """Add the vector to `b`, without communication.  rows: coefficients of the entities; default: `packed`."""
+        """Add the vector to `b`, without communication.  The coefficients of the entities are `rows`, or `packed()`."""
         form = form or self.form
         packed = self.packed(form) if rows is None else dict.fromkeys(self._keys, rows)
         cpp.fem.assemble_vector(b, form, cpp.fem.pack_constants(form), packed)
 
     def assemble_matrix(self, A: PETSc.Mat, rows: NDArray[np.float64] | None = None, form=None) -> None:
-        """Add the matrix, in unrolled dofs, to `A` without final assembly; rows: as for `assemble_vector`."""
+        """Add the matrix, in unrolled dofs, to `A` without final assembly.  `rows`: see `assemble_vector`."""
         form = form or self.form
         packed = self.packed(form) if rows is None else dict.fromkeys(self._keys, rows)
         cpp.fem.petsc.assemble_matrix(A, form, cpp.fem.pack_constants(form), packed, [], unrolled=True)
 
     @cached_property
     def _keys(self) -> list[tuple]:
-        """Keys of the coefficients: indices of the integrals in dolfinx 0.11, subdomain ids in earlier releases."""
+        """Keys of the coefficients.  In dolfinx 0.11 they are indices of the integrals, else subdomain ids."""
         return [(fem.IntegralType.cell, key) for _, key in self.packed()] or [(fem.IntegralType.cell, SUBDOMAIN)]
 
 

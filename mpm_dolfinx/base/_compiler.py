@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""Quiet and crash-safe compilation of dolfinx's forms and function spaces, with error messages of one line.
+"""Compilation of dolfinx's forms and function spaces.  It prints no log, survives aborted runs, and reports errors in a
+line.
 
 FFCx marks a library by a `.c` file in the cache before compiling it.  Other programs wait ten seconds for a marked
-library.  An aborted run leaves its mark behind, and all later runs fail.  Here each library is compiled in a separate
-folder and moved into the cache when complete.  Incomplete or broken libraries in the cache are compiled again.
+library.  After an aborted run the mark remains, and all later runs fail.  This module compiles each library in a
+separate folder, and moves the complete library into the cache.  Incomplete or broken libraries in the cache are
+compiled again.
 """
 
 from __future__ import annotations
@@ -37,20 +39,20 @@ from mpm_dolfinx.parallel.exchange import at_root, first
 WORKSHOP = ".mpm_dolfinx-"
 """Prefix of the folders in which libraries are compiled."""
 ABANDONED = 600.0
-"""Age, s, above which the mark of another program (a `.c` file without `.c.cached`) is ignored."""
+"""Age, in s, above which a mark of another program is ignored.  The mark is a `.c` file without a `.c.cached` file."""
 DAY = 86400.0  # Source: definition
 logger = logging.getLogger("mpm_dolfinx")
 _settings = jit.get_options if hasattr(jit, "get_options") else jit.get_parameters  # OLD
 _ffcx_settings = ffcx.get_options if hasattr(ffcx, "get_options") else ffcx.get_parameters  # OLD
 _replacements: dict[Path, Path] = {}
-"""Temporary folders of this run.  Each replaces a cache folder that is not writable, which is its key."""
+"""Temporary folders of this run, by the cache folder that each replaces.  These cache folders are not writable."""
 _warnings: dict[Path, str] = {}
-"""Warnings still to be issued, by temporary folder.  The first compilation in a folder issues the warning."""
+"""Warnings still to be issued, by temporary folder.  The first compilation in a folder issues its warning."""
 
 
 @contextmanager
 def compiler(comm: MPI.Intracomm) -> Iterator[None]:
-    """Let dolfinx find or compile libraries within this context, on all processes of `comm`.
+    """Context in which dolfinx finds or compiles libraries, on all processes of `comm`.
 
     Raises
     ------
@@ -98,7 +100,7 @@ def _folder() -> Path:
 
 def _of_this_run(cache: Path, why: OSError) -> Path:
     """Return a new folder for libraries that exists until the end of the run."""
-    allowed = "must be a folder that can be written; set XDG_CACHE_HOME to another"
+    allowed = "must be a folder that can be written; set XDG_CACHE_HOME to another folder"
     what = f"cache folder of dolfinx's compiled forms, {cache}: {why.strerror}"
     try:
         folder = Path(tempfile.mkdtemp(prefix="mpm_dolfinx-"))
@@ -140,7 +142,7 @@ def _complete(make: Callable, folder: Path, messages: list[str]) -> Callable:
             messages.append(f"C compiler: {line_of(error)}, {allowed}")
             raise
         except OSError as error:
-            allowed = "must be a folder that can be written, with free space, or set XDG_CACHE_HOME to another"
+            allowed = "must be a folder that can be written, with free space, or set XDG_CACHE_HOME to another one"
             messages.append(f"{folder}: {line_of(error)}, {allowed}")
             raise
         finally:
@@ -159,14 +161,15 @@ def _loaded(name: str, library: Path) -> ModuleType:
 
 
 def _library(place: Path, name: str) -> Path | None:
-    """Return the file of a library that Python would load; None if no such file exists."""
+    """Return the file that Python would load for a library, or None if no file exists."""
     return next(filter(Path.exists, (place / (name + suffix) for suffix in EXTENSION_SUFFIXES)), None)
 
 
 def _is_complete(place: Path, name: str) -> bool:
-    """Return whether the cache holds a complete library: files `.c` and `.c.cached`, and an untruncated library.
+    """Return whether the cache holds a complete library, and its files `.c` and `.c.cached`.
 
-    Python's loader does not notice truncation: the run ends with a bus error at the first missing page.
+    Python's loader does not notice that a library is truncated.  The run would end with a bus error at the first
+    missing page.
     """
     library = _library(place, name)
     if library is None or not all((place / f"{name}{end}").exists() for end in (".c", ".c.cached")):
@@ -211,7 +214,7 @@ def _replaced(**functions: Callable) -> Iterator[None]:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Suppress the log lines of setuptools about compiler calls.  The root logger is restored afterwards."""
+    """Context without setuptools' log lines about compiler calls.  Afterwards the root logger is as before."""
     root = logging.getLogger()
     level, handlers = root.level, root.handlers[:]
     root.addFilter(_is_wanted)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Check of the environment before other imports; errors name missing packages and the remedy in one line."""
+"""Check of the environment before other imports.  An error names the missing packages and the remedy in one line."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def _check() -> None:
     try:
         Path.home()
     except RuntimeError as error:  # without HOME Open MPI fails, and so does dolfinx
-        raise ImportError("HOME is not set, dolfinx needs it: set it to a folder that can be written") from error
+        raise ImportError("HOME is not set, but dolfinx needs it; set HOME to a folder that can be written") from error
 
     from mpi4py import MPI  # noqa: F401 - initialises MPI before PETSc does
     from petsc4py import PETSc
@@ -38,7 +38,7 @@ def _check() -> None:
 
     if np.issubdtype(PETSc.ScalarType, np.complexfloating):
         raise ImportError(
-            "PETSc: its numbers are complex, mpm_dolfinx needs real ones: on Debian, PETSC_DIR unset or ending in "
+            "PETSc has complex numbers, but mpm_dolfinx needs real ones: on Debian, PETSC_DIR unset or ending in "
             "-real and `apt install python3-dolfinx-real`, elsewhere `conda install -c conda-forge 'petsc=*=real*'`"
         )
     root = logging.getLogger()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Cache of the last value together with its key.  Keys are compared by value."""
+"""Cache of a single value, the last one, together with its key.  Keys are compared by value."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Latest(Generic[T]):
 
     The cache is empty during the computation of a value, so an exception leaves no incomplete value behind.
 
-    derived: caches of values that depend on this value; they are emptied together with this cache.
+    derived: caches of values that depend on this value.  They are emptied together with this cache.
     """
 
     def __init__(self, *derived: Latest) -> None:
@@ -29,11 +29,11 @@ class Latest(Generic[T]):
         self._derived = derived
 
     def __call__(self, key: Any, make: Callable[[], T], comm: MPI.Intracomm = MPI.COMM_SELF) -> T:
-        """Return the value for a key; compute the value again if the key differs from the last key.
+        """Return the value for a key.  It is computed again if the key differs from the last key.
 
-        key: everything on which the value depends: numbers, objects, arrays that never change, or tuples of these;
-        make: function that computes the value; comm: processes that compute the value together.  If one process needs a
-        new value, all processes compute it.
+        key: all data on which the value depends: numbers, objects, arrays that never change, or tuples of these
+        make: function that computes the value
+        comm: processes that compute the value together; if one of them needs a new value, all compute it
         """
         other = self._entry is None or not (self._entry[0] is key or same(self._entry[0], key))
         if other if comm.size == 1 else over_all(comm, other) > 0:
@@ -47,7 +47,7 @@ class Latest(Generic[T]):
 
     @property
     def value(self) -> T | None:
-        """The last value; None if the cache is empty."""
+        """The last value, or None if the cache is empty."""
         return None if self._entry is None else self._entry[1]
 
     def clear(self) -> None:
@@ -58,7 +58,7 @@ class Latest(Generic[T]):
 
 
 class Keyed:
-    """Base class of objects that are identified in cache keys by a token, so that caches do not keep them alive."""
+    """Base class of objects for which a token stands in cache keys.  Caches therefore do not keep the objects alive."""
 
     @cached_property
     def key(self) -> object:
@@ -67,7 +67,7 @@ class Keyed:
 
 
 def same(a: Any, b: Any) -> bool:
-    """Return whether two keys are equal: arrays by shape and values, tuples entry by entry."""
+    """Return whether two keys are equal.  Arrays are compared by shape and values, tuples entry by entry."""
     if a is b:
         return True
     if isinstance(a, tuple) and isinstance(b, tuple):

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 @dataclass
 class Report:
-    """Report of a converged time step.  Pressures are cell pressures; see `motion_error` for the motion."""
+    """Report of a converged time step.  Pressures are cell pressures.  For the motion see `motion_error`."""
 
     newton: int = 0  # Newton iterations
     coupling: int = 0  # iterations of the coupled linear solver
@@ -33,12 +33,12 @@ class Report:
 
 
 class StepFailed(RuntimeError):
-    """A time step that failed; a shorter step may succeed.
+    """A time step that failed.  A shorter step may succeed.
 
     Attributes
     ----------
     history
-        Relative residuals (momentum, storage) of the iterations; empty if there were none.
+        Relative residuals (momentum, storage) of each iteration.  The list is empty if there were no iterations.
     """
 
     history: Sequence[tuple[float, float]] = ()
@@ -67,7 +67,7 @@ class LeftGrid(StepFailed):
     Attributes
     ----------
     report
-        Report of the step.  A shorter step helps only if the estimated error of this step is too large.
+        Report of the step.  A shorter step helps only if the report's estimated error is too large.
     """
 
     def __init__(self, message: str, report: Report | None = None):
@@ -76,7 +76,7 @@ class LeftGrid(StepFailed):
 
 
 def raise_interrupt(error: BaseException) -> None:
-    """Raise the KeyboardInterrupt that caused an error.  Some PETSc releases replace it by an error of the solver."""
+    """Raise the KeyboardInterrupt that caused an error.  Some PETSc releases replace an interrupt by a solver error."""
     cause = error
     while cause is not None and not isinstance(cause, KeyboardInterrupt):
         cause = cause.__cause__ or cause.__context__

@@ -1,20 +1,20 @@
 # SPDX-License-Identifier: MIT
 """Fluid content of the pores: the quantity stored in the fluid balance.
 
-Per reference volume, the content zeta changes by d zeta = alpha dJ + S J dp.  alpha is Biot's coefficient, J the volume
-ratio, and p the pore pressure.  S = n / K_w + (alpha - n) / K_s is the storage coefficient, with the bulk moduli K_w of
-water and K_s of grains.  The porosity is n = 1 - (1 - n0) / J, with n0 at J = 1.  Therefore S J = a J + b is linear in
-J, with a = S(n = 1), and
+Per reference volume, the content zeta changes by (d zeta = alpha dJ + S J dp).  Here alpha is Biot's coefficient, J the
+volume ratio, and p the pore pressure.  The storage coefficient S = n / K_w + (alpha - n) / K_s contains the bulk moduli
+K_w of water and K_s of grains.  The porosity is n = 1 - (1 - n0) / J, where n0 is the porosity at J = 1.  Therefore (S
+J = a J + b) is linear in J, with a = S(n = 1), and
 
     d zeta = (alpha / rho) d[(J + b / a) rho],    rho = exp(a p / alpha).
 
 The bracket is the mass of a fluid of density rho that fills the volume J + b / a.  The change of zeta in a step is
 computed as alpha times the change of this mass, divided by rho at the mean pressure of the step.  This formula is
-second-order accurate for any path.  If no fluid flows, the formula gives exactly zero, in a step of any size.
+second-order accurate for any path.  If no fluid flows, the change is exactly zero in a step of any size.
 
 Fluxes between cells conserve mass.  A fluid of density rho_w exp(p / K_w) has the mass flux -rho_w kappa grad pi, with
 kappa = conductivity / unit weight.  The mass potential is pi = K_w (exp(p / K_w) - 1) (Kirchhoff's transformation).
-The density between pressures p- and p+ is, in units of rho_w, the logarithmic mean (pi+ - pi-) / (p+ - p-).
+The density between pressures p- and p+ is rho_w times the logarithmic mean (pi+ - pi-) / (p+ - p-).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from mpm_dolfinx.base.tolerances import EPSILON
 
 SERIES = (120 * EPSILON) ** 0.25
-"""Argument z below which sinh(z) / z is computed as 1 + z^2 / 6.  Source: the next term, z^4 / 120, is then epsilon."""
+"""Argument z below which (sinh(z) / z) is computed as (1 + z^2 / 6).  Source: z^4 / 120 = epsilon, the next term."""
 
 
 def change_of_content(alpha, a, storage, J, dp):
@@ -37,7 +37,8 @@ def change_of_content(alpha, a, storage, J, dp):
     alpha
         Biot coefficient.
     a, storage
-        Storage coefficients, 1/Pa: `a` for a porosity of one (see the module), `storage` at the start of the step.
+        Storage coefficients, in 1/Pa.  `a` refers to a porosity of one (see the module), `storage` to the start of the
+        step.
     J
         Volume ratio of the step.
     dp
@@ -48,7 +49,7 @@ def change_of_content(alpha, a, storage, J, dp):
 
 
 def change_at_points(alpha, a, storage, J, dp) -> NDArray[np.float64]:
-    """Return the change of the fluid content (n,) of points in a step; see `change_of_content`."""
+    """Return the changes (n,) of the fluid content of points in a step, see `change_of_content`."""
     z = a * dp / (2 * alpha)
     small = np.abs(z) < SERIES
     away = np.where(small, 1.0, z)
@@ -56,27 +57,27 @@ def change_at_points(alpha, a, storage, J, dp) -> NDArray[np.float64]:
 
 
 def mass_potential(p, bulk: float):
-    """Return the mass potential pi (n,), Pa, at pressures p (n,), Pa.  `bulk` is K_w, Pa."""
+    """Return the mass potentials pi (n,), in Pa, at pressures p (n,), in Pa.  `bulk` is K_w, in Pa."""
     return p if np.isinf(bulk) else bulk * np.expm1(p / bulk)
 
 
 def pressure_of(pi, bulk: float):
-    """Return the pressures (n,), Pa, at mass potentials pi (n,), Pa.  `bulk` is K_w, Pa."""
+    """Return the pressures (n,), in Pa, at mass potentials pi (n,), in Pa.  `bulk` is K_w, in Pa."""
     return pi if np.isinf(bulk) else bulk * np.log1p(pi / bulk)
 
 
 def mass_potential_form(p, compliance):
-    """Return the mass potential, Pa, as a UFL expression.  `compliance` is 1 / K_w, 1/Pa."""
+    """Return the mass potential (Pa) at p as a UFL expression.  `compliance` is (1 / K_w), in 1/Pa."""
     return p * density_between(p, 0.0, compliance)
 
 
 def density_between(p0, p1, compliance):
-    """Return the logarithmic mean of the densities at two pressures, divided by the density at p = 0, as UFL."""
+    """Return the mean density between two pressures, divided by the density at p = 0, as a UFL expression."""
     return ufl.exp(compliance * (p0 + p1) / 2) * _sinhc(compliance * (p0 - p1) / 2)
 
 
 def mean_density(p0, p1, bulk: float) -> NDArray[np.float64]:
-    """Return the result of `density_between` (n,) for arrays of pressures (n,), Pa.  `bulk` is K_w, Pa."""
+    """Return the relative densities (n,) of `density_between` for pressures (n,), in Pa.  `bulk` is K_w, in Pa."""
     z = (p0 - p1) / (2 * bulk)
     small = np.abs(z) < SERIES
     away = np.where(small, 1.0, z)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Histories of a run: quantities at each output time, in growing arrays shared by all results of the run."""
+"""Histories of a run: quantities at each output time.  All results of a run share the growing arrays."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ COLUMNS = tuple(name for name in Row._fields if name != "outcome")
 
 
 class _Columns:
-    """Storage of the histories: an array (capacity, ...) per quantity, and the outcomes; `used` rows are filled."""
+    """Storage of the histories: an array (capacity, ...) per quantity, and the outcomes.  `used` rows are filled."""
 
     def __init__(self, arrays: dict[str, NDArray[np.float64]], outcomes: list[Any]):
         self.arrays, self.outcomes = arrays, outcomes
@@ -44,7 +44,7 @@ class _Columns:
         return len(self.outcomes)
 
     def reshaped(self, count: int, capacity: int, shapes: dict[str, tuple[int, ...]]) -> _Columns:
-        """Return the first `count` rows in larger arrays, padded with nan to the given capacity and row shapes."""
+        """Return the first `count` rows in larger arrays with this capacity and these row shapes.  The rest is nan."""
         out = {}
         for name, shape in shapes.items():
             out[name] = np.full((capacity, *shape), np.nan)
@@ -55,10 +55,10 @@ class _Columns:
 
 
 class Rows(Sequence[Row]):
-    """Immutable sequence of the quantities at all output times of a run: one `Row` for each output time.
+    """Immutable sequence of one `Row` for each output time of a run.
 
-    The result of `more` shares its arrays with this object, so the time to append a row does not grow with the run.
-    If a quantity has different shapes in two rows, the smaller array is padded with nan.
+    The result of `more` shares its arrays with this object.  The time to append a row therefore does not grow with the
+    run.  If a quantity has different shapes in two rows, the smaller array is padded with nan.
 
     Attributes
     ----------
@@ -76,11 +76,11 @@ class Rows(Sequence[Row]):
 
     @classmethod
     def of_columns(cls, columns: dict[str, NDArray[np.float64]], outcomes: Sequence[Any]) -> Rows:
-        """Return rows of columns (name -> values (n, ...)) and outcomes (n,); raise ValueError if they do not match."""
+        """Return rows from values (n, ...) by name, and from outcomes (n,).  Raise ValueError if they do not match."""
         if columns.keys() != set(COLUMNS):
-            raise ValueError(f"columns {', '.join(columns)}, must be {', '.join(COLUMNS)}")
+            raise ValueError(f"the columns are {', '.join(columns)}, must be {', '.join(COLUMNS)}")
         if {len(values) for values in columns.values()} != {len(outcomes)}:
-            raise ValueError("columns and outcomes differ in length, must have equal lengths")
+            raise ValueError("columns and outcomes have different lengths, must have equal lengths")
         out = cls()
         arrays = {name: np.array(columns[name], dtype=np.float64) for name in COLUMNS}
         out._columns, out._count = _Columns(arrays, list(outcomes)), len(outcomes)
@@ -104,7 +104,7 @@ class Rows(Sequence[Row]):
         return self._columns.outcomes[: self._count]
 
     def column(self, name: str) -> NDArray[np.float64]:
-        """Return the values of one quantity at all output times (n, ...), as a read-only view."""
+        """Return the values (n, ...) of one quantity at all output times, as a read-only view."""
         if not len(self):
             return np.array([getattr(Row(0.0), name)])[:0]
         out = self._columns.arrays[name][: self._count]

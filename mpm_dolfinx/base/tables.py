@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Histories of a run as tables: columns with names and units, pandas data frames, xarray data sets."""
+"""Histories of a run as tables: columns with names and units, pandas data frames, or xarray data sets."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 SYMMETRIC = {"xx": (0, 0), "yy": (1, 1), "zz": (2, 2), "xy": (0, 1), "xz": (0, 2), "yz": (1, 2)}
-"""Indices of the components of a symmetric tensor; plane strain has the first four."""
+"""Indices of the components of a symmetric tensor.  Tables of plane strain have the first four components."""
 
 Outcome = Mapping[str, Mapping[str, NDArray[np.float64]]]
 
 
 class Histories(Protocol):
-    """Results at the probes at one output time, or at all output times (first axis: time)."""
+    """Results at the probes at one output time, or at all output times.  In the latter case the first axis is time."""
 
     t: Any
     displacement: NDArray[np.float64]
@@ -29,12 +29,12 @@ class Histories(Protocol):
 
 
 def components(tensors: NDArray[np.float64], dim: int) -> dict[str, NDArray[np.float64]]:
-    """Return the components of symmetric tensors (..., 3, 3) by name.  If dim = 2, xz and yz are left out."""
+    """Return the components of symmetric tensors (..., 3, 3) by name.  In 2D, xz and yz are left out."""
     return {name: tensors[..., i, j] for name, (i, j) in list(SYMMETRIC.items())[: 4 if dim == 2 else 6]}
 
 
 def columns(of: Histories, outcome: Outcome) -> dict[str, tuple[Any, str]]:
-    """Return the columns by name, each as (values, unit), for one output time or all output times."""
+    """Return the values and the unit of each column by name, for one output time or for all."""
     dim, rank = of.displacement.shape[-1], np.ndim(of.t)
     out = {"t": (of.t, "s")}
     for k, name in enumerate(("p_min", "p_max")[: of.pressure.shape[-1]]):
@@ -60,13 +60,13 @@ def columns(of: Histories, outcome: Outcome) -> dict[str, tuple[Any, str]]:
 
 
 def _axes(dim: int, size: int) -> list[str]:
-    """Return the suffixes of the components of a force and, if `size` > `dim`, of its moments."""
+    """Return the suffixes of the `dim` components of a force and, if `size` is larger, of its moments."""
     axes = ["_x", "_y", "_z"][:dim]
     return axes + {0: [], 1: ["_moment"], 3: [f"_moment{axis}" for axis in axes]}[size - dim]
 
 
 def unit_of(quantity: str, dim: int, moment: bool = False) -> str:
-    """Return the unit of a quantity, or of its moments.  Units are per metre of thickness in plane strain."""
+    """Return the unit of a quantity, or of its moments.  In plane strain, units are per metre of thickness."""
     units = {"tool_travel": "m", "tool_velocity": "m/s", "tool_rotation": "rad", "tool_spin": "rad/s"}
     units |= {"outflows": "m^3/s", "runoff": "m^3/s", "energy": "J"}
     units |= dict.fromkeys(("flowed", "ran_off", "ponded"), "m^3")
@@ -113,7 +113,7 @@ def data_set(of: Histories, outcome: Outcome, about: dict[str, Any]):
 
 
 def _library(name: str) -> ModuleType:
-    """Return an optional library.  Raise ImportError, in one line, if it is not installed."""
+    """Return an optional library.  Raise ImportError with a message of one line if the library is not installed."""
     try:
         return import_module(name)
     except ImportError as error:

@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: MIT
-"""Time integration: the substeps (stages) of a time step, also used by the finite element reference solution.
+"""Time integration: the substeps (stages) of a time step.  The finite element reference solution also uses them.
 
-Without inertia the momentum balance has no time derivative.  The fluid content zeta of a cell satisfies
-zeta' + Q(u, p) = 0 with the net outflow Q.  With the subscript n at the start of a step,
+Without inertia the momentum balance has no time derivative.  The fluid content zeta of a cell satisfies zeta' + Q(u, p)
+= 0 with the net outflow Q.  The subscript n denotes the start of a step.  The two methods are
 
     backward-euler   zeta(u, p) - zeta_n + dt Q(u, p) = 0,
     sdirk2           zeta(u1, p1) - zeta_n + gamma dt Q(u1, p1) = 0                               loads at t + gamma dt,
                      zeta(u2, p2) - zeta_n + gamma dt Q(u2, p2) + (1 - gamma) dt Q(u1, p1) = 0    loads at t + dt.
 
-With gamma = 1 - 1 / sqrt(2) this is Alexander's method (1977), second order and L-stable.  The method does not use the
-rate at the start of the step, which is noisy after a transfer between grids.  (u2, p2) are the values at the end of the
-step.  After a jump of the loads, one long step overshoots by a fifth of the change, but two half steps do not, see
+With gamma = 1 - 1 / sqrt(2), `sdirk2` is Alexander's method (1977).  It is second-order and L-stable.  The rate at the
+start of the step is not used, because a transfer between grids makes this rate noisy.  The step ends with the values
+(u2, p2).  After a jump of the loads, one long step overshoots by a fifth of the change, but two half steps do not, see
 `step_size`.  The error of a step is estimated from the rates of the two substeps: see `solve.newton.note_pressures`.
 """
 
@@ -26,7 +26,7 @@ GAMMA = 1 - 1 / np.sqrt(2)  # Source: Alexander (1977), the L-stable method of t
 
 @dataclass(frozen=True)
 class Substep:
-    """A stage of a diagonally implicit Runge-Kutta method; numbers are fractions of the step."""
+    """A stage of a diagonally implicit Runge-Kutta method.  Its numbers are fractions of the step."""
 
     end: float  # c_i: time at which the stage is in equilibrium
     own: float  # a_ii: weight of the rate of this stage
@@ -42,14 +42,14 @@ METHODS = {
 def in_step(
     share: float, start: NDArray[np.float64], now: NDArray[np.float64], end: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the displacement to prescribe at the end of the first substep, so that the velocity there is second-order.
+    """Return the displacement to prescribe at the end of the first substep, for a second-order velocity at this time.
 
-    The method computes this velocity v from the increment of displacement, which equals `share` dt v.  With the exact
-    displacement, v is first-order accurate, and accelerations do not converge.  This function takes v from the parabola
-    through three displacements, and returns `start` + `share` dt v.
+    The method divides the displacement in the substep by its length (`share` dt), and so obtains the velocity v.  With
+    the exact displacement, v is first-order accurate, and accelerations do not converge.  Here v is the slope of the
+    parabola through three displacements, and the result is (`start` + `share` dt v).
 
-    `share` is the end of the substep as a fraction of the step.  The prescribed displacements are
-    `start` at the start of the step, `now` at the end of the substep, and `end` at the end of the step.
+    `share` is the end of the substep as a fraction of the step.  The three displacements are `start` at the start of
+    the step, `now` at the end of the substep, and `end` at the end of the step.
     """
     return start + ((2 * share - 1) * (now - start) - share**2 * (end - start)) / (share - 1)
 
@@ -58,7 +58,7 @@ EULER = METHODS["backward-euler"]
 
 
 def substeps(method: str, evolves: bool) -> tuple[Substep, ...]:
-    """Return the substeps of a method; one substep if the scene has no time derivatives (`evolves` is False)."""
+    """Return the substeps of a method.  A scene without time derivatives (`evolves` is False) needs only one."""
     if not isinstance(method, str) or method not in METHODS:
         raise ValueError(f"method {method!r}: must be one of {', '.join(METHODS)}")
     return METHODS[method if evolves else "backward-euler"]

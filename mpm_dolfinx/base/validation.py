@@ -1,23 +1,23 @@
 # SPDX-License-Identifier: MIT
-"""Validation of user values, given as numbers or as functions of time and position.
+"""Validation of values that users give, as numbers or as functions of time and position.
 
-An error message is one line: the object, the value, and the allowed values.
+An error message has one line.  It names the object, the value, and the allowed values.
 
 The parameter names of a function decide its arguments:
 
 t
     Time, s, at the ends of the substeps, see `time_integration`.
-X : (m, d), m
-    Reference positions of m places.
-x : (m, d), m
-    Positions of the same places at the start of the step, for example to prescribe a water level.
+X : (n, d), m
+    Reference positions of n places.
+x : (n, d), m
+    Positions of these n places at the start of the step, for example to prescribe a water level.
 
-A single parameter with another name receives the time.  With several parameters, other names raise an error.
-Parameters with a default receive no argument, unless all have a default.  Material constants are functions of X.
-Initial pressures and stresses are functions of x, the seeded positions.
+If a function has a single parameter with another name, this parameter receives the time.  With several parameters,
+other names raise an error.  Parameters with a default receive no argument, unless all parameters have one.  Material
+constants may be functions of X.  Initial pressures and stresses may be functions of x, the seeded positions.
 
-A function of position returns a number or an array (m,).  Where vectors are allowed, it may also return a vector (d,)
-or an array (m, d).  Places are repeated until m exceeds d, so that the shape of the array is unambiguous.
+A function of position returns a number or an array (n,).  Where vectors are allowed, the function may also return a
+vector (d,) or an array (n, d).  Places are repeated until n exceeds d, so that the array's shape is unambiguous.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from numpy.typing import NDArray
 
 LONGEST = 160  # most characters of a value in a message
 _known: WeakKeyDictionary[Callable, list[Parameter]] = WeakKeyDictionary()
-"""Parameters of functions that have been called."""
+"""Parameters of each function that has been called."""
 
 
 def line(value) -> str:
@@ -69,11 +69,11 @@ def numbers(
     name
         Name of the object, for the message.
     shapes
-        Allowed shapes, None for any shape; by default a scalar.
+        Allowed shapes; None allows any shape.  By default only a scalar is allowed.
     allowed
         Description of the allowed values, for the message.
     test
-        Condition on each number, or on all of them together.
+        Condition that each number, or all numbers together, must meet.
 
     Raises
     ------
@@ -93,7 +93,7 @@ def numbers(
 
 
 def whole(name: str, value, least: int = 1) -> int:
-    """Return the value as an integer >= `least`; raise ValueError for other values."""
+    """Return the value as an integer >= `least`.  Raise ValueError for other values."""
     allowed = f"an integer >= {least}"
     return int(numbers(name, value, allowed=allowed, test=lambda v: (least <= v) & (v < inf) & (v == np.floor(v))))
 
@@ -149,7 +149,7 @@ def asked(name: str, allowed: str, function: Callable, *values):
 
 
 def path(name: str, value) -> Path:
-    """Return a value as a path; raise ValueError if it is neither text nor a path."""
+    """Return a value as a path.  Raise ValueError for values that are neither text nor a path."""
     if not isinstance(value, (str, os.PathLike)):
         raise ValueError(f"{name} = {line(value)}, must be a path")
     return Path(value)
@@ -157,7 +157,7 @@ def path(name: str, value) -> Path:
 
 @contextmanager
 def on_disk(name: str, allowed: str) -> Iterator[None]:
-    """Add the object and the remedy to an OSError, for example for a missing folder or a full disk."""
+    """Context that adds the object and the remedy to an OSError, for example to that of a missing folder."""
     try:
         yield
     except OSError as error:
@@ -166,7 +166,7 @@ def on_disk(name: str, allowed: str) -> Iterator[None]:
 
 
 Places = Callable[[str], NDArray[np.float64]]
-"""Function that returns the positions (m, d), m, of places: reference ("X") or current ("x")."""
+"""Function of "X" or "x" that returns the reference or the current positions (n, d), in m, of n places."""
 PLACES = ("X", "x")
 NAMES = ("t", *PLACES)
 PLAIN = (FunctionType, MethodType)
@@ -183,7 +183,7 @@ def _plain(function: Callable) -> bool:
 
 
 def _parameters(function: Callable) -> list[Parameter] | None:
-    """Return the parameters to which arguments are passed; None if they are unknown."""
+    """Return the parameters that receive arguments, or None if the parameters are unknown."""
     try:
         return _known[function]
     except (KeyError, TypeError):  # some objects have no hash
@@ -202,12 +202,12 @@ def _parameters(function: Callable) -> list[Parameter] | None:
 
 
 def takes(function: Callable) -> tuple[str, ...] | None:
-    """Return the arguments of a function, among t, X and x; None if it has other parameters."""
+    """Return which of the arguments t, X and x a function takes, or None if it has other parameters."""
     return _names(function, _parameters(function))
 
 
 def _names(function: Callable, parameters: list[Parameter] | None) -> tuple[str, ...] | None:
-    """Return the arguments of a function with these parameters; see `takes`."""
+    """Return which arguments a function with these parameters takes, see `takes`."""
     if parameters is None or (len(parameters) == 1 and parameters[0].name not in PLACES):
         return ("t",)
     names = tuple([p.name for p in parameters])
@@ -222,7 +222,7 @@ def by_place(value) -> bool:
 
 
 def check_names(what: str, function: Callable, among: Sequence[str]) -> tuple[str, ...]:
-    """Return the arguments of a function, among t, X and x.
+    """Return which of the arguments t, X and x a function takes.
 
     Raises
     ------
@@ -242,7 +242,7 @@ def check_names(what: str, function: Callable, among: Sequence[str]) -> tuple[st
 
 
 def called(function: Callable, values: dict) -> object:
-    """Return the value of a function for the arguments t, X and x in `values`."""
+    """Call a function with its arguments among t, X and x in `values`, and return the result."""
     parameters = _parameters(function)
     if parameters is None:
         return function(values["t"])
@@ -253,7 +253,7 @@ def called(function: Callable, values: dict) -> object:
 
 
 def at_places(what: str, allowed: str, function: Callable, name: str, places: NDArray[np.float64]) -> object:
-    """Return the value of a function of positions.  Its only parameter must have the name `name`, "X" or "x".
+    """Return the value of a function of positions.  The name of its only parameter must be `name`, "X" or "x".
 
     Raises
     ------
@@ -270,9 +270,9 @@ def at_places(what: str, allowed: str, function: Callable, name: str, places: ND
 def given(
     what: str, value, t: float, side: Places | None = None, dim: int = 0, *, among: Sequence[str] = NAMES, number=True
 ) -> NDArray[np.float64]:
-    """Return a value at time t, of shape () or (m,) for m places; if `dim` > 0 also (d,) or (m, d).
+    """Return a value at time t.  Its shape is () or (m,) for m places; if `dim` > 0 it may also be (d,) or (m, d).
 
-    A function of position that returns one vector gives this vector at each place, (m, d).
+    If a function of position returns one vector, the result contains this vector for each place, (m, d).
 
     Parameters
     ----------
@@ -281,18 +281,18 @@ def given(
     t
         Time, s.
     side
-        Function that returns the places; None if there are none.
+        Function that returns positions of places, or None without places.
     dim
-        Number of components of a vector value, 0 if only scalars are allowed.
+        Number of components of a vector value, or 0 if only scalars are allowed.
     among
         Allowed parameter names, among t, X and x.
     number
-        Whether a scalar is allowed if `dim` > 0.
+        Whether a scalar is allowed as well, if `dim` > 0.
 
     Raises
     ------
     ValueError
-        The value is not allowed; the message gives the object, the value and the allowed values.
+        The value is not allowed.  The message names the object, the value and the allowed values.
     """
     one = [*[()] * number, *[(dim,)] * bool(dim)]
     allowed = f"a finite number{f' or {dim} of them' if dim else ''}" if number else f"{dim} finite numbers"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Reader of Abaqus (and CalculiX) input files, which returns a meshio mesh with placed instances, sets and surfaces.
+"""Reader of Abaqus (and CalculiX) input files.  It returns a meshio mesh with placed instances, sets and surfaces.
 
 meshio's reader keeps only the nodes of the last part, and ignores the placement of instances.
 """
@@ -21,7 +21,7 @@ from mpm_dolfinx.bodies.mesh_cells import Block
 PLANE = re.compile(r"(?:(?:C|DC|DCC|EC)?(?:PE|PS|PEG|AX|GAX|2D)|AC(?:2D|AX)|S|STRI|DS|M3D|SFM3D|R3D)(3|4|6|8|9)(?!\d)")
 SOLID = re.compile(r"(?:(?:C|DC|DCC|EC|AC|Q)3D|SC)(4|5|6|8|10|13|15|20|27)(?![\dV])")
 LINE = re.compile(r"(?:T2D|T3D|R2D|RAX|DC1D|AC1D)(2|3)|(?:B|PIPE|SAX)[23]?([123])")
-"""Pattern of the types of line elements.  The first group is the number of nodes, the second the order of a beam."""
+"""Pattern of the types of line elements.  The first group is the number of nodes, the second is the order of a beam."""
 NO_CELL = ("SPRING", "DASHPOT", "MASS", "ROTARY", "CONN", "GAP", "JOINT", "HEATCAP", "DCOUP", "ITS", "DIST", "FRAME")
 """Name prefixes of elements without volume or area."""
 KINDS = {
@@ -45,7 +45,7 @@ MAKES = ("NGEN", "NFILL", "NCOPY", "NMAP", "ELGEN", "ELCOPY", "SYSTEM", "SYMMETR
 
 @dataclass
 class _Set:
-    """A set of elements.  Each entry is (name of an instance or "", element numbers or name of another set)."""
+    """A set of elements.  Each entry has an instance's name or "", and element numbers or the name of another set."""
 
     name: str
     internal: bool
@@ -72,7 +72,7 @@ class _Scope:
 
 @dataclass
 class _Placed:
-    """Definitions of a part with the placement of an instance, or without a placement."""
+    """Definitions of a part, and the placement of one of its instances if there are instances."""
 
     scope: _Scope
     name: str = ""
@@ -80,7 +80,7 @@ class _Placed:
     rotation: tuple[float, ...] = ()
 
     def places(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return positions x (n, 3) after placement: translated, then rotated about an axis."""
+        """Return positions x (n, 3) after placement, that is, after a translation and then a rotation."""
         x = x + self.shift
         if not self.rotation:
             return x
@@ -92,7 +92,7 @@ class _Placed:
 
 
 def is_abaqus(file: Path) -> bool:
-    """Return whether a file is an Abaqus input file: its suffix is `.inp` and it has keywords, unlike AVS files."""
+    """Return whether a file has the suffix `.inp` and Abaqus keywords.  AVS files have this suffix but no keywords."""
     if file.suffix.lower() != ".inp" or not file.is_file():
         return False
     with file.open(errors="replace") as lines:
@@ -138,14 +138,14 @@ def _keyword(file: Path, line: str, rows: list[str]) -> Iterator[tuple[str, dict
 
 
 def _placed(file: Path) -> list[_Placed]:
-    """Return the definitions outside of parts, followed by all instances, or by all parts if no instance exists."""
+    """Return the definitions outside of parts, and then all instances.  Without instances, return all parts instead."""
     whole = _Scope()
     scope = whole
     parts = {}
     instances = []
     for keyword, options, rows in _keywords(file):
         if keyword in MAKES:
-            raise ValueError(f"*{keyword}, must be nodes and elements one by one, as Abaqus/CAE writes them")
+            raise ValueError(f"*{keyword}: the file must list nodes and elements one by one, as files of Abaqus/CAE do")
         if keyword == "PART":
             scope = parts[options["NAME"].upper()] = _Scope(options["NAME"])
         elif keyword == "INSTANCE":
@@ -156,8 +156,8 @@ def _placed(file: Path) -> list[_Placed]:
             scope = deepcopy(of)
             shift, turn = ([float(v) for v in row.split(",") if v.strip()] for row in (*rows, "", "")[:2])
             if len(shift) > 3 or len(turn) not in (0, 7):
-                what = f"*INSTANCE {options['NAME']}: {len(shift)} and {len(turn)} numbers"
-                raise ValueError(f"{what}, must be at most 3 numbers of a translation, and 7 or none of a rotation")
+                what = f"*INSTANCE {options['NAME']}: translation of {len(shift)} and rotation of {len(turn)} numbers"
+                raise ValueError(f"{what}, must be at most 3 for the translation, and 0 or 7 for the rotation")
             instances.append(_Placed(scope, options["NAME"], np.array((*shift, 0.0, 0.0, 0.0)[:3]), tuple(turn)))
         elif keyword in ("END PART", "END INSTANCE"):
             scope = whole
@@ -173,7 +173,7 @@ def _define(scope: _Scope, keyword: str, options: dict[str, str], rows: list[str
     """Add the nodes, elements, sets or surfaces of one keyword to a scope.  Other keywords are ignored."""
     if keyword == "NODE" and rows:
         if options.get("SYSTEM", "R").upper() != "R":
-            raise ValueError(f"*NODE, SYSTEM={options['SYSTEM']}: must be in Cartesian coordinates")
+            raise ValueError(f"*NODE, SYSTEM={options['SYSTEM']}: coordinates must be Cartesian")
         rows = [row.upper().replace("D", "E") + ",0,0,0" for row in rows]  # exponents as in Fortran, 1D3
         x = np.array([[float(v.strip() or 0) for v in row.split(",")[:4]] for row in rows])
         scope.nodes.append((x[:, 0].astype(np.int64), x[:, 1:]))
@@ -262,7 +262,7 @@ def _unique(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return node or element numbers in ascending order, and the permutation that sorts them.
 
-    Raise ValueError for a repeated number.  A node may be repeated at the same position x (n, 3), m.
+    Raise ValueError for a repeated number.  Only a node may be repeated, and only at the same position x (n, 3), in m.
     """
     numbers = np.concatenate([np.empty(0, np.int64), *numbers])
     order = np.argsort(numbers, kind="stable")
@@ -303,7 +303,7 @@ def _groups(placed: list[_Placed], cells: list, numbers: list) -> dict[str, list
 def _members(
     placed: list[_Placed], k: int, key: str, above: tuple[str, ...] = ()
 ) -> list[tuple[int, NDArray[np.int64]]]:
-    """Return arrays of the element numbers in a set, each with the index of its instance or part in `placed`."""
+    """Return pairs for a set: index of an instance or part in `placed`, and the numbers of its elements in the set."""
     out = []
     if key not in placed[k].scope.sets or key in above:
         known = ", ".join(found.name for found in placed[k].scope.sets.values()) or "none"

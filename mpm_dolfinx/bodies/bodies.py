@@ -19,15 +19,15 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Body:
-    """A seeded body: reference geometry of all its particle domains, the same on every process.
+    """A seeded body: the reference geometry of all its particle domains, which is the same on every process.
 
-    Each domain is the image of a box under `map`, see `mapped`.  Subclasses define `spacing`, m: the edge lengths of
-    the boxes (n, d), or (d,) if all boxes are equal; in a `RowsBody`, the smallest edge lengths (d,).  Arrays over all
-    domains are not stored, so that large bodies can be processed in chunks.
+    Each domain is the image of a box under `map`, see `mapped`.  Subclasses define `spacing`: the edge lengths of the
+    boxes, in m.  Its shape is (n, d), or (d,) if all boxes are equal.  In a `RowsBody`, it contains the smallest edge
+    lengths (d,).  Arrays over all domains are not stored, so that large bodies can be processed in chunks.
     """
 
     material: int = 0  # index in the scene's list of materials
-    map: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None  # of the boxes' corners
+    map: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None  # maps corners of the boxes
 
     def __len__(self) -> int:
         raise NotImplementedError
@@ -38,16 +38,16 @@ class Body:
         raise NotImplementedError
 
     def lower_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the lower corners (m, d), m, of the boxes of the chosen domains."""
+        """Return the lower corners (n, d), in m, of the boxes of the chosen domains."""
         raise NotImplementedError
 
     def sides_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return whether the faces (m, d, 2) of the chosen domains lie on the surface of the body."""
+        """Return whether the faces (n, d, 2) of the chosen domains lie on the surface of the body."""
         raise NotImplementedError
 
     @property
     def lower(self) -> NDArray[np.float64]:
-        """Lower corners (n, d), m, of the boxes of all domains."""
+        """Lower corners (n, d), in m, of the boxes of all domains."""
         return self.lower_of(slice(None))
 
     @property
@@ -57,16 +57,16 @@ class Body:
 
     @property
     def centre(self) -> NDArray[np.float64]:
-        """Reference positions (n, d), m, of the centres of all domains."""
+        """Reference positions (n, d), in m, of the centres of all domains."""
         return self.centre_of(slice(None))
 
     def centre_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the reference positions (m, d), m, of the centres of the chosen domains."""
+        """Return the reference positions (n, d), in m, of the centres of the chosen domains."""
         return self.lower_of(chosen) + 0.5 * self.spacing
 
     @cached_property
     def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Lower and upper corner (d,), m, of the bounding box of the body, before the map."""
+        """Lower and upper corners (d,) of the body's bounding box before the map, in m."""
         low, high = np.full((2, self.dim), [[np.inf], [-np.inf]])
         for part in in_chunks(len(self)):
             lower = self.lower_of(part)
@@ -85,54 +85,55 @@ class Body:
         return tuple(SIDES[self.dim])
 
     def named(self, name: str) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the domains (m,) with a face on the side `name`, in ascending order, and the face indices (m,)."""
+        """Return the domains (n,) and face indices (n,) of faces on the side `name`, in ascending order of domains."""
         return self.facing(*SIDES[self.dim][name]) if name in self.names else (np.empty(0, np.int64),) * 2
 
     def facing(self, axis: int, end: int, least: float = 0.0) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return domains (m,) with a surface face at the lower (0) or upper (1) end of an axis, and face indices (m,).
+        """Return domains (n,) and face indices (n,) of the surface faces at the lower (0) or upper (1) end of an axis.
 
-        In unstructured bodies, these are the surface faces whose outward unit normal has its largest component along
-        this direction, if this component exceeds `least`.
+        In unstructured bodies, the outward unit normals of these faces have their largest component towards this end.
+        This component exceeds `least`.
         """
         row = self._with_face(axis, end)
         return row, np.full(len(row), 2 * axis + end)
 
     def _with_face(self, axis: int, end: int) -> NDArray[np.int64]:
-        """Return the domains (m,), in ascending order, whose face at an end of an axis lies on the surface."""
+        """Return the domains (n,), in ascending order, whose face at an end of an axis lies on the surface."""
         rows = [part.start + np.flatnonzero(self.sides_of(part)[:, axis, end]) for part in in_chunks(len(self))]
         return np.concatenate([np.empty(0, np.int64), *rows])
 
     def across(self, axis: int) -> tuple[float, float]:
-        """Return two means over the body: number of domains in a row along an axis, and their edge length, m."""
+        """Return two means over the body: number of domains in a row along an axis, and their edge length in m."""
         return len(self) / max(1, len(self._with_face(axis, 0))), float(self.spacing[axis])
 
     def outer(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the domains (m,) and face indices (m,) of all surface faces, sorted by face index."""
+        """Return the domains (n,) and face indices (n,) of all surface faces, sorted by face index."""
         rows = [self._with_face(axis, end) for axis in range(self.dim) for end in (0, 1)]
         return np.concatenate(rows), np.repeat(np.arange(len(rows)), list(map(len, rows)))
 
     def reference(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
-        """Return the reference positions (m, 2^d, d), m, of the corners of the chosen domains, before the map."""
+        """Return the reference positions (n, 2^d, d), in m, of corners of the chosen domains, before the map."""
         return self.lower_of(chosen)[:, None] + corner_bits(self.dim) * self.spacing
 
     def corners(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
-        """Return the corners (m, 2^d, d), m, of the chosen domains, after the map."""
+        """Return the corners (n, 2^d, d) of the chosen domains after the map, in m."""
         return self.images(self.reference(chosen))
 
     def images(self, X: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the images of reference positions (..., d), m, under the map."""
+        """Return the images (..., d) of reference positions (..., d) under the map, both in m."""
         if self.map is None or not X.size:  # user maps may fail for no positions
             return X
         x = X.reshape(-1, X.shape[-1])
         images = numbers("body: the map", asked("body: the map", "a function of positions", self.map, x), None)
         if images.shape != x.shape:
-            raise ValueError(f"body: the map returns shape {images.shape}, must be {x.shape}, as the positions")
+            raise ValueError(f"body: the map returns shape {images.shape}, must be {x.shape}, that of the positions")
         return images.reshape(X.shape)
 
     def bend(self, chosen: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return for each chosen domain the largest distance (m,), m, between its straight edges and mapped box edges.
+        """Return the distances (n,), in m, of chosen domains' straight edges from the curved images of their box edges.
 
-        Distances are between midpoints of edges.  Edges of two domains on the same curve may differ by this distance.
+        Each domain has the largest distance between midpoints of both kinds of edges.  Straight edges of two domains
+        that follow one curve may be apart by this distance.
         """
         out = np.zeros(len(chosen))
         if self.map is None:
@@ -146,16 +147,16 @@ class Body:
         return out
 
     def boxes(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
-        """Return the edge lengths (m, d), m, of the boxes of the chosen domains, before the map."""
+        """Return the edge lengths (n, d), in m, of the boxes of the chosen domains, before the map."""
         return np.broadcast_to(self.spacing, (len(self), self.dim))[chosen]
 
     @property
     def volume_of_boxes(self) -> float:
-        """Total volume of all boxes, m^d, if these are equal."""
+        """Total volume of all boxes, in m^d.  The boxes must be equal."""
         return float(len(self) * self.spacing.prod())
 
     def size(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
-        """Return the edge lengths (m, d), m, of the boxes, scaled uniformly to the volumes of the chosen domains."""
+        """Return edge lengths (n, d), in m, of chosen domains' boxes, scaled uniformly to the domains' volumes."""
         boxes = self.boxes(chosen)
         if self.aligned:
             return boxes
@@ -189,8 +190,8 @@ class Moving:
 def mapped(grid: Grid, body: Body, map: Callable[[NDArray[np.float64]], NDArray[np.float64]]) -> Body:
     """Return a body deformed by a map: its boxes become quadrilaterals or hexahedra with mapped corners.
 
-    Regions, probes, and X in fields of materials and displacements remain positions before all maps.  Contact, overlap,
-    loads and the check for flat sides use the mapped shape.  Sides keep their names.
+    Regions, probes, and the positions X in functions for materials and displacements refer to the shape before all
+    maps.  Contact, overlap, loads and the check for flat sides use the mapped shape.  Sides keep their names.
 
     Parameters
     ----------
@@ -199,12 +200,12 @@ def mapped(grid: Grid, body: Body, map: Callable[[NDArray[np.float64]], NDArray[
     body
         Body from `box`, `shape`, `from_mesh`, `polygon`, or `mapped`.  An earlier map is applied first.
     map
-        Function from positions (n, d), m, to positions (n, d), m, in the grid; smooth, and preserving orientation.
+        Smooth function from positions (n, d) to positions (n, d) in the grid, both in m.  It preserves orientation.
 
     Raises
     ------
     ValueError
-        The map raises an exception, returns another shape or nan, leads out of the grid, or inverts a box.
+        The map raises an exception, returns nan or an array of a wrong shape, leads out of the grid, or inverts a box.
     """
     begin_with("body: grid", grid)
     instance("body to map", body, Body)
@@ -244,7 +245,7 @@ def check_inside(grid: Grid, body: Body, name: str = "body") -> Body:
 
 
 def pressure_at(pressure: float | Callable[[NDArray], ArrayLike], x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the seeded pore pressure (n,), Pa, at positions x (n, d), m, from a number or a function of position."""
+    """Return the pore pressures (n,), in Pa, that a number or a function of position gives at x (n, d), in m."""
     if callable(pressure) and len(x):
         allowed = f"a finite number, or one for each of {len(x)} places"
         given = at_places("pressure", allowed, pressure, "x", x)
@@ -277,7 +278,7 @@ def material_points(
 
 
 def _own(grid: Grid, body: Body) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the domains (m,) whose centroids lie in cells of this process, and their corners (m, 2^d, d), m."""
+    """Return the domains (n,) whose centroids lie in cells of this process, and their corners (n, 2^d, d), in m."""
     rows, corners = [np.empty(0, dtype=np.int64)], [np.empty((0, 2**grid.dim, grid.dim))]
     for part in in_chunks(len(body)):
         of_part = body.corners(part) - grid.base
@@ -289,7 +290,7 @@ def _own(grid: Grid, body: Body) -> tuple[NDArray[np.int64], NDArray[np.float64]
 
 
 def points_in_cells(grid: Grid, bodies: Sequence[Body]) -> NDArray[np.float64]:
-    """Return the number of seeded points in each cell of the grid (cells,)."""
+    """Return the number (cells,) of seeded points in each cell of the grid."""
     out = np.zeros(int(np.prod(grid.shape)))
     for body in bodies:
         for part in in_chunks(len(body)):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Bodies of boxes on a regular lattice, stored as a few numbers for any number of boxes."""
+"""Bodies of boxes on a regular lattice.  A few numbers describe any number of boxes."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class LatticeBody(Body):
         return len(self.count)
 
     def _index(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the lattice indices (m, d) of the chosen domains."""
+        """Return the lattice indices (n, d) of the chosen domains."""
         if self.filled is not None:
             numbers = self.filled[chosen]
         elif isinstance(chosen, slice):
@@ -45,22 +45,22 @@ class LatticeBody(Body):
         return np.stack(np.unravel_index(numbers, self.count), axis=-1)
 
     def _at(self, index: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the positions (..., d), m, of lattice corners with indices (..., d)."""
+        """Return the positions (..., d), in m, of lattice corners with indices (..., d)."""
         return self.origin + index * self.spacing
 
     def lower_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the lower corners (m, d), m, of the boxes of the chosen domains."""
+        """Return the lower corners (n, d), in m, of the boxes of the chosen domains."""
         return self._at(self._index(chosen))
 
     def reference(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
-        """Return the reference positions (m, 2^d, d), m, of the corners of the chosen domains, before the map.
+        """Return the reference positions (n, 2^d, d), in m, of corners of the chosen domains, before the map.
 
-        Domains have the same digits at a shared corner, so that no gap opens between them far from the origin.
+        Domains have bitwise equal coordinates at a shared corner, so that rounding opens no gaps far from the origin.
         """
         return self._at(self._index(chosen)[:, None] + corner_bits(self.dim))
 
     def sides_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return whether the faces (m, d, 2) of the chosen domains lie on the surface of the body."""
+        """Return whether the faces (n, d, 2) of the chosen domains lie on the surface of the body."""
         index = self._index(chosen)
         out = np.stack([index == 0, index == np.array(self.count) - 1], axis=-1)
         if self.filled is None:
@@ -73,7 +73,7 @@ class LatticeBody(Body):
         return out
 
     def _with_face(self, axis: int, end: int) -> NDArray[np.int64]:
-        """Return the domains (m,), in ascending order, whose face at an end of an axis lies on the surface."""
+        """Return the domains (n,), in ascending order, whose face at an end of an axis lies on the surface."""
         if self.filled is not None:
             return super()._with_face(axis, end)
         along = [np.arange(n) for n in self.count]
@@ -90,68 +90,68 @@ class LatticeBody(Body):
 
     @property
     def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Lower and upper corner (d,), m, of the bounding box of the body, before the map."""
+        """Lower and upper corners (d,) of the body's bounding box before the map, in m."""
         low, high = self._ends
         return self._at(low), self._at(high + 1)
 
     def neighbour(self, rows: NDArray[np.int64], step: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the domains (m,) of the body at lattice steps (m, d) from domains `rows` (m,)."""
+        """Return the domains (n,) of the body that lie at lattice steps (n, d) from the domains `rows` (n,)."""
         number = np.ravel_multi_index(tuple((self._index(rows) + step).T), self.count)
         return number if self.filled is None else np.searchsorted(self.filled, number)
 
     @property
     def lattice(self) -> tuple[int, ...]:
-        """Number of lattice boxes along each axis within the bounding box of the body; some may not be filled."""
+        """Number of lattice boxes along each axis within the body's bounding box.  Some of these boxes may be empty."""
         low, high = self._ends
         return tuple(high - low + 1)
 
     def places(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the lattice indices (m, d) of domains, from the lower corner of the body's bounding box."""
+        """Return the lattice indices (n, d) of domains, counted from the lower corner of the body's bounding box."""
         return self._index(rows) - self._ends[0]
 
     def nodes(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the lexicographic node indices (m, 2^d) of the corners of domains.  Shared corners have one index."""
+        """Return the lexicographic node indices (n, 2^d) of the corners of domains.  Shared corners have one index."""
         corners = self.places(rows)[:, None] + corner_bits(self.dim)
         return np.ravel_multi_index(tuple(np.moveaxis(corners, 2, 0)), tuple(np.add(self.lattice, 1)))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RowsBody(LatticeBody):
-    """A body of boxes on a lattice with rows of different widths; `spacing` (d,), m, are the smallest widths."""
+    """A body of boxes on a lattice with rows of different widths.  `spacing` (d,) has the smallest widths, in m."""
 
     rows: tuple[NDArray[np.float64], ...]  # coordinates of the rows' boundaries along each axis (count + 1,), m
 
     def _at(self, index: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the positions (..., d), m, of lattice corners with indices (..., d)."""
+        """Return the positions (..., d), in m, of lattice corners with indices (..., d)."""
         return np.stack([rows[i] for rows, i in zip(self.rows, np.moveaxis(index, -1, 0), strict=True)], axis=-1)
 
     def boxes(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
-        """Return the edge lengths (m, d), m, of the boxes of the chosen domains, before the map."""
+        """Return the edge lengths (n, d), in m, of the boxes of the chosen domains, before the map."""
         index = self._index(chosen)
         return self._at(index + 1) - self._at(index)
 
     def centre_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the reference positions (m, d), m, of the centres of the chosen domains."""
+        """Return the reference positions (n, d), in m, of the centres of the chosen domains."""
         return self.lower_of(chosen) + 0.5 * self.boxes(chosen)
 
     def across(self, axis: int) -> tuple[float, float]:
-        """Return means over the body: number of domains in a row along an axis, and their edge length along it, m."""
+        """Return two means over the body: number of domains in a row along an axis, and their edge length in m."""
         low, high = self.bounds
         return super().across(axis)[0], float(high[axis] - low[axis]) / self.lattice[axis]
 
     @property
     def volume_of_boxes(self) -> float:
-        """Total volume of all boxes, m^d."""
+        """Total volume of all boxes, in m^d."""
         return sum(float(self.boxes(part).prod(axis=1).sum()) for part in in_chunks(len(self)))
 
     def corner_rows(self, axis: int) -> NDArray[np.float64]:
-        """Return the coordinates (n,), m, of the boundaries of the rows that the body occupies along an axis."""
+        """Return the coordinates (n,), in m, of the boundaries of the rows that the body occupies along an axis."""
         low, high = self._ends
         return self.rows[axis][low[axis] : high[axis] + 2]
 
 
 def _rows(grid: Grid, axis: int, low: float, high: float, per_cell: int) -> NDArray[np.float64]:
-    """Return boundaries of rows from low to high, m: `per_cell` rows in a whole cell, fewer in a part of a cell."""
+    """Return row boundaries from `low` to `high`, in m.  A cell has `per_cell` rows, a part of a cell fewer rows."""
     lines = grid.lines[axis] + grid.base[axis]
     tolerance = SAME * grid.finest[axis]
     ends = np.concatenate([[low], lines[(lines > low + tolerance) & (lines < high - tolerance)], [high]])
@@ -162,12 +162,12 @@ def _rows(grid: Grid, axis: int, low: float, high: float, per_cell: int) -> NDAr
 
 
 def _rounded(rows: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return numbers of rows as integers >= 1, which do not depend on small rounding errors of coordinates."""
+    """Return numbers of rows as integers >= 1.  Small rounding errors of coordinates do not change these integers."""
     return np.maximum(1, np.rint(NEAR * np.rint(rows / NEAR))).astype(np.int64)
 
 
 def _lattice(rows: list[NDArray[np.float64]], **more: Any) -> RowsBody:
-    """Return a body on the lattice with these boundaries of rows along each axis, m."""
+    """Return a body on a lattice.  `rows` are the boundaries of the lattice's rows along each axis, in m."""
     narrowest, count = np.array([np.diff(r).min() for r in rows]), tuple(len(r) - 1 for r in rows)
     return RowsBody(origin=np.array([r[0] for r in rows]), spacing=narrowest, count=count, rows=tuple(rows), **more)
 
@@ -183,15 +183,15 @@ def box(grid: Grid, lower: ArrayLike, upper: ArrayLike, per_cell: int = 2, mater
         Corners of the box, inside the grid; need not lie on grid lines.
     per_cell
         Points per cell and direction, >= 1, rounded to fit the box.  In grids of unequal cells, domains end at grid
-        lines.  With 1 point, bodies deflect too much and creep; a warning names slender ones.  In 3D, scenes refuse
-        bodies with one domain in each cell that end at grid lines.
+        lines.  With 1 point, bodies deflect too much and creep.  A warning names slender bodies.  In 3D, scenes
+        refuse bodies that end at grid lines and have one domain in each cell.
     material
         Index of the material in the scene's list, >= 0.
 
     Raises
     ------
     ValueError
-        A corner outside the grid, `upper` not above `lower`, or an invalid `per_cell` or `material`.
+        A corner is outside the grid, `upper` is not above `lower`, or `per_cell` or `material` is invalid.
     """
     begin_with("body: grid", grid)
     lower, upper = (
@@ -212,16 +212,17 @@ def box(grid: Grid, lower: ArrayLike, upper: ArrayLike, per_cell: int = 2, mater
 def shape(
     grid: Grid, inside: Callable[[NDArray[np.float64]], NDArray[np.bool_]], per_cell: int = 2, material: int = 0
 ) -> Body:
-    """Seed a body from a lattice over the whole grid: all domains with centres inside a shape; return the body.
+    """Seed a body from a lattice over the whole grid, and return it.
 
-    The surface of the body has steps of the size of a domain.  `mapped` gives smooth sides.
+    The body consists of all domains of the lattice with centres inside a shape.  Its surface has steps of the size of a
+    domain.  `mapped` gives smooth sides.
 
     Parameters
     ----------
     grid
         Background grid.
     inside
-        Function from positions (n, d), m, to booleans (n,).
+        Function from positions (n, d), in m, to booleans (n,).
     per_cell
         Points per cell and direction, >= 1.
     material

@@ -35,15 +35,15 @@ TANGENTIAL = {d: np.array([[a for a in range(d) if a != axis] for axis in range(
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Faces of particle domains on one side of the bodies, the same on every process; arrays over m rows.
+    """Faces of particle domains on one side of the bodies, which are the same on every process.
 
-    The free part of a face is the part that touches no other body.  It is divided into polygons of up to four corners;
-    each polygon has a row.
+    The free part of a face is the part that touches no other body.  It is divided into polygons of up to four corners.
+    Arrays have m rows, one for each polygon.
     """
 
     id: NDArray[np.int64]  # identifier of the material point (m,), ascending
     face: NDArray[np.int64]  # index of the face in its domain (m,), see `grid.FACES`
-    # corners of the free part in local coordinates of the domain in [-1, 1] (m, 2^(d-1), d); triangles repeat the last
+    # corners (m, 2^(d-1), d) of the polygon, in local coordinates of the domain from -1 to 1; triangles repeat the last
     xi: NDArray[np.float64]
     domain: NDArray[np.float64]  # seeded corners of the domain, after all maps (m, 2^d, d), m
     before: NDArray[np.float64]  # reference positions of the domain's corners, before all maps (m, 2^d, d), m
@@ -53,7 +53,7 @@ class Surface:
         return len(self.id)
 
     def off_axis(self) -> Surface:
-        """Return the surface without faces that lie on the axis of revolution, which have no area."""
+        """Return the surface without the faces on the axis of revolution.  They have no area."""
         off = self.places()[:, :, 0].max(axis=1, initial=0.0) > SAME * self.whole0
         if off.all():
             return self
@@ -62,17 +62,17 @@ class Surface:
 
     @cached_property
     def outward(self) -> NDArray[np.float64]:
-        """Seeded outward area vectors (m, d), m^(d-1), of the whole faces."""
+        """Seeded outward area vectors (m, d), in m^(d-1), of the whole faces."""
         return face_vectors(self.domain, self.face)
 
     @cached_property
     def whole0(self) -> NDArray[np.float64]:
-        """Seeded areas (m,), m^(d-1), of the whole faces."""
+        """Seeded areas (m,), in m^(d-1), of the whole faces."""
         return np.linalg.norm(self.outward, axis=1)
 
     @cached_property
     def area0(self) -> NDArray[np.float64]:
-        """Seeded areas (m,), m^(d-1), of the polygons."""
+        """Seeded areas (m,), in m^(d-1), of the polygons."""
         x = self.places()
         if x.shape[2] == 2:
             return np.linalg.norm(x[:, 1] - x[:, 0], axis=1)
@@ -91,18 +91,18 @@ class Surface:
         return interpolate(domain, self.xi.reshape(-1, self.xi.shape[2])).reshape(self.xi.shape)
 
     def reference(self, at: NDArray[np.int64], xi: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the reference positions (n, d), m, at local coordinates xi (n, d) of the domains in rows `at` (n,)."""
+        """Return the reference positions (n, d), in m, at local coordinates xi (n, d) of domains in rows `at` (n,)."""
         return np.clip(interpolate(self.before[at], xi), *self.region)
 
     @cached_property
     def corners(self) -> NDArray[np.float64]:
-        """Reference positions (m, 2^(d-1), d), m, of the corners of the polygons."""
+        """Reference positions (m, 2^(d-1), d), in m, of the corners of the polygons."""
         at = np.repeat(np.arange(len(self)), self.xi.shape[1])
         return self.reference(at, self.xi.reshape(len(at), self.xi.shape[2])).reshape(self.xi.shape)
 
     @property
     def X(self) -> NDArray[np.float64]:
-        """Bounding boxes (m, 2, d), m, of the reference positions of the polygons."""
+        """Bounding boxes (m, 2, d), in m, of the reference positions of the polygons."""
         return np.stack([self.corners.min(axis=1), self.corners.max(axis=1)], axis=1)
 
     def check_apart(self, others: Surface, conditions: tuple[Any, Any]) -> None:
@@ -124,9 +124,9 @@ Region = tuple[ArrayLike, ArrayLike]
 
 
 def limits(region: Region | None, dim: int) -> NDArray[np.float64]:
-    """Return the lower and upper corner (2, d), m, of a region; infinite if there is no region.
+    """Return the lower and upper corners (2, d) of a region, in m.  They are infinite if there is no region.
 
-    Equal regions give equal bytes (`tobytes`), which serve as a key.
+    Equal regions give equal bytes (`tobytes`), so that these bytes can be used as a key.
     """
     if region is None:
         return np.repeat([[-np.inf], [np.inf]], dim, axis=1)
@@ -140,7 +140,7 @@ def surface(
 ) -> Surface:
     """Return the faces on a side of the active bodies, without the parts that touch other bodies.
 
-    Contact is determined for the seeded bodies, after their maps.  Contact is permanent, because touching bodies stick.
+    Contact between bodies is determined from their seeded shapes after the maps.  Touching bodies stick permanently.
 
     Parameters
     ----------
@@ -183,7 +183,7 @@ def joined(surfaces: Sequence[Surface]) -> Surface:
 
 
 def _face_corners(body: Body, row: NDArray[np.int64], face: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return the reference positions (m, 2^(d-1), d), m, of the corners of faces."""
+    """Return the reference positions (n, 2^(d-1), d), in m, of the corners of faces."""
     return np.take_along_axis(body.reference(row), FACES[body.dim][face][:, :, None], axis=1)
 
 
@@ -209,9 +209,10 @@ def _limited(
     t: NDArray[np.float64],
     region: NDArray[np.float64],
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Limit parts of faces to a region; return for each limited part its face (m,), and corners xi as in `Surface`.
+    """Limit n parts of k faces to a region.  Return the face (m,) and the corners xi of each limited part.
 
-    `row` and `face` (k,) are domains and face indices.  Part i of n lies on face `part[i]`, with corners t[i] (4, 2).
+    `row` and `face` (k,) are domains and indices of the faces.  `part` (n,) is the face of each part, and `t` (n, 4, 2)
+    are the part's corners in face coordinates.  For xi see `Surface`.
     """
     dim, three = body.dim, (t[:, 2] == t[:, 3]).all(axis=1)
     X = _face_corners(body, row[part], face[part])
@@ -239,15 +240,15 @@ def _limited(
 
 
 def _along_axes(X: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return whether faces with corners X (n, 4, 3), m, are rectangles with edges along the axes."""
+    """Return whether faces with corners X (n, 4, 3), in m, are rectangles with edges along the axes."""
     edges = X[:, [1, 2, 3, 3]] - X[:, [0, 0, 2, 1]]
     return ((np.abs(edges) > rounding(X)).sum(axis=2) == 1).all(axis=1)
 
 
 def _interval(X: NDArray[np.float64], region: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the lower and upper bounds (n, 2) of the parts of faces in a region, in the coordinates of the faces.
+    """Return the lower and upper face coordinates (n, 2) that bound the part of each face inside a region.
 
-    X (n, 2^(d-1), d), m, are reference corners of edges, or of rectangles with edges along the axes.
+    X (n, 2^(d-1), d), in m, are reference corners of edges, or of rectangles with edges along the axes.
     """
     low, high = np.zeros((len(X), 2)), np.ones((len(X), 2))
     for k in range(X.shape[2] - 1):
@@ -262,9 +263,9 @@ def _interval(X: NDArray[np.float64], region: NDArray[np.float64]) -> tuple[NDAr
 def _clipped(
     X: NDArray[np.float64], t: NDArray[np.float64], region: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Clip parts t (n, 4, 2) of faces X (n, 4, 3) to a region; return triangles, and for each the index of its part."""
+    """Clip parts t (n, 4, 2) of faces X (n, 4, 3) to a region.  Return triangles, and the part of each triangle."""
     places = np.einsum("npk,nkd->npd", weights(t.reshape(-1, 2)).reshape(*t.shape[:2], 4), X)
-    three = (t[:, 2] == t[:, 3]).all(axis=1)[:, None]  # in triangles, a corner serves as the middle
+    three = (t[:, 2] == t[:, 3]).all(axis=1)[:, None]  # in triangles, the middle is a corner
     middle = np.where(three, places[:, 2], places.mean(axis=1))
     places = np.concatenate([places, middle[:, None]], axis=1)
     s = np.concatenate([places[:, list(triangle)].transpose(1, 2, 0) for triangle in ABOUT_MIDDLE], axis=2)
@@ -278,7 +279,7 @@ def _clipped(
 
 
 def _free(own: Faces, others: Sequence[Faces]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the parts of faces that touch no other body: their faces (n,), and corners (n, 4, 2) in face coordinates.
+    """Return the face (n,) and corners (n, 4, 2), in face coordinates, of n parts of faces that touch no other body.
 
     A part is a rectangle if the edges of its face are parallel to the edges of all covering faces.  Otherwise it is a
     triangle with a repeated last corner.
@@ -307,7 +308,7 @@ def interpolate(corners: NDArray[np.float64], xi: NDArray[np.float64]) -> NDArra
 def on_face(
     corners: NDArray[np.float64], face: NDArray[np.int64], x: NDArray[np.float64], xi: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return xi (n, 3) with new tangential components: those of positions x (n, 3), m, projected onto faces."""
+    """Return xi (n, 3) with the tangential components of positions x (n, 3), in m, that are projected onto faces."""
     quads = np.take_along_axis(corners, FACES[3][face][:, :, None], axis=1)
     normal = face_vectors(corners, face)
     t, _ = local(quads, x[:, None], normal)

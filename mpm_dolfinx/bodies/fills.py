@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Placement of bodies that are added in a later stage (fills) onto the displaced surface of their neighbours."""
+"""Placement of fills onto the displaced surface of their neighbours.  Fills are bodies added in a later stage."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ INSIDE = 0.05  # fraction of a domain's shortest edge; deeper penetration into a
 
 @dataclass
 class Contact:
-    """Contact between a side of a seeded fill and a body; n pairs of faces."""
+    """Contact between a side of a seeded fill and a body.  It consists of n pairs of faces."""
 
     side: tuple[int, int]  # (axis, end) of the fill
     own: Faces  # faces of the fill on this side
@@ -38,23 +38,23 @@ class Contact:
     moved: NDArray[np.float64]  # displacement of the corners of the body's faces since seeding (n, 4, d), m
 
     def area(self) -> float:
-        """Return the contact area, m^(d-1)."""
+        """Return the contact area, in m^(d-1)."""
         return float(covered(len(self.own.row), self.cover) @ np.linalg.norm(self.own.outward, axis=1))
 
     def corners(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the domains (n, 1) of the fill, and the corner indices (n, 4) of the paired faces."""
+        """Return the domains (n, 1) of the fill's paired faces, and the corner indices (n, 4) of these faces."""
         face = self.cover.face
         return self.own.row[face][:, None], self.own.index[face]
 
     def given(self) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
-        """Return which corners (n, 4) of the fill lie on paired faces, and the body's displacement there (n, 4, d)."""
+        """Return which corners (n, 4) of the fill's faces touch the body, and displacements of the body there (m)."""
         face, by = self.cover.face, self.cover.by
         s, _ = local(self.other.corners[by], self.own.corners[face], self.other.outward[by])
         on = np.abs(s - 0.5).max(axis=2) <= 0.5 + np.maximum(self.cover.slack, SAME)[:, None]
         return on, weights(np.clip(s, 0, 1).reshape(-1, 2)).reshape(*s.shape[:2], 4) @ self.moved
 
     def misfit(self, u: NDArray[np.float64]) -> float:
-        """Return the largest distance, m, between the body's corners and the fill, whose corners have moved by u."""
+        """Return the largest distance, in m, of the body's corners from the fill after displacements u of the fill."""
         on = (np.abs(self.cover.t - 0.5) <= 0.5).all(axis=2)
         share = weights(np.clip(self.cover.t, 0, 1).reshape(-1, 2)).reshape(*on.shape, 4)
         off = share @ u[self.corners()] - self.moved
@@ -73,8 +73,8 @@ def put(
     """Return the material points of a fill, placed onto the active bodies.
 
     Sides of the fill that touched a neighbour when seeded follow the neighbour's displacement.  The side opposite to
-    the largest contact stays where it was seeded.  Displacements in between are interpolated.  The fill has zero
-    velocity; its domains have the volumes of the displaced shape.
+    the largest contact stays where it was seeded.  Displacements between these sides are interpolated.  The fill has no
+    velocity.  The initial volumes of its domains belong to the displaced shape.
 
     Parameters
     ----------
@@ -140,7 +140,7 @@ def _contacts(grid: Grid, bodies: Sequence[Body], other: int, fill: Body, points
 
 
 def _follow(grid: Grid, body: Body, corners: NDArray[np.float64], contacts: Sequence[Contact]) -> NDArray[np.float64]:
-    """Return the displacements (n, 2^d, d), m, of the corners of a fill whose touching sides follow the neighbours."""
+    """Return the displacements (n, 2^d, d), in m, of a fill's corners.  Touching sides follow the neighbours."""
     number = body.nodes(np.arange(len(body)))
     nodes, node = np.unique(number, return_inverse=True)
     node = node.reshape(number.shape)
@@ -177,14 +177,14 @@ def _springs(body: Body, node: NDArray[np.int64], count: int) -> csr_array:
 
 
 def _between(K: csr_array, fixed: NDArray[np.bool_], u: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the displacements (n,) along an axis: u at fixed nodes, elsewhere from equilibrium with stiffness K."""
+    """Return displacements (n,) along an axis: u at fixed nodes, equilibrium of springs K at all other nodes."""
     out, free = u.copy(), np.flatnonzero(~fixed)
     if len(free):
         held = np.flatnonzero(fixed)
         rows = K[free]
         A = rows[:, free].tocsr()
         csr = (A.indptr.astype(PETSc.IntType), A.indices.astype(PETSc.IntType), A.data)
-        matrix = PETSc.Mat().createAIJ(A.shape, csr=csr, comm=MPI.COMM_SELF)  # every process reads the whole fill
+        matrix = PETSc.Mat().createAIJ(A.shape, csr=csr, comm=MPI.COMM_SELF)  # every process solves for the whole fill
         solver = PETSc.KSP().create(MPI.COMM_SELF)
         solver.setErrorIfNotConverged(True)
         solver.setOperators(matrix)
@@ -221,7 +221,7 @@ def _check_shape(grid: Grid, fill: int, corners: NDArray, u: NDArray) -> None:
 def _penetration(
     grid: Grid, bodies: Sequence[Body], other: int, corners: NDArray, points: MaterialPoints, misfit: float
 ) -> tuple[float, float, NDArray[np.float64]]:
-    """Return a body's penetration depth into the fill, m, their gap divided by the cell size, and the position (d,), m.
+    """Return how deep a body penetrates the fill, in m, the gap between both in cells, and the position (d,), in m.
 
     At least one of depth and gap is zero.
     """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Reader of gmsh files of format 4.1, which returns a meshio mesh with all physical groups of each entity.
+"""Reader of gmsh files of format 4.1.  It returns a meshio mesh with all physical groups of each entity.
 
 meshio's reader keeps only the first group of an entity, and fails for entities without a group.
 """
@@ -25,7 +25,7 @@ TYPES = {
     **{12: ("hexahedron27", 27), 13: ("wedge18", 18), 14: ("pyramid14", 14), 15: ("vertex", 1), 16: ("quad8", 8)},
     **{17: ("hexahedron20", 20), 18: ("wedge15", 15), 19: ("pyramid13", 13)},
 }
-"""meshio's name and number of nodes of each gmsh element type.  Nodes of an element remain in gmsh's sequence."""
+"""Name in meshio and number of nodes of each gmsh element type.  Nodes of an element remain in gmsh's sequence."""
 
 
 class _Numbers:
@@ -36,7 +36,7 @@ class _Numbers:
         self._bytes, self._words = BytesIO(section), iter(() if binary else section.split())
 
     def take(self, count: int, kind: str = "i") -> NDArray:
-        """Return the next `count` numbers of a type: "i" int, "u" size_t, "d" double."""
+        """Return the next `count` numbers.  `kind` is "i" for the type int, "u" for size_t, "d" for double."""
         dtype, out = np.dtype({"i": "<i4", "u": "<u8", "d": "<f8"}[kind]), float if kind == "d" else np.int64
         if self._binary:
             return np.frombuffer(self._bytes.read(count * dtype.itemsize), dtype).astype(out)
@@ -53,17 +53,17 @@ def version(file: Path) -> str:
 
 
 def read(file: Path) -> meshio.Mesh:
-    """Return the mesh of a file of format 4.1, with `cell_sets` by tag of the physical group, `field_data` by name."""
+    """Return the mesh of a file of format 4.1.  `cell_sets` has physical groups by tag, `field_data` by name."""
     data = file.read_bytes()
     _, kind, size = _section(data, "MeshFormat").split()[:3]
     binary = kind == b"1"
     if binary and b"\n\x01\0\0\0" not in _section(data, "MeshFormat"):
-        raise ValueError("binary file of another byte order, must be that of this machine")
+        raise ValueError("the byte order of the binary file is not that of this machine, must be the same")
     if binary and size != b"8":
-        raise ValueError(f"binary file with numbers of {size.decode()} bytes, must be of 8")
+        raise ValueError(f"the binary file has numbers of {size.decode()} bytes, must be 8")
     groups = dict(_groups(_Numbers(_section(data, "Entities"), binary))) if b"$Entities" in data else {}
     if b"$PartitionedEntities" in data:
-        raise ValueError("partitioned mesh, must be whole: gmsh writes it with Mesh.PartitionCreateTopology = 0")
+        raise ValueError("the mesh is partitioned, must be whole; set Mesh.PartitionCreateTopology = 0 in gmsh")
     numbers, x = _nodes(_Numbers(_section(data, "Nodes"), binary))
     order = np.argsort(numbers)
     cells, of = [], []
@@ -92,7 +92,7 @@ def _section(data: bytes, name: str) -> bytes:
 
 
 def _names(data: bytes) -> dict[str, NDArray[np.int64]]:
-    """Return (tag, dimension) of the physical groups with each name, as an array (k, 2)."""
+    """Return for each name an array (k, 2) with tag and dimension of the k physical groups of this name."""
     out: dict[str, list[tuple[int, int]]] = {}
     if b"$PhysicalNames" in data:
         for line in _section(data, "PhysicalNames").decode(errors="replace").splitlines()[1:]:
@@ -115,7 +115,7 @@ def _groups(numbers: _Numbers) -> Iterator[tuple[tuple[int, int], list[int]]]:
 
 
 def _nodes(numbers: _Numbers) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the tags (n,) and positions (n, 3), m, of the nodes."""
+    """Return the tags (n,) and positions (n, 3), in m, of the nodes."""
     tags, x = [np.empty(0, np.int64)], [np.empty((0, 3))]
     for _ in range(numbers.take(4, "u")[0]):
         dim, _, parametric = numbers.take(3)
@@ -131,6 +131,6 @@ def _elements(numbers: _Numbers) -> Iterator[tuple[int, int, str, NDArray[np.int
     for _ in range(numbers.take(4, "u")[0]):
         dim, entity, kind = map(int, numbers.take(3))
         if kind not in TYPES:
-            raise ValueError(f"elements of gmsh's type {kind}, must be of first or second order")
+            raise ValueError(f"elements have gmsh's type {kind}, must be of first or second order")
         (name, width), count = TYPES[kind], int(numbers.take(1, "u")[0])
         yield dim, entity, name, numbers.take(count * (1 + width), "u").reshape(count, 1 + width)[:, 1:]

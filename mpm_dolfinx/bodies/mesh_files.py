@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Bodies from meshes: files and objects of meshio, meshes of dolfinx with tags."""
+"""Bodies from mesh files, from mesh objects of meshio, and from dolfinx meshes with tags."""
 
 from __future__ import annotations
 
@@ -46,42 +46,43 @@ def from_mesh(
     per_cell: int = 2,
     material: int = 0,
 ) -> MeshBody:
-    """Seed a body from a mesh whose cells become particle domains; return the body.
+    """Seed a body from a mesh whose cells become particle domains, and return the body.
 
-    Sides have the names of the mesh's facets: gmsh's physical groups of lines in 2D and surfaces in 3D, Abaqus
-    surfaces, or facet tags.  Bodies from several parts of a mesh share the faces between the parts.  Shared faces are
-    no surface while both bodies are active.  Vertices of the mesh are reference positions.  The points form no lattice,
-    so the filter of short waves does not act.  On several processes the first one reads the mesh, and each machine has
-    a copy of the domains in a temporary file.
+    Sides have the names of groups of the mesh's facets.  Such groups are Abaqus surfaces, facet tags, or gmsh's
+    physical groups of lines (in 2D) or surfaces (in 3D).  Bodies from two parts of a mesh share the faces between the
+    parts.  Shared faces are no surface while both bodies are active.  Vertices of the mesh are reference positions.
+    The points form no lattice, so the filter of short waves does not act.  If there are several processes, the first
+    process reads the mesh, and each machine has a copy of the domains in a temporary file.
 
     Parameters
     ----------
     grid
         Background grid.
     mesh
-        A file that meshio reads, an Abaqus input file, a meshio mesh or a dolfinx mesh: triangles and quadrilaterals in
-        2D; tetrahedra, hexahedra, wedges and pyramids in 3D.  Second-order cells are reduced to their corners, with a
-        warning that gives the distance of edge nodes from edge midpoints.  2D cells must lie in a plane of equal z.
-        A dolfinx mesh may be distributed over the processes of the grid.
+        A file that meshio reads, an Abaqus input file, a meshio mesh or a dolfinx mesh.  Cells are triangles and
+        quadrilaterals in 2D, and tetrahedra, hexahedra, wedges and pyramids in 3D.  Second-order cells are reduced to
+        their corners.  A warning then gives the distance of edge nodes from edge midpoints.  2D cells must lie in a
+        plane of equal z.  A dolfinx mesh may be distributed over the processes of the grid.
     part
-        Group of cells, by default all cells: a physical group, an Abaqus part, instance or set, or a tag in data such
-        as "MaterialIDs".
+        Name of a group of cells; by default the body has all cells.  A group is a physical group, an Abaqus part,
+        instance or set, or a tag in cell data such as "MaterialIDs".
     cell_tags, facet_tags
         Tags of a dolfinx mesh.  For a file, `cell_tags` is the name of the cell data with the tags of parts and sides.
     names
         Tags by name, such as {"top": 3}.  A tag without a name is named by its digits, such as "3".
     per_cell
-        Desired points per grid cell and direction, >= 1.  Domains with an edge above 1.5 / per_cell cells are divided.
+        Desired points per grid cell and direction, >= 1.  Domains with an edge longer than 1.5 / `per_cell` times the
+        cell size are divided.
     material
         Index of the material in the scene's list, >= 0.
 
     Raises
     ------
     ValueError
-        A missing or unreadable file; another kind of mesh; an unknown part.  Cells that are flat, inverted, non-convex,
-        repeated or overlapping; vertices outside the grid; hanging or duplicate nodes.
+        The file is missing or unreadable, the kind of mesh is not supported, or the part is unknown.  Cells are flat,
+        inverted, non-convex, repeated or overlapping.  Vertices are outside the grid.  Nodes are hanging or duplicate.
     OSError
-        On several processes: a temporary file cannot be written.
+        A temporary file cannot be written.  Such files are used only on several processes.
     """
     import meshio
 
@@ -117,7 +118,7 @@ def _file(file: Path) -> meshio.Mesh:
 
 
 def _of_meshio(grid: Grid, mesh: meshio.Mesh | Path, names: Mapping[str, int], tags: str | None, name: str) -> Mesh:
-    """Convert a meshio mesh, or a file.  `tags` is the name of the cell data with the tags of parts and sides."""
+    """Convert a meshio mesh or a mesh file.  `tags` is the name of the cell data with the tags of parts and sides."""
     from mpm_dolfinx.bodies import mesh_readers
 
     if isinstance(mesh, Path):
@@ -162,12 +163,12 @@ def _of_meshio(grid: Grid, mesh: meshio.Mesh | Path, names: Mapping[str, int], t
 
 
 def _positions(dim: int, points: Any) -> NDArray[np.float64]:
-    """Return the positions (n, 2 or 3), m, of the vertices of a mesh."""
+    """Return the positions (n, 2 or 3), in m, of the vertices of a mesh."""
     x = np.asarray(points, dtype=float)
     if not len(x):
         raise ValueError("mesh: has no vertices, must have cells to fill a body")
     if x.ndim != 2 or not dim <= x.shape[1] <= 3:
-        raise ValueError(f"mesh: vertices of shape {x.shape}, must have the grid's {dim} coordinates")
+        raise ValueError(f"mesh: vertices have shape {x.shape}, must have the grid's {dim} coordinates")
     return x
 
 
@@ -193,7 +194,7 @@ def _check_nodes(rows: NDArray[np.int64], count: int) -> None:
 
 
 def _edge_node_distance(x: NDArray[np.float64], rows: NDArray[np.int64], kind: str) -> float:
-    """Return the largest distance, m, between the edge nodes of second-order cells and the midpoints of edges.
+    """Return the largest distance, in m, between the edge nodes of second-order cells and the midpoints of edges.
 
     Edge nodes follow the vertices in the row of a cell, in an order that depends on the format.
     """
@@ -206,7 +207,7 @@ def _edge_node_distance(x: NDArray[np.float64], rows: NDArray[np.int64], kind: s
 
 
 def _warn_curved(name: str, count: int, off: float) -> None:
-    """Warn on one process about second-order cells, which are reduced to their corners."""
+    """Warn on one process that second-order cells are reduced to their corners."""
     what = "%s: %d cells are of second order; only their corners are used, with straight edges; edge nodes lie "
     warn(MPI.COMM_SELF, ResolutionWarning, what + "up to %.2g m off the midpoints", name, count, off)
 
@@ -214,7 +215,7 @@ def _warn_curved(name: str, count: int, off: float) -> None:
 def _merged(
     cells: dict[str, NDArray[np.int64]], parts: dict[str, dict[str, NDArray[np.int64]]]
 ) -> tuple[dict[str, NDArray[np.int64]], dict[str, dict[str, NDArray[np.int64]]]]:
-    """Remove repetitions of cells that belong to several parts; return the cells and their indices by part.
+    """Remove repetitions of cells that belong to several parts.  Return the cells, and their indices for each part.
 
     gmsh's format 2.2 repeats a cell for each of its physical groups.
     """
@@ -244,7 +245,7 @@ def _groups(
     names: Mapping[str, int],
     tags: str | None,
 ) -> Iterator[tuple[str, NDArray[np.bool_]]]:
-    """Yield the names of groups, and which cells (count,) of a meshio block belong to each."""
+    """Yield the name of each group of cells, and which cells (count,) of a meshio block belong to it."""
     known = {name: int(tag) for name, (tag, d) in _pairs(mesh.field_data) if int(d) == dim} | dict(names)
     families = getattr(mesh, "cell_tags", None) or {}  # in MED files: names of groups for each number
     for key in (tags,) if tags is not None else TAGS:
@@ -267,7 +268,7 @@ def _groups(
 
 
 def _pairs(field_data: Mapping[str, Any]) -> Iterator[tuple[str, NDArray]]:
-    """Yield gmsh's physical groups as (name, (tag, dimension)); several groups may have the same name."""
+    """Yield gmsh's physical groups as (name, (tag, dimension)).  Several groups may have one name."""
     for name, value in field_data.items():
         if np.shape(value)[-1:] == (2,):
             for pair in np.reshape(value, (-1, 2)):
@@ -275,7 +276,7 @@ def _pairs(field_data: Mapping[str, Any]) -> Iterator[tuple[str, NDArray]]:
 
 
 def _numbers(names: Mapping[str, int] | None) -> Mapping[str, int]:
-    """Return the user's tags by name; empty if there are none."""
+    """Return the user's tags by name, or an empty mapping without tags."""
     whole = (int, np.integer)
     if names is not None and not (
         isinstance(names, Mapping) and all(isinstance(k, str) and isinstance(v, whole) for k, v in names.items())
@@ -302,14 +303,14 @@ def _plane(dim: int, x: NDArray[np.float64], cells: Mapping[str, NDArray[np.int6
         raise ValueError(f"mesh: vertex {invalid} is at {x[invalid]}, must be at finite coordinates")
     if len(used) and x.shape[1] > dim and np.ptp(x[used, 2]) > NEAR * np.ptp(x[used, :2], axis=0).max():
         low, high = x[used, 2].min(), x[used, 2].max()
-        raise ValueError(f"mesh: a surface in space, z from {low:.3g} to {high:.3g}, must be flat in 2D, with equal z")
+        raise ValueError(f"mesh: cells have z from {low:.3g} to {high:.3g}, must lie in a plane of equal z in 2D")
     return x[:, :dim]
 
 
 def _of_dolfinx(grid: Grid, mesh, cell_tags, facet_tags, names: Mapping[str, int]) -> Callable[[], Mesh]:
-    """Gather a dolfinx mesh on rank 0; return a function that converts it there.
+    """Gather a dolfinx mesh on rank 0.  Return a function that converts the mesh on this rank.
 
-    Cells are sorted by position, so any partition of the mesh gives the same result.
+    Cells are sorted by position, so the result does not depend on the partition of the mesh.
     """
     dim = grid.dim
     topology = mesh.topology
@@ -324,8 +325,8 @@ def _of_dolfinx(grid: Grid, mesh, cell_tags, facet_tags, names: Mapping[str, int
     dofs = _compat.geometry_dofs(mesh)[:owned]
     vertices, orders = KINDS[dim][kind], OF_DOLFINX[dim][kind]
     if dofs.shape[1] not in (vertices, orders):
-        what = f"must have {vertices} or {orders}, for first or second order"
-        raise ValueError(f"mesh: cells of {dofs.shape[1]} nodes, {what}")
+        what = f"must have {vertices} for first order or {orders} for second order"
+        raise ValueError(f"mesh: cells have {dofs.shape[1]} nodes, {what}")
     curved, off = dofs.shape[1] != vertices, 0.0
     if curved:
         off = _edge_node_distance(mesh.geometry.x, _as_meshio(dofs, kind), kind)
@@ -342,8 +343,9 @@ def _of_dolfinx(grid: Grid, mesh, cell_tags, facet_tags, names: Mapping[str, int
 def _of_rows(dim: int, kind: str, rows: list[tuple], curved: bool, names: Mapping[str, int]) -> Mesh:
     """Convert a dolfinx mesh.
 
-    rows: from each process, node indices and positions, nodes of cells, tags of cells and facets, and distance of edge
-    nodes from edge midpoints, m; curved: whether cells are of second order.
+    `rows`: from each process, indices of nodes, positions of nodes, nodes of cells, tags of cells, tags of facets, and
+    distance of edge nodes from edge midpoints, in m.
+    `curved`: whether cells are of second order.
     """
     number, x, cells, tag, side, off = map(np.concatenate, zip(*rows, strict=True))
     if curved:
@@ -368,7 +370,7 @@ def _as_meshio(nodes: NDArray[np.int32], kind: str) -> NDArray[np.int32]:
 
 
 def _tag_of(tags, entities: NDArray[np.int32]) -> NDArray[np.int64]:
-    """Return the tags of entities on this process; 0 for entities without a tag."""
+    """Return the tags of entities on this process.  Entities without a tag have 0."""
     found = np.zeros(entities.shape, dtype=np.int64)
     if tags is not None and len(tags.indices):
         at = np.minimum(np.searchsorted(tags.indices, entities), len(tags.indices) - 1)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Mesh files through meshio, with corrections or errors for data that its readers silently lose or misplace."""
+"""Mesh files are read by meshio.  Data that meshio silently loses or misplaces are corrected, or cause an error."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from mpm_dolfinx.bodies import abaqus_files, gmsh_files
 
 
 def read(file: Path) -> meshio.Mesh:
-    """Return the mesh of a file.  Known errors of meshio are corrected, or raise ValueError."""
+    """Return the mesh of a file.  Known errors of meshio are corrected, or cause ValueError."""
     if abaqus_files.is_abaqus(file):
         return abaqus_files.read(file)
     version = gmsh_files.version(file) if file.suffix.lower() == ".msh" else ""
     if version in ("4", "4.1"):
         return gmsh_files.read(file)
     if version == "4.0":
-        raise ValueError("gmsh's format 4.0, must be 2.2 or 4.1, for example by gmsh -0 -format msh41")
+        raise ValueError("gmsh's format 4.0, must be 2.2 or 4.1; gmsh -0 -format msh41 converts the file")
     mesh = _bulk(file) if file.suffix.lower() in (".bdf", ".nas", ".fem") else meshio.read(file)
     _check_pieces(file, mesh)
     return mesh
 
 
 def _bulk(file: Path) -> meshio.Mesh:
-    """Return the mesh of a Nastran file.  Add the header that meshio needs, because files of gmsh lack it."""
+    """Return the mesh of a Nastran file.  meshio needs a header, which is added if it is missing."""
     text = file.read_text(errors="replace")
     if re.search(r"^BEGIN\s+BULK", text, re.MULTILINE | re.IGNORECASE):
         return meshio.read(file, "nastran")
@@ -45,18 +45,18 @@ def _check_pieces(file: Path, mesh: meshio.Mesh) -> None:
     counts = re.findall(rb"<Piece\b[^>]*NumberOfCells\s*=\s*[\"'](\d+)", file.read_bytes())
     read, whole = sum(len(block.data) for block in mesh.cells), sum(map(int, counts))
     if len(counts) > 1 and read != whole:
-        raise ValueError(f"{len(counts)} pieces with {whole} cells, but meshio reads {read}; must be one piece")
+        raise ValueError(f"{len(counts)} pieces with {whole} cells, must be one piece, because meshio reads {read}")
 
 
 def check_systems(mesh: meshio.Mesh) -> None:
-    """Raise an error for Nastran nodes that are given in local coordinate systems, which meshio ignores."""
+    """Raise an error for Nastran nodes in local coordinate systems, because meshio ignores these systems."""
     systems = np.asarray(mesh.point_data.get("nastran:ref", 0))
     if systems.any():
-        raise ValueError(f"mesh: GRID in the coordinate system {systems[systems != 0][0]}, must be in the basic one")
+        raise ValueError(f"mesh: GRID is in the coordinate system {systems[systems != 0][0]}, must be in the basic one")
 
 
 def sets_of(mesh: meshio.Mesh) -> dict[str, list]:
-    """Return the cell indices of sets, which start at 0 in each block.  meshio's indices for FLAC3D files do not."""
+    """Return the cell indices of sets.  Indices start at 0 in each block, unlike meshio's indices for FLAC3D files."""
     flac = {name: rows for name, rows in mesh.cell_sets.items() if re.match("(zone|face):", name)}
     count = [len(block.data) for block in mesh.cells]
     start = np.cumsum([0, *count[:-1]])

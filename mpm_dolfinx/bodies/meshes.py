@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: MIT
 """Bodies from meshes: each mesh cell becomes one or more particle domains.
 
-`mesh_cells` divides cells into domains.  Domains that are too large for the grid are divided further, by their
-(tri)linear map.
+`mesh_cells` divides cells into domains.  Domains that are too large for the grid are divided further, evenly in their
+local coordinates.
 
-The first process reads and divides a mesh.  Each machine then has the domains once, in a file that its processes map
-into memory: a process loads the domains that it reads, such as those of its own points.
+The first process reads and divides a mesh.  Each machine then has one file with all domains.  The processes of the
+machine map this file into memory.  A process loads only the domains that it needs, such as the domains of its points.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
 from mpm_dolfinx.points.cutting import centroids, simplex_volumes, vertices, volumes
 
 LONG = 1.5  # domains with edges longer than this factor times (cell size / per_cell) are divided
-SMALL = 0.2  # fraction of the desired domain size: smaller domains cause a warning
+SMALL = 0.2  # fraction of the desired domain size; smaller domains cause a warning
 
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """A mesh, on one process.  In quadrilaterals and hexahedra, the first axis of nodes varies fastest."""
+    """A mesh on one process.  In the nodes of quadrilaterals and hexahedra, the first axis varies fastest."""
 
     x: NDArray[np.float64]  # positions of nodes (nodes, d), m
     cells: Mapping[str, NDArray[np.int64]]  # cell type -> nodes (n, k)
@@ -80,29 +80,29 @@ class MeshBody(Body):
 
     @cached_property
     def spacing(self) -> NDArray[np.float64]:
-        """Smallest edge lengths (d,), m, of the bounding boxes of domains."""
+        """Smallest edge lengths (d,), in m, of the bounding boxes of domains."""
         return np.min([self.boxes(part).min(axis=0) for part in in_chunks(len(self))], axis=0)
 
     def boxes(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
-        """Return the edge lengths (m, d), m, of the bounding boxes of the chosen domains, before the map."""
+        """Return the edge lengths (n, d), in m, of the bounding boxes of the chosen domains, before the map."""
         x = self.vertices[chosen]
         return x.max(axis=1) - x.min(axis=1)
 
     def lower_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the lower corners (m, d), m, of the bounding boxes of the chosen domains."""
+        """Return the lower corners (n, d), in m, of the bounding boxes of the chosen domains."""
         return self.vertices[chosen].min(axis=1)
 
     def sides_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return whether the faces (m, d, 2) of the chosen domains lie on the surface of the body."""
+        """Return whether the faces (n, d, 2) of the chosen domains lie on the surface of the body."""
         return self.surface[chosen]
 
     def centre_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the reference positions (m, d), m, of the centres of the chosen domains."""
+        """Return the reference positions (n, d), in m, of the centres of the chosen domains."""
         return centroids(self.vertices[chosen])
 
     @property
     def aligned(self) -> bool:
-        """Whether all domains are boxes with edges along the axes; False for a mesh."""
+        """Whether all domains are boxes with edges along the axes.  This is False for bodies from a mesh."""
         return False
 
     @property
@@ -111,13 +111,13 @@ class MeshBody(Body):
         return tuple(self.tagged)
 
     def named(self, name: str) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the domains (m,) with a face on the side `name`, in ascending order, and the face indices (m,)."""
+        """Return the domains (n,) and face indices (n,) of faces on the side `name`, in ascending order of domains."""
         if name not in self.tagged:
             return (np.empty(0, np.int64),) * 2
         return np.nonzero(self.tagged[name].reshape(len(self), 2 * self.dim))
 
     def facing(self, axis: int, end: int, least: float = 0.0) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the domains (m,) with a surface face in a direction, and the face indices; see `Body.facing`."""
+        """Return the domains (n,) and face indices (n,) of the surface faces in a direction; see `Body.facing`."""
         row, face = self.outer()
         outward = face_vectors(self.corners(row), face)
         along = np.abs(outward).argmax(axis=1) == axis
@@ -125,21 +125,21 @@ class MeshBody(Body):
         return row[along], face[along]
 
     def across(self, axis: int) -> tuple[float, float]:
-        """Return the body's extent along an axis divided by the mean edge length of domains, and this length, m."""
+        """Return the body's extent along an axis divided by the mean edge length of domains, and this length in m."""
         edge = float(np.concatenate([self.boxes(part)[:, axis] for part in in_chunks(len(self))]).mean())
         return float(np.ptp(self.vertices[:, :, axis])) / edge, edge
 
     def reference(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
-        """Return the reference positions (m, 2^d, d), m, of the corners of the chosen domains, before the map."""
+        """Return the reference positions (n, 2^d, d), in m, of corners of the chosen domains, before the map."""
         return self.vertices[chosen]
 
     def nodes(self, rows: slice | NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return node indices (m, 2^d) of the corners of domains.  Shared corners have one index."""
+        """Return node indices (n, 2^d) of the corners of domains.  Shared corners have one index."""
         return self.numbers[rows]
 
 
 def _numbered(vertices: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return the node indices (n, 2^d) of the corners of domains (n, 2^d, d), m."""
+    """Return the node indices (n, 2^d) of the corners of domains (n, 2^d, d), in m."""
     x = vertices.reshape(-1, vertices.shape[2])
     pairs = cKDTree(x).query_pairs(NEAR * np.ptp(vertices, axis=1).min(), output_type="ndarray")
     graph = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(x), len(x)))
@@ -158,7 +158,8 @@ def seeded(
 ) -> MeshBody:
     """Return the body of a part of a mesh, or of the whole mesh; see `from_mesh`.
 
-    mesh: function that returns the mesh on rank 0; warns: whether to warn about domains that are too small.
+    `mesh`: function that returns the mesh on rank 0.
+    `warns`: whether to warn about domains that are too small.
     """
     per_cell, material = whole("body: per_cell", per_cell), whole("body: material", material, 0)
 
@@ -192,7 +193,7 @@ def _divided(grid: Grid, mesh: Mesh, part: str | None, per_cell: int, name: str)
     if count[1:].max() > 2:
         nodes = facets[1 + count[1:].argmax()]
         x = mesh.x[nodes[nodes >= 0]].mean(axis=0)
-        raise ValueError(f"{name}: three cells share the facet at {x}, must be two at most")
+        raise ValueError(f"{name}: three cells share the facet at {x}, must be at most two cells")
     outer = (facet > 0) & (count[facet] == 1)  # facet 0: face inside a cell
     twice = (of > 0) & (count[of] == 2)
     _check_sides(mesh, domains, facets, facet, count == 2, name)
@@ -201,7 +202,7 @@ def _divided(grid: Grid, mesh: Mesh, part: str | None, per_cell: int, name: str)
     vertices, row, kept = _split(grid, domains, per_cell)
     surface, *tagged_rows = (rows[row].reshape(kept.shape) & kept for rows in (outer, *tagged.values()))
     named = {side: rows for side, rows in zip(tagged, tagged_rows, strict=True) if rows.any()}
-    node = _numbered(vertices)  # domains have the same digits at a shared node, as those of boxes
+    node = _numbered(vertices)  # domains get equal coordinates at a shared node, to the last digit
     vertices[...] = vertices.reshape(-1, grid.dim)[np.unique(node, return_index=True)[1]][node]
     body = MeshBody(vertices=vertices, surface=surface, tagged=named, numbers=node)
     _check_conforming(body, name)
@@ -209,9 +210,10 @@ def _divided(grid: Grid, mesh: Mesh, part: str | None, per_cell: int, name: str)
 
 
 def _domains(mesh: Mesh, cells: Mapping[str, NDArray[np.int64]]) -> list[tuple[NDArray, NDArray, NDArray]]:
-    """Return tuples: domains (n, 2^d, d), nodes (n, 2d, 2^(d-1)) of the facet that contains each face, cells (n,).
+    """Return tuples for n domains: corners (n, 2^d, d), facets of the mesh (n, 2d, 2^(d-1)), cells of the mesh (n,).
 
-    Nodes of a facet ascend; a -1 precedes the nodes of a triangle.  A face inside a cell has only -1.
+    Facets are the nodes of the mesh facet that contains each face.  Nodes ascend; -1 precedes the nodes of a triangle.
+    A face inside a cell has only -1.
     """
     d = mesh.x.shape[1]
     start = 0
@@ -230,7 +232,7 @@ def _domains(mesh: Mesh, cells: Mapping[str, NDArray[np.int64]]) -> list[tuple[N
 
 
 def _check_repeated(mesh: Mesh, cells: Mapping[str, NDArray[np.int64]], name: str) -> None:
-    """Raise an error for repeated cells, because their weight and stiffness would count twice."""
+    """Raise an error for repeated cells, because the weight and stiffness of such cells would count twice."""
     for kind, nodes in cells.items():
         first, same = distinct(np.sort(nodes, axis=1))
         count = np.bincount(same)
@@ -248,9 +250,10 @@ def _check_sides(
     shared: NDArray[np.bool_],
     name: str,
 ) -> None:
-    """Raise an error if both cells of a facet lie on one side of it, so that their outward vectors do not cancel.
+    """Raise an error if both cells of a facet lie on one side of this facet.
 
-    `facet` is the facet of each face of `domains`; `shared` (m,) tells which facets belong to two cells.
+    `facet` is the facet of each face of `domains`.  `shared` (m,) tells which facets belong to two cells.  Outward
+    vectors of both cells do not cancel if the cells lie on one side.
     """
     d, size = domains.shape[2], len(facets)
     outward = np.stack([face_vectors(domains, face) for face in range(2 * d)], axis=1).reshape(-1, d)
@@ -274,10 +277,13 @@ def _check_overlaps(
     """Raise an error for overlapping cells.
 
     Each facet inside the mesh has a cell on both sides.  The number of cells that cover a position therefore changes
-    only across the surface.  If cells overlap, a cell at the surface overlaps another; only cells there are checked.
+    only across the surface.  If any cells overlap, at least one overlapping cell is at the surface.  It is therefore
+    sufficient to check the cells at the surface.
 
-    x (nodes, d): positions, m; cells: nodes of the cells by cell type; outer (m,): cells with a facet on the surface;
-    neighbours (n, 2): pairs of cells that share a facet.
+    `x` (nodes, d), in m: positions of the nodes.
+    `cells`: nodes of the cells by cell type.
+    `outer` (k,): cells with a facet on the surface.
+    `neighbours` (n, 2): pairs of cells that share a facet.
     """
     corners = [x[nodes] for nodes in cells.values()]
     boxes = np.concatenate([np.stack([c.min(axis=1), c.max(axis=1)], axis=1) for c in corners])
@@ -297,14 +303,14 @@ def _check_overlaps(
     if len(deep):
         one, other = boxes[pairs[deep[depth.argmax()]]]
         meet = (np.maximum(one[0], other[0]) + np.minimum(one[1], other[1])) / 2
-        what = f"{len(np.unique(pairs[deep]))} cells overlap, the first at {meet}"
-        raise ValueError(f"{name}: {what}, by {depth.max():.3g} m, must be apart or touch")
+        what = f"{len(np.unique(pairs[deep]))} cells overlap, most deeply at {meet}"
+        raise ValueError(f"{name}: {what} by {depth.max():.3g} m; cells must be apart or touch")
 
 
 def _box_overlaps(
     boxes: NDArray[np.float64], size: NDArray[np.float64], outer: NDArray[np.int64], slack: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return pairs of cells, as two arrays (n,): one of the cells `outer`, and a cell whose bounding box overlaps.
+    """Return n pairs of cells with overlapping bounding boxes as two arrays (n,).  The first has cells of `outer`.
 
     Boxes are grouped by size, in octaves.  In one group, small boxes would be searched with the largest box's radius.
     """
@@ -326,7 +332,7 @@ def _box_overlaps(
 
 
 def _oriented(domains: NDArray[np.float64], keys: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Swap the first two axes of left-handed domains; return the domains and the facets (keys) of their faces."""
+    """Swap the first two axes of left-handed domains.  Return all domains, and the facets (keys) of their faces."""
     d, left = domains.shape[2], volumes(domains) < 0
     bits, face = corner_bits(d), np.arange(2 * d)
     swapped = (bits[:, [1, 0, *range(2, d)]] << np.arange(d)).sum(axis=1)
@@ -337,7 +343,7 @@ def _oriented(domains: NDArray[np.float64], keys: NDArray[np.int64]) -> tuple[ND
 
 
 def _check_convex(domains: NDArray[np.float64], name: str) -> None:
-    """Raise an error for cells that are flat, inverted or not convex, at a corner or in one of their simplices."""
+    """Raise an error for cells that are flat, inverted or not convex.  Corners and simplices of domains are checked."""
     d, bits = domains.shape[2], corner_bits(domains.shape[2])
     size = np.ptp(domains, axis=1).prod(axis=1)
     ends = np.arange(2**d)[:, None] ^ (1 << np.arange(d))
@@ -348,12 +354,12 @@ def _check_convex(domains: NDArray[np.float64], name: str) -> None:
     invalid = np.flatnonzero(~(least > NEAR * size))
     if len(invalid):
         x = domains[invalid[0]].mean(axis=0)
-        what = f"{len(invalid)} cells are flat, turned inside out or not convex, the first at {x}"
-        raise ValueError(f"{name}: {what}; must be convex, with no flat corner")
+        what = f"{len(invalid)} cells are flat, inverted or not convex, the first at {x}"
+        raise ValueError(f"{name}: {what}; cells must be convex, with no flat corner")
 
 
 def _facets(keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the distinct facets (m, k), and each face's facet index (n, 2d).  Facet 0 is for faces inside cells."""
+    """Return the different facets (m, k), and the facet index (n, 2d) of each face.  It is 0 for faces inside cells."""
     rows = np.concatenate([np.full((1, keys.shape[2]), -1), keys.reshape(-1, keys.shape[2])])
     first, facet = distinct(rows)
     return rows[first], facet[1:].reshape(keys.shape[:2])
@@ -372,9 +378,10 @@ def _in_side(facets: NDArray[np.int64], named: Sequence[NDArray[np.int64]]) -> N
 def _split(
     grid: Grid, domains: NDArray[np.float64], per_cell: int
 ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.bool_]]:
-    """Divide domains that are too large; return corners (m, 2^d, d), m, original domains (m,), and a mask of faces.
+    """Divide domains that are too large.  Return three arrays for the n new domains.
 
-    The mask (m, d, 2) tells which faces of a new domain lie on faces of the original domain.
+    These are the corners (n, 2^d, d) of the new domains, in m, the index (n,) of each original domain, and a mask of
+    faces.  The mask (n, d, 2) tells which faces of a new domain lie on faces of the original domain.
     """
     d = grid.dim
     bits = corner_bits(grid.dim)
@@ -399,13 +406,13 @@ def _split(
 
 
 def _check_conforming(body: MeshBody, name: str) -> None:
-    """Raise an error for surface faces of one mesh that touch each other, because conditions would act on them."""
+    """Raise an error if surface faces of a body touch each other, because conditions would act on such faces."""
     own = Faces.around(body)
     cover = covers(own, own)
     if len(cover.face):
         x = own.corners[cover.face[0]].mean(axis=0)[: body.dim]
-        what = f"{len(np.unique(cover.face))} faces touch others without common nodes, the first at {x}"
-        raise ValueError(f"{name}: {what}; must share nodes, or belong to two parts")
+        what = f"{len(np.unique(cover.face))} faces touch other faces without common nodes, the first at {x}"
+        raise ValueError(f"{name}: {what}; touching faces must share nodes or belong to two parts")
 
 
 def _warn_small(grid: Grid, body: MeshBody, per_cell: int, name: str) -> None:

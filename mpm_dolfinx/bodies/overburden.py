@@ -20,12 +20,14 @@ from mpm_dolfinx.grid.grid import ABOUT_MIDDLE, FACE_SIGNS, FACES, corner_bits, 
 def overburden(
     corners: NDArray[np.float64], unit_weight: NDArray[np.float64], x: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the overburden stress (k,), Pa, at positions, and the level (k,), m, of the ground surface above them.
+    """Return the overburden stress (k,), in Pa, at positions x, and the level (k,), in m, of the ground above them.
 
-    Both are means over vertical lines beside the position, on all sides, because domains may meet exactly above it.
+    Domains may meet exactly above a position.  Both results are therefore means over vertical lines on all sides of the
+    position, very close to it.
 
-    corners (n, 2^d, d), m: corners of the particle domains of all bodies; the last axis is vertical. unit_weight (n,),
-    N/m^3: unit weights of the domains; x (k, d), m: positions in the domains.
+    `corners` (n, 2^d, d), in m: corners of the particle domains of all bodies; the last axis is vertical.
+    `unit_weight` (n,), in N/m^3: unit weights of the domains.
+    `x` (k, d), in m: positions in the domains.
     """
     if not len(x):
         return np.zeros(0), np.zeros(0)
@@ -36,7 +38,7 @@ def overburden(
 
 
 def _along(corners: NDArray, unit_weight: NDArray, x: NDArray, places: NDArray) -> tuple[NDArray, NDArray]:
-    """Return overburden stresses, Pa, and surface levels, m, above x, on vertical lines at `places` (k, d-1)."""
+    """Return overburden stresses, in Pa, and ground levels, in m, for x, on vertical lines at `places` (k, d-1)."""
     low, high = corners[..., :-1].min(axis=1), corners[..., :-1].max(axis=1)
     half = (high - low).max(initial=0.0) / 2
     across, line = np.unique(places, axis=0, return_inverse=True)
@@ -66,9 +68,10 @@ def _along(corners: NDArray, unit_weight: NDArray, x: NDArray, places: NDArray) 
 
 
 def _hits(corners: NDArray, at: NDArray) -> Iterator[tuple[NDArray, NDArray, NDArray]]:
-    """Yield for each face: indices (k,) of the vertical lines that cross it, heights (k,), m, and signs (k,).
+    """Yield for each face the vertical lines (k,) that cross it, the heights (k,) of crossings, in m, and signs (k,).
 
-    Line i is at `at[i]` (d-1,); its domain has `corners[i]` (2^d, d).  A rising line has sign 1 at exit, -1 at entry.
+    Line i is at the horizontal coordinates `at[i]` (d-1,).  Only its crossings of one domain are found; this domain has
+    the corners `corners[i]` (2^d, d).  A rising line has the sign 1 where it leaves the domain, and -1 where it enters.
     """
     d = corners.shape[2]
     for face, turn in zip(FACES[d], FACE_SIGNS, strict=False):

@@ -29,7 +29,7 @@ def polygon(
     per_cell: int = 2,
     material: int = 0,
 ) -> MeshBody:
-    """Seed a polygon, such as a slope or a soil layer, with material points; return the body.
+    """Seed a polygon, such as a slope or a soil layer, with material points, and return the body.
 
     Each layer is a separate polygon.  Polygons in contact stick without a surface between them, even if their
     quadrilaterals differ in size.  The function needs gmsh.
@@ -38,7 +38,7 @@ def polygon(
     ----------
     grid
         Background grid, in 2D.
-    corners : (m, 2), m
+    corners : (n, 2), m
         Consecutive corners, in either direction.
     sides
         Name of the edge from each corner to the next, or "" for no name.  A single name applies to all edges.
@@ -54,16 +54,16 @@ def polygon(
     ImportError
         gmsh is missing.
     ValueError
-        A polygon or hole that crosses itself or another outline, or leaves the grid.  Wrong number of side names.
+        A polygon or hole crosses itself or another outline, or leaves the grid.  The number of side names is wrong.
     """
     begin_with("body: grid", grid)
     if grid.dim != 2:
-        raise ValueError(f"polygon: grid of {grid.dim} dimensions, must have 2; in 3D use a mesh (`from_mesh`)")
+        raise ValueError(f"polygon: the grid has {grid.dim} dimensions, must have 2; in 3D, use `from_mesh`")
     outline = _outline("corners", corners)
     sides = [sides] * len(outline) if isinstance(sides, str) else sides
     if not isinstance(sides, Sequence) or len(sides) != len(outline) or not all(isinstance(s, str) for s in sides):
         raise ValueError(
-            f"polygon: sides = {line(sides)}, must be a name for each of {len(outline)} edges, or one for all"
+            f"polygon: sides = {line(sides)}, must be a name for each of {len(outline)} edges, or one name for all"
         )
     if not isinstance(holes or {}, Mapping) or not all(isinstance(name, str) for name in holes or {}):
         raise ValueError(f"polygon: holes = {line(holes)}, must map the name of each hole's side to the hole's corners")
@@ -81,8 +81,8 @@ def polygon(
 
 
 def _outline(name: str, corners: ArrayLike) -> NDArray[np.float64]:
-    """Return the corners (m, 2), m, of an outline; raise ValueError if two neighbours coincide."""
-    allowed = "at least 3 corners of 2 finite coordinates each, no two neighbours the same"
+    """Return the corners (n, 2) of an outline, in m.  Raise ValueError if two neighbouring corners coincide."""
+    allowed = "at least 3 corners of 2 finite coordinates each, without equal neighbours"
     x = numbers(f"polygon: {name}", corners, None, allowed=allowed)
     if x.ndim != 2 or x.shape[1] != 2 or len(x) < 3 or not np.any(np.roll(x, -1, axis=0) != x, axis=1).all():
         raise ValueError(f"polygon: {name} = {line(corners)} of shape {x.shape}, must be {allowed}")
@@ -120,7 +120,7 @@ def _areas(a: NDArray[np.float64], b: NDArray[np.float64], c: NDArray[np.float64
 
 
 def _inside(x: NDArray[np.float64], outline: NDArray[np.float64]) -> bool:
-    """Return whether a position x (2,) is inside a polygon, that is, a ray from x crosses an odd number of edges."""
+    """Return whether a position x (2,) is inside a polygon: a ray from x then crosses an odd number of edges."""
     a, b = outline - x, np.roll(outline, -1, axis=0) - x
     crosses = (a[:, 1] > 0) != (b[:, 1] > 0)
     return bool((crosses & ((cross_in_plane(a, b) > 0) == (b[:, 1] > a[:, 1]))).sum() % 2)
@@ -161,7 +161,7 @@ def _gmsh() -> Iterator:
 
 
 def _filled(loops: Sequence[tuple[NDArray[np.float64], Sequence[str]]], size: float) -> Mesh:
-    """Return the mesh of a polygon with holes: quadrilaterals with edges of `size`, m, and a few triangles."""
+    """Return the mesh of a polygon with holes.  It has quadrilaterals of edge length `size` (m) and a few triangles."""
     extent = np.ptp(loops[0][0], axis=0).max()
     origin = extent * np.round(loops[0][0][0] / extent, -2)  # gmsh aborts at large coordinates
     with _gmsh() as gmsh:

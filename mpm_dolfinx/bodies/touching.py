@@ -25,7 +25,7 @@ BITS = corner_bits(2)  # Source: definition
 
 @dataclass
 class Faces:
-    """Faces of a body after its map; arrays over m faces."""
+    """Faces of a body after its map.  Arrays have a row for each of m faces."""
 
     row: NDArray[np.int64]  # domain of the face (m,)
     index: NDArray[np.int64]  # indices of the face's corners in the domain (m, 4)
@@ -51,7 +51,7 @@ class Faces:
         return cls.of(body, *body.outer())
 
     def edge(self) -> NDArray[np.float64]:
-        """Return the length (m,), m, of the shortest edge of each face; the unit width in plane strain is ignored."""
+        """Return the length (n,), in m, of the shortest edge of each face.  Unit width in plane strain is no edge."""
         c = self.corners
         pairs = [(1, 0), (3, 2), (2, 0), (3, 1)] if (self.index[:, 0] != self.index[:, 2]).any() else [(1, 0)]
         return np.min([np.linalg.norm(c[:, i] - c[:, j], axis=1) for i, j in pairs], axis=0)
@@ -59,7 +59,7 @@ class Faces:
 
 @dataclass
 class Cover:
-    """Pairs of faces in contact; arrays over n pairs.
+    """Pairs of faces in contact.  Arrays have a row for each of n pairs.
 
     The covering face lies on the covered face.  Face coordinates run from 0 to 1 along two edges of the covered face.
     """
@@ -79,9 +79,9 @@ class Cover:
 
 
 def face_vectors(corners: NDArray[np.float64], face: NDArray[np.int64] | int) -> NDArray[np.float64]:
-    """Return the outward area vectors (m, d), m^(d-1), of one face of each domain (m, 2^d, d).
+    """Return the outward area vectors (n, d), in m^(d-1), of one face of each domain (n, 2^d, d).
 
-    `face` is the index of the face, (m,) or the same for all domains.
+    `face` contains the face indices (n,), or is one face index for all domains.
     """
     dim = corners.shape[2]
     x = corners[np.arange(len(corners))[:, None], FACES[dim][face]]
@@ -99,7 +99,7 @@ def weights(t: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def near(a: NDArray[np.float64], b: NDArray[np.float64], distance: float = 0.0) -> tuple[NDArray, NDArray]:
-    """Return index pairs (n,), (n,) of polytopes a (k, c, d), b (l, c, d) whose boxes may lie within a distance, m."""
+    """Return two index arrays (n,) of polytopes a (k, c, d), b (l, c, d) with boxes within about `distance`, in m."""
     if not (len(a) and len(b)):
         return (np.empty(0, dtype=np.int64),) * 2
     low, high = np.maximum(a.min(axis=(0, 1)), b.min(axis=(0, 1))), np.minimum(a.max(axis=(0, 1)), b.max(axis=(0, 1)))
@@ -154,14 +154,14 @@ def covers(own: Faces, other: Faces) -> Cover:
 
 
 def _parallelograms(corners: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return faces (n, 4, 3), made parallelograms by moving the last corner."""
+    """Return faces (n, 4, 3) with moved last corners, so that all faces are parallelograms."""
     return np.stack([*(corners[:, k] for k in range(3)), corners[:, 1] + corners[:, 2] - corners[:, 0]], axis=1)
 
 
 def local(corners: NDArray, x: NDArray, normal: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the face coordinates (n, c, 2) of positions x (n, c, 3), and their distances (n, c) along the normal.
+    """Return the face coordinates (n, c, 2) of positions x (n, c, 3), and the normal distances (n, c) from the faces.
 
-    `corners` (n, 4, 3) are the faces; `normal` (n, 3) are their unit normals.
+    `corners` (n, 4, 3) are the corners of the faces.  `normal` (n, 3) are the unit normals of the faces.
     """
     t = np.full((*x.shape[:2], 2), 0.5)
     c0, c1, c2, c3 = (corners[:, k, None] for k in range(4))
@@ -179,7 +179,7 @@ def local(corners: NDArray, x: NDArray, normal: NDArray) -> tuple[NDArray[np.flo
 
 
 def covered(count: int, cover: Cover) -> NDArray[np.float64]:
-    """Return the covered fraction (m,) of each face, as area in face coordinates."""
+    """Return the covered fraction (n,) of each face, that is, its covered area in face coordinates."""
     s, owner = within(*_triangles(cover.t, cover.face), np.zeros(2), np.ones(2))
     return sum_by(owner, _areas(s), count)
 
@@ -187,7 +187,7 @@ def covered(count: int, cover: Cover) -> NDArray[np.float64]:
 def uncovered_triangles(
     own: Faces, cover: Cover, faces: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return uncovered parts of faces (m,) as triangles: their faces (n,), and corners (n, 3, 2) in [0, 1]."""
+    """Return face (n,) and corners (n, 3, 2), in face coordinates, of triangles that cover free parts of `faces`."""
     corners = own.corners[faces]
     normal = own.outward[faces] / np.linalg.norm(own.outward[faces], axis=1, keepdims=True)
     whole, _ = local(_parallelograms(corners), corners, normal)
@@ -227,7 +227,7 @@ def uncovered_triangles(
 
 
 def within(s: NDArray, owner: NDArray, low: NDArray, high: NDArray) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Clip triangles (3, 2, n) to boxes [low, high], (2,) or (n, 2); return the parts, and the face (owner) of each."""
+    """Clip triangles (3, 2, n) to boxes from `low` to `high`, (2,) or (n, 2).  Return parts, and each part's owner."""
     low, high = (np.broadcast_to(x, (s.shape[2], 2)) for x in (low, high))
     index = np.arange(s.shape[2])
     for axis in (0, 1):
@@ -237,7 +237,7 @@ def within(s: NDArray, owner: NDArray, low: NDArray, high: NDArray) -> tuple[NDA
 
 
 def _triangles(quads: NDArray, owner: NDArray) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Divide each quadrilateral (n, 4, 2) into two triangles; return these (3, 2, 2n), and the face (owner) of each."""
+    """Divide each quadrilateral (n, 4, 2) into two.  Return the triangles (3, 2, 2n) and the face (owner) of each."""
     both = [quads[:, list(simplex)].transpose(1, 2, 0) for simplex in kuhn_simplices(2)]
     return np.concatenate(both, axis=2).astype(float), np.tile(owner, 2)
 
@@ -248,7 +248,7 @@ def _areas(s: NDArray) -> NDArray[np.float64]:
 
 
 def split(s: NDArray, owner: NDArray, axis: int, plane) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-    """Divide triangles (3, e, n) at a plane normal to an axis; return parts and owners below it, and above it."""
+    """Divide triangles (3, e, n) at a plane normal to an axis.  Return parts and owners below it, then above it."""
     plane = np.broadcast_to(plane, len(owner))
     low, high = s[:, axis].min(axis=0) < plane, s[:, axis].max(axis=0) > plane
     both = np.flatnonzero(low & high)
@@ -261,10 +261,12 @@ def split(s: NDArray, owner: NDArray, axis: int, plane) -> tuple[NDArray, NDArra
 def uncovered(
     count: int, face: NDArray[np.int64], low: NDArray[np.float64], high: NDArray[np.float64], slack: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return the rectangles of faces that no box covers: face (m,), lower and upper corner (m, 2) of each rectangle.
+    """Return the face (m,), lower corner and upper corner (m, 2) of rectangles that fill uncovered parts of faces.
 
-    count: number of faces; face (n,): index of the face that each box covers in part; low, high (n, 2): corners of the
-    boxes, in face coordinates from 0 to 1; slack (n,): largest difference between ends of boxes that count as equal.
+    `count`: number of faces.
+    `face` (n,): index of the face that each box covers in part.
+    `low`, `high` (n, 2): corners of the boxes, in face coordinates from 0 to 1.
+    `slack` (n,): largest difference between ends of boxes that count as equal.
     """
     touched, row = np.unique(face, return_inverse=True)
     whole = np.setdiff1d(np.arange(count), touched)
@@ -322,10 +324,10 @@ def uncovered(
 
 
 def separation(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the gaps (n,), m, between convex domains a and b (n, 2^d, d), m; a negative gap is the depth of overlap.
+    """Return the gaps (n,) between convex domains a and b (n, 2^d, d), in m.  A negative gap is a depth of overlap.
 
-    Domains overlap unless a plane separates them.  The plane may be parallel to a face of either domain or,
-    in 3D, to two edges, one of each domain.
+    Domains overlap unless a plane separates them.  It is sufficient to try planes parallel to a face of either domain.
+    In 3D, planes parallel to one edge of each domain must also be tried.
     """
     d = a.shape[2]
     out = _between_planes(a, b, (face_vectors(c, face) for c in (a, b) for face in range(2 * d)))
@@ -339,7 +341,7 @@ def separation(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.flo
 
 
 def _between_planes(a: NDArray, b: NDArray, normals: Iterable[NDArray]) -> NDArray[np.float64]:
-    """Return the largest distance (n,), m, between two parallel planes that separate a and b, for normals (n, d)."""
+    """Return the largest distances (n,), in m, of two parallel planes with any of `normals` that separate a and b."""
     out, size = np.full(len(a), -np.inf), np.ptp(a, axis=1).max(axis=1)
     for n in normals:
         length = np.linalg.norm(n, axis=1)
@@ -351,7 +353,7 @@ def _between_planes(a: NDArray, b: NDArray, normals: Iterable[NDArray]) -> NDArr
 
 
 def solids(body: Body) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return convex domains (m, 2^d, d), m, of a body, one for a box, and tolerances (m,), m, of gaps and overlaps."""
+    """Return convex domains (n, 2^d, d) of a body, one for a box, and the tolerances (n,) of overlaps, both in m."""
     low, high = body.bounds
     size, edge = high - low, body.spacing.min()
     if body.aligned and np.isclose(size.prod(), body.volume_of_boxes, rtol=SAME, atol=0):
@@ -368,7 +370,7 @@ def solids(body: Body) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 def allowance(edge: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the tolerance, m, for gaps and overlaps of touching domains with edge lengths (m,), m."""
+    """Return the tolerances (n,), in m, of gaps and overlaps of touching domains with edge lengths (n,), in m."""
     return NEAR / 2 * edge
 
 
@@ -377,10 +379,10 @@ def meeting(
     b: tuple[NDArray[np.float64], NDArray[np.float64]],
     in_cells: Callable[[NDArray[np.float64]], NDArray[np.float64]],
 ) -> tuple[float, float, NDArray[np.float64]]:
-    """Return the largest overlap of domains, m, their smallest gap divided by the cell size, and the position (d,), m.
+    """Return the largest overlap of two bodies, in m, the smallest gap, in cells, and the position (d,), in m.
 
-    `a` and `b` are domains and tolerances, see `solids`.  `in_cells` divides positions by the cell size.  Touching
-    domains have overlap 0 and gap 0; the gap of distant domains is inf.
+    Touching bodies have overlap 0 and gap 0.  The gap of distant bodies is inf.  `a` and `b` are the domains of the
+    bodies with their tolerances, see `solids`.  `in_cells` divides positions by the cell size.
     """
     i, j = near(a[0], b[0])
     separations, slack = separation(a[0][i], b[0][j]), a[1][i] + b[1][j] + rounding(a[0])
@@ -415,14 +417,14 @@ def check_apart(grid: Grid, bodies: Sequence[Body], present: Sequence[bool]) -> 
 
 
 def _inside(x: NDArray[np.float64], domains: NDArray[np.float64]) -> bool:
-    """Return whether a position (d,), m, lies in one of the domains (n, 2^d, d), m."""
+    """Return whether a position (d,), in m, lies in one of the domains (n, 2^d, d), in m."""
     point = np.broadcast_to(x, (1, *domains.shape[1:]))
     which, _ = near(domains, point)
     return bool((separation(domains[which], np.repeat(point, len(which), axis=0)) <= 0).any())
 
 
 def warn_near(grid: Grid, names: str, gap: float, x: NDArray[np.float64]) -> None:
-    """Warn about bodies with a gap smaller than a cell: they share nodes of the grid, and therefore stick."""
+    """Warn about bodies with a gap smaller than a cell.  Such bodies share nodes of the grid, and therefore stick."""
     if 0 < gap < 1:
         where = "%s: %.2g cells apart at %s, but they stick, because they share nodes of the grid"
         warn(

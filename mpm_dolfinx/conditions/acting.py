@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: MIT
 """Interface of all loads in the momentum balance: tractions, prescribed displacements, tools, weight, user conditions.
 
-The method `acting(setting)` of a condition returns an `Acting`.  See `flow/feeding.py` for conditions on the fluid.
+The method `acting(setting)` of a condition returns an `Acting`.  `flow/feeding.py` treats conditions on the fluid.
 
-A condition acts on three levels: stage, substep, assembly.  `Acting` is created once in a stage and holds loaded faces.
-`Acting.placed` returns the `Loads` of a substep at the current position of the faces.  At each assembly `Loads` add
-forces to the residual and stiffness to the tangent.  The code of the step and of the momentum balance calls only this
-interface, and names no particular condition.
+A condition acts on three levels: stage, substep and assembly.  An `Acting` is created once in a stage, and contains the
+loaded faces.  Its method `placed` returns the `Loads` of a substep, for the current position of these faces.  At each
+assembly, `Loads` add forces to the residual and stiffness to the tangent.  The step and the momentum balance call only
+this interface.  They name no particular condition.
 """
 
 from __future__ import annotations
@@ -36,19 +36,21 @@ from mpm_dolfinx.points.parts import Parts
 T = TypeVar("T")
 
 Outcome = Mapping[str, Mapping[str, NDArray[np.float64]]]
-"""Reactions, outflows and other results of the conditions: quantity (such as "reactions") -> condition -> values."""
+"""Reactions, outflows and other results, by quantity (such as "reactions") and then by condition."""
 QUANTITIES = ("reactions", "wall_reactions", "outflows", "tool_forces", "tool_travel")
 """Quantities that the conditions of the package return."""
 OF_RAIN = ("runoff", "flowed", "ran_off", "ponded")
-"""Further quantities of scenes with rain."""
+"""Further quantities that scenes with rain return."""
 MOTIONS = ("tool_velocity", "tool_rotation", "tool_spin")
-"""Further quantities of free tools."""
+"""Further quantities that free tools return."""
 
 
 class FormsOf:
     """Compiled forms of the conditions of a scene.  Each kind of form is compiled at the first use.
 
-    grid: background grid; u: displacement increment of the step, m; velocity: velocity of the bodies in a substep.
+    grid: background grid
+    u, m: displacement increment of the step
+    velocity: velocity of the bodies in a substep
     """
 
     def __init__(self, grid: Grid, u: fem.Function, velocity: Velocity):
@@ -57,7 +59,7 @@ class FormsOf:
         self._made: dict[Callable, Any] = {}
 
     def __call__(self, make: Callable[..., T], *more) -> T:
-        """Return the forms `make(grid, u, ...)` with further arguments, compiled once for each class `make`."""
+        """Return the forms `make(grid, u, *more)` of a class `make`.  They are compiled once for each class."""
         if make not in self._made:
             self._made[make] = make(self.grid, self.u, *more)
         return self._made[make]
@@ -85,7 +87,7 @@ class Setting:
 
     @cached_property
     def held(self) -> list[tuple[Displacement, Surface, Sequence[int]]]:
-        """Prescribed displacements of the stage, with the faces and the axes on which they are imposed."""
+        """Prescribed displacements of the stage, each with its faces and its prescribed axes."""
         holds = [(hold, hold.axes(self.grid.dim)) for hold in self.of(Displacement).values()]
         rest = [[other for other, more in holds if other is not hold and set(axes) & set(more)] for hold, axes in holds]
         return [(hold, self.sides.held(hold, those), axes) for (hold, axes), those in zip(holds, rest, strict=True)]
@@ -119,7 +121,7 @@ class Shares(NamedTuple):
 
 
 class At(NamedTuple):
-    """Numbering of the unknowns, displacement increment u of the step (a local array, m), and connected parts."""
+    """Numbering of the unknowns, displacement increment u of the step (local array, in m), and connected parts."""
 
     unknowns: Unknowns
     u: NDArray[np.float64]
@@ -132,9 +134,9 @@ class At(NamedTuple):
 
 
 class Loads:
-    """Forces and tangents of the conditions of one kind in a substep.  A method that is not overridden adds nothing.
+    """Forces and tangents of the conditions of one kind in a substep.  Methods that are not overridden add nothing.
 
-    Arrays b are local, unrolled nodal forces, N.  Entries at ghost nodes are added at their owners.
+    Arrays b are local nodal forces, in N, as flat arrays.  Entries of ghost nodes are added at the owners of the nodes.
     """
 
     linear: bool = True
@@ -146,29 +148,29 @@ class Loads:
     stiff: bool = False
     """Whether the condition adds a `penalty`."""
     holding: bool = False
-    """Whether the condition may constrain bodies in ways that `touching` does not report."""
+    """Whether the condition may constrain bodies by constraints that `touching` does not return."""
     couples: bool = False
     """Whether the tangent couples nodes of different cells."""
     touches: bool = False
-    """Whether this is a contact with a tool or another body, from which bodies may separate."""
+    """Whether the condition is a contact with a tool or another body, from which bodies may separate."""
     key: Any = None
-    """Key of everything on which the penalty, or the pattern, depends, except for the positions of faces."""
+    """Key of all data on which the penalty and the pattern depend, except for the positions of faces."""
 
     def joined(self, substeps: Sequence[Any]) -> Loads:
-        """Return the loads with the pattern of the same condition in all substeps of the step."""
+        """Return the loads with a pattern that contains the condition's patterns in all substeps of the step."""
         return self
 
     def begun(self, shares: Shares, earlier: Any) -> Loads:
-        """Return the loads for a substep with inertia.  `earlier` is the result of `flown` in the previous substep."""
+        """Return the loads of a substep with inertia.  `earlier` is the result of `flown` in the previous substep."""
         return self
 
     def flown(self, at: At) -> Any:
-        """With inertia, return the data of this converged substep that the next substep needs."""
+        """Return the data of this converged substep that the next substep with inertia needs."""
 
     def rubbing(self, at: At, v: NDArray[np.float64]) -> tuple[float, float]:
-        """Return two powers at u on this process, W: the dissipation by slip, and the correction of the external power.
+        """Return two powers (in W) at u on this process: dissipation by slip, and correction of the external power.
 
-        The external power is first computed from the forces in `push` and the nodal velocities v, a local array, m/s.
+        The uncorrected external power is that of the forces in `push` at the nodal velocities v, a local array, in m/s.
         """
         return 0.0, 0.0
 
@@ -176,7 +178,7 @@ class Loads:
         """Add forces that are constant during the substep."""
 
     def pulls(self, b: NDArray[np.float64]) -> None:
-        """Add the constant part of the penalty forces.  The scale of residuals does not include these forces."""
+        """Add the constant part of the penalty forces.  The scale of residuals omits this part."""
 
     def loads(self, b: NDArray[np.float64]) -> None:
         """Add forces that depend on u."""
@@ -185,36 +187,36 @@ class Loads:
         """Add resisting forces at u, with the sign of the internal forces."""
 
     def takes_up(self, b: NDArray[np.float64]) -> None:
-        """Add forces at u that count as internal forces; the scale of residuals includes them."""
+        """Add forces at u that count as internal forces.  The scale of residuals includes these forces."""
 
     def penalty(self, A: PETSc.Mat, walls: bool) -> None:
-        """Add the matrix of forces that are linear in u.  `walls`: whether to add rows of components fixed by walls."""
+        """Add the matrix of forces that are linear in u.  `walls`: whether to add rows of components that walls fix."""
 
     def pulling(self, at: At, v: NDArray[np.float64]) -> float:
-        """Return the power, W, of `pulls` and `penalty` at u on this process.  `v`: velocities, a local array, m/s."""
+        """Return the power (in W) of `pulls` and `penalty` at u on this process.  `v`: nodal velocities, m/s."""
         return 0.0
 
     def tangent(self, K: PETSc.Mat) -> None:
         """Add the derivative of `resists` minus `loads` at u, without final assembly."""
 
     def push(self, at: At, residual: PETSc.Vec, on: Unknowns) -> None:
-        """Subtract forces at u from the residual of unknowns or fixed components.  The scale omits these forces."""
+        """Subtract forces at u from the residual of unknowns or fixed components.  The residual's scale omits them."""
 
     def inertia(self, at: At) -> PETSc.Vec | None:
-        """Return the inertia forces at u, N, or None.  These forces enter the residual and its scale."""
+        """Return the inertia forces (in N) at u, or None.  The residual and its scale include these forces."""
 
     def pattern(self, unknowns: Unknowns) -> PETSc.Mat | None:
-        """Return a zero matrix with the entries that `coupling` adds to the pattern of the cells, or None."""
+        """Return a zero matrix with the entries that `coupling` adds to the pattern of cells, or None."""
 
     def coupling(self, at: At) -> PETSc.Mat | None:
-        """Return minus the derivative of the forces in `push`, without the part in `tangent`."""
+        """Return the negative derivative of the forces in `push`, without the part that `tangent` adds."""
 
     def settle(self, at: At, sticks: bool) -> bool:
-        """Update which points slip at u; return whether any point changed.  `sticks`: whether points may stick."""
+        """Update which points slip at u, and return whether any changed.  `sticks` tells whether points may stick."""
         return False
 
     def augment(self, at: At) -> bool:
-        """When equilibrium is reached, update the multipliers; return whether forces changed."""
+        """Update the multipliers after equilibrium is reached, and return whether forces changed."""
         return False
 
     def follow(self, at: At) -> bool:
@@ -222,24 +224,25 @@ class Loads:
         return False
 
     def guess(self, parts: Parts, nodal: NDArray[np.float64]) -> NDArray[np.float64] | None:
-        """Return an initial guess of the displacements (nodes, d), m, or None."""
+        """Return an initial guess of the displacements (nodes, d), in m, or None without a guess."""
 
     def moved(self, u: fem.Function) -> Loads:
-        """Return the loads in the initial state, with the penalty forces that a displacement u, m, causes."""
+        """Return the loads in the initial state, with the penalty forces that a displacement u (in m) causes."""
         return self
 
     def counted(self, at: At) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return local dofs (n,) on walls, unrolled, and their loads (n,), N, which are not part of wall reactions."""
+        """Return flat local dofs (n,) on walls, and loads (n,), in N, at these dofs that wall reactions exclude."""
         return np.empty(0, dtype=np.int64), np.empty(0)
 
     def within_reach(self) -> NDArray[np.int64]:
-        """Return pairs (m, 2) of lexicographic cells, on this process, that the condition may couple in the step."""
+        """Return lexicographic indices (n, 2) of cells on this process that the condition may couple in the step."""
         return np.empty((0, 2), dtype=np.int64)
 
     def touching(self) -> tuple | None:
-        """Return the initial constraints: cells (m,), cells of the other body (m,), positions and directions (m, d).
+        """Return arrays of initial constraints: cells and cells of the other body (n,), positions and directions (n,
+        d).
 
-        Cells of the other body are None if that body does not deform.
+        The cells of the other body are None if this body does not deform.
         """
 
     @property
@@ -248,7 +251,7 @@ class Loads:
         return np.empty(0, dtype=np.int32)
 
     def rounding(self, of_cells: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return rounding errors (cells,), N, of forces in local cells.  `of_cells`: errors without this condition."""
+        """Return rounding errors (cells,), in N, of forces in local cells.  `of_cells`: errors without it."""
         return of_cells
 
     @property
@@ -257,11 +260,11 @@ class Loads:
         return 0.0
 
     def outcome(self, at: At) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return the reactions and other results at u: quantity -> condition -> values."""
+        """Return the reactions and other results at u, by quantity and then by condition."""
         return {}
 
     def gripped(self, at: At, points: MaterialPoints) -> MaterialPoints:
-        """Return the points with the updated history of the condition."""
+        """Return the points with an updated history of this condition."""
         return points
 
     def ended(self, at: At) -> Loads:
@@ -269,31 +272,33 @@ class Loads:
         return self
 
     def near(self, points: MaterialPoints, corners: NDArray[np.float64]) -> NDArray[np.bool_] | bool:
-        """Return which corners (n, 2^d, d), m, are near a contact after a step, and must follow the Q1 field alone."""
+        """Return which corners (n, 2^d, d), in m, are near a contact after a step.  These follow the Q1 field alone."""
         return False
 
     def outside(
         self, corners: NDArray[np.float64], free: NDArray[np.bool_], everywhere: bool = False
     ) -> NDArray[np.float64]:
-        """Return the corners (n, 2^d, d), m, moved out of forbidden regions.
+        """Return the corners (n, 2^d, d), in m, after they are moved out of forbidden regions.
 
-        `free` (n, 2^d, d) tells which components no other condition prescribes.  By default only small penetrations
-        are corrected; with `everywhere`, penetrations of any depth are corrected.
+        `free` (n, 2^d, d) tells which components no other condition prescribes.  By default only small penetrations are
+        corrected.  With `everywhere`, penetrations of any depth are corrected.
         """
         return corners
 
     def under_held(
         self, ids: NDArray[np.int64], tracked: NDArray[np.float64], volume: NDArray[np.float64], corners: NDArray
     ) -> NDArray[np.float64]:
-        """Return new corners (m, 2^d, d), m, of re-initialised domains; on prescribed sides these are tracked corners.
+        """Return new corners (n, 2^d, d), in m, of re-initialised domains.  On prescribed sides these are tracked
+        corners.
 
-        `ids` (m,) identify the points; `tracked` are the tracked corners, `corners` the corners initialised from F, and
-        `volume` (m,), m^d, the volumes.  A domain with a face on a prescribed side becomes a prism of its volume.
+        A domain with a face on a prescribed side becomes a prism of equal volume.  `ids` (n,) identify the points.
+        `tracked` are the tracked corners, and `corners` the corners initialised from F.  `volume` (n,), in m^d, are the
+        volumes of the domains.
         """
         return corners
 
     def check_end(self, points: MaterialPoints, before: MaterialPoints) -> None:
-        """Raise an error if points lie in forbidden regions after a step; `before` are the points at the start."""
+        """Raise an error if points lie in forbidden regions after a step.  `before` are the points at its start."""
 
 
 class Acting:
@@ -308,19 +313,19 @@ class Acting:
     conditions: ClassVar[tuple[type, ...]] = ()
     """Classes of conditions of this kind."""
     title: ClassVar[str] = "user-defined conditions"
-    """Name in the summary of a scene."""
+    """Name of this kind in the summary of a scene."""
     symmetric: bool = True
     """Whether the tangent is symmetric."""
     linear: bool = True
     """Whether the tangent is independent of the displacement."""
     surfaces: Sequence[Surface] = ()
-    """Loaded faces; the grid cuts all of them together."""
+    """Loaded faces.  The grid cuts the faces of all conditions together."""
     outside: Surface | None = None
-    """Faces that tools may touch; None without tools."""
+    """Faces that tools may touch, or None without tools."""
     held: Sequence[tuple[Any, Surface, Sequence[int]]] = ()
-    """Prescribed displacements: (condition, faces, prescribed axes)."""
+    """Prescribed displacements, each with condition, faces and prescribed axes."""
     seeded: Sequence[Surface] = ()
-    """Further faces whose displacement from the seeded position is needed; renewal must not replace their domains."""
+    """Further faces whose displacement from the seeded position is needed.  Renewal must not replace their domains."""
 
     def placed(self, place: Place) -> Loads:
         """Return the loads of a substep."""
@@ -330,7 +335,7 @@ class Acting:
         """Raise an error if the stage cannot start from the current positions."""
 
     def kept(self, n: int) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return the initial history of n points: condition -> name of the data -> values."""
+        """Return the initial history of n points, by condition and then by name of the data."""
         return {}
 
     def unknown(self, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:

@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: MIT
 """Conditions on sides of bodies: tractions, pressures, displacements, plates, drained sides, prescribed flux, rain.
 
-Sides of seeded bodies are named "left", "right", "bottom" and "top", in 3D also "front" (lower y) and "back" (upper y),
-by their position before any map.  Meshes name their own sides (`from_mesh`).  A side moves with its body, and excludes
-faces that touched another body at seeding.  Regions and X are reference positions, before all maps (`mapped`).
-Reference areas refer to the seeded shape, after the maps.
+Sides of seeded bodies are named "left", "right", "bottom" and "top", in 3D also "front" (lower y) and "back" (upper y).
+A name refers to the position of the side before any map.  Meshes name their own sides (`from_mesh`).  A side moves with
+its body, and excludes faces that touched another body at seeding.  Regions and X are reference positions before all
+maps (`mapped`).  Reference areas are areas of the seeded shape, after the maps.
 
-A new kind of condition is a class in a separate file.  Its method `acting` adds terms to the momentum
-balance (`conditions/acting.py`); its method `feeding` adds terms to the fluid balance (`flow/feeding.py`).
+A new kind of condition is a class in a separate file.  Its method `acting` adds terms to the momentum balance
+(`conditions/acting.py`).  Its method `feeding` adds terms to the fluid balance (`flow/feeding.py`).
 
-Values may be functions of time t, reference positions X and current positions x.  The names of a function's parameters
-decide which of these it receives, see `validation`.
+Values may be functions of time t, reference positions X and current positions x.  The parameter names of a function
+decide which of these arguments the function receives, see `validation`.
 
 An invalid condition raises a ValueError when the condition, a scene or a stage is created.  An invalid value of a
 function raises the error in the step that needs the value.  A condition is equal only to itself, because values and
@@ -36,12 +36,12 @@ from mpm_dolfinx.materials.skeleton import Skeleton
 class Condition:
     """Base class of conditions.  Lists and arrays are copied, so that later changes to them have no effect.
 
-    `name` is the name of the results.  The default consists of kind and side, such as "displacement_top".
+    `name` is the key of the results.  The default name consists of kind and side, such as "displacement_top".
     """
 
     name: str | None = field(default=None, kw_only=True, repr=False)
     FUNCTIONS: ClassVar[Mapping[str, Sequence[str]]] = {"value": NAMES}
-    """Attributes that may be functions, and the allowed parameters of each."""
+    """Attributes that may be functions, and the allowed parameters of each function."""
 
     def __post_init__(self):
         for name in ("side", "other"):
@@ -71,7 +71,7 @@ class Traction(Condition):
         Side of the bodies: "left", "right", "bottom", "top", in 3D also "front" (lower y) and "back" (upper y), or a
         name from a mesh.  The condition applies to all bodies that have a side with this name.
     value : (d,) or number, or callable (t, X, x) -> (d,) or number, or one of these for each place, Pa
-        Force per reference area.  A number acts along the outward normal at the start of the step; a negative number
+        Force per reference area.  A number acts along the outward normal at the start of the step.  A negative number
         is compressive.  Several tractions on the same face add up.
     region : ((d,), (d,)), m
         Lower and upper corner of a box of reference positions.  The traction acts on the parts of faces inside the box.
@@ -79,7 +79,7 @@ class Traction(Condition):
     Raises
     ------
     ValueError
-        Raised by the scene or a step: no point lies on the side, or the value is invalid.
+        No point lies on the side, or the value is invalid.  The scene or a step raises the error.
     """
 
     side: str
@@ -87,25 +87,25 @@ class Traction(Condition):
     region: Region | None = None
 
     def at(self, t: float, dim: int, side: Places | None = None) -> NDArray[np.float64]:
-        """Return the traction at time t (s), Pa: a vector (d,) or (m, d), or along the normal () or (m,)."""
+        """Return the traction, in Pa, at time t (s): a vector (d,) or (n, d), or its normal component () or (n,)."""
         return self._given("value", t, side, dim)
 
 
 @dataclass(frozen=True, eq=False)
 class Pressure(Condition):
-    """Pressure on a side of the bodies: always normal to the moving surface, per current area.
+    """Pressure on a side of the bodies.  It is always normal to the moving surface, and refers to the current area.
 
-    The pressure adds to tractions, and is carried by skeleton and pore fluid together.  For water that also enters the
-    pores, `Drained` prescribes the pore pressure in addition.  A uniform pressure has a potential if the loaded surface
-    is closed, or ends at walls that fix the edges of this surface.  Without a potential the tangent is unsymmetric (LU,
-    FGMRES), and the stability of dry equilibria is not checked.
+    The pressure is added to tractions.  Skeleton and pore fluid carry it together.  For water that also enters the
+    pores, a `Drained` must also prescribe the pore pressure.  A uniform pressure has a potential if the loaded surface
+    is closed, or ends at walls that fix the edges of this surface.  Without a potential the tangent is unsymmetric.
+    The solver is then LU or FGMRES, and the stability of dry equilibria is not checked.
 
     Parameters
     ----------
     side
         Side of the bodies, as for `Traction`.
     value : float or callable (t, X, x) -> float, Pa
-        Finite; positive for compression.  Functions of position give an unsymmetric tangent.
+        Finite number, positive for compression.  Functions of position give an unsymmetric tangent.
     region : ((d,), (d,)), m
         As for `Traction`.
 
@@ -128,26 +128,27 @@ class Pressure(Condition):
 class Quiet(Condition):
     """Quiet (absorbing) boundary of bodies with inertia (Lysmer and Kuhlemeyer 1969).
 
-    The traction resists the velocity.  The traction is the velocity times the impedance of the material: rho c_p along
-    the normal, rho c_s in the tangent plane.  rho is the density; c_p and c_s are the speeds of compression and shear
-    waves.  Waves along the normal are absorbed.  At 30 degrees to it, up to 4 % of the energy is reflected (nu = 0.2 to
-    0.4).  A side fixed in a stage without inertia keeps its tractions.  Bodies with weight need such a stage.
+    The traction resists the velocity.  It is the velocity times the impedance of the material: (rho c_p) along the
+    normal, (rho c_s) in the tangent plane.  Here rho is the density; c_p and c_s are the speeds of compression and
+    shear waves.  Waves along the normal are absorbed.  Of waves at 30 degrees to the normal, up to 4 % of the energy is
+    reflected (nu = 0.2 to 0.4).  If the side was fixed in an earlier stage without inertia, it keeps the tractions of
+    this stage.  Bodies with weight need the earlier stage, because these tractions carry their weight.
 
     Parameters
     ----------
     side
         Side of the bodies, as for `Traction`.
     incoming : (d,) or callable t (s) -> (d,), m/s
-        Particle velocity of a wave that enters along the inward normal.  A free surface would move twice as fast.
+        Particle velocity of a wave that enters along the inward normal.  A free surface moves at twice this velocity.
     region : ((d,), (d,)), m
         As for `Traction`.
 
     Raises
     ------
     ValueError
-        Raised by the scene: bodies without inertia; bodies that had inertia before the side became quiet; no point on
-        it; another `Quiet`, or a `Displacement` of all components, on the same part of a face; a wall of the grid
-        that fixes the side; a weight that changes as the stage begins, because the traction at rest does not change.
+        The scene raises the error.  The bodies have no inertia, or had inertia before the side became quiet.  No point
+        lies on the side.  Another `Quiet`, or a `Displacement` of all components, is on the same part of a face.  A
+        wall of the grid fixes the side.  The weight changes as the stage begins, but the kept tractions do not.
     """
 
     side: str
@@ -156,13 +157,13 @@ class Quiet(Condition):
     FUNCTIONS: ClassVar[Mapping[str, Sequence[str]]] = {"incoming": ("t",)}
 
     def at(self, t: float, dim: int) -> NDArray[np.float64]:
-        """Return the velocity (d,), m/s, of the incoming wave at time t (s)."""
+        """Return the particle velocity (d,), in m/s, of the incoming wave at time t (s)."""
         return np.zeros(dim) if self.incoming is None else self._given("incoming", t, None, dim, number=False)
 
 
 @dataclass(frozen=True, eq=False)
 class OnSide(Condition):
-    """User-defined UFL term on a side of the bodies, for example springs, dashpots or loads that depend on the motion.
+    """User-defined UFL term on a side of the bodies, such as springs, dashpots or loads that depend on the motion.
 
     An `OnSide` is an element of the scene's `terms`, and acts in all stages.
 
@@ -171,15 +172,15 @@ class OnSide(Condition):
     side
         Side of the bodies, as for `Traction`.
     term
-        Function as in `terms`, see `user_functions`.  Its `points` are quadrature points on the side: `points.dx` is
-        the area measure and `points.normal` the outward normal, both at the start of the step.
+        Function as in `terms`, see `user_functions`.  Its `points` are quadrature points on the side.  `points.dx` is
+        the area measure, and `points.normal` the outward normal, both at the start of the step.
     region : ((d,), (d,)), m
         As for `Traction`.
 
     Raises
     ------
     ValueError
-        Raised by the scene: the function is invalid, or no point lies on the side.
+        The function is invalid, or no point lies on the side.  The scene raises the error.
     """
 
     side: str
@@ -197,14 +198,14 @@ class Source:
     Parameters
     ----------
     term
-        Function of a test function q of the pressure, see `user_functions`.  A positive term, 1/s, adds fluid.
+        Function of a test function q of the pressure, see `user_functions`.  A positive term (in 1/s) adds fluid.
     """
 
     term: Callable
 
 
 def sorted_terms(terms: Sequence[Callable | OnSide | Source]) -> tuple[list[Callable | OnSide], list[Callable]]:
-    """Return the user's terms of the momentum balance, and the terms of the fluid balance."""
+    """Return two lists of the user's terms: terms of the momentum balance, and terms of the fluid balance."""
     if isinstance(terms, (str, bytes)) or not isinstance(terms, Sequence):
         raise ValueError(f"terms = {line(terms)}, must be a list of functions, OnSide and Source")
     sources = [term.term for term in terms if isinstance(term, Source)]
@@ -212,7 +213,7 @@ def sorted_terms(terms: Sequence[Callable | OnSide | Source]) -> tuple[list[Call
 
 
 class Through(NamedTuple):
-    """Flow condition at the quadrature points of a side; each value is () or (m,)."""
+    """Flow condition at the n quadrature points of a side.  Each value has shape () or (n,)."""
 
     pressure: NDArray[np.float64] | float  # pore pressure outside, Pa; nan if only the flux is prescribed
     flux: NDArray[np.float64] | float  # prescribed flux into the body, m/s
@@ -233,16 +234,17 @@ class Drained(Condition):
     pressure : float or callable (t, X, x) -> float, Pa
         Pore pressure outside, finite.  Below a water level: lambda t, x: 9810 * np.maximum(level(t) - x[:, 1], 0).
     region : ((d,), (d,)), m
-        Box of reference positions; the parts of faces inside it are drained.
+        Box of reference positions.  The parts of faces inside the box are drained.
     seepage
-        Whether the side is a seepage face: where the outside pressure is <= 0, as above a water level, water can leave
-        but not enter.  The pore pressure there is at most the outside pressure, and lower only where no water leaves.
+        Whether the side is a seepage face.  Where the outside pressure is <= 0, as above a water level, water can then
+        leave but not enter.  The pore pressure there is at most the outside pressure.  It is lower only where no water
+        leaves.
 
     Raises
     ------
     ValueError
-        The pressure is not finite.  Raised by the scene: no fluid; no point on the side; another `Drained` or `Inflow`
-        on the same part of a face.
+        The pressure is not finite.  The scene raises the error without fluid, without a point on the side, or with
+        another `Drained` or `Inflow` on the same part of a face.
     """
 
     side: str
@@ -268,7 +270,7 @@ class Drained(Condition):
 
 
 class Flux(Condition):
-    """Base class of conditions with a flux (m/s) through a side: a number or a function of t, X, x."""
+    """Base class of conditions with a flux (m/s) through a side.  The flux is a number or a function of t, X, x."""
 
     side: str
     flux: float | Callable[..., ArrayLike]
@@ -293,9 +295,9 @@ class Inflow(Flux):
     side
         Side of the bodies, as for `Traction`.
     flux : float or callable (t, X, x) -> float, m/s
-        Inflow per current area and time, as a volume at zero pressure.  Finite; negative for outflow.
+        Inflow per current area and time, as a volume at zero pressure.  The flux is finite, and negative for outflow.
     region : ((d,), (d,)), m
-        Box of reference positions; fluid enters through the parts of faces inside it.
+        Box of reference positions.  Fluid enters through the parts of faces inside the box.
 
     Raises
     ------
@@ -316,27 +318,28 @@ class Inflow(Flux):
 class Rain(Flux):
     """Side of the bodies with rain or evaporation, limited by the soil's capacity to take up or release water.
 
-    Rain infiltrates until the pressure at the side reaches `ponding`; the excess runs off.  Water evaporates at the
-    prescribed rate until the pressure at the side falls to `driest`.  Water can also seep out of the side.
-    `outflows` of the simulation are the flow through the side; `simulation.outcome("runoff")` is the run-off, m^3/s
-    (m^2/s in plane strain).  Three outcomes are volumes, m^3 (m^2), since the condition began.  `outcome("flowed")` is
-    outflow of each open side, `outcome("ran_off")` its run-off and seepage, `outcome("ponded")` ponded water.
+    Rain infiltrates until the pressure at the side reaches `ponding`.  The excess runs off.  Water evaporates at the
+    prescribed rate until the pressure at the side falls to `driest`.  Water can also seep out of the side.  `outflows`
+    of the simulation are the flow through the side.  `simulation.outcome("runoff")` is the run-off, in m^3/s (m^2/s in
+    plane strain).  Three further outcomes are volumes since the condition began, in m^3 (m^2).  `outcome("flowed")` is
+    the outflow through each open side, `outcome("ran_off")` its run-off and seepage, and `outcome("ponded")` the ponded
+    water.
 
     Parameters
     ----------
     side
         Side of the bodies, as for `Traction`.
     flux : float or callable (t, X, x) -> float, m/s
-        Rain per current area of the side, as a volume at zero pressure.  Finite; negative for potential evaporation.
-        Vertical rain of rate r on a slope of angle b has the flux r cos(b).
+        Rain per current area of the side, as a volume at zero pressure.  The flux is finite, and negative for potential
+        evaporation.  Vertical rain of rate r on a slope of angle b has the flux r cos(b).
     ponding
-        Largest pressure of ponded water (depth times unit weight), Pa, >= 0.  The pond has one depth for the whole
-        side.  Water runs off once the pond is full; ponded water infiltrates or evaporates later.
+        Largest pressure >= 0 of ponded water, in Pa: depth times unit weight.  The pond has one depth for the whole
+        side.  Water runs off once the pond is full.  Ponded water infiltrates or evaporates later.
     driest
-        Lowest pressure at the side, Pa, < 0 and finite: the pore pressure in equilibrium with the air.  By Kelvin's
-        equation, -1e7 Pa corresponds to air of 93 % humidity at 20 °C.
+        Lowest pressure at the side, in Pa, < 0 and finite.  It is the pore pressure in equilibrium with the air.  By
+        Kelvin's equation, -1e7 Pa corresponds to air of 93 % humidity at 20 °C.
     region : ((d,), (d,)), m
-        Box of reference positions; rain falls on the parts of faces inside it.
+        Box of reference positions.  Rain falls on the parts of faces inside the box.
 
     Raises
     ------
@@ -362,21 +365,21 @@ class Rain(Flux):
 
 @dataclass(frozen=True, eq=False)
 class Tied(Condition):
-    """Two opposite sides of a box with equal displacements, as if the ground repeated itself beyond the box.
+    """Two opposite sides of a box with equal displacements, as in ground that repeats itself beyond the box.
 
-    Displacements at equal heights are equal, and forces are equal and opposite, with and without inertia.  A wave that
-    leaves the box at one side enters at the other.  No water flows through these sides.
+    At equal heights, the two sides have equal displacements, and equal and opposite forces, with and without inertia.
+    A wave that leaves the box at one side enters at the other.  No water flows through these sides.
 
     Parameters
     ----------
     side, other
-        Opposite sides of a box, as for `Traction`, with equal faces.
+        Names of two opposite sides of a box, as for `Traction`.  Both sides must have equal faces.
 
     Raises
     ------
     ValueError
-        Raised by the scene: the sides are not opposite, or their faces differ; another `Tied`, a `Quiet`, `Drained`,
-        `Inflow` or `Rain` on the same part of a face.
+        The sides are not opposite, or their faces differ.  Another `Tied`, a `Quiet`, `Drained`, `Inflow` or `Rain` is
+        on the same part of a face.  The scene raises the error.
     """
 
     side: str
@@ -388,24 +391,24 @@ class Tied(Condition):
 RIGIDITY = 1e4
 """Rigidity of a plate, divided by the oedometric modulus of the body and by the length of the side."""
 HOLD = 3e2
-"""Penalty stiffness for cell means of prescribed displacements, times cell size, divided by the `holding` modulus.
+"""Penalty stiffness for prescribed displacements, times cell size, divided by the `holding` modulus.
 
-The displacement error is the change of traction in the step (without its rotation), divided by this stiffness.  The
-error does not accumulate, because each step measures the error from the prescribed position.  Where a body is much
-stiffer than the penalty, multipliers remove the error, see `HoldLoads.augment`.
+The penalty acts on means over cells.  The displacement error is the change of traction in the step (without its
+rotation), divided by the stiffness.  This error does not accumulate, because each step measures it from the prescribed
+position.  If a body is much stiffer than the penalty, multipliers remove the error, see `HoldLoads.augment`.
 
 Halving this value changes the result of scene "soil" in tests/plateaus.py by 5.9e-05 (relative), doubling it by
 2.0e-05, and finer cells by 3.0e-02.
 """
 YIELDING = 0.1
-"""Factor on the elastic modulus in the penalty of laws with state variables, because yielding soil is much softer.
-Halving this value changes the result of scene "soil" in tests/plateaus.py by 6.5e-05 (relative), doubling it by
+"""Factor on the elastic modulus in the penalty of laws with state variables.  Yielding soil is much softer than elastic
+soil.  Halving this value changes the result of scene "soil" in tests/plateaus.py by 6.5e-05 (relative), doubling it by
 1.9e-05, and finer cells by 3.0e-02.
 """
 
 
 def resistance(material: Skeleton) -> NDArray[np.float64]:
-    """Return the reference modulus of a side, Pa: the oedometric modulus, but at most 4G (its value at nu = 1/3)."""
+    """Return the reference modulus, Pa, of a side: the oedometric modulus, limited to 4G, its value at nu = 1/3."""
     return np.minimum(material.oedometric, 4 * material.shear)
 
 
@@ -413,36 +416,39 @@ def holding(material: Skeleton) -> NDArray[np.float64]:
     """Return the reference modulus, Pa, of the penalty for prescribed displacements.
 
     A Q1 field with constant volumetric strain in each cell cannot follow a curved side.  The penalty converts the
-    difference into pressure, so it must not be stiff compared with the shear stiffness.  In an undrained cavity, a
-    penalty of 300 times lambda + 2G gives up to 1.9 times the exact pressure, one of 30 times 4G gives 1.01 times it.
+    difference between field and side into pressure.  It must therefore not be stiff compared with the shear stiffness.
+    In an undrained cavity, a penalty of 300 (lambda + 2G) gives up to 1.9 times the exact pressure.  A penalty of 30
+    (4G) gives 1.01 times the exact pressure.
     """
     return (YIELDING if material.state else 1.0) * resistance(material)
 
 
 @dataclass(frozen=True, eq=False)
 class Displacement(Condition):
-    """Side of the bodies with a prescribed displacement: a footing, a moving clamp, a transported body.
+    """Side of the bodies with a prescribed displacement, such as a side under a footing or in a moving clamp.
 
-    The forces on the side are in `reactions` of the simulation.
+    `reactions` of the simulation contain the forces on the side.
 
     Parameters
     ----------
     side
         Side of the bodies, as for `Traction`.
     value : (d,) or callable (t, X) -> (d,) or (m, d), m
-        Displacement since the start, or since a stage set it to zero, at reference positions X (m, d).  For a mapped
-        body, the map converts X to seeded positions.  All d components are required, even those not prescribed.
+        Displacement since the start, or since a stage set it to zero, at reference positions X (m, d).  In a mapped
+        body, the map converts X to seeded positions.  The value has all d components, even if some are not prescribed.
     components
-        Prescribed components, such as "y"; by default all d components.
+        Prescribed components, such as "y".  By default all d components are prescribed.
     region : ((d,), (d,)), m
-        Box of reference positions; faces inside it are prescribed.  Where the box ends within a cell, the cell also has
-        a node outside the box.  This node is prescribed if the box covers more than half of the cell, otherwise free.
+        Box of reference positions.  The displacement is prescribed on faces inside the box.  If the box ends within a
+        cell, this cell also has a node outside the box.  The node is prescribed if the box covers more than half of the
+        cell, otherwise free.
 
     Raises
     ------
     ValueError
-        Raised by the scene or a step: no point on the side; invalid value or components; a moving component that a wall
-        fixes; another `Displacement` of the component on the same part of a face, or different values at a common edge.
+        No point lies on the side, or value or components are invalid.  A wall fixes a component that moves.  Another
+        `Displacement` prescribes the component on the same part of a face, or another value at a common edge.  The
+        scene or a step raises the error.
     """
 
     side: str
@@ -458,7 +464,7 @@ class Displacement(Condition):
         return sorted("xyz".index(c) for c in set(self.components or "xyz"[:dim]))
 
     def at(self, t: float, X: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the displacement (m, d), m, at time t (s) of reference positions X (m, d), m."""
+        """Return the displacements (n, d), in m, at time t (s) of places with reference positions X (n, d), in m."""
         value = self._given("value", t, lambda name: X, X.shape[1], number=False)
         return np.broadcast_to(value, X.shape)
 
@@ -473,26 +479,26 @@ class _OfPlate(Traction):
 
 @dataclass(frozen=True, eq=False)
 class RigidPlate(Condition):
-    """Rigid, smooth plate on a flat side of the bodies: all faces have the same displacement normal to the side.
+    """Rigid, smooth plate on a flat side of the bodies.  All faces have an equal displacement normal to the side.
 
-    A penalty kappa/2 int (grad_t x_n)^2 dA on the slope of the faces keeps the plate flat and prevents tilting.  x_n is
-    the position along the normal, grad_t the gradient along the side, and kappa the stiffness from `RIGIDITY`.  The
-    penalty does not resist a uniform displacement, so the plate transfers the total force exactly.
+    A penalty on the slope of the faces, (kappa/2 int (grad_t x_n)^2 dA), keeps the plate flat and prevents tilting.
+    Here x_n is the position along the normal, grad_t the gradient along the side, and kappa the stiffness from
+    `RIGIDITY`.  The penalty does not resist a uniform displacement, so the plate transfers the total force exactly.
 
     Parameters
     ----------
     side
-        Side of the bodies, as for `Traction`.  Its seeded faces must be connected, in one plane normal to an axis.
+        Side of the bodies, as for `Traction`.  Its seeded faces must be connected, and in one plane normal to an axis.
     force : float or callable t (s) -> float, N (N/m in plane strain)
-        Total force on the side, positive for compression.  In axisymmetry: the force on the whole circumference.
+        Total force on the side, positive for compression.  In axisymmetry it acts on the whole circumference.
     region : ((d,), (d,)), m
-        Box of reference positions; the plate lies on the faces inside it.
+        Box of reference positions.  The plate lies on the faces inside the box.
 
     Raises
     ------
     ValueError
-        The force is not finite.  Raised by the scene or a step: no point on the side; faces that are not connected or
-        not coplanar (define one plate, with a region, for each part).
+        The force is not finite, or no point lies on the side.  The faces are not connected or not coplanar; define one
+        plate, with a region, for each part.  The scene or a step raises the error.
     """
 
     side: str
@@ -506,7 +512,7 @@ class RigidPlate(Condition):
             numbers("RigidPlate: force", self.force)
 
     def traction(self, area: float, inward: NDArray[np.float64]) -> Traction:
-        """Return the traction of the plate: the force along `inward` (d,) divided by the reference area, m^(d-1)."""
+        """Return the plate's traction: the force along `inward` (d,), divided by the reference `area`, m^(d-1)."""
 
         def even(t: float) -> NDArray[np.float64]:
             return inward * self._given("force", t) / area

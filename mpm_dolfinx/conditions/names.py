@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Names of conditions, by which their results are found."""
+"""Names of conditions.  Results of a condition are found by its name."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class ByName(dict[str, T]):
 
     @property
     def array(self) -> NDArray[np.float64]:
-        """All values (conditions, ...) as one array; shape (0,) if there are no conditions."""
+        """All values (conditions, ...) as one array.  Without conditions its shape is (0,)."""
         return np.stack(list(self.values())) if self else np.zeros(0)
 
     def __missing__(self, name: Any) -> T:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Recorded motions: accelerograms or velocities as functions of time."""
+"""Recorded motions: displacements as functions of time, from recorded accelerations or velocities."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from numpy.typing import ArrayLike, NDArray
 from mpm_dolfinx.base.validation import flag, line, numbers, on_disk, path
 
 QUANTITIES = ("acceleration", "velocity")
-ALLOWED = "two columns, increasing times in s and finite values, of at least two rows"
+ALLOWED = "two columns of at least two rows, with increasing times in s and finite values"
 
 
 class Record:
-    """Recorded motion along a direction, as a function of time (s) that returns the displacement (d,), m.
+    """Recorded motion along a direction.  It is a function of time (s) that returns the displacement (d,), in m.
 
     Recorded values are interpolated linearly in time and integrated exactly.  The motion is zero before the first
     recorded time.  After the last recorded time the velocity is constant.
@@ -24,11 +24,11 @@ class Record:
     Parameters
     ----------
     record : file, or (n, 2)
-        Two columns: times, s, and values.  Columns of a file are separated by blanks or commas; # starts a comment.
+        Two columns: times (in s) and values.  Blanks or commas separate the columns of a file, and # starts a comment.
     direction : (d,)
-        Direction of the motion.  Its length multiplies the values: (9.81, 0) for a record in units of g.
+        Direction of the motion.  Its length multiplies the values.  For a record in units of g, use (9.81, 0).
     quantity
-        Recorded quantity: "acceleration", m/s^2, or "velocity", m/s.
+        Recorded quantity: "acceleration" (m/s^2) or "velocity" (m/s).
     at_rest
         Whether to correct the accelerations by a linear function of time, so that the motion ends at its initial
         position with zero velocity.  Without the correction, a record with a non-zero integral ends in motion.
@@ -52,7 +52,7 @@ class Record:
             raise ValueError(f"Record: quantity = {line(quantity)}, must be one of {', '.join(QUANTITIES)}")
         flag("Record: at_rest", at_rest)
         if at_rest and quantity == "velocity":
-            raise ValueError("Record: at_rest = True with velocities, must be True for accelerations only")
+            raise ValueError("Record: at_rest = True, must be False for velocities")
         self.direction = numbers("Record: direction", direction, (2,), (3,), allowed="2 or 3 finite numbers")
         rows = numbers(
             "Record", _read(record) if isinstance(record, (str, os.PathLike)) else record, None, allowed=ALLOWED
@@ -85,12 +85,12 @@ class Record:
         return self._within(self._of[0], t) * (t <= self.end)
 
     def _within(self, value: scipy.interpolate.PPoly, t: float) -> NDArray[np.float64]:
-        """Return a quantity (d,) at time t along the direction: zero before the record, the last value after it."""
+        """Return a quantity (d,) at time t.  It is zero before the record, and constant after it."""
         return self.direction * (float(value(min(t, self.end))) if t >= value.x[0] else 0.0)
 
 
 def _linear(t: NDArray[np.float64], values: NDArray[np.float64]) -> scipy.interpolate.PPoly:
-    """Return the piecewise linear interpolant of values (n,) at times t (n,), s."""
+    """Return the piecewise linear interpolant of values (n,) at times t (n,), in s."""
     return scipy.interpolate.PPoly(np.stack([np.diff(values) / np.diff(t), values[:-1]]), t)
 
 

@@ -21,7 +21,8 @@ from mpm_dolfinx.parallel.exchange import over_all
 class Sides:
     """Finder of the faces on which a condition acts.  Conditions on the same faces share one `Surface`.
 
-    grid, bodies: background grid and all bodies of the scene; present: whether each body is active in the stage.
+    grid, bodies: background grid, and all bodies of the scene
+    present: whether each body is active in the stage
     """
 
     def __init__(self, grid: Grid, bodies: Sequence[Body], present: Sequence[bool]):
@@ -31,7 +32,7 @@ class Sides:
         self._found: dict[tuple[str, bytes], Surface] = {}
 
     def of(self, condition) -> Surface:
-        """Return the faces of a condition's side and region; raise ValueError if there are none."""
+        """Return the faces of a condition's side in its region.  Raise ValueError if there are none."""
         found = self._of(condition.side, condition.region)
         if not len(found):
             where = " in the region" if condition.region is not None else ""
@@ -52,14 +53,15 @@ class Sides:
         return self._found[key]
 
     def held(self, condition: Displacement, others: Sequence[Displacement]) -> Surface:
-        """Return the faces of a prescribed displacement, without cells that the region covers by at most one half.
+        """Return the faces of a prescribed displacement, without cells that its region covers by at most one half.
 
-        The last prescribed node also moves half a cell of the side outside the region.  If the region covers at most
-        half of the cell in which it ends, the faces therefore end where the region enters this cell.  On a side
-        inclined to the grid, the faces end half a cell before the end of the region.  Both rules apply only where the
-        side continues outside the region and no other condition prescribes the same components there.
+        The last prescribed node also moves half a cell of the side beyond it.  If the region covers at most half of the
+        cell in which it ends, the faces therefore end where the region enters this cell.  On a side inclined to the
+        grid, the faces end half a cell before the end of the region.  Both rules apply only if the side continues
+        outside the region, and no condition in `others` applies there.
 
-        condition: the prescribed displacement; others: other prescribed displacements of the same components.
+        condition: the prescribed displacement
+        others: other prescribed displacements that have a component in common with it
         """
         faces, d = self.of(condition), self.grid.dim
         box, X = faces.region.copy(), faces.X
@@ -72,7 +74,7 @@ class Sides:
         neighbours = [self.of(other).X for other in others]
 
         def along(boxes: NDArray[np.float64], axis: int, x: float) -> NDArray[np.bool_]:
-            """Return which boxes (m, 2, d) are adjacent to the faces and contain the coordinate x along an axis."""
+            """Return which boxes (n, 2, d) are adjacent to the faces, and contain the coordinate x along an axis."""
             across = np.arange(d) != axis
             low, high = X[:, 0].min(axis=0) - near, X[:, 1].max(axis=0) + near
             beside = ((boxes[:, 0] < high) & (boxes[:, 1] > low))[:, across].all(axis=1)
@@ -91,9 +93,9 @@ class Sides:
         return shorter if len(shorter) else faces  # the region is narrower than a cell
 
     def _beyond_nodes(self, side: Surface, at_end: NDArray[np.bool_], axis: int, x: float, sign: int) -> float:
-        """Return the length, m, by which to shorten a region that ends at coordinate x along a reference axis.
+        """Return the length, in m, by which to shorten a region that ends at x along a reference axis, see `held`.
 
-        `at_end` (m,) tells which faces of the side contain x; `sign` is the direction out of the region.  See `held`.
+        `at_end` (faces,) tells which faces of the side contain x.  `sign` is the direction out of the region.
         """
         faces = np.flatnonzero(at_end)
         X, places = side.corners[faces][:, :, axis], side.places()[faces]
@@ -113,9 +115,9 @@ class Sides:
         return share / abs(float(slope[a])) if share <= (1 + NEAR) / 2 else 0.0
 
     def check_moves(self, one, holds: Iterable[Displacement], free: NDArray[np.bool_]) -> None:
-        """Raise ValueError if a displacement or a wall of the grid fixes all components of faces of a condition.
+        """Raise ValueError if prescribed displacements or a wall fix all displacement components on a condition's side.
 
-        `holds` are the prescribed displacements of the stage; `free` (nodes, d) tells which components no wall fixes.
+        `holds` are the prescribed displacements of the stage.  `free` (nodes, d) tells which components no wall fixes.
         """
         faces, grid = self.of(one), self.grid
         for hold in holds:
@@ -139,15 +141,15 @@ class Sides:
         return self._found[key]
 
     def all(self) -> Surface:
-        """Return all surface faces of all contact groups, including faces between groups, which may separate."""
+        """Return all surface faces of all contact groups.  Faces between groups count: groups may separate."""
         start = np.cumsum([0, *(len(body) for body in self.bodies[:-1])])
         copy = np.broadcast_to(self.grid.copy(start), len(self.bodies))
         return joined([self.around(np.flatnonzero(copy == group).tolist()) for group in np.unique(copy)])
 
     def meeting(self, one: Surface, other: Surface) -> NDArray[np.float64]:
-        """Return the reference positions (k, d), m, of corners that faces of two conditions have in common.
+        """Return the reference positions (n, d), in m, of corners that faces of two conditions have in common.
 
-        A mapped body has no common corners with other bodies.
+        Corners of a mapped body are never common to faces of other bodies.
         """
         dim, ends = self.grid.dim, np.cumsum([len(body) for body in self.bodies])
         moved = np.array([i if body.map is not None else -1 for i, body in enumerate(self.bodies)])

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Walls of the grid: displacement components that they fix, and their forces on the bodies.
+"""Walls of the grid: the displacement components that walls fix, and the forces of walls on bodies.
 
-In all functions `walls` maps names of walls to the components that each fixes.
+In all functions, `walls` has the fixed components of each wall by name.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from mpm_dolfinx.grid.grid import SIDES, Grid, sum_by
 
 
 def with_axis(grid: Grid, walls: Mapping[str, str]) -> Mapping[str, str]:
-    """Return the fixed components of each wall; the wall on the axis also fixes the radial component."""
+    """Return the fixed components of each wall.  The wall on the axis also fixes the radial component."""
     left = walls.get("left", "") if isinstance(walls, Mapping) else None
     if not grid.has_axis or not isinstance(left, str) or "x" in left:
         return walls
@@ -25,7 +25,7 @@ def with_axis(grid: Grid, walls: Mapping[str, str]) -> Mapping[str, str]:
 
 
 def fixed_nodes(grid: Grid, walls: Mapping[str, str]) -> NDArray[np.bool_]:
-    """Return which displacement components (nodes, d) walls fix; raise ValueError for invalid walls."""
+    """Return which displacement components (nodes, d) walls fix.  Raise ValueError for invalid walls."""
     d = grid.dim
     out = np.zeros((len(grid.node_x), d), dtype=bool)
     if not isinstance(walls, Mapping):
@@ -39,7 +39,7 @@ def fixed_nodes(grid: Grid, walls: Mapping[str, str]) -> NDArray[np.bool_]:
 
 
 def fixed_corners(grid: Grid, walls: Mapping[str, str], corners: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return which displacement components (n, 2^d, d) walls fix, at corners of domains that lie on the walls."""
+    """Return which displacement components (n, 2^d, d) walls fix at corners of domains."""
     out = np.zeros(corners.shape, dtype=bool)
     for name, axes in walls.items():
         axis, end = SIDES[grid.dim][name]
@@ -52,7 +52,10 @@ def fixed_corners(grid: Grid, walls: Mapping[str, str], corners: NDArray[np.floa
 def stopped(
     grid: Grid, walls: Mapping[str, str], corners: NDArray[np.float64], before: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return corners (n, 2^d, d), m, moved into the grid if walls fix the normal component or `before` is inside."""
+    """Return corners (n, 2^d, d), in m, after some corners outside the grid are moved to its sides.
+
+    Corners move to a side if its wall fixes the normal component, or if their old position `before` was in the grid.
+    """
     shut = np.zeros((2, grid.dim), dtype=bool)
     for name, axes in walls.items():
         axis, end = SIDES[grid.dim][name]
@@ -64,13 +67,14 @@ def stopped(
 def wall_forces(
     grid: Grid, walls: Mapping[str, str], dofs: NDArray[np.int64], forces: NDArray[np.float64]
 ) -> dict[str, NDArray[np.float64]]:
-    """Return the force (d,), N, of each wall by name; all processes must call this function.
+    """Return the force (d,), in N, of each wall by name.  All processes must call this function.
 
-    If several walls fix a component of a node, the wall normal to this component carries the force.  If none of
-    these walls is normal to it, they share the force equally.  The axis of revolution has no area and no radial force.
+    If several walls fix a component of a node, the wall normal to this component carries the force.  If none of these
+    walls is normal to the component, they share the force equally.  The axis of revolution has no area and no radial
+    force.
 
-    dofs (n,): local degrees of freedom, unrolled; repetitions are allowed.  Free components are ignored.  forces (n,),
-    N: forces on these degrees of freedom.
+    dofs (n,): flat local degrees of freedom; they may occur repeatedly, and free ones are ignored
+    forces (n,), N: forces on these degrees of freedom
     """
     d, sides = grid.dim, SIDES[grid.dim]
     node, component = np.divmod(dofs, d)

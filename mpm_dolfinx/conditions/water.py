@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Free water at a side of the bodies: hydrostatic pressure below the water level, a seepage face above."""
+"""Free water at a side of the bodies: hydrostatic pressure below the water level, and a seepage face above."""
 
 from __future__ import annotations
 
@@ -22,27 +22,27 @@ def water(
     region: Region | None = None,
     unit_weight: float | None = None,
 ) -> tuple[Pressure, Drained]:
-    """Return two conditions, which both belong in the scene, for still water at a side.
+    """Return two conditions for still water at a side.  Both must be conditions of the scene.
 
-    Below the level, hydrostatic pressure acts on the surface and on the pore fluid.  Above the level, the side is a
-    seepage face.  Both conditions follow the motion of the side in each step.
+    Below the water level, hydrostatic pressure acts on the surface and on the pore fluid.  Above the level, the side is
+    a seepage face.  In each step both conditions follow the motion of the side.
 
     Parameters
     ----------
     side
         Side of the bodies, as for `Traction`.
     level : float or callable t (s) -> float, m
-        Height of the water level along the last axis, finite.
+        Coordinate of the water level along the last axis.  It must be finite.
     region : ((d,), (d,)), m
-        Box of reference positions; water acts on the parts of faces inside it.
+        Box of reference positions.  Water acts on the parts of faces inside the box.
     unit_weight
-        Unit weight of the water, N/m^3, > 0; by default that of the scene's fluid.  If it differs from fluid density
-        times gravity, a warning is issued.
+        Unit weight > 0 of the water, in N/m^3.  By default it is that of the scene's fluid.  A warning is issued if the
+        unit weight differs from fluid density times gravity.
 
     Raises
     ------
     ValueError
-        A value out of range.  An invalid value of a function raises the error in the step that needs the value.
+        A value is out of range.  An invalid value of a function raises the error in the step that needs the value.
     """
     if unit_weight is not None:
         numbers("water: unit_weight", unit_weight, test=lambda v: (0 < v) & (v < np.inf), allowed="> 0 and finite")
@@ -64,6 +64,6 @@ class WaterPressure(OfWater):
     given: float | None = None
 
     def __call__(self, t: float, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the pressures (m,), Pa, at positions x (m, d), m."""
+        """Return the pressures (n,), in Pa, at positions x (n, d), in m, and time t (s)."""
         height = given(f"water at {self.side!r}: level at t = {t:g} s", self.level, t)
         return self.unit_weight * np.maximum(height - x[:, -1], 0.0)

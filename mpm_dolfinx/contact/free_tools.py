@@ -1,24 +1,25 @@
 # SPDX-License-Identifier: MIT
-"""Free tools: rigid tools with a mass, which weight, loads and contact forces move.
+"""Free tools: rigid tools with a mass, which are moved by weight, loads and contact forces.
 
-Let q be the motion of a tool in a step: displacement and, in 2D, rotation.  The equation of motion has the same form as
-for nodes (`mechanics/inertia.py`), m (q - q^) / (g dt)^2 = l - sum A^T f.  Here m are mass and moment of inertia, and
-q^ is the motion without forces in the step.  g is the time weight of the substep's rate, and dt is the length of the
-step.  l are load and weight, and f the contact forces on the points.  A q is the displacement of the contact positions
-on the tool.  The columns of A are e_x, e_y, and e_z x r with the lever arm r.
+Let q be the motion of a tool in a step: its displacement and, in 2D, its rotation.  The equation of motion has the form
+of that for nodes (`mechanics/inertia.py`): `m (q - q^) / (g dt)^2 = l - sum A^T f`.  Here m are mass and moment of
+inertia, and q^ is the motion without forces in the step.  g is the time weight of the substep's rate, and dt is the
+length of the step.  l are load and weight, and f are the contact forces on the points.  `A q` is the displacement of
+the contact positions on the tool.  The columns of A are e_x, e_y, and `e_z x r` with the lever arm r.
 
-The unknowns q are condensed.  Let D be minus the derivative of f with respect to the displacement w of the
-points, and dw the increment of w.  Forces rotate with the tool, so f changes by (D A + E) dq, where E has the columns
-0, 0, e_z x f.  The force on the tool changes by the product of dq with
+The unknowns q are eliminated (static condensation).  Let D be minus the derivative of f with respect to the
+displacement w of the points, and let dw be the increment of w.  Forces rotate with the tool, so f changes by
+`(D A + E) dq`, where E has the columns 0, 0, `e_z x f`.  The force on the tool changes by the product of dq with
+==
 
     A^T D A + [[0, e_z x F], [(e_z x F)^T, sum r . f]],     F = sum f.
 
-With S, the sum of this matrix and m / (g dt)^2, Newton's method gives
+Let S be the sum of this matrix and `m / (g dt)^2`.  Newton's method then gives
 
     dq = S^-1 (l - sum A^T f - m (q - q^) / (g dt)^2 + sum (A^T D + E^T) dw).
 
-Forces on the points are therefore f + (D A + E) S^-1 (...); minus their derivative is
-D - (D A + E) S^-1 (A^T D + E^T).
+Forces on the points are therefore `f + (D A + E) S^-1 (...)`.  Minus the derivative of these forces is
+`D - (D A + E) S^-1 (A^T D + E^T)`.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ from mpm_dolfinx.mechanics.inertia import Flight
 
 
 class FreeMotion(NamedTuple):
-    """Linearised motion of free tools for contact pairs at relative displacements w, see the module."""
+    """Motion of free tools, linearised about relative displacements w of contact pairs.  For symbols see the module."""
 
     w: NDArray[np.float64]  # relative displacements of the pairs (m, d), m
     motion: NDArray[np.float64]  # motion of the tools at w (k, q), m and rad
@@ -57,9 +58,11 @@ class MotionEquation(NamedTuple):
 class FreeTools(ContactProblem):
     """Base class that adds the motion of free tools to `ToolLoads`.
 
-    placed: arguments of `ToolLoads`; mass (k, q): masses, kg, and moments of inertia, kg m^2, 0 for tools that are not
-    free; guides (k, q, q): projections on the motions that each tool can perform, see `motion_count`; velocity (k, q):
-    velocities at the start of the step, m/s and rad/s; pushes (k, q): prescribed loads, N and N m.
+    `placed`: arguments of `ToolLoads`.
+    `mass` (k, q): masses, in kg, and moments of inertia, in kg m^2; 0 for tools that are not free.
+    `guides` (k, q, q): projections on the motions that each tool can perform, see `motion_count`.
+    `velocity` (k, q): velocities at the start of the step, in m/s and rad/s.
+    `pushes` (k, q): prescribed loads, in N and N m.
     """
 
     couples = True
@@ -70,7 +73,10 @@ class FreeTools(ContactProblem):
         self._free_tools = mass[:, 0] > 0
         self._pushes = pushes
         self.flight = Flight(velocity, velocity)
-        """Velocities and accelerations (k, q) of the tools at the start of the substep, m/s, m/s^2, rad/s, rad/s^2."""
+        """Velocities and accelerations (k, q) of the tools at the start of the substep.
+
+        Velocities are in m/s and rad/s, accelerations are in m/s^2 and rad/s^2.
+        """
         self._rate, self._free = 0.0, np.zeros_like(velocity)
 
     def begun(self, shares: Shares, earlier: SubstepMotion | None) -> FreeTools:
@@ -96,7 +102,7 @@ class FreeTools(ContactProblem):
         return np.where(free, self._moved(self.found(at), self._after(at).velocity), super().tool_velocity(at))
 
     def rubbing(self, at: At, v: NDArray[np.float64]) -> tuple[float, float]:
-        """See `Loads`.  Contact forces change the energy of free tools, and loads do work on them."""
+        """See `Loads`.  Contact forces change the energy of free tools, and loads do work on free tools."""
         rubs, more = super().rubbing(at, v)
         free = self._free_tools[self.pairs.number]
         more -= float((self.found(at).touch.force * self.tool_velocity(at))[free].sum())
@@ -115,31 +121,32 @@ class FreeTools(ContactProblem):
         return found._replace(balanced=found.touch.force + self._pulled(found, self._equation(found).shift))
 
     def _moved(self, found: Found, q: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return A q (m, d), the displacements of contact positions caused by motions q (k, q) of the tools."""
+        """Return `A q` (m, d), the displacements of contact positions that motions q (k, q) of the tools cause."""
         d, of = self.grid.dim, q[self.pairs.number]
         return of[:, :d] + of[:, d:] * across(found.at.arm) if d == 2 else of
 
     def _pulled(self, found: Found, q: NDArray[np.float64], adjoint: bool = False) -> NDArray[np.float64]:
-        """Return (D A + E) q (m, d), N, for motions q (k, q) of the tools.  `adjoint` replaces D by its adjoint."""
+        """Return `(D A + E) q` (m, d), in N, for motions q (k, q) of the tools.  `adjoint`: D is replaced by `D^T`."""
         out = self.now.law.slope(found.touch, found.at, self._moved(found, q), adjoint)
         d = self.grid.dim
         return out + q[self.pairs.number, d:] * across(found.touch.force) if d == 2 else out
 
     def _onto(self, found: Found, force: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the generalised forces A^T f (m, q) on the tools, from the contact forces f (m, d), N."""
+        """Return the generalised forces `A^T f` (m, q) on the tools from the contact forces f (m, d), in N."""
         moment = (across(found.at.arm) * force).sum(axis=1, keepdims=True)[:, : self.grid.dim == 2]
         return np.hstack([force, moment])
 
     def _sizes(self, found: Found, force: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return bounds (m, q) of the generalised forces on the tools, from the sizes (m, d) of contact forces, N.
+        """Return upper bounds (m, q) of the generalised forces on the tools.
 
-        A moment is compared with lever arm times force, because the moment of a smooth disc is a rounding error.
+        `force` (m, d), in N, contains magnitudes of the contact forces.  The bound of a moment is lever arm times
+        force, because the moment itself is only a rounding error for a smooth disc.
         """
         moment = np.linalg.norm(found.at.arm, axis=1) * np.linalg.norm(force, axis=1)
         return np.hstack([force, moment[:, None][:, : self.grid.dim == 2]])
 
     def _motion(self, w: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the motions (k, q) of the tools at w (m, d), m, from the last linearisation."""
+        """Return the motions (k, q) of tools at relative displacements w (m, d), in m, from the last linearisation."""
         last = self.now.linear
         law = self.now.law
         dw = w - last.w
@@ -152,13 +159,13 @@ class FreeTools(ContactProblem):
         return last.motion + last.shift + np.einsum("kij,kj->ki", last.inverse, on[:, 1:])
 
     def _free_motion(self, w: NDArray[np.float64], motion: NDArray[np.float64]) -> FreeMotion:
-        """Return the linearised motion of the tools about the motions `motion` (k, q), for pairs at w (m, d), m."""
+        """Return the motion of tools, linearised about `motion` (k, q) and relative displacements w (m, d), in m."""
         found = self._find_at(w, motion)
         equation = self._equation(found)
         return FreeMotion(w, motion, equation.shift, equation.inverse, found)
 
     def _equation(self, found: Found) -> MotionEquation:
-        """Return the linearised equation of motion of the tools, for a contact."""
+        """Return the equation of motion of the tools, linearised about the contact `found`."""
         law = self.now.law
         d = self.grid.dim
         motions = self._guides.transpose(2, 0, 1)
@@ -226,7 +233,7 @@ class FreeTools(ContactProblem):
         return True
 
     def outcome(self, at: At) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """See `Loads`.  Free tools also have velocities (d,), m/s, rotations, rad, and angular velocities, rad/s."""
+        """See `Loads`.  Free tools also have velocities (d,) (m/s), rotations (rad), and angular velocities (rad/s)."""
         out = super().outcome(at)
         d, names = self.grid.dim, self.now.law.names
         motion, velocity = self.pushes.start + self.found(at).motion, self._after(at).velocity

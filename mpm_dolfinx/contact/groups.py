@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Groups of bodies that touch other groups without sticking: each group has a separate copy of the grid."""
+"""Groups of bodies.  Groups may touch without sticking, because each group has a separate copy of the grid."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from mpm_dolfinx.grid.grid import Grid, GridOfGroups
 class Contact:
     """Two groups of bodies in contact, with slip and separation.
 
-    Bodies of the same group stick where they touch.  Groups cannot penetrate each other, but may slide and separate.
+    Bodies of one group stick where they touch.  Groups cannot penetrate each other, but may slide and separate.
     No fluid passes between them.  In a scene with contacts, each body must belong to a group, and each pair of groups
-    must have one contact.  `tool_forces` of the simulation are the forces on the bodies of `one`.
+    must have one contact.  The forces on the bodies of `one` are in `tool_forces` of the simulation.
 
     Parameters
     ----------
@@ -37,7 +37,7 @@ class Contact:
     Raises
     ------
     ValueError
-        An invalid value.  Raised by the scene: groups with common bodies, or a pair of groups without a contact.
+        A value is invalid.  A scene also raises this error if two groups have a common body or no contact.
     """
 
     one: int | Sequence[int]
@@ -78,7 +78,7 @@ class Contact:
 
 
 def groups_of(contacts: Sequence[Contact], count: int) -> list[tuple[int, ...]]:
-    """Return the groups in a scene of `count` bodies, sorted by first body; raise ValueError for invalid groups."""
+    """Return the groups in a scene of `count` bodies, sorted by first body.  Raise ValueError for invalid groups."""
     pairs = [contact.groups(count) for contact in contacts]
     groups = sorted({group for pair in pairs for group in pair})
     for one, other in combinations(groups, 2):
@@ -96,7 +96,7 @@ def groups_of(contacts: Sequence[Contact], count: int) -> list[tuple[int, ...]]:
 def grouped(
     grid: Grid, bodies: Sequence[Body], contacts: Sequence[Contact], quadrature: str, other: dict[str, Any]
 ) -> Grid:
-    """Return the grid of a scene; in a scene with contacts, a grid with a copy for each group.
+    """Return the grid of a scene.  In a scene with contacts, this grid has a copy for each group.
 
     Parameters
     ----------
@@ -108,7 +108,7 @@ def grouped(
     Raises
     ------
     ValueError
-        Invalid contacts, or options that contacts exclude.
+        Contacts are invalid, or an option is not available with contacts.
     """
     if not contacts:
         return grid

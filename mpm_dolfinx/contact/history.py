@@ -16,7 +16,7 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 
 
 class Rough(Protocol):
-    """Shear strength of a tool or contact: coefficient mu, adhesion, Pa, and whether the contact resists slip."""
+    """Shear strength of a tool or contact: Coulomb's coefficient, adhesion in Pa, and whether it resists slip."""
 
     friction: float
     adhesion: float
@@ -24,18 +24,18 @@ class Rough(Protocol):
 
 
 def pressure_name(name: str) -> str:
-    """Return the name of the point field with the pressure (n,), Pa, of a tool or contact."""
+    """Return the name of the point field with the pressure (n,), in Pa, of a tool or contact."""
     return f"{name}_pressure"
 
 
 def shear_name(name: str) -> str:
-    """Return the name of the point field with the shear traction (n, d), Pa, of a tool or contact."""
+    """Return the name of the point field with the shear traction (n, d), in Pa, of a tool or contact."""
     return f"{name}_shear"
 
 
 @dataclass(frozen=True, eq=False)
 class Origin:
-    """Material points to which contact pairs belong; arrays over n pairs, before these are sent to owners of cells."""
+    """The material point and the contact of each of n pairs, before `exchange` sends the pairs to owners of cells."""
 
     exchange: Exchange  # sends the pairs to the owners of their cells
     point: NDArray[np.int64]  # index of the material point on this process (n,)
@@ -45,7 +45,7 @@ class Origin:
     def means(
         self, contacts: Mapping[str, Rough], points: MaterialPoints, push: NDArray, shear: NDArray
     ) -> MaterialPoints:
-        """Return the points with area-weighted means over their pairs: pressures `push`, tractions `shear`, Pa."""
+        """Return the points with area-weighted means of their pairs' pressures `push` and tractions `shear`, in Pa."""
         push = self.exchange.back(push)
         shear = self.exchange.back(shear)
         data = dict(points.data)
@@ -63,7 +63,7 @@ class Origin:
 
 
 def joined(both: Sequence[Origin], kept: Sequence[NDArray[np.bool_]]) -> tuple[Origin, NDArray[np.int64]]:
-    """Return one `Origin` of all pairs flagged in `kept`, and indices (n,) of these pairs after the exchange."""
+    """Return one `Origin` of all pairs flagged in `kept`, and the order (n,) in which its exchange delivers them."""
     columns, start = [], 0
     comm = both[0].exchange.comm
     for of, rows in zip(both, kept, strict=True):

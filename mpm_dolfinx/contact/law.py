@@ -6,21 +6,22 @@ At a position with gap g, the contact pressure and its energy per area are
     p = <lambda - k g>,     psi = p^2 / (2 k).
 
 <...> is the positive part.  The stiffness k is limited so that a Q1 field can follow curved surfaces.  The multiplier
-lambda has one value for each contact and cell, which starts from the pressure of the previous step.  Augmentation
-(Uzawa's method) updates lambda until the mean penetration in each cell is below `DEPTH`.  Friction depends on means
-over the pairs in a cell: the slip s in the step, and the shear traction t_n after the previous step,
+lambda has one value for each contact and cell.  Its initial value is the pressure after the previous step.
+Augmentation (Uzawa's method) updates lambda until the mean penetration in each cell is below `DEPTH` cell sizes.  The
+shear traction t depends on means over the pairs in a cell: the slip s in the step, and the shear traction t_n after the
+previous step.  Radial return gives
 
-    t = P (t_n - k_t s),     |t| <= mu p + min(adhesion, 10 p)      by radial return,
+    t = P (t_n - k_t s),     |t| <= mu p + min(adhesion, 10 p).
 
-with the projection P on the tangent plane and Coulomb's coefficient mu.  Sticking contact is elastic with stiffness
+P is the projection on the tangent plane, and mu is Coulomb's coefficient.  Sticking contact is elastic with stiffness
 k_t.
 
-The set of slipping cells is updated after Newton steps (active-set method).  With an update in each residual, cells
+The set of slipping cells is updated after Newton steps (active-set method).  If it were updated in each residual, cells
 would alternate between stick and slip, because slip has no stiffness.  All cells start in stick, whatever their
-traction.  Only near equilibrium does a cell with reversed slip return to stick; it may slip again.  A sticking cell
-that opens is set to slip.  If it had returned from slip to stick before, it then slips until the pairs are updated or
-the substep ends.  Without this rule, shear alone could open and close cells again and again under a
-round tool at first contact, where mean normals are inclined.
+traction.  A cell with reversed slip returns to stick only near equilibrium.  It may slip again later.  A sticking cell
+that opens is set to slip.  If this cell had returned from slip to stick before, it slips until the pairs are updated or
+the substep ends.  This rule is needed at first contact under a round tool, where mean normals are inclined.  Shear
+alone could otherwise open and close cells again and again.
 """
 
 from __future__ import annotations
@@ -41,13 +42,14 @@ from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.parallel.exchange import first, over_all
 
 STIFF = 100.0
-"""Stiffness k, times the cell size, divided by the modulus from `resistance`."""
+"""The stiffness k is this factor times the modulus from `resistance`, divided by the cell size."""
 GRIP = 6.0
-"""Stiffness k_t, times the cell size, divided by the modulus from `resistance`.  With a larger k_t, spurious shear
-stresses would alternate between cells: their nodal forces cancel, so nothing would resist them.
+"""The stiffness k_t is this factor times the modulus from `resistance`, divided by the cell size.  With a larger k_t,
+spurious shear tractions would alternate between cells.  The nodal forces of such tractions cancel, so that nothing
+would resist them.
 """
 DEPTH = 5e-4  # allowed mean penetration, divided by the cell size
-SLIVER = 0.25  # fraction of a cell's face: penetrations of smaller contact areas are reduced in proportion
+SLIVER = 0.25  # fraction of a cell's face; penetrations of smaller contact areas are reduced in proportion
 ROUNDS = 20  # largest number of augmentations
 BEGIN = 1.0, np.inf, 0.0, 0.0  # initial values of `ContactState.updates`
 SLOW, STIFFER = 0.6, 10.0
@@ -57,7 +59,7 @@ RAMP = 10.0  # largest ratio of adhesion to normal pressure
 
 @dataclass(frozen=True, eq=False)
 class ContactState:
-    """State of the contact iterations, without displacements.  There are k conditions: one per contact and cell."""
+    """State of the contact iterations, except displacements.  k conditions exist, one for each contact and cell."""
 
     pressure: NDArray[np.float64]  # multiplier lambda (k,), Pa
     slip: NDArray[np.float64]  # direction of slip, zero in stick (k, d)
@@ -92,7 +94,7 @@ class Touch:
 class ContactLaw:
     """Contact pressures, shear tractions and their derivatives in a substep.
 
-    names: names of the `contacts`; pairs: possible contact pairs.
+    `names` are the names of the `contacts`.  `pairs` are the possible contact pairs.
     """
 
     def __init__(self, names: Sequence[str], contacts: Sequence[Rough], pairs: Pairs):
@@ -131,7 +133,7 @@ class ContactLaw:
         return self.total(self.pairs.area[each] * values) / self.area[each]
 
     def stiffness(self, state: ContactState) -> NDArray[np.float64]:
-        """Return the stiffness k (m,), Pa/m, of the pairs."""
+        """Return the stiffness k (m,), in Pa/m, of the pairs."""
         return state.updates[self.of, 0] * self._stiffness
 
     def touch(self, state: ContactState, at: Geometry) -> Touch:
@@ -156,7 +158,9 @@ class ContactLaw:
     ) -> tuple:
         """Return the fields of `Touch` from `sticks` to `by_pressure`.
 
-        Means over the pairs of each condition (k, d): normal `n`, `slip`, m, and traction before the step `old`, Pa.
+        `n` (k, d): mean normal of the pairs of each condition.
+        `slip` (k, d), in m: mean slip of these pairs in the step.
+        `old` (k, d), in Pa: mean shear traction of these pairs before the step.
         """
         P = np.eye(n.shape[1]) - n[:, :, None] * n[:, None, :]
         hold = np.where(self.strength.any(axis=1), self._hold, 0.0) * on
@@ -173,7 +177,7 @@ class ContactLaw:
         return ~slips & on, trial, shear, most, grip, by_pressure
 
     def tangent(self, touch: Touch, at: Geometry) -> scipy.sparse.csr_matrix:
-        """Return minus the derivative D (m d, m d) of forces with respect to w, without rotation of shear tractions."""
+        """Return D (m d, m d), minus the derivative of forces by w.  The rotation of shear tractions is neglected."""
         pairs = self.pairs
         d = self.grid.dim
         m = len(self.pairs.cell)
@@ -197,7 +201,7 @@ class ContactLaw:
         return (D + wide.T @ (grip @ wide + by_pressure @ (mean @ slope))).tocsr()
 
     def slope(self, touch: Touch, at: Geometry, v: NDArray, adjoint: bool = False) -> NDArray[np.float64]:
-        """Return D v (m, d) for v (m, d), or D^T v with `adjoint`; D: see `tangent`."""
+        """Return `D v` (m, d) for v (m, d) and D of `tangent`.  `adjoint`: return `D^T v` instead."""
         area, across = self.pairs.area[:, None], (touch.stiff * (at.n * v).sum(axis=1))[:, None]
         out = across * at.n
         if at.curvature is not None:
@@ -212,7 +216,7 @@ class ContactLaw:
         return area * out
 
     def choose(self, state: ContactState, touch: Touch, sticks: bool) -> tuple[ContactState, bool]:
-        """Update which conditions slip; return the state, and whether any condition changed.  `sticks`: allow stick."""
+        """Update which conditions slip.  Return the state and whether any changed.  `sticks` allows return to stick."""
         before = state.slips
         left = ~before & ~touch.sticks & state.stuck.any(axis=1)
         parts = state.parts | (left & state.resticks)
@@ -229,9 +233,10 @@ class ContactLaw:
         return replace(state, slip=slip, resticks=resticks, parts=parts, stuck=stuck), changed
 
     def augmented(self, state: ContactState, touch: Touch, largest: Callable[[NDArray], NDArray]) -> ContactState:
-        """Return the state; in parts with large penetrations, lambda is set to the pressures.  May raise NotConverged.
+        """Return the state after an augmentation.  Raise NotConverged if there have been too many augmentations.
 
-        `largest` returns the largest value in the part of each condition (k,).
+        lambda is set to the contact pressures in connected parts with too large penetrations.  `largest` is a function
+        of values (k,), which returns the largest value (k,) in the connected part of each condition.
         """
         # small parts of faces in a cell cannot correct their penetration alone, but follow their neighbours
         x = self.pairs.x
@@ -255,7 +260,7 @@ class ContactLaw:
         return replace(state, pressure=np.where(most > DEPTH, touch.pressure, state.pressure), updates=updates)
 
     def rounding(self, state: ContactState) -> NDArray[np.float64]:
-        """Return the rounding errors of the forces (m,), N, of the pairs."""
+        """Return the rounding errors (m,), in N, of the forces of the pairs."""
         of_gap = 4 * EPSILON * self.pairs.largest_coordinate
         return of_gap * self.stiffness(state) * self.pairs.area
 
@@ -266,19 +271,20 @@ class ContactLaw:
         return over_all(self.grid.comm, sums).reshape(len(self.contacts), *values.shape[1:])
 
     def forces(self, touch: Touch, at: Geometry) -> NDArray[np.float64]:
-        """Return the forces and moments of each contact on the bodies, on all processes, N and N m.
+        """Return the forces, in N, and moments, in N m, of each contact on the bodies, as sums over all processes.
 
-        Shape (contacts, 3) in 2D, (contacts, 6) in 3D.  In axisymmetry moments are zero, and the radial force is the
-        integral of the outward traction.
+        The shape is (contacts, 3) in 2D, and (contacts, 6) in 3D.  In axisymmetry, moments are zero, and the radial
+        force is the integral of the outward traction.
         """
         force, arm = self.pairs.sign[:, None] * touch.force, at.arm * (not self.grid.axisymmetric)
         cross = np.cross(arm, force) if arm.shape[1] == 3 else arm[:, :1] * force[:, 1:] - arm[:, 1:] * force[:, :1]
         return self.by_contact(np.hstack([force, cross]))
 
     def tractions(self, touch: Touch, at: Geometry) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the pressures (m,) and shear tractions (m, d), Pa, of the pairs.
+        """Return the pressures (m,) and shear tractions (m, d), in Pa, of the pairs.
 
-        In stick, pairs keep their deviations from the cell's mean shear traction: repeated averaging would cause creep.
+        In stick, pairs keep their deviations from the cell's mean shear traction, because repeated averaging would
+        cause creep.
         """
         off = (at.shear - self.mean(at.shear)[self.of]) * touch.sticks[self.of, None]
         return touch.push, touch.shear[self.of] + off

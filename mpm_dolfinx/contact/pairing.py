@@ -38,7 +38,7 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.points.parts import parts_of_domains
 
 REACH = 2.0
-"""Largest gap, divided by the cell size, that may close in a step.  Motions above half of it are rejected."""
+"""Largest gap, divided by the cell size, that may close in a step.  Motions of more than half this gap are rejected."""
 CLEAR = 0.5
 """Gap, divided by the cell size, above which faces cannot touch before the next update of the pairs."""
 DEEP = 0.25
@@ -52,7 +52,7 @@ PLACES = 1 << 32
 
 
 class Facets(NamedTuple):
-    """Quadrature points of all processes on the faces of one group; arrays over n points."""
+    """Quadrature points of all processes on the faces of one group.  Arrays have a row for each of n points."""
 
     x: NDArray[np.float64]  # position (n, d), m
     face: NDArray[np.int64]  # row of the face in its `Surface` (n,)
@@ -64,7 +64,7 @@ class Facets(NamedTuple):
 
 
 class Pairs(NamedTuple):
-    """Points of one surface, and opposite positions on the other surface; arrays over m pairs."""
+    """Pairs of a point on one surface and the opposite position on the other surface.  Arrays have m rows."""
 
     row: NDArray[np.int64]  # index of the point among the quadrature points of this process (m,)
     facet: NDArray[np.int64]  # index in `Facets` of a point on the opposite face (m,)
@@ -73,7 +73,7 @@ class Pairs(NamedTuple):
 
 
 class Contacts(Touching):
-    """The contacts between groups in a stage; setting: data of the stage; contacts: contacts by name."""
+    """The contacts between groups in a stage.  `setting` is the stage's data.  `contacts` has contacts by name."""
 
     conditions, title = (Contact,), "contacts"
 
@@ -113,9 +113,10 @@ class Contacts(Touching):
         present: MaterialPoints,
         cell_pairs: Callable[[], NDArray[np.int64]],
     ) -> tuple[ContactLaw, Origin]:
-        """Return the contact law of pairs that were found for the points `seen`.
+        """Return the contact law and the origin of pairs that were found for the points `seen`.
 
-        `points` are the points at the start of the step, with the contact history; `present` are the current points.
+        `points`: points at the start of the step, with the contact history.
+        `present`: points at their current positions.
         """
         grid = self.grid
         d = self.grid.dim
@@ -167,9 +168,9 @@ class Contacts(Touching):
         return [self._opposite(cut, own, other, points) for _, own, other, _ in self._faces]
 
     def _cells_within_reach(self, cut: CutDomains, found: Sequence[tuple[Facets, Pairs]]) -> NDArray[np.int64]:
-        """Return all pairs of cells (m,), as integers first * cells + second, that contact pairs may join in the step.
+        """Return all pairs of cells (n,) that contact pairs may join in the step, as integers `first * cells + second`.
 
-        These are the pairs of cells of the initial contact pairs, and all pairs of neighbouring cells.
+        These are the pairs of cells of the initial contact pairs, and all pairs of neighbouring cells on both surfaces.
         """
         grid = self.grid
         keys = []
@@ -235,9 +236,9 @@ class Contacts(Touching):
         return facets, Pairs(row[order], other[order], t[order], gap[order])
 
     def _under(self, facets: Facets, chosen: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the cells (m,) just inside the chosen facets at positions x (m, d).
+        """Return the cells (n,) just inside the chosen facets at positions x (n, d).
 
-        If a cell contains no quadrature point of the face, the cell of the facet is returned instead.
+        If such a cell contains no quadrature point of the face, the cell of the facet's own point is returned instead.
         """
         grid, inside = self.grid, x - NEAR * self.grid.least * facets.outward[chosen]
         number = grid.number(grid.index_from_base(inside)) + facets.cell[chosen] // grid.cells * grid.cells
@@ -245,7 +246,7 @@ class Contacts(Touching):
         return np.where(np.isin(facets.face[chosen] * grid.all_cells + number, keys), number, facets.cell[chosen])
 
     def near(self, cut: CutDomains, points: MaterialPoints, corners: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return which corners (n, 2^d, d) are near another group; points: points at the start of the step."""
+        """Return which corners (n, 2^d, d) are near another group.  `points`: points at the start of the step."""
         out, largest = np.zeros(corners.shape[:2], dtype=bool), BESIDE * self.grid.sizes_at(corners).max(axis=-1)
         largest = np.broadcast_to(largest, corners.shape[:2])
         for _, *pair, _ in self._faces:
@@ -257,7 +258,7 @@ class Contacts(Touching):
         return out
 
     def _sizes(self, x: NDArray[np.float64]) -> NDArray[np.float64] | float:
-        """Return the shortest edges (...), m, of the cells at positions x (..., d), m; one number for equal cells."""
+        """Return the shortest edges (...) of the cells at positions x (..., d), in m.  Equal cells give one number."""
         return self.grid.least if self.grid.even else self.grid.sizes_at(x).min(axis=-1)
 
     def check_end(self, cut: CutDomains, points: MaterialPoints, before: MaterialPoints) -> None:
@@ -286,7 +287,7 @@ class Contacts(Touching):
             raise ValueError(f"{message}, at the start t = {place.start:g} s, must be apart or touch")
 
     def _too_deep(self, cut: CutDomains, points: MaterialPoints) -> str:
-        """Return a message with depth and position of an overlap of groups, or "" if none overlap."""
+        """Return a message with depth and position of an overlap of groups, or "" without an overlap."""
         h, comm = self.grid.least, self.grid.comm
         for number, faces, others, _ in self._faces:
             _, pairs = self._opposite(cut, faces, others, points)
@@ -299,9 +300,9 @@ class Contacts(Touching):
 
 
 class ContactLoads(ContactProblem):
-    """Contact loads between groups; the contact pairs follow the motion of the bodies.
+    """Contact loads between groups.  The contact pairs follow the motion of the bodies.
 
-    cut: cut particle domains; law, origin, again, cell_pairs: see `ContactProblem`.
+    `cut` has the cut particle domains.  For the other parameters see `ContactProblem`.
     """
 
     def __init__(self, contacts: Contacts, cut: CutDomains, law: ContactLaw, origin: Origin, again, cell_pairs):
@@ -322,9 +323,10 @@ class ContactLoads(ContactProblem):
 
 
 def _ranks(setting: Setting) -> NDArray[np.int64]:
-    """Return the rank (points,) of the connected part of each point, by surface area and then by extent.
+    """Return the rank (points,) of the connected part of each point.  Parts are ranked by surface area, then by extent.
 
-    The ranking of two parts is the same in all stages and for any order of the bodies, whatever other parts exist.
+    The order of two parts is therefore the same in all stages.  It does not depend on other parts, nor on the order of
+    the bodies.
     """
     grid, bodies = setting.grid, setting.sides.bodies
     corners = np.concatenate([body.corners() for body in bodies])
@@ -355,7 +357,7 @@ def _on(corners: NDArray[np.float64], t: NDArray[np.float64]) -> NDArray[np.floa
 
 
 def _along(corners: NDArray, x: NDArray, n: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return where lines from x along n (m, d) intersect faces: face coordinates (m, 2), distances (m,), m, from x."""
+    """Return face coordinates (m, 2), and distances (m,) from x, in m, where lines from x along n intersect faces."""
     if corners.shape[2] == 2:  # as in `Faces`, with unit width along a third axis
         corners = np.dstack([corners[:, BITS[:, 0]], np.broadcast_to(BITS[:, 1], (len(x), 4))])
         x, n = np.column_stack([x, np.full(len(x), 0.5)]), np.column_stack([n, np.zeros(len(x))])

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Contact pairs: a quadrature point on a surface, and the opposite position on a tool or another group of bodies.
 
-The relative displacement of a pair is w = B u.  The columns of B belong to the nodes of the point's cell and, between
-groups, of the cell on the other side.  A position on a tool moves with the tool.
+The relative displacement of a pair is `w = B u`.  The columns of B belong to the nodes of the point's cell.  In pairs
+between groups, they also belong to the nodes of the cell on the other side.  A position on a tool moves with the tool.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from mpm_dolfinx.parallel.exchange import Exchange, together
 
 
 class Geometry(NamedTuple):
-    """Geometry of m contact pairs at relative displacements w (m, d), m."""
+    """Geometry of m contact pairs at relative displacements w (m, d), in m."""
 
     gap: NDArray[np.float64]  # gap (m,), m; negative in penetration
     n: NDArray[np.float64]  # derivative of the gap with respect to w (m, d): outward unit normal of the other side
@@ -52,24 +52,24 @@ class Pairs:
     sign: NDArray[np.float64]  # sign of the forces on points in the results (m,)
 
     def at(self, w: NDArray[np.float64], motion: NDArray[np.float64]) -> Geometry:
-        """Return the geometry at w (m, d), m.
+        """Return the geometry at the relative displacements w (m, d), in m.
 
-        `motion` (contacts,), m: displacements of tools that loads cause in the step; with free tools (contacts, q):
-        displacements, m, and rotations, rad.
+        `motion` (contacts,) are the displacements of tools, in m, that loads cause in the step.  With free tools, its
+        shape is (contacts, q), with displacements in m and rotations in rad.
         """
         raise NotImplementedError
 
     @property
     def largest_coordinate(self) -> NDArray[np.float64] | float:
-        """Largest coordinate in the computation of gaps, m: (m,) for each pair, or one value for all."""
+        """Largest coordinates (m,), in m, from which the gaps of pairs are computed, or one value for all pairs."""
         return self.grid.reach
 
     def other_side(self) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
-        """Return lexicographic cells (m,) of opposite positions, and shape functions (m, 2^d) there; None on tools."""
+        """Return lexicographic cells (m,) of opposite positions and shape functions (m, 2^d), or None on tools."""
         return None
 
     def operator(self, unknowns: Unknowns) -> PETSc.Mat:
-        """Return the matrix B, which maps the unknowns to w (m d,), m."""
+        """Return the matrix B, which maps the unknowns to w (m d,), in m."""
         value, other = self.grid.shape_values(self.cell, self.x), self.other_side()
         if other is None:
             return at_nodes(self.grid, unknowns, self.cell, value)
@@ -78,7 +78,7 @@ class Pairs:
 
 @dataclass(frozen=True, eq=False)
 class ToolPairs(Pairs):
-    """Contact pairs of points on a surface and tools.  Shear tractions are rotated with the tool."""
+    """Contact pairs between tools and points on a surface.  Shear tractions are rotated with the tool."""
 
     tools: Sequence[Tool]  # (contacts,)
     poses: Sequence[Pose]  # poses of tools at the end of the substep, without motion by loads in the step (contacts,)
@@ -118,14 +118,14 @@ class ToolPairs(Pairs):
 
     @property
     def largest_coordinate(self) -> NDArray[np.float64]:
-        """See `Pairs`.  User functions are evaluated at true positions, whose size decides the rounding error."""
+        """See `Pairs`.  User functions are evaluated at true positions, which determine the rounding error."""
         true = np.array([callable(tool.shape) for tool in self.tools])[self.number]
         return np.where(true, np.abs([self.grid.lower, self.grid.upper]).max(), self.grid.reach)
 
 
 @dataclass(frozen=True, eq=False)
 class FacePairs(Pairs):
-    """Contact pairs of points on the surface of a group with opposite positions, along normals, on another group."""
+    """Contact pairs of points on the surface of one group with positions, along their normals, on another group."""
 
     other: NDArray[np.int64]  # lexicographic cell of the other side (m,)
     y: NDArray[np.float64]  # opposite position in the undeformed grid (m, d), m
@@ -144,7 +144,7 @@ class FacePairs(Pairs):
 
 
 def shape_values_in(grid: Grid, cells: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the Q1 shape functions (m, 2^d) of lexicographic cells (m,) of any process, at positions x (m, d), m."""
+    """Return Q1 shape functions (m, 2^d) of lexicographic cells (m,) of any process at positions x (m, d), in m."""
     index = np.stack(np.unravel_index(cells % grid.cells, tuple(grid.shape)), axis=1)
     off = grid.in_cells(x) - index - 0.5
     return np.prod(0.5 + off[:, None] * grid.signs, axis=2)
@@ -192,7 +192,7 @@ def petsc_matrix(rows: scipy.sparse.csr_matrix, columns: int, comm: MPI.Intracom
 
 
 def _check_distance(tool: Tool, x: NDArray, gap: NDArray, n: NDArray, h: float) -> None:
-    """Raise an error if a user function is no signed distance near the tool, because its slope differs from 1."""
+    """Raise an error if a user function is no signed distance near the tool, that is, if its slope there is not 1."""
     size = np.linalg.norm(n, axis=1)
     wrong = np.flatnonzero((np.abs(gap) < h) & (np.abs(size - 1) > DISTANCE))
     if len(wrong):

@@ -1,19 +1,19 @@
 # SPDX-License-Identifier: MIT
 """Contact problem of a substep, with tools or between groups of bodies.
 
-A pair consists of a quadrature point on a surface and the opposite position, on a tool or another group (`pairs`).
-The pairs have the relative displacements w = B u and the forces f(w); the nodal forces are B^T f(w).  Forces on both
-bodies are therefore equal and opposite within rounding.  If both sides deform, the pairs and their geometry are first
-taken at the start of the step.  After convergence, both are updated at the new positions, and the step is solved
-again.  This is repeated until an update changes the gaps by less than `DEPTH` cells.
+A pair consists of a quadrature point on a surface and the opposite position on a tool or another group (`pairs`).  The
+pairs have the relative displacements `w = B u` and the forces `f(w)`.  The nodal forces are `B^T f(w)`.  Forces on both
+bodies are therefore equal and opposite within rounding.  If both sides deform, the pairs are first determined at the
+start of the step.  After convergence, the pairs are updated at the new positions, and the step is solved again.  This
+is repeated until an update changes the gaps by less than `DEPTH` cells.
 
-A load-controlled tool has one more unknown: its displacement a along the direction e of the load.  Let f(w - a e) be
-the forces on points, let D be minus their derivative with respect to w, and let s = e . D e.  Newton's method solves
-e . f = load together with the equilibrium of the bodies, by
+A load-controlled tool has one more unknown: its displacement a along the direction e of the load.  Let `f(w - a e)` be
+the forces on points.  Let D be minus the derivative of these forces with respect to w, and let `s = e . D e`.  Newton's
+method solves `e . f = load` together with the equilibrium of the bodies, by
 
     da = (e . D dw + load - e . f) / s.
 
-Forces are therefore f + (D e) (load - e . f) / s; minus their derivative is D - (D e) (e . D) / s.
+Forces are therefore `f + (D e) (load - e . f) / s`.  Minus the derivative of these forces is `D - (D e) (e . D) / s`.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class Pushes:
     """Prescribed loads on k load-controlled tools."""
 
     names: Sequence[str]  # names of the tools, for error messages
-    start: NDArray[np.float64]  # displacement by the load before the step (k,), m
+    start: NDArray[np.float64]  # displacement that the load caused before the step (k,), m
     direction: NDArray[np.float64]  # unit vector of the load (k, d)
     load: NDArray[np.float64]  # load (k,), N; nan for tools without a load
 
@@ -59,7 +59,7 @@ class Pushes:
 class LinearMotion:
     """Linearised displacements of k load-controlled tools in the step, as functions of relative displacements w'.
 
-    The displacements are `motion` + `shift` + sum `slope` . (w' - w); the sum is over the pairs of a tool.  Newton's
+    The displacements are `motion + shift + sum slope . (w' - w)`.  The sum is over the pairs of a tool.  Newton's
     method uses this linear function.
     """
 
@@ -74,12 +74,12 @@ class Found(NamedTuple):
 
     at: Geometry  # geometry of the pairs
     touch: Touch  # forces of the pairs
-    motion: NDArray[np.float64]  # displacements of tools by loads (k,), m
+    motion: NDArray[np.float64]  # displacements of tools that loads cause (k,), m
     balanced: NDArray[np.float64]  # forces on points after the Newton increment of the tools (m, d), N
 
 
 class Current(NamedTuple):
-    """Contact law of the current pairs, their material points, state of the iterations, and motions of tools."""
+    """Contact law and material points of the current pairs, state of the iterations, and motions of tools."""
 
     law: ContactLaw
     origin: Origin
@@ -88,7 +88,7 @@ class Current(NamedTuple):
 
 
 class SubstepMotion(NamedTuple):
-    """Motion of tools in a substep with time weight `own`, s: their poses, and the `Flight` of free tools."""
+    """Motion of tools in a substep: time weight `own` (s) of the substep, poses of tools, `Flight` of free tools."""
 
     own: float
     poses: Any
@@ -96,7 +96,7 @@ class SubstepMotion(NamedTuple):
 
 
 class Touching(Acting):
-    """Contact conditions of one kind in a stage.  `given` are its tools, or its contacts between groups, by name."""
+    """Contact conditions of one kind in a stage.  `given` are the stage's tools or contacts between groups, by name."""
 
     linear = False
 
@@ -107,7 +107,7 @@ class Touching(Acting):
         self.symmetric = not any(self._grips)
 
     def kept(self, n: int) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return zero histories of n points: pressures (n,), Pa; if contacts resist slip also tractions (n, d), Pa."""
+        """Return zero histories of n points: pressures (n,) and, for contacts that resist slip, tractions (n, d)."""
         out = {name: {pressure_name(name): np.zeros(n)} for name in self.names}
         for name, grips in zip(self.names, self._grips, strict=True):
             out[name] |= {shear_name(name): np.zeros((n, self.grid.dim))} if grips else {}
@@ -120,7 +120,7 @@ class Touching(Acting):
 
 
 class ContactProblem(Loads):
-    """Contact forces in a substep.  `now` is replaced during the solution.
+    """Contact forces in a substep.  The attribute `now` is replaced during the solution.
 
     Parameters
     ----------
@@ -129,9 +129,10 @@ class ContactProblem(Loads):
     pushes
         Prescribed loads on the tools.
     again
-        Function from displacements (a local array, m) to law and origin of the pairs found there, see `FacePairs`.
+        Function of displacements (a local array, in m).  It returns the law and the origin of the pairs that are found
+        at these displacements, see `FacePairs`.
     cell_pairs
-        Function that returns all pairs of cells, as integers first * cells + second, that contact pairs may join.
+        Function that returns all pairs of cells, as integers `first * cells + second`, that contact pairs may join.
     """
 
     linear, smooth, touches = False, False, True
@@ -171,12 +172,12 @@ class ContactProblem(Loads):
 
     @property
     def _loaded(self) -> NDArray[np.int64]:
-        """Indices of the tools that loads move; each of them couples all nodes under it."""
+        """Indices of the tools that loads move.  Each of these tools couples all nodes under it."""
         return np.flatnonzero(~np.isnan(self.pushes.load)) if self.pushed else np.empty(0, dtype=np.int64)
 
     @cached_property
     def key(self) -> tuple[NDArray[np.int32], ...]:
-        """The cells under each of the tools that loads move; they depend on the length of the step."""
+        """The cells under each tool that loads move.  These cells depend on the length of the step."""
         return tuple(np.unique(self.pairs.cell[self.pairs.number == number]) for number in self._loaded)
 
     def joined(self, substeps: Sequence[ContactProblem]) -> ContactProblem:
@@ -195,7 +196,7 @@ class ContactProblem(Loads):
         return self._found((self.now, at.unknowns, at.u[at.unknowns.owned]), find, self.grid.comm)
 
     def _apart_by(self, law: ContactLaw, at: At) -> NDArray[np.float64]:
-        """Return the relative displacements w (m, d), m, of the pairs of a law."""
+        """Return the relative displacements w (m, d), in m, of the pairs of a law."""
         B, w = self._B(law, at.unknowns)
         B.mult(at.unknowns.gather_owned(at.u[at.unknowns.owned]), w)
         return w.array_r.reshape(-1, self.grid.dim).copy()
@@ -221,7 +222,7 @@ class ContactProblem(Loads):
         return found._replace(balanced=touch.force + more)
 
     def push(self, at: At, residual: PETSc.Vec, on: Unknowns) -> None:
-        """Subtract the contact forces at u."""
+        """Subtract the contact forces at u from the residual."""
         B, w = self._B(self.now.law, at.unknowns)
         w.array_w[:] = -self.found(at).balanced.ravel()
         B = B if on is at.unknowns else self.pairs.operator(on)
@@ -275,7 +276,7 @@ class ContactProblem(Loads):
         return K
 
     def _nodal(self, unknowns: Unknowns, values: NDArray[np.float64]) -> PETSc.Vec:
-        """Return B^T v for values v (m, d) at the pairs."""
+        """Return `B^T v` for values v (m, d) at the pairs."""
         B, w = self._B(self.now.law, unknowns)
         w.array_w[:] = values.ravel()
         out = unknowns.vector()
@@ -283,9 +284,9 @@ class ContactProblem(Loads):
         return out
 
     def _motion(self, w: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the displacements of tools that loads cause at w (m, d), m, from the last linearisation.
+        """Return the displacements of tools that loads cause at w (m, d), in m, from the last linearisation.
 
-        Shape (tools,), or before the first substep of free tools (tools, q).
+        The shape is (tools,).  Before the first substep of free tools, it is (tools, q).
         """
         if not self.pushed:
             return np.zeros(len(self.now.law.contacts)) if self.pushes is None else np.zeros_like(self.pushes.start)
@@ -296,7 +297,7 @@ class ContactProblem(Loads):
         return np.clip(linear.motion + linear.shift + more, -h, h)
 
     def _linearised(self, w: NDArray[np.float64], motion: NDArray[np.float64]) -> LinearMotion:
-        """Return the displacements of tools, linearised about `motion` (tools,), m, for pairs at w (m, d), m."""
+        """Return displacements of tools, linearised about `motion` (tools,) and relative displacements w (m, d)."""
         law, of = self.now.law, self.pairs.number
         at, touch, *_ = found = self._find_at(w, motion)
         _, slope, _ = self._reactions(found)
@@ -306,7 +307,7 @@ class ContactProblem(Loads):
         return LinearMotion(w, motion, shift, by[of, None] * slope)
 
     def _reactions(self, found: Found) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Return the reactions along the loads (tools,), N, their derivatives, N/m, and their rounding errors, N."""
+        """Return three arrays (tools,) of reactions along loads: values (N), derivatives (N/m), rounding errors (N)."""
         law, e = self.now.law, self.pushes.direction[self.pairs.number]
         slope = law.slope(found.touch, found.at, e)
         both = (e * found.touch.force).sum(axis=1), (e * slope).sum(axis=1)
@@ -315,7 +316,7 @@ class ContactProblem(Loads):
         return reaction, slope, law.by_contact(off[:, None])[:, 0]
 
     def _seek(self, found: Found) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Return the least displacements (tools,), m, at which a single point bears the load, and which tools touch."""
+        """Return displacements (tools,), in m, at which one point would bear the load, and which tools touch bodies."""
         law, state = self.now.law, self.now.state
         of = self.pairs.number
         along, k = (found.at.n * self.pushes.direction[of]).sum(axis=1), law.stiffness(state)
@@ -328,7 +329,7 @@ class ContactProblem(Loads):
         return over_all(self.grid.comm, nearest, MPI.MIN), touches
 
     def _shift(self, found: Found) -> NDArray[np.float64]:
-        """Return the Newton increments (tools,), m, with which reactions approach the loads."""
+        """Return the Newton increments (tools,), in m, of the tool displacements that bring reactions to the loads."""
         reaction, slope, _ = self._reactions(found)
         off = np.nan_to_num(self.pushes.load - reaction)
         far, touches = self._seek(found)
@@ -336,7 +337,7 @@ class ContactProblem(Loads):
         return np.divide(off, slope, out=seeks, where=slope > 0)
 
     def _begins(self) -> NDArray[np.float64]:
-        """Return guessed tool displacements (tools,), m, with bodies at rest, at most until a point bears the load."""
+        """Return guesses (tools,), in m, of tool displacements.  Tools move at most until a point bears the load."""
         motion = np.zeros(len(self.now.law.contacts))
         still = np.zeros_like(self.pairs.x)
         h = self.grid.least
@@ -348,7 +349,7 @@ class ContactProblem(Loads):
         return motion
 
     def settle(self, at: At, sticks: bool) -> bool:
-        """See `Loads`.  The conditions, one per contact and cell, change between stick and slip."""
+        """See `Loads`.  Conditions change between stick and slip; there is one for each contact and cell."""
         changed, w = False, self._apart_by(self.now.law, at) if self.pushed else None
         motion = self.found(at).motion
         if self.now.law.grips:
@@ -359,7 +360,7 @@ class ContactProblem(Loads):
         return changed
 
     def augment(self, at: At) -> bool:
-        """Augment the pressures if mean penetrations at u are too large; return whether forces changed.
+        """Augment the pressures if mean penetrations at u are too large.  Return whether contact forces changed.
 
         If penetrations are small enough, move tools whose reaction differs from the load.
         """
@@ -389,7 +390,7 @@ class ContactProblem(Loads):
         return True
 
     def follow(self, at: At) -> bool:
-        """Update the pairs at u; return whether this changes the equilibrium."""
+        """Update the pairs at u.  Return whether the update changes the equilibrium."""
         if self._again is None:
             return False
         new, late = self._continued(Current(*self._again(at.u), self.now.state), at)
@@ -404,9 +405,9 @@ class ContactProblem(Loads):
         return bool(late.any())
 
     def _continued(self, new: Current, at: At) -> tuple[Current, NDArray[np.bool_]]:
-        """Return the contact with pairs found at u, and in which connected parts (parts,) gaps change by over `DEPTH`.
+        """Return the contact with pairs found at u, and in which parts (parts,) gaps change by more than `DEPTH` cells.
 
-        Pairs that are open before and after the update are ignored, as are parts after `FOLLOWS` updates.
+        Pairs that are open before and after the update are ignored.  Parts after `FOLLOWS` updates are also ignored.
         """
         found = self.found(at)
         law, state = self.now.law, self.now.state
@@ -440,9 +441,10 @@ class ContactProblem(Loads):
         return origin.means(contacts, points, *law.tractions(found.touch, found.at))
 
     def rubbing(self, at: At, v: NDArray[np.float64]) -> tuple[float, float]:
-        """See `Loads`.  Only tools do external work.  Elastic slip counts as dissipation, negative on unloading.
+        """See `Loads`.  Only tools do external work.  Work of elastic slip counts as dissipation.
 
-        Work of contact pressures is not counted as dissipation, because velocities of substeps jump where a gap closes.
+        This part of the dissipation is negative on unloading.  Work of contact pressures does not count as dissipation,
+        because velocities of substeps jump where a gap closes.
         """
         law = self.now.law
         found = self.found(at)
@@ -456,11 +458,14 @@ class ContactProblem(Loads):
         return -float((shear * (moves - tool)).sum()), more
 
     def tool_velocity(self, at: At) -> NDArray[np.float64] | float:
-        """Return the velocities (m, d), m/s, of contact positions on tools; zero if both sides deform."""
+        """Return the velocities (m, d), in m/s, of contact positions on tools, or zero if both sides deform."""
         return 0.0
 
     def outcome(self, at: At) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """See `Loads`: forces, N, and moments, N m, on the bodies (3,), in 3D (6,); displacements due to loads, m."""
+        """See `Loads`.  Results are forces (N) and moments (N m) on bodies, and displacements of tools by loads (m).
+
+        The forces and moments of each contact are one array: (3,), or (6,) in 3D.
+        """
         where, touch, motion, _ = self.found(at)
         names = self.now.law.names
         if self.pairs.other_side() is not None:  # arms to present positions: moments of a body at rest sum to zero
@@ -492,21 +497,21 @@ class ContactProblem(Loads):
 
     @property
     def rounding_beside(self) -> float:
-        """Rounding error of forces in cells of other sides that deform, N."""
+        """Rounding error, in N, of forces in the cells on the other side of pairs, if this side deforms."""
         if self.pairs.other_side() is None:
             return 0.0
         return over_all(self.grid.comm, float(self.now.law.rounding(self.now.state).max(initial=0.0)), MPI.MAX)
 
 
 def _merged(both: Sequence[Any], kept: Sequence[NDArray[np.bool_]], order: NDArray[np.int64]) -> Any:
-    """Merge two objects, both `Pairs` or both `ContactState`: keep the rows flagged in `kept`, in the order `order`."""
+    """Merge two `Pairs` or two `ContactState`.  The result has the rows flagged in `kept`, in the order `order`."""
     names = (f.name for f in fields(both[1]) if f.name != "grid")
     columns = {name: [getattr(of, name)[rows] for of, rows in zip(both, kept, strict=True)] for name in names}
     return replace(both[1], **{name: np.concatenate(rows)[order] for name, rows in columns.items()})
 
 
 def outer(a: PETSc.Vec, b: PETSc.Vec) -> PETSc.Mat:
-    """Return the matrix a b^T, without entries in zero rows and columns."""
+    """Return the matrix `a b^T`, without entries in zero rows and columns."""
     start, comm = b.owner_range[0], b.comm.tompi4py()
     rows, columns = np.flatnonzero(a.array_r), np.flatnonzero(b.array_r)
     at, value = start + columns, b.array_r[columns]

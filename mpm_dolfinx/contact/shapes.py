@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Shapes of rigid tools: signed distances, m, positive outside the tool, for its initial position."""
+"""Shapes of rigid tools in their initial position.  They return signed distances, in m, positive outside the tool."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ DISTANCE = 0.1
 
 
 class Shape(Protocol):
-    """A rigid solid.  Positions y (m, d), m, refer to the frame of the tool."""
+    """A rigid solid.  Positions y (n, d), in m, are in the frame of the tool."""
 
     def distance(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the signed distances (m,), m, from the surface."""
+        """Return the signed distances (n,), in m, from the surface."""
 
     def normal(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the gradients (m, d) of the distance."""
+        """Return the gradients (n, d) of the distance."""
 
     def curvature(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the second derivatives (m, d, d) of the distance, 1/m."""
+        """Return the second derivatives (n, d, d) of the distance, in 1/m."""
 
 
 def _flat(y: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -38,21 +38,21 @@ def _flat(y: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _across(offset: NDArray[np.float64]) -> tuple[NDArray, NDArray, NDArray]:
-    """Return lengths (m,), m, of vectors (m, d), m, their directions, and second derivatives of the lengths, 1/m."""
+    """Return the lengths (n,), in m, of vectors (n, d), their directions, and second derivatives of lengths, in 1/m."""
     r = np.maximum(np.linalg.norm(offset, axis=1), TINY)
     e = offset / r[:, None]
     return r, e, (np.eye(offset.shape[1]) - e[:, :, None] * e[:, None, :]) / r[:, None, None]
 
 
 class Uniform(NamedTuple):
-    """Uniform solid in 2D: centroid (d,), m, and squared radius of gyration about the centroid, m^2."""
+    """Uniform solid in 2D: centroid (d,), in m, and squared radius of gyration about the centroid, in m^2."""
 
     centroid: NDArray[np.float64]
     gyration: float
 
 
 def unit_vector(name: str, value: ArrayLike) -> NDArray[np.float64]:
-    """Return the unit vector (d,) along a vector; raise ValueError if the vector is invalid or zero."""
+    """Return the unit vector (d,) along a vector.  Raise ValueError if the vector is invalid or zero."""
     v = numbers(name, value, (2,), (3,), allowed="a vector of 2 or 3 finite components, not zero")
     if not v.any():
         raise ValueError(f"{name} = {line(value)}, must be a vector of 2 or 3 finite components, not zero")
@@ -61,7 +61,7 @@ def unit_vector(name: str, value: ArrayLike) -> NDArray[np.float64]:
 
 
 class Placed:
-    """Base class of shapes, with positions (d,) or (m, d), m, in their first field."""
+    """Base class of shapes.  The first field of each shape is a position (d,), or positions (n, d), in m."""
 
     @property
     def dim(self) -> int:
@@ -70,11 +70,11 @@ class Placed:
 
     @property
     def middle(self) -> NDArray[np.float64]:
-        """Mean (d,), m, of these positions."""
+        """Mean (d,), in m, of the positions in the first field."""
         return np.atleast_2d(getattr(self, fields(self)[0].name)).mean(axis=0)
 
     def moved(self, by: NDArray[np.float64]) -> Shape:
-        """Return the shape, translated by a vector (d,), m."""
+        """Return the shape, translated by a vector (d,), in m."""
         place = fields(self)[0].name
         return replace(self, **{place: np.asarray(getattr(self, place)) + by})
 
@@ -102,21 +102,21 @@ class HalfSpace(Placed):
         return unit_vector("HalfSpace: outward", self.outward)
 
     def distance(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the signed distances (m,), m, from the surface."""
+        """Return the signed distances (n,), in m, from the surface."""
         return (y - self.point) @ self._n
 
     def normal(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the gradients (m, d) of the distance."""
+        """Return the gradients (n, d) of the distance."""
         return np.broadcast_to(self._n, y.shape)
 
     def curvature(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the second derivatives (m, d, d) of the distance, 1/m."""
+        """Return the second derivatives (n, d, d) of the distance, in 1/m."""
         return _flat(y)
 
 
 @dataclass(frozen=True, eq=False)
 class Ball(Placed):
-    """A sphere; in 2D a disc, the section of a cylinder.
+    """A sphere in 3D.  In 2D, a disc, which is the section of a cylinder.
 
     Parameters
     ----------
@@ -134,28 +134,28 @@ class Ball(Placed):
         numbers("Ball: radius", self.radius, test=lambda r: (r > 0) & (r < np.inf), allowed="> 0 and finite")
 
     def distance(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the signed distances (m,), m, from the surface."""
+        """Return the signed distances (n,), in m, from the surface."""
         return _across(y - self.centre)[0] - self.radius
 
     def normal(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the gradients (m, d) of the distance."""
+        """Return the gradients (n, d) of the distance."""
         return _across(y - self.centre)[1]
 
     def curvature(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the second derivatives (m, d, d) of the distance, 1/m."""
+        """Return the second derivatives (n, d, d) of the distance, in 1/m."""
         return _across(y - self.centre)[2]
 
 
 @dataclass(frozen=True, eq=False)
 class Convex(Placed):
-    """The convex hull of corners: a polygon, in 3D a polyhedron.
+    """The convex hull of corners: a polygon in 2D, a polyhedron in 3D.
 
-    The signed distance is the largest distance from the planes of the surface.  It is exact inside.  Outside, near
-    edges and corners, it is too small, but no contact occurs there.
+    The signed distance is the largest distance from the planes of the surface.  It is exact inside the hull.  Outside
+    the hull, it is too small near edges and corners, but no contact occurs there.
 
     Parameters
     ----------
-    corners : (m, d), m
+    corners : (n, d), m
         At least d + 1 corners, not all on one line or plane.
     """
 
@@ -183,22 +183,22 @@ class Convex(Placed):
         return y @ self._planes[:, :-1].T + self._planes[:, -1]
 
     def distance(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the signed distances (m,), m, from the surface."""
+        """Return the signed distances (n,), in m, from the surface."""
         return self._each(y).max(axis=1)
 
     def normal(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the gradients (m, d) of the distance; at equal distances from planes, the mean of their normals."""
+        """Return the gradients (n, d) of the distance.  At equal distances from planes, return their mean normal."""
         each = self._each(y)
         near = each >= each.max(axis=1, keepdims=True) - ROUNDED * np.abs(each).max(axis=1, keepdims=True)
         return near @ self._planes[:, :-1] / near.sum(axis=1, keepdims=True)
 
     def curvature(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the second derivatives (m, d, d) of the distance, 1/m."""
+        """Return the second derivatives (n, d, d) of the distance, in 1/m."""
         return _flat(y)
 
 
 def uniform(shape: Ball | Convex) -> Uniform:
-    """Return centroid and radius of gyration of a disc, or of a polygon as a fan of triangles from one corner."""
+    """Return the centroid and squared radius of gyration of a disc, or of a polygon divided into triangles."""
     if isinstance(shape, Ball):
         return Uniform(np.array(shape.centre, dtype=float), shape.radius**2 / 2)
     hull = ConvexHull(np.asarray(shape.corners, dtype=float))
@@ -213,7 +213,7 @@ def uniform(shape: Ball | Convex) -> Uniform:
 
 @dataclass(frozen=True, eq=False)
 class Cone(Placed):
-    """An infinite cone; in 2D a wedge.
+    """An infinite cone in 3D, or an infinite wedge in 2D.
 
     Parameters
     ----------
@@ -222,7 +222,7 @@ class Cone(Placed):
     axis : (d,)
         Direction from the tip into the tool, of any length.
     angle_deg
-        Angle between axis and flank, degrees, in (0, 90); 30 for the cone of a CPT.
+        Angle between axis and flank, in degrees, between 0 and 90.  The cone of a CPT has 30 degrees.
     """
 
     tip: ArrayLike
@@ -238,24 +238,24 @@ class Cone(Placed):
         return unit_vector("Cone: axis", self.axis)
 
     def _polar(self, y: NDArray[np.float64]) -> tuple:
-        """Return heights (m,) above the tip, and the results of `_across` for the offsets from the axis."""
+        """Return heights (n,) above the tip, in m, and the results of `_across` for the offsets from the axis."""
         z = (y - self.tip) @ self._axis
         return z, *_across(y - self.tip - z[:, None] * self._axis)
 
     def distance(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the signed distances (m,), m, from the flank."""
+        """Return the signed distances (n,), in m, from the flank."""
         z, r, _, _ = self._polar(y)
         beta = np.radians(self.angle_deg)
         return r * np.cos(beta) - z * np.sin(beta)
 
     def normal(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the gradients (m, d) of the distance; on the axis, the mean of the flank's normals."""
+        """Return the gradients (n, d) of the distance.  On the axis, return the mean of the flank's normals."""
         beta = np.radians(self.angle_deg)
         z, r, away, _ = self._polar(y)
         return away * (r > ROUNDED * np.abs(z))[:, None] * np.cos(beta) - self._axis * np.sin(beta)
 
     def curvature(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the second derivatives (m, d, d) of the distance, 1/m."""
+        """Return the second derivatives (n, d, d) of the distance, in 1/m."""
         _, r, _, second = self._polar(y)
         if y.shape[1] == 2:
             return _flat(y)
@@ -266,10 +266,10 @@ class Cone(Placed):
 
 @dataclass(frozen=True, eq=False)
 class Distance:
-    """A shape given by a user's signed distance function, with derivatives by finite differences.
+    """A shape given by a user's signed distance function.  Derivatives are finite differences.
 
-    The function is evaluated at true positions, not relative to the base of the grid.  Increments are powers of two,
-    because these are added to positions almost without rounding.
+    The function is evaluated at true positions, not at positions relative to the base of the grid.  Increments are
+    powers of two, because adding a power of two to a position causes almost no rounding error.
     """
 
     function: Callable[[NDArray[np.float64]], ArrayLike]  # signed distance, m
@@ -277,11 +277,11 @@ class Distance:
     base: NDArray[np.float64] | float = 0.0  # origin of the positions (d,), m
 
     def distance(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the signed distances (m,), m, from the surface."""
+        """Return the signed distances (n,), in m, from the surface."""
         return self._at(y + self.base)
 
     def _at(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the signed distances (m,), m, at true positions."""
+        """Return the signed distances (n,), in m, at true positions y."""
         if not len(y):  # user functions may fail for no positions
             return np.zeros(0)
         allowed = f"a finite number for each of {len(y)} places (m, {y.shape[1]})"
@@ -289,16 +289,16 @@ class Distance:
         return numbers("Tool: shape", value, (len(y),), allowed=allowed)
 
     def normal(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the gradients (m, d) of the distance."""
+        """Return the gradients (n, d) of the distance."""
         return self._slopes(y + self.base, _power_of_two(CENTRAL * self.size))
 
     def _slopes(self, y: NDArray[np.float64], step: float) -> NDArray[np.float64]:
-        """Return central differences (m, d) of the distance, with an increment of `step`, m, at true positions."""
+        """Return the gradients (n, d) of the distance at true positions y, by central differences over `step`, in m."""
         slopes = [(self._at(y + e) - self._at(y - e)) / (2 * step) for e in step * np.eye(y.shape[1])]
         return np.stack(slopes, axis=1)
 
     def curvature(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the second derivatives (m, d, d) of the distance, 1/m."""
+        """Return the second derivatives (n, d, d) of the distance, in 1/m."""
         y, wide = y + self.base, _power_of_two(SECOND * self.size)
         steps = wide * np.eye(y.shape[1])
         slopes = [(self._slopes(y + e, wide) - self._slopes(y - e, wide)) / (2 * wide) for e in steps]

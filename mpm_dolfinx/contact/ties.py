@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Tied sides: two opposite sides of a box have equal displacements, as if the ground repeated itself beyond the box.
 
-A penalty resists the difference of the displacements at equal heights: k/2 int (u_one - u_other)^2 dA.  Displacements
-are measured from the seeded positions, so errors do not accumulate.  Forces on both sides are equal and opposite.
+The penalty energy `k/2 int (u_one - u_other)^2 dA` resists differences of the displacements at equal heights.
+Displacements are measured from the seeded positions, so errors do not accumulate.  Forces on both sides are equal and
+opposite.
 """
 
 from __future__ import annotations
@@ -33,8 +34,8 @@ from mpm_dolfinx.grid.grid import Grid
 class Tie:
     """Two opposite tied sides, and their pairs of faces at equal heights.
 
-    For each face of one side, `partner` (m,) is the index of the opposite face, and `offset` (m, d), m, is the vector
-    to this face.  `axis` is the axis normal to the sides.
+    For each face of one side, `partner` (n,) is the index of the opposite face, and `offset` (n, d), in m, is the
+    vector to the opposite face.  `axis` is the axis normal to the sides.
     """
 
     def __init__(self, tied: Tied, one: Surface, other: Surface):
@@ -61,7 +62,7 @@ class Ties(Acting):
     Raises
     ------
     ValueError
-        The sides are not opposite, or their faces differ; a side is tied twice, quiet, or open to water.
+        The sides are not opposite, or their faces differ.  A side is tied twice, quiet, or open to water.
     """
 
     conditions, title = (Tied,), "tied sides"
@@ -133,11 +134,11 @@ class TieLoads(Loads):
         self._operator: Latest[PETSc.Mat] = Latest()
 
     def _B(self, unknowns: Unknowns) -> PETSc.Mat:
-        """Return the matrix B, which maps the unknowns to differences of displacements (m d,), m."""
+        """Return the matrix B, which maps the unknowns to differences of displacements (m d,), in m."""
         return self._operator((unknowns,), lambda: self._difference(unknowns), self._grid.comm)
 
     def push(self, at: At, residual: PETSc.Vec, on: Unknowns) -> None:
-        """Add the penalty forces at u."""
+        """Add the penalty forces at u to the residual."""
         B = self._B(at.unknowns)
         w = B.createVecLeft()
         B.mult(at.unknowns.gather_owned((at.u + self._rest)[at.unknowns.owned]), w)
@@ -146,20 +147,20 @@ class TieLoads(Loads):
         B.multTransposeAdd(w, residual, residual)
 
     def moved(self, u: fem.Function) -> Loads:
-        """Return the ties with differences of displacements changed by a displacement u."""
+        """Return the ties with u added to the displacements of all nodes."""
         out = copy(self)
         out._rest = u.x.array.copy()
         return out
 
     @property
     def held_cells(self) -> NDArray[np.int32]:
-        """Cells of both sides."""
+        """Cells at both tied sides."""
         cell, other = self._cells
         return np.append(cell, on_owners(self._grid, other))
 
     def pattern(self, unknowns: Unknowns) -> PETSc.Mat:
         """Return a zero matrix with the pattern of `coupling`."""
-        out = self.coupling(At(unknowns, np.empty(0)))  # it does not depend on the displacement
+        out = self.coupling(At(unknowns, np.empty(0)))  # the coupling does not depend on the displacement
         out.zeroEntries()
         return out
 

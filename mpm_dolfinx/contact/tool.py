@@ -19,7 +19,7 @@ ONTO = 100  # largest number of projections onto the surface
 
 
 class Pose(NamedTuple):
-    """Pose of a tool: rotation R (d, d) about `centre` (d,), m, then translation by `shift` (d,), m."""
+    """Pose of a tool: rotation R (d, d) about `centre` (d,), then translation by `shift` (d,), both in m."""
 
     R: NDArray[np.float64]
     centre: NDArray[np.float64]
@@ -35,19 +35,19 @@ class Pose(NamedTuple):
         return y + self.shift + (y - self.centre) @ (self.R - np.eye(len(self.R))).T
 
     def moved(self, by_forces: NDArray[np.float64]) -> Pose:
-        """Return the pose after a further motion `by_forces`: displacement (d,), m, and a rotation, rad, if any."""
+        """Return the pose after a motion `by_forces`: displacement (d,), in m, and possibly rotation, in rad."""
         d = len(self.R)
         R = rotation(by_forces[d]) @ self.R if by_forces[d:].any() else self.R
         return Pose(R, self.centre, self.shift + by_forces[:d])
 
 
 def rotation(angle: float) -> NDArray[np.float64]:
-    """Return the matrix (2, 2) of a rotation by an angle, rad."""
+    """Return the matrix (2, 2) of a rotation by an angle, in rad."""
     return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
 
 
 def motion_by_forces(outcome: Mapping[str, Mapping[str, NDArray]], name: str) -> NDArray[np.float64]:
-    """Return a tool's motion due to forces, from an outcome: displacement, m, and the rotation, rad, if any."""
+    """Return the motion of a tool due to forces from an outcome: displacement, in m, and possibly rotation, in rad."""
     angle = outcome.get("tool_rotation", {})
     by_forces = outcome["tool_travel"][name]
     return np.append(by_forces, angle[name]) if name in angle else by_forces
@@ -65,44 +65,46 @@ class Tool:
     shape : HalfSpace, Ball, Convex, Cone, or callable y (m, d) -> (m,), m
         The tool in its initial position.  A function returns the signed distance, positive outside the tool.
     displacement : (d,) or callable t (s) -> (d,), m
-        Displacement from the initial position, even in later stages.  In axisymmetry: along the axis.
+        Displacement from the initial position, also in later stages.  In axisymmetry, it must be along the axis.
     rotation_rad : float or callable t (s) -> float, rad
-        Counterclockwise rotation about `centre`, before the displacement; only in 2D, not in axisymmetry.
+        Counterclockwise rotation about `centre`, which precedes the displacement.  Tools can rotate only in 2D, and not
+        in axisymmetry.
     centre : (d,), m
-        Centre of rotation, reference of moments, and centre of mass of a free tool.  The centre moves with the tool.
-        By default the centroid of a free disc or polygon; the origin for other tools.
+        Centre of rotation and reference of moments.  In a free tool, it is also the centre of mass.  The centre moves
+        with the tool.  The default is the centroid of a free disc or polygon, and the origin for other tools.
     friction
         Coulomb's coefficient mu, >= 0.
     adhesion
         Additional shear strength of the contact, Pa, >= 0.  An adhesion above ten times the normal pressure is reduced
-        to this value.  For undrained soil: alpha s_u, with friction 0.
+        to ten times this pressure.  For undrained soil, use alpha s_u with friction 0.
     load : float or callable t (s) -> float, N (N/m in plane strain), >= 0
-        The tool moves along `direction`, in addition to its displacement, until the reaction equals the load, from the
-        first step on.  The tool must start in contact, or less than a cell away.  `tool_travel` of the simulation
-        is this additional displacement.  In axisymmetry: the load on the whole circumference.
+        The load acts from the first step on.  The tool moves along `direction` so that the reaction equals the load.
+        This motion is added to `displacement`, and is in `tool_travel` of the simulation.  The tool must start in
+        contact, or less than a cell away.  In axisymmetry, the load acts on the whole circumference.
     direction : (d,)
-        Direction of the load, of any length.  In axisymmetry: along the axis.
+        Direction of the load, of any length.  In axisymmetry, it must be along the axis.
     mass
         Mass of a free tool, kg (kg/m in plane strain), > 0, for bodies with inertia.  The tool starts from its position
-        after `displacement`.  Weight, load and contact forces move it along `direction`, by default in any direction.
-        The tool keeps its position while an initial stress is balanced.  Results are `tool_travel` (d,), m, and the
-        velocity `outcome("tool_velocity")` (d,), m/s.
+        after `displacement`.  Weight, load and contact forces move the tool along `direction`, by default in any
+        direction.  The tool keeps its position while an initial stress is balanced.  Results are the displacement
+        `tool_travel` (d,), in m, and the velocity `outcome("tool_velocity")` (d,), in m/s.
     velocity : (d,), m/s
         Initial velocity of a free tool.
     moment
         Moment of inertia of a free tool about `centre`, kg m^2 (kg m in plane strain), > 0; only in 2D.  The default is
         that of a uniform disc or polygon.  Other shapes, and tools with `direction`, rotate only if `moment` is
-        specified.  Results are `outcome("tool_rotation")`, rad, and `outcome("tool_spin")`, rad/s.
+        specified.  Results are `outcome("tool_rotation")`, in rad, and `outcome("tool_spin")`, in rad/s.
     spin
         Initial angular velocity of a free tool, rad/s, counterclockwise.
     name
-        Name of the results, and of the contact pressure on points, NAME_pressure; by default "tool".  A tool with the
-        same name in a later stage takes over this pressure.
+        Name of the tool in results; by default "tool".  The field NAME_pressure of points is the contact pressure.
+        In a later stage, a tool of equal name takes over this pressure.
 
     Raises
     ------
     ValueError
-        An invalid value.  A step raises it if the tool starts in a body or touches a side with prescribed displacement.
+        A value is invalid.  A step also raises this error if the tool starts in a body, or touches a side with
+        prescribed displacement.
     """
 
     shape: Shape | Callable[[NDArray[np.float64]], ArrayLike]
@@ -166,7 +168,7 @@ class Tool:
         return self.mass is not None
 
     def begins(self, dim: int) -> NDArray[np.float64]:
-        """Return the initial velocity (d,), m/s, of a free tool."""
+        """Return the initial velocity (d,), in m/s, of a free tool."""
         if self.velocity is None:
             return np.zeros(dim)
         v = numbers("Tool: velocity", self.velocity, (dim,), allowed=f"{dim} finite numbers")
@@ -180,11 +182,11 @@ class Tool:
         return np.eye(dim) if self.direction is None else np.outer(along, along)
 
     def _uniform(self, dim: int) -> Uniform | None:
-        """Return centroid and radius of gyration of a free disc or polygon; None for other tools."""
+        """Return the centroid and the squared radius of gyration of a free disc or polygon, or None for other tools."""
         return uniform(self.shape) if self.free and dim == 2 and isinstance(self.shape, (Ball, Convex)) else None
 
     def inertia(self, dim: int) -> float:
-        """Return the moment of inertia about the centre, kg m^2; infinity for a tool that does not rotate."""
+        """Return the moment of inertia about the centre, in kg m^2.  It is infinite for a tool that does not rotate."""
         if self.moment is not None:
             return float(self.moment)
         of = self._uniform(dim)
@@ -195,7 +197,7 @@ class Tool:
         return self.free and np.isfinite(self.inertia(dim))
 
     def pushes(self, t: float) -> float:
-        """Return the load at time t (s), N; nan if the tool has no load."""
+        """Return the load at time t (s), in N, or nan without a load."""
         if self.load is None:
             return np.nan
         value = float(self._given("load", t))
@@ -204,11 +206,11 @@ class Tool:
         return value
 
     def _given(self, name: str, t: float, dim: int = 0) -> NDArray[np.float64]:
-        """Return the value of an attribute at time t (s): a number or, if `dim` > 0, also a vector (d,)."""
+        """Return the value of an attribute at time t (s).  It is a number, or with `dim` > 0 possibly a vector (d,)."""
         return given(f"{line(self)}: {name} at t = {t:g} s", getattr(self, name), t, None, dim)
 
     def along(self, dim: int) -> NDArray[np.float64]:
-        """Return the unit vector (d,) along `direction`; zero if no direction is given."""
+        """Return the unit vector (d,) along `direction`, or zero without a direction."""
         if self.direction is None:
             return np.zeros(dim)
         along = unit_vector("Tool: direction", self.direction)
@@ -229,14 +231,14 @@ class Tool:
         return self.friction > 0 or self.adhesion > 0
 
     def solid(self, h: float) -> Shape:
-        """Return the shape; `h` is the cell size, m."""
+        """Return the shape.  `h` is the cell size, in m."""
         return Distance(self.shape, h, self._base) if callable(self.shape) else self._moved or self.shape
 
     def check(self, dim: int) -> None:
         """Raise an error for a tool of the wrong dimension, or with an invalid initial motion."""
         of = dim if callable(self.shape) else self.shape.dim
         if of != dim:
-            raise ValueError(f"{line(self)}: a shape in {of}D, must be in {dim}D as the grid")
+            raise ValueError(f"{line(self)}: the shape is in {of}D, must be in {dim}D as the grid")
         if dim == 3 and (callable(self.rotation_rad) or self.rotation_rad):
             raise ValueError(f"Tool: rotation_rad = {line(self.rotation_rad)}, must be 0 in 3D")
         for name in ("displacement", "rotation_rad"):  # values of functions are checked when they are used
@@ -269,7 +271,11 @@ class Tool:
         return numbers("Tool: centre", self.centre, (dim,), allowed=f"{dim} finite coordinates") - self._base
 
     def pose(self, t: float, dim: int, by_forces: NDArray[np.float64] | float = 0.0) -> Pose:
-        """Return the pose at t (s).  by_forces: displacement by loads, m; of a free tool (d,), m, and rotation, rad."""
+        """Return the pose at time t (s).
+
+        `by_forces` is the displacement that the load causes, in m.  For a free tool, it is a vector of displacement
+        (d,), in m, and possibly rotation, in rad.
+        """
         shift = self._given("displacement", t, dim)
         if shift.ndim == 0 and shift:
             raise ValueError(f"{line(self)}: displacement at t = {t:g} s = {shift:g}, must be {dim} finite numbers")
@@ -278,10 +284,10 @@ class Tool:
         return pose.moved(by_forces if np.ndim(by_forces) else by_forces * self.along(dim))
 
     def drawn(self, grid: Grid, t: float, by_forces: NDArray[np.float64] | float = 0.0) -> NDArray[np.float64]:
-        """Return the corners (m, 2^d, d), m, of the grid cells inside the tool at time t (s), for pictures.
+        """Return the corners (n, 2^d, d), in m, of the grid cells inside the tool at time t (s), for pictures.
 
-        `by_forces`: see `pose`.  Corners outside the tool are projected onto its surface, so edges are blunt by a
-        fraction of a cell.
+        Corners outside the tool are projected onto its surface, so edges are blunt by a fraction of a cell.
+        `by_forces`: see `pose`.
         """
         pose = self.pose(t, grid.dim, by_forces)
         solid = self.solid(grid.least)

@@ -39,7 +39,7 @@ FACING = 0.5  # smallest cosine between the normal of a face that faces the tool
 
 
 def _box(x: NDArray[np.float64]) -> list[tuple[NDArray[np.float64], MPI.Op]]:
-    """Return both corners (d,) of the bounding box of positions (m, d), each with its MPI reduction over processes."""
+    """Return both corners (d,) of the box around x (n, d), each with the MPI operation that combines processes."""
     return [(x.min(axis=0, initial=np.inf), MPI.MIN), (x.max(axis=0, initial=-np.inf), MPI.MAX)]
 
 
@@ -49,7 +49,7 @@ def motion_count(dim: int) -> int:
 
 
 class LoadMotion(NamedTuple):
-    """Displacements (k,), m, of k tools due to loads in a step; if any tool is free, (k, q) with rotations, rad."""
+    """Displacements (k,), in m, by loads of k tools in a step.  With free tools: motions (k, q), in m and rad."""
 
     start: float  # start of the step, s
     end: float  # end of the step, s
@@ -63,7 +63,7 @@ class LoadMotion(NamedTuple):
 
 
 class Tools(Touching):
-    """The tools of a stage, with their motion in a step; setting: data of the stage; tools: tools by name."""
+    """The tools of a stage, with their motion in a step.  `setting` is the stage's data.  `tools` has tools by name."""
 
     conditions, title = (Tool,), "tools"
 
@@ -75,7 +75,7 @@ class Tools(Touching):
         still = np.zeros(len(self.tools))
         self.by_loads, self._end = LoadMotion(0.0, 0.0, still, still), None
         if len({id(tool) for tool in self.tools}) < len(self.tools):
-            raise ValueError("tools: one tool is listed twice, must be distinct")
+            raise ValueError("tools: one tool is listed twice, tools must be distinct")
         for tool in self.tools:
             tool.check(grid.dim)
             if grid.axisymmetric and tool.along(grid.dim)[0]:
@@ -83,7 +83,7 @@ class Tools(Touching):
             if grid.axisymmetric and tool.begins(grid.dim)[0]:
                 raise ValueError(f"Tool: velocity = {line(tool.velocity)}, must be along the axis in axisymmetry")
             if grid.axisymmetric and tool.free and (tool.spin or np.isfinite(tool.moment or np.inf)):
-                raise ValueError(f"{line(tool)}: spin and moment, must be left out in axisymmetry")
+                raise ValueError(f"{line(tool)}: spin and moment must be left out in axisymmetry")
             if not callable(tool.displacement) and not callable(tool.rotation_rad):
                 self._pose(tool, 0.0)
         self.tools = tuple(tool.on(grid) for tool in self.tools)
@@ -99,7 +99,7 @@ class Tools(Touching):
 
     @property
     def masses(self) -> NDArray[np.float64]:
-        """Masses, kg, and moments of inertia, kg m^2, of free tools (tools, q); 0 for other tools."""
+        """Masses (kg) and moments of inertia (kg m^2) of free tools, as an array (tools, q).  Other tools have 0."""
         d = self.grid.dim
         out = np.array([np.full(motion_count(d), float(tool.mass or 0)) for tool in self.tools])
         for row, tool in zip(out, self.tools, strict=True):
@@ -109,7 +109,7 @@ class Tools(Touching):
 
     @property
     def guides(self) -> NDArray[np.float64]:
-        """Projections (tools, q, q) onto the possible motions of free tools; in axisymmetry along the axis."""
+        """Projections (tools, q, q) onto the motions that free tools can perform, in axisymmetry along the axis."""
         d = self.grid.dim
         out = np.zeros((len(self.tools), motion_count(d), motion_count(d)))
         out[:, d:, d:] = np.reshape(self.turning, (-1, 1, 1))
@@ -123,14 +123,14 @@ class Tools(Touching):
         return [tool.rotates(self.grid.dim) and not self.grid.axisymmetric for tool in self.tools]
 
     def pushes(self, t: float) -> NDArray[np.float64]:
-        """Return the loads (tools, q), N, on free tools at time t (s); torques are zero."""
+        """Return the loads (tools, q), in N, on free tools at time t (s).  Torques are zero."""
         d = self.grid.dim
         out = np.zeros((len(self.tools), motion_count(d)))
         out[:, :d] = [np.nan_to_num(tool.pushes(t)) * tool.free * tool.along(d) for tool in self.tools]
         return out
 
     def going(self, by_loads: LoadMotion, end: float | None = None) -> Tools:
-        """Return the tools with the motion that loads cause in a step.  `end` is the end of a step with inertia, s."""
+        """Return the tools with the motion that loads cause in a step.  `end` (s): end of a step with inertia."""
         tools = copy(self)
         tools.by_loads, tools._end = by_loads, end
         return tools
@@ -142,7 +142,8 @@ class Tools(Touching):
     def _posed(self, tool: Tool, start: float, t: float) -> Pose:
         """Return the pose of a tool at time t (s), the end of a substep.
 
-        With inertia, `in_step` corrects a prescribed pose after the first of two substeps, for a second-order velocity.
+        With inertia, `in_step` corrects a prescribed pose after the first of two substeps.  Velocities are then
+        second-order accurate.
         """
         pose = self._pose(tool, t)
         if self._end is None or not start < t < self._end or tool.free:
@@ -157,7 +158,7 @@ class Tools(Touching):
         return pose._replace(shift=shift, R=rotation(angle) @ before.R)
 
     def _pose(self, tool: Tool, t: float) -> Pose:
-        """Return the pose of a tool at time t (s); raise ValueError for motions that axisymmetry excludes."""
+        """Return the pose of a tool at time t (s).  Raise ValueError for motions that axisymmetry excludes."""
         pose = tool.pose(t, self.grid.dim, self.by_loads.at(t)[self.tools.index(tool)])
         if self.grid.axisymmetric and (pose.shift[0] or pose.R[0, 1]):
             what = f"moves by {pose.shift}{' and rotates' * bool(pose.R[0, 1])} at t = {t:g} s"
@@ -178,13 +179,13 @@ class Tools(Touching):
         return out
 
     def _before(self, place: Place) -> NDArray[np.float64]:
-        """Return displacements due to loads before a step (tools,), m; if a tool is free, (tools, q) with rotations."""
+        """Return displacements (tools,), in m, by loads before a step.  With free tools, return motions (tools, q)."""
         if self.free:
             return self._of_free(place.before, "tool_travel", "tool_rotation")
         return np.array([place.before["tool_travel"][name] for name in self.names], dtype=float)
 
     def _of_free(self, before: Outcome, along: str, around: str) -> NDArray[np.float64]:
-        """Return the displacements and rotations (tools, q), or the velocities; zero for tools that are not free."""
+        """Return the displacements and rotations (tools, q) of free tools, or their rates.  Other tools have zeros."""
         d = self.grid.dim
         out = np.zeros((len(self.names), motion_count(d)))
         for row, name in zip(out, self.names, strict=True):
@@ -193,7 +194,7 @@ class Tools(Touching):
         return out
 
     def placed(self, place: Place) -> Loads:
-        """Return the contact loads of tools in a substep; without inertia, free tools keep their position."""
+        """Return the contact loads of tools in a substep.  Without inertia, free tools keep their position."""
         before = self._before(place)
         tools = self.going(LoadMotion(place.start, place.t, before, before), place.start + place.dt * place.inertia)
         if not (self.free and place.inertia):  # an initial stress is balanced without inertia
@@ -239,12 +240,15 @@ class Tools(Touching):
     def _edge(
         self, tool: Tool, pose: Pose, x: NDArray[np.float64], unit: NDArray[np.float64], faces: NDArray[np.bool_]
     ) -> NDArray[np.bool_]:
-        """Return which positions facing a tool lie within half a cell of the tool's edge, if the body continues there.
+        """Return which positions that face a tool lie within half a cell of an edge of the tool.
 
-        The last loaded node also carries half a cell outside the edge, so this margin has no contact.  A tool narrower
-        than a cell keeps its whole contact.
+        Edges beyond which the body ends are ignored.  The last loaded node also represents half a cell outside the
+        edge.  Half a cell inside the edge has therefore no contact.  A tool narrower than a cell keeps its whole
+        contact.
 
-        x, unit (m, d): positions on the surface, m, and outward normals; faces (m,): whether each faces the tool.
+        `x` (n, d), in m: positions on the surface.
+        `unit` (n, d): outward unit normals at these positions.
+        `faces` (n,): whether the surface at each position faces the tool.
         """
         grid, (y, n) = self.grid, (x[faces], unit[faces])
         h = grid.sizes_at(y)
@@ -305,7 +309,7 @@ class Tools(Touching):
                 raise NotConverged(f"{line(tool)}: has passed through a body within a step, at {where}")
 
     def near(self, corners: NDArray[np.float64], t: float) -> NDArray[np.bool_]:
-        """Return which corners (n, 2^d, d) of domains touch tools at time t (s): they must follow the Q1 field.
+        """Return which corners (n, 2^d, d) of domains touch tools at time t (s).  Such corners follow the Q1 field.
 
         The tool would reverse any other motion of these corners in the next step, and pressures would oscillate.
         """
@@ -317,12 +321,14 @@ class Tools(Touching):
     def pushed_out(
         self, corners: NDArray[np.float64], t: float, free: NDArray[np.bool_], most: float
     ) -> NDArray[np.float64]:
-        """Return the corners of domains; small penetrations into tools are reduced to the tolerated depth `LEFT`.
+        """Return the corners of domains.  Small penetrations into tools are reduced to the tolerated depth `LEFT`.
 
-        Tools constrain means over cells, so corners of sliding domains would remain inside the tool.
+        Tools constrain means over cells.  Without this correction, corners of sliding domains would stay inside a tool.
 
-        corners (n, 2^d, d): corners of the domains, m; t: time, s; free (n, 2^d, d): whether no other condition
-        prescribes a component; most: largest corrected penetration, divided by the cell size.
+        `corners` (n, 2^d, d), in m: corners of the domains.
+        `t`, in s: time.
+        `free` (n, 2^d, d): whether no other condition prescribes a component.
+        `most`: largest corrected penetration, divided by the cell size.
         """
         out, h = corners.copy(), self.grid.least
         for tool in self.tools:
@@ -335,13 +341,13 @@ class Tools(Touching):
         return out
 
     def _gaps(self, tool: Tool, corners: NDArray[np.float64], t: float) -> NDArray[np.float64]:
-        """Return the distances (n, 2^d), m, of corners (n, 2^d, d) from a tool at time t (s)."""
+        """Return the distances (n, 2^d), in m, of corners (n, 2^d, d) from a tool at time t (s)."""
         own = self._pose(tool, t).own(corners.reshape(-1, self.grid.dim))
         gap = together(self.grid.comm, lambda: tool.solid(self.grid.least).distance(own))
         return gap.reshape(corners.shape[:2])
 
     def _passed(self, tool: Tool, x: tuple[NDArray[np.float64], ...], times: tuple[float, ...]) -> str:
-        """Return, as text, a position whose path between two times (s) crosses a tool; "" if there is none.
+        """Return, as text, a position whose path between two times (s) crosses a tool, or "" without a crossing.
 
         Straight paths from x[0] to x[1] are searched in steps of the distance to the tool (sphere tracing: Hart 1996).
         """
@@ -379,7 +385,7 @@ class Tools(Touching):
 
 
 class ToolLoads(ContactProblem):
-    """Contact loads of tools in a substep; tools: tools and their motion in the step; place: positions and times."""
+    """Contact loads of tools in a substep.  `tools` has their motion in the step.  `place` has positions and times."""
 
     def __init__(self, tools: Tools, place: Place):
         super().__init__(*tools.contact(place))
@@ -397,7 +403,7 @@ class ToolLoads(ContactProblem):
         return SubstepMotion(self.shares.own, self.pairs.poses)
 
     def tool_velocity(self, at: At) -> NDArray[np.float64] | float:
-        """See `ContactProblem`.  The time integration finds the velocity from tool positions in both substeps."""
+        """See `ContactProblem`.  The velocity follows from the time integration of the tool's positions."""
         pairs = self.pairs
         moved = pairs.carried - pairs.now
         if self._earlier is not None:

@@ -7,12 +7,12 @@ and the sawtooth remains as stress.  The corner displacement therefore contains 
 
     u(x) = sum_i N_i(x) [u_i - 1/2 sum_a t_a (1 - t_a) D_a],
 
-with the shape functions N_i, the nodal displacements u_i, and the position t_a along axis a in the cell, from 0 to 1.
-This field is exact for quadratic displacements, equal to Q1 at the nodes, and continuous.  D_a belongs to the cell edge
-along axis a that ends at node i.  D_a is the smaller, in absolute value, of the second differences at both ends of this
-edge, or zero if their signs differ.  If only one end has a second difference, D_a is this difference.  If cell sizes
-vary, D_a is the squared edge length times the second derivative of a parabola through three nodes.  Physical kinks, for
-example at the boundary of two materials, are kept.
+where N_i are the shape functions, u_i are the nodal displacements, and t_a is the position along axis a in the cell,
+from 0 to 1.  This field is exact for quadratic displacements, equal to Q1 at the nodes, and continuous.  D_a belongs to
+the cell edge along axis a that ends at node i.  D_a is the smaller, in absolute value, of the second differences at
+both ends of this edge, or zero if their signs differ.  If only one end has a second difference, D_a is this difference.
+If cell sizes vary, D_a is the squared edge length times the second derivative of a parabola through three nodes.
+Physical kinks, for example at the boundary of two materials, are kept.
 """
 
 from __future__ import annotations
@@ -26,11 +26,14 @@ from mpm_dolfinx.grid.grid import Grid, corner_bits, in_chunks, polynomial
 def followed(
     grid: Grid, cells: NDArray[np.int32], x: NDArray[np.float64], u: NDArray[np.float64], filled: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
-    """Return two fields (2, n, d), m: the Q1 displacement of the corners, and its quadratic correction.
+    """Return two fields (2, n, d), in m: the Q1 displacement of the corners, and its quadratic correction.
 
-    cells (n,): owned cells that contain the corners; x (n, d), m: positions of the corners; u (nodes, d), m: nodal
-    displacements; filled (cells,): whether local cells contain material.  Far nodes of empty neighbour cells
-    are not used, because they may belong to another body.
+    Far nodes of empty neighbour cells are not used, because such nodes may belong to another body.
+
+    `cells` (n,): owned cells that contain the corners.
+    `x` (n, d), in m: positions of the corners.
+    `u` (nodes, d), in m: nodal displacements.
+    `filled` (cells,): whether local cells contain material.
     """
     used = np.bincount(cells, minlength=1).nonzero()[0]
     slot = np.zeros(used.max(initial=0) + 1, dtype=np.intp)
@@ -56,9 +59,9 @@ def _at(u: NDArray[np.float64], nodes: NDArray[np.int32]) -> NDArray[np.float64]
 def _second_differences(
     grid: Grid, cells: NDArray[np.int32], u: NDArray[np.float64], filled: NDArray[np.bool_]
 ) -> list[NDArray[np.float64]]:
-    """Return, for each axis, the second differences D_a, m, along the edges of owned cells.
+    """Return for each axis the second differences D_a, in m, along the edges of owned cells.
 
-    D_a is a polynomial of the other coordinates, with coefficients (d, 2^(d-1), cells) as in `polynomial`.
+    D_a is a polynomial in the other coordinates, with coefficients (d, 2^(d-1), cells) as in `polynomial`.
     """
     d = grid.dim
     bits = corner_bits(grid.dim)

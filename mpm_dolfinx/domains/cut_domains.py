@@ -31,14 +31,15 @@ settlement changes by 3e-5 of its value.  Both changes are proportional to STILL
 
 
 class Patches:
-    """Quadrature points on faces of particle domains; arrays over n points.
+    """Quadrature points on faces of particle domains.  Arrays have a row for each of n points.
 
     Parameters
     ----------
     grid
         Background grid.
     faces, row : (n,)
-        Faces on the surface of the bodies and on parts of their domains, and index of each point's face among these.
+        Surface faces of the bodies, and index in these faces of each point's face.  The faces may be parts of seeded
+        faces.
     face, at : (n,)
         Index of the face, and index of the material point.
     cell : (n,)
@@ -67,33 +68,33 @@ class Patches:
             area0, self._whole0, self._face = renewed.in_place_of(area0, self._whole0, self._face)
         self._share0 = share * area0
         self.base = grid.base
-        """Origin of positions (d,), m, see `Grid`."""
+        """Origin of positions (d,), in m, see `Grid`."""
         around = grid.around(interpolate(faces.domain[row], xi)) if grid.axisymmetric else 1.0
         if renewed is not None:
             around = np.where(renewed.old, around, 1.0)  # areas of renewed faces are already areas of rings
         self.area0 = self._share0 * around
-        """Reference areas (n,), m^(d-1); in axisymmetry of the rings, m^2."""
+        """Reference areas (n,), in m^(d-1).  In axisymmetry, these are areas of rings, in m^2."""
 
     @cached_property
     def X(self) -> NDArray[np.float64]:
-        """Reference positions (n, d), m."""
+        """Reference positions (n, d), in m."""
         X = self._faces.reference(self._row, self.xi)
         return X if self._renewed is None else self._renewed.reference(X, self.xi)
 
     def origin(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the positions (n, d), m, at zero displacement."""
+        """Return the positions (n, d), in m, at zero displacement."""
         return interpolate(points.origin[self.at], self.xi)
 
     def now(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the current positions (n, d), m."""
+        """Return the current positions (n, d), in m."""
         return interpolate(points.corners[self.at], self.xi)
 
     def positions(self, points: MaterialPoints) -> Callable[[str], NDArray[np.float64]]:
-        """Return the function that gives user functions the reference or current positions."""
+        """Return a function of the name of a position: "X" gives reference positions, "x" gives current positions."""
         return lambda name: self.X if name == "X" else self.now(points) + self.base
 
     def area(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the current outward area vectors (n, d), m^(d-1); in axisymmetry of the rings, m^2."""
+        """Return the current outward area vectors (n, d), in m^(d-1), or in axisymmetry of rings, in m^2."""
         share = self._share0 / self._whole0
         if self._grid.axisymmetric:
             share = share * self._grid.around(self.now(points))
@@ -111,7 +112,7 @@ class CutDomains(Keyed):
     grid
         Background grid.
     points
-        Material points of this process; they must be inside the grid.
+        Material points of this process.  They must be inside the grid.
     domains
         Whether to integrate over the exact pieces of the domains.  If not, each point is one piece, as in standard MPM.
     second, faces
@@ -132,18 +133,18 @@ class CutDomains(Keyed):
         self.to_pieces = exchange.back
         """Function that sends values of the pieces from the owners of their cells to the processes of the points."""
         self.cells, self.x = grid.locals[exchange.send(pieces.cell)], exchange.send(pieces.x)
-        """Owned cells (m,) of the pieces, and centroids (m, d), m, of the pieces."""
+        """For each of m pieces: the owned cell (m,) that contains it, and its centroid (m, d), in m."""
         self.mixed = exchange.send(pieces.mixed) if grid.dim == 3 and domains else None
-        """In 3D: mean products of the offsets in each piece from its centroid, see `Pieces`."""
+        """In 3D: means over each piece of products of the offsets from its centroid, see `Pieces`."""
         self.hoop = exchange.send(pieces.hoop) if grid.axisymmetric else None
         """In axisymmetry: moments (m, 4) of the pieces in the plane, see `Pieces`."""
         self._faces = exchange.send(pieces.faces) if faces else None
         pieces.faces, pieces.mixed = pieces.faces[:0].copy(), pieces.mixed[:0].copy()
         self.pieces = pieces
-        """Pieces of this process's points, without areas and mean products, which only integrals over cells need."""
+        """Pieces of this process's points, without areas and mean products.  Only integrals over cells need these."""
 
     def faces(self) -> NDArray[np.float64]:
-        """Return the areas (m, d, 2), m^(d-1), of the pieces on faces of their cells, once: they are as large as F."""
+        """Return areas (m, d, 2), in m^(d-1), of pieces on cell faces.  Call it once, because they are then deleted."""
         faces, self._faces = self._faces, None
         return faces
 
@@ -163,11 +164,11 @@ class CutDomains(Keyed):
         return self.moved(points, part, count) <= STILL
 
     def to_cells(self, values: NDArray) -> NDArray:
-        """Send values of the points (n, ...) to the owners of their pieces' cells; return values (m, ...)."""
+        """Send values (n, ...) of points to owners of their pieces' cells.  Return values (m, ...) of owned pieces."""
         return self.pieces_to_cells(values[self.pieces.point])
 
     def plane(self, volume: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return sizes (m,), m^d, and centroids (m, d), m, of pieces; in axisymmetry of their sections in the plane."""
+        """Return volumes (m,) and centroids (m, d) of pieces; in axisymmetry areas and centroids of their sections."""
         if not self.grid.axisymmetric:
             return volume, self.x
         return volume / (TURN * self.hoop[:, 3]), self.grid.midpoints[self.cells] + self.hoop[:, :2]
@@ -179,9 +180,9 @@ class CutDomains(Keyed):
         return means.T.copy().reshape(len(self.points), *values.shape[1:])
 
     def in_plane(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return each point's mean over its pieces like `mean`; in axisymmetry the weights are areas in the plane.
+        """Return for each point the volume mean over its pieces, or in axisymmetry the area mean in the plane.
 
-        `values` are values at the centroids of these areas.
+        In axisymmetry, `values` (m,) refer to the centroids of the pieces' areas in the plane.
         """
         if not self.grid.axisymmetric:
             return self.mean(values)
@@ -198,7 +199,7 @@ class CutDomains(Keyed):
         return self.surfaces([faces])[0]
 
     def surfaces(self, several: Sequence[Surface]) -> list[Patches]:
-        """Return the quadrature points of several surfaces, which are cut together in the time of one."""
+        """Return the quadrature points of several surfaces.  They are cut together, which takes as long as one cut."""
         if new := [faces for faces in dict.fromkeys(several) if faces not in self._patches]:
             self._patches.update(zip(new, self._cut_surfaces(new), strict=True))
         return [self._patches[faces] for faces in several]
@@ -237,12 +238,12 @@ class CutDomains(Keyed):
         return out
 
     def displacement(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return values (n, d) of a Q1 field u (nodes, d) at the material points; only for a cut without `domains`."""
+        """Return values (n, d) of a Q1 field u (nodes, d) at the points.  The cut must be without `domains`."""
         exchange, cells = self._followed
         return exchange.back(self.grid.at(cells, exchange.send(self._tracked), u))
 
     def followed(self, u: NDArray[np.float64], filled: NDArray[np.bool_]) -> Iterator[NDArray[np.float64]]:
-        """Yield the Q1 field u (nodes, d), m, at the corners (n, 2^d, d), then its quadratic correction there, m.
+        """Yield two fields (n, 2^d, d) at the corners, in m: the Q1 field u (nodes, d), and its quadratic correction.
 
         `filled` (cells,) tells which local cells contain material.
         """
@@ -252,19 +253,19 @@ class CutDomains(Keyed):
 
     @property
     def _tracked(self) -> NDArray[np.float64]:
-        """Positions (n, d), m, of all corners, or of the points if not `domains`."""
+        """Positions (n, d), in m, of all corners, or of the points without `domains`."""
         return self.points.corners.reshape(-1, self.grid.dim) if self.domains else self.points.x
 
     @cached_property
     def _followed(self) -> tuple[Exchange, NDArray[np.int32]]:
-        """Exchange of `_tracked` positions with the owners of their cells; and these cells (m,)."""
+        """Exchange that sends `_tracked` positions to owners of their cells, and local indices (m,) of these cells."""
         grid, at = self.grid, np.arange(len(self.points))
         cell = self.cells_at(at.repeat(2**grid.dim) if self.domains else at, self._tracked)
         exchange = Exchange(grid.comm, grid.owner(cell))
         return exchange, grid.locals[exchange.send(cell)]
 
     def total_displacement(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return total displacements (m, d), m, of the pieces' centroids, computed from the corners of the domains."""
+        """Return total displacements (m, d), in m, of the pieces' centroids, computed from the domains' corners."""
         pieces = self.pieces
         now, then = (c - c.mean(axis=1, keepdims=True) for c in (points.corners, points.origin))
         stretch = np.linalg.solve(then.swapaxes(1, 2) @ then, then.swapaxes(1, 2) @ now)  # affine fit to the corners
@@ -273,12 +274,12 @@ class CutDomains(Keyed):
         return off + (middle(points.corners) - middle(points.origin))[pieces.point] - off0
 
     def cells_at(self, at: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the lexicographic index (m,) of the cell of each x (m, d), m, in or on the domain of point `at`."""
+        """Return the lexicographic cells (n,) of positions x (n, d), in m, in or on the domains of points `at` (n,)."""
         # rounding must not assign a corner on a grid line to a cell outside the domain
         return self._filled_cell(at, x + NEAR * (self.points.x[at] - x))
 
     def _filled_cell(self, at: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the cell (m,) of each x; if the domain has no piece in this cell, the cell of its largest piece."""
+        """Return the cells (n,) of positions x.  A domain without a piece there gives the cell of its largest piece."""
         pieces, cells = self.pieces, self.grid.all_cells
         cell = self.grid.number(self.grid.index_from_base(x)) + self.grid.copy(self.points.id[at])
         key, keys = at * cells + cell, pieces.point * cells + pieces.cell

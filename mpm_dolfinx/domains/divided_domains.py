@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Parts of seeded domains, after division and merging: intervals of seeded domains, identifiers, corners and faces.
+"""Parts of seeded domains after division and merging: their intervals, identifiers, corners and faces.
 
 A part is the image of a box [a, b] under the bilinear or trilinear map of its domain, in the reference configuration
 and in the deformed one. Coordinates count seeded domains: a whole domain is the interval [0, 1] along each axis.
@@ -28,11 +28,12 @@ PLACES = "corners", "reference", "origin"
 
 
 class SeededDomains:
-    """Seeded domains of the bodies, and identifiers of their parts, which follow from domain and interval.
+    """Seeded domains of the bodies, and identifiers of their parts.
 
-    An identifier is a number of `material_points.body_of` with an odd index in the body; renewed points have even ones.
+    The identifier of a part follows from its domain and its interval.  It is a number for `material_points.body_of`
+    with an odd index in the body.  Renewed points have even indices.
 
-    bodies: all bodies of the scene.
+    `bodies`: all bodies of the scene.
     """
 
     def __init__(self, bodies: Sequence[Body]):
@@ -48,7 +49,7 @@ class SeededDomains:
         return (self._code(part) < self._codes).all(axis=1)
 
     def of(self, root: NDArray[np.int64], part: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the identifiers (n,) of parts; a whole domain has its seeded identifier."""
+        """Return the identifiers (n,) of parts.  A whole domain has its seeded identifier."""
         code = np.zeros(len(root), dtype=np.int64)
         for column in self._code(part).T:
             code = code * self._codes + column
@@ -58,15 +59,16 @@ class SeededDomains:
 
     @staticmethod
     def _code(part: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return a number (n, d) for each dyadic interval: even up to the size 1, odd above."""
+        """Return a number (n, d) for each dyadic interval.  It is even for sizes up to 1, and odd for larger sizes."""
         size = np.ptp(part, axis=2)
         code = np.where(size <= 1, 2 * (1 + part[..., 0]) / size, 2 * np.log2(size) - 1)
         return np.rint(code).astype(np.int64)
 
     def at(self, root: NDArray[np.int64], lower: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return the domain (n,) with the lower corner of a part, and this corner (n, d) relative to the domain.
+        """Return the domain (n,) that has the lower corner of each part, and this corner (n, d) relative to the domain.
 
-        root (n,), lower (n, d): any domain of the body, and the corner relative to this domain.
+        `root` (n,): any domain of the body.
+        `lower` (n, d): lower corner of the part, relative to `root`.
         """
         step = np.floor(lower).astype(np.int64)
         out, moved = root.copy(), step.any(axis=1).nonzero()[0]
@@ -77,7 +79,7 @@ class SeededDomains:
         return out, lower - step
 
     def places(self, root: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the body and lattice index (n, 1 + d) of seeded domains; -1 - id for domains that are not boxes."""
+        """Return body and lattice index (n, 1 + d) of seeded domains.  Without a lattice, the body is -1 - id."""
         out = np.zeros((len(root), 1 + self._dim), dtype=np.int64)
         body = body_of(root, self.starts)
         for i in np.unique(body):
@@ -89,12 +91,12 @@ class SeededDomains:
         return out
 
     def sizes(self, grid: Grid, points: MaterialPoints) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the edge lengths (n, d) of domains in cells: now, and of their seeded domains at seeding."""
+        """Return two arrays (n, d), in cells: edge lengths of domains now, and of their seeded domains at seeding."""
         root = roots(points)[0]
         return _lengths(grid.in_cells(points.corners)), self._seeded((root,), lambda: self._as_seeded(grid, root))
 
     def _as_seeded(self, grid: Grid, root: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the edge lengths (n, d) of domains in cells at seeding; nan for renewed domains."""
+        """Return the edge lengths (n, d) of domains in cells at seeding.  Renewed domains have nan."""
         seeded, body = np.full((len(root), self._dim), np.nan), body_of(root, self.starts)
         for i in range(len(self.bodies)):
             at = (body == i) & (root < self.starts[-1])
@@ -104,10 +106,10 @@ class SeededDomains:
         return seeded
 
     def from_middle(self, places: NDArray[np.int64], axis: int) -> NDArray[np.float64]:
-        """Return the index (n,) of rows of the lattice along an axis, from the middle of the body.
+        """Return the indices (n,) of rows of the lattice along an axis, counted from the middle of the body.
 
-        Pairs of rows are then the same in a mirrored scene. The result is nan without a pair: in the middle of an odd
-        number of rows, and for domains that are not on a lattice.
+        Rows merge in pairs, which are therefore the same in a mirrored scene.  The result is nan for the middle row of
+        an odd number of rows, which has no pair, and for domains that are not on a lattice.
         """
         out = np.full(len(places), np.nan)
         for i in np.unique(places[places[:, 0] >= 0, 0]):
@@ -117,7 +119,7 @@ class SeededDomains:
         return out
 
     def middle(self, root: NDArray[np.int64], part: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
-        """Return the local coordinates (n,), in (0, 1), of the middles of intervals along an axis.
+        """Return the local coordinates (n,), between 0 and 1, of the middles of intervals along an axis.
 
         Rows of boxes on a lattice may have different widths, so the middle of a merged domain may not be at 1/2.
         """
@@ -149,7 +151,7 @@ def whole(part: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 
 def halves(corners: NDArray[np.float64], axis: int, middle: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the corners (2, n, 2^d, d) of both parts of domains (n, 2^d, d), divided at `middle` (n,) of an axis."""
+    """Return both halves (2, n, 2^d, d) of domains (n, 2^d, d), divided at the local coordinates `middle` (n,)."""
     low, high = FACES[corners.shape[2]][2 * axis : 2 * axis + 2]
     t = middle[:, None, None]
     out = np.stack([corners, corners])
@@ -163,14 +165,14 @@ def merged(lower: NDArray[np.float64], upper: NDArray[np.float64], axis: int) ->
 
 
 def beyond_corners(points: MaterialPoints, axisymmetric: bool) -> NDArray[np.float64]:
-    """Return the part (n, k, k) of F that corners do not determine: F, divided by the gradient of the corners."""
+    """Return the factor (n, k, k) of F that corners do not determine.  F is the corners' gradient times this factor."""
     return np.linalg.inv(gradient(points.corners, points.reference, axisymmetric)) @ points.F
 
 
 def halved(points: MaterialPoints, axis: int, domains: SeededDomains, axisymmetric: bool) -> MaterialPoints:
-    """Return both halves (2n,) of each point, the lower half of all points first.
+    """Return both halves (2n,) of n points: first all lower halves, then all upper halves.
 
-    The sum of the volumes, at rest and deformed, is the volume of the point.
+    The volumes of both halves add up to the volume of the point, both at rest and deformed.
     """
     root, part = roots(points)
     at, n = domains.middle(root, part, axis), len(points)
@@ -190,7 +192,7 @@ def joined(
 ) -> MaterialPoints:
     """Return the points (n,) merged from their halves.
 
-    F is the ratio of corners and reference corners.  Data are means, weighted by the volumes at rest.
+    F follows from the corners and the reference corners.  Data are means, weighted by the volumes at rest.
     """
     places = {name: merged(getattr(lower, name), getattr(upper, name), axis) for name in PLACES}
     root, part = roots(lower)
@@ -215,7 +217,7 @@ def _placed(
     of: tuple[NDArray[np.int64], NDArray[np.float64]],
     beyond: NDArray[np.float64],
 ) -> MaterialPoints:
-    """Return points at other places, with `ROOT` and `PART` in `of`, and F from their corners and `beyond_corners`."""
+    """Return points with new corners, identifiers and parts `of`.  F follows from the corners and `beyond_corners`."""
     root, part = of
     is_whole = whole(part)
     data = {ROOT: np.where(is_whole, -1, root), PART: np.where(is_whole[:, None, None], 0.0, part)}
@@ -226,7 +228,7 @@ def _placed(
 def with_defect(new: MaterialPoints, old: MaterialPoints, into: NDArray[np.int64]) -> MaterialPoints:
     """Return new points with a volume defect such that soil and fluid fill the same volume as before.
 
-    into: old point of each new point, or new point of each old point, if there are fewer.
+    `into`: index of the old point of each new point; if points were merged, index of the new point of each old point.
     """
     if "owed" not in new.data:
         return new

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Deformation gradients of particle domains and volume ratios of cells, computed from corner positions for any path."""
+"""Deformation gradients of particle domains and volume ratios of cells, which follow from corner positions alone."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from mpm_dolfinx.points.material_points import MaterialPoints, cofactor, determi
 def gradient(
     corners: NDArray[np.float64], reference: NDArray[np.float64], axisymmetric: bool = False
 ) -> NDArray[np.float64]:
-    """Return the deformation gradient F (n, d, d) of each particle domain, the mean over the simplices of the domain.
+    """Return the deformation gradients F (n, d, d) of particle domains.  F is a mean over the simplices of the domain.
 
     In 2D the diagonals determine F, and det F is the ratio of the areas.  In 3D F is scaled so that det F is the ratio
-    of the volumes.  (For a twisted hexahedron, the determinant of the unscaled mean differs from this ratio by a
-    second-order term.)  In axisymmetry F has the shape (n, 3, 3).  The circumferential stretch is the ratio of the
+    of the volumes.  For a twisted hexahedron, the determinant of the unscaled mean differs from this ratio by a
+    second-order term.  In axisymmetry F has the shape (n, 3, 3).  The circumferential stretch is the ratio of the
     centroid radii, and det F is the ratio of the ring volumes.
 
-    corners, reference (n, 2^d, d), m: current corners, and reference corners.
+    `corners`, `reference` (n, 2^d, d), in m: current corners, and reference corners.
     """
     if corners.shape[2] == 2:
         dx, dX = (y[:, :1:-1] - y[:, :2] for y in (corners, reference))  # the diagonals
@@ -44,9 +44,9 @@ def gradient(
 def _of_hexahedra(
     corners: NDArray[np.float64], reference: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the mean F (n, 3, 3) over the simplices, and the reference volumes V (n,), m^3.
+    """Return the mean F (n, 3, 3) over the simplices, and the reference volumes V (n,), in m^3.
 
-    F = sum_k x_k dV/dX_k / V, over the corners k.  The last axis of the local arrays is the point.
+    `F = sum_k x_k dV/dX_k / V`, where the sum is over the corners k.  The last axis of the local arrays is the point.
     """
     x, X = (np.ascontiguousarray((y - y[:, :1]).transpose(1, 2, 0)) for y in (corners, reference))
     slope = _slopes(X)
@@ -55,7 +55,7 @@ def _of_hexahedra(
 
 
 def _slopes(X: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the derivatives (8, 3, n), m^2, of hexahedron volumes with respect to the corners X (8, 3, n), m."""
+    """Return the derivatives (8, 3, n), in m^2, of hexahedron volumes with respect to corners X (8, 3, n), in m."""
     slope = np.zeros_like(X)
     for face, sign in zip(FACES[3], FACE_SIGNS, strict=True):
         p, q, r, s = X[face]
@@ -71,9 +71,9 @@ def _slopes(X: NDArray[np.float64]) -> NDArray[np.float64]:
 def volume_slopes(
     corners: NDArray[np.float64], axisymmetric: bool = False
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the volumes (n,) of domains, m^d, and derivatives (n, 2^d, d) with respect to corners, m^(d-1).
+    """Return the volumes (n,) of domains, in m^d, and their derivatives (n, 2^d, d) by the corners, in m^(d-1).
 
-    In axisymmetry the domains are rings: volumes, m^3, are integrals of pi r^2 dz, and the derivatives are in m^2.
+    In axisymmetry the domains are rings.  Volumes are integrals of `pi r^2 dz`, in m^3, and derivatives are in m^2.
     """
     now = domain_volumes(corners, axisymmetric)
     if corners.shape[2] == 3:
@@ -94,15 +94,17 @@ def cell_ratios(
 ) -> NDArray[np.float64]:
     """Return the volume ratios (m,) of the pieces of a cut at the start of a step.
 
-    With mean dilatation, the ratio of a cell is the current volume of its domains, computed from the corners, divided
-    by the reference volume.  This ratio does not depend on the path of deformation.  Differences between the volume
-    ratios of domains in a cell do no work.  If the ratio of a cell were updated by increments only, no force would
-    oppose a drift of the domains' volume from this ratio.  Without mean dilatation, pieces have the ratio of their
-    point.  The same applies in cells with yielded soil, because corner volumes are meaningless near plastic flow.
+    With F-bar, the volume ratio of a cell is the current volume of its domains, computed from the corners, divided by
+    their reference volume.  This ratio does not depend on the path of deformation.  Differences between the volume
+    ratios of domains in a cell do no work.  If the ratio of a cell were updated by increments only, it could drift from
+    the volume of the domains, and no force would oppose this drift.  Without F-bar, pieces have the ratio of their
+    point.  In cells with yielded soil they also do, because corner volumes are meaningless near plastic flow.
 
-    cut, points: cut particle domains, and points at the start of the step; share (n,): weight, in [0, 1], of the ratio
-    from corners in the geometric mean of this ratio and the ratio of the point; 0 without mean dilatation.  flows (n,):
-    whether points have yielded.
+    `cut`: cut particle domains.
+    `points`: points at the start of the step.
+    `share` (n,): weight, from 0 to 1, of the ratio from corners in its geometric mean with the point's ratio.  It is 0
+    without F-bar.
+    `flows` (n,): whether points have yielded.
     """
     cells, size = cut.cells, cut.grid.num_local
     corner_ratio = cut.to_cells(determinant(gradient(points.corners, points.reference, cut.grid.axisymmetric)))

@@ -2,15 +2,15 @@
 """Deformation gradients that vary linearly within the particle domains of elastic soil.
 
 The gradient F of a point is the mean over its domain.  In bending the gradient varies across the domain.  With one
-value per domain, and n domains over the thickness, the bending stiffness is too small by the fraction 1/n^2.  At a
-piece of the domain the gradient is
+value for each domain, and n domains over the thickness, the bending stiffness is too small by the fraction `1/n^2`.  At
+a piece of the domain the gradient is therefore
 
-    F(xi) = F (1 + e),   F e = sum_a D_a (xi_a - mean of xi_a over the reference volume),
+    F(xi) = F (1 + e),   F e = sum_a D_a (xi_a - mean of xi_a over the reference volume).
 
-with the local coordinates xi of the domain, in units of its edge lengths.  The slopes D_a are a least-squares fit to
-the gradients F of neighbours of the same material across faces.  e is then corrected so that int dV / det F, summed
-over the pieces, is the reference volume of the domain.  The fit reproduces linear fields on any mesh, and uniform
-fields stay uniform.
+The local coordinates xi of the domain are in units of its edge lengths.  The slopes D_a are a least-squares fit to the
+gradients F of neighbours across faces.  Only neighbours of the same material are used.  Then e is corrected so that the
+sum of `int dV / det F` over the pieces is the reference volume of the domain.  The fit reproduces linear fields on any
+mesh, and uniform fields stay uniform.
 """
 
 from __future__ import annotations
@@ -38,8 +38,10 @@ from mpm_dolfinx.points.material_points import MaterialPoints, body_of, cofactor
 class Neighbours:
     """Neighbours of domains across shared faces, including neighbours on other processes.
 
-    comm: communicator of the processes; bodies: all bodies of the scene; points: material points of this process;
-    chosen (n,): whether to find the neighbours of each point.
+    `comm`: communicator of the processes.
+    `bodies`: all bodies of the scene.
+    `points`: material points of this process.
+    `chosen` (n,): whether to find the neighbours of each point.
     """
 
     def __init__(self, comm: MPI.Intracomm, bodies: Sequence[Body], points: MaterialPoints, chosen: NDArray[np.bool_]):
@@ -60,9 +62,10 @@ class Neighbours:
         self._partner = partner.reshape(-1, 2 * dim).T.copy()  # index of the opposite face; -1 if there is none
 
     def at_neighbours(self, own: NDArray[np.float64], faces: Sequence[NDArray[np.float64]]) -> Callable[[int], tuple]:
-        """Return a function of a face index.  It returns neighbours' data (c, k), their face centres, and which exist.
+        """Return a function of a face index.  It returns neighbours' data (c, k), face centres, and which exist.
 
-        `own` (c, k) are c data columns of the k points.  `faces` are, for each face index, the face centres (d, k), m.
+        `own` (c, k): c data columns of the points.
+        `faces`: centres (d, k), in m, of the points' faces, for each face index.
         """
         centres = np.array(faces).transpose(1, 2, 0).reshape(len(faces[0]), own.shape[1] * len(faces))
         point = np.arange(own.shape[1]).repeat(len(faces))
@@ -84,7 +87,8 @@ class Neighbours:
 class LinearGradients:
     """Deformation gradients at the pieces of the domains in a scene.
 
-    comm: communicator of the processes; bodies: all bodies of the scene.
+    `comm`: communicator of the processes.
+    `bodies`: all bodies of the scene.
     """
 
     def __init__(self, comm: MPI.Intracomm, bodies: Sequence[Body]):
@@ -94,13 +98,13 @@ class LinearGradients:
     def at_pieces(
         self, cut: CutDomains, F: NDArray[np.float64], elastic: NDArray[np.bool_], soils: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return `linear_gradients`, which vary only in domains of `elastic` points (n,); all processes call it."""
+        """Return `linear_gradients` that vary only in domains of `elastic` points (n,).  All processes must call it."""
         make = partial(Neighbours, self._comm, self._bodies, cut.points, elastic)
         return linear_gradients(self._neighbours((cut.points.id, elastic), make, self._comm), cut, F, soils)
 
 
 def _seeded_faces(bodies: Sequence[Body], ids: NDArray[np.int64], seeded: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Return a key (k, 2d, 1) for each face of the seeded domains `ids` (k,), equal in both domains at the face."""
+    """Return a key (k, 2d, 1) for each face of the seeded domains `ids` (k,).  Both domains at a face have one key."""
     dim, starts = bodies[0].dim, np.cumsum([0, *map(len, bodies)])
     of, key = np.where(seeded, body_of(ids, starts), -1), np.zeros((len(ids), 2 * dim), dtype=np.int64)
     for i, body in enumerate(bodies):
@@ -116,10 +120,11 @@ def _seeded_faces(bodies: Sequence[Body], ids: NDArray[np.int64], seeded: NDArra
 def _faces_of_parts(
     comm: MPI.Intracomm, bodies: Sequence[Body], points: MaterialPoints, seeded: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    """Return a key (n, 2d, 2) for each face of parts of domains, and of whole domains on lattices; else `seeded`.
+    """Return a key (n, 2d, 2) for each face of domains and of parts of domains.
 
-    The key of a face on a lattice: its lower corner, its normal and its size, in units of the smallest part of all.
-    Parts of other domains have neighbours only in the same domain.
+    The key of a face on a lattice consists of its lower corner, its normal and its size, in units of the smallest part
+    in the scene.  Parts of domains that are not on a lattice have neighbours only in their domain.  Other whole domains
+    keep the keys `seeded` of their faces.
     """
     dim, part = bodies[0].dim, is_part(points)
     root, ends = roots(points)
@@ -156,8 +161,10 @@ def linear_gradients(
 ) -> NDArray[np.float64]:
     """Return deformation gradients (m, k, k) at the pieces of this process's points.
 
-    neighbours: neighbours of the domains in which F may vary; cut: cut particle domains; F (n, k, k): deformation
-    gradients of the points; soils (n, c): constants of the points' soil. Points with equal rows have the same material.
+    `neighbours`: neighbours of the domains in which F may vary.
+    `cut`: cut particle domains.
+    `F` (n, k, k): deformation gradients of the points.
+    `soils` (n, c): constants of the points' soil; points with equal rows have the same material.
     """
     # the last axis is the point or piece: numpy takes several times as long for rows of a few numbers each
     of, fraction = cut.pieces.point, cut.pieces.fraction
@@ -191,7 +198,7 @@ def linear_gradients(
 def _slopes(
     neighbours: Neighbours, cut: CutDomains, F: NDArray[np.float64], soils: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the derivatives dF/dxi (d, k, k, r), and the inverse edge matrices (d, d, r) of domains, 1/m."""
+    """Return the derivatives `dF/dxi` (d, k, k, r), and the inverse edge matrices (d, d, r) of domains, in 1/m."""
     rows = neighbours.rows
     d, k = cut.grid.dim, F.shape[1]
     corners = cut.points.corners[rows].transpose(1, 2, 0).copy()

@@ -26,13 +26,15 @@ def fitted_at(
     xi: NDArray[np.float64],
     tensor: Callable[[MaterialPoints], NDArray[np.float64]],
 ) -> NDArray[np.float64]:
-    """Return tensors (m, k, k) at positions in particle domains; all processes must call this function.
+    """Return tensors (m, k, k) at positions in particle domains.  All processes must call this function.
 
     The fit uses points of the same body and material, weighted by the distance in the reference configuration.  Results
     in removed domains are meaningless.
 
-    sizes: number of points of each body of the scene; id (m,), xi (m, d): identifiers of the points, and local
-    coordinates in their domains, the same on all processes; tensor: function from material points to tensors (n, k, k).
+    `sizes`: number of points of each body of the scene.
+    `id` (m,): identifiers of the points in whose domains the positions lie, the same on all processes.
+    `xi` (m, d): local coordinates of the positions in these domains, the same on all processes.
+    `tensor`: function from material points to tensors (n, k, k).
     """
     m = len(id)
     d = xi.shape[1]
@@ -61,7 +63,7 @@ def fitted_at(
 
 
 def _near(x: NDArray[np.float64], places: NDArray[np.float64], radius: NDArray[np.float64]) -> tuple[NDArray, NDArray]:
-    """Return index pairs of `places` (m, d) and points x (n, d) within `radius` (m,) along each axis; all in m."""
+    """Return index pairs of `places` (k, d) and points x (n, d) closer than `radius` (k,) along each axis, all in m."""
     low, high = ((places + sign * radius[:, None]).T for sign in (-1, 1))
     bounds = low.min(axis=1, initial=np.inf), high.max(axis=1, initial=-np.inf)
     some = np.flatnonzero(((x >= bounds[0]) & (x <= bounds[1])).all(axis=1))

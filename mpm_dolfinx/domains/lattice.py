@@ -1,20 +1,21 @@
 # SPDX-License-Identifier: MIT
 """Lattice of the seeded corners of a body, and a third-difference filter of their displacements.
 
-Nodes cannot represent a displacement wave of the corners with a wavelength of two domains, so no nodal force resists
-it.  Corners that cross grid lines excite such waves, and the waves would grow from one load cycle to the next.
-The filter damps them when the grid is reset.  For each axis a in turn,
+Nodes cannot represent a displacement wave of the corners with a wavelength of two domains.  No nodal force therefore
+resists such a wave.  Corners that cross grid lines excite these waves, and the waves would grow from one load cycle to
+the next.  The filter damps them when the grid is reset.  It replaces the displacement d of the corners from their
+reference positions, for each axis a in turn, by
 
-    d <- d - D_a^T (s / 64) D_a d.
+    d - D_a^T (s / 64) D_a d.
 
-The result is the mean over all orders of the axes.  d is the displacement of the corners from their reference
-positions.  D_a is the third difference along axis a, of four corners in a row.  If the domains in a row have different
-widths, D_a is the divided difference, scaled to the same sum of absolute weights.  s is min(1, `FAST` c), if the
-corners have crossed c cells since the last grid reset.  Bodies that hardly move are not filtered.  Quadratic fields
-remain unchanged, even at the surface.  A wave with a length of two domains is reduced by the fraction s, a wave of
-eight domains by 0.003 s.  Domains that have separated from their neighbours are not filtered.  Yielded soil is not
-filtered either: its deformation is irreversible, and its kinks are physical.  The filter does not move corners held by
-a wall, a prescribed displacement, a plate or another body.
+The result is the mean over all orders of the axes.  D_a is the third difference of four corners in a row along axis a.
+If the domains in a row have different widths, D_a is the divided difference, scaled to the same sum of absolute
+weights.  The factor is `s = min(1, FAST c)`, where c is the number of cells that the corners have crossed since the
+last grid reset.  Bodies that hardly move are thus not filtered.  Quadratic fields remain unchanged, even at the
+surface.  A wave with a length of two domains is reduced by the fraction s.  A wave with a length of eight domains is
+reduced by 0.003 s.  Domains that have separated from their neighbours are not filtered.  Yielded soil is not filtered
+either, because its deformation is irreversible, and its kinks are physical.  The filter does not move corners held by a
+wall, a prescribed displacement, a plate or another body.
 """
 
 from __future__ import annotations
@@ -38,7 +39,8 @@ from mpm_dolfinx.parallel.exchange import Exchange
 from mpm_dolfinx.points.material_points import MaterialPoints
 
 FAST = 10
-"""Fraction of a wave of two domains that the filter removes per crossed cell; it removes at most the whole wave.
+"""Fraction of a wave with a length of two domains that the filter removes for each crossed cell.  At most the whole
+wave is removed.
 Halving this value changes the result of scene "cycles" in tests/plateaus.py by 1.5e-04 (relative), doubling it by
 3.4e-04, and finer cells by 6.2e-03.
 """
@@ -50,9 +52,9 @@ MARGIN = len(THIRD) - 1
 class Lattice:
     """Lattice of the domain corners of an active body, and the held corners.  Bodies from meshes are not filtered.
 
-    start: identifier of the body's first point; given: for each condition, the faces on which it prescribes
-    displacements, and the prescribed axes.  contacts: for faces that touch other bodies, the
-    index (m,) of the domain, and the indices (m, 4) of the corners of the face in this domain.
+    `start`: identifier of the body's first point.
+    `given`: for each condition, the faces on which it prescribes displacements, and the prescribed axes.
+    `contacts`: for faces that touch other bodies, the domain (m,), and the indices (m, 4) of the face's corners in it.
     """
 
     def __init__(
@@ -123,10 +125,11 @@ class Lattice:
         crossed: NDArray[np.float64],
         parts: Sequence[int],
     ) -> NDArray[np.float64]:
-        """Return the change (n, 2^d, d), m, by which the filter corrects displacements of domain corners.
+        """Return the change (n, 2^d, d), in m, by which the filter corrects displacements of domain corners.
 
-        `d` (n, 2^d, d), m, are the displacements; `crossed` (n, 2^d) the numbers of cells crossed since the grid reset;
-        `parts` (m,) the indices of corners of parts of domains: these corners are not filtered.
+        `d` (n, 2^d, d), in m: displacements of the corners.
+        `crossed` (n, 2^d): numbers of cells that the corners have crossed since the grid reset.
+        `parts` (k,): indices of corners of parts of domains; these corners are not filtered.
         """
         if self._count is None:
             return np.zeros_like(d)
@@ -154,11 +157,12 @@ def _at_sites(
 ) -> tuple[NDArray[np.float64], slice, Callable[[NDArray[np.float64]], NDArray[np.float64]]]:
     """Return values at the sites of a lattice (..., k), which is distributed over the processes in slabs of layers.
 
-    Also return the first layers of third differences in this slab, and a function from values at all its sites to rows.
+    Also return the range of first layers of third differences in this process's slab, and a function that converts
+    values at all sites of the slab to rows.
 
-    shape: number of lattice sites along each axis; number (m,): lexicographic index of the site of each row of values;
-    values (m, k); tolerance (k,): largest difference between rows of a site; if it is exceeded, the domains have
-    separated, and the site is nan.
+    `shape`: number of lattice sites along each axis.
+    `number` (m,): lexicographic index of the site of each row of values (m, k).
+    `tolerance` (k,): largest difference between rows of a site; if domains differ by more, the site is nan.
     """
     across, starts = int(np.prod(shape[1:])), np.arange(comm.size + 1) * shape[0] // comm.size
     layer = number // across
@@ -192,7 +196,7 @@ def _filtered(
     thirds: Sequence[NDArray[np.float64]] | None,
     axes: Sequence[int] | None = None,
 ) -> NDArray[np.float64]:
-    """Return values on a box (..., k) of sites, filtered along some axes (default: all); nan marks missing sites.
+    """Return values on a box (..., k) of sites, filtered along some axes, by default along all.  Missing sites are nan.
 
     Filters along two axes do not commute where s varies.  The mean over all orders of the axes makes the result
     independent of rotations by right angles.
@@ -256,7 +260,7 @@ def given(lattices: Sequence[Lattice], points: MaterialPoints) -> NDArray[np.boo
 
 
 def seeded(lattices: Sequence[Lattice], points: MaterialPoints) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Return indices (n, 2^d) of corners in bodies, -1 for renewed domains, and which corners touch other bodies."""
+    """Return indices (n, 2^d) of corners in bodies, or -1 in renewed domains, and which corners touch other bodies."""
     numbers, touching = np.full(points.corners.shape[:2], -1), np.zeros(points.corners.shape[:2], dtype=bool)
     for lattice in lattices:
         rows = lattice.rows(points)
@@ -268,7 +272,7 @@ def seeded(lattices: Sequence[Lattice], points: MaterialPoints) -> tuple[NDArray
 def filtered(
     grid: Grid, lattices: Sequence[Lattice], points: MaterialPoints, then: MaterialPoints, free: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
-    """Return the change of the corners (n, 2^d, d), m, by the filter.
+    """Return the change of the corners (n, 2^d, d), in m, by the filter.
 
     `then` are the points at the last grid reset.  `free` (n,) tells which points are filtered.
     """
@@ -282,5 +286,5 @@ def filtered(
 
 
 def crossed(grid: Grid, points: MaterialPoints, then: MaterialPoints, free: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return the number of cells crossed by corners (n, 2^d) since the grid reset; 0 for points that are not `free`."""
+    """Return the numbers (n, 2^d) of cells that corners have crossed since the grid reset, or 0 if not `free`."""
     return grid.cells_between(then.corners, points.corners).sum(axis=2) * free[:, None]

@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: MIT
 """Conservative, second-order remap of the pore pressure from one grid to the next.
 
-In each cell the pressure is reconstructed as p + s . (x - c) about the centroid c of the cell's storage.  Along an
-axis, s is van Leer's mean of the slopes at both ends of the cell.  The slope at an end leads to the neighbour across an
-open face, or to the pressure on a drained side.  If one of the two slopes is missing, s is zero.  The slope is then
+In each cell the pressure is reconstructed as `p + s . (x - c)` about the centroid c of the cell's storage.  Along an
+axis, s is van Leer's mean of the slopes at both ends of the cell.  The slope at an end is that towards the neighbour
+across an open face, or towards the pressure on a drained side.  If one of both slopes is missing, s is zero.  Then s is
 scaled so that the pressure in the cell stays between the extremes of cell, neighbours and drained sides.
 
 A piece of a particle domain receives the pressure at its centroid and moves with the domain.  Then the domain is cut
-again.  In a cell that contained the domain before, the smaller of the old and new fractions keeps its pressure.  A
-fraction that is new in a cell receives the mean pressure of the fractions that left other cells.  The centroids of the
+again.  A cell may contain a fraction of the domain before and after the cut.  The smaller of both fractions keeps its
+pressure.  A further fraction in the cell receives the mean pressure of the fractions that left other cells.  The
+centroids of the
 pieces are remapped in the same way.  The error of the remapped centroid, times the mean slope of the domain, corrects
 the pressure.  The fractions of a domain add up to one, and the corrections add up to zero, so the remap is
 conservative.  Without motion, the remap changes nothing.
@@ -35,9 +36,9 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 
 @dataclass(frozen=True, eq=False)
 class PiecePressures:
-    """Pore pressure of a scene between two steps; arrays over the m pieces of domains, ordered by point and cell.
+    """Pore pressure of a scene between two steps.  Arrays have a row for each of m pieces, by point and cell.
 
-    Pieces to be moved to the next grid have pressures at their centroids; pieces that stay have pressures of cells.
+    Pieces to be moved to the next grid have pressures at their centroids.  Pieces that stay have pressures of cells.
     """
 
     id: NDArray[np.int64]  # identifier of the point (m,)
@@ -48,7 +49,7 @@ class PiecePressures:
     slope: NDArray[np.float64] | None  # pressure gradient (m, d), Pa/m; None for pieces that stay
     bounds: NDArray[np.float64] | None  # smallest and largest allowed pressure (m, 2), Pa; None for pieces that stay
     of_cell: NDArray[np.float64] | None = None  # current pressure of the cell (m,), Pa; None for pieces to be moved
-    start: NDArray[np.float64] | None = None  # pressure of the cell at the grid reset (m,), Pa; None like `of_cell`
+    start: NDArray[np.float64] | None = None  # pressure of the cell at the grid reset (m,), Pa; None like of_cell
 
     def __post_init__(self):
         for rows in self.arrays.values():
@@ -64,24 +65,24 @@ class PiecePressures:
         return self._each(exchange.send)._ordered()
 
     def potentials(self, bulk: float) -> PiecePressures:
-        """Return mass potentials (see `fluid_content`) instead of pressures, for a fluid of bulk modulus `bulk`, Pa."""
+        """Return mass potentials (see `fluid_content`) instead of pressures.  `bulk`, in Pa: the fluid's modulus."""
         pi, bounds = mass_potential(self.pressure, bulk), mass_potential(self.bounds, bulk)
         slope = np.exp(self.pressure / bulk)[:, None] * self.slope
         return replace(self, pressure=pi, slope=slope, bounds=bounds)
 
     def less(self, slope: NDArray[np.float64]) -> PiecePressures:
-        """Return the pressures minus a field with uniform slope (d,), Pa/m."""
+        """Return the pressures minus a field with uniform slope (d,), in Pa/m."""
         even = self.x @ slope
         bounds = self.bounds - even[:, None]
         return replace(self, pressure=self.pressure - even, slope=self.slope - slope, bounds=bounds)
 
     def of(self, ids: NDArray[np.int64], kept: bool = True) -> PiecePressures:
-        """Return the pieces of the points with these ids or, if not `kept`, of all other points."""
+        """Return the pieces of the points with these ids.  Without `kept`, return the pieces of all others."""
         rows = np.isin(self.id, ids) == kept
         return self._each(lambda values: values[rows])
 
     def joined(self, other: PiecePressures) -> PiecePressures:
-        """Return these pieces and `other`, the pieces of points new on the grid; all are pieces to be moved."""
+        """Return these pieces and the pieces `other` of points new on the grid.  All must be pieces to be moved."""
         pairs = {name: (getattr(self, name), values) for name, values in other.arrays.items()}
         return PiecePressures(**{name: np.concatenate(both) for name, both in pairs.items()})._ordered()
 
@@ -124,9 +125,9 @@ class Reconstruction:
     def __call__(
         self, pressures: CellPressures, origin: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return slopes (n, d), Pa/m, and bounds (n, 2), Pa, of the pressures in cells.
+        """Return the slopes (n, d), in Pa/m, and the bounds (n, 2), in Pa, of the pressures in cells.
 
-        `origin` (n, d), m, is the position to which the cell's pressure refers, relative to the cell's midpoint.
+        `origin` (n, d), in m, is the position to which the cell's pressure refers, relative to the cell's midpoint.
         """
         cells, p, centroid, *_ = pressures
         jump, one_sided, _, drained = self._differences(pressures)
@@ -141,9 +142,9 @@ class Reconstruction:
         return slope * scale[:, None], p[cells, None] + np.array([low, high]).T
 
     def _differences(self, pressures: CellPressures) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-        """Return pressure differences, Pa, slopes, Pa/m, and masks of the neighbours and of the drained sides of cells.
+        """Return four arrays (n, d, 2) by axis and end of cells.
 
-        All four arrays have the shape (n, d, 2), by axis and end, and are zero without a neighbour or drained side.
+        They are pressure differences in Pa, slopes in Pa/m, and masks of neighbours and of drained sides.
         """
         cells, p, centroid, faces, outer = pressures
         neighbours, own = self._neighbour[cells], cells[:, None, None]
@@ -160,14 +161,15 @@ class Reconstruction:
     def up_to_surface(
         self, pressures: CellPressures, x: NDArray[np.float64], slot: NDArray[np.int64]
     ) -> NDArray[np.float64]:
-        """Return pressures (m,), Pa, at positions in owned cells, with second-order accuracy even at the surface.
+        """Return pressures (m,), in Pa, at positions in owned cells, with second-order accuracy even at the surface.
 
-        In a cell at a no-flow side, the slope is the smaller of two: the slope in the next cell inside, and the linear
-        extrapolation of the slopes inside.  Linear fields are exact, and steep slopes are not continued.  Pressures
-        stay between the extremes of cell, neighbours, drained sides, and the reconstructed value at the surface.
+        In a cell at a no-flow side, the slope is the smaller of two slopes.  One is the slope in the next cell inside,
+        the other is the linear extrapolation of the slopes inside.  Linear fields are exact, and steep slopes are not
+        continued.  Pressures stay between the extremes of cell, neighbours and drained sides, and of the reconstructed
+        value at the surface.
 
-        x (m, d), m: positions relative to the midpoints of their cells; slot (m,): index of the cell of each position
-        among the owned cells.
+        `x` (m, d), in m: positions relative to the midpoints of their cells.
+        `slot` (m,): index of the cell of each position in `pressures.cells`.
         """
         cells, p, centroid, *_ = pressures
         jump, one_sided, is_open, drained = self._differences(pressures)
@@ -195,7 +197,7 @@ class Reconstruction:
 
 
 def van_leer(one_sided: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the harmonic means (n, d) of the slopes to both sides (n, d, 2); zero where their signs differ."""
+    """Return the harmonic means (n, d) of the slopes to both sides (n, d, 2), or zero if their signs differ."""
     a, b = one_sided[..., 0], one_sided[..., 1]
     return np.divide(2 * a * b, a + b, out=np.zeros(a.shape), where=a * b > 0)
 
@@ -216,7 +218,7 @@ def _bounds_of(jump: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[
 
 
 def transport(old: PiecePressures, points: MaterialPoints, new: Pieces) -> NDArray[np.float64]:
-    """Return the pressures (m,), Pa, of the new pieces; mass potentials (`fluid_content`) if `old` contains these."""
+    """Return the pressures (n,), in Pa, of new pieces, or mass potentials (`fluid_content`) if `old` has potentials."""
     n = len(points)
     if not n:
         return np.empty(0)
@@ -249,7 +251,7 @@ def transport(old: PiecePressures, points: MaterialPoints, new: Pieces) -> NDArr
 
 
 def _limited(correction, pressure, old: PiecePressures, owner, new: Pieces) -> NDArray[np.float64]:
-    """Return the factor (m,) of corrections that keeps pressures within bounds, equal for all pieces of a domain."""
+    """Return factors (m,) of corrections that keep pressures within bounds.  All pieces of a domain have one factor."""
     first, new_first = (of.searchsorted(np.arange(of[-1] + 1)) for of in (owner, new.point))
     low, high = np.minimum.reduceat(old.bounds[:, 0], first), np.maximum.reduceat(old.bounds[:, 1], first)
     margin = np.where(correction > 0, high[new.point] - pressure, low[new.point] - pressure)
@@ -266,8 +268,11 @@ def halved_pieces(
 ) -> PiecePressures:
     """Return one piece for each new point.  Its pressure follows from the mean slope in its old point.
 
-    pieces: pieces of the old points; points: old and new points; into (m,): old point of each new point; storage:
-    storage coefficients of old and new points (n,), (m,), 1/Pa; bulk: K_w, Pa.
+    `pieces`: pieces of the n old points.
+    `points`: old points, and m new points.
+    `into` (m,): old point of each new point.
+    `storage` (n,), (m,), in 1/Pa: storage coefficients of old points, and of new points.
+    `bulk`, in Pa: K_w.
     """
     (old, new), n = points, len(points[0])
     order = np.argsort(into, kind="stable")
@@ -293,9 +298,10 @@ def joined_pieces(
     storage: tuple[NDArray[np.float64], NDArray[np.float64]],
     bulk: float,
 ) -> PiecePressures:
-    """Return the pieces of merged points: pieces of their old points in one cell become one piece.
+    """Return the pieces of merged points.  Pieces of the old points of a new point become one piece in each cell.
 
-    into (n,): new point of each old point; other parameters: see `halved_pieces`.
+    `into` (n,): new point of each old point.
+    For the other parameters see `halved_pieces`.
     """
     old, new = points
     order = np.argsort(old.id)
@@ -324,13 +330,13 @@ def joined_pieces(
 def _missing(
     held: NDArray[np.float64], store: NDArray[np.float64], potential: NDArray[np.float64], of: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Return the change (n,), Pa, of potentials (m,), so that rows `of` with storage (m,) contain the fluid `held`."""
+    """Return the change (n,), in Pa, of potentials (m,) for which points `of` (m,) contain the fluid `held` (n,)."""
     (total, now), n = sum_by(of, np.array([store, store * potential]), len(held)), len(held)
     return np.divide(held - now, total, out=np.zeros(n), where=total > 0)
 
 
 def _outermost(bounds: NDArray[np.float64], of: NDArray[np.int64], n: int) -> NDArray[np.float64]:
-    """Return the smallest and largest bounds (n, 2), Pa, of rows of bounds (m, 2) with indices `of` (m,)."""
+    """Return the smallest lower and largest upper bounds (n, 2), in Pa, of rows (m, 2) with equal indices `of` (m,)."""
     out = np.stack([np.full(n, np.inf), np.full(n, -np.inf)], axis=1)
     np.minimum.at(out[:, 0], of, bounds[:, 0])
     np.maximum.at(out[:, 1], of, bounds[:, 1])

@@ -29,11 +29,11 @@ GAP = 0.01
 changes the result of scene "flow" in tests/plateaus.py by 2.5e-05 (relative), doubling it by 0.0e+00, and
 finer cells by 9.0e-02."""
 CRUMB = NEAR
-"""Area of a part of a domain, divided by its cell's area, below which other parts receive its mass and its seeded
-faces.  Source: `NEAR`."""
+"""Smallest area of a part of a domain, divided by the area of its cell.  If a part is smaller, other parts receive its
+mass and its seeded faces.  Source: `NEAR`."""
 SMALL = (0.5 / EDGES) ** 2
-"""Smallest part of an old domain that remains in a cell, divided by the cell area.  A cell with a smaller part is
-renewed too.  Source: definition, a square with half the length of a surface edge (`EDGES` edges in a cell)."""
+"""Smallest area of a part of an old domain that remains in a cell, divided by the cell area.  A cell with a smaller
+part is renewed too.  Source: definition, a square with half the length of a surface edge (`EDGES` edges in a cell)."""
 COVERED = 0.25
 """Largest difference between the area of the pieces in a renewed cell and its filled area, in cell areas.  Source:
 definition, the area of a new domain in a full cell, which is divided into four."""
@@ -44,7 +44,7 @@ START, END = np.array([2, 1, 0, 3]), np.array([0, 3, 1, 2])
 
 
 class Parts(NamedTuple):
-    """Parts of the surface, each in one cell; arrays over m parts."""
+    """Parts of the surface.  Each part is in one cell.  Arrays have a row for each of m parts."""
 
     row: NDArray[np.int64]  # index of the face in `OuterFaces` (m,)
     cell: NDArray[np.int64]  # cell (m,)
@@ -55,7 +55,7 @@ class Parts(NamedTuple):
 
 @dataclass(frozen=True)
 class OuterFaces:
-    """Faces of domains on the surface of the bodies; arrays over n faces."""
+    """Faces of domains on the surface of the bodies.  Arrays have a row for each of n faces."""
 
     point: NDArray[np.int64]  # material point (n,)
     face: NDArray[np.int64]  # index of the face in its domain (n,)
@@ -65,7 +65,7 @@ class OuterFaces:
 
 
 class New(NamedTuple):
-    """New particle domains; arrays over n domains."""
+    """New particle domains.  Arrays have a row for each of n domains."""
 
     corners: NDArray[np.float64]  # (n, 4, 2), m
     group: NDArray[np.int64]  # index of the group (n,); domains of a group receive values from the same pieces
@@ -75,7 +75,7 @@ class New(NamedTuple):
 
 
 def ring_lengths(grid: Grid, x: NDArray[np.float64]) -> NDArray[np.float64] | float:
-    """Return the factor from lengths in the plane to areas at x (n, 2), m, see `Grid.around`; not zero at the axis."""
+    """Return the factor (> 0) from lengths in the plane to areas at x (n, 2), in m, see `Grid.around`."""
     return np.maximum(grid.around(x), TURN * EPSILON * grid.least) if grid.axisymmetric else 1.0
 
 
@@ -93,9 +93,12 @@ def misshapen(grid: Grid, corners: NDArray[np.float64], longest: float) -> NDArr
 class RefilledCells:
     """Renewal: replacement of distorted particle domains by new domains, in one grid reset.
 
-    body (n,): index of each point's body; flowed (n,): whether points may be renewed; needs (n,): whether their domains
-    need renewal; faces: surface of the bodies; signs: keys of these faces, and the index of the set of
-    conditions on each face, see `SeededFaces.signatures`; second: whether to compute second moments of the pieces.
+    `body` (n,): index of each point's body.
+    `flowed` (n,): whether points may be renewed.
+    `needs` (n,): whether the domains of points need renewal.
+    `faces`: surface of the bodies.
+    `signs`: keys of seeded faces, and index of each face's set of conditions, see `SeededFaces.signatures`.
+    `second`: whether to compute second moments of the pieces.
     """
 
     def __init__(
@@ -128,12 +131,12 @@ class RefilledCells:
         """Whether each point (n,) loses its domain or a part of it."""
 
     def _volume(self, cells: NDArray[np.int64]) -> NDArray[np.float64] | float:
-        """Return the areas (n,), m^2, of cells (n,); one number for equal cells."""
+        """Return the areas (n,), in m^2, of cells (n,), or one number for equal cells."""
         return self.grid.sizes_of(cells).prod(axis=-1)
 
     @cached_property
     def _areas(self) -> NDArray[np.float64]:
-        """Areas (m,), m^2, of the pieces of domains, in axisymmetry of their sections."""
+        """Areas (m,), in m^2, of the pieces of domains, or in axisymmetry of the pieces' sections in the plane."""
         pieces = self.pieces
         whole = np.abs(volumes(self.points.corners))
         if not self.grid.axisymmetric:
@@ -148,7 +151,10 @@ class RefilledCells:
         return out
 
     def _excluded(self, flowed: NDArray[np.bool_], signs: tuple[NDArray, NDArray]) -> NDArray[np.bool_]:
-        """Return which cells cannot be renewed, due to points not `flowed`, several bodies, or conditions on faces."""
+        """Return which cells cannot be renewed.
+
+        They contain points that have not `flowed`, points of two bodies, or faces whose conditions prevent renewal.
+        """
         of, cell = self.pieces.point, self.cell
         parts = self.parts
         low, high = np.full(self.cells, np.iinfo(np.int64).max), np.full(self.cells, -1)
@@ -208,9 +214,9 @@ class RefilledCells:
         return Parts(row, grid.number(index.T), (s[:, :2] - index).transpose(2, 0, 1), s[:, 2].T, side)
 
     def _chains(self, excluded: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], Region]:
-        """Return which cells the surface crosses, and the filled region of the cells that it crosses once.
+        """Return which cells the surface crosses, and the filled region of the cells that the surface crosses once.
 
-        Cells that the surface crosses more than once are excluded.
+        Cells that the surface crosses more than once are added to `excluded`.
         """
         inner = self.parts.side == NONE
         cell, x = self.parts.cell[inner], self.parts.x[inner]
@@ -252,12 +258,12 @@ class RefilledCells:
         return number[cells]
 
     def _place(self, cells: NDArray[np.int64], y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the positions (n, k, 2), m, of local coordinates y (n, k, 2), from 0 to 1, in cells (n,)."""
+        """Return the positions (n, k, 2), in m, of local coordinates y (n, k, 2), from 0 to 1, in cells (n,)."""
         index = np.stack(np.unravel_index(cells % self.grid.cells, tuple(self.grid.shape)), axis=1)
         return self.grid.places(np.broadcast_to(index[:, None], y.shape), y)
 
     def full(self) -> New:
-        """Return the new domains of full cells: each cell is divided into four equal domains."""
+        """Return the new domains of full cells.  Each full cell is divided into four equal domains."""
         cells = np.flatnonzero(self.chosen & ~self.crossed)
         bits = corner_bits(2)
         y = (bits[:, None] + bits[None]) / 2  # (4 domains, 4 corners, 2)
@@ -292,7 +298,7 @@ class RefilledCells:
         lower: NDArray[np.float64],
         upper: NDArray[np.float64],
     ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return the keys (n,) of edges in cells (n,), and the reference positions (n, 2, 2), m, of the edges' ends.
+        """Return the keys (n,) of edges in cells (n,), and the reference positions (n, 2, 2), in m, of the edges' ends.
 
         The key of an edge is the key of the surface part nearest to the middle of the edge.  Reference positions of
         the ends come from the parts nearest to the ends.
@@ -315,12 +321,12 @@ class RefilledCells:
         return key, np.stack([self._seeded_at(*one) for one in found[1:]], axis=1)
 
     def _seeded(self, row: NDArray[np.int64], t: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the seeded areas (n,), m^(d-1), of the parts of faces between two coordinates t (n, 2) on each."""
+        """Return the seeded areas (n,), in m^(d-1), of parts of faces between two coordinates t (n, 2) on each face."""
         return self._face_areas[row] * self._share(row, t)
 
     @cached_property
     def _face_areas(self) -> NDArray[np.float64]:
-        """Seeded areas of faces, increased so that the parts in remaining domains represent the other parts as well."""
+        """Seeded areas of faces, increased so that remaining parts of a face also represent its other parts."""
         parts, left = self.parts, self._left
         of, share = self.faces.point[parts.row], self._share(parts.row, parts.t)
         remains = np.isin(of * self.cells + parts.cell, self.pieces.point[left] * self.cells + self.cell[left])
@@ -330,7 +336,7 @@ class RefilledCells:
         return area * np.divide(whole, there, out=np.ones(len(area)), where=there > 0)
 
     def _share(self, row: NDArray[np.int64], t: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the fractions (n,) of faces between two coordinates t (n, 2) on each."""
+        """Return the fractions (n,) of faces between two coordinates t (n, 2) on each face."""
         share = np.ptp(t, axis=1)
         if self.grid.axisymmetric:
             corners, face = self.points.corners[self.faces.point[row]], self.faces.face[row]
@@ -339,7 +345,7 @@ class RefilledCells:
         return share
 
     def _seeded_at(self, row: NDArray[np.int64], t: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the reference positions (n, 2), m, at coordinates t (n,) on faces, from 0 (start) to 1 (end)."""
+        """Return the reference positions (n, 2), in m, at coordinates t (n,) on faces, from 0 (start) to 1 (end)."""
         face = self.faces.face[row]
         flipped = START[face] != FACES[2][face, 0]
         share = np.where(flipped, 1 - t, t)[:, None]
@@ -354,7 +360,7 @@ class RefilledCells:
         area: NDArray[np.float64],
         ends: NDArray[np.float64],
     ) -> New:
-        """Return new domains in cells (n,).  Faces on a cell's side join the surface where it runs along this side."""
+        """Return new domains in cells (n,).  If the surface runs along a cell's side, faces there are surface faces."""
         parts = self.parts
         on = np.flatnonzero(parts.side != NONE)
         place = 4 * parts.cell[on] + parts.side[on]
@@ -397,7 +403,7 @@ class RefilledCells:
 
     @cached_property
     def remainders(self) -> tuple[New, NDArray[np.int64]]:
-        """New domains, a group for each piece of a removed domain outside the renewed cells; and these pieces."""
+        """New domains in pieces of removed domains outside renewed cells, and these pieces.  One piece is one group."""
         pieces, points = self.pieces, self.points
         left = self._left
         rings, of = _convex(points.corners[pieces.point[left]], self._volume(self.cell[left]))
@@ -443,7 +449,7 @@ class RefilledCells:
     # ---- transfer of values ---------------------------------------------------------------------
 
     def slopes(self, values: NDArray[np.float64], group: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return slopes (n, 2, k), 1/m, in new domains: least-squares fits to point values (points, k) in the cells."""
+        """Return slopes (n, 2, k), in 1/m, of point values (points, k) in new domains, from least squares in a cell."""
         pieces, grid = self.pieces, self.grid
         weight = pieces.fraction * self.points.volume0[pieces.point]
         whole = np.maximum(sum_by(self.cell, weight, self.cells), TINY)
@@ -500,7 +506,7 @@ class RefilledCells:
         group: NDArray[np.int64],
         points: MaterialPoints,
     ) -> NDArray[np.float64]:
-        """Return point data (n, ...) of new domains on the surface: means over the old surface in the same cell."""
+        """Return point data (n, ...) of new domains on the surface, as means over the old surface in each cell."""
         parts = self.parts
         inside = np.flatnonzero(self.chosen[parts.cell])
         cell, of = parts.cell[inside], self.faces.point[parts.row[inside]]
@@ -523,15 +529,15 @@ def no_faces(n: int) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np
 
 
 def ring_share(r0: NDArray[np.float64], r1: NDArray[np.float64], t: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return radii (n,) at coordinates t (n,) on faces from radius r0 to r1 (n,), m, relative to the mean radius."""
+    """Return radii (n,) at coordinates t (n,) on faces from radius r0 to r1 (n,), divided by the mean radius."""
     mean = (r0 + r1) / 2
     return np.divide(r0 + t * (r1 - r0), mean, out=np.ones(len(t)), where=mean > 0)
 
 
 def _convex(corners: NDArray[np.float64], volume: NDArray[np.float64] | float) -> tuple[Polygons, NDArray[np.int64]]:
-    """Divide domains (n, 4, 2) into convex polygons; return these, and the index of the domain of each polygon.
+    """Divide domains (n, 4, 2) into convex polygons.  Return the polygons, and the index of each polygon's domain.
 
-    The polygons have the face index of each edge.  `volume` (n,), m^2: area of the cell of each domain.
+    The polygons have the face index of each edge.  `volume` (n,), in m^2, is the area of the cell of each domain.
     """
     ring = corners[:, RING]
     edge = np.tile(SIDE, (len(ring), 1))

@@ -20,12 +20,20 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 PARENT = "renewed faces"
 AREA = "renewed areas"
 ENDS = "renewed ends"
-"""Names of data of a point's faces: seeded face's key, or -1 (PARENT); seeded area, m^(d-1); reference ends, m."""
+"""Names of point data for the faces of the point's domain.
+
+PARENT is the key of the seeded face, or -1.  AREA is the seeded area, in m^(d-1).  ENDS are the reference positions of
+the ends, in m.
+"""
 
 
 ROOT = "seeded domain"
 PART = "part of the seeded domain"
-"""Names of point data: id of the seeded domain with the lower corner of a part, or -1; ends (n, d, 2) of the part."""
+"""Names of point data for parts of seeded domains.
+
+ROOT is the identifier of the seeded domain that has the lower corner of the part, or -1.  PART are the ends (n, d, 2)
+of the part.
+"""
 
 
 def keys(point: NDArray[np.int64], face: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -55,7 +63,7 @@ def is_part(points: MaterialPoints) -> NDArray[np.bool_]:
 
 
 def roots(points: MaterialPoints) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return `ROOT` (n,) and `PART` (n, d, 2) of all points; a whole domain is [0, 1] of its own."""
+    """Return `ROOT` (n,) and `PART` (n, d, 2) of all points.  A whole domain has its own identifier and [0, 1]."""
     part, (n, d) = is_part(points), points.x.shape
     if not part.any():
         return points.id, np.broadcast_to([0.0, 1.0], (n, d, 2))
@@ -67,7 +75,7 @@ def faces_of_parts(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
     """Return which parts of domains lie on faces of seeded domains.
 
-    id, face (m,): seeded domains and indices of their faces.
+    `id`, `face` (m,): seeded domains and indices of their faces.
 
     Returns
     -------
@@ -87,7 +95,8 @@ def faces_of_parts(
 def on_parts(faces: Surface, points: MaterialPoints) -> tuple[Surface, NDArray[np.int64]]:
     """Return a surface together with its faces on parts of domains, and for each row the index of the given face.
 
-    Polygons of the surface on seeded domains are clipped to the parts; they must be rectangles in local coordinates.
+    Polygons of the surface on seeded domains are clipped to the parts.  These polygons must be rectangles in local
+    coordinates.
     """
     own = np.arange(len(faces))
     if not is_part(points).any():
@@ -110,9 +119,10 @@ def on_parts(faces: Surface, points: MaterialPoints) -> tuple[Surface, NDArray[n
 
 
 class SeededFaces:
-    """Outer faces of the bodies of a scene in 2D: as seeded, and of the domains that represent them now.
+    """Outer faces of the bodies of a scene in 2D: the seeded faces, and the faces that represent them now.
 
-    grid: background grid; bodies: all bodies of the scene.
+    `grid`: background grid.
+    `bodies`: all bodies of the scene.
     """
 
     def __init__(self, grid: Grid, bodies: Sequence[Body]):
@@ -163,7 +173,7 @@ class SeededFaces:
         return out
 
     def signatures(self, surfaces: Sequence[Surface]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return keys of outer faces, and the index of each face's set of conditions; -1 for faces that must stay."""
+        """Return keys of outer faces, and the index of each face's set of conditions, or -1 if the face must stay."""
         key = self.seeded.key
         kind = np.zeros((len(key), len(surfaces)), dtype=np.int8)
         barred = np.zeros(len(key), dtype=bool)
@@ -179,7 +189,7 @@ class SeededFaces:
 
 @dataclass(frozen=True)
 class RenewedFaces:
-    """Faces of renewed domains on surfaces; arrays over m faces."""
+    """Faces of renewed domains on surfaces.  Arrays have a row for each of m faces."""
 
     row: NDArray[np.int64]  # index of the seeded face among the faces of all surfaces (m,)
     at: NDArray[np.int64]  # index of the point (m,)
@@ -190,7 +200,7 @@ class RenewedFaces:
     old: NDArray[np.bool_] | None = None  # in the result of `of`: which positions lie on seeded faces (n,)
 
     def of(self, number: NDArray[np.int64]) -> RenewedFaces:
-        """Return the renewed faces with indices `number` (n,); rows of seeded faces (index < 0) are `old`."""
+        """Return the renewed faces with indices `number` (n,).  Rows of seeded faces (index < 0) are `old`."""
         old, at = number < 0, np.maximum(number, 0)
         if not len(self.row):
             return RenewedFaces(*(np.zeros((len(number), *v.shape[1:]), v.dtype) for v in self._columns), old)
@@ -209,7 +219,7 @@ class RenewedFaces:
         return tuple(np.where(self.old, a, b) for a, b in zip((area, whole, face), new, strict=True))
 
     def reference(self, X: NDArray[np.float64], xi: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the reference positions (n, 2), m, at local coordinates xi (n, 2); they are X on seeded faces."""
+        """Return the reference positions (n, 2), in m, at local coordinates xi (n, 2), or X on seeded faces."""
         along = xi[np.arange(len(xi)), 1 - self.face // 2]
         share = (1 + along[:, None]) / 2
         new = self.ends[:, 0] + share * (self.ends[:, 1] - self.ends[:, 0])
@@ -243,7 +253,7 @@ def renewed_faces(points: MaterialPoints, several: Sequence[Surface]) -> Renewed
 
 
 def _within(ends: NDArray[np.float64], region: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return where edges (n, 2, 2), m, enter and leave a region (2, 2), m: two fractions (n,) of their lengths."""
+    """Return two fractions (n,) of the lengths of edges (n, 2, 2) at which edges enter and leave a region (2, 2)."""
     low, high = np.zeros(len(ends)), np.ones(len(ends))
     edge_vector = ends[:, 1] - ends[:, 0]
     slack = SAME * np.abs(edge_vector).max(axis=1)

@@ -32,16 +32,17 @@ def check_follow(follow: Any, lines: Sequence[ArrayLike] | None) -> None:
     else:
         raise ValueError(f"grid: follow = {line(follow)}, must be a Tool, or a function of t, x or both")
     if lines is None:
-        raise ValueError("grid: follow without lines, must be given with lines; the number of lines stays constant")
+        raise ValueError("grid: follow is given without lines; lines must be given, their number stays constant")
 
 
 def lines_at(
     follow: Any, given: Sequence[NDArray[np.float64]], t: float, x: NDArray[np.float64] | None
 ) -> list[NDArray[np.float64]]:
-    """Return the lines (n,), m, along each axis, from a function of time t (s) and positions x (n, d), m.
+    """Return the lines (n,), in m, along each axis, from a function `follow` of time t (s) and positions x (n, d), in
+    m.
 
-    `given` are the lines with which the grid was created.  Along each axis, the number of lines, the first and
-    the last coordinate must not change.
+    `given` are the lines with which the grid was created.  Along each axis, the number of lines must not change.  The
+    first and the last coordinate must not change either.
     """
     what, count = f"grid: follow at t = {t:g} s", [len(of) for of in given]
     allowed = f"{' and '.join(map(str, count))} coordinates along the axes"
@@ -51,23 +52,24 @@ def lines_at(
     for letter, new, old in zip("xyz", out, given, strict=False):
         if np.abs(new - old)[[0, -1]].max() > rounding(old):
             raise ValueError(
-                f"{what}: lines along {letter} from {new[0]} to {new[-1]} m, must be {old[0]} to {old[-1]}"
+                f"{what}: lines along {letter} reach from {new[0]} to {new[-1]} m, must be from {old[0]} to {old[-1]} m"
             )
         new[[0, -1]] = old[[0, -1]]
     return out
 
 
 def carried(lines: Sequence[NDArray[np.float64]], shift: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """Return lines (n,), m, along each axis, after a displacement `shift` (d,), m, of the smallest cells.
+    """Return the lines (n,), in m, along each axis, after a displacement `shift` (d,), in m, of the smallest cells.
 
-    The smallest cells move by whole cells, rounded towards zero.  A tool therefore crosses them like fixed cells.
-    Between the smallest cells and a side, the edge of the k-th cell is multiplied by the k-th power of a common factor;
-    k = 1 next to the smallest cells.  Cells still grow with the distance from these, but faster or slower.
+    The smallest cells move by whole cells, rounded towards zero.  A tool therefore crosses them like fixed cells.  From
+    them to each side, the edge of the k-th cell (k = 1, 2, ...) is multiplied by the k-th power of a common factor.
+    Cells still grow towards the sides, but faster or slower.
 
     Raises
     ------
     ValueError
-        The smallest cells touch a side and move along its normal, or other cells would become smaller still.
+        The smallest cells touch a side and move along its normal, or other cells would become smaller than the
+        smallest.
     """
     out = []
     for letter, x, step in zip("xyz", lines, shift.tolist(), strict=False):
@@ -88,13 +90,14 @@ def carried(lines: Sequence[NDArray[np.float64]], shift: NDArray[np.float64]) ->
 
 
 def _filled(width: NDArray[np.float64], length: float, more: float, least: float, letter: str) -> NDArray[np.float64]:
-    """Return edge lengths (n,), m, between the smallest cells and a side, whose distance has grown by `more`, m.
+    """Return the new edge lengths (n,), in m, of the cells between the smallest cells and a side.
 
-    `width` are the edge lengths before, `length` the distance before, `least` the smallest edge length, m.
+    `width` (n,), in m, are the edge lengths before.  The distance between the smallest cells and the side has grown by
+    `more` from `length`, in m.  `least` is the smallest edge length, in m.
     """
     what = f"grid: follow: the tool has moved by {abs(more):.3g} m along {letter}"
     if not len(width):
-        raise ValueError(f"{what}, but the small cells begin at a side; lines must have larger cells on both sides")
+        raise ValueError(f"{what}, but the small cells begin at a side; there must be larger cells on both sides")
     power = np.arange(1, len(width) + 1)
     total = length + more
     if total < len(width) * least * (1 - SAME):

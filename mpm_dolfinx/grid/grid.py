@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: MIT
 """Background grid: a box of quadrilaterals or hexahedra between lines along the axes.
 
-In grids of equal cells, points are located by arithmetic, in other grids by a search along each axis.  Methods such as
-`sizes` and `volumes` return cell sizes.  For equal cells they return a single row (`h`) or a single number.
+Grids of equal cells locate points by arithmetic.  Other grids search along each axis.  Methods such as `sizes` and
+`volumes` return a value for each cell.  In grids of equal cells they return a single row (`h`) or a single number.
 
-The mesh is created at its first use.  Before that, a simulation distributes the cells by their numbers of points.
+The mesh is created at its first use.  Before that, a simulation distributes the cells to processes by numbers of
+points.
 """
 
 from __future__ import annotations
@@ -32,15 +33,15 @@ SIDES = {
     2: {"left": (0, 0), "right": (0, 1), "bottom": (1, 0), "top": (1, 1)},
     3: {"left": (0, 0), "right": (0, 1), "front": (1, 0), "back": (1, 1), "bottom": (2, 0), "top": (2, 1)},
 }
-"""Axis and end of each side of a box: (axis, 0 for the lower or 1 for the upper end)."""
+"""Axis and end of each side of a box.  The end is 0 at the lower and 1 at the upper coordinate."""
 REACH = 1e-4  # distance, in cell sizes, by which bodies may lie outside the grid: walls act by penalties, inexactly
 
 TURN = 2 * np.pi
-"""Angle of a whole revolution, for axisymmetric volumes, forces and outflows.  Source: definition."""
+"""Angle of a whole revolution.  Axisymmetric volumes, forces and outflows refer to this angle.  Source: definition."""
 CHUNK = 2**14
-"""Number of rows of an array that are processed together.  It limits the size of temporary arrays."""
+"""Number of rows of an array that are processed together.  This number limits the size of temporary arrays."""
 SNAP = 1e-10
-"""Vertices nearer to a grid plane than this, in cell sizes, lie on it; `Grid.snap` allows for rounding errors."""
+"""Vertices nearer to a grid plane than this distance, in cell sizes, count as on it.  `Grid.snap` adds rounding."""
 ORDER = "the order is Grid(lower, upper, cells)"
 MANY = "grid: h is undefined for unequal cells, must be replaced by sizes"
 
@@ -51,38 +52,38 @@ def cross_in_plane(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np
 
 
 def corner_bits(dim: int) -> NDArray[np.int64]:
-    """Return at which end of each axis each corner of a box lies (2^d, d): 0 lower, 1 upper."""
+    """Return the ends (2^d, d) at which the corners of a box lie along each axis: 0 lower, 1 upper."""
     return (np.arange(2**dim)[:, None] >> np.arange(dim)) & 1
 
 
 def _faces(dim: int) -> NDArray[np.int64]:
-    """Return the indices (2d, 2^(d-1)) of the corners of a box's faces; face 2 a + e is at end e of axis a."""
+    """Return the corner indices (2d, 2^(d-1)) of a box's faces.  Face `2 a + e` is at end `e` of axis `a`."""
     bits = corner_bits(dim)
     return np.stack([(bits[:, axis] == end).nonzero()[0] for axis in range(dim) for end in (0, 1)])
 
 
 FACES = {d: _faces(d) for d in (2, 3)}
-"""Indices (2d, 2^(d-1)) of the corners of the faces of a box: of a cell, or of a particle domain."""
+"""Corner indices (2d, 2^(d-1)) of the faces of a box.  The box is a cell or a particle domain."""
 FACE_SIGNS = (-1, 1, 1, -1, -1, 1)
-"""Orientation (6,) of faces with corners in the order of `FACES`: 1 outward, -1 inward.  2D: the first four."""
+"""Orientation (6,) of faces with corners in the order of `FACES`: 1 outward, -1 inward.  In 2D the first four apply."""
 ABOUT_MIDDLE = ((0, 1, 4), (1, 3, 4), (3, 2, 4), (2, 0, 4))
-"""Triangles of a face in 3D: two corners and the middle, without a preferred diagonal."""
+"""Triangles of a face in 3D.  Each has two corners and the middle of the face, so no diagonal is preferred."""
 
 
 def side(name: str, dim: int) -> tuple[int, int]:
-    """Return (axis, end) of a side of a box, by name."""
+    """Return the axis and the end (see `SIDES`) of the side `name` of a box."""
     if not isinstance(name, str) or name not in SIDES[dim]:
         raise ValueError(f"side {name!r}: must be one of {', '.join(SIDES[dim])} in {dim}D")
     return SIDES[dim][name]
 
 
 def in_chunks(count: int) -> list[slice]:
-    """Return consecutive slices of at most `CHUNK` rows; an empty list for no rows."""
+    """Divide `count` rows into consecutive slices of at most `CHUNK` rows.  Without rows the list is empty."""
     return [slice(start, min(start + CHUNK, count)) for start in range(0, count, CHUNK)]
 
 
 def sum_by(index: NDArray, values: NDArray[np.float64], size: int) -> NDArray[np.float64]:
-    """Return the sums (..., size) of values (..., n) with equal index (n,), as floats even if there are no values."""
+    """Return the sums (..., size) of values (..., n) with equal index (n,).  Sums are floats even without values."""
     shape = values.shape[:-1]
     if shape and len(index) > CHUNK:  # the index of all rows together would take as much memory as the values
         return np.array([sum_by(index, row, size) for row in values])
@@ -95,10 +96,10 @@ def sum_by(index: NDArray, values: NDArray[np.float64], size: int) -> NDArray[np
 def polynomial(
     coefficients: NDArray[np.float64], y: NDArray[np.float64], slot: NDArray[np.intp], without: int | None = None
 ) -> NDArray[np.float64]:
-    """Return the values (d, m) of a multilinear vector field at offsets y (d, m), m, from the midpoints of cells.
+    """Return the values (d, n) of a multilinear vector field at offsets y (d, n), in m, from the midpoints of cells.
 
-    `coefficients` (d, k, cells) are factors of the monomials, in the order of `Grid.monomials`.  `slot` (m,) is the
-    index of the cell of each value.  The field is constant along the axis `without`.
+    `coefficients` (d, k, cells) are factors of the monomials, in the order of `Grid.monomials`.  `slot` (n,) is the
+    index of each value's cell.  If an axis `without` is given, the field is constant along this axis.
     """
     rows = [row for row in range(2 ** len(y)) if without is None or not row >> without & 1]
     total = np.zeros(y.shape)
@@ -112,13 +113,13 @@ def polynomial(
 
 
 def ranges(first: NDArray[np.int64], count: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return index of range (n,), and value (n,), of all integers in m ranges with these first integers and counts."""
+    """Return, for each integer in these ranges, the index (n,) of its range and the integer (n,) itself."""
     of = np.arange(len(count)).repeat(count)
     return of, np.arange(len(of)) + np.repeat(first - (np.cumsum(count) - count), count)
 
 
 def among(numbers: NDArray[np.integer], chosen: NDArray[np.integer]) -> NDArray[np.bool_]:
-    """Return which numbers (...) occur in the sorted array `chosen` (m,), with less memory than numpy's `isin`."""
+    """Return which numbers (...) occur in the sorted array `chosen` (m,). numpy's `isin` would need more memory."""
     if not len(chosen):
         return np.zeros(numbers.shape, dtype=bool)
     return chosen[np.minimum(chosen.searchsorted(numbers), len(chosen) - 1)] == numbers
@@ -127,14 +128,14 @@ def among(numbers: NDArray[np.integer], chosen: NDArray[np.integer]) -> NDArray[
 def values_at(
     chosen: NDArray[np.int64], numbers: NDArray[np.int64], values: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the values (n, k) of the numbers `chosen` (n,), from values (m, k) of ascending numbers (m,); else 0."""
+    """Return the values (n, k) of the numbers `chosen` (n,), given values of sorted `numbers` (m,), else 0."""
     at = numbers.searchsorted(chosen)
     found = np.append(numbers, -1)[at] == chosen
     return np.concatenate([values, np.zeros((1, values.shape[1]))])[np.where(found, at, len(numbers))]
 
 
 def across_faces(grid: Grid, n: Any) -> tuple[Any, Any, Any]:
-    """Return the edge lengths, m, of the "+" and "-" cells along the normal n of a face, and their mean, as UFL."""
+    """Return three UFL lengths along the normal n of a face: of the "+" cell, of the "-" cell, and the mean length."""
     h = grid.edge_in_forms()
     if grid.even:
         return (sum(abs(n[a]) * h[a] for a in range(grid.dim)),) * 3
@@ -143,7 +144,7 @@ def across_faces(grid: Grid, n: Any) -> tuple[Any, Any, Any]:
 
 
 class CellPlaces(NamedTuple):
-    """Positions of nodes and cells relative to the base of the grid."""
+    """Positions of nodes and cells, relative to the base of the grid."""
 
     node_x: NDArray[np.float64]  # nodes (nodes, d), m
     midpoints: NDArray[np.float64]  # midpoints of cells (cells, d), m
@@ -151,7 +152,7 @@ class CellPlaces(NamedTuple):
 
 
 class Spacing(NamedTuple):
-    """The lines of a grid, and quantities that depend on the lines; see the attributes of `Grid`."""
+    """The lines of a grid, and quantities that depend on the lines.  The attributes of `Grid` explain them."""
 
     lines: tuple[NDArray[np.float64], ...]
     widths: tuple[NDArray[np.float64], ...]
@@ -162,9 +163,9 @@ class Spacing(NamedTuple):
 
 
 class LocalCells:
-    """Local indices of cells by lexicographic index, as an array: `[number]` is -1 for cells of other processes.
+    """The local index of each cell by its lexicographic index: `[number]`.  Cells of other processes have -1.
 
-    number (cells,): lexicographic indices of the local cells.  Memory: a table of the box around these cells.
+    number (cells,): lexicographic indices of the local cells.  The table covers the box around these cells only.
     """
 
     def __init__(self, grid: Grid, number: NDArray[np.int64]):
@@ -188,23 +189,23 @@ class Cells:
     """The cells of a grid on this process, ghosts included, in the numbering of the mesh.
 
     num_owned, num_local
-        Number of cells without and with ghosts.
+        Number of cells of this process: without ghosts, and with ghosts.
     cell_nodes : (cells, 2^d)
-        Nodes of each cell, as numbered in Q1 functions.
+        Nodes of each cell, in the numbering of Q1 functions.
     signs : (2^d, d)
-        Directions from the midpoint of a cell to its nodes.
+        Direction from the midpoint of a cell to each of its nodes: -1 or 1 along each axis.
     at
         Current positions of nodes and cells.
     cell_number
         Lexicographic index of each local cell.
     partition
-        Boxes of cells of all processes.
+        The box of cells of each process.
     locals
-        Local index of each cell of the grid, one copy after the other; -1 if not on this process.
+        Local index of each cell of the grid, one copy after the other.  Cells of other processes have -1.
     cell_facets : (cells, 2d)
         Facets of each cell.
     facet_cells : (facets, 2)
-        Cells at each facet, -1 outside the boundary.
+        The two cells at each facet.  At the boundary the second is -1.
     """
 
     def __init__(self, grid: Grid, mesh: Any, partition: Partition):
@@ -245,13 +246,13 @@ class Cells:
         self.facet_cells[two, 1] = adjacency.array[first[two] + 1]
         self.facets_owned = topology.index_map(d - 1).size_local
         self.cellwise = cache(partial(_compat.function_space, mesh, "DG", 0))
-        """Function spaces by value shape, each created once.  All functions of a shape share memory."""
+        """Function space of each value shape, created once."""
         self.memory = cache(lambda shape, space=self.cellwise: fem.Function(space(shape)))
         self.move(grid)
 
     @cached_property
     def near_others(self) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Masks of local nodes at most two cells from nodes of several processes, and of local cells at such nodes."""
+        """Masks: local nodes at most two cells from nodes of several processes, and local cells with shared nodes."""
         holders = fem.Function(self._nodes)
         holders.x.array[:] = 1.0
         _compat.scatter_reverse_add(holders)
@@ -264,13 +265,13 @@ class Cells:
 
     @cached_property
     def edges(self) -> fem.Function:
-        """Edge lengths of the cells, m, for forms on cells of several sizes."""
+        """Edge lengths of the cells, in m, for forms on grids of unequal cells."""
         out = fem.Function(self.cellwise((self.at.sizes.shape[1],)))
         out.x.array[:] = self.at.sizes.ravel()
         return out
 
     def move(self, grid: Grid) -> None:
-        """Move mesh, nodes and cells to the current lines of the grid; positions depend only on these lines."""
+        """Move mesh, nodes and cells to the current lines of the grid.  Positions depend only on these lines."""
         if grid.follow is None:
             return
         node_x, x = map(grid.places, self._index)
@@ -286,20 +287,20 @@ def of_cells(name: str) -> cached_property:
 
 
 def of_places(name: str) -> property:
-    """Return a property of a grid: current positions of nodes or of midpoints of cells, kept in `at` of its `Cells`."""
+    """Return a property of a grid: current positions of nodes or of midpoints, an attribute of `at` of its `Cells`."""
     return property(lambda grid: getattr((grid._cells or grid._of_process).at, name))
 
 
 def of_spacing(name: str) -> property:
-    """Return a property of a grid that depends on its current lines, see `Spacing`."""
+    """Return a property of a grid that is an attribute of its current `Spacing`."""
     return property(lambda grid: getattr(grid._spacing, name))
 
 
 class Grid:
     """Background grid over the box [lower, upper], with equal cells or with cells between given lines.
 
-    Bodies must stay inside.  Empty cells cost next to nothing.  The sides of the grid are the walls of a scene: "left",
-    "right" (x), "bottom", "top" (y in 2D, z in 3D), and in 3D "front", "back" (y).
+    Bodies must stay inside the grid.  Empty cells cost next to nothing.  The sides of the grid are the walls of a
+    scene: "left", "right" (x), "bottom", "top" (y in 2D, z in 3D), and in 3D "front", "back" (y).
 
     Parameters
     ----------
@@ -314,14 +315,15 @@ class Grid:
         lines along all axes give a grid of equal cells.
     follow : Tool, or callable -> (n,) along each axis, m
         Object that the lines follow, at each reset of the grid.  With a tool, the smallest cells of `lines` move like
-        the centre of its ball, the tip of its cone, or the mean of its corners; if its shape is a function, like its
-        `centre`.  The cells around them widen or narrow.  The tool must be a condition of the first stage; lines do
-        not move in stages without it.  A function depends on time t (s), the positions x (n, d) of all points, or both.
-        It returns all lines: as many along each axis as `lines`, with the same first and last coordinate.
+        the centre of the tool's ball, the tip of its cone, or the mean of its corners.  If the tool's shape is a
+        function, they move like its `centre`.  The other cells widen or narrow.  The tool must be a condition of the
+        first stage.  Lines do not move in stages without this tool.  A function depends on time t (s), the positions x
+        (n, d) of all points, or both.  The function returns all lines.  Along each axis, their number, first and last
+        coordinate must be as in `lines`.
     axisymmetric
-        Whether the first axis is the radius r >= 0, the second the axis of revolution.  There is no torsion.  Volumes,
-        forces and outflows refer to the whole revolution, m^3, N, m^3/s.  If the grid begins at r = 0, its side "left"
-        is the axis, where radial displacements are zero.
+        Whether the first axis is the radius r >= 0, and the second axis is the axis of revolution.  There is no
+        torsion.  Volumes (m^3), forces (N) and outflows (m^3/s) refer to the whole revolution.  If the grid begins at r
+        = 0, its side "left" is the axis, where radial displacements are zero.
 
     Raises
     ------
@@ -344,23 +346,23 @@ class Grid:
     widths : (n - 1,) along each axis, m
         Current edge lengths of the cells.
     finest : (d,), m
-        Shortest edge along each axis.
+        Shortest edge of all cells along each axis.
     least, most : m
         Shortest and longest edge of all cells.
     snap
-        Distances (d,) along the axes, in cell sizes: vertices nearer to a grid plane count as on the plane.
+        Distances (d,) along the axes, in cell sizes.  Vertices that are nearer to a grid plane count as on the plane.
     base : (d,), m
-        Origin of all internal positions: the lower corner, with a radius of 0 in axisymmetry.  This origin preserves
-        digits of positions far from the true origin.
+        Origin of all internal positions.  It is the lower corner of the grid; in axisymmetry its radius is 0.  With
+        this origin, positions far from the true origin keep their digits.
     low, high : (d,), m
         Lower and upper corner relative to `base`.
     stretches
-        Dimension of deformation gradients: d, or in axisymmetry 3, with the circumferential stretch as third component.
+        Dimension of deformation gradients: d.  In axisymmetry it is 3, for the circumferential stretch.
     mesh
-        The dolfinx mesh, with coordinates relative to `base`, created at its first use.  On several processes, a second
-        scene with another distribution of points has a separate mesh and grid, `Simulation.grid`.  The same holds for a
-        scene that distributes its cells anew.  Scenes with terms or sources always keep this mesh, because terms may be
-        defined on it.
+        The dolfinx mesh, created at its first use.  Its coordinates are relative to `base`.  On several processes, a
+        second scene with another distribution of points has a separate mesh and grid, `Simulation.grid`.  A scene that
+        distributes its cells anew also has a separate mesh and grid.  Scenes with terms or sources always keep this
+        mesh, because terms may be defined on it.
     """
 
     def __init__(
@@ -379,7 +381,7 @@ class Grid:
             check_follow(follow, lines)
         if not self.even:
             if any(value is not None for value in (lower, upper, cells)):
-                raise ValueError("grid: lines together with lower, upper or cells, must be given without these")
+                raise ValueError("grid: lines are given together with lower, upper or cells; lines must be given alone")
             lines = checked(lines)
             self.even = all(map(equal, lines)) and follow is None
             lower, upper, cells = ([of(x) for x in lines] for of in (np.min, np.max, lambda x: len(x) - 1))
@@ -400,23 +402,23 @@ class Grid:
         self.shape = count.astype(np.int64)
         if d * np.prod(count + 1) > MOST:
             raise ValueError(
-                f"grid: cells = {line(cells)}: has {np.prod(count + 1):.3g} nodes, must be below {MOST // d}"
+                f"grid: cells = {line(cells)}: has {np.prod(count + 1):.3g} nodes, must have fewer than {MOST // d}"
             )
         self.base = self.lower * [not axisymmetric, *[True] * (d - 1)]
         self.low, self.high = self.lower - self.base, self.upper - self.base
         self._h = (self.upper - self.lower) / self.shape if self.even else None
         self.seeded: tuple[NDArray[np.float64], ...] | None = None if self.even else self.from_base(lines)
-        """Lines as given, relative to the base (n,), m, along each axis.  Bodies are seeded on these lines."""
+        """Lines (n,), in m, along each axis as given, but relative to the base.  Bodies are seeded on these lines."""
         self._spacing = self._spaced(self.seeded)
         self.comm = comm
         self._cells: Cells | None = None
 
     def from_base(self, lines: Sequence[NDArray[np.float64]]) -> tuple[NDArray[np.float64], ...]:
-        """Return true lines (n,), m, along each axis as coordinates relative to the base."""
+        """Convert lines (n,), in m, along each axis from true coordinates to coordinates relative to the base."""
         return tuple(x - start for x, start in zip(lines, self.base, strict=True))
 
     def _spaced(self, lines: tuple[NDArray[np.float64], ...] | None) -> Spacing:
-        """Return the spacing of the grid.  `lines` are positions relative to the base; None: equal cells."""
+        """Return the spacing of the grid.  `lines` are positions relative to the base, or None for equal cells."""
         finest, most = self._h, self._h
         if lines is None:
             lines = tuple(low + np.arange(n + 1) * h for low, n, h in zip(self.low, self.shape, self._h, strict=True))
@@ -427,10 +429,10 @@ class Grid:
         return Spacing(lines, widths, finest, float(finest.min()), float(most.max()), snap)
 
     def move(self, lines: Mapping[str, NDArray[np.float64]] | None) -> None:
-        """Move the lines of a grid with `follow` to coordinates (n,), m, by axis "x", "y", "z", relative to the base.
+        """Move the lines of a grid with `follow` to coordinates (n,), in m and from the base, by axis "x", "y", "z".
 
-        None: the given lines.  Afterwards all coordinates of nodes, cells and mesh are exactly as in a new grid with
-        these lines.
+        With None, the lines return to their initial coordinates.  Afterwards all coordinates of nodes, cells and mesh
+        are exactly as in a new grid with these lines.
         """
         new = self.seeded if lines is None else tuple(lines[letter] for letter in "xyz"[: self.dim])
         if self.follow is not None and any((x != old).any() for x, old in zip(new, self.lines, strict=True)):
@@ -450,43 +452,45 @@ class Grid:
 
     @cached_property
     def cell_volume(self) -> float:
-        """Volume of equal cells, m^d; in axisymmetry the area in the plane."""
+        """Volume of equal cells, m^d.  In axisymmetry it is the area of a cell in the plane."""
         return float(np.prod(self.h))
 
     def sizes(self, cells: Any) -> NDArray[np.float64]:
-        """Return the edge lengths (n, d), m, of local cells; one row (d,) for equal cells."""
+        """Return the edge lengths (n, d), in m, of local cells.  Equal cells give one row (d,)."""
         return self._h if self.even else self._of_process.at.sizes[cells]
 
     def along(self, cells: Any, axis: Any) -> NDArray[np.float64]:
-        """Return the edge lengths (n,), m, of local cells (n,) along one axis, or along an axis for each cell."""
+        """Return the edge lengths (n,), in m, of local cells (n,) along an axis.  Each cell may have another axis."""
         return self.h[axis] if self.even else self._of_process.at.sizes[cells, axis]
 
     def between(self, cells: Any, others: Any, axis: Any) -> NDArray[np.float64]:
-        """Return the distances (n,), m, between midpoints of local cells (n,) and their neighbours along an axis."""
+        """Return the distances (n,), in m, between midpoints of local cells (n,) and of neighbours along an axis."""
         return self.h[axis] if self.even else (self.along(cells, axis) + self.along(others, axis)) / 2
 
     def volumes(self, cells: Any) -> NDArray[np.float64] | float:
-        """Return the volumes (n,), m^d, of local cells, in axisymmetry plane areas; one number for equal cells."""
+        """Return the volumes (n,), m^d, of local cells; in axisymmetry areas.  Equal cells give one number."""
         return self.cell_volume if self.even else self._of_process.at.sizes[cells].prod(axis=-1)
 
     def smallest_faces(self, cells: Any) -> NDArray[np.float64] | float:
-        """Return the volume divided by the longest edge of local cells (n,), m^(d-1); one number for equal cells."""
+        """Return the areas (n,), m^(d-1), of the smallest faces of local cells.  Equal cells give one number."""
         return self.volumes(cells) / self.sizes(cells).max(axis=-1)
 
     def sizes_of(self, number: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the edge lengths (n, d), m, of cells with lexicographic indices (n,); one row (d,) for equal cells."""
+        """Return the edge lengths (n, d), in m, of cells by lexicographic indices (n,).  Equal cells give one row."""
         if self.even:
             return self._h
         return self.widths_of(np.stack(np.unravel_index(number % self.cells, tuple(self.shape)), axis=-1))
 
     def sizes_at(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the edge lengths (..., d), m, of cells at x (..., d), m, from the base; one row for equal cells."""
+        """Return the edge lengths (..., d), in m, of cells at x (..., d), in m, from the base.  Equal cells give one
+        row.
+        """
         if self.even:
             return self._h
         return self.widths_of(self.index_from_base(x.reshape(-1, self.dim))).reshape(x.shape)
 
     def in_cells(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return cell index + fraction of the cell along each axis (..., d), for x (..., d), m, from the base."""
+        """Convert positions x (..., d), in m, from the base to cell index plus fraction of the cell along each axis."""
         if self.even:
             return (x - self.low) / self._h
         out = np.empty(x.shape)
@@ -496,15 +500,15 @@ class Grid:
         return out
 
     def cells_between(self, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return distances (..., d) >= 0 along the axes between x and y, divided by the cell size, see `in_cells`."""
+        """Return the distances (..., d), in cells, between x and y along the axes.  `in_cells` defines fractions."""
         if self.even:
             return np.abs((y - x) / self._h)
         return np.abs(self.in_cells(y) - self.in_cells(x))
 
     def places(self, index: NDArray[np.integer], share: NDArray[np.float64] | float = 0.0) -> NDArray[np.float64]:
-        """Return positions (n, d), m, from the base: the lower corner of a cell plus a fraction `share` of the cell.
+        """Return positions (n, d), in m, from the base: lower corners of cells plus a fraction `share` of their edges.
 
-        Indices (n, d) outside the grid refer to cells with the size of the outermost cell.
+        `index` (n, d) are cell indices along the axes.  Cells beyond a side have the size of the outermost cell.
         """
         if self.even:
             return self.low + (index + share) * self._h
@@ -516,25 +520,29 @@ class Grid:
         return out
 
     def edge_in_forms(self) -> Any:
-        """Return the edge lengths (d,), m, of the cell as a UFL coefficient; a constant for equal cells."""
+        """Return the edge lengths (d,), in m, of a cell as a UFL coefficient, or as a constant if cells are equal."""
         return fem.Constant(self.mesh, self._h) if self.even else self._of_process.edges
 
     def nodes_along(self, x: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the indices (..., d) along the axes of nodes at positions (..., d), m, from the base."""
+        """Return the indices (..., d) along the axes of nodes at positions x (..., d), in m and from the base."""
         return np.rint(self.in_cells(x)).astype(np.int64)
 
     def widths_of(self, index: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the edge lengths (n, d), m, of cells with indices (n, d) along the axes; one row for equal cells."""
+        """Return the edge lengths (n, d), in m, of cells with indices (n, d) along the axes, or one row for equal
+        cells.
+        """
         if self.even:
             return self._h
         return np.stack([w[i] for w, i in zip(self.widths, index.T, strict=True)], axis=-1)
 
     def next_plane(self, axis: int, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the next line (n,), m, above coordinates x (n,) along an axis of unequal cells; inf above the last."""
+        """Return the next line (n,), in m, above coordinates x (n,) along an axis of unequal cells, or inf above the
+        last.
+        """
         return np.append(self.lines[axis], np.inf)[self.lines[axis].searchsorted(x, side="right")]
 
     def cells_along(self, axis: int, x: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the indices of cells at coordinates x, m, along an axis of unequal cells, limited to the grid."""
+        """Return the indices of cells in the grid nearest to coordinates x, in m, along an axis of unequal cells."""
         return np.minimum(np.maximum(self.lines[axis].searchsorted(x, side="right") - 1, 0), self.shape[axis] - 1)
 
     mesh = of_cells("mesh")
@@ -553,21 +561,21 @@ class Grid:
 
     @property
     def _of_process(self) -> Cells:
-        """The cells of this process; they are distributed evenly if no scene has distributed them."""
+        """The cells of this process.  If no scene has distributed the cells, each process gets an equal number."""
         if self._cells is None:
             self.share(np.zeros(int(np.prod(self.shape))))
         return self._cells
 
     def share(self, load: NDArray[np.float64]) -> None:
-        """Create the mesh, unless it exists, with cells distributed among processes by their loads (cells,)."""
+        """Create the mesh, unless it exists.  The cells are distributed among processes by their loads (cells,)."""
         if self._cells is None:
             self._cells = self._made(boxes(load.reshape(self.shape), self.comm.size))
 
     def shared(self, load: NDArray[np.float64], keep: bool) -> Grid:
-        """Return a grid with cells distributed by their loads: this grid, or an equal grid with another mesh.
+        """Return a grid whose cells are distributed by their loads: this grid, or an equal grid with another mesh.
 
-        load (cells,): load of each cell, such as its number of points, >= 0; keep: whether to return this grid
-        even if its mesh is distributed by other loads, because other objects were created on this mesh.
+        load (cells,): load >= 0 of each cell, such as its number of points
+        keep: whether to return this grid in any case, because other objects were created on its mesh
         """
         new = boxes(load.reshape(self.shape), self.comm.size)
         if self._cells is None:
@@ -577,9 +585,11 @@ class Grid:
         return self
 
     def better(self, x: NDArray[np.float64]) -> NDArray[np.int64] | None:
-        """Return boxes (ranks, 2, d) that distribute points at x (n, d), m, more evenly; None to keep the present ones.
+        """Return boxes (ranks, 2, d) that distribute points at x (n, d), in m, more evenly than the present ones, or
+        None.
 
-        Points on all processes count.  The present boxes remain if their imbalance is at most `UNEVEN`.
+        The points of all processes are counted.  The present boxes remain (None) if their imbalance is at most
+        `UNEVEN`.
         """
         number = self.number(self.index_from_base(x))
         counts = over_all(self.comm, np.bincount(self.owner(number), minlength=self.comm.size))
@@ -593,7 +603,7 @@ class Grid:
         Partition(boxes, tuple(self.shape))
 
     def distributed(self, boxes: NDArray[np.int64]) -> Grid:
-        """Return an equal grid, with the present lines, whose mesh is distributed by these boxes (ranks, 2, d)."""
+        """Return an equal grid, with the present lines, whose mesh is distributed by the boxes (ranks, 2, d)."""
         other = self._again()
         other.seeded, other._spacing = self.seeded, self._spacing
         other._cells = other._made(boxes)
@@ -603,7 +613,7 @@ class Grid:
         return Grid(**self.given, comm=self.comm, axisymmetric=self.axisymmetric)
 
     def _made(self, boxes: NDArray[np.int64]) -> Cells:
-        """Create the mesh, and return its cells.  `boxes` (ranks, 2, d): cells of each process, see `Partition`."""
+        """Create the mesh, and return its cells.  `boxes` (ranks, 2, d): see `Partition`."""
         partition = Partition(boxes, tuple(self.shape))
         own = partition.cells(self.comm.rank)
         nodes = np.concatenate([self.corners(own) + copy * self.nodes for copy in range(self.copies)])
@@ -620,7 +630,7 @@ class Grid:
         return np.ravel_multi_index(tuple(index.transpose(2, 0, 1)), tuple(self.shape + 1))
 
     def _nodes(self) -> NDArray[np.float64]:
-        """Return the positions (n, d), m, of the nodes that this process contributes, in lexicographic order."""
+        """Return the positions (n, d), in m, of the nodes that this process contributes, in lexicographic order."""
         count = self.copies * self.nodes
         start, stop = (count * (self.comm.rank + end) // self.comm.size for end in (0, 1))
         index = np.stack(np.unravel_index(np.arange(start, stop) % self.nodes, self.shape + 1), axis=-1)
@@ -628,7 +638,7 @@ class Grid:
 
     @property
     def copies(self) -> int:
-        """Number of copies of the box in the mesh: one, or one for each contact group, see `GridOfGroups`."""
+        """Number of copies of the box in the mesh.  It is one; `GridOfGroups` has one copy for each contact group."""
         return 1
 
     @property
@@ -647,27 +657,27 @@ class Grid:
         return int(np.prod(self.shape + 1))
 
     def copy(self, ids: NDArray[np.int64]) -> NDArray[np.int64] | int:
-        """Return, for material points with these ids (n,), the index of the first cell of their copy of the box."""
+        """Return the index of the first cell in the copy of the box to which material points `ids` (n,) belong."""
         return 0
 
     def cellwise(self, shape: tuple[int, ...] = ()):
-        """Return the space of cellwise constant functions (DG0) with a value shape; it is created once."""
+        """Return the space of cellwise constant functions (DG0) with this value shape.  Each space is created once."""
         return self._of_process.cellwise(shape)
 
     def coefficient(self, shape: tuple[int, ...] = ()) -> fem.Function:
-        """Return a new cellwise function as a coefficient of forms.  All functions of a shape share their memory."""
+        """Return a cellwise coefficient of forms.  All coefficients of the same value shape share one array."""
         return fem.Function(self.cellwise(shape), self._of_process.memory(shape).x)
 
     @property
     def given(self) -> dict[str, Any]:
-        """Arguments of an equal grid: corners and numbers of cells, or lines."""
+        """Arguments with which an equal grid can be created: corners and numbers of cells, or lines."""
         if self.even:
             return {"lower": self.lower, "upper": self.upper, "cells": self.shape}
         return {"lines": [x + start for x, start in zip(self.seeded, self.base, strict=True)], "follow": self.follow}
 
     @property
     def reach(self) -> float:
-        """Largest coordinate of a position on the grid, relative to the base, m."""
+        """Largest absolute coordinate on the grid, in m, relative to the base."""
         return float(np.abs([self.low, self.high]).max())
 
     @property
@@ -676,19 +686,19 @@ class Grid:
         return self.axisymmetric and bool(self.lower[0] <= SAME * self.finest[0])
 
     def around(self, x: NDArray[np.float64]) -> NDArray[np.float64] | float:
-        """Return the factor from plane to volume integrals at x (n, d), m: 2 pi r (n,), m, in axisymmetry, else 1."""
+        """Return the factor from plane to volume integrals at x (n, d): 1, or in axisymmetry `2 pi r` (n,), in m."""
         return TURN * x[:, 0] if self.axisymmetric else 1.0
 
     def number(self, index: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the lexicographic indices (n,), in the first copy, of cells with indices (n, d) along the axes."""
+        """Return the lexicographic indices (n,) of cells of the first copy with indices (n, d) along the axes."""
         return np.ravel_multi_index(tuple(index.T), tuple(self.shape))
 
     def index(self, x: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the indices (n, d) of the cells at true positions x (n, d), m, limited to the grid."""
+        """Return the indices (n, d) of the nearest cells in the grid to true positions x (n, d), in m."""
         return self.index_from_base(x - self.base)
 
     def index_from_base(self, x: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the indices (n, d) of the cells at positions x (n, d), m, from the base, limited to the grid."""
+        """Return the indices (n, d) of the nearest cells in the grid to positions x (n, d), in m, from the base."""
         if not self.even:
             return np.stack([self.cells_along(a, x[:, a]) for a in range(self.dim)], axis=1)
         i = np.floor((x - self.low) / self.h).astype(np.int64)
@@ -701,7 +711,7 @@ class Grid:
         return self.partition.owner(np.array(np.unravel_index(number % self.cells, tuple(self.shape))))
 
     def gathered(self, rows: Sequence[tuple], width: int) -> tuple[NDArray, NDArray, NDArray]:
-        """Send rows (cells, positions, values) to the owners of cells; return local cells, positions and values."""
+        """Send rows (cells, positions, values) to the owners of the cells.  Return received rows with local cells."""
         empty = (np.empty(0, dtype=np.int64), np.empty((0, self.dim)), np.empty((0, width)))
         parts = [np.concatenate(column) for column in zip(empty, *rows, strict=True)]
         travel = Exchange(self.comm, self.owner(parts[0]))
@@ -709,7 +719,7 @@ class Grid:
         return self.locals[cell], x, values
 
     def node_places(self, nodes: NDArray[np.integer]) -> NDArray[np.int64]:
-        """Return for local nodes (n,) the indices along the axes and, in column d, the index of the copy."""
+        """Return the indices (n, d + 1) of local nodes (n,) along the axes.  Column d is the index of the copy."""
         copy = np.zeros(len(self.node_x), dtype=np.int64)
         if self.copies > 1:
             copy[self.cell_nodes] = (self.cell_number // self.cells)[:, None]
@@ -721,15 +731,16 @@ class Grid:
         return np.ravel_multi_index(tuple(index), tuple(self.shape + 1)) + copy * self.nodes
 
     def from_other(self, other: Grid, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return nodal values (unknowns,) from an equal grid with other owners."""
+        """Convert nodal values (unknowns,) from `other`, an equal grid with another partition, to this grid."""
         rows = nodal.reshape(-1, self.dim)
         some = rows.any(axis=1)
         return self.from_rows(other.node_numbers()[some], rows[some])
 
     def from_rows(self, nodes: NDArray[np.int64], rows: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return nodal values (unknowns,) from rows (n, d) of nodes (n,) on any processes; others are zero.
+        """Return nodal values (unknowns,) from rows (n, d) of nodes (n,), which may be on any process.
 
-        nodes: lexicographic indices, see `node_numbers`.  Rank i % P of P passes on node i.
+        The values of all other nodes are zero.  `nodes`: lexicographic indices.  Rank `i % P` of P forwards the row of
+        node i.
         """
         new = self.node_numbers()
         store, fetch = (Exchange(self.comm, (node % self.comm.size).astype(np.int32)) for node in (nodes, new))
@@ -737,12 +748,14 @@ class Grid:
         return fetch.back(values_at(fetch.send(new), node, store.send(rows)[first])).ravel()
 
     def cell_places(self, cells: NDArray[np.integer]) -> NDArray[np.int64]:
-        """Return for local cells (n,) the indices along the axes and, in column d, the index of the copy."""
+        """Return the indices (n, d + 1) of local cells (n,) along the axes.  Column d is the index of the copy."""
         copy, number = np.divmod(self.cell_number[cells].astype(np.int64), self.cells)
         return np.array([*np.unravel_index(number, tuple(self.shape)), copy]).T.copy()
 
     def neighbours(self, cells: NDArray[np.integer]) -> NDArray[np.int64]:
-        """Return the local neighbours (n, d, 2) of local cells, by axis and end; -1 if not on this process."""
+        """Return the local indices (n, d, 2) of neighbours of local cells, by axis and end.  Cells of other processes
+        have -1.
+        """
         index = self.cell_places(cells)
         out = np.full((len(cells), self.dim, 2), -1, dtype=np.int64)
         for axis in range(self.dim):
@@ -766,8 +779,8 @@ class Grid:
     ) -> NDArray[np.float64]:
         """Return the gradients (n, 2^d, d), 1/m, of the Q1 shape functions of local cells at points x.
 
-        `mixed` (n, 3), m^2, in 3D: means of the products of two offsets from a point, over a subdomain about the point.
-        With `mixed`, gradients are means over the subdomains.
+        With `mixed`, used in 3D, gradients are means over subdomains about the points.  `mixed` (n, 3), m^2, are the
+        means, over each subdomain, of the products of two offsets from the point.
         """
         hats, h = self._hats(cells, x), self.sizes(cells).T[..., None] if not self.even else self.h
         dN = np.empty((*hats[0].shape, self.dim))
@@ -782,16 +795,16 @@ class Grid:
 
     @cached_property
     def monomials(self) -> NDArray[np.float64]:
-        """Coefficients (2^d, 2^d) of the Q1 shape functions about the midpoint of a cell; one column for each function.
+        """Coefficients (2^d, 2^d) of the Q1 shape functions about the midpoint of a cell; columns are functions.
 
-        Row s is the factor of the product of the offsets along all axes whose bit is set in s.  For unequal cells, the
-        offsets are divided by the edge lengths, see `over_edges`.
+        Row s has the factors of the monomial s, the product of the offsets along all axes whose bit is set in s.  For
+        unequal cells, the offsets are divided by the edge lengths, see `over_edges`.
         """
         bits = corner_bits(self.dim)[:, None]
         return np.where(bits, self.signs / (self.h if self.even else 1.0), 0.5).prod(axis=2)
 
     def over_edges(self, coefficients: NDArray[np.float64], cells: NDArray[np.int32]) -> NDArray[np.float64]:
-        """Convert coefficients (d, 2^d, cells) of `monomials` for offsets in m; for equal cells they are unchanged."""
+        """Convert coefficients (d, 2^d, cells) of `monomials` for offsets in m.  Equal cells need no change."""
         if self.even:
             return coefficients
         bits = corner_bits(self.dim)[:, None]
@@ -810,26 +823,26 @@ class Grid:
         return out
 
     def _hats(self, cells: NDArray[np.int32], x: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-        """Return for each axis the factors (n, 2^d) of the shape functions, which are linear along this axis."""
+        """Return for each axis a factor (n, 2^d) of the shape functions.  This factor is linear along the axis."""
         y = (x - self.midpoints[cells]) / self.sizes(cells)
         return [0.5 + y[:, a, None] * self.signs[:, a] for a in range(self.dim)]
 
     def interior_facets(self, active: NDArray[np.bool_], cells: NDArray[np.int32]) -> NDArray[np.int32]:
-        """Return the facets of this process between two active cells.  `cells` are the indices of `active` cells."""
+        """Return the owned facets between two active cells.  `cells` are the indices of the mask `active`."""
         facets = np.unique(self.cell_facets[cells])
         facets = facets[facets < self.facets_owned]
         both = self.facet_cells[facets]
         return facets[(both[:, 1] >= 0) & active[both[:, 0]] & active[both[:, 1]]]
 
     def wall_nodes(self, name: str) -> NDArray[np.bool_]:
-        """Return which nodes lie on a side of the box, given by name."""
+        """Return which nodes lie on the side `name` of the box."""
         axis, end = side(name, self.dim)
         plane = (self.low, self.high)[end][axis]
         return np.abs(self.node_x[:, axis] - plane) < NEAR * self.finest[axis]
 
 
 def begin_with(name: str, grid: Any) -> None:
-    """Move lines that follow to where they were given, for new bodies and scenes; raise ValueError for no grid."""
+    """Move lines that follow to their initial coordinates, for new bodies and scenes.  Raise ValueError for no grid."""
     instance(name, grid, Grid)
     grid.move(None)
 
@@ -837,10 +850,11 @@ def begin_with(name: str, grid: Any) -> None:
 class GridOfGroups(Grid):
     """A grid with a separate copy of the box for each contact group, so that groups share no nodes.
 
-    The copies coincide in space.  The same process owns corresponding cells of all copies.
+    The copies coincide in space.  Cells at the same place in all copies belong to the same process.
 
-    grid: grid of the bodies; group (bodies,): index, from 0, of the group of each body; starts (bodies,): id of the
-    first material point of each body.
+    grid: grid of the bodies
+    group (bodies,): index, from 0, of the group of each body
+    starts (bodies,): id of the first material point of each body
     """
 
     def __init__(self, grid: Grid, group: NDArray[np.int64], starts: NDArray[np.int64]):
@@ -860,5 +874,5 @@ class GridOfGroups(Grid):
         return GridOfGroups(self, self._group, self._starts)
 
     def copy(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return, for material points with these ids (n,), the index of the first cell of their copy of the box."""
+        """Return the index of the first cell in the copy of the box to which material points `ids` (n,) belong."""
         return self._group[self._starts.searchsorted(ids, side="right") - 1] * np.int64(self.cells)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Grid lines for cells of different sizes: equal spacing, and lines graded away from fine boxes."""
+"""Grid lines: checks of given lines, and lines for cells that grow with the distance from fine boxes."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from mpm_dolfinx.base.tolerances import EPSILON, SAME
 from mpm_dolfinx.base.validation import line, numbers
 
 MOST = 2**31 - 1
-"""Largest number of unknowns for PETSc's 32-bit integers."""
+"""Largest number of unknowns that PETSc's 32-bit integers allow."""
 
 
 def rounding(x: NDArray[np.float64]) -> float:
-    """Return the largest rounding error, m, of coordinates with the magnitudes of x, m."""
+    """Return the largest rounding error, in m, of coordinates as large as x, in m."""
     return 8 * EPSILON * float(np.abs(x).max(initial=0.0))
 
 
 def checked(lines: Sequence[ArrayLike], what: str = "grid") -> list[NDArray[np.float64]]:
-    """Return the grid lines (n,), m, along each of two or three axes; raise ValueError if they are invalid."""
+    """Return the grid lines (n,), in m, along each of two or three axes.  Raise ValueError if they are invalid."""
     if not isinstance(lines, Sequence | np.ndarray) or len(lines) not in (2, 3):
         raise ValueError(f"{what}: lines = {line(lines)}, must be 2 or 3 lists of coordinates, one for each axis")
     out = []
@@ -60,23 +60,22 @@ def graded(
     lower, upper : (d,), m
         Lower and upper corner of the grid; d = 2 or 3.
     fine : (boxes, 2, d), m
-        Lower and upper corners of the fine boxes, at least one box, inside the grid.  Small cells also
-        fill gaps narrower than a cell, along an axis, between two boxes or a box and a side of the grid.
+        Lower and upper corners of at least one fine box.  Boxes must be inside the grid.  Small cells also fill gaps,
+        along an axis, narrower than a cell.  Such gaps lie between two boxes, or between a box and a side.
     size : number or (d,), m
-        Largest edge lengths of the small cells, > 0.  Each box contains a whole number of cells.
+        Largest edge lengths > 0 of the small cells.  Cells may be smaller, because each box contains a whole number of
+        cells.
     ratio
-        Largest ratio of edge lengths of neighbouring cells, > 1; it is exceeded if there is not enough space.
+        Largest ratio > 1 of edge lengths of neighbouring cells.  This ratio is exceeded if there is not enough space.
     largest : m
         Largest edge length of a cell, >= size.
 
-    Returns
-    -------
-    Lines (n,), m, along each axis, for `Grid(lines=...)`.
+    Returns ------- Lines (n,), in m, along each axis, for `Grid(lines=...)`.
 
     Raises
     ------
     ValueError
-        Boxes outside the grid, numbers out of range, or more cells than a grid can have.
+        Boxes are outside the grid, numbers are out of range, or a box has more cells than a grid can have.
     """
     lower = numbers("graded: lower", lower, (2,), (3,), allowed="2 or 3 finite coordinates")
     d = lower.size
@@ -101,7 +100,9 @@ def graded(
 def _along(
     low: float, high: float, fine: NDArray[np.float64], size: float, ratio: float, largest: float
 ) -> NDArray[np.float64]:
-    """Return the lines (n,), m, from low to high along an axis.  `fine` (k, 2) are the intervals of small cells, m."""
+    """Return the lines (n,), in m, from low to high along an axis.  `fine` (k, 2), in m, are the intervals of small
+    cells.
+    """
     joined: list[list[float]] = []
     for start, stop in sorted(fine.tolist()):
         if joined and start - joined[-1][1] <= size * (1 + SAME):
@@ -128,9 +129,10 @@ def _along(
 
 
 def _growing(gap: float, size: float, ratio: float, largest: float) -> NDArray[np.float64]:
-    """Return edge lengths (n,), m, that fill a gap, m, and grow from `size` by a common factor.
+    """Return edge lengths (n,), in m, that fill a gap, in m.  They grow from `size` by a common factor.
 
-    The factor is at most `ratio` if possible.  Of two numbers of edges, the one with a factor nearer to 1 is used.
+    The factor is at most `ratio` if possible.  Two numbers of edges are tried, and the number with a factor nearer to 1
+    is used.
     """
     if gap <= 0:
         return np.empty(0)

@@ -2,8 +2,8 @@
 """Partition of the grid's cells among processes: recursive coordinate bisection, weighted by loads.
 
 dolfinx's partitioners distribute the whole background grid.  Most of its cells are empty, so one process might hold the
-whole body.  Here the box is bisected recursively, across the longest extent of the filled cells, into halves of equal
-load.  The two halves are separated by a plane between cells (Berger and Bokhari 1987).
+whole body.  Here the box of the grid is bisected recursively into halves of equal load (Berger and Bokhari 1987).  Each
+plane lies between cells, normal to the longest extent of the filled cells.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 UNEVEN = 1.2
-"""Largest number of points of a process, divided by the mean, above which cells are distributed anew.  The answers do
-not depend on this number.  Source: definition, the documented limit of the imbalance.
+"""Imbalance: largest number of points of a process, divided by the mean.  Above this limit, cells are distributed anew.
+The results of a scene do not depend on the limit.  Source: definition, the documented limit of the imbalance.
 """
 EMPTY = 1e-2
-"""Weight of an empty cell divided by the mean weight of a filled cell, for memory and time that empty cells need."""
+"""Weight of an empty cell divided by the mean weight of a filled cell.  Empty cells need memory and time."""
 
 
 class Partition:
@@ -25,7 +25,7 @@ class Partition:
     Parameters
     ----------
     boxes : (ranks, 2, d)
-        First cell index along each axis, and last index plus one, of the cells of each process.
+        The box of each process.  The two rows are the first cell index along each axis, and the last index plus one.
     shape : (d,)
         Number of cells of the grid along each axis.
 
@@ -65,7 +65,7 @@ class Partition:
         return self.numbered(np.full(self.count[rank].prod(), rank), np.arange(self.count[rank].prod()))
 
     def numbered(self, rank: NDArray[np.int64], k: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the lexicographic index (n,) of the k-th cell (n,), from 0, of each process `rank` (n,)."""
+        """Return the lexicographic indices (n,) of cells: the k-th cell (n,), from 0, of process `rank` (n,)."""
         out, stride = np.zeros_like(k), 1
         for axis in reversed(range(len(self.shape))):
             k, place = np.divmod(k, self.count[rank, axis])
@@ -75,9 +75,10 @@ class Partition:
 
 
 def boxes(load: NDArray[np.float64], processes: int) -> NDArray[np.int64]:
-    """Return the boxes of cells of all ranks (ranks, 2, d): first cell index along each axis, and last index plus one.
+    """Return the boxes of cells (ranks, 2, d) of all ranks, see `Partition`.
 
-    load (cells along each axis): load of a cell, such as its number of points, >= 0; processes: number of ranks, >= 1.
+    load (cells along each axis): load >= 0 of each cell, such as its number of points
+    processes: number of ranks, >= 1
     """
     filled = load > 0
     weight = load + (EMPTY * load[filled].mean() if filled.any() else 1.0)
@@ -87,25 +88,26 @@ def boxes(load: NDArray[np.float64], processes: int) -> NDArray[np.int64]:
 
 
 def better(load: NDArray[np.float64], of: NDArray[np.int64]) -> NDArray[np.int64] | None:
-    """Return the boxes (ranks, 2, d) of a new bisection if it is more even than the uneven boxes `of`, else None.
+    """Return the boxes (ranks, 2, d) of a new bisection, or None if they are hardly more even than the boxes `of`.
 
-    A bisection with an imbalance above `UNEVEN` must reduce the imbalance by this factor.  Without this rule, each
-    reset of the grid might distribute a few cells anew.
+    If the imbalance of the new boxes is above `UNEVEN`, they must reduce the imbalance by the factor `UNEVEN`.  Without
+    this rule, each reset of the grid might distribute a few cells anew.
     """
     new = boxes(load, len(of))
     return new if imbalance(load, new) < max(UNEVEN, imbalance(load, of) / UNEVEN) else None
 
 
 def imbalance(load: NDArray[np.float64], of: NDArray[np.int64]) -> float:
-    """Return the largest load of the boxes `of` (ranks, 2, d), divided by the mean; 1 without loads."""
+    """Return the largest load of the boxes `of` (ranks, 2, d), divided by the mean load, or 1 without loads."""
     each = np.array([load[tuple(map(slice, *box))].sum() for box in of])
     return float(each.max() / each.mean()) if each.any() else 1.0
 
 
 def _bisect(weight: NDArray[np.float64], filled: NDArray[np.bool_], low: NDArray[np.int64], out: NDArray[np.int64]):
-    """Distribute a box of cells, with first cell `low` (d,), among ranks: set their boxes `out` (ranks, 2, d).
+    """Distribute a box of cells, with first cell `low` (d,), among ranks.  Set the boxes `out` (ranks, 2, d) of the
+    ranks.
 
-    If there are enough cells, each rank gets at least one; this has priority over equal loads.
+    If there are enough cells, each rank gets at least one cell.  This rule has priority over equal loads.
     """
     count = len(out)
     if count == 1 or weight.size == 1:
@@ -135,9 +137,9 @@ def _extent(filled: NDArray[np.bool_], axis: int) -> int:
 
 
 def destinations(partition: Partition, cells: NDArray[np.int64]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Return the ranks that hold each cell, the owner first, in one list; and the start of each cell in this list.
+    """Return two arrays: the ranks that hold each cell, the owner first, in one list, and the start of each cell in it.
 
-    Processes that own a neighbour across a face hold the cell as a ghost.  cells (n,): lexicographic indices.
+    `cells` (n,) are lexicographic indices.  Processes that own a neighbour across a face hold the cell as a ghost.
     """
     index, shape = np.array(np.unravel_index(cells, partition.shape)), np.array(partition.shape)[:, None]
     ranks = [partition.owner(index)]

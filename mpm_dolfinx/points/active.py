@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Active cells of a grid: a step computes only cells with material, in a box of any size."""
+"""Active cells of a grid.  A step computes only cells with material, so the grid may be a box of any size."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class ActiveSet:
 
     @cached_property
     def parts_of_cells(self) -> tuple[NDArray[np.int64], int]:
-        """Index (cells,), from 1, of each local cell's connected part, 0 for empty cells, and the number of parts."""
+        """Index (cells,), from 1, of each local cell's connected part, or 0 if it is empty, and the number of parts."""
         return parts_of_cells(self.grid, self.contains)
 
 
@@ -56,12 +56,12 @@ class Active:
     wet
         Whether cells may contain fluid.
     cells, dofs
-        Arrays over the local cells, and over the unrolled local degrees of freedom, that `clear` resets to zero.
+        Arrays over the local cells, and over the unrolled local degrees of freedom.  `clear` resets them to zero.
 
     Attributes
     ----------
     now
-        The active set; the same object while the cells are the same.
+        The active set.  It remains one object as long as the cells do not change.
     slot : (cells,)
         Index of each cell among the owned active cells.
     centroid : (cells, d), m
@@ -81,11 +81,11 @@ class Active:
         self._of_dofs = tuple(dofs)
 
     def clear(self) -> None:
-        """Reset the arrays `cells` and `dofs` to zero; called before other cells become active."""
+        """Reset the arrays `cells` and `dofs` to zero.  Call this before other cells become active."""
         for rows, arrays in ((self.now.cells, self._of_cells), (self.now.dofs, self._of_dofs)):
             for values in arrays:
                 values[rows] = 0.0
 
     def set(self, cells: NDArray[np.int64], nodes: Callable[[], NDArray[np.int64]]) -> None:
-        """Set the active cells; nodes: function that returns their nodes.  All processes must call it."""
+        """Set the active cells.  `nodes` returns the nodes of these cells.  All processes must call this method."""
         self.now = self._last(cells, lambda: ActiveSet(self._grid, cells, nodes()), self._grid.comm)

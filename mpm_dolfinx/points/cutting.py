@@ -1,18 +1,20 @@
 # SPDX-License-Identifier: MIT
-"""Particle domains cut by the grid into pieces: the parts of a domain in one cell each.
+"""Particle domains cut by the grid into pieces.  A piece is the part of a domain in one cell.
 
-A material point has a quadrilateral or hexahedral domain with tracked corners. Its pieces have exact volumes and
-centroids, in 3D also mean products of coordinates. Gradients of Q1 functions are linear within a cell, in 3D bilinear.
-One quadrature point per piece therefore integrates these gradients exactly, wherever the domain lies on the grid.
+A material point has a quadrilateral or hexahedral domain with tracked corners.  The pieces of the domain have exact
+volumes and centroids.  In 3D they also have exact mean products of coordinates.  Gradients of Q1 functions are linear
+within a cell, in 3D bilinear.  One quadrature point in each piece therefore integrates these gradients exactly,
+wherever the domain lies on the grid.
 
 The surface of a domain has 4 edges, or in 3D 4 triangles about the middle of each face.  The triangles of neighbouring
-domains match, and prefer no diagonal.  The grid planes, axis by axis, slice this surface.  Gauss's theorem gives the
-volumes and first moments between a slice and the lower face of its cell, and in the column of cells below.  The
-interior of a domain is never cut.  Areas of the faces of pieces need no further cuts.
+domains match, and do not favour a diagonal of the face.  The grid planes of one axis after another slice this surface.
+Gauss's theorem gives the volumes and first moments between a slice and the lower face of its cell, and in the column of
+cells below.  The interior of a domain is never cut.  Areas of the faces of pieces need no further cuts.
 
-In axisymmetry pieces are rings. Their volume is 2 pi r_c times the area, with the radius r_c of the area's centroid
-(Pappus). Gradients are evaluated at the volume's centroid, (mean r^2 / r_c, mean r z / r_c). The hoop strain u_r / r is
-(mean u_r over the area) / r_c. The nodal forces of uniform stresses are then exact.
+In axisymmetry pieces are rings.  The volume of a ring is `2 pi r_c` times the area of its section, where r_c is the
+radius of the section's centroid (Pappus).  Gradients are evaluated at the centroid of the volume,
+`(mean r^2 / r_c, mean r z / r_c)`.  The circumferential strain `u_r / r` is the mean of u_r over the section, divided
+by r_c.  The nodal forces of uniform stresses are then exact.
 """
 
 from __future__ import annotations
@@ -31,12 +33,12 @@ from mpm_dolfinx.grid.grid import ABOUT_MIDDLE, FACE_SIGNS, FACES, TURN, Grid, c
 SLIVER = NEAR**2
 """Smallest volume fraction of a piece. Pieces thinner than `Grid.snap` have an open face. Source: epsilon."""
 CHUNK = 2**15  # simplices cut in one call, so that they fit into the processor's cache
-TANGLED = 0.2  # least volume between corners, divided by the domain's; below it corners are re-initialised from F
+TANGLED = 0.2  # smallest volume between corners / volume of domain; below it corners are re-initialised from F
 
 
 @dataclass
 class Pieces:
-    """Pieces of particle domains; arrays for m pieces, ordered by point and cell."""
+    """Pieces of particle domains.  Arrays have a row for each of m pieces, ordered by point and cell."""
 
     point: NDArray[np.int64]  # (m,) index of the domain
     cell: NDArray[np.int64]  # (m,) lexicographic index of the cell
@@ -79,13 +81,13 @@ def simplices(dim: int) -> NDArray[np.int64]:
 
 
 def vertices(y: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the corners y (2^d, d, n) of domains, in 3D then the middles of faces, and last the middles of domains."""
+    """Return the corners y (2^d, d, n) of domains, in 3D the middles of their faces, and the middles of domains."""
     faces = [y[index].sum(axis=0) / 4 for index in FACES[3]] if y.shape[1] == 3 else []
     return np.concatenate([y, *(v[None] for v in faces), y.sum(axis=0)[None] / len(y)])
 
 
 def simplex_volumes(v: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the signed volumes (k, n) of the simplices of domains; v (m, d, n): vertices, see `vertices`."""
+    """Return the signed volumes (k, n) of the simplices of domains with vertices v (m, d, n), see `vertices`."""
     d, vertex = v.shape[1], simplices(v.shape[1]).T
     s = v[vertex[:-1]].transpose(0, 2, 1, 3).reshape(d, d, -1)
     height = s[0] - v[vertex[-1]].transpose(1, 0, 2).reshape(d, -1)
@@ -94,7 +96,7 @@ def simplex_volumes(v: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def volumes(corners: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the volumes (n,), m^d, of domains with corners (n, 2^d, d); negative for inverted domains.
+    """Return the volumes (n,), in m^d, of domains with corners (n, 2^d, d).  They are negative for inverted domains.
 
     In 3D each face contributes a third of the product of its middle and its area vector.
     """
@@ -117,7 +119,7 @@ def cross(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]
 
 
 def domain_volumes(corners: NDArray[np.float64], axisymmetric: bool) -> NDArray[np.float64]:
-    """Return the volumes (n,), m^d, of domains with corners (n, 2^d, d); in axisymmetry of their rings, m^3."""
+    """Return the volumes (n,) of domains with corners (n, 2^d, d), in m^d, or in axisymmetry of their rings, in m^3."""
     if not axisymmetric:
         return volumes(corners)
     v = vertices(np.ascontiguousarray(corners.transpose(1, 2, 0)))
@@ -125,15 +127,15 @@ def domain_volumes(corners: NDArray[np.float64], axisymmetric: bool) -> NDArray[
 
 
 def edges(corners: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the mean edge vectors (n, d, d), m, as columns, of domains with corners (n, 2^d, d)."""
+    """Return the mean edge vectors of domains with corners (n, 2^d, d), as columns of matrices (n, d, d), in m."""
     signs = 2.0 * corner_bits(corners.shape[2]) - 1
     return np.einsum("nki,ka->nia", corners, signs) / 2 ** (corners.shape[2] - 1)
 
 
 def centroids(corners: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the centroids (n, d), m, of domains with corners (n, 2^d, d); in axisymmetry of their sections.
+    """Return the centroids (n, d), in m, of domains with corners (n, 2^d, d), or in axisymmetry of their sections.
 
-    As in `cut`, inverted simplices count with positive volume.
+    Inverted simplices count with positive volume, as in `cut`.
     """
     chunks = _chunks(len(corners), corners.shape[2])
     return _centroids(corners) if len(chunks) == 1 else np.concatenate([_centroids(corners[part]) for part in chunks])
@@ -149,7 +151,7 @@ def _centroids(corners: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def tangled(corners: NDArray[np.float64], volume: NDArray[np.float64], axisymmetric: bool = False) -> NDArray[np.bool_]:
-    """Return whether each domain (n,) is inverted: the volume between its corners is far from `volume` (n,), m^d."""
+    """Return which domains (n,) are inverted, that is, have corners whose volume is far from `volume` (n,), in m^d."""
     ratio = domain_volumes(corners, axisymmetric) / volume
     return (ratio < TANGLED) | (ratio > 1 / TANGLED)
 
@@ -157,7 +159,7 @@ def tangled(corners: NDArray[np.float64], volume: NDArray[np.float64], axisymmet
 def parallelepipeds(
     x: NDArray[np.float64], F: NDArray[np.float64], spacing: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the corners (n, 2^d, d), m, of boxes with edges `spacing` (n, d), at x (n, d), deformed by F (n, d, d)."""
+    """Return corners (n, 2^d, d), in m, of boxes with centres x and edges `spacing` (n, d), deformed by F (n, d, d)."""
     offset = (corner_bits(x.shape[1]) - 0.5) * spacing[:, None, :]
     return x[:, None] + np.einsum("nab,nkb->nka", F, offset)
 
@@ -171,12 +173,12 @@ def _chunks(count: int, dim: int) -> list[slice]:
 def cut(grid: Grid, corners: NDArray[np.float64], second: bool = False, faces: bool = True) -> Pieces:
     """Cut the particle domains by the grid.
 
-    corners (n, 2^d, d), m: corners of the domains, inside the grid; corner k is at the ends `corner_bits(d)[k]`;
-    second, faces: whether to compute second moments and face areas of the pieces.
+    `corners` (n, 2^d, d), in m: corners of the domains, inside the grid; corner k is at the ends `corner_bits(d)[k]`.
+    `second`, `faces`: whether to compute second moments and face areas of the pieces.
 
     Returns
     -------
-    The pieces of at least 1e-12 of their domain's volume; the fractions of every domain sum to one.
+    The pieces with at least 1e-12 of their domain's volume.  The fractions of every domain sum to one.
     """
     chunks = _chunks(len(corners), grid.dim)
     if len(chunks) == 1:
@@ -191,12 +193,14 @@ def cut(grid: Grid, corners: NDArray[np.float64], second: bool = False, faces: b
 def on_planes(
     grid: Grid, true: NDArray[np.float64], x: NDArray[np.float64], axes: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return positions in units of cells, and positions for slicing, snapped to grid planes nearer than `Grid.snap`.
+    """Return positions in units of cells, and positions for slicing.
 
-    Positions for slicing are in units of cells if all cells are equal, else in m: domain edges are straight in m.
+    Both are snapped to grid planes nearer than `Grid.snap`.  If all cells are equal, positions for slicing are in units
+    of cells.  Otherwise they are in m, because domain edges are straight in m.
 
-    true: positions from the grid's lower corner, in units of cells; x, m: the same positions from the grid's base;
-    axes: array axis of the position's components.
+    `true`: positions from the grid's lower corner, in units of cells.
+    `x`, in m: these positions from the grid's base.
+    `axes`: array axis of the position's components.
     """
     shape = [1] * true.ndim
     shape[axes] = grid.dim
@@ -263,7 +267,7 @@ def _area_vectors(s: NDArray[np.float64]) -> NDArray[np.float64]:
 def _facets(dim: int) -> NDArray[np.int64]:
     """Return the vertices (k, d+1, d) of the facets of a domain's simplices, oriented outward.
 
-    The i-th facet of a simplex omits its i-th vertex.  The last facets omit the middle: they form the surface.
+    The i-th facet of a simplex omits its i-th vertex.  The last facets omit the middle, and form the surface.
     """
     out = np.stack([np.delete(simplices(dim), k, axis=1) for k in range(dim + 1)], axis=1)
     box = vertices(corner_bits(dim).astype(float)[:, :, None])[:, :, 0]
@@ -276,7 +280,7 @@ def _facets(dim: int) -> NDArray[np.int64]:
 
 
 class _Slots:
-    """Cells in the bounding boxes of domains: one slot for each domain and cell; the last axis varies fastest."""
+    """Cells in the bounding boxes of domains.  Each domain and cell has a slot.  The last axis varies fastest."""
 
     def __init__(self, grid: Grid, y: NDArray[np.float64]):
         top = (grid.shape - 1)[:, None]
@@ -415,9 +419,9 @@ def _sum(
 
 
 def spreads(corners: NDArray[np.float64], rings: bool) -> NDArray[np.float64]:
-    """Return second moments about the centroid divided by volume (n, d, d), m^2, of domains; exact for parallelepipeds.
+    """Return the second moments (n, d, d) of domains about their centroids, divided by their volumes, in m^2.
 
-    rings: whether the domains are sections of rings, in axisymmetry.
+    The results are exact for parallelepipeds.  `rings`: whether the domains are sections of rings, in axisymmetry.
     """
     E = edges(corners)
     out = E @ E.swapaxes(1, 2) / 12  # 1/12: second moment of a unit length, exact
@@ -425,10 +429,12 @@ def spreads(corners: NDArray[np.float64], rings: bool) -> NDArray[np.float64]:
 
 
 def of_rings(spread: NDArray[np.float64], radius: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return second moments about the centroid divided by volume (n, 2, 2), m^2, of rings; third moments are neglected.
+    """Return the second moments (n, 2, 2) of rings about their centroids, divided by their volumes, in m^2.
 
-    spread (n, 2, 2): second moments of the sections, divided by their areas, m^2; radius (n,): radius of the sections'
-    centroids, m. The vector from a section's centroid to the ring's centroid is spread[:, 0] / radius.
+    Third moments are neglected.  The vector from the section's to the ring's centroid is `spread[:, 0] / radius`.
+
+    `spread` (n, 2, 2), in m^2: second moments of the sections, divided by their areas.
+    `radius` (n,), in m: radii of the sections' centroids.
     """
     off = spread[:, 0] / radius[:, None]
     return spread - off[:, :, None] * off[:, None]
@@ -437,10 +443,13 @@ def of_rings(spread: NDArray[np.float64], radius: NDArray[np.float64]) -> NDArra
 def _rings(
     grid: Grid, cell: NDArray[np.int64], c: NDArray[np.float64], squares: NDArray, products: NDArray
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return radii (m,), m, of pieces, their volume centroids (m, 2), 0 to 1 in their cells, and `hoop`, see `Pieces`.
+    """Return the radii (n,), in m, of pieces, the centroids (n, 2) of their volumes, and `hoop` of `Pieces`.
 
-    cell (m, 2): grid indices of the pieces' cells.  With coordinates r, z from 0 to 1 in the cell: centroid c (m, 2) of
-    the section; squares, products (m,): means of r^2 and r z over the section.
+    Coordinates r, z of centroids, and in the last parameters, are from 0 to 1 in the cell of each piece.
+
+    `cell` (n, 2): grid indices of the pieces' cells.
+    `c` (n, 2): centroids of the pieces' sections.
+    `squares`, `products` (n,): means of r^2 and of r z over the sections.
     """
     (h, height), (x, z) = grid.widths_of(cell).T, c.T
     squares = np.minimum(np.maximum(squares, x**2), x)  # rounding may violate these bounds in very thin pieces
@@ -462,11 +471,14 @@ def _products(
     total: Callable[[NDArray[np.float64]], NDArray[np.float64]],
     slots: _Slots,
 ) -> list[NDArray[np.float64]]:
-    """Return integrals over the pieces of products of two coordinates, relative to the lower corners of their cells.
+    """Return integrals over the pieces of products of two coordinates, from the lower corners of the pieces' cells.
 
-    pairs: axes of the two coordinates, ascending.  x (d, d, m): vertices of the slices; sums (d, m): sums over these
-    vertices; area (m,): slice areas projected along the first axis.  pair: function that returns the sum over a slice's
-    vertices of the product of two coordinates; total: function that returns the sum of slice values in each slot.
+    `pairs`: axes of the two coordinates, ascending.
+    `x` (d, d, m): vertices of the slices.
+    `sums` (d, m): sums over these vertices.
+    `area` (m,): slice areas projected along the first axis.
+    `pair`: function that returns the sum of the product of two coordinates over the vertices of each slice.
+    `total`: function that returns the sum of slice values in each slot.
     """
     d = len(x)
 
@@ -494,18 +506,19 @@ def _products(
 def cut_faces(
     grid: Grid, corners: NDArray[np.float64], local: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Cut faces of domains by the grid; return integration points, exact for products of Q1 functions.
+    """Cut faces of domains by the grid.  Return integration points, which are exact for products of Q1 functions.
 
-    A face across a grid line must load the nodes on each side in proportion to its part there. With one point per face,
-    the error would move nodes of partly filled cells in every step without limit.
+    If a face crosses a grid line, its part on each side must load the nodes of that side.  With one point for each
+    face, the error would move nodes of partly filled cells in every step without limit.
 
-    corners (faces, 2^(d-1), d), m: corners of the faces; triangles repeat their last corner; local (faces, 2^(d-1), e):
-    coordinates of the corners, to be interpolated.
+    `corners` (faces, 2^(d-1), d), in m: corners of the faces; triangles repeat their last corner.
+    `local` (faces, 2^(d-1), e): coordinates of the corners, to be interpolated.
 
     Returns
     -------
-    For each point: index of its face (n,), position (n, d), interpolated coordinates (n, e), the fraction of the face
-    that it represents (n,), and the middle (n, d) of its segment or triangle, a part of the face in one cell.
+    For each of n points: index (n,) of its face, position (n, d), interpolated coordinates (n, e), and the fraction
+    (n,) of the face that the point represents.  The last result is the middle (n, d) of the point's segment or
+    triangle, which is a part of the face in one cell.
     """
     d, m = grid.dim, len(corners)
     y = on_planes(grid, grid.in_cells(corners), corners, 2)[1]
@@ -532,7 +545,7 @@ def cut_faces(
     share /= sum_by(owner, share, m)[owner]  # slices left out must not reduce a face
 
     def place(y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return positions (n, d), m, relative to the base."""
+        """Return positions (n, d), in m, relative to the base."""
         return grid.low + grid.h * y if grid.even else y
 
     points = (_RULES[d] @ s.reshape(d, -1)).reshape(len(_RULES[d]), *s.shape[1:])
@@ -550,8 +563,8 @@ def _polygons(
 
     The slices of a triangle in one cell form a convex polygon. The polygon is divided about the mean of its corners.
 
-    s (3, a, n): corners of the slices, first positions for slicing, last barycentric coordinates in the triangle; owner
-    (n,): index of the triangle of each slice.
+    `s` (3, a, n): corners of the slices, as positions for slicing and, last, barycentric coordinates in the triangle.
+    `owner` (n,): index of the triangle of each slice.
     """
     cut = np.bincount(owner, minlength=1)[owner] > 1
     part, of = s[:, :, cut], owner[cut]
@@ -589,7 +602,7 @@ def _polygons(
 
 
 def _around(group: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the index (n,) of each entry's successor in its group, cyclically; group (n,): group index, ascending."""
+    """Return the index (n,) of each entry's successor in its group, cyclically.  `group` (n,) has ascending indices."""
     after, starts = np.arange(1, len(group) + 1), np.diff(group, prepend=-1).nonzero()[0]
     after[np.append(starts[1:], len(group))[: len(starts)] - 1] = starts
     return after
@@ -612,7 +625,7 @@ _RULES = {  # Source: Gauss, Strang and Fix (1973); equal weights, exact to thir
 
 
 def sliced(s: NDArray[np.float64], owner: NDArray[np.int64], axis: int, grid: Grid):
-    """Slice simplices, in positions for slicing, by the grid planes of an axis until no simplex crosses a plane."""
+    """Slice simplices by the grid planes of an axis until no simplex crosses a plane.  For units see `on_planes`."""
     done_s, done_owner = [], []
     while True:
         least, most = np.minimum.reduce(s[:, axis]), np.maximum.reduce(s[:, axis])
@@ -628,7 +641,7 @@ def sliced(s: NDArray[np.float64], owner: NDArray[np.int64], axis: int, grid: Gr
 
 
 def cut_at(s, owner, axis: int, plane):
-    """Cut each simplex at its plane; return the parts below, their owners, the parts above, and their owners."""
+    """Cut each simplex at its plane.  Return the parts below and their owners, then the parts above, and theirs."""
     order = s[:, axis].argsort(axis=0)
     s = s[order[:, None], np.arange(s.shape[1])[:, None], np.arange(s.shape[2])]
     count = (s[:, axis] < plane).sum(axis=0)  # vertices below the plane
@@ -649,7 +662,7 @@ def cut_at(s, owner, axis: int, plane):
 
 
 def _on_plane(a, b, axis: int, plane):
-    """Return the intersections of the edges from a to b with the plane, with the plane's exact coordinate."""
+    """Return the intersections of edges from a to b with the plane.  They have the exact coordinate of the plane."""
     t = (plane - a[axis]) / (b[axis] - a[axis])
     x = a + t * (b - a)
     x[axis] = plane

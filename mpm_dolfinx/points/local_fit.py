@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: MIT
 """Values at given positions from polynomials that are fitted to surrounding data (moving least squares).
 
-    sum_i w(o_i) (P(o_i) - v_i)^2 + small terms of P's coefficients -> min,      o_i: offsets from the position.
+    sum_i w(o_i) (P(o_i) - v_i)^2 + small terms of P's coefficients -> min.
 
-P is a polynomial, v_i are the data, and w is a weight. The value is the constant term of P (Lancaster and Salkauskas
-1981). Polynomials up to the degree of P are exact. The weights decrease smoothly to zero, so values are continuous when
-data enter or leave the fit. The small terms set coefficients to zero that the data do not determine, the higher degrees
-first.
+P is a polynomial, v_i are the data, o_i are the offsets of the data from the position, and w is a weight.  The value is
+the constant term of P (Lancaster and Salkauskas 1981).  Polynomials up to the degree of P are exact.  The weights
+decrease smoothly to zero, so values are continuous when data enter or leave the fit.  Data may not determine all
+coefficients.  The small terms then set coefficients to zero, higher degrees first.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from mpm_dolfinx.parallel.exchange import over_all
 RADIUS = 3.0
 """Offset beyond which the weight is zero, in spacings of the data.
 
-Source: exact. A parabola needs three points: at an end of the data these are at offsets of 0.5, 1.5 and 2.5.
+Source: exact. A parabola needs three points.  At an end of the data, these points have offsets of 0.5, 1.5 and 2.5.
 """
 UNTOLD = (0.0, 1e-10, 1e-6)
 """Weights of the small terms for coefficients of degrees 0, 1 and 2, divided by the sum of the data weights.
@@ -47,10 +47,12 @@ def fitted(
     values: NDArray[np.float64],
     weight: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Return the fitted values (count, width) at `count` positions, on every process; zero without data.
+    """Return the fitted values (count, width) at `count` positions, on every process.  Without data they are zero.
 
-    Data of this process: values (r, width), their weights (r,), the index `at` (r,), from 0, of the fitted position,
-    and the offset (r, d) from it, in spacings of the data.  degree: degree of the polynomials, 1 or 2.
+    `degree`: degree of the polynomials, 1 or 2.
+    `at` (r,): index, from 0, of the position to whose fit each row of this process's data belongs.
+    `offset` (r, d): offset from this position, in spacings of the data.
+    `values`, `weight` (r, width), (r,): values and weights of the data.
     """
     powers = [rows for k in range(degree + 1) for rows in combinations_with_replacement(range(offset.shape[1]), k)]
     size = len(powers)

@@ -24,23 +24,24 @@ ACROSS = "stretch across"
 
 
 def body_of(ids: NDArray[np.int64], starts: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the index (n,) of each point's body; starts (bodies + 1,): first id of each body, and of renewed points.
+    """Return the index (n,) of each point's body.
 
-    Successive ids of renewed points belong to the bodies in turn: the first body, the second, and so on cyclically.
+    `starts` (bodies + 1,) has the first id of each body, and the first id of renewed points.  Successive ids of renewed
+    points belong to the bodies in turn: the first body, the second, and so on cyclically.
     """
     beyond = ids - starts[-1]
     return np.where(beyond < 0, starts.searchsorted(ids, side="right") - 1, beyond % max(1, len(starts) - 1))
 
 
 def determinant(F: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return det F (n,) of F (n, d, d); numpy's function uses LU factors and takes twenty times as long."""
+    """Return `det F` (n,) of F (n, d, d).  numpy's function uses LU factors, and takes twenty times as long."""
     if F.shape[1] == 2:
         return F[:, 0, 0] * F[:, 1, 1] - F[:, 0, 1] * F[:, 1, 0]
     return np.einsum("ni,ni->n", F[:, 0], np.cross(F[:, 1], F[:, 2]))
 
 
 def middle(corners: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the means (n, d) of corners (n, 2^d, d); numpy's mean takes five times as long."""
+    """Return the means (n, d) of corners (n, 2^d, d).  numpy's mean takes five times as long."""
     total = corners[:, 0].copy()
     for k in range(1, corners.shape[1]):
         total += corners[:, k]
@@ -49,14 +50,14 @@ def middle(corners: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def with_ratio(F: NDArray[np.float64], J: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return F (n, d, d), scaled to volume ratios J (n,)."""
+    """Return F (n, d, d), scaled so that its determinants are the volume ratios J (n,)."""
     with np.errstate(divide="ignore", invalid="ignore"):  # inverted points are rejected later
         ratio = J / determinant(F)
     return F * (np.sign(ratio) * np.abs(ratio) ** (1 / F.shape[1]))[:, None, None]
 
 
 def in_space(F: NDArray[np.float64], across: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return F (n, 3, 3) from its out-of-plane stretch (n,), and its plane part (n, 2, 2) scaled to the same det F."""
+    """Return F (n, 3, 3) from its out-of-plane stretch (n,) and its scaled in-plane part (n, 2, 2), see `in_plane`."""
     out = np.zeros((len(F), 3, 3))
     out[:, :2, :2] = F / np.sqrt(across)[:, None, None]
     out[:, 2, 2] = across
@@ -64,20 +65,20 @@ def in_space(F: NDArray[np.float64], across: NDArray[np.float64]) -> NDArray[np.
 
 
 def unstretched(F: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return F (n, 3, 3), without stretch out of plane if F is (n, 2, 2)."""
+    """Return F (n, 3, 3).  If F is (n, 2, 2), the result has no stretch out of plane."""
     out = np.tile(np.eye(3), (len(F), 1, 1))
     out[:, : F.shape[1], : F.shape[1]] = F
     return out
 
 
 def in_plane(F: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the scaled in-plane part and the out-of-plane stretch of F (n, 3, 3): the inverse of `in_space`."""
+    """Return the in-plane part of F (n, 3, 3), scaled to `det F`, and the out-of-plane stretch.  Inverts `in_space`."""
     across = F[:, 2, 2]
     return F[:, :2, :2] * np.sqrt(across)[:, None, None], across.copy()
 
 
 def cofactor(F: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return det F F^-T (n, d, d) of F (n, d, d); numpy's inverse takes ten times as long."""
+    """Return `det F F^-T` (n, d, d) of F (n, d, d).  numpy's inverse takes ten times as long."""
     if F.shape[1] == 2:
         flat = F.reshape(-1, 4)[:, ::-1] * [1.0, -1.0, -1.0, 1.0]
         return flat.reshape(F.shape)
@@ -86,9 +87,9 @@ def cofactor(F: NDArray[np.float64]) -> NDArray[np.float64]:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class MaterialPoints:
-    """Material points of this process; immutable arrays over its n points.
+    """Material points of this process.  Immutable arrays have a row for each of n points.
 
-    Positions in a state are relative to the grid's `base`; `Simulation.points` has true positions.
+    Positions in a state are relative to the grid's `base`.  `Simulation.points` has true positions.
 
     Attributes
     ----------
@@ -97,21 +98,22 @@ class MaterialPoints:
     corners : (n, 2^d, d), m
         Tracked corners of the particle domain, in the order of `grid.corner_bits`.
     F : (n, d, d)
-        Deformation gradient; in plane strain with an out-of-plane stretch only its in-plane part, scaled to det F.
+        Deformation gradient.  In plane strain with an out-of-plane stretch, this is its in-plane part, scaled to det F.
     volume0 : (n,), m^d
         Reference volume.
     material : (n,)
         Index of the point's material in the scene's list.
     pressure : (n,), Pa
-        Pore pressure, positive in compression: second-order accurate mean over the domain; balances use cell pressures.
+        Pore pressure, positive in compression.  It is a second-order accurate mean over the domain.  Balances use cell
+        pressures instead.
     x : (n, d), m
-        Centroid of the domain, in axisymmetry of its section. F and pressure are exact there for linear fields.
+        Centroid of the domain, or in axisymmetry of its section.  For linear fields, F and pressure are exact at x.
     origin : (n, 2^d, d), m
-        Corners at zero displacement: as seeded, or at the last time a stage set displacements to zero.
+        Corners at zero displacement: seeded corners, or corners when a stage last set displacements to zero.
     reference : (n, 2^d, d), m
-        Corners of the domain in the reference configuration of F: as seeded, or as re-initialised.
+        Corners of the domain in the reference configuration of F: seeded corners, or re-initialised corners.
     data : (n, ...) by name
-        Further data of the points: parameters that vary with position, state of the law.
+        Further data of the points, such as parameters that vary with position, and the state of the law.
     """
 
     id: NDArray[np.int64]
@@ -136,11 +138,11 @@ class MaterialPoints:
         return type(self), (*(getattr(self, f.name) for f in fields(self) if f.name != "data"), dict(self.data))
 
     def placed(self, base: NDArray[np.float64]) -> MaterialPoints:
-        """Return the points with true positions, from positions relative to `base` (d,), m; base 0 returns `self`."""
+        """Return the points with true positions.  `base` (d,), in m, is added to positions; base 0 returns `self`."""
         return PlacedPoints(**self._moved(base)) if base.any() else self
 
     def _moved(self, by: NDArray[np.float64]) -> dict[str, Any]:
-        """Return the fields with all positions translated by the vector `by` (d,), m."""
+        """Return the fields with all positions translated by the vector `by` (d,), in m."""
         own = {f.name: getattr(self, f.name) for f in fields(self)}
         corners, x = self.corners + by, self.x + by
 
@@ -173,7 +175,7 @@ class MaterialPoints:
 
     @property
     def F_of_laws(self) -> NDArray[np.float64]:
-        """Deformation gradient used by laws (n, 3, 3); in plane strain without an out-of-plane stretch (n, 2, 2)."""
+        """Deformation gradient (n, 3, 3) for laws, or (n, 2, 2) in plane strain without an out-of-plane stretch."""
         return in_space(self.F, self.data[ACROSS]) if ACROSS in self.data else self.F
 
     def strained(self, F: NDArray[np.float64], **others: NDArray[np.float64]) -> MaterialPoints:
@@ -185,13 +187,13 @@ class MaterialPoints:
 
     @property
     def displacement(self) -> NDArray[np.float64]:
-        """Displacement (n, d), m, of the centroids since the start, or since a stage set it to zero."""
+        """Displacement (n, d), in m, of the centroids since the start, or since a stage set it to zero."""
         return self.x - centroids(self.origin)
 
     def map(self, function: Callable[[NDArray], NDArray], shared: bool = True) -> MaterialPoints:
-        """Return points with a function applied to each array: a selection, a copy, or a transfer of its entries.
+        """Return points with a function applied to each array.  The function selects, copies or transfers entries.
 
-        shared: whether fields that share an array share the new array too.
+        `shared`: whether fields that share an array also share the new array.
         """
         cache: dict[int, NDArray] = {}
 
@@ -204,7 +206,7 @@ class MaterialPoints:
         return type(self)(**arrays, data={name: once(values) for name, values in self.data.items()})
 
     def where(self, rows: NDArray[np.bool_], other: MaterialPoints) -> MaterialPoints:
-        """Return these points where `rows` (n,) is true, and elsewhere `other`: the same points in another state."""
+        """Return these points where `rows` (n,) is true, elsewhere `other`, which are these points in another state."""
 
         def chosen(a: NDArray, b: NDArray) -> NDArray:
             return a if a is b else np.where(rows.reshape(-1, *[1] * (a.ndim - 1)), a, b)
@@ -220,12 +222,12 @@ class MaterialPoints:
         return type(self)(**{name: np.concatenate(pair)[order] for name, pair in pairs.items()}, data=data)
 
     def of(self, ids: NDArray[np.int64], kept: bool = True) -> MaterialPoints:
-        """Return the points with the given ids; if `kept` is false, all other points."""
+        """Return the points with the given ids.  If `kept` is false, return all other points."""
         rows = np.isin(self.id, ids) == kept
         return self if rows.all() else self.map(lambda values: values[rows])
 
     def of_bodies(self, chosen: Sequence[bool], starts: NDArray[np.int64]) -> MaterialPoints:
-        """Return the points of the chosen bodies; starts: see `body_of`."""
+        """Return the points of the chosen bodies.  For `starts` see `body_of`."""
         rows = np.asarray(chosen)[body_of(self.id, starts)]
         return self if rows.all() else self.map(lambda values: values[rows])
 
@@ -251,8 +253,8 @@ _ARRAYS = attrgetter(*(f.name for f in fields(MaterialPoints) if f.name != "data
 
 
 class PlacedPoints(MaterialPoints):
-    """Material points with true positions, not relative to the grid's `base`; a `State` does not accept them."""
+    """Material points with true positions, not relative to the grid's `base`.  A `State` does not accept them."""
 
     def from_base(self, base: NDArray[np.float64]) -> MaterialPoints:
-        """Return the points with positions relative to `base` (d,), m, as in a state."""
+        """Return the points with positions relative to `base` (d,), in m, as in a state."""
         return MaterialPoints(**self._moved(-base))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Connected parts of the bodies: neither forces nor fluid pass between two parts."""
+"""Connected parts of the bodies.  Neither forces nor fluid pass between two parts."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Parts:
     nodes: NDArray[np.int64]  # index, from 0, of each active local node's part, else -1
 
     def largest(self, comm: MPI.Comm, part: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the largest of the values (n, ...) in each part (count, ...), or -inf; part (n,): their parts."""
+        """Return the largest value (count, ...) in each part, or -inf if empty.  `part` (n,): parts of `values`."""
         return largest_of_parts(comm, part, values, self.count)
 
 
@@ -36,7 +36,7 @@ class Parts:
 class OfParts:
     """Entries of a distributed vector on this process, with the connected part of each entry.
 
-    comm: the processes; of (n,): index of each entry's part; count: number of parts.
+    `of` (n,) is the index of each entry's part, and `count` is the number of parts.
     """
 
     comm: MPI.Comm
@@ -68,7 +68,7 @@ class OfParts:
 
 
 def largest_of_parts(comm: MPI.Comm, part: NDArray, values: NDArray, count: int) -> NDArray[np.float64]:
-    """Return the largest value (count, ...) in each part, over all processes; part (n,): index of each value's part."""
+    """Return the largest value (count, ...) in each part, over all processes.  `part` (n,): part of each value."""
     out = np.full((count, *values.shape[1:]), -np.inf)
     np.maximum.at(out, part, values)
     return over_all(comm, out, MPI.MAX)
@@ -77,10 +77,10 @@ def largest_of_parts(comm: MPI.Comm, part: NDArray, values: NDArray, count: int)
 def largest_of_bodies(
     comm: MPI.Comm, part: NDArray[np.int64], values: NDArray[np.float64], inside: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
-    """Return the largest values (k, bodies) in the connected parts of each body, over all processes; 0 without parts.
+    """Return the largest values (k, bodies) in the connected parts of each body on all processes, or 0 without parts.
 
-    part (m,): index, from 0, of the connected part of each column of `values` (k, m); inside (bodies, parts): whether a
-    part contains points of a body on this process.
+    `part` (m,): index, from 0, of the connected part of each column of `values` (k, m).
+    `inside` (bodies, parts): whether a part contains points of a body on this process.
     """
     largest = largest_of_parts(comm, part, values.T, inside.shape[1]).T[:, None]
     inside = over_all(comm, inside.astype(int), MPI.MAX) > 0
@@ -90,7 +90,7 @@ def largest_of_bodies(
 def relative(
     norms: NDArray[np.float64], scales: NDArray[np.float64], round_off: NDArray[np.float64] | float = 0.0
 ) -> NDArray[np.float64]:
-    """Return the norms divided by the scales: 0 where a norm is at most `round_off`, and inf instead of nan."""
+    """Return the norms divided by the scales.  Norms of at most `round_off` give 0.  Undefined ratios give inf."""
     ratio = np.empty(norms.shape)
     ratio.fill(np.inf)
     np.divide(norms, scales, out=ratio, where=(scales > 0) & (norms < np.inf))
@@ -101,8 +101,8 @@ def relative(
 def parts_of_cells(grid: Grid, active: NDArray[np.bool_]) -> tuple[NDArray[np.int64], int]:
     """Return the index (cells,), from 1, of each active local cell's connected part, and the number of parts.
 
-    Cells with common nodes belong to one part; inactive cells have index 0. Parts are numbered in the order of their
-    first cells, in the same way on any number of processes.
+    Cells with common nodes belong to one part.  Inactive cells have index 0.  Parts are numbered in the order of their
+    first cells, so that the numbers do not depend on the number of processes.
     """
     cells, out = active.nonzero()[0], np.zeros(len(active), dtype=np.int64)
     own, count = _touching(grid.cell_places(cells))
@@ -120,7 +120,7 @@ def parts_of_cells(grid: Grid, active: NDArray[np.bool_]) -> tuple[NDArray[np.in
 
 
 def parts_of_domains(grid: Grid, corners: NDArray[np.float64], copy: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the index (n,), from 0, of each domain's connected part; copy (n,): first cell of its copy of the grid."""
+    """Return the index (n,), from 0, of each domain's connected part.  `copy` (n,): first cell of its grid copy."""
     cell = grid.number(grid.index(corners.reshape(-1, grid.dim))).reshape(corners.shape[:2]) + copy.reshape(-1, 1)
     cell, at = np.unique(cell, return_inverse=True)
     own, count = _touching(
@@ -133,9 +133,10 @@ def parts_of_domains(grid: Grid, corners: NDArray[np.float64], copy: NDArray[np.
 def joined_parts(
     grid: Grid, part: NDArray[np.int64], count: int, pairs: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], int]:
-    """Return parts and count, results of `parts_of_cells`, after the parts of some pairs of cells have been joined.
+    """Join the parts of some pairs of cells.  Return the new `part` and `count`, results of `parts_of_cells`.
 
-    pairs (m, 2): lexicographic indices of active cells; each process may have other pairs. All processes must call it.
+    `pairs` (m, 2): lexicographic indices of active cells.  Each process may have other pairs.  All processes must call
+    this function.
     """
     cells, at = np.unique(np.concatenate(grid.comm.allgather(np.unique(pairs, axis=0))), return_inverse=True)
     of = np.where(grid.owner(cells) == grid.comm.rank, part[grid.locals[cells]], 0)
@@ -146,7 +147,7 @@ def joined_parts(
 
 
 def _touching(index: NDArray[np.int64]) -> tuple[NDArray[np.int64], int]:
-    """Return each cell's part (n,), from 0, and the number of parts; index (n, d + 1): grid indices and copy."""
+    """Return the part (n,), from 0, of cells, and the number of parts.  `index` (n, d + 1): grid indices and copy."""
     if not len(index):
         return np.empty(0, dtype=np.int64), 0
     low = index.min(axis=0)
@@ -159,7 +160,7 @@ def _touching(index: NDArray[np.int64]) -> tuple[NDArray[np.int64], int]:
 
 
 def _joined(rows: NDArray[np.int64], columns: NDArray[np.int64], shape: Sequence[int]) -> tuple[NDArray[np.int64], int]:
-    """Return the component of each row, an index from 0, and their number; rows with a common column are connected."""
+    """Return each row's component, from 0, and the number of components.  Rows with a common column are connected."""
     n = sum(shape)
     pairs = coo_array((np.ones(len(rows)), (rows, shape[0] + columns)), shape=(n, n)).tocsr()
     count, part = connected_components(pairs, directed=False)
@@ -171,8 +172,9 @@ def _over_processes(
 ) -> tuple[NDArray[np.int64], int]:
     """Return for each cell the index of its connected part, unique on all processes, and the number of parts.
 
-    own, count: index of each cell's part, and number of parts, on this process alone; nodes (n,): local indices of the
-    cells' nodes; of_node (n,): index of each node's part on this process.
+    `own`, `count`: index of each cell's part, and number of parts, on this process alone.
+    `nodes` (n,): local indices of the cells' nodes.
+    `of_node` (n,): index of each node's part on this process.
     """
     counts = grid.comm.allgather(count)
     start = sum(counts[: grid.comm.rank])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Convex polygons in the plane, many at once: cut by lines, and divided into quadrilaterals."""
+"""Convex polygons in the plane.  Many polygons are cut by lines, or divided into quadrilaterals, at once."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Polygons:
 
     @classmethod
     def rings(cls, x: NDArray[np.float64], edge: NDArray[np.int64] | None = None) -> Polygons:
-        """Return polygons with k vertices each, x (n, k, 2); by default their edges (n, k) have no identifiers."""
+        """Return polygons with k vertices x (n, k, 2) each.  By default their edges have no identifiers (n, k)."""
         n, k = x.shape[:2]
         return cls(x, np.full(n, k), np.full((n, k), NONE) if edge is None else edge)
 
@@ -32,32 +32,32 @@ class Polygons:
 
     @property
     def after(self) -> NDArray[np.float64]:
-        """Next vertex (n, k, 2), m, after each vertex."""
+        """Next vertex (n, k, 2), in m, after each vertex."""
         last = np.arange(self.x.shape[1]) == self.count[:, None] - 1
         return np.where(last[:, :, None], self.x[:, :1], np.roll(self.x, -1, axis=1))
 
     @property
     def area(self) -> NDArray[np.float64]:
-        """Areas (n,), m^2."""
+        """Areas (n,) of the polygons, in m^2."""
         return self._moments[0]
 
     @property
     def centroid(self) -> NDArray[np.float64]:
-        """Centroids (n, 2), m; for polygons without area the first vertex."""
+        """Centroids (n, 2), in m.  Polygons without area have the first vertex."""
         area, moment = self._moments
         some = area > 0
         return self.x[:, 0] + np.divide(moment, area[:, None], out=np.zeros_like(moment), where=some[:, None])
 
     @property
     def _moments(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Areas, m^2, and first moments of area about the first vertices, m^3."""
+        """Areas, in m^2, and first moments of area about the first vertices, in m^3."""
         y = self.x - self.x[:, :1]
         after = np.roll(y, -1, axis=1)
         twice = y[:, :, 0] * after[:, :, 1] - y[:, :, 1] * after[:, :, 0]
         return twice.sum(axis=1) / 2, np.einsum("nk,nki->ni", twice, y + after) / 6
 
     def cut(self, normal: NDArray[np.float64], level: NDArray[np.float64]) -> Polygons:
-        """Return the part of each polygon where normal . x <= level; normal (n, 2), level (n,).
+        """Return the part of each polygon where `normal . x <= level`, with normal (n, 2) and level (n,).
 
         The algorithm is that of Sutherland and Hodgman (1974). New edges have no identifier.
         """
@@ -78,7 +78,7 @@ class Polygons:
     def within(self, others: NDArray[np.float64], near: float = 0.0) -> Polygons:
         """Return the intersection of each polygon with a convex, anti-clockwise polygon with vertices (n, m, 2).
 
-        near: tolerance, m: vertices within this distance outside count as inside.
+        `near`, in m: tolerance; vertices that are outside by at most this distance count as inside.
         """
         out = self
         for k in range(others.shape[1]):
@@ -89,9 +89,9 @@ class Polygons:
         return out
 
     def simplified(self, near: float) -> Polygons:
-        """Return the polygons without vertices within `near`, m, of the next one, or inside a straight edge.
+        """Return the polygons without vertices inside straight edges, or within `near`, in m, of the next vertex.
 
-        A trapezoid with such a vertex has two diagonals that divide it equally well; rounding would select one.
+        A trapezoid with such a vertex has two diagonals that divide it equally well.  Rounding would select one.
         """
         used = np.arange(self.edge.shape[1]) < self.count[:, None]
         out = _packed(self.x, self.edge, used & (np.abs(self.after - self.x).max(axis=2) > near))
@@ -132,7 +132,7 @@ class Polygons:
         return rows, x, edge
 
     def _divided(self) -> tuple[Polygons, Polygons]:
-        """Cut a triangle off pentagons, a quadrilateral off polygons with more vertices; return both parts."""
+        """Cut a triangle off pentagons, and a quadrilateral off polygons with more vertices.  Return both parts."""
         n = self.x.shape[1]
         size = 3 if n == 5 else 4
         whole, best = self.area, None
@@ -159,7 +159,7 @@ class Polygons:
         return np.concatenate([x[:, :1], middle, x[:, 1:]], axis=1), edge[:, [0, 0, 1, 2]]
 
     def _joined(self, other: Polygons) -> Polygons:
-        """Return these polygons, then `other`, whose arrays have at most as many vertices per polygon as these."""
+        """Return these polygons, followed by `other`.  Polygons of `other` have at most as many vertices as these."""
         more = self.x.shape[1] - other.x.shape[1]
         x = np.concatenate([self.x, np.pad(other.x, ((0, 0), (0, more), (0, 0)), mode="edge")])
         edge = np.concatenate([self.edge, np.pad(other.edge, ((0, 0), (0, more)), constant_values=NONE)])

@@ -15,9 +15,9 @@ EDGES = 4
 "flow" in tests/plateaus.py by 1.6e-03 (relative), doubling it by 1.5e-03, and finer cells by 9.0e-02.
 """
 BENT = 1 - 3**0.5 / 2
-"""Largest deviation of a surface without a corner from its chord, in cell sizes; flatter parts are divided evenly.
+"""Largest deviation of a surface without a corner from its chord, in cell sizes.  Flatter parts are divided evenly.
 
-Source: exact for a chord and a radius of one cell size; the grid cannot resolve a circle of smaller radius.
+Source: exact for a chord and a radius of one cell size.  The grid cannot resolve a circle of smaller radius.
 """
 RING = np.array([0, 1, 3, 2])
 """Corners of a particle domain, anti-clockwise."""
@@ -29,8 +29,8 @@ _HALVES = np.array([[0, 0], [1, 0], [2, 0], [2, 1], [2, 2], [1, 2], [0, 2], [0, 
 class Region:
     """The filled part of n cells that the surface crosses once, in cell coordinates from 0 to 1.
 
-    cells: local indices of the cells; surface (n, EDGES + 1, 2): vertices of the surface in each cell, from entry to
-    exit, with the body on the left.
+    `cells`: local indices of the cells.
+    `surface` (n, EDGES + 1, 2): vertices of the surface in each cell, from entry to exit, with the body on the left.
     """
 
     def __init__(self, cells: NDArray[np.int64], surface: NDArray[np.float64]):
@@ -67,7 +67,7 @@ class Region:
         self.simple = (angles.min(axis=1) > 0) & (self.area > NEAR)
 
     def area_of(self, count: int) -> NDArray[np.float64]:
-        """Return the filled area fraction of each of `count` cells; 1 for cells that are not in `cells`."""
+        """Return the filled area fraction of each of `count` cells.  Cells that are not in `cells` have 1."""
         out = np.ones(count)
         out[self.cells] = self.area
         return out
@@ -75,7 +75,7 @@ class Region:
     def quadrilaterals(
         self, chosen: NDArray[np.bool_]
     ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.bool_]]:
-        """Return for m domains in chosen cells: index in `cells`, corners (m, 4, 2), flags (m, 4) of surface faces."""
+        """Return index in `cells` (m,), corners (m, 4, 2) and surface flags (m, 4) of new domains in chosen cells."""
         rows = np.flatnonzero(chosen[self.cells])
         corners, of = [np.zeros((0, 4, 2))], [rows[:0]]
         surface = [np.zeros((0, 4), dtype=bool)]
@@ -102,12 +102,14 @@ def resampled(
     Q: NDArray[np.float64],
     around: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Return the surface in n cells as vertices (n, EDGES + 1, 2) from P to Q (n, 2), at sharp bends or evenly spaced.
+    """Return the surface in n cells as vertices (n, EDGES + 1, 2) from P to Q (n, 2).
 
-    A shift of vertices preserves the area between surface and chord, in axisymmetry the volume of the area's ring.
+    Vertices lie at sharp bends.  Nearly straight parts are divided evenly.  The vertices are then shifted so that the
+    area between surface and chord is preserved, or in axisymmetry the volume of this area's ring.
 
-    of (m,): index of each segment's cell, ascending; x (m, 2, 2): both ends of each segment, from 0 to 1 in its cell;
-    around (n, 2): `Grid.around` at the lower and the upper side of each cell along the first axis.
+    `of` (m,): index of each segment's cell, ascending.
+    `x` (m, 2, 2): both ends of each segment, from 0 to 1 in its cell.
+    `around` (n, 2): `Grid.around` at the lower and the upper side of each cell along the first axis.
     """
     length = np.linalg.norm(x[:, 1] - x[:, 0], axis=1)
     arc = np.concatenate([[0.0], np.cumsum(length)])
@@ -166,7 +168,7 @@ def resampled(
 
 
 def _around(x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the distances (n,), 0 to 4, of positions (n, 2) from (0, 0), anti-clockwise along the unit square."""
+    """Return the distances (n,), from 0 to 4, of positions (n, 2) from (0, 0), anti-clockwise along the unit square."""
     near = np.stack([x[:, 1], 1 - x[:, 0], 1 - x[:, 1], x[:, 0]], axis=1)
     side = near.argmin(axis=1)
     along = np.stack([x[:, 0], 1 + x[:, 1], 3 - x[:, 0], 4 - x[:, 1]], axis=1)

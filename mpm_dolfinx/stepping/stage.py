@@ -77,19 +77,19 @@ def contacts_of(conditions: Sequence[Any]) -> list[Contact]:
 
 
 def named(conditions: Sequence[Any]) -> dict[str, Any]:
-    """Return the conditions by name.  A default name consists of kind and side, and if necessary a number.
+    """Return the conditions by name.  A default name consists of kind and side, and a number if necessary.
 
     Raises
     ------
     ValueError
-        An invalid name, or a name used twice.
+        A name is invalid, or two conditions have an equal name.
     """
     given = [getattr(one, "name", None) for one in conditions]
     for name, one in zip(given, conditions, strict=True):
         if name is not None and not (isinstance(name, str) and re.fullmatch(r"[\w .-]+", name)):
             raise ValueError(f"{line(one)}: name = {line(name)}, must consist of letters, digits, blanks and _ . -")
         if name is not None and given.count(name) > 1:
-            raise ValueError(f"{line(one)}: name = {line(name)} of another condition, must be unique")
+            raise ValueError(f"{line(one)}: name = {line(name)} is the name of another condition, must be unique")
     out: dict[str, Any] = {}
     for name, one in zip(given, conditions, strict=True):
         base, count = name or _default(one), 1
