@@ -13,8 +13,8 @@ face, r is the logarithmic mean over both cells.  With this mean, `r [p+ - p-]` 
 divided by the r of the storage term.  The tangent neglects the difference between the r of a face and the r of the
 storage term.  A is the exact area of the body on the face, and k is the conductivity.  The points x+- are the centroids
 of the material in both cells, and d+- are their distances from the face.  `layers` defines kappa and d of mixed cells.
-With distances from centroids, the error is 0.2 % for any filling of the cells.  With half of the cell size as distance,
-the error would be up to 12 %.  `nonorthogonal` corrects fluxes if the two centroids are offset along the face.  The sum
+Distances from centroids are exact for partly filled cells.  Half of the cell size would be too long there.
+`nonorthogonal` corrects fluxes if the two centroids are offset along the face.  The sum
 of the balances of all cells is the fluid balance of the bodies.  `fluid_content` defines the change of the content, and
 `time_integration` the integral over a substep.
 

@@ -12,11 +12,12 @@ Here t are tractions (dead loads or pressures), and m is the mass of soil and fl
 k/(rho_w g), and the relative density is rho = exp((p + p_n)/(2 K_w)).  `fluid_content` defines the content zeta and the
 mass potential pi.  In unsaturated soil, kappa is multiplied by k_r, and rho [zeta - zeta_n] is replaced by S rho
 [zeta - zeta_n] + (S - S_n) J_n n_n exp(p_n/K_w).  S(p) is the saturation, and n_n the porosity in state n.  Saturated
-pores have chi = S = k_r = 1.  If the pressure is constant in each cell, two-point fluxes kappa J |F^-T N|^2 (p+ - p-)/h
-are used.  Here h is the distance between the centres of the cells.  Two-point fluxes contain the mean of k_r between
-the two pressures.  They are not consistent under shear.  In axisymmetry F contains the circumferential stretch, and
-integrals extend over the full circumference.  Materials, retention, user-defined terms and time integration use the
-code of the material point method.  The two methods therefore differ only in discretisation.
+pores have chi = S = k_r = 1.  If the pressure is constant in each cell, two-point fluxes replace the last integral.
+They are kappa J |F^-T N|^2 / h times the jump of pi and of the potential of gravity, with the distance h between the
+centres of two cells.  Two-point fluxes contain the mean of k_r between the two pressures.  They are not consistent
+under shear.  In axisymmetry F contains the circumferential stretch, and integrals extend over the full circumference.
+Materials, retention, user-defined terms and time integration use the code of the material point method.  The two
+methods therefore differ only in discretisation.
 """
 
 from __future__ import annotations
