@@ -15,6 +15,7 @@ CEILINGS = {
     "parameters of the longest list": 12,
     "assignments of three and more values": 19,
     "changes of hidden state": 0,
+    "asserts and RuntimeErrors": 3,  # of users on other processes, and of two reference solutions
     "files that name a condition's class, most": 6,
     "lines of the package": 38780,
 }
