@@ -50,7 +50,7 @@ class SumsOfPart(NamedTuple):
     """Sums for theta and pi, in each cell, over one part of the scene's integration points: see `MeanDilatation`."""
 
     ratio: CellSums
-    stress: PointExpression  # components of the stress P, and its derivative with respect to theta
+    stress: PointExpression  # components of P for the residual, and the derivative with respect to theta for pi
 
 
 class FBar:
@@ -113,7 +113,6 @@ class FBar:
         """
         J_n, J = ufl.det(points.F), ufl.det(F)
         P, slope = self.stresses(law, F, Fbar, known)
-        # evaluated once for both residual and pi
         stress = PointExpression(ufl.as_vector([*(P[i] for i in np.ndindex(P.ufl_shape)), slope / J_n]), points)
         sums, own = SumsOfPart(CellSums([ratio], points), stress), points.follow(STRESS, P.ufl_shape)
         P_F, P_theta, slope_F, slope_theta = self._slopes(law, F, Fbar, values)
