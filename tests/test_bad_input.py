@@ -149,7 +149,7 @@ CASES = {
     ),
     "cohesion of nan": (lambda: sand(cohesion=NAN), "DruckerPrager: cohesion", "= nan"),
     "unknown cone": (lambda: sand(match="square"), "DruckerPrager: match", "'square'"),
-    "law without energy": (lambda: scene(materials=[law()]), "Law", "energy or kirchhoff"),
+    "law without energy": (lambda: scene(materials=[law()]), "Law: defines neither", "energy and kirchhoff"),
     "law of what there is not": (lambda: scene(materials=[law(energy=lambda F, colour: F[0, 0])]), "Law", "'colour'"),
     "law with a name that is taken": (lambda: scene(materials=[law(**PULL, state={"weight": 0.0})]), "Law", "'weight'"),
     "fluid of nan": (lambda: mpm.Fluid(bulk=NAN), "Fluid: bulk", "= nan"),

@@ -70,7 +70,7 @@ def test_terms_that_the_reference_cannot_take_are_refused_in_a_line():
     def reference(**options):
         return BiotFEM(mpm.Grid([0, 0], [1, 1], (2, 2)), SOFT, walls={"left": "xy"}, **options)
 
-    with pytest.raises(ValueError, match="drained sides or sources without fluid"):
+    with pytest.raises(ValueError, match="drained sides and sources must be given with a fluid"):
         reference(terms=[mpm.Source(lambda points, q: q * points.dx)])
     with pytest.raises(ValueError, match=r"terms = .*, must be a list of functions"):
         reference(terms=5)

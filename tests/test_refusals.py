@@ -124,8 +124,8 @@ CASES = {
     ),
     "law with an energy and a stress": (
         lambda: scene(materials=[law(energy=ENERGY, kirchhoff=lambda F, bulk: bulk * F)]),
-        "Law: has both",
-        "energy or kirchhoff",
+        "Law: defines both",
+        "energy and kirchhoff",
     ),
     "constant of nan": (lambda: scene(materials=[Scaled(1e6, 1e6, scale=NAN)]), "Scaled: scale", "nan"),
     "constant in words": (lambda: scene(materials=[Scaled(1e6, 1e6, scale="two")]), "Scaled: scale", "two"),
