@@ -17,9 +17,10 @@ and the cell volume |cell|.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property, partial
 from math import factorial
+from types import MappingProxyType
 
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -66,8 +67,11 @@ class FormPoints:
             name: grid.coefficient(shape)
             for name, shape in {"offset": (grid.dim,), "weight": (), **_moments(grid), **fields}.items()
         }
-        self.live: dict[str, Callable[[PointData], NDArray[np.float64]]] = {}
-        """Functions that return the values (n, size) of fields that change between assemblies."""
+        self.live: dict[str, Callable[[PointData], NDArray[np.float64]] | None] = {}
+        """Functions that return the values (n, size) of fields that change between assemblies.
+
+        A field has None if the caller passes its values to each assembly.
+        """
         self.dx = PointMeasure(grid.mesh, self.functions["weight"])
         self.sizes = {name: int(np.prod(shape, dtype=int)) for name, shape in fields.items()}
 
@@ -117,8 +121,10 @@ class FormPoints:
             self.follow("gradient", (self.grid.dim, self.grid.dim), partial(PointData.gradients, u=values))
         return self.functions["gradient"]
 
-    def follow(self, name: str, shape: tuple[int, ...], values: Callable[[PointData], NDArray]) -> fem.Function:
-        """Return a new field as a coefficient.  The function `values` is called at each assembly."""
+    def follow(
+        self, name: str, shape: tuple[int, ...], values: Callable[[PointData], NDArray] | None = None
+    ) -> fem.Function:
+        """Return a new field as a coefficient, with a function of its values as in `live`."""
         self.functions[name] = self.grid.coefficient(shape)
         self.live[name] = values
         return self.functions[name]
@@ -321,6 +327,10 @@ class PointData(Keyed):
         return out.reshape(len(self.cells), d**2)
 
 
+Given = Mapping[str, NDArray[np.float64]]
+"""Values (n, size) by name that a caller passes to the forms of n points, see `FormPoints.follow`."""
+NONE: Given = MappingProxyType({})
+
 Packed = tuple[NDArray[np.float64], list[tuple[slice, NDArray[np.float64], NDArray[np.intp]]]]
 """Coefficients with one row per point; and for each grid function its columns, its values, and the dofs of each row."""
 
@@ -347,11 +357,11 @@ class Rows:
         self._packed: Latest[Packed] = Latest()
         self._room: Latest[NDArray[np.float64]] = Latest(self._packed)
 
-    def live(self, data: PointData) -> dict[str, NDArray[np.float64]]:
+    def live(self, data: PointData, given: Given) -> Given:
         """Return the present values of the fields that change between assemblies."""
         out = {}
         for _, name, values in self._changing:
-            out[name] = values(data)
+            out[name] = given[name] if values is None else values(data)
         return out
 
     def room(self, size: int) -> NDArray[np.float64]:
@@ -361,9 +371,7 @@ class Rows:
             buffer = self._room(size, lambda: np.zeros((size, self._width)))
         return buffer
 
-    def __call__(
-        self, data: PointData, chosen: slice | NDArray[np.int64], live: dict[str, NDArray[np.float64]]
-    ) -> NDArray[np.float64]:
+    def __call__(self, data: PointData, chosen: slice | NDArray[np.int64], live: Given) -> NDArray[np.float64]:
         """Return the rows of the chosen points.  The argument `live` is the result of the method `live`."""
         if isinstance(chosen, slice):
             key = (data.key, chosen.start) if chosen.start else data.key
@@ -405,15 +413,15 @@ class PointForm:
         cells, bind = data.places.slots if self._dense else data.cells, self.compiled.bind
         return self._bound(cells, lambda: [(rows, bind(cells[rows])) for rows in in_chunks(len(cells))])
 
-    def assemble_vector(self, b: NDArray[np.float64], data: PointData) -> None:
+    def assemble_vector(self, b: NDArray[np.float64], data: PointData, given: Given = NONE) -> None:
         """Add the vector to the local array `b`, with contributions to ghosts in the ghost entries."""
-        live = self._rows.live(data)
+        live = self._rows.live(data, given)
         for part, form in self._parts(data):
             self.compiled.assemble_vector(b, self._rows(data, part, live), form)
 
     def assemble_matrix(self, A: PETSc.Mat, data: PointData) -> None:
         """Add the matrix to `A`, with unrolled local dofs and without final assembly."""
-        live = self._rows.live(data)
+        live = self._rows.live(data, NONE)
         for part, form in self._parts(data):
             self.compiled.assemble_matrix(A, self._rows(data, part, live), form)
 
@@ -493,12 +501,12 @@ class PointExpression:
         self._values = np.empty((max(sizes), int(np.prod(self._shape, dtype=int))))
         self._grid = points.grid
 
-    def live(self, data: PointData) -> dict[str, NDArray[np.float64]]:
+    def live(self, data: PointData, given: Given = NONE) -> Given:
         """Return the present values of the fields that change between assemblies."""
-        return self._rows.live(data)
+        return self._rows.live(data, given)
 
     def evaluate(
-        self, data: PointData, chosen: NDArray[np.int64] | None = None, live: dict[str, NDArray] | None = None
+        self, data: PointData, chosen: NDArray[np.int64] | None = None, live: Given | None = None
     ) -> NDArray[np.float64]:
         """Return the values (n, *shape) at the chosen points, by default at all points.
 
@@ -529,12 +537,9 @@ class CellSums:
         dense = points.grid.even
         self._form = PointForm(ufl.inner(ufl.as_vector(quantities), q) * points.dx, points, dense)
 
-    def __call__(self, data: PointData) -> NDArray[np.float64]:
+    def __call__(self, data: PointData, given: Given = NONE) -> NDArray[np.float64]:
         """Return the sums (cells, quantities) in the cells that contain points."""
-        if not self._grid.even:
-            sums = np.zeros((self._grid.num_local, self._count))
-            self._form.assemble_vector(sums.reshape(-1), data)
-            return sums[data.places.filled]
-        sums = np.zeros((len(data.places.filled), self._count))
-        self._form.assemble_vector(sums.reshape(-1), data)
-        return sums
+        even, filled = self._grid.even, data.places.filled
+        sums = np.zeros((len(filled) if even else self._grid.num_local, self._count))
+        self._form.assemble_vector(sums.reshape(-1), data, given)
+        return sums if even else sums[filled]

@@ -29,10 +29,10 @@ from mpm_dolfinx.base.caching import Latest
 from mpm_dolfinx.base.errors import NotConverged
 from mpm_dolfinx.base.tolerances import EPSILON, SAME
 from mpm_dolfinx.base.validation import asked, instance, line
-from mpm_dolfinx.forms.point_forms import FormPoints, PointData, PointExpression
+from mpm_dolfinx.forms.point_forms import FormPoints, Given, PointData, PointExpression
 from mpm_dolfinx.materials.skeleton import BY_SCENE, Skeleton
 from mpm_dolfinx.materials.user_functions import call, named
-from mpm_dolfinx.parallel.exchange import everywhere, first
+from mpm_dolfinx.parallel.exchange import first, together
 
 MOST, HALVINGS = 60, 25  # largest numbers of Newton iterations, and of halvings of steps in all iterations together
 
@@ -40,7 +40,6 @@ MOST, HALVINGS = 60, 25  # largest numbers of Newton iterations, and of halvings
 class Solved(NamedTuple):
     """Solution of the local equations at n points."""
 
-    key: object  # identifies the data for which the equations were solved
     unknowns: NDArray[np.float64]  # (n, m)
     trial: NDArray[np.float64]  # trial values (n, k)
     derive: Callable[[], Derived]  # function that returns the derivatives
@@ -80,16 +79,13 @@ class LocalUnknowns:
         z = _parts(trial.values())
         self._trial, self._dt = PointExpression(ufl.as_vector(z), points), values["dt"]
         self._solved: Latest[Solved] = Latest()
-        self._derived: Latest[tuple[Solved, Derived]] = Latest()
+        self._derived: Latest[Derived] = Latest()
         self._of_energy = law.kirchhoff is None
         bends = self._of_energy and law.residual is not None
         self._equations = _Equations(law, points, trial, {name: values[name] for name in BY_SCENE}, bends)
         m, k = self._equations.count, len(z)
         shapes = {"unknowns": (m,), "trial": (k,), "slopes": (m, k)} | ({"bends": (m, k * k)} if bends else {})
-        at = {
-            what: points.follow(f"local {what}", s, lambda data, w=what: self._now(data, w))
-            for what, s in shapes.items()
-        }
+        at = {what: points.follow(f"local {what}", s) for what, s in shapes.items()}
         # component by component: in 3D products of tensors take ten times as long to compile
         off = [z[j] - at["trial"][j] for j in range(k)]
         y = [at["unknowns"][i] + sum(at["slopes"][i, j] * off[j] for j in range(k)) for i in range(m)]
@@ -100,37 +96,21 @@ class LocalUnknowns:
         self.values = given | _named(shapes, y)
         self.known = self.values if self._of_energy else given | _named(shapes, at["unknowns"])
 
-    def update(self, data: PointData, derive: bool = True) -> None:
-        """Solve for the local unknowns of the points at their present F.  All processes must call this method.
+    def solve(self, data: PointData, derive: bool = True, motion: tuple = ()) -> Given:
+        """Solve for the local unknowns at the present F, and return values for the forms.  All processes must call it.
 
-        NotConverged is raised if the equations of a point have no solution.
+        derive: whether to differentiate with respect to the trial values, which `values` needs.
+        motion: key for `Latest`, which changes whenever trial values of the same `data` change, except with time.
 
         derive: whether to differentiate with respect to the trial values, which `values` needs.
         """
-        trial = self._trial.evaluate(data)
-        self._solved((data.key, trial, float(self._dt.value)), lambda: self._equations.solve(data, trial), self._comm)
+        key = data.key, motion, float(self._dt.value)
+        solved = self._solved(key, lambda: self._equations.solve(data, self._trial.evaluate(data)), self._comm)
+        out = {"local unknowns": solved.unknowns, "local trial": solved.trial}
         if derive or self._of_energy:
-            self.derive(data)
-
-    def derive(self, data: PointData) -> None:
-        """Differentiate the last solution with respect to the trial values.  All processes must call this method."""
-        solved = self._at(data)
-        self._derived(solved.derive, lambda: (solved, solved.derive()), self._comm)
-
-    def _at(self, data: PointData) -> Solved:
-        solved = self._solved.value
-        if solved is None or solved.key is not data.key:
-            raise RuntimeError(f"{self._law.__name__}: local unknowns are used before they are solved")
-        return solved
-
-    def _now(self, data: PointData, what: str) -> NDArray[np.float64]:
-        solved = self._at(data)
-        if what not in Derived._fields:
-            return getattr(solved, what)
-        of, derived = self._derived.value or (None, None)
-        if of is not solved:
-            raise RuntimeError(f"{self._law.__name__}: derivatives of local unknowns are used before they are computed")
-        return getattr(derived, what)
+            derived = self._derived(solved.derive, solved.derive, self._comm)
+            out |= {"local slopes": derived.slopes, "local bends": derived.bends}
+        return out
 
 
 class _Equations:
@@ -158,7 +138,7 @@ class _Equations:
         if law.residual is None:
             return
         k = sum(_size(s) for s in self._trial.values())
-        y, z = (ufl.variable(own.follow(name, (size,), _given)) for name, size in (("unknowns", m), ("trial", k)))
+        y, z = (ufl.variable(own.follow(name, (size,))) for name, size in (("unknowns", m), ("trial", k)))
         given = {name: getattr(own, name) for name in self._names} | _named(self._unknowns, y) | self._by_scene
         residual = call(law.residual, **self._with_trial(_named(self._trial, z)), **given)
         found = named(f"{law.__name__}.residual", residual, self._unknowns)
@@ -169,7 +149,7 @@ class _Equations:
         self._slopes = PointExpression(ufl.as_vector([*steps, *(by_z[i, j] for i in range(m) for j in range(k))]), own)
         self._bends = None
         if bends:  # the second derivative of f along y = y* + Y (z - z*)
-            Y = own.follow("slopes", (m, k), _given)
+            Y = own.follow("slopes", (m, k))
             along = ufl.as_matrix([[_along(by_y, by_z, Y, m, (i,), j) for j in range(k)] for i in range(m)])
             by_y, by_z = ufl.diff(along, y), ufl.diff(along, z)
             each = product(range(m), range(k), range(k))
@@ -209,7 +189,7 @@ class _Equations:
             bends = -_solve(by_y, second.reshape(n, m, k * k))
             return Derived(slopes.reshape(n, m * k), bends.reshape(n, m * k * k))
 
-        return Solved(data.key, y, trial, derive)
+        return Solved(y, trial, derive)
 
     def _refuse(self, data: PointData, failed: NDArray[np.int64], why: str) -> None:
         """Raise NotConverged on all processes if any point has failed."""
@@ -232,14 +212,14 @@ class _Equations:
             return [found[of][0].reshape(n, _size(shape)) for of, shape in self._unknowns.items()]
 
         def derive() -> Derived:
-            each = everywhere(self._grid.comm, lambda: [self._slopes_of(of, found[of][1], n) for of in self._unknowns])
+            each = together(self._grid.comm, lambda: [self._slopes_of(of, found[of][1], n) for of in self._unknowns])
             slopes = np.concatenate(each, axis=1)
             self._refuse(data, np.flatnonzero(~np.isfinite(slopes).all(axis=(1, 2))), ".solution: is not finite")
             return Derived(slopes.reshape(n, self.count * k))
 
-        y = np.concatenate(everywhere(self._grid.comm, solution), axis=1)
+        y = np.concatenate(together(self._grid.comm, solution), axis=1)
         self._refuse(data, np.flatnonzero(~np.isfinite(y).all(axis=1)), ".solution: is not finite")
-        return Solved(data.key, y, trial, derive)
+        return Solved(y, trial, derive)
 
     @property
     def _title(self) -> str:
@@ -373,7 +353,3 @@ def _named(shapes: Mapping[str, tuple[int, ...]], vector) -> dict:
 
 def _nested(vector, index: NDArray[np.int64]):
     return [_nested(vector, row) for row in index] if index.ndim else vector[int(index)]
-
-
-def _given(data: PointData) -> NDArray[np.float64]:
-    raise RuntimeError("trial values and unknowns must be passed to each evaluation")

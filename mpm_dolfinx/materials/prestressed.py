@@ -25,7 +25,7 @@ AT_REST = " at rest"
 
 
 def stressed(m: Skeleton, knows_space: bool) -> Skeleton:
-    """Return a material with a point field, set later, for its initial stress or for the strain that causes it.
+    """Return a material with a point field for its initial stress or initial strain.
 
     knows_space: whether the material's law accepts F (3, 3).
     """

@@ -24,7 +24,7 @@ PLANE, SPACE = ((0, 0), (1, 1), (2, 2), (0, 1)), ((0, 0), (1, 1), (2, 2), (0, 1)
 
 
 class Isotropic:
-    """Isotropic functions of a symmetric UFL tensor b (3, 3); `plane` tells whether the third axis is principal."""
+    """Isotropic functions of a symmetric UFL tensor (3, 3)."""
 
     def __init__(self, b, plane: bool):
         self._b, self._plane = b, plane

@@ -59,7 +59,7 @@ def stiffness(material: Skeleton) -> NDArray[np.float64]:
 
 
 def kinks(grid: Grid, V: fem.FunctionSpace, strength: ufl.core.expr.Expr, power: int) -> FacetForm:
-    """Return the form `int strength h^power [d_n u].[d_n v] dS` over faces, with the mean cell size h, in m."""
+    """Return the form `int strength h^power [d_n u].[d_n v] dS` over faces, with the cell size h."""
     n = ufl.FacetNormal(grid.mesh)("+")
     *_, across = across_faces(grid, n)
     dS = ufl.Measure("dS", domain=grid.mesh, subdomain_id=_compat.SUBDOMAIN, metadata={"quadrature_degree": 2})

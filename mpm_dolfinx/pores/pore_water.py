@@ -37,7 +37,7 @@ class PoreWater:
     scale: NDArray[np.float64]  # (n,) suction at which the pores of each cell drain, Pa
 
     def emptied(self, p: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return (S - 1) rho of the pieces at pressures p, in Pa, and its derivative with respect to p."""
+        """Return (S - 1) rho of the pieces at pressures p, and its derivative."""
         return emptied(p, self.bulk, *self.saturation(p)[:2])
 
     def of_cells(self, p: NDArray[np.float64]) -> NDArray[np.float64]:

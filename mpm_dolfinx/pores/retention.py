@@ -401,7 +401,7 @@ class Conductance:
         self._edges = edges
 
     def __call__(self, p: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return three columns at pressures p, in Pa: the integral, in Pa, k_r, and dk_r/dp, in 1/Pa."""
+        """Return the integral, k_r and dk_r/dp at pressures p, in Pa, as columns."""
         s = np.clip(-p, self._edges[0], self._edges[-1])
         z = (np.log(s) - self._low) / self._step
         i = np.minimum(z.astype(np.int64), ROWS - 2)

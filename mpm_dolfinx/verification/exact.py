@@ -54,7 +54,7 @@ def _series(amplitudes: Array, roots: Array, T: Array) -> Array:
 
 
 def _transient(k: complex, z: ArrayLike, T: Array) -> NDArray:
-    """Return the inverse Laplace transform of exp(-z X) / (X (X - k)), X = sqrt(s); Abramowitz & Stegun 29.3.90."""
+    """Return the inverse of the transform exp(-z X) / (X (X - k)); Abramowitz & Stegun 29.3.90."""
     return np.exp(-np.square(z) / (4 * T)) * erfcx(z / (2 * np.sqrt(T)) - k * np.sqrt(T))
 
 
@@ -228,7 +228,7 @@ def cryer_pressure(t: ArrayLike, radius: float, cv: float, nu: float, p0: float 
 
 
 def _cryer_short(mu: float, T: Array) -> Array:
-    """Return the inverse Laplace transform of (1 - 2 X exp(-X)) / (X² - mu X + mu), X = sqrt(s)."""
+    """Return the inverse of the transform (1 - 2 X exp(-X)) / (X² - mu X + mu)."""
     k = (mu + 1j * np.sqrt(mu * (4 - mu))) / 2
     uniform = (k * _transient(k, 0, T)).imag / k.imag
     gauss = np.exp(-1 / (4 * T)) / np.sqrt(np.pi * T)
