@@ -19,13 +19,12 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Body:
-    """A seeded body: the reference geometry of all its particle domains.
+    """A seeded body: the reference geometry of all its particle domains, the same on every process.
 
-    Every process has the same body.  Each domain is the image of a box under `map`, see `mapped`.  Subclasses define
-    the
-    edge lengths `spacing` of the boxes, in m.  Their shape is (n, d), or (d,) if all boxes are equal.  A `RowsBody` has
-    the
-    smallest edge lengths (d,).  Large bodies are processed in chunks, so that no array over all domains is stored.
+    Each domain is the image of a box under `map`.  Subclasses define the edge lengths `spacing` of the boxes, in m.
+    Their
+    shape is (n, d), or (d,) if all boxes are equal.  A `RowsBody` has the smallest edge lengths (d,).  Large bodies are
+    processed in chunks, so no array over all domains is stored.
     """
 
     material: int = 0  # index in the scene's list of materials
@@ -93,9 +92,8 @@ class Body:
     def facing(self, axis: int, end: int, least: float = 0.0) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return the surface faces at the lower (0) or upper (1) end of an axis, as domains (n,) and face indices (n,).
 
-        In unstructured bodies, the outward unit normal of each of these faces has its largest component towards this
-        end.
-        The largest component exceeds `least`.
+        In unstructured bodies, the largest component of each face's unit normal points to this end, and exceeds
+        `least`.
         """
         row = self._with_face(axis, end)
         return row, np.full(len(row), 2 * axis + end)
@@ -133,10 +131,7 @@ class Body:
         return images.reshape(X.shape)
 
     def bend(self, chosen: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return how far the straight edges of chosen domains are from the curved images of their box edges, in m.
-
-        The distance (n,) of each domain is the largest distance between the midpoints of a straight and a curved edge.
-        """
+        """Return how far the straight edges of chosen domains are from the curved images of their box edges, in m."""
         out = np.zeros(len(chosen))
         if self.map is None:
             return out
@@ -158,9 +153,7 @@ class Body:
         return float(len(self) * self.spacing.prod())
 
     def size(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
-        """Return the edge lengths (n, d), in m, of boxes with the proportions of chosen boxes and the volumes of their
-        domains.
-        """
+        """Return the edge lengths (n, d), in m, of chosen boxes, scaled uniformly to the volumes of their domains."""
         boxes = self.boxes(chosen)
         if self.aligned:
             return boxes

@@ -92,9 +92,7 @@ class Surface:
         return interpolate(domain, self.xi.reshape(-1, self.xi.shape[2])).reshape(self.xi.shape)
 
     def reference(self, at: NDArray[np.int64], xi: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the reference positions (n, d), in m, of local coordinates xi (n, d) in the domains of polygons `at`
-        (n,).
-        """
+        """Return the reference positions (n, d), in m, at local coordinates xi (n, d) in the domains of polygons."""
         return np.clip(interpolate(self.before[at], xi), *self.region)
 
     @cached_property
@@ -275,12 +273,7 @@ def _clipped(
 
 
 def _free(own: Faces, others: Sequence[Faces]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the parts of faces that touch no other body.
-
-    A part is a rectangle if its face and all covering faces have parallel edges.  Otherwise the part is a triangle with
-    a
-    repeated last corner.
-    """
+    """Return the parts of faces that touch no other body, as rectangles or as triangles with a repeated last corner."""
     on = [covers(own, other) for other in others]
     if not on:
         return np.arange(len(own.row)), np.tile(BITS, (len(own.row), 1, 1)).astype(float)
@@ -305,9 +298,7 @@ def interpolate(corners: NDArray[np.float64], xi: NDArray[np.float64]) -> NDArra
 def on_face(
     corners: NDArray[np.float64], face: NDArray[np.int64], x: NDArray[np.float64], xi: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Project positions x (n, 3), in m, onto faces, and return xi (n, 3) with the tangential components of the
-    projections.
-    """
+    """Return xi (n, 3) with the tangential components of positions x (n, 3), in m, projected onto faces."""
     quads = np.take_along_axis(corners, FACES[3][face][:, :, None], axis=1)
     normal = face_vectors(corners, face)
     t, _ = local(quads, x[:, None], normal)

@@ -57,7 +57,7 @@ def edges(kind: str) -> list[tuple[int, int]]:
 def distinct(rows: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Group the equal rows of an array (n, k), and return the first row of each group and the group of each row.
 
-    Groups are sorted by the values of their rows.  `np.unique` takes five times as long.
+    The groups are sorted by the values of their rows.
     """
     order = np.lexsort(rows.T[::-1])
     new = np.append(True, (np.diff(rows[order], axis=0) != 0).any(axis=1))[: len(rows)]
@@ -126,11 +126,7 @@ class Polytopes:
 
     @classmethod
     def of(cls, x: NDArray[np.float64], cells: dict[str, NDArray[np.int64]]) -> Polytopes:
-        """Return all cells as polytopes.
-
-        `x` (nodes, d), in m: positions of the nodes.
-        `cells`: nodes (n, k) of the cells, by cell type.
-        """
+        """Return all cells as polytopes, from the nodes `x` (nodes, d), in m, and the nodes of cells by type."""
         d = x.shape[1]
         most = [max(len(of) for of in parts) for parts in zip(*(_shape(kind) for kind in cells), strict=True)]
         rows = [_polytopes(d, kind, x[nodes], *most) for kind, nodes in cells.items()]

@@ -213,10 +213,7 @@ def _warn_curved(name: str, count: int, off: float) -> None:
 def _merged(
     cells: dict[str, NDArray[np.int64]], parts: dict[str, dict[str, NDArray[np.int64]]]
 ) -> tuple[dict[str, NDArray[np.int64]], dict[str, dict[str, NDArray[np.int64]]]]:
-    """Return the cells without repetitions, and the cells of each part.
-
-    gmsh's format 2.2 repeats a cell for each of its physical groups.
-    """
+    """Return the cells without gmsh's repetitions for several physical groups, and the cells of each part."""
     cells = dict(cells)
     for kind, rows in cells.items():
         first, same = distinct(np.sort(rows, axis=1))
@@ -284,8 +281,7 @@ def _numbers(names: Mapping[str, int] | None) -> Mapping[str, int]:
 
 
 def numbered(tags: NDArray[np.int64], names: Mapping[str, int]) -> Iterator[tuple[str, NDArray[np.bool_]]]:
-    """Yield each name, and which entries of `tags` (n,) have this name.  Digits are the name of a tag without a name.
-    """
+    """Yield each name, and which entries of `tags` (n,) have this name.  Tags without a name are named by digits."""
     for name, number in names.items():
         if (tags == number).any():
             yield name, tags == number

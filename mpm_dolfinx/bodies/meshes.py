@@ -210,9 +210,7 @@ def _divided(grid: Grid, mesh: Mesh, part: str | None, per_cell: int, name: str)
 def _domains(mesh: Mesh, cells: Mapping[str, NDArray[np.int64]]) -> list[tuple[NDArray, NDArray, NDArray]]:
     """Return the corners of the particle domains, the mesh facet of each face, and the cell of each domain.
 
-    A facet is given by its nodes in ascending order, with -1 before the nodes of a triangle.  A face inside a cell has
-    only
-    -1.
+    A facet is given by its nodes, with -1 before the nodes of a triangle.  A face inside a cell has only -1.
     """
     d = mesh.x.shape[1]
     start = 0
@@ -249,10 +247,7 @@ def _check_sides(
     shared: NDArray[np.bool_],
     name: str,
 ) -> None:
-    """Raise an error if both cells of a facet lie on one side of this facet.
-
-    `shared` (m,): whether each facet belongs to two cells.  The outward area vectors of two such cells must cancel.
-    """
+    """Raise an error if both cells of a `shared` facet lie on one side of this facet."""
     d, size = domains.shape[2], len(facets)
     outward = np.stack([face_vectors(domains, face) for face in range(2 * d)], axis=1).reshape(-1, d)
     of = facet.ravel()
@@ -305,10 +300,7 @@ def _check_overlaps(
 def _box_overlaps(
     boxes: NDArray[np.float64], size: NDArray[np.float64], outer: NDArray[np.int64], slack: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return pairs of cells with overlapping bounding boxes.  The first cell of a pair is one of `outer`.
-
-    Boxes are grouped by size, because one search for all sizes would need the radius of the largest box.
-    """
+    """Return pairs of cells with overlapping bounding boxes.  The first cell of a pair is one of `outer`."""
     octave, middle = np.frexp(size.max(axis=1))[1], (boxes[:, 0] + boxes[:, 1]) / 2
     of = [[rows[octave[rows] == k] for k in np.unique(octave[rows])] for rows in (outer, np.arange(len(boxes)))]
     largest = [[size[rows].max(axis=0) for rows in groups] for groups in of]

@@ -68,12 +68,11 @@ def _along(corners: NDArray, unit_weight: NDArray, x: NDArray, places: NDArray) 
 
 
 def _hits(corners: NDArray, at: NDArray) -> Iterator[tuple[NDArray, NDArray, NDArray]]:
-    """Yield the crossings of vertical lines with the faces of domains.
+    """Yield the crossings of vertical lines with the faces of domains, each line with its own domain.
 
-    Line i is at the position `at[i]` (d-1,) and is intersected with the domain `corners[i]` only.  Each face yields the
-    lines that cross the face, the heights of the crossings in m, and signs.  The sign is 1 where a rising line leaves
-    the
-    domain, and -1 where the line enters.
+    Each face yields the lines that cross the face, the heights of the crossings, in m, and signs.  The sign is 1 where
+    a
+    rising line leaves the domain, and -1 where the line enters.
     """
     d = corners.shape[2]
     for face, turn in zip(FACES[d], FACE_SIGNS, strict=False):

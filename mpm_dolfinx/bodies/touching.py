@@ -51,9 +51,7 @@ class Faces:
         return cls.of(body, *body.outer())
 
     def edge(self) -> NDArray[np.float64]:
-        """Return the length (n,), in m, of the shortest edge of each face.  Edges of unit width in plane strain are
-        ignored.
-        """
+        """Return the length (n,), in m, of the shortest edge of each face, without the unit width in plane strain."""
         c = self.corners
         pairs = [(1, 0), (3, 2), (2, 0), (3, 1)] if (self.index[:, 0] != self.index[:, 2]).any() else [(1, 0)]
         return np.min([np.linalg.norm(c[:, i] - c[:, j], axis=1) for i, j in pairs], axis=0)
@@ -186,9 +184,7 @@ def covered(count: int, cover: Cover) -> NDArray[np.float64]:
 def uncovered_triangles(
     own: Faces, cover: Cover, faces: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Divide the uncovered parts of `faces` into triangles, and return the face (n,) and corners (n, 3, 2) of each
-    triangle.
-    """
+    """Divide the uncovered parts of `faces` into triangles, and return the face and corners (n, 3, 2) of each."""
     corners = own.corners[faces]
     normal = own.outward[faces] / np.linalg.norm(own.outward[faces], axis=1, keepdims=True)
     whole, _ = local(_parallelograms(corners), corners, normal)
@@ -249,8 +245,7 @@ def _areas(s: NDArray) -> NDArray[np.float64]:
 
 
 def split(s: NDArray, owner: NDArray, axis: int, plane) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-    """Divide triangles (3, e, n) at a plane normal to an axis.  Return parts and owners below the plane, then above it.
-    """
+    """Divide triangles (3, e, n) at a plane normal to an axis.  Return parts and owners below, then above the plane."""
     plane = np.broadcast_to(plane, len(owner))
     low, high = s[:, axis].min(axis=0) < plane, s[:, axis].max(axis=0) > plane
     both = np.flatnonzero(low & high)

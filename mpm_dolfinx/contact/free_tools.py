@@ -137,10 +137,7 @@ class FreeTools(ContactProblem):
         return np.hstack([force, moment])
 
     def _sizes(self, found: Found, force: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return upper bounds of the generalised forces on the tools.
-
-        The bound of a moment is lever arm times force, because the moment of a smooth disc is only a rounding error.
-        """
+        """Return upper bounds of the generalised forces on the tools, with lever arm times force for a moment."""
         moment = np.linalg.norm(found.at.arm, axis=1) * np.linalg.norm(force, axis=1)
         return np.hstack([force, moment[:, None][:, : self.grid.dim == 2]])
 

@@ -53,9 +53,7 @@ SLIVER = 0.25  # fraction of a cell's face; penetrations of smaller contact area
 ROUNDS = 20  # largest number of augmentations
 BEGIN = 1.0, np.inf, 0.0, 0.0  # initial values of `ContactState.updates`
 SLOW, STIFFER = 0.6, 10.0
-"""Each augmentation should reduce the penetration to less than SLOW times the previous one.  Otherwise the stiffness is
-multiplied by STIFFER.
-"""
+"""The stiffness is multiplied by STIFFER if an augmentation leaves more than SLOW times the previous penetration."""
 RAMP = 10.0  # largest ratio of adhesion to normal pressure
 
 
@@ -155,12 +153,7 @@ class ContactLaw:
     def _friction(
         self, state: ContactState, n: NDArray, slip: NDArray, old: NDArray, pressure: NDArray, on: NDArray
     ) -> tuple:
-        """Return the fields of `Touch` from `sticks` to `by_pressure`.
-
-        `n` (k, d): mean normal of the pairs of each condition.
-        `slip` (k, d), in m: mean slip of these pairs in the step.
-        `old` (k, d), in Pa: mean shear traction of these pairs before the step.
-        """
+        """Return the fields of `Touch` from `sticks` to `by_pressure`, from means over the pairs of each condition."""
         P = np.eye(n.shape[1]) - n[:, :, None] * n[:, None, :]
         hold = np.where(self.strength.any(axis=1), self._hold, 0.0) * on
         (mu, adhesion), slips = self.strength.T, state.slips

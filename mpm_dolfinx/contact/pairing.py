@@ -46,8 +46,7 @@ DEEP = 0.25
 CANDIDATES = {2: 8, 3: 24}
 """Number of nearest points on the other surface whose faces may contain the opposite position."""
 BESIDE = 0.6
-"""Distance from the surface of another group, divided by the cell size, below which domain corners follow the Q1 field.
-"""
+"""Distance from another group, divided by the cell size, below which domain corners follow the Q1 field alone."""
 PLACES = 1 << 32
 """Upper bound of the number of quadrature points of a process on a surface."""
 
@@ -114,12 +113,7 @@ class Contacts(Touching):
         present: MaterialPoints,
         cell_pairs: Callable[[], NDArray[np.int64]],
     ) -> tuple[ContactLaw, Origin]:
-        """Return the contact law and the origin of pairs.
-
-        `points`: points at the start of the step, with the contact history.
-        `seen`: points for which the pairs were found.
-        `present`: points at their current positions.
-        """
+        """Return the contact law and the origin of pairs that were found for the points `seen`."""
         grid = self.grid
         d = self.grid.dim
         rows = []
@@ -235,10 +229,7 @@ class Contacts(Touching):
         return facets, Pairs(row[order], other[order], t[order], gap[order])
 
     def _under(self, facets: Facets, chosen: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the cells just inside the chosen facets at positions x.
-
-        A cell without a quadrature point of the face is replaced by the cell of the facet's own point.
-        """
+        """Return the cells just inside the chosen facets at positions x, or the cells of the facets' own points."""
         grid, inside = self.grid, x - NEAR * self.grid.least * facets.outward[chosen]
         number = grid.number(grid.index_from_base(inside)) + facets.cell[chosen] // grid.cells * grid.cells
         keys = np.unique(facets.face * grid.all_cells + facets.cell)
@@ -313,10 +304,7 @@ class ContactLoads(ContactProblem):
 
 
 def _ranks(setting: Setting) -> NDArray[np.int64]:
-    """Return the rank of the connected part of each point.
-
-    Parts are ranked by surface area, then by extent, so that the order of two parts is the same in all stages.
-    """
+    """Return the rank of the connected part of each point, by surface area and extent, the same in all stages."""
     grid, bodies = setting.grid, setting.sides.bodies
     corners = np.concatenate([body.corners() for body in bodies])
     copy = np.asarray(grid.copy(np.arange(len(corners))))

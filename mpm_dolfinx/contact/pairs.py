@@ -66,8 +66,7 @@ class Pairs:
         return self.grid.reach
 
     def other_side(self) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
-        """Return the cells (m,) and shape functions (m, 2^d) at the opposite positions, or None for pairs with a tool.
-        """
+        """Return the cells (m,) and shape functions (m, 2^d) at the opposite positions, or None with a tool."""
         return None
 
     def operator(self, unknowns: Unknowns) -> PETSc.Mat:

@@ -403,10 +403,7 @@ class ContactProblem(Loads):
         return bool(late.any())
 
     def _continued(self, new: Current, at: At) -> tuple[Current, NDArray[np.bool_]]:
-        """Return the contact with updated pairs, and in which parts of the bodies gaps change by more than `DEPTH`.
-
-        Pairs that are open before and after the update are ignored, and so are parts after `FOLLOWS` updates.
-        """
+        """Return the contact with updated pairs, and in which parts of the bodies gaps change by more than `DEPTH`."""
         found = self.found(at)
         law, state = self.now.law, self.now.state
         pairs = new.law.pairs

@@ -187,9 +187,7 @@ class Convex(Placed):
         return self._each(y).max(axis=1)
 
     def normal(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the gradients (n, d) of the distance.  Where several planes are equally near, return their mean
-        normal.
-        """
+        """Return the gradients (n, d) of the distance.  Where planes are equally near, return their mean normal."""
         each = self._each(y)
         near = each >= each.max(axis=1, keepdims=True) - ROUNDED * np.abs(each).max(axis=1, keepdims=True)
         return near @ self._planes[:, :-1] / near.sum(axis=1, keepdims=True)

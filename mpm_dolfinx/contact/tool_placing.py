@@ -99,9 +99,7 @@ class Tools(Touching):
 
     @property
     def masses(self) -> NDArray[np.float64]:
-        """Masses (kg) and moments of inertia (kg m^2) of the tools, as an array (tools, q).  Tools that are not free
-        have 0.
-        """
+        """Masses (kg) and moments of inertia (kg m^2) of free tools, as an array (tools, q), zero for other tools."""
         d = self.grid.dim
         out = np.array([np.full(motion_count(d), float(tool.mass or 0)) for tool in self.tools])
         for row, tool in zip(out, self.tools, strict=True):
@@ -142,11 +140,7 @@ class Tools(Touching):
         return self._pose(self.tools[number], t)
 
     def _posed(self, tool: Tool, start: float, t: float) -> Pose:
-        """Return the pose of a tool at time t, the end of a substep.
-
-        With inertia, `in_step` corrects the pose after the first of two substeps, so that velocities are second-order
-        accurate.
-        """
+        """Return the pose of a tool at the end of a substep, corrected for second-order velocities with inertia."""
         pose = self._pose(tool, t)
         if self._end is None or not start < t < self._end or tool.free:
             return pose
@@ -249,10 +243,6 @@ class Tools(Touching):
         The last loaded node also represents half a cell outside the edge, so half a cell inside has no contact.  Edges
         beyond
         which the body ends are ignored.  A tool narrower than a cell keeps its whole contact.
-
-        `x` (n, d), in m: positions on the surface.
-        `unit` (n, d): outward unit normals at these positions.
-        `faces` (n,): whether the surface at each position faces the tool.
         """
         grid, (y, n) = self.grid, (x[faces], unit[faces])
         h = grid.sizes_at(y)

@@ -130,8 +130,7 @@ class CutDomains(Keyed):
         self.pieces_to_cells = exchange.send
         """Function that sends values of the pieces to the owners of their cells."""
         self.to_pieces = exchange.back
-        """Function that sends values of the pieces from the owners of their cells back to the processes of the points.
-        """
+        """Function that returns values of the pieces from the owners of their cells to the processes of the points."""
         self.cells, self.x = grid.locals[exchange.send(pieces.cell)], exchange.send(pieces.x)
         """For each of m pieces: the owned cell (m,) that contains it, and its centroid (m, d), in m."""
         self.mixed = exchange.send(pieces.mixed) if grid.dim == 3 and domains else None
@@ -180,8 +179,7 @@ class CutDomains(Keyed):
         return means.T.copy().reshape(len(self.points), *values.shape[1:])
 
     def in_plane(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return for each point the volume mean over its pieces, or in axisymmetry the area mean over their sections.
-        """
+        """Return for each point the volume mean over its pieces, in axisymmetry the area mean over their sections."""
         if not self.grid.axisymmetric:
             return self.mean(values)
         area = self.pieces.fraction / self.pieces.hoop[:, 3]

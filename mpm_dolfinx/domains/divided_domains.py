@@ -32,8 +32,6 @@ class SeededDomains:
 
     The identifier of a part follows from its domain and its interval.  It is a number for `material_points.body_of`
     with an odd index in the body.  Renewed points have even indices.
-
-    `bodies`: all bodies of the scene.
     """
 
     def __init__(self, bodies: Sequence[Body]):

@@ -43,10 +43,7 @@ def gradient(
 def _of_hexahedra(
     corners: NDArray[np.float64], reference: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the mean F over the simplices of hexahedra, and the reference volumes V.
-
-    With the corner positions x_k and the reference positions X_k, `F = sum_k x_k dV/dX_k / V`.
-    """
+    """Return the mean F over the simplices of hexahedra, and the reference volumes."""
     x, X = (np.ascontiguousarray((y - y[:, :1]).transpose(1, 2, 0)) for y in (corners, reference))
     slope = _slopes(X)
     volume = (X * slope).sum(axis=(0, 1)) / 3

@@ -36,13 +36,7 @@ from mpm_dolfinx.points.material_points import MaterialPoints, body_of, cofactor
 
 
 class Neighbours:
-    """Neighbours of domains across shared faces, including neighbours on other processes.
-
-    `comm`: communicator of the processes.
-    `bodies`: all bodies of the scene.
-    `points`: material points of this process.
-    `chosen` (n,): whether to find the neighbours of each point.
-    """
+    """Neighbours of the `chosen` domains across shared faces, including neighbours on other processes."""
 
     def __init__(self, comm: MPI.Intracomm, bodies: Sequence[Body], points: MaterialPoints, chosen: NDArray[np.bool_]):
         dim = bodies[0].dim
@@ -86,11 +80,7 @@ class Neighbours:
 
 
 class LinearGradients:
-    """Deformation gradients at the pieces of the domains in a scene.
-
-    `comm`: communicator of the processes.
-    `bodies`: all bodies of the scene.
-    """
+    """Deformation gradients at the pieces of the domains in a scene."""
 
     def __init__(self, comm: MPI.Intracomm, bodies: Sequence[Body]):
         self._comm, self._bodies = comm, bodies
@@ -99,9 +89,7 @@ class LinearGradients:
     def at_pieces(
         self, cut: CutDomains, F: NDArray[np.float64], elastic: NDArray[np.bool_], soils: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return `linear_gradients` that vary only in domains of `elastic` points.  All processes must call this
-        method.
-        """
+        """Return `linear_gradients` that vary only in domains of `elastic` points.  All processes must call it."""
         make = partial(Neighbours, self._comm, self._bodies, cut.points, elastic)
         return linear_gradients(self._neighbours((cut.points.id, elastic), make, self._comm), cut, F, soils)
 
@@ -127,7 +115,7 @@ def _faces_of_parts(
 
     On a lattice, the key consists of the lower corner, the normal and the size of the face.  Other whole domains keep
     the
-    keys `seeded` of their faces.  Other parts have neighbours only in their domain.
+    keys `seeded`.  Other parts have neighbours only in their domain.
     """
     dim, part = bodies[0].dim, is_part(points)
     root, ends = roots(points)

@@ -89,9 +89,7 @@ def _joined(
 ) -> NDArray[np.int64]:
     """Return an index for each corner of domains, which is equal for corners that coincide.
 
-    Two corners of one `body` coincide if their seeded indices `number` are equal, or if their coordinates differ by at
-    most
-    about `tolerance`, in m.
+    Corners of one body coincide if their seeded indices are equal, or if they are closer than about `tolerance`, in m.
     """
     keys = [body.repeat(x.shape[1])]
     for column in x.reshape(-1, x.shape[2]).T:

@@ -160,9 +160,7 @@ def _at_sites(
     """Return values at the sites of a lattice, which is distributed over the processes in slabs of layers.
 
     The function also returns the range of layers of this process, and a function that converts values at sites to rows.
-
-    `number` (m,): lexicographic index of the site of each row of values (m, k).
-    `tolerance` (k,): largest difference between rows of a site; if domains differ by more, the site is nan.
+    Sites have nan where their rows of values differ by more than `tolerance`.
     """
     across, starts = int(np.prod(shape[1:])), np.arange(comm.size + 1) * shape[0] // comm.size
     layer = number // across
@@ -196,10 +194,7 @@ def _filtered(
     thirds: Sequence[NDArray[np.float64]] | None,
     axes: Sequence[int] | None = None,
 ) -> NDArray[np.float64]:
-    """Return the values on a box of sites, filtered along some axes, by default along all.
-
-    The mean over all orders of the axes makes the result independent of rotations by right angles.
-    """
+    """Return the values on a box of sites, filtered along some axes, by default along all."""
     if axes is None:
         axes = tuple(axis for axis, count in enumerate(d.shape[:-1]) if count >= len(THIRD))
     if not axes:

@@ -144,10 +144,7 @@ class Reconstruction:
         return slope * scale[:, None], p[cells, None] + np.array([low, high]).T
 
     def _differences(self, pressures: CellPressures) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-        """Return differences and slopes of the pressure at the ends of cells.
-
-        The function also returns which ends have neighbours, and which are drained sides.
-        """
+        """Return pressure differences and slopes at cell ends, and which ends have neighbours or drained sides."""
         cells, p, centroid, faces, outer = pressures
         neighbours, own = self._neighbour[cells], cells[:, None, None]
         axis, end = np.arange(self.grid.dim)[:, None], np.arange(2)

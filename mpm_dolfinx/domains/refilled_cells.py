@@ -42,8 +42,10 @@ A cell with a smaller part is renewed too.  Source: definition, a square with ha
 (`EDGES` edges in a cell).
 """
 COVERED = 0.25
-"""Largest difference between the area of the pieces in a renewed cell and its filled area, in cell areas.  Source:
-definition, the area of a new domain in a full cell, which is divided into four."""
+"""Largest difference between the area of the pieces in a renewed cell and its filled area, in cell areas.
+
+Source: definition, the area of a new domain in a full cell, which is divided into four.
+"""
 SIDE = np.array([2, 1, 3, 0])
 """Index of the face at each edge of the ring of a domain's corners."""
 START, END = np.array([2, 1, 0, 3]), np.array([0, 3, 1, 2])
@@ -158,10 +160,7 @@ class RefilledCells:
         return out
 
     def _excluded(self, flowed: NDArray[np.bool_], signs: tuple[NDArray, NDArray]) -> NDArray[np.bool_]:
-        """Return which cells cannot be renewed.
-
-        They contain points that have not `flowed`, points of two bodies, or faces whose conditions prevent renewal.
-        """
+        """Return which cells cannot be renewed, because of unyielded soil, two bodies, or conditions on faces."""
         of, cell = self.pieces.point, self.cell
         parts = self.parts
         low, high = np.full(self.cells, np.iinfo(np.int64).max), np.full(self.cells, -1)
@@ -305,10 +304,7 @@ class RefilledCells:
         lower: NDArray[np.float64],
         upper: NDArray[np.float64],
     ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return the keys of edges in cells, and the reference positions of the ends of these edges.
-
-        Both come from the parts of the surface that are nearest to the middle and to the ends of the edge.
-        """
+        """Return the keys of edges in cells, and the reference positions of their ends, from the nearest surface."""
         first = np.searchsorted(parts.cell[order], cells, side="left")
         stop = np.searchsorted(parts.cell[order], cells, side="right")
         edge, at = ranges(first, stop - first)
@@ -455,9 +451,7 @@ class RefilledCells:
     # ---- transfer of values ---------------------------------------------------------------------
 
     def slopes(self, values: NDArray[np.float64], group: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the slopes (n, 2, k), in 1/m, of point values (points, k) in new domains, from least squares in a
-        cell.
-        """
+        """Return the slopes (n, 2, k), in 1/m, of point values (points, k) in new domains, from least squares."""
         pieces, grid = self.pieces, self.grid
         weight = pieces.fraction * self.points.volume0[pieces.point]
         whole = np.maximum(sum_by(self.cell, weight, self.cells), TINY)
@@ -537,9 +531,7 @@ def no_faces(n: int) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np
 
 
 def ring_share(r0: NDArray[np.float64], r1: NDArray[np.float64], t: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the radii (n,) at coordinates t (n,) on faces from radius r0 to r1, divided by the mean radius of each
-    face.
-    """
+    """Return the radii (n,) at coordinates t (n,) on faces from radius r0 to r1, divided by the mean radius."""
     mean = (r0 + r1) / 2
     return np.divide(r0 + t * (r1 - r0), mean, out=np.ones(len(t)), where=mean > 0)
 

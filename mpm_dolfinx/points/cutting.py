@@ -263,10 +263,7 @@ def _area_vectors(s: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _facets(dim: int) -> NDArray[np.int64]:
-    """Return the vertices of the facets of a domain's simplices, oriented outward.
-
-    The i-th facet of a simplex omits its i-th vertex.  The last facets form the surface of the domain.
-    """
+    """Return the vertices of the facets of a domain's simplices.  Facet i omits vertex i."""
     out = np.stack([np.delete(simplices(dim), k, axis=1) for k in range(dim + 1)], axis=1)
     box = vertices(corner_bits(dim).astype(float)[:, :, None])[:, :, 0]
     for simplex, facets in zip(simplices(dim), out, strict=True):
@@ -419,8 +416,6 @@ def _sum(
 def spreads(corners: NDArray[np.float64], rings: bool) -> NDArray[np.float64]:
     """Return the second moments (n, d, d) of domains about their centroids, divided by their volumes, in m^2.
 
-    The second moments of parallelepipeds are exact.
-
     `rings`: whether the domains are sections of rings, in axisymmetry.
     """
     E = edges(corners)
@@ -441,13 +436,7 @@ def of_rings(spread: NDArray[np.float64], radius: NDArray[np.float64]) -> NDArra
 def _rings(
     grid: Grid, cell: NDArray[np.int64], c: NDArray[np.float64], squares: NDArray, products: NDArray
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return the radii of pieces, the centroids of their volumes, and `hoop` of `Pieces`.
-
-    Coordinates r, z, except for the radii, are from 0 to 1 in the cell of each piece.
-
-    `c` (n, 2): centroids of the pieces' sections.
-    `squares`, `products` (n,): means of r^2 and of r z over the sections.
-    """
+    """Return the radii of pieces, the centroids of their volumes in cell coordinates, and `hoop` of `Pieces`."""
     (h, height), (x, z) = grid.widths_of(cell).T, c.T
     squares = np.minimum(np.maximum(squares, x**2), x)  # rounding may violate these bounds in very thin pieces
     products = np.minimum(np.maximum(products, np.maximum(0.0, x + z - 1)), np.minimum(x, z))
@@ -468,13 +457,7 @@ def _products(
     total: Callable[[NDArray[np.float64]], NDArray[np.float64]],
     slots: _Slots,
 ) -> list[NDArray[np.float64]]:
-    """Return integrals over the pieces of products of two coordinates, from the lower corners of the pieces' cells.
-
-    `sums` (d, m): sums of coordinates over the vertices x of each slice.
-    `area` (m,): slice areas projected along the first axis.
-    `pair`: function that returns the sum of the product of two coordinates over the vertices of each slice.
-    `total`: function that returns the sum of slice values in each slot.
-    """
+    """Return integrals over the pieces of products of two coordinates, from the lower corners of the cells."""
     d = len(x)
 
     def mean(*factors: int) -> NDArray[np.float64]:
@@ -554,12 +537,7 @@ def cut_faces(
 def _polygons(
     grid: Grid, s: NDArray[np.float64], owner: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Return the parts of cut triangles, divided into triangles that do not depend on the order of the axes.
-
-    The slices of a triangle in one cell form a convex polygon, which is divided about the mean of its corners.
-
-    `s` (3, a, n): corners of the slices, as positions for slicing and, last, barycentric coordinates in the triangle.
-    """
+    """Return the parts of cut triangles, divided into triangles that do not depend on the order of the axes."""
     cut = np.bincount(owner, minlength=1)[owner] > 1
     part, of = s[:, :, cut], owner[cut]
     cell = np.floor(slices_in_cells(grid, part[:, :3]).mean(axis=0)).astype(np.int64)

@@ -28,10 +28,7 @@ class Parts:
     nodes: NDArray[np.int64]  # index, from 0, of each active local node's part, else -1
 
     def largest(self, comm: MPI.Comm, part: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the largest of `values` (n, ...) in each connected part, as (count, ...).  Empty parts have -inf.
-
-        `part` (n,): connected part of each value.
-        """
+        """Return the largest of `values` (n, ...) in each connected part (count, ...), or -inf for empty parts."""
         return largest_of_parts(comm, part, values, self.count)
 
 
@@ -90,8 +87,7 @@ def largest_of_bodies(
 def relative(
     norms: NDArray[np.float64], scales: NDArray[np.float64], round_off: NDArray[np.float64] | float = 0.0
 ) -> NDArray[np.float64]:
-    """Return the norms divided by the scales.  Norms of at most `round_off` give 0, and undefined quotients give inf.
-    """
+    """Return the norms divided by the scales.  Norms of at most `round_off` give 0, undefined quotients give inf."""
     ratio = np.empty(norms.shape)
     ratio.fill(np.inf)
     np.divide(norms, scales, out=ratio, where=(scales > 0) & (norms < np.inf))
@@ -102,9 +98,7 @@ def relative(
 def parts_of_cells(grid: Grid, active: NDArray[np.bool_]) -> tuple[NDArray[np.int64], int]:
     """Return the connected part (cells,) of each active local cell, counted from 1, and the number of parts.
 
-    Cells with common nodes belong to one part.  Inactive cells have index 0.  The numbers of the parts do not depend on
-    the
-    number of processes.
+    Cells with common nodes belong to one part.  Inactive cells have index 0.  The number of processes has no influence.
     """
     cells, out = active.nonzero()[0], np.zeros(len(active), dtype=np.int64)
     own, count = _touching(grid.cell_places(cells))
@@ -122,10 +116,7 @@ def parts_of_cells(grid: Grid, active: NDArray[np.bool_]) -> tuple[NDArray[np.in
 
 
 def parts_of_domains(grid: Grid, corners: NDArray[np.float64], copy: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the connected part (n,) of each domain, counted from 0.
-
-    `copy` (n,): first cell of the domain's grid copy.
-    """
+    """Return the connected part (n,) of each domain, counted from 0.  `copy` (n,): first cell of its grid copy."""
     cell = grid.number(grid.index(corners.reshape(-1, grid.dim))).reshape(corners.shape[:2]) + copy.reshape(-1, 1)
     cell, at = np.unique(cell, return_inverse=True)
     own, count = _touching(
@@ -140,9 +131,8 @@ def joined_parts(
 ) -> tuple[NDArray[np.int64], int]:
     """Join the parts of some pairs of cells, and return the new results of `parts_of_cells`.
 
-    All processes must call this function.
-
-    `pairs` (m, 2): lexicographic indices of active cells, on any process.
+    `pairs` (m, 2): lexicographic indices of active cells.  Processes may have different pairs.  All processes must call
+    it.
     """
     cells, at = np.unique(np.concatenate(grid.comm.allgather(np.unique(pairs, axis=0))), return_inverse=True)
     of = np.where(grid.owner(cells) == grid.comm.rank, part[grid.locals[cells]], 0)
@@ -166,10 +156,7 @@ def _touching(index: NDArray[np.int64]) -> tuple[NDArray[np.int64], int]:
 
 
 def _joined(rows: NDArray[np.int64], columns: NDArray[np.int64], shape: Sequence[int]) -> tuple[NDArray[np.int64], int]:
-    """Return the component of each row, and the number of components.
-
-    Rows with a common column are connected.
-    """
+    """Return the component of each row, and the number of components.  Rows with a common column are connected."""
     n = sum(shape)
     pairs = coo_array((np.ones(len(rows)), (rows, shape[0] + columns)), shape=(n, n)).tocsr()
     count, part = connected_components(pairs, directed=False)
@@ -179,11 +166,7 @@ def _joined(rows: NDArray[np.int64], columns: NDArray[np.int64], shape: Sequence
 def _over_processes(
     grid: Grid, own: NDArray[np.int64], count: int, nodes: NDArray[np.integer], of_node: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], int]:
-    """Return the connected part of each cell on all processes, and the number of parts.
-
-    `own`, `count`: index of each cell's part, and number of parts, on this process alone.
-    `of_node` (n,): index of the part of each of the cells' `nodes` on this process.
-    """
+    """Return the connected part of each cell on all processes, and the number of parts."""
     counts = grid.comm.allgather(count)
     start = sum(counts[: grid.comm.rank])
     index, copy = np.split(grid.node_places(nodes), [grid.dim], axis=1)

@@ -155,7 +155,7 @@ def resampled(
     inner, wider = around[:, 0], around[:, 1] - around[:, 0]
 
     def ring(a: NDArray, b: NDArray, of: NDArray) -> NDArray:
-        """Return twice the areas of triangles (P, P + a, P + b), or in axisymmetry the volumes of their rings."""
+        """Return twice the areas of triangles (P, P + a, P + b), or twice the volumes of their rings in axisymmetry."""
         return cross_in_plane(a, b) * (inner[of] + wider[of] * (P[of, 0] + (a[:, 0] + b[:, 0]) / 3))
 
     bulge = sum_by(of, ring(a, b, of), len(P)) + sum_by(of[1:], ring(b[:-1], b[:-1] + gap, of[1:]), len(P))
