@@ -21,7 +21,7 @@ from mpm_dolfinx.bodies.mesh_cells import Block
 PLANE = re.compile(r"(?:(?:C|DC|DCC|EC)?(?:PE|PS|PEG|AX|GAX|2D)|AC(?:2D|AX)|S|STRI|DS|M3D|SFM3D|R3D)(3|4|6|8|9)(?!\d)")
 SOLID = re.compile(r"(?:(?:C|DC|DCC|EC|AC|Q)3D|SC)(4|5|6|8|10|13|15|20|27)(?![\dV])")
 LINE = re.compile(r"(?:T2D|T3D|R2D|RAX|DC1D|AC1D)(2|3)|(?:B|PIPE|SAX)[23]?([123])")
-"""Pattern of the types of line elements.  The first group is the number of nodes, the second is the order of a beam."""
+"""Pattern of line elements.  The first group is the number of nodes.  The second group is the order of a beam."""
 NO_CELL = ("SPRING", "DASHPOT", "MASS", "ROTARY", "CONN", "GAP", "JOINT", "HEATCAP", "DCOUP", "ITS", "DIST", "FRAME")
 """Name prefixes of elements without volume or area."""
 KINDS = {
@@ -100,7 +100,7 @@ def is_abaqus(file: Path) -> bool:
 
 
 def read(file: Path) -> meshio.Mesh:
-    """Return the mesh of an input file.  Element sets and instances become parts; surfaces become sides."""
+    """Return the mesh of an input file, with element sets and instances as parts, and surfaces as sides."""
     return _assembled(_placed(file))
 
 

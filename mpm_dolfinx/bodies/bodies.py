@@ -86,14 +86,14 @@ class Body:
         return tuple(SIDES[self.dim])
 
     def named(self, name: str) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the domains (n,) and face indices (n,) of faces on the side `name`, in ascending order of domains."""
+        """Return the faces on the side `name`, as domains (n,) in ascending order and face indices (n,)."""
         return self.facing(*SIDES[self.dim][name]) if name in self.names else (np.empty(0, np.int64),) * 2
 
     def facing(self, axis: int, end: int, least: float = 0.0) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return the surface faces at the lower (0) or upper (1) end of an axis, as domains (n,) and face indices (n,).
 
-        In unstructured bodies, the largest component of each face's unit normal points to this end, and exceeds
-        `least`.
+        In unstructured bodies, the unit normals of these faces have their largest component, above `least`, towards
+        this end.
         """
         row = self._with_face(axis, end)
         return row, np.full(len(row), 2 * axis + end)
@@ -108,7 +108,7 @@ class Body:
         return len(self) / max(1, len(self._with_face(axis, 0))), float(self.spacing[axis])
 
     def outer(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the domains (n,) and face indices (n,) of all surface faces, sorted by face index."""
+        """Return all surface faces, as domains (n,) and face indices (n,), sorted by face index."""
         rows = [self._with_face(axis, end) for axis in range(self.dim) for end in (0, 1)]
         return np.concatenate(rows), np.repeat(np.arange(len(rows)), list(map(len, rows)))
 

@@ -151,7 +151,7 @@ class RowsBody(LatticeBody):
 
 
 def _rows(grid: Grid, axis: int, low: float, high: float, per_cell: int) -> NDArray[np.float64]:
-    """Return row boundaries from `low` to `high`, in m.  A cell has `per_cell` rows, a part of a cell fewer rows."""
+    """Return the boundaries of rows from `low` to `high`, in m, with `per_cell` rows in each whole cell."""
     lines = grid.lines[axis] + grid.base[axis]
     tolerance = SAME * grid.finest[axis]
     ends = np.concatenate([[low], lines[(lines > low + tolerance) & (lines < high - tolerance)], [high]])
@@ -162,7 +162,7 @@ def _rows(grid: Grid, axis: int, low: float, high: float, per_cell: int) -> NDAr
 
 
 def _rounded(rows: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return numbers of rows as integers >= 1.  Small rounding errors of coordinates do not change these integers."""
+    """Return numbers of rows as integers >= 1, unaffected by rounding errors of coordinates."""
     return np.maximum(1, np.rint(NEAR * np.rint(rows / NEAR))).astype(np.int64)
 
 
@@ -173,14 +173,14 @@ def _lattice(rows: list[NDArray[np.float64]], **more: Any) -> RowsBody:
 
 
 def box(grid: Grid, lower: ArrayLike, upper: ArrayLike, per_cell: int = 2, material: int = 0) -> Body:
-    """Seed the box [lower, upper] with a lattice of points whose domains fill it exactly; return the body.
+    """Seed the box [lower, upper] with a lattice of points whose domains fill it exactly, and return the body.
 
     Parameters
     ----------
     grid
         Background grid.
     lower, upper : (d,), m
-        Corners of the box, inside the grid; need not lie on grid lines.
+        Corners of the box, inside the grid.  They need not lie on grid lines.
     per_cell
         Points per cell and direction, >= 1, rounded to fit the box.  In grids of unequal cells, domains end at grid
         lines.  With 1 point, bodies deflect too much and creep.  A warning names slender bodies.  In 3D, scenes

@@ -36,7 +36,7 @@ SMALL = 0.2  # fraction of the desired domain size; smaller domains cause a warn
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """A mesh on one process.  In the nodes of quadrilaterals and hexahedra, the first axis varies fastest."""
+    """A mesh on one process, with the nodes of quadrilaterals and hexahedra such that the first axis varies fastest."""
 
     x: NDArray[np.float64]  # positions of nodes (nodes, d), m
     cells: Mapping[str, NDArray[np.int64]]  # cell type -> nodes (n, k)
@@ -109,7 +109,7 @@ class MeshBody(Body):
         return tuple(self.tagged)
 
     def named(self, name: str) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the domains (n,) and face indices (n,) of faces on the side `name`, in ascending order of domains."""
+        """Return the faces on the side `name`, as domains (n,) in ascending order and face indices (n,)."""
         if name not in self.tagged:
             return (np.empty(0, np.int64),) * 2
         return np.nonzero(self.tagged[name].reshape(len(self), 2 * self.dim))
@@ -365,9 +365,9 @@ def _in_side(facets: NDArray[np.int64], named: Sequence[NDArray[np.int64]]) -> N
 def _split(
     grid: Grid, domains: NDArray[np.float64], per_cell: int
 ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.bool_]]:
-    """Divide domains that are too large, and return the corners of the new domains.
+    """Divide domains that are too large.  Return the new domains, their original domains, and their outer faces.
 
-    The function also returns the original domain of each new domain, and which faces lie on faces of original domains.
+    Outer faces are those faces of a new domain that lie on faces of the original domain.
     """
     d = grid.dim
     bits = corner_bits(grid.dim)

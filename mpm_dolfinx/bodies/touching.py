@@ -96,7 +96,7 @@ def weights(t: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def near(a: NDArray[np.float64], b: NDArray[np.float64], distance: float = 0.0) -> tuple[NDArray, NDArray]:
-    """Return pairs of polytopes a (k, c, d) and b (l, c, d) whose boxes are within about `distance`, in m."""
+    """Return pairs of polytopes a (k, c, d) and b (l, c, d) with bounding boxes within about `distance`, in m."""
     if not (len(a) and len(b)):
         return (np.empty(0, dtype=np.int64),) * 2
     low, high = np.maximum(a.min(axis=(0, 1)), b.min(axis=(0, 1))), np.minimum(a.max(axis=(0, 1)), b.max(axis=(0, 1)))
@@ -158,7 +158,8 @@ def _parallelograms(corners: NDArray[np.float64]) -> NDArray[np.float64]:
 def local(corners: NDArray, x: NDArray, normal: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the face coordinates (n, c, 2) of positions x (n, c, 3), and the normal distances (n, c) from the faces.
 
-    `corners` (n, 4, 3) are the corners of the faces.  `normal` (n, 3) are the unit normals of the faces.
+    `corners` (n, 4, 3): corners of the faces.
+    `normal` (n, 3): unit normals of the faces.
     """
     t = np.full((*x.shape[:2], 2), 0.5)
     c0, c1, c2, c3 = (corners[:, k, None] for k in range(4))
@@ -339,7 +340,7 @@ def separation(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.flo
 
 
 def _between_planes(a: NDArray, b: NDArray, normals: Iterable[NDArray]) -> NDArray[np.float64]:
-    """Return how far apart two parallel planes with one of `normals` can separate a and b, in m."""
+    """Return the largest distance, in m, between two parallel planes with one of `normals` that separate a and b."""
     out, size = np.full(len(a), -np.inf), np.ptp(a, axis=1).max(axis=1)
     for n in normals:
         length = np.linalg.norm(n, axis=1)

@@ -130,7 +130,7 @@ class Quiet(Condition):
 
     The traction resists the velocity.  Along the normal, the traction is (rho c_p) times the velocity, with the density
     rho
-    and the speed c_p of compression waves.  In the tangent plane, it is (rho c_s) times the velocity, with the speed
+    and the speed c_p of compression waves.  In the tangent plane, the traction is (rho c_s) times the velocity, with the speed
     c_s of
     shear waves.  Waves along the normal are absorbed.  Waves at 30 degrees to the normal are reflected with up to 4 %
     of
@@ -236,7 +236,7 @@ class Drained(Condition):
     side
         Side of the bodies, as for `Traction`.
     pressure : float or callable (t, X, x) -> float, Pa
-        Pore pressure outside, finite.  Below a water level: lambda t, x: 9810 * np.maximum(level(t) - x[:, 1], 0).
+        Finite pore pressure outside.  Below a water level: lambda t, x: 9810 * np.maximum(level(t) - x[:, 1], 0).
     region : ((d,), (d,)), m
         Box of reference positions.  The parts of faces inside the box are drained.
     seepage

@@ -71,7 +71,7 @@ class ContactState:
 
     @property
     def slips(self) -> NDArray[np.bool_]:
-        """Which conditions slip (k,)."""
+        """Whether each condition (k,) slips."""
         return self.slip.any(axis=1)
 
 

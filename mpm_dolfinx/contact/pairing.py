@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Contacts between groups in a stage: pairs of opposite positions on the surfaces of two groups.
-
-`problem` has the contact equations.
-"""
+"""Contacts between groups in a stage: pairs of opposite positions on the surfaces of two groups."""
 
 from __future__ import annotations
 
@@ -44,7 +41,7 @@ CLEAR = 0.5
 DEEP = 0.25
 """Penetration, divided by the cell size, above which a position is taken to lie behind a thin body."""
 CANDIDATES = {2: 8, 3: 24}
-"""Number of nearest points on the other surface whose faces may contain the opposite position."""
+"""Number of nearest points on the surface of another group whose faces may contain the opposite position."""
 BESIDE = 0.6
 """Distance from another group, divided by the cell size, below which domain corners follow the Q1 field alone."""
 PLACES = 1 << 32

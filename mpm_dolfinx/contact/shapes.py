@@ -88,7 +88,7 @@ class HalfSpace(Placed):
     point : (d,), m
         A position on the plane.
     outward : (d,)
-        Normal of the plane, of any length, pointing out of the tool towards the bodies.
+        Normal of the plane, of any length.  It points out of the tool towards the bodies.
     """
 
     point: ArrayLike

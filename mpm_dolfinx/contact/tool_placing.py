@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Tools of a stage: their poses, the contact pairs in a step, and checks for penetration.
-
-`problem` has the contact equations.
-"""
+"""Tools of a stage: their poses, the contact pairs in a step, and checks for penetration."""
 
 from __future__ import annotations
 

@@ -8,13 +8,13 @@ and the sawtooth remains as stress.  The displacement u of a corner at the posit
     u(x) = sum_i N_i(x) [u_i - 1/2 sum_a t_a (1 - t_a) D_a],
 
 where N_i are the shape functions, u_i are the nodal displacements, and t_a is the position along axis a in the cell,
-from 0 to 1.  D_a is a second difference of nodal displacements along axis a.  This field is exact for quadratic
+from 0 to 1.  D_a is a second difference of nodal displacements along axis a.  The field u is exact for quadratic
 displacements, equal to Q1 at the nodes, and continuous.
 
 D_a belongs to the cell edge along axis a that ends at node i.  Each end of the edge has a second difference.  D_a is
-the smaller one in absolute value, or zero if their signs differ.  If only one end has a second difference, D_a is this
-difference.  If cell sizes vary, D_a is the squared edge length times the second derivative of a parabola through three
-nodes.  Physical kinks, for example at the boundary of two materials, are kept.
+the smaller of both in absolute value, or zero if their signs differ.  If only one end has a second difference, D_a is
+this difference.  If cell sizes vary, D_a is the squared edge length times the second derivative of a parabola through
+three nodes.  Physical kinks, for example at the boundary of two materials, are kept.
 """
 
 from __future__ import annotations

@@ -43,7 +43,7 @@ class SeededDomains:
         self._codes = int((most // (len(bodies) * int(self.starts[-1] + 1))) ** (1 / self._dim))
 
     def known(self, part: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return which intervals (n, d, 2) are so large that 64-bit integers identify them."""
+        """Return which intervals (n, d, 2) are large enough to be identified by 64-bit integers."""
         return (self._code(part) < self._codes).all(axis=1)
 
     def of(self, root: NDArray[np.int64], part: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -227,7 +227,8 @@ def _placed(
 def with_defect(new: MaterialPoints, old: MaterialPoints, into: NDArray[np.int64]) -> MaterialPoints:
     """Return new points with a volume defect such that soil and fluid fill the same volume as before.
 
-    `into`: index of the old point of each new point; if points were merged, index of the new point of each old point.
+    `into`: index of the old point of each new point.  For merged points, it is the index of the new point of each old
+    point.
     """
     if "owed" not in new.data:
         return new

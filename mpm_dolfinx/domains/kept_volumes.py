@@ -9,9 +9,9 @@ After a step the corners of yielded domains therefore move by the vectors d that
     sum_p V_p e_p^2 + SOFT^2 sum_p V_p mean |d / h|^2,  V_p e_p = V_p - V - dV/dx d.
 
 The sums are over the points p.  V_p is the volume of a point, V is the volume of its domain, and dV/dx is the
-derivative of V with respect to the corners.  The mean is over the domain's corners, and h are the edges of cells.
-Shared corners move together.  Corners of elastic domains and held corners do not move.  Kugelstadt et al. (2019)
-correct densities of cells in this way.
+derivative of V with respect to the corners.  The relative volume error after the motion is e_p.  The mean is over the
+domain's corners, and h are the edges of cells.  Shared corners move together.  Corners of elastic domains and held
+corners do not move.  Kugelstadt et al. (2019) correct densities of cells in this way.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ from mpm_dolfinx.parallel.exchange import to_root
 SOFT = 0.1
 """Weight of the motion d of the corners.
 
-The weight is needed for errors e that alternate between the domains of a regular lattice.  No motion reduces such
-errors to first order.
+Volume errors may alternate between the domains of a regular lattice.  To first order, no motion of the corners reduces
+such errors, so the weight is needed.
 Halving this value changes the result of scene "flow" in tests/plateaus.py by 2.5e-04 (relative), doubling it by
 1.4e-04, and finer cells by 9.2e-02.
 """

@@ -4,9 +4,9 @@
 In each cell the pressure at the position x is reconstructed as `p + s . (x - c)`, with the cell pressure p, the slope
 s,
 and the centroid c of the cell's storage.  Along an axis, s is van Leer's mean of the slopes at both ends of the cell.
-The slope at an end points to the neighbour across an open face, or to the pressure on a drained side.  If an end has no
-slope, s is zero.  Then s is scaled so that the pressure in the cell stays between the extremes of cell, neighbours and
-drained sides.
+At an open face, the slope follows from the pressure of the neighbour.  At a drained side, the slope follows from the
+pressure on the side.  If an end is neither open nor drained, s is zero.  Then s is scaled so that the pressure in the
+cell stays between the extremes of cell, neighbours and drained sides.
 
 A piece of a particle domain receives the pressure at its centroid and moves with the domain.  Then the domain is cut
 again.  A cell may contain a fraction of the domain before and after the cut.  The smaller of both fractions keeps its
@@ -266,7 +266,7 @@ def halved_pieces(
     storage: tuple[NDArray[np.float64], NDArray[np.float64]],
     bulk: float,
 ) -> PiecePressures:
-    """Return one piece for each new point.  Its pressure follows from the mean slope in its old point.
+    """Return one piece for each new point.  The pressure of the piece follows from the mean slope in its old point.
 
     `pieces`: pieces of the n old points.
     `points`: old points, and m new points.

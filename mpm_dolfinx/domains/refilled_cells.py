@@ -399,7 +399,7 @@ class RefilledCells:
 
     @cached_property
     def _left(self) -> NDArray[np.int64]:
-        """Pieces of removed domains outside the renewed cells, without crumbs."""
+        """Pieces of removed domains outside the renewed cells, without parts smaller than `CRUMB`."""
         left = np.flatnonzero(self.affected[self.pieces.point] & ~self.chosen[self.cell])
         return left[self._areas[left] > CRUMB * self._volume(self.cell[left])]
 

@@ -64,7 +64,7 @@ def kuhn_simplices(dim: int) -> NDArray[np.int64]:
 
 @cache
 def simplices(dim: int) -> NDArray[np.int64]:
-    """Return the vertices (4 or 24, d+1), as numbered by `vertices`, of the simplices of a domain.
+    """Return the vertices (4 or 24, d+1) of the simplices of a domain, numbered as in `vertices`.
 
     A simplex consists of a facet of the surface, oriented outward, and the middle of the domain.
     """
@@ -494,9 +494,11 @@ def cut_faces(
 
     Returns
     -------
-    For each of n points: index (n,) of its face, position (n, d), interpolated coordinates (n, e), and the fraction
-    (n,) of the face that the point represents.  The last result is the middle (n, d) of the point's segment or
-    triangle, which is a part of the face in one cell.
+    Index (n,) of the face of each of n points.
+    Position (n, d) of each point.
+    Coordinates (n, e) that are interpolated at each point.
+    Fraction (n,) of the face that each point represents.
+    Middle (n, d) of the segment or triangle of each point, which is a part of the face in one cell.
     """
     d, m = grid.dim, len(corners)
     y = on_planes(grid, grid.in_cells(corners), corners, 2)[1]

@@ -53,7 +53,7 @@ def fitted(
     zero.
 
     `degree`: degree of the polynomials, 1 or 2.
-    `at` (r,): index, from 0, of the position to whose fit each row of this process's data belongs.
+    `at` (r,): index of the position to which each row of this process's data belongs, counted from 0.
     `offset` (r, d): offset of the data from this position, in spacings of the data.
     `values` (r, width): values of the data.
     `weight` (r,): weights of the data.

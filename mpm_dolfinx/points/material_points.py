@@ -242,7 +242,9 @@ class MaterialPoints:
         return received.map(lambda rows: rows[order])
 
     def find(self, ids: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the indices of entries of `ids` that are points of this process, and the indices of these points."""
+        """Find the `ids` that are points of this process.  Return their indices in `ids`, and the indices of the
+        points.
+        """
         at = self.id.searchsorted(ids)
         found = ((at < len(self)) & (self.id[np.minimum(at, len(self) - 1)] == ids)).nonzero()[0] if len(self) else []
         found = np.asarray(found, dtype=np.int64)

@@ -131,8 +131,9 @@ def joined_parts(
 ) -> tuple[NDArray[np.int64], int]:
     """Join the parts of some pairs of cells, and return the new results of `parts_of_cells`.
 
-    `pairs` (m, 2): lexicographic indices of active cells.  Processes may have different pairs.  All processes must call
-    it.
+    `pairs` (m, 2): lexicographic indices of active cells.  Processes may have different pairs.
+
+    All processes must call this function.
     """
     cells, at = np.unique(np.concatenate(grid.comm.allgather(np.unique(pairs, axis=0))), return_inverse=True)
     of = np.where(grid.owner(cells) == grid.comm.rank, part[grid.locals[cells]], 0)

@@ -105,8 +105,9 @@ class Polygons:
 
         Returns
         -------
-        For each quadrilateral: index of its polygon (m,), vertices (m, 4, 2) and edge identifiers (m, 4).  In a
-        triangle the middle of the longest edge is the fourth vertex.
+        Index (m,) of the polygon of each quadrilateral.
+        Vertices (m, 4, 2) and edge identifiers (m, 4) of the quadrilaterals.  In a triangle, the fourth vertex is the
+        middle of the longest edge.
         """
         left, rows = self, np.arange(len(self.count))
         found = []
