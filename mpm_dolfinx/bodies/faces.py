@@ -38,8 +38,7 @@ class Surface:
     """Faces of particle domains on one side of the bodies.
 
     Every process has the same faces.  Parts of faces that touch another body are left out.  The remaining part of a
-    face
-    is divided into polygons of up to four corners.  Arrays have a row for each of m polygons.
+    face is divided into polygons of up to four corners.  Arrays have a row for each of m polygons.
     """
 
     id: NDArray[np.int64]  # identifier of the material point (m,), ascending

@@ -25,7 +25,7 @@ TYPES = {
     **{12: ("hexahedron27", 27), 13: ("wedge18", 18), 14: ("pyramid14", 14), 15: ("vertex", 1), 16: ("quad8", 8)},
     **{17: ("hexahedron20", 20), 18: ("wedge15", 15), 19: ("pyramid13", 13)},
 }
-"""Name in meshio and number of nodes of each gmsh element type.  Nodes of an element remain in gmsh's sequence."""
+"""Name in meshio and number of nodes of each gmsh element type, with the nodes in gmsh's sequence."""
 
 
 class _Numbers:

@@ -52,8 +52,7 @@ def from_mesh(
     physical groups of lines (in 2D) or surfaces (in 3D).  Bodies from two parts of a mesh share the faces between the
     parts.  Shared faces are no surface while both bodies are active.  Vertices of the mesh are reference positions.
     The points form no lattice, so the filter of short waves does not act.  On several processes, the first process
-    reads
-    the mesh, and each machine has a copy of the domains in a temporary file.
+    reads the mesh, and each machine has a copy of the domains in a temporary file.
 
     Parameters
     ----------

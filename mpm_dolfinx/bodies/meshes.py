@@ -270,8 +270,7 @@ def _check_overlaps(
     """Raise an error for overlapping cells.
 
     The number of cells that cover a position changes only across the surface of the mesh.  If any cells overlap, at
-    least
-    one of them is at the surface, so only the cells `outer` at the surface are checked.
+    least one of them is at the surface, so only the cells `outer` at the surface are checked.
 
     `neighbours` (n, 2): pairs of cells that share a facet.
     """

@@ -71,8 +71,7 @@ def _hits(corners: NDArray, at: NDArray) -> Iterator[tuple[NDArray, NDArray, NDA
     """Yield the crossings of vertical lines with the faces of domains, each line with its own domain.
 
     Each face yields the lines that cross the face, the heights of the crossings, in m, and signs.  The sign is 1 where
-    a
-    rising line leaves the domain, and -1 where the line enters.
+    a rising line leaves the domain, and -1 where the line enters.
     """
     d = corners.shape[2]
     for face, turn in zip(FACES[d], FACE_SIGNS, strict=False):

@@ -236,8 +236,7 @@ class Loads:
         """Return the initial constraints of this condition.
 
         Each constraint has cells (n,), opposite cells (n,), positions (n, d) and directions (n, d).  Opposite cells
-        belong to
-        another body in contact, or are None if this body does not deform.
+        belong to another body in contact, or are None if this body does not deform.
         """
 
     @property

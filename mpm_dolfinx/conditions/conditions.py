@@ -129,14 +129,11 @@ class Quiet(Condition):
     """Quiet (absorbing) boundary of bodies with inertia (Lysmer and Kuhlemeyer 1969).
 
     The traction resists the velocity.  Along the normal, the traction is (rho c_p) times the velocity, with the density
-    rho
-    and the speed c_p of compression waves.  In the tangent plane, the traction is (rho c_s) times the velocity, with the speed
-    c_s of
-    shear waves.  Waves along the normal are absorbed.  Waves at 30 degrees to the normal are reflected with up to 4 %
-    of
-    their energy (nu = 0.2 to 0.4).  If the side was fixed in an earlier stage without inertia, it keeps the tractions
-    of
-    this stage.  Bodies with weight need such an earlier stage, because the kept tractions carry their weight.
+    rho and the speed c_p of compression waves.  In the tangent plane, the traction is (rho c_s) times the velocity,
+    with the speed c_s of shear waves.  Waves along the normal are absorbed.  Waves at 30 degrees to the normal are
+    reflected with up to 4 % of their energy (nu = 0.2 to 0.4).  If the side was fixed in an earlier stage without
+    inertia, it keeps the tractions of the earlier stage.  Bodies with weight need such a stage, because the kept
+    tractions carry their weight.
 
     Parameters
     ----------
@@ -372,8 +369,7 @@ class Tied(Condition):
     """Two opposite sides of a box with equal displacements, as in ground that repeats itself beyond the box.
 
     At equal heights, forces on both sides are equal and opposite, with and without inertia.  A wave that leaves the box
-    at
-    one side enters at the opposite side.  No water flows through tied sides.
+    at one side enters at the opposite side.  No water flows through tied sides.
 
     Parameters
     ----------
@@ -421,9 +417,9 @@ def holding(material: Skeleton) -> NDArray[np.float64]:
     """Return the reference modulus, in Pa, of the penalty for prescribed displacements.
 
     A Q1 field with constant volumetric strain in each cell cannot follow a curved side.  The penalty converts the
-    difference between field and side into pressure, so it must not be stiff compared with the shear stiffness.
-    In an undrained cavity, a penalty of 300 (lambda + 2G) gives up to 1.9 times the exact pressure.  A penalty of 30
-    (4G) gives 1.01 times the exact pressure.
+    difference between field and side into pressure, so it must not be stiff compared with the shear stiffness.  In an
+    undrained cavity, a penalty of 300 (lambda + 2G) gives up to 1.9 times the exact pressure.  A penalty of 30 (4G)
+    gives 1.01 times the exact pressure.
     """
     return (YIELDING if material.state else 1.0) * resistance(material)
 
@@ -487,10 +483,8 @@ class RigidPlate(Condition):
     """Rigid, smooth plate on a flat side of the bodies.  All faces have an equal displacement normal to the side.
 
     The penalty energy (kappa/2 int (grad_t x_n)^2 dA) keeps the plate flat and prevents tilting.  Here x_n is the
-    position
-    along the normal, grad_t is the gradient along the side, and kappa is the stiffness from `RIGIDITY`.  The penalty
-    does
-    not resist a uniform displacement, so the plate transfers the total force exactly.
+    position along the normal, grad_t is the gradient along the side, and kappa is the stiffness from `RIGIDITY`.  The
+    penalty does not resist a uniform displacement, so the plate transfers the total force exactly.
 
     Parameters
     ----------

@@ -74,8 +74,7 @@ def warn_levels(comm: MPI.Intracomm, fluid: Fluid | None, gravity: Gravity, leve
     """Warn about each water level whose unit weight differs from that of the pore fluid.
 
     A dry scene with gravity has no pore fluid.  The function then warns about levels whose default unit weight is not
-    that
-    of water under this gravity.
+    that of water under this gravity.
 
     `levels`: name and water pressure of each level.
     """

@@ -130,8 +130,7 @@ class ContactProblem(Loads):
         Prescribed loads on the tools.
     again
         Function of displacements (a local array, in m), which finds the pairs at these displacements.  It returns the
-        law
-        and the origin of the pairs, see `FacePairs`.
+        law and the origin of the pairs, see `FacePairs`.
     cell_pairs
         Function that returns all pairs of cells, as integers `first * cells + second`, that contact pairs may join.
     """

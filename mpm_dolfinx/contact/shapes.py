@@ -269,8 +269,7 @@ class Distance:
     """A shape given by a user's signed distance function.
 
     The function is evaluated at true positions, not at positions relative to the base of the grid.  Derivatives are
-    finite
-    differences over powers of two, because adding a power of two to a position causes almost no rounding error.
+    finite differences over powers of two, because adding a power of two to a position causes almost no rounding error.
     """
 
     function: Callable[[NDArray[np.float64]], ArrayLike]  # signed distance, m

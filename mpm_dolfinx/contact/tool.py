@@ -97,8 +97,8 @@ class Tool:
     spin
         Initial angular velocity of a free tool, rad/s, counterclockwise.
     name
-        Name of the tool in results; by default "tool".  The field NAME_pressure of points is the contact pressure.
-        In a later stage, a tool of equal name takes over this pressure.
+        Name of the tool in results; by default "tool".  The field NAME_pressure of points is the contact pressure.  In
+        a later stage, a tool of equal name takes over this pressure.
 
     Raises
     ------
@@ -274,8 +274,7 @@ class Tool:
         """Return the pose at time t (s).
 
         `by_forces`, in m: displacement that the load causes.  For a free tool, it is a vector of the displacement (d,),
-        in m,
-        and possibly the rotation, in rad.
+        in m, and possibly the rotation, in rad.
         """
         shift = self._given("displacement", t, dim)
         if shift.ndim == 0 and shift:

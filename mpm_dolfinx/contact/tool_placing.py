@@ -238,8 +238,7 @@ class Tools(Touching):
         """Return which positions that face a tool lie within half a cell of an edge of the tool.
 
         The last loaded node also represents half a cell outside the edge, so half a cell inside has no contact.  Edges
-        beyond
-        which the body ends are ignored.  A tool narrower than a cell keeps its whole contact.
+        beyond which the body ends are ignored.  A tool narrower than a cell keeps its whole contact.
         """
         grid, (y, n) = self.grid, (x[faces], unit[faces])
         h = grid.sizes_at(y)

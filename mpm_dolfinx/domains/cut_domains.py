@@ -190,8 +190,7 @@ class CutDomains(Keyed):
         """Return the quadrature points on a surface, for faces whose points are on this process.
 
         The cell of a quadrature point contains the position just under the surface, and a piece of the domain.  Loads
-        therefore
-        act on nodes with stiffness.
+        therefore act on nodes with stiffness.
         """
         return self.surfaces([faces])[0]
 

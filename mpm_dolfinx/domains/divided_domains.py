@@ -107,8 +107,7 @@ class SeededDomains:
         """Return the indices (n,) of rows of the lattice along an axis, counted from the middle of the body.
 
         The pairs of rows that merge are therefore the same in a mirrored scene.  The result is nan for domains without
-        a
-        lattice, and for the middle row of an odd number of rows, which has no pair.
+        a lattice, and for the middle row of an odd number of rows, which has no pair.
         """
         out = np.full(len(places), np.nan)
         for i in np.unique(places[places[:, 0] >= 0, 0]):

@@ -92,10 +92,9 @@ def cell_ratios(
 
     With F-bar, the volume ratio of a cell is the current volume of its domains, computed from the corners, divided by
     their reference volume.  Differences between the volume ratios of domains in a cell do no work.  If the ratio of a
-    cell
-    were updated by increments only, it could drift from the volume of the domains without any opposing force.  Pieces
-    have
-    the ratio of their point without F-bar, and in cells with yielded soil, where corner volumes are meaningless.
+    cell were updated by increments only, it could drift from the volume of the domains without any opposing force.
+    Pieces have the ratio of their point without F-bar, and in cells with yielded soil, where corner volumes are
+    meaningless.
 
     `cut`: cut particle domains.
     `points`: points at the start of the step.

@@ -8,8 +8,8 @@ a piece with the local coordinates xi in its domain, the gradient is therefore
     F(xi) = F (1 + e),   F e = sum_a D_a (xi_a - mean of xi_a over the reference volume).
 
 The sum is over the axes a, and xi is in units of the domain's edge lengths.  The slopes D_a are a least-squares fit to
-the gradients F of neighbours of the same material across faces.  Then e is corrected so that the sum of `int dV / det
-F` over the pieces is the reference volume of the domain.  The fit reproduces linear fields on any mesh, and uniform
+the gradients F of neighbours of the same material across faces.  Then e is corrected so that the sum of
+`int dV / det F` over the pieces is the reference volume of the domain.  The fit reproduces linear fields on any mesh, and uniform
 fields stay uniform.
 """
 
@@ -114,8 +114,7 @@ def _faces_of_parts(
     """Return a key for each face of domains and of parts of domains.
 
     On a lattice, the key consists of the lower corner, the normal and the size of the face.  Other whole domains keep
-    the
-    keys `seeded`.  Other parts have neighbours only in their domain.
+    the keys `seeded`.  Other parts have neighbours only in their domain.
     """
     dim, part = bodies[0].dim, is_part(points)
     root, ends = roots(points)

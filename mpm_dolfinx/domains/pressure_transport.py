@@ -2,11 +2,10 @@
 """Conservative, second-order remap of the pore pressure from one grid to the next.
 
 In each cell the pressure at the position x is reconstructed as `p + s . (x - c)`, with the cell pressure p, the slope
-s,
-and the centroid c of the cell's storage.  Along an axis, s is van Leer's mean of the slopes at both ends of the cell.
-At an open face, the slope follows from the pressure of the neighbour.  At a drained side, the slope follows from the
-pressure on the side.  If an end is neither open nor drained, s is zero.  Then s is scaled so that the pressure in the
-cell stays between the extremes of cell, neighbours and drained sides.
+s, and the centroid c of the cell's storage.  Along an axis, s is van Leer's mean of the slopes at both ends of the
+cell.  At an open face, the slope follows from the pressure of the neighbour.  At a drained side, the slope follows from
+the pressure on the side.  If an end is neither open nor drained, s is zero.  Then s is scaled so that the pressure in
+the cell stays between the extremes of cell, neighbours and drained sides.
 
 A piece of a particle domain receives the pressure at its centroid and moves with the domain.  Then the domain is cut
 again.  A cell may contain a fraction of the domain before and after the cut.  The smaller of both fractions keeps its
@@ -163,10 +162,8 @@ class Reconstruction:
         """Return pressures (m,), in Pa, at positions in owned cells, with second-order accuracy even at the surface.
 
         In a cell at a no-flow side, the slope is the smaller of two slopes: that in the next cell inside, and the
-        linear
-        extrapolation of the slopes inside.  Pressures stay between the extremes of cell, neighbours and drained sides,
-        and of
-        the reconstructed value at the surface.
+        linear extrapolation of the slopes inside.  Pressures stay between the extremes of cell, neighbours and drained
+        sides, and of the reconstructed value at the surface.
 
         `x` (m, d), in m: positions relative to the midpoints of their cells.
         `slot` (m,): index of the cell of each position in `pressures.cells`.

@@ -193,8 +193,7 @@ def on_planes(
     `Grid.snap`.
 
     If all cells are equal, positions for slicing are in units of cells.  Otherwise they are in m, because domain edges
-    are
-    straight in m.
+    are straight in m.
 
     `true`: positions from the grid's lower corner, in units of cells.
     `x`, in m: these positions from the grid's base.

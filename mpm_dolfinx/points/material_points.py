@@ -27,8 +27,7 @@ def body_of(ids: NDArray[np.int64], starts: NDArray[np.int64]) -> NDArray[np.int
     """Return the index (n,) of each point's body.
 
     `starts` (bodies + 1,): first id of each body, and first id of renewed points.  Successive ids of renewed points
-    belong
-    to the bodies in turn, cyclically.
+    belong to the bodies in turn, cyclically.
     """
     beyond = ids - starts[-1]
     return np.where(beyond < 0, starts.searchsorted(ids, side="right") - 1, beyond % max(1, len(starts) - 1))
@@ -99,7 +98,7 @@ class MaterialPoints:
     corners : (n, 2^d, d), m
         Tracked corners of the particle domain, in the order of `grid.corner_bits`.
     F : (n, d, d)
-        Deformation gradient.  In plane strain with an out-of-plane stretch, this is its in-plane part, scaled to det F.
+        Deformation gradient.  In plane strain with an out-of-plane stretch, F is the in-plane part, scaled to det F.
     volume0 : (n,), m^d
         Reference volume.
     material : (n,)

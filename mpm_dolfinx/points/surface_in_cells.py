@@ -107,8 +107,7 @@ def resampled(
     """Return the surface in n cells as vertices (n, EDGES + 1, 2) from P to Q (n, 2).
 
     Vertices lie at sharp bends.  Nearly straight parts are divided evenly.  The vertices are then shifted to preserve
-    the
-    area between surface and chord, or in axisymmetry the volume of the ring of this area.
+    the area between surface and chord, or in axisymmetry the volume of the ring of this area.
 
     `of` (m,): index of each segment's cell, ascending.
     `x` (m, 2, 2): both ends of each segment, from 0 to 1 in its cell.
