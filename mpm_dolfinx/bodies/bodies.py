@@ -202,7 +202,7 @@ def mapped(grid: Grid, body: Body, map: Callable[[NDArray[np.float64]], NDArray[
 
 
 def check_inside(grid: Grid, body: Body, name: str = "body") -> Body:
-    """Return the body, or raise ValueError if the body is not inside the grid."""
+    """Return the body, or raise ValueError for a body outside the grid."""
     count, where = 0, None
     for part in in_chunks(len(body) if body.map is None else 0):
         lower = body.lower_of(part) - grid.base
@@ -282,7 +282,7 @@ def check_bodies(grid: Grid, bodies: Sequence[Body]) -> None:
 
 
 def check_different(bodies: Sequence[Body]) -> None:
-    """Raise an error for a repeated body, because conditions would act on only one of its copies."""
+    """Raise an error for a repeated body, because conditions would count its faces twice."""
     for j, body in enumerate(bodies):
         for i in range(j):
             if bodies[i] is body:

@@ -145,7 +145,7 @@ class RowsBody(LatticeBody):
         return sum(float(self.boxes(part).prod(axis=1).sum()) for part in in_chunks(len(self)))
 
     def corner_rows(self, axis: int) -> NDArray[np.float64]:
-        """Return the coordinates, in m, of the boundaries between the body's rows along an axis."""
+        """Return the coordinates, in m, of the boundaries of the body's rows along an axis."""
         low, high = self._ends
         return self.rows[axis][low[axis] : high[axis] + 2]
 

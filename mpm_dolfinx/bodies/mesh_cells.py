@@ -167,7 +167,7 @@ class Polytopes:
 
 
 def _crossed(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the cross products of edges, which are exactly zero for nearly parallel edges."""
+    """Return the cross products of edges, which are zero for edges that are parallel within rounding."""
     out = np.cross(a, b)
     size = np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1)
     return np.where((np.linalg.norm(out, axis=1) > SAME * size)[:, None], out, 0.0)

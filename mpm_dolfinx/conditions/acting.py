@@ -155,7 +155,10 @@ class Loads:
         return self
 
     def begun(self, shares: Shares, earlier: Any) -> Loads:
-        """Return the loads of a substep with inertia.  `earlier` is the result of `flown` in the previous substep."""
+        """Return the loads of a substep with inertia.
+
+        `earlier`: result of `flown` in the previous substep.
+        """
         return self
 
     def flown(self, at: At) -> Any:
@@ -236,7 +239,8 @@ class Loads:
         """Return the initial constraints of this condition.
 
         Each constraint has cells (n,), opposite cells (n,), positions (n, d) and directions (n, d).  Opposite cells
-        belong to another body in contact, or are None if this body does not deform.
+        belong to
+        another body in contact.  Without a second deforming body, they are None.
         """
 
     @property
@@ -282,18 +286,22 @@ class Loads:
     def under_held(
         self, ids: NDArray[np.int64], tracked: NDArray[np.float64], volume: NDArray[np.float64], corners: NDArray
     ) -> NDArray[np.float64]:
-        """Return the corners (n, 2^d, d), in m, of re-initialised domains, with the tracked corners on prescribed
-        sides.
+        """Return the corners (n, 2^d, d), in m, of re-initialised domains, with tracked corners on prescribed sides.
 
         A domain with a face on a prescribed side becomes a prism of equal volume.
 
-        `ids`, `volume` (n,), in m^d: identifiers of the points, and volumes of their domains.
-        `tracked`, `corners`: tracked corners, and corners that are initialised from F.
+        `ids` (n,): identifiers of the points.
+        `tracked`: tracked corners.
+        `volume` (n,), in m^d: volumes of the domains.
+        `corners`: corners that are initialised from F.
         """
         return corners
 
     def check_end(self, points: MaterialPoints, before: MaterialPoints) -> None:
-        """Raise an error if points lie in forbidden regions after a step.  `before` are the points at its start."""
+        """Raise an error if points lie in forbidden regions after a step.
+
+        `before`: points at the start of the step.
+        """
 
 
 class Acting:

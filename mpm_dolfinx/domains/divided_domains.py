@@ -77,7 +77,10 @@ class SeededDomains:
         return out, lower - step
 
     def places(self, root: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the body and lattice index (n, 1 + d) of seeded domains.  Without a lattice, the body is -1 - id."""
+        """Return the body and lattice index (n, 1 + d) of seeded domains.
+
+        For a domain without a lattice, the body is -1 - id.
+        """
         out = np.zeros((len(root), 1 + self._dim), dtype=np.int64)
         body = body_of(root, self.starts)
         for i in np.unique(body):

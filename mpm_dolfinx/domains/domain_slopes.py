@@ -9,8 +9,8 @@ a piece with the local coordinates xi in its domain, the gradient is therefore
 
 The sum is over the axes a, and xi is in units of the domain's edge lengths.  The slopes D_a are a least-squares fit to
 the gradients F of neighbours of the same material across faces.  Then e is corrected so that the sum of
-`int dV / det F` over the pieces is the reference volume of the domain.  The fit reproduces linear fields on any mesh, and uniform
-fields stay uniform.
+`int dV / det F` over the pieces is the reference volume of the domain.  The fit reproduces linear fields on any
+mesh, and uniform fields stay uniform.
 """
 
 from __future__ import annotations

@@ -55,8 +55,8 @@ class Lattice:
     """Lattice of the domain corners of an active body, and the held corners.
 
     `start`: identifier of the body's first point.
-    `given`: for each condition, the faces on which it prescribes displacements, and the prescribed axes.
-    `contacts`: for faces that touch other bodies, the domain (m,), and the indices (m, 4) of the face's corners in it.
+    `given`: for each condition, the faces with prescribed displacements, and the prescribed axes.
+    `contacts`: faces that touch other bodies, as the domain (m,) and the corner indices (m, 4) of each face.
     """
 
     def __init__(

@@ -64,7 +64,10 @@ def is_part(points: MaterialPoints) -> NDArray[np.bool_]:
 
 
 def roots(points: MaterialPoints) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return `ROOT` (n,) and `PART` (n, d, 2) of all points.  A whole domain has its own identifier and [0, 1]."""
+    """Return `ROOT` (n,) and `PART` (n, d, 2) of all points.
+
+    A whole domain has its own identifier as `ROOT`, and the interval [0, 1] along each axis.
+    """
     part, (n, d) = is_part(points), points.x.shape
     if not part.any():
         return points.id, np.broadcast_to([0.0, 1.0], (n, d, 2))
@@ -80,7 +83,9 @@ def faces_of_parts(
 
     Returns
     -------
-    Index of the face (n,), index of the point (n,), and lower and upper ends (n, d) of the part in its seeded domain.
+    Index (n,) of the face for each part.
+    Index (n,) of the point for each part.
+    Lower and upper ends (n, d) of each part in its seeded domain.
     """
     at = is_part(points).nonzero()[0]
     root, part = (of[at] for of in roots(points))
@@ -197,7 +202,7 @@ class RenewedFaces:
     old: NDArray[np.bool_] | None = None  # in the result of `of`: which positions lie on seeded faces (n,)
 
     def of(self, number: NDArray[np.int64]) -> RenewedFaces:
-        """Return the renewed faces with indices `number` (n,).  Rows of seeded faces (index < 0) are `old`."""
+        """Return the renewed faces with indices `number` (n,).  Negative indices belong to seeded faces (`old`)."""
         old, at = number < 0, np.maximum(number, 0)
         if not len(self.row):
             return RenewedFaces(*(np.zeros((len(number), *v.shape[1:]), v.dtype) for v in self._columns), old)

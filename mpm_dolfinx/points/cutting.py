@@ -147,7 +147,7 @@ def _centroids(corners: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def tangled(corners: NDArray[np.float64], volume: NDArray[np.float64], axisymmetric: bool = False) -> NDArray[np.bool_]:
-    """Return which domains (n,) are inverted: the volume of their corners is far from `volume` (n,), in m^d."""
+    """Return which domains (n,) are inverted, with a volume far from the prescribed `volume` (n,), in m^d."""
     ratio = domain_volumes(corners, axisymmetric) / volume
     return (ratio < TANGLED) | (ratio > 1 / TANGLED)
 

@@ -87,7 +87,10 @@ def largest_of_bodies(
 def relative(
     norms: NDArray[np.float64], scales: NDArray[np.float64], round_off: NDArray[np.float64] | float = 0.0
 ) -> NDArray[np.float64]:
-    """Return the norms divided by the scales.  Norms of at most `round_off` give 0, undefined quotients give inf."""
+    """Return the norms divided by the scales.
+
+    Norms of at most `round_off` give 0.  Undefined quotients give inf.
+    """
     ratio = np.empty(norms.shape)
     ratio.fill(np.inf)
     np.divide(norms, scales, out=ratio, where=(scales > 0) & (norms < np.inf))
@@ -116,7 +119,10 @@ def parts_of_cells(grid: Grid, active: NDArray[np.bool_]) -> tuple[NDArray[np.in
 
 
 def parts_of_domains(grid: Grid, corners: NDArray[np.float64], copy: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the connected part (n,) of each domain, counted from 0.  `copy` (n,): first cell of its grid copy."""
+    """Return the connected part (n,) of each domain, counted from 0.
+
+    `copy` (n,): first cell of the domain's grid copy.
+    """
     cell = grid.number(grid.index(corners.reshape(-1, grid.dim))).reshape(corners.shape[:2]) + copy.reshape(-1, 1)
     cell, at = np.unique(cell, return_inverse=True)
     own, count = _touching(
