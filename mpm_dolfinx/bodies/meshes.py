@@ -366,7 +366,7 @@ def _split(
 ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.bool_]]:
     """Divide domains that are too large.  Return the new domains, their original domains, and their outer faces.
 
-    Outer faces are those faces of a new domain that lie on faces of the original domain.
+    Outer faces of a new domain lie on faces of the original domain.
     """
     d = grid.dim
     bits = corner_bits(grid.dim)

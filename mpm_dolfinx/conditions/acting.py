@@ -238,9 +238,8 @@ class Loads:
     def touching(self) -> tuple | None:
         """Return the initial constraints of this condition.
 
-        Each constraint has cells (n,), opposite cells (n,), positions (n, d) and directions (n, d).  Opposite cells
-        belong to
-        another body in contact.  Without a second deforming body, they are None.
+        Each constraint has cells (n,), opposite cells (n,), positions (n, d) and directions (n, d).
+        Opposite cells belong to another body in contact.  They are None without a second deforming body.
         """
 
     @property

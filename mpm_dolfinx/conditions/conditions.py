@@ -9,7 +9,7 @@ maps (`mapped`).  Reference areas are areas of the seeded shape, after the maps.
 A new kind of condition is a class in a separate file.  Its method `acting` adds terms to the momentum balance
 (`conditions/acting.py`).  Its method `feeding` adds terms to the fluid balance (`flow/feeding.py`).
 
-A value may be a function of time t, reference positions X and current positions x.  The package passes those arguments
+A value may be a function of time t, reference positions X and current positions x.  The package passes the arguments
 that the function names, see `validation`.
 
 An invalid condition raises a ValueError when the condition, a scene or a stage is created.  A function with an invalid
@@ -206,7 +206,7 @@ class Source:
 
 
 def sorted_terms(terms: Sequence[Callable | OnSide | Source]) -> tuple[list[Callable | OnSide], list[Callable]]:
-    """Return the user's terms of the momentum balance, and those of the fluid balance."""
+    """Return the user's terms of the momentum balance, and the user's terms of the fluid balance."""
     if isinstance(terms, (str, bytes)) or not isinstance(terms, Sequence):
         raise ValueError(f"terms = {line(terms)}, must be a list of functions, OnSide and Source")
     sources = [term.term for term in terms if isinstance(term, Source)]
@@ -395,14 +395,15 @@ HOLD = 3e2
 """Penalty stiffness for prescribed displacements, times cell size, divided by the `holding` modulus.
 
 The penalty acts on means over cells.  The displacement error is the change of traction in the step (without its
-rotation), divided by the stiffness.  It does not accumulate, because each step measures it from the prescribed
+rotation), divided by the stiffness.  The error does not accumulate, because each step measures it from the prescribed
 position.  If a body is much stiffer than the penalty, multipliers remove the error, see `HoldLoads.augment`.
 Halving this value changes the result of scene "soil" in tests/plateaus.py by 5.9e-05 (relative), doubling it by
 2.0e-05, and finer cells by 3.0e-02.
 """
 YIELDING = 0.1
-"""Factor on the elastic modulus in the penalty of yielding soil, which is much softer than elastic soil.
+"""Factor on the elastic modulus in the penalty of laws with state variables.
 
+Yielding soil is much softer than elastic soil.
 Halving this value changes the result of scene "soil" in tests/plateaus.py by 6.5e-05 (relative), doubling it by
 1.9e-05, and finer cells by 3.0e-02.
 """

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Walls of the grid: the displacement components that walls fix, and the forces of walls on bodies."""
+"""Walls of the grid: the displacement components that walls fix, and the forces of walls on bodies.
+
+The argument `walls` of a function gives the fixed components of each wall by name.
+"""
 
 from __future__ import annotations
 

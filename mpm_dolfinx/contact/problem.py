@@ -435,10 +435,10 @@ class ContactProblem(Loads):
         return origin.means(contacts, points, *law.tractions(found.touch, found.at))
 
     def rubbing(self, at: At, v: NDArray[np.float64]) -> tuple[float, float]:
-        """See `Loads`.  Only tools do external work.  The work of elastic slip counts as dissipation, negative on
-        unloading.
+        """See `Loads`.  Only tools do external work.  The work of elastic slip counts as dissipation.
 
-        The work of contact pressures does not count, because velocities of substeps jump where a gap closes.
+        This dissipation is negative on unloading.  The work of contact pressures does not count as dissipation, because
+        velocities of substeps jump where a gap closes.
         """
         law = self.now.law
         found = self.found(at)
@@ -456,8 +456,7 @@ class ContactProblem(Loads):
         return 0.0
 
     def outcome(self, at: At) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """See `Loads`.  Results are forces (N) and moments (N m) on bodies, and displacements (m) of tools that loads
-        cause.
+        """See `Loads`.  Results are forces (N) and moments (N m) on bodies, and tool displacements (m) due to loads.
 
         The forces and moments of each contact are one array: (3,), or (6,) in 3D.
         """

@@ -93,7 +93,7 @@ class Patches:
         return lambda name: self.X if name == "X" else self.now(points) + self.base
 
     def area(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the current outward area vectors (n, d), in m^(d-1), or those of rings in axisymmetry, in m^2."""
+        """Return the current outward area vectors (n, d), in m^(d-1), or in m^2 for rings in axisymmetry."""
         share = self._share0 / self._whole0
         if self._grid.axisymmetric:
             share = share * self._grid.around(self.now(points))
@@ -167,7 +167,7 @@ class CutDomains(Keyed):
         return self.pieces_to_cells(values[self.pieces.point])
 
     def plane(self, volume: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the volumes (m,) and centroids (m, d) of pieces, or in axisymmetry those of their sections."""
+        """Return the volumes (m,) and centroids (m, d) of pieces, or areas and centroids of sections in axisymmetry."""
         if not self.grid.axisymmetric:
             return volume, self.x
         return volume / (TURN * self.hoop[:, 3]), self.grid.midpoints[self.cells] + self.hoop[:, :2]
