@@ -229,8 +229,7 @@ def _placed(
 def with_defect(new: MaterialPoints, old: MaterialPoints, into: NDArray[np.int64]) -> MaterialPoints:
     """Return new points with a volume defect such that soil and fluid fill the same volume as before.
 
-    `into`: index of the old point of each new point.  For merged points, it is the index of the new point of each old
-    point.
+    `into`: index of the old point of each new point, or of the new point of each old point if points were merged.
     """
     if "owed" not in new.data:
         return new

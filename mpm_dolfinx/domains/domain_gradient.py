@@ -17,9 +17,10 @@ def gradient(
 ) -> NDArray[np.float64]:
     """Return the deformation gradients F (n, d, d) of particle domains, as means over the simplices of each domain.
 
-    In 2D the diagonals determine F, and det F is the ratio of the areas.  In 3D F is scaled so that det F is the ratio
-    of the volumes.  In axisymmetry F has the shape (n, 3, 3).  The circumferential stretch is the ratio of the centroid
-    radii, and det F is the ratio of the ring volumes.
+    In 2D the diagonals of the domain determine F, and det F is the current area divided by the reference area.  In 3D F
+    is scaled so that det F is the current volume divided by the reference volume.  In axisymmetry F has the shape (n,
+    3, 3).  The circumferential stretch is then the ratio of the centroid radii, and det F is the ratio of the ring
+    volumes.
 
     `corners`, `reference` (n, 2^d, d), in m: current corners, and reference corners.
     """
