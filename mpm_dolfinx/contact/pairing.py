@@ -233,7 +233,7 @@ class Contacts(Touching):
         return np.where(np.isin(facets.face[chosen] * grid.all_cells + number, keys), number, facets.cell[chosen])
 
     def near(self, cut: CutDomains, points: MaterialPoints, corners: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return which corners (n, 2^d, d) of domains are near another group, with the points of the start of a step."""
+        """Return which corners (n, 2^d, d) of domains are near another group; `points` are those before the step."""
         out, largest = np.zeros(corners.shape[:2], dtype=bool), BESIDE * self.grid.sizes_at(corners).max(axis=-1)
         largest = np.broadcast_to(largest, corners.shape[:2])
         for _, *pair, _ in self._faces:
