@@ -21,7 +21,7 @@ circumference.
 
 from mpm_dolfinx.base import _environment  # noqa: F401 - first: it reports missing dependencies
 from mpm_dolfinx.base.errors import LeftGrid, NotConverged, Report
-from mpm_dolfinx.bodies.bodies import Body, mapped
+from mpm_dolfinx.bodies.bodies import Body, Later, Moving, mapped
 from mpm_dolfinx.bodies.boxes import box, shape
 from mpm_dolfinx.bodies.mesh_files import from_mesh
 from mpm_dolfinx.bodies.meshes import MeshBody
@@ -75,6 +75,7 @@ from mpm_dolfinx.probing.cell_fields import CellFields
 from mpm_dolfinx.probing.point_fields import PointFields
 from mpm_dolfinx.probing.probes import Probes, probes
 from mpm_dolfinx.simulation.simulation import Simulation
+from mpm_dolfinx.simulation.step_size import Adaptive
 from mpm_dolfinx.simulation.strength_reduction import Safety, factor_of_safety
 from mpm_dolfinx.simulation.tangent import Tangent
 from mpm_dolfinx.solve.numerics import Numerics
@@ -88,6 +89,7 @@ __all__ = [
     "COUPLINGS",
     "K0",
     "Acting",
+    "Adaptive",
     "Ball",
     "BarcelonaBasic",
     "Body",
@@ -112,6 +114,7 @@ __all__ = [
     "HalfSpace",
     "Hencky",
     "Inflow",
+    "Later",
     "Leaving",
     "LeftGrid",
     "LinearElastic",
@@ -120,6 +123,7 @@ __all__ = [
     "MeshBody",
     "ModifiedCamClay",
     "MohrCoulomb",
+    "Moving",
     "NeoHookean",
     "NotConverged",
     "Numerics",

@@ -63,8 +63,7 @@ def test_a_constant_load_is_kept_while_the_layer_drains():
     s, seen = layer(pushed(lambda t: 3e4 * min(1, t / 10)), wet=True), []
     s.run(
         1e4,
-        rtol=1e-2,
-        first_step=1.0,
+        rtol=mpm.Adaptive(1e-2, first_step=1.0),
         observe=lambda s: seen.append((s.t, s.tool_travel.array[0], -s.tool_forces.array[0, 1])),
     )
     t, travel, force = np.array(seen).T

@@ -2,8 +2,8 @@
 """Pore pressure and stress at probes, which lie at any position in the bodies.
 
 The pressure at a probe is a weighted polynomial fit (`local_fit`) to the pressures of cells.  The fit uses cells of the
-same soil, at most three cells away, that open faces connect to the cell of the probe.  The fit also uses pressures
-on faces to excluded cells and on drained sides.  Heads are fitted instead of pressures, so hydrostatic states are exact.
+same soil, at most three cells away, that open faces connect to the cell of the probe.  The fit also uses pressures on
+faces to excluded cells and on drained sides.  Heads are fitted instead of pressures, so hydrostatic states are exact.
 The result is limited to the range of heads in the cell of the probe, in neighbouring cells and on drained sides.
 Towards an undrained side, this range is extended with the gradient of the head.
 
