@@ -186,11 +186,9 @@ def _arrays(state: State) -> dict[str, NDArray]:
 
 
 def _state(file: Path, arrays: dict[str, NDArray], note: dict[str, Any], simulation: Simulation, count: int) -> State:
-    """Return the state in a file, with the points that this process has read.
+    """Return the state in a file with `count` points; raise ValueError if the file does not fit the simulation.
 
-    count: number of points in the file.
-
-    Nodal fields are pairs of node numbers and values.  Raise ValueError if the file does not fit the simulation.
+    Nodal fields are pairs of node numbers and values.
     """
     now, dim = simulation.state, simulation.grid.dim
     wet = simulation.scene.fluid is not None
@@ -306,10 +304,7 @@ def _points(arrays: dict[str, NDArray], like: MaterialPoints) -> MaterialPoints:
 
 
 def _check_ids(points: MaterialPoints, simulation: Simulation, count: int) -> None:
-    """Raise ValueError if the points of a file do not belong to the present bodies.
-
-    count: number of points in the file.
-    """
+    """Raise ValueError if the points of a file with `count` points do not belong to the present bodies."""
     lengths, present = np.array([len(body) for body in simulation.bodies]), np.asarray(simulation.state.stage.present)
     starts = np.concatenate([[0], lengths.cumsum()])
     whole = count == lengths[present].sum() and (points.id < starts[-1]).all()

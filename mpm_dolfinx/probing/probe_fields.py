@@ -74,11 +74,7 @@ class _Lattice:
 
 
 class _Around:
-    """Data of the cells around n probes, in arrays (n, cells, ...) that are equal on all processes.
-
-    centroid: vectors from the probes to the centroids of the material in the cells, in m.
-    half: vectors from the midpoints of the cells to the centroids of the material in the cells, in m.
-    """
+    """Data of the cells around n probes, in arrays (n, cells, ...) that are equal on all processes."""
 
     def __init__(self, scene: Scene, state: State, on_grid: OnGrid, probes: Probes):
         self._grid = scene.grid

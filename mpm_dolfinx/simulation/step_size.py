@@ -138,10 +138,7 @@ class StepSize:
         return 1.0 if self._excess(report, control) <= 1 else self._factor(report, control, 1.0)
 
     def next(self, size: float, report: Report, control: StepControl, failed: bool) -> float:
-        """Return the length of the next trial step.
-
-        failed: whether a longer trial of the completed step did not converge.
-        """
+        """Return the length of the next trial step; `failed` means that a longer trial did not converge."""
         if not self.by_error:
             grows = report.easy and not self._rings(size, report, control)  # twice the step would be rejected
             return max(control.small, min(2 * size, self.longest)) if grows else control.small
