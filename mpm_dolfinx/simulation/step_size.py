@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Length of the steps of a run: all equal, or adapted to the estimated error of each step.
 
-The estimated error of the pressures comes from `solve/newton.py`, that of the water content from `flow/storage.py`, and
-that of the motion from `dynamics/motion_error.py`.
+Three errors are estimated: the error of the pressures in `solve/newton.py`, the error of the water content in
+`flow/storage.py`, and the error of the motion in `dynamics/motion_error.py`.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from mpm_dolfinx.stepping.scene import Scene
 from mpm_dolfinx.stepping.state import StepControl
 
 MIN_CUT, MIN_CUT_BY_ERROR = 2.0**-10, 2.0**-30
-"""Length of a step, divided by the nominal length, below which a run with equal or adaptive steps gives up.
+"""Shortest length of equal steps and of adaptive steps, divided by the nominal length.
 
 Adaptive steps may have grown by several powers of ten before a slide begins, and must then shrink again.
 """
@@ -174,13 +174,13 @@ class StepSize:
     def _rings(self, size: float, report: Report, control: StepControl) -> bool:
         """Return whether the step may have overshot a jump of the loads.
 
-        Pressure changes that are as sudden in the last step are no jumps.  Grid resets may cause such changes.
+        A sudden pressure change is no jump if pressures also changed suddenly in the last step.
         """
         excess = report.sudden - AGAIN * size * np.asarray(control.first)
         return bool((excess > np.maximum(RINGS * np.asarray(control.change), NEAR * max(control.change))).any())
 
     def _factor(self, report: Report, control: StepControl, power: float) -> float:
-        """Return the ratio of the next step to the computed step, for the error of the computed step."""
+        """Return the ratio of the next step to the computed step, from the error of the computed step."""
         excess = self._excess(report, control)
         return min(GROWS, max(SHRINKS, SAFETY / excess**power if excess > 0 else GROWS))
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Factor of safety: the largest number by which the strength of the soil can be divided before the bodies fail.
 
-Trials with different factors find this number.  A factor divides cohesion, tensile strength and the tangents of the
+Trials with different factors bracket this number.  A factor divides cohesion, tensile strength and the tangents of the
 angles of friction and dilation (Griffiths and Lane 1999).  If Newton's method fails, the soil need not be too weak, so
 this failure is no criterion.  A trial adds a viscous stress to the soil instead, and follows the motion in time.  The
 criterion is the overload, the ratio of the viscous stress to the shear stress.  If the soil is strong enough, the
