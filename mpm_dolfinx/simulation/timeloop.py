@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Time loop and histories of a run; steps that do not converge are reduced, and later steps grow again."""
+"""Time loop of a run, which takes steps and records histories."""
 
 from __future__ import annotations
 
@@ -47,10 +47,10 @@ PARTS = (
     "move points",
     "output",
 )
-"""Timed parts of a run."""
+"""Parts of a run whose wall time is measured."""
 
 Observer = Callable[[Any], None]
-"""A function of the simulation."""
+"""A function that is called with the simulation."""
 
 
 def run(
@@ -184,13 +184,13 @@ def run(
 
 
 def _bar(start: float, now: float, end: float, shown: bool) -> tqdm:
-    """Return a progress bar for the time from start to end, s."""
+    """Return a progress bar for the time of a run."""
     form = "{percentage:3.0f}%|{bar}| {elapsed}<{remaining}{postfix}"
     return tqdm(total=end - start, initial=now - start, bar_format=form, disable=None if shown else True)
 
 
 def _show(bar: tqdm, state: State, before: float) -> None:
-    """Update the progress bar; before: time at the last update, s."""
+    """Update the progress bar, which shows the time `before`."""
     result = state.result
     bar.update(state.t - before)
     counts = {"t": f"{state.t:.4g} s", "steps": result.steps, "newton": result.newton, "coupling": result.coupling}
@@ -199,13 +199,13 @@ def _show(bar: tqdm, state: State, before: float) -> None:
 
 
 def _note(simulation: Simulated, result: Result, control: StepControl | None = None) -> Result:
-    """Store the histories in the state, and the step control if it is given."""
+    """Store histories in the state, and also a step control if one is passed."""
     simulation.state = replace(simulation.state, result=result, control=control or simulation.state.control)
     return result
 
 
 def _takes_nothing(function: Callable) -> bool:
-    """Return whether a function has no parameter; False for built-in functions without a signature."""
+    """Return whether a function has no parameters."""
     try:
         return not signature(function).parameters
     except (TypeError, ValueError):
@@ -215,7 +215,7 @@ def _takes_nothing(function: Callable) -> bool:
 def _histories(
     simulation: Simulated, times: Times, rule: StepSize, probes: Probes | None, after: Result | None
 ) -> tuple[Result, StepControl]:
-    """Return histories that start at the present state or that the run continues, and the step control."""
+    """Return the histories and the step control at the start of a run."""
     state = simulation.state
     latest = simulation.state.result
     control = simulation.state.control
@@ -243,7 +243,7 @@ def _histories(
 
 
 def _counting(scene: Scene, state: State, energies: bool, goes_on: bool) -> State:
-    """Return the state with energies that start now, with the energies of the continued run, or without energies."""
+    """Return the state with the energies at the start of a run, or without energies."""
     if energies and not state.stage.inertia:
         raise ValueError("energies = True: bodies have no inertia, must be in a stage with inertia=True")
     if energies and goes_on and "energy" in state.outcome:
@@ -256,7 +256,7 @@ def _counting(scene: Scene, state: State, energies: bool, goes_on: bool) -> Stat
 
 
 class _Stopwatch:
-    """Wall time and profile of a run, including the earlier run that this run continues."""
+    """Wall time and profile of a run, including the time of a run that it continues."""
 
     def __init__(self, result: Result):
         self._start = time.perf_counter() - result.wall
@@ -269,7 +269,7 @@ class _Stopwatch:
 
 
 def _take_step(simulation: Simulated, rule: StepSize, target: float, verbose: bool, events: Events) -> bool:
-    """Take one step towards the time `target`, s; return whether an event has ended the run."""
+    """Take one step towards the time `target`, and return whether an event ends the run."""
     distribute(simulation)
     step, new = _advance(simulation, rule, target, verbose)
     found = events.within(step, new)
@@ -285,7 +285,7 @@ def _take_step(simulation: Simulated, rule: StepSize, target: float, verbose: bo
 def _accepted(
     rule: StepSize, start: State, size: float, new: State, report: Report, preferred: float | None = None
 ) -> State:
-    """Return the state after a step of length `size`, s, with updated histories; preferred: nominal step, s."""
+    """Return the state after an accepted step, with new histories and a new step control."""
     grown = measured(start.control, report)
     grown = rule.grown(size, report, grown, failed=size < (1 - SAME) * (preferred or size))
     grown = replace(grown, first=np.divide(report.first, size).tolist())
@@ -293,11 +293,9 @@ def _accepted(
 
 
 def _advance(simulation: Simulated, rule: StepSize, target: float, verbose: bool) -> tuple[Step, State]:
-    """Return a step towards the time `target`, s, and the state at the end of the step.
+    """Return a step towards the time `target`, and the state at the end of this step.
 
-    The step is reduced until it meets its tolerances.
-
-    verbose: whether to warn of the first reduced step of a run.
+    The step is shortened until it converges and meets the tolerances.
     """
     comm = simulation.scene.grid.comm
     preferred = whole = None
@@ -341,9 +339,9 @@ def _advance(simulation: Simulated, rule: StepSize, target: float, verbose: bool
 
 
 def _by_euler(simulation: Simulated, dt: float, failed: StepFailed) -> tuple[State, Report] | None:
-    """Return the state after a step of dt, s, by backward Euler, and its report; None if this step fails too.
+    """Return the state and the report after a step by backward Euler, or None if this step fails too.
 
-    After a jump of the loads the second substep of SDIRK2 overshoots. Soil may be too weak for the overshoot.
+    After a jump of the loads, SDIRK2 overshoots, and the soil may be too weak for the overshoot.
     """
     if isinstance(failed, LeftGrid) or len(simulation.scene.substeps) == 1:
         return None
@@ -358,14 +356,14 @@ def _by_euler(simulation: Simulated, dt: float, failed: StepFailed) -> tuple[Sta
 
 
 def _has_left(failed: StepFailed, rule: StepSize, size: float, state: State) -> bool:
-    """Return whether points leave the grid in an accurate step, so that shorter steps cannot prevent it."""
+    """Return whether points leave the grid in a step that is short enough."""
     if not isinstance(failed, LeftGrid) or failed.report is None:
         return False
     return rule.refused(size, failed.report, measured(state.control, failed.report)) == 1
 
 
 def _why(t: float, small: float, failed: StepFailed) -> str:
-    """Return the message of a run that gave up at time t, s, after a step `small`, s."""
+    """Return the error message of a run that gave up."""
     if isinstance(failed, LeftGrid):
         return str(failed)
     why = "shorter steps help only where loads grow with time, as functions of t; the soil may have no equilibrium"
@@ -373,7 +371,7 @@ def _why(t: float, small: float, failed: StepFailed) -> str:
 
 
 def _row(simulation: Simulated, probes: Probes | None) -> Row:
-    """Return the results at the present time, as one row of the histories."""
+    """Return the results at the present time as a row of the histories."""
     scene, state = simulation.scene, simulation.state
     comm = scene.grid.comm
     d = scene.grid.dim
