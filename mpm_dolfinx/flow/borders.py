@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Fluxes through faces between cells of different unsaturated soil, and through faces of cells with several soils.
+"""Fluxes of unsaturated soil through faces between cells of different soil, and through faces of cells with several
+soils.
 
-`series` computes the fluxes through these faces.  All other faces have two-point fluxes in UFL.
+`series` computes the conductivities of these faces. All other faces have two-point fluxes in UFL.
 """
 
 from __future__ import annotations
@@ -66,7 +67,7 @@ class Borders:
         first, other = grid.facet_cells[facets].T
         differ = (known[first] != known[other]).any(axis=1) | (known[first, 0] > 0)
         self.facets, self.uniform = facets[differ], facets[~differ]
-        """Two arrays of facets of this process: facets between cells of different soil, and all other facets."""
+        """Facets of this process between cells of different soil, and all other facets."""
         offset = grid.midpoints[grid.facet_cells[self.facets]]
         offset = offset[:, 1] - offset[:, 0]
         self._axis = np.abs(offset).argmax(axis=1)
@@ -81,7 +82,8 @@ class Borders:
     ) -> BorderFaces:
         """Return the faces with their current conductivities.
 
-        `laws`: relative conductivities as functions of pressure, see `Laws`.  `contents`: material in the cells.
+        `laws`: relative conductivities as functions of pressure, see `Laws`.
+        `contents`: material in the cells.
         `flow`: conductivities of the filled owned cells.
         `places` (c, d), m: vectors from the midpoints of local cells to the pressure positions of these cells.
         `moved` (c, d), m: displacements of the cells in the step.
@@ -134,7 +136,9 @@ class Borders:
         outer: NDArray[np.float64],
         drop: NDArray[np.float64],
     ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]]:
-        """Yield indices (k,) of faces at owned mixed cells, and results of `Relative.through_sides` for these faces."""
+        """Yield the indices (k,) of faces at owned mixed cells, and the result of `Relative.through_sides` for these
+        faces.
+        """
         rows = np.flatnonzero(self.mixed[cells] >= 0)
         if not len(rows):
             return
@@ -150,7 +154,7 @@ class Borders:
         yield rows, *np.divide(found, across, out=np.zeros_like(found), where=across > 0)
 
     def _from_others(self, paths: Paths) -> Paths:
-        """Return the flow paths in all cells at these faces.  The paths in ghost cells come from their owners."""
+        """Return the flow paths in all cells at these faces, ghost cells included."""
         if self.grid.comm.size == 1:
             return paths
         columns = [values.reshape(len(self._cells), np.prod(values.shape[1:])) for values in paths]
@@ -177,7 +181,11 @@ class BorderFaces:
     bulk: float  # bulk modulus of the fluid, Pa
 
     def flows(self, p: NDArray[np.float64], force: NDArray[np.float64] | None) -> BorderFlows:
-        """Return the fluxes at pressures p (2, m), in Pa.  `force` (c, d), N/m^3: inertia force in local cells."""
+        """Return the fluxes through the faces.
+
+        `p` (2, m), Pa: pressures on both sides of each face.
+        `force` (c, d), N/m^3: inertia force in local cells.
+        """
         weight = (
             self.weight
             if force is None
@@ -204,7 +212,9 @@ class BorderFlows:
             np.add.at(out, cells, sign * self.flux)
 
     def add_slopes(self, A: PETSc.Mat, unknowns: Unknowns) -> None:
-        """Add the derivatives of the outflows with respect to the pressures to a matrix, without final assembly."""
+        """Add the derivatives of the outflows with respect to the pressures to a matrix. The matrix is not yet
+        assembled.
+        """
         if not len(self.flux):
             return
         number = unknowns.map.indices[self.pair]

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: MIT
 """Two-point fluxes of the pore fluid through the covered parts of cell faces, and damping of pressure jumps.
 
-The material in the cells enters the forms through coefficients, which are set at each grid reset.  In a moving body the
-fluxes through the deformed cells are pulled back to the start of the step.  The mobility kappa of a cell (conductivity
-/ unit weight) becomes `J F^-1 kappa F^-T`.  Here F is `I + grad u` at the centroid of the cell's material, and J is
-`det F`.  `drained_sides` computes the fluxes through open sides.  `StorageProblem` in `storage` adds these to the
-fluxes between cells.
+The coefficients of the forms describe the material in the cells, and are set at each grid reset.  In a moving body, the
+fluxes through the deformed cells are pulled back to the start of the step.  Let kappa be the mobility of a cell
+(conductivity divided by unit weight), `F = I + grad u` the deformation gradient at the centroid of the cell's material,
+and `J = det F`.  The pulled-back mobility is `J F^-1 kappa F^-T`.  `drained_sides` computes the fluxes through open
+sides.
 """
 
 from __future__ import annotations
@@ -91,17 +91,18 @@ class Conduction:
         return across if hoop is None else across * hoop[at]
 
     def distance_ratio(self, at: NDArray[np.int64], normal: NDArray, offset: NDArray) -> NDArray[np.float64]:
-        """Return the ratio (m,) of two distances of each face: from the centroid, and from the pressure position.
+        """Return the distance of the centroid from each face, divided by the distance of the pressure position (m,).
 
         See `layers` for pressure positions.
-        `normal` (m, d): normals of the faces.  `offset` (m, d), m: vectors from the centroids to the faces.
+        `normal` (m, d): normals of the faces.
+        `offset` (m, d), m: vectors from the centroids to the faces.
         """
         distance = (offset * normal).sum(axis=1)
         shifted = distance - (self.mobility.shift[at] * normal).sum(axis=1)
         return np.divide(distance, shifted, out=np.ones(len(distance)), where=shifted > 0)
 
     def deformed(self, at: NDArray[np.int64], vector: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the images (m, d) of vectors in cells `at` under the deformation gradients of these cells."""
+        """Map vectors (m, d) in cells `at` by the deformation gradients of these cells."""
         return vector if self.motion is None else (self.motion.F[at] @ vector[:, :, None])[:, :, 0]
 
 

@@ -52,7 +52,7 @@ class Sources(Feeding):
         self.linear = not self._slopes
 
     def gain(self, pieces: PointData) -> NDArray[np.float64]:
-        """Return the inflow (m^d/s) into each filled cell at p, as an array over local cells."""
+        """Return the inflow (m^d/s) into each filled cell, as an array over local cells."""
         return self._sum(self._forms, pieces)
 
     def slope(self, pieces: PointData) -> NDArray[np.float64]:
@@ -71,7 +71,7 @@ class Sources(Feeding):
         return SourceFeeds(self, wet)
 
     def fed(self, cut: CutDomains, pieces: PointData) -> NDArray[np.int64]:
-        """Return the indices of points with pieces in cells that contain a source; indices may be repeated."""
+        """Return the indices of points with pieces in cells that contain a source. Indices may be repeated."""
         return cut.pieces.point[cut.to_pieces(self.gain(pieces)[cut.cells] != 0)]
 
 
@@ -84,7 +84,7 @@ class SourceFeeds(Feeds):
         self.linear = sources.linear
 
     def leaving(self, at: None, fluid: Fluid) -> Leaving:
-        """Return minus the inflow into the cells."""
+        """Return the inflow into the cells as a negative outflow."""
         gain = self._sources.gain(self._pieces)[self._cells]
         return Leaving(-gain, gain=np.abs(gain))
 

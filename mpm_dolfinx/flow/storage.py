@@ -1,22 +1,23 @@
 # SPDX-License-Identifier: MIT
 """Storage of the pore fluid: a finite volume method with constant pressures (DG0) in the cells.
 
-`drained_sides` treats open sides.  The fluid balance of an active cell, with J_Delta = det(I + grad u), is
+The fluid balance of an active cell, with J_Delta = det(I + grad u), is
 
     int r [zeta(J_Delta, p) - zeta_n] dV_n  +  int sum_faces Q dt  =  0,      d zeta = alpha dJ + S J dp,
     Q = T r [p+ - p- + rho_w g . (x- - x+)],   T = A / (d+ / kappa+ + d- / kappa-),   kappa = k / (rho_w g).
 
-With div u instead of J_Delta, rotations would cause volume changes.  The factor `r = exp(p / K_w)` is the fluid density
-divided by the density rho_w at zero pressure.  In the storage term, r is taken at the pressure `(p_n + p) / 2`.  On a
-face, r is the logarithmic mean over both cells.  With this mean, `r [p+ - p-]` is the jump of the mass potential
-(`fluid_content`), and the mass that leaves a cell enters the neighbour.  The residual is the left side of the balance,
-divided by the r of the storage term.  The tangent neglects the difference between the r of a face and the r of the
-storage term.  A is the exact area of the body on the face, and k is the conductivity.  The points x+- are the centroids
-of the material in both cells, and d+- are their distances from the face.  `layers` defines kappa and d of mixed cells.
-Distances from centroids are exact for partly filled cells.  Half of the cell size would be too long there.
-`nonorthogonal` corrects fluxes if the two centroids are offset along the face.  The sum
-of the balances of all cells is the fluid balance of the bodies.  `fluid_content` defines the change of the content, and
-`time_integration` the integral over a substep.
+With div u instead of J_Delta, rotations would cause volume changes.  `fluid_content` defines the change of the fluid
+content zeta, and `time_integration` the integral over a substep.  A is the exact area of the body on the face, and k is
+the conductivity.  The points x+ and x- are the centroids of the material in both cells, and d+ and d- are their
+distances from the face.  Distances from centroids are exact for partly filled cells.  `layers` defines kappa and d of
+mixed cells.  `nonorthogonal` corrects the fluxes if the two centroids are offset along the face.  `drained_sides`
+treats open sides.
+
+The factor `r = exp(p / K_w)` is the fluid density divided by the density rho_w at zero pressure.  In the storage term,
+r is taken at the pressure `(p_n + p) / 2`.  On a face, r is the logarithmic mean over both cells.  With this mean, `r
+[p+ - p-]` is the jump of the mass potential (`fluid_content`), and the mass that leaves a cell enters the neighbour.
+The residual is the left side of the balance, divided by the r of the storage term.  The tangent neglects the difference
+between the r of a face and the r of the storage term.
 
 The volumes of domains drift from their fluid content, for three reasons: corners do not follow u alone, points move to
 other cells, and pressure jumps are damped (see below).  Each point stores the difference as a volume defect (`owed`).
@@ -25,11 +26,13 @@ The next steps correct fractions of this defect (`defect`), at a constant rate o
 If no fluid flows within a step, Q1 displacements with DG0 pressures violate the inf-sup condition: pressures that
 alternate from cell to cell have no effect.  Therefore jumps of the pressure increment of the step are stabilised by the
 term `max(0, tau d - dt kappa / d) A [p - p_n]`.  Here tau (1/Pa) is the strength of the stabilisation, and `d = d+ +
-d-`.  In this term, dt (s) is the length of the step times the coefficient of Q(u, p) in `time_integration`, which is 1
-or gamma.  The term raises the coefficient `dt kappa A / d` of a face to `tau d A` if `tau d A` is larger.  The term
-conserves fluid, and it is zero in steady states.  For elastic soil, tau is a quarter of Silvester and Kechkar's patch
-value (Camargo, White and Borja 2021).  Soil in plastic flow needs a tau up to a hundred times larger.  The increase of
-tau acts on second differences only (`second_differences`), because damping of jumps would smear steep pressures.
+d-`.  In this term, dt is the length of the step times the coefficient of Q(u, p) in `time_integration`.  The term
+raises the coefficient `dt kappa A / d` of a face to at least `tau d A`.  The term conserves fluid, and it is zero in
+steady states.
+
+For elastic soil, tau is a quarter of Silvester and Kechkar's patch value (Camargo, White and Borja 2021).  Soil in
+plastic flow needs a tau up to a hundred times larger.  The increase of tau acts on second differences only
+(`second_differences`), because damping of jumps would smear steep pressures.
 """
 
 from __future__ import annotations
@@ -165,7 +168,9 @@ class StorageForms:
         """Sources and open sides of all stages."""
 
     def change(self, data: PointData) -> NDArray[np.float64]:
-        """Return an array over local cells: change (m^d) of the fluid volume in filled cells since the step's start."""
+        """Return the changes (m^d) of the fluid volume in filled cells since the start of the step, as an array over
+        local cells.
+        """
         b = self._sums
         b[data.places.filled] = 0.0
         self._change.assemble_vector(b, data)
@@ -174,9 +179,10 @@ class StorageForms:
     def derivatives(self, data: PointData) -> list[NDArray[np.float64]]:
         """Return the derivatives of `change` with respect to p, and with respect to the nodal displacements u.
 
-        The derivative d/dp is an array (filled cells,), in m^d/Pa.  The derivatives d/du are one or two arrays (filled
-        cells, n), in m^(d-1).  The first array is for the momentum balance, and differentiates `alpha dJ_Delta`.  The
-        second array exists unless `symmetric` is set, and differentiates the content.
+        The derivative with respect to p is an array (filled cells,), in m^d/Pa.  The derivatives with respect to u are
+        one or two arrays (filled cells, n), in m^(d-1).  The first array is for the momentum balance, and
+        differentiates `alpha dJ_Delta`.  The second array differentiates the content.  It exists only if `symmetric` is
+        False.
         """
         sums, count = self._derivatives(data), self.grid.dim * 2**self.grid.dim
         return [sums[:, 0], *[sums[:, start : start + count] for start in range(1, sums.shape[1], count)]]
@@ -189,7 +195,8 @@ class StorageForms:
     def driven(
         self, assembled: FacetSum, active: NDArray[np.int64], force: NDArray[np.float64] | None
     ) -> NDArray[np.float64]:
-        """Return the outflow (c,) of active cells to other cells, in m^d/s, caused by p and by the fluid's weight.
+        """Return the outflow (c,) of active cells to other cells, in m^d/s, due to the pressures and the fluid's
+        weight.
 
         `force` (c, d), N/m^3: inertia force on the fluid in the local cells, or None.
         """
@@ -275,24 +282,25 @@ class StorageSystem:
         return (self._uniform or self._over_uniform())[1]
 
     def _over_uniform(self) -> tuple[FacetSum | None, FacetSum | None]:
-        """Return two forms over the faces between cells of one soil: the form of the flux matrix, and `gravity`."""
+        """Return the forms of the flux matrix and of `gravity`, over the faces between cells of one soil."""
         fluxes, facets = self._forms.fluxes, self._facets
         facets = facets if fluxes.relative is None else fluxes.relative.uniform(facets)
         return tuple(form and form.on(facets) for form in (fluxes.flux, fluxes.gravity))
 
     def places(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the grid positions of this process's unknowns, and an empty array, because no pressure is fixed."""
+        """Return the grid positions of this process's unknowns, and an empty array, because no pressure is prescribed.
+        """
         places = self._forms.grid.cell_places(self.unknowns.owned)
         return places, places[:0]
 
     def change_by(self, u: PETSc.Vec, out: PETSc.Vec, *slopes: FluxSlope) -> None:
-        """Set `out` to the change (m^d) of the residual due to u: by content and, with `slopes`, by fluxes."""
+        """Set `out` to the change (m^d) of the residual due to u.  With `slopes`, the change includes the fluxes."""
         self.B.mult(u, out)
         for slope in slopes:
             out.array_w[:] += slope(u)
 
     def between(self, pi: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the outflow to other cells, in m^d/s, caused by differences of the mass potentials pi (n,), in Pa."""
+        """Return the outflow to other cells, in m^d/s, due to the mass potentials pi (n,), in Pa."""
         self._potentials.array_w[:] = pi
         return (self.T * self._potentials).array_r
 
@@ -309,7 +317,10 @@ class StorageSystem:
         flow: Conduction,
         off: tuple[FacetSum, Gradients, OpenSides] | None,
     ) -> Outflow:
-        """Assemble the fluxes through inner faces.  `off` are arguments of `NonorthogonalFlow`, or None."""
+        """Assemble the fluxes through inner faces.
+
+        `off`: arguments of `NonorthogonalFlow`, or None.
+        """
         fluxes = self._forms.fluxes
         mobility = fluxes.set_conduction(contents, flow)
         if (relative := self._forms.fluxes.relative) is not None:
@@ -325,7 +336,10 @@ class StorageSystem:
         return Outflow([one.conducting(flow) for one in feeds], total, mobility, nonorthogonal)
 
     def assemble_fluxes(self, force: NDArray[np.float64] | None = None) -> None:
-        """Assemble the matrix of fluxes (in unsaturated soil at p).  `force`: see `StorageForms.driven`."""
+        """Assemble the matrix of fluxes, in unsaturated soil at the current pressures.
+
+        `force`: see `StorageForms.driven`.
+        """
         zero(self.T)
         relative, borders = self._forms.fluxes.relative, None
         if relative is not None:
@@ -431,7 +445,7 @@ class StorageProblem:
     def _damping_of_soft_soil(
         self, tau: NDArray[np.float64], softest: NDArray[np.float64], mobility: NDArray[np.float64]
     ) -> PETSc.Mat:
-        """Return the matrix of additional damping in soft cells.  `tau` (n,), 1/Pa: strength for elastic soil."""
+        """Return the matrix of additional damping in soft cells."""
         contents, grid = self._contents, self.forms.grid
         flow = self.dt * mobility / grid.sizes(contents.filled) ** 2
         more = np.maximum((softest * tau)[:, None] - flow, 0) - np.maximum(tau[:, None] - flow, 0)
@@ -446,7 +460,7 @@ class StorageProblem:
 
     @property
     def _density(self) -> NDArray[np.float64]:
-        """Density of the fluid in the active owned cells at mid-step, divided by the density at zero pressure."""
+        """Relative density of the fluid in the active owned cells at mid-step."""
         (p, p_n), owned = self._p, self.system.unknowns.owned
         return np.exp((p[owned] + p_n[owned]) / (2 * self.forms.bulk))
 
@@ -481,15 +495,16 @@ class StorageProblem:
 
     @property
     def fill(self) -> NDArray[np.float64]:
-        """Volume fraction of material in each cell, the weight of errors and changes of the cell's pressure."""
+        """Volume fraction of material in each cell.  It is the weight of the cell's pressure error."""
         return self._contents.fill
 
     def sealed(self, volumes: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the pressure rises (Pa) of cells at fixed stress that keep their lost fluid `volumes` (m^d)."""
+        """Return the pressure rises (Pa) of cells if the outflows `volumes` (m^d) stay in the cells at fixed stress."""
         return volumes / (self.forms.derivatives(self.data)[0] + self._contents.fixed_stress)
 
     def filling(self, error: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return errors (n,) of the water content by pressure errors (Pa), and changes (n,) of this content."""
+        """Return the errors (n,) of the water content for pressure errors (Pa), and the changes (n,) of this content.
+        """
         capacity, _ = self.forms.drained(self.data)
         change = self.forms.change(self.data)[self.system.unknowns.owned]
         share = self.fill / self._contents.volume
@@ -502,7 +517,7 @@ class StorageProblem:
         return float(whole / area)
 
     def _begin(self, outflow: Outflow) -> NDArray[np.float64] | float:
-        """Start the substep.  Return the non-orthogonal correction (m^d/s) of fluxes between cells."""
+        """Start the substep, and return the non-orthogonal correction (m^d/s) of fluxes between cells."""
         p, fluid = self._p[0], self._fluid
         sides = [0 if one.sides is None else len(one.sides.cells) for one in self._feeds]
         between, difference = 0.0, np.zeros(sum(sides))
@@ -516,14 +531,14 @@ class StorageProblem:
 
     @property
     def accuracy(self) -> float:
-        """Largest relative tolerance of linear solves.  Dry cells store little fluid, so their errors must be small."""
+        """Largest relative tolerance of linear solvers.  Dry cells store little fluid, so their errors must be small.
+        """
         return SAME if self.forms.retains else 1.0
 
     def restrained(
         self, dp: NDArray[np.float64], previous: NDArray[np.float64] | float
     ) -> tuple[NDArray[np.float64], NDArray[np.float64] | float]:
-        """Return two arrays (n,): limited pressure decreases (Pa), and the resulting changes of the suction's
-        logarithm.
+        """Return the limited pressure decreases (Pa), and the resulting changes of the suction's logarithm.
 
         `dp` (n,), Pa: pressure decreases in the Newton step.
         `previous` (n,): change of the suction's logarithm in the previous iteration.
@@ -533,10 +548,7 @@ class StorageProblem:
         return dp, logarithm(p - dp, self._scale) - logarithm(p, self._scale)
 
     def settle(self) -> bool:
-        """Update the active sets for the flow at (u, p), and return whether any set has changed.
-
-        Newton's method solves for (u, p) with fixed active sets, and then updates the sets.
-        """
+        """Update the active sets for the flow at (u, p), and return whether any set has changed."""
         if not self._settles:
             return False
         fluid, both = self._fluid, zip(self._feeds, self._flow(False).at, strict=True)
@@ -551,6 +563,7 @@ class StorageProblem:
 
         The function computes a matrix-free finite difference (Knoll and Keyes 2004) of the conductivity laws and of the
         geometry of the fluxes.  Its caller must then reset the fluxes with `set_fluxes`.
+
         `dofs`: active dofs of u.
         """
         h = self.forms.grid.least
@@ -615,7 +628,7 @@ class StorageProblem:
         return Rates(cells + net, net, turnover, gain)
 
     def _local(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return values (n, d) of the active owned cells as an array (c, d) over local cells."""
+        """Return values of the active owned cells as an array over local cells."""
         out = np.zeros((self.forms.grid.num_local, values.shape[1]))
         out[self.system.unknowns.owned] = values
         return out
@@ -623,8 +636,7 @@ class StorageProblem:
     def net_inflow(self, rates: Rates) -> NDArray[np.float64]:
         """Return the net inflow (n,) into each filled owned cell in the step by fluxes and sources, in m^d.
 
-        Volumes refer to the density at mid-step, as in `change`.
-        `rates`: rates at the end of the substep.
+        Volumes refer to the density at mid-step.  `rates`: rates at the end of the substep.
         """
         return (-self.dt * rates.cells - self._before.cells) / self._density
 
@@ -634,8 +646,8 @@ class StorageProblem:
         """Assemble the derivatives `C = d/dp` and `B = d/du` of the residual at (u, p).
 
         `data`: quadrature points of the pieces, by default the points of the problem.
-        `of_suction`: for laws that depend on suction, cells (c,) and derivatives (c, n), m^(d-1), of their nodal forces
-        with respect to p.
+        `of_suction`: cells (c,) and derivatives (c, n), m^(d-1), of their nodal forces with respect to p.  Only laws
+        that depend on suction have these derivatives.
         """
         forms = self.forms
         system = self.system

@@ -103,7 +103,7 @@ class Stage:
         return [*self.surfaces, *(one.outside for one in self.acting if one.outside is not None)]
 
     def of(self, *kinds: type) -> dict[str, Any]:
-        """Return the conditions of the given classes, by name."""
+        """Return the conditions of some classes, by name."""
         return {name: one for name, one in self.named.items() if isinstance(one, kinds)}
 
     def followed(self, grid: Grid) -> str | None:
@@ -114,7 +114,9 @@ class Stage:
         return None
 
     def moved(self, grid: Grid, t: float, outcome: Outcome) -> NDArray[np.float64] | None:
-        """Return the displacement (d,), in m, at time t (s) of the tool that grid lines follow, or None without it."""
+        """Return the displacement (d,), in m, at time t (s) of the tool that grid lines follow, or None without such a
+        tool.
+        """
         if (name := self.followed(grid)) is None:
             return None
         tool = self.given[name]
@@ -166,7 +168,7 @@ class Stage:
         return QUANTITIES + OF_RAIN + MOTIONS
 
     def unknown(self, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return the results of conditions before the first step, by quantity and name.  All are equal to `value`."""
+        """Return the results of conditions before the first step, by quantity and name, all equal to `value`."""
         d = self.free.shape[1]
         out = {quantity: {} for quantity in QUANTITIES}
         out["wall_reactions"] = {wall: np.full(d, value) for wall in SIDES[d]}
@@ -193,7 +195,7 @@ class Stage:
         }
 
     def kinetic(self, outcome: Outcome) -> float:
-        """Return the kinetic energy (J) of free tools.  `outcome`: results of conditions, with velocities of tools."""
+        """Return the kinetic energy (J) of free tools from the results of conditions."""
         d, tools = self.free.shape[1], self.of(Tool)
         moving = [(tools[name].mass, v) for name, v in outcome.get("tool_velocity", {}).items() if name in tools]
         moving += [(tools[name].inertia(d), v) for name, v in outcome.get("tool_spin", {}).items() if name in tools]
@@ -283,10 +285,7 @@ def stage(
 
 
 def _check_inertia(by_name: Mapping[str, Any], inertia: bool) -> None:
-    """Raise ValueError in a stage with inertia for conditions that do not support inertia.
-
-    In a quasi-static stage, raise ValueError for conditions that require inertia.
-    """
+    """Raise ValueError for conditions that do not fit to a stage with inertia, or without it."""
     for name, one in by_name.items():
         if isinstance(one, Quiet) and not inertia:
             raise ValueError(f"{name}: bodies have no inertia, must be given with inertia=True")
