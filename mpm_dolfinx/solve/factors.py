@@ -96,7 +96,7 @@ def renew(A: PETSc.Mat) -> None:
 def solved(ksp: PETSc.KSP, name: str) -> int:
     """Return the number of iterations of a solver's last solve. Raise NotConverged if this solve failed.
 
-    The line search judges results after the largest number of iterations, or with an indefinite tangent.
+    With an indefinite tangent, or after the largest number of iterations, the line search judges the result.
     """
     count, reason = ksp.getIterationNumber(), ksp.getConvergedReason()
     if reason < 0 and reason not in TOLERABLE:
@@ -121,7 +121,7 @@ def displacement_solver(A: PETSc.Mat, name: str, unknowns: Unknowns, how: str, s
 
 
 def _set_gathered(ksp: PETSc.KSP, A: PETSc.Mat, factors: NodalFactors | SingleFactors, rank: int) -> None:
-    """Make a solver use factors on the process `rank`."""
+    """Make a solver use factors on one process."""
     ksp.pc.setType(PETSc.PC.Type.PYTHON)
     ksp.pc.setPythonContext(Gathered(A.createVecRight(), factors, rank))
 
@@ -147,8 +147,8 @@ class Gathered:
     rank
         Process that holds the factors.
 
-    `setUp` gathers a matrix. The factors are computed at the next solve, or by the function `factorise`. This function
-    gathers all matrices first, so that the processes compute their factors at the same time.
+    `setUp` gathers a matrix. The factors are computed at the next solve, or by the function `factorise`, which lets the
+    processes compute their factors at the same time.
     """
 
     def __init__(self, x: PETSc.Vec, factors: NodalFactors | SingleFactors, rank: int):
@@ -276,7 +276,7 @@ def dissection(x: NDArray[np.float64]) -> NDArray[np.int64]:
 
 
 def _lines(x: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return the index (n,) of the grid line of each coordinate (n,). Only lines with nodes are counted."""
+    """Return the index of the grid line of each coordinate, among the lines with nodes."""
     values, at = np.unique(x, return_inverse=True)
     return np.cumsum(np.diff(values, prepend=values[:1]) > SAME * (values[-1:] - values[:1]))[at]
 

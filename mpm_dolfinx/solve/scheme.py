@@ -17,8 +17,8 @@ COUPLINGS = {
     "fixed-stress-full": 1.0,
     "fixed-stress-fluid": None,
 }
-"""Coupling schemes, each with the factor f in the fixed-stress coefficient `beta = f alpha^2 / K_dr`. None means `beta
-= 1 / K_w`.
+"""Coupling schemes, each with the factor f in the fixed-stress coefficient `beta = f alpha^2 / K_dr`. With None, beta
+is `1 / K_w`.
 """
 
 

@@ -351,7 +351,7 @@ class Motion:
     def _corrected(
         self, points: MaterialPoints, state: State, loads: Sequence[Loads], keeps: NDArray[np.bool_]
     ) -> MaterialPoints:
-        """Return the points after `with_volumes` has corrected yielded domains that have moved."""
+        """Return the points after `with_volumes` has corrected the yielded domains that do not keep their pieces."""
         grid, stage = self._momentum.grid, state.stage
         yielded = self._materials.evolved(points) & ~keeps
         if not over_all(grid.comm, int(yielded.sum())):

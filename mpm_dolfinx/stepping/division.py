@@ -7,7 +7,8 @@ extends over as many cells as one domain at seeding. Whole domains on the lattic
 surface. Domains are not replaced if they yield, contain probes, or have a side whose displacement a condition needs.
 
 The corners of elastic domains determine F, so a division adds no error: both halves have the mapping of the whole
-domain. After merging, F follows from the outer corners. Mass, fluid, and the volume defect are exact.
+domain. After merging, F follows from the outer corners. Mass, fluid, and the volume that the fluid has to fill are
+exact.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ class Division:
         self._domains = SeededDomains(faces.bodies)
 
     def divided(self, state: State) -> tuple[State, int]:
-        """Return the state with divided and merged domains, and the number of these domains. All processes must call
+        """Return the state with divided and merged domains, and the number of replaced domains. All processes must call
         it.
         """
         now, seeded = self._domains.sizes(self._grid, state.points)

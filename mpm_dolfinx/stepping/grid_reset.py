@@ -180,8 +180,8 @@ class OnGrid(Keyed):
     def _carried(self, state: State, pi: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the pressures of the pieces for which the pieces contain the pore water of the points.
 
-        The mass potentials pi, in Pa, are interpolated, because then linear fields are preserved (`fluid_content`).
-        Then a constant is added to the pressures of the pieces of each point, which preserves its water.
+        The mass potentials pi (Pa) preserve linear fields (`fluid_content`). A constant is then added to the pressures
+        of the pieces of each point, which preserves the water of the point.
         """
         materials = self._quadrature.materials
         points = self.cut.points
@@ -205,9 +205,7 @@ class OnGrid(Keyed):
         return self.cut.pieces_to_cells(there + more[pieces.point])
 
     def of_pieces(self, state: State, name: str, fresh: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the data `name` (m, ...) of the pieces. Pieces that points keep have stored values, all others have
-        `fresh`.
-        """
+        """Return the data `name` (m, ...) of the pieces. Pieces that points do not keep have the values `fresh`."""
         return state.of_pieces(name, fresh, self.cut.pieces.point)
 
     @contextmanager

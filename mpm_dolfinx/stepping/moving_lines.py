@@ -24,10 +24,7 @@ def with_lines(grid: Grid, state: State, left: Callable[[State], State]) -> Stat
 
     All domains are cut anew if any line moves by more than `STILL` cells.
 
-    Parameters
-    ----------
-    left
-        Function that adds pressures of pieces to a state with kept pieces, for a reset. It is called before the grid moves.
+    `left`: function that adds pressures of pieces to a state with kept pieces. It is called before the grid moves.
     """
     grid.move(state.lines)
     before = grid.lines

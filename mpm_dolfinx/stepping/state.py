@@ -102,9 +102,8 @@ class Trend:
         """Return the changes (n, ...) in a time `seconds` (s), from the polynomial through the last states.
 
         `implicit`: whether the rate at the end of this time replaces the mean rate.
-        `first`, s: length of a first substep, or 0. If it is positive, the implicit change in this substep is
-        multiplied by
-        `seconds / first` and subtracted.
+        `first`, s: length of a first substep. If it is positive, the implicit change in this substep, times `seconds /
+        first`, is subtracted.
         """
         order, last = np.arange(1, len(self.lengths) + 1), self.lengths[0]
         ends, powers = -self.lengths.cumsum()[:, None] / last, (seconds / last) ** order * (order if implicit else 1)
@@ -203,8 +202,7 @@ class State:
         return self.stay.points if self.stay.keeps is None else self.stay.points.where(self.stay.keeps, self.points)
 
     def of_pieces(self, name: str, fresh: NDArray[np.float64], point: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the data `name` (m, ...) of the pieces. Pieces that points keep have stored values, all others have
-        `fresh`.
+        """Return the data `name` (m, ...) of the pieces. Pieces that points do not keep have the values `fresh`.
 
         `point` (m,): index of the point of each piece.
         """
