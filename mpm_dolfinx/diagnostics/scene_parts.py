@@ -17,7 +17,9 @@ from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
 
 
 def check_parts(grid: Grid, bodies: Sequence[Body], materials: Sequence[Skeleton], later: Sequence[int]) -> None:
-    """Raise an error for invalid grid, bodies or materials, bodies outside the grid, or invalid `later` indices."""
+    """Raise an error for an invalid grid, invalid bodies or materials, bodies outside the grid, or invalid `later`
+    indices.
+    """
     begin_with("grid", grid)
     all_of("bodies", bodies, Body, 1)
     all_of("materials", materials, Skeleton, 1)
@@ -48,7 +50,7 @@ def check_options(
 
 
 def check_axisymmetry(grid: Grid, bodies: Sequence[Body], quadrature: str) -> None:
-    """Raise an error for point quadrature on grids that do not support it.  Warn about narrow holes around the axis."""
+    """Raise an error for point quadrature on grids that do not support it. Warn about narrow holes around the axis."""
     if quadrature == "point" and (grid.axisymmetric or grid.follow is not None):  # fine cells would become empty
         raise ValueError("quadrature = 'point', must be 'domain' in axisymmetry, and on grid lines that follow")
     if not grid.has_axis:
@@ -70,7 +72,7 @@ def check_axisymmetry(grid: Grid, bodies: Sequence[Body], quadrature: str) -> No
 
 
 def _functions_of(terms):
-    """Return the functions of terms in bodies and on sides.  An invalid list is returned unchanged."""
+    """Return the functions of terms in bodies and on sides."""
     if isinstance(terms, str) or not isinstance(terms, Sequence):
         return terms
     return [term.term if isinstance(term, OnSide) else term for term in terms]

@@ -288,8 +288,7 @@ class Newton:
         return errors
 
     def _begin(self, ahead: Callable | None) -> tuple[Errors, list[NDArray[np.float64]] | None]:
-        """Choose the start of Newton's method. Return the errors at the start, and the previous (u, p) if the start is
-        another.
+        """Choose the start of Newton's method. Return its errors, and the previous (u, p) if the start differs from it.
 
         The start is `ahead` if the square of its residual is small. Otherwise each part starts at its guess of least
         residual.
