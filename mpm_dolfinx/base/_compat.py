@@ -151,10 +151,7 @@ class CompiledForm:
     The kernel is called once for each entry of the list, so a cell may occur several times.  Ghost cells are not
     allowed, because dolfinx 0.5 silently skips them.
 
-    Parameters
-    ----------
-    form
-        Form whose integrals are all of one type, and have the subdomain id `SUBDOMAIN`.
+    `form`: form whose integrals are all of one type, and have the subdomain id `SUBDOMAIN`.
     """
 
     def __init__(self, form: ufl.Form):

@@ -33,17 +33,11 @@ SERIES = (120 * EPSILON) ** 0.25
 def change_of_content(alpha, a, storage, J, dp):
     """Return the change of the fluid content in a step, per volume at the start of the step, as a UFL expression.
 
-    Parameters
-    ----------
-    alpha
-        Biot coefficient.
-    a, storage
-        Storage coefficients, in 1/Pa.  `a` refers to a porosity of one (see the module), `storage` to the start of the
-        step.
-    J
-        Volume ratio of the step.
-    dp
-        Change of the pore pressure, Pa.
+    `alpha`: Biot coefficient.
+    `a`, `storage`: storage coefficients, in 1/Pa.  `a` refers to a porosity of one (see the module), `storage` to the
+    start of the step.
+    `J`: volume ratio of the step.
+    `dp`: change of the pore pressure, Pa.
     """
     z = a * dp / (2 * alpha)
     return _change(alpha, a, storage, J, dp, ufl.cosh(z), _sinhc(z))

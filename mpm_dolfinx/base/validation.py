@@ -64,16 +64,10 @@ def numbers(
 ) -> NDArray[np.float64]:
     """Return a value as an array of floats.
 
-    Parameters
-    ----------
-    name
-        Name of the object, for the message.
-    shapes
-        Allowed shapes; None allows any shape.  By default only a scalar is allowed.
-    allowed
-        Description of the allowed values, for the message.
-    test
-        Condition that each number, or all numbers together, must meet.
+    `name`: name of the object, for the message.
+    `shapes`: allowed shapes; None allows any shape.  By default only a scalar is allowed.
+    `allowed`: description of the allowed values, for the message.
+    `test`: condition that each number, or all numbers together, must meet.
 
     Raises
     ------

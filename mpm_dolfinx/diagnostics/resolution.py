@@ -71,10 +71,7 @@ def warn_smeared(
 ) -> Callable[..., Any]:
     """Warn about the soft material that loses the largest fraction of its deformation in cells with stiffer materials.
 
-    Parameters
-    ----------
-    least
-        Smallest lost fraction, in [0, 1], for which the function warns.
+    `least`: smallest lost fraction, in [0, 1], for which the function warns.
 
     Returns
     -------

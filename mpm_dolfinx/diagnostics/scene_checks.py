@@ -23,19 +23,12 @@ def check_held(
 ) -> None:
     """Raise an error if a connected part of the bodies can move as a rigid body.
 
-    Parameters
-    ----------
-    active
-        Cells of this process that contain pieces of domains.
-    free : (nodes, d)
-        Whether no wall fixes a displacement component.
-    holds
-        Constraints by prescribed displacements, tools and contact, each a tuple of four arrays: the constrained cells (n,),
-        the cells (n,) of the part in contact, positions (n, d) in m, and directions (n, d). The second array has
-        lexicographic indices. It is None without a part in contact. Of two parts in contact, a constrained part constrains
-        the other part.
-    each
-        Whether to check each connected part, not only all parts together.
+    `active`: cells of this process that contain pieces of domains.
+    `free` (nodes, d): whether no wall fixes a displacement component.
+    `holds`: constraints by prescribed displacements, tools and contact. Each is a tuple of the constrained cells (n,),
+    the cells (n,) of the part in contact or None, positions (n, d) in m, and directions (n, d). The cells of the part
+    in contact are lexicographic indices. Of two parts in contact, a constrained part constrains the other part.
+    `each`: whether to check each connected part, not only all parts together.
 
     Raises
     ------

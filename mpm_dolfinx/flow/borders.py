@@ -28,20 +28,11 @@ from mpm_dolfinx.forms.unknowns import Unknowns, with_ghosts
 class Borders:
     """Faces between cells of different soil, and faces of cells with several soils, at the last grid reset.
 
-    Parameters
-    ----------
-    contents
-        Material in the cells.
-    cells : (m,)
-        Cell of each piece.
-    soils : (m, k)
-        Numbers that identify the soil of each piece.  Pieces with equal rows have equal conductivities.
-    law : (m,)
-        Index of the retention curve of each piece.
-    facets
-        Facets of this process between two active cells.
-    mixed
-        Cells with several soils, or None.
+    `cells` (m,): cell of each piece.
+    `soils` (m, k): numbers that identify the soil of each piece.  Pieces with equal rows have equal conductivities.
+    `law` (m,): index of the retention curve of each piece.
+    `facets`: facets of this process between two active cells.
+    `mixed`: cells with several soils, or None.
     """
 
     def __init__(

@@ -50,12 +50,7 @@ material, or behind the centroid, bounds only a part of the material.  Such a fa
 class DrainedSides(Feeding):
     """Drained sides, prescribed inflows and rain of a stage.
 
-    Parameters
-    ----------
-    setting
-        Data that all conditions of the stage share.
-    outlets
-        Conditions by name.
+    `setting`: data that all conditions of the stage share.
 
     Raises
     ------
@@ -279,8 +274,7 @@ class SideFeeds(Feeds):
     def _pond(
         self, sides: OpenSides, ponds: tuple[float | None, ...], dt: float
     ) -> tuple[OpenSides, NDArray[np.float64]]:
-        """Return the open sides with the inflow from the ponds added to the rain, and the largest volumes of the ponds.
-        """
+        """Return the open sides with the inflow from the ponds added to the rain, and the largest volumes of the ponds."""
         depth, number = np.array([depth or 0.0 for depth in ponds]), sides.number
         size = np.linalg.norm(sides.area, axis=1)
         area = over_all(self._comm, sum_by(number, size, len(self._names)))

@@ -296,24 +296,12 @@ class CellContents(Keyed):
 class FluxForms:
     """Compiled forms over the faces between active cells, and their coefficients.
 
-    Parameters
-    ----------
-    grid
-        Background grid.
-    active
-        Active part of the grid.
-    weight : (d,), N/m^3
-        Unit weight rho_w g of the pore fluid, as UFL, or None without gravity.
-    flows
-        Whether any material is permeable.  Otherwise there are no fluxes.
-    pressure
-        Pore pressure of the cells (DG0), Pa.
-    bulk
-        Bulk modulus of the fluid, Pa.
-    inertial : (d,), N/m^3
-        Inertia force on the pore fluid, as UFL, or None without inertia.
-    relative
-        Relative conductivities in unsaturated soil, see `unsaturated`, or None.
+    `weight` (d,), N/m^3: unit weight rho_w g of the pore fluid, as UFL, or None without gravity.
+    `flows`: whether any material is permeable.  Otherwise there are no fluxes.
+    `pressure`: pore pressure of the cells (DG0), Pa.
+    `bulk`: bulk modulus of the fluid, Pa.
+    `inertial` (d,), N/m^3: inertia force on the pore fluid, as UFL, or None without inertia.
+    `relative`: relative conductivities in unsaturated soil, see `unsaturated`, or None.
     """
 
     def __init__(

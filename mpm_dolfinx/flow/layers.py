@@ -55,22 +55,12 @@ class Lines:
 class MixedCells:
     """Owned cells with several conductivities (mixed cells), and lines through them.
 
-    Parameters
-    ----------
-    rows
-        Indices (m,) of the pieces in mixed cells, ordered by cell.
-    cells
-        Cells (m,) of the pieces.
-    low, high
-        Corners (m, d) of the bounding boxes of pieces, in cell coordinates from 0 to 1.
-    x
-        Centroids (m, d) of the pieces, in cell coordinates.
-    volume
-        Volumes (m,) of the pieces, m^d.
-    contents
-        Material in the cells.
-    soils
-        Numbers (m, k) that identify the soils.  Pieces with equal rows have equal conductivities.
+    `rows`: indices (m,) of the pieces in mixed cells, ordered by cell.
+    `cells`: cells (m,) of the pieces.
+    `low`, `high`: corners (m, d) of the bounding boxes of pieces, in cell coordinates from 0 to 1.
+    `x`: centroids (m, d) of the pieces, in cell coordinates.
+    `volume`: volumes (m,) of the pieces, m^d.
+    `soils`: numbers (m, k) that identify the soils.  Pieces with equal rows have equal conductivities.
     """
 
     def __init__(self, rows, cells, low, high, x, volume, contents: CellContents, soils):

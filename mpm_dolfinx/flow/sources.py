@@ -20,16 +20,10 @@ from mpm_dolfinx.materials.user_functions import compiling, form
 class Sources(Feeding):
     """All sources of a scene, for all stages.
 
-    Parameters
-    ----------
-    sources
-        User functions that return UFL terms.
-    pieces
-        Quadrature points of all pieces, with the volumes of the material points.
-    p
-        Pore pressure of the cells (DG0), Pa.
-    t : s
-        Time at the end of the substep, a UFL constant.
+    `sources`: user functions that return UFL terms.
+    `pieces`: quadrature points of all pieces, with the volumes of the material points.
+    `p`: pore pressure of the cells (DG0), Pa.
+    `t`, s: time at the end of the substep, a UFL constant.
     """
 
     title = "sources"

@@ -88,30 +88,19 @@ class CellPressure(NamedTuple):
 class StorageForms:
     """Compiled forms of the fluid balance of a scene.
 
-    Parameters
-    ----------
-    pieces
-        Quadrature points with the fields `biot`, `storage` (1/Pa) and `storage_at_one` (1/Pa), see `change_of_content`.
-        With a specific yield they also have the field `drainage`: specific yield and suction (Pa), see
-        `skeleton.unsaturated`.
-    displacement
-        Increment of the displacement since the start of the step.
-    pressure
-        Pore pressure of the cells, positive in compression.
-    active
-        Active part of the grid.
-    materials
-        Materials and fluid of the scene.  With retention curves, pieces have the fields `retention`, `lever`, `pores`.
-    weight : (d,), N/m^3
-        Unit weight rho_w g of the pore fluid, as UFL, or None without gravity.
-    symmetric
-        Whether to use alpha as the derivative of the content with respect to J_Delta.  If True, the Jacobian is
-        symmetric.  The neglected term is of the order of `(p - p_n) / K_w`.  Newton's method converges as fast without
-        this term.
-    feeding
-        Sources and open sides of all stages.
-    inertial : (d,), N/m^3
-        Inertia force `-rho_w a` on the pore fluid, as UFL, or None without inertia.
+    `pieces`: quadrature points with the fields `biot`, `storage` (1/Pa) and `storage_at_one` (1/Pa), see
+    `change_of_content`.  With a specific yield they also have the field `drainage`: specific yield and suction (Pa),
+    see `skeleton.unsaturated`.
+    `displacement`: increment of the displacement since the start of the step.
+    `pressure`: pore pressure of the cells, positive in compression.
+    `materials`: materials and fluid of the scene.  With retention curves, pieces have the fields `retention`, `lever`,
+    `pores`.
+    `weight` (d,), N/m^3: unit weight rho_w g of the pore fluid, as UFL, or None without gravity.
+    `symmetric`: whether to use alpha as the derivative of the content with respect to J_Delta.  If True, the Jacobian
+    is symmetric.  The neglected term is of the order of `(p - p_n) / K_w`.  Newton's method converges as fast without
+    this term.
+    `feeding`: sources and open sides of all stages.
+    `inertial` (d,), N/m^3: inertia force `-rho_w a` on the pore fluid, as UFL, or None without inertia.
     """
 
     def __init__(
@@ -237,16 +226,10 @@ class Rates:
 class StorageSystem:
     """Vectors and matrices of the pressure unknowns, for one set of active cells.
 
-    Parameters
-    ----------
-    forms
-        Compiled forms, with the material in the cells.
-    cells, facets
-        Active local cells including ghosts, and the faces between two of these cells.
-    momentum
-        Unknowns of the displacement.
-    parts
-        Connected parts of the bodies.
+    `forms`: compiled forms, with the material in the cells.
+    `cells`, `facets`: active local cells including ghosts, and the faces between two of these cells.
+    `momentum`: unknowns of the displacement.
+    `parts`: connected parts of the bodies.
     """
 
     def __init__(
@@ -288,8 +271,7 @@ class StorageSystem:
         return tuple(form and form.on(facets) for form in (fluxes.flux, fluxes.gravity))
 
     def places(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the grid positions of this process's unknowns, and an empty array, because no pressure is prescribed.
-        """
+        """Return the grid positions of this process's unknowns, and an empty array, because no pressure is prescribed."""
         places = self._forms.grid.cell_places(self.unknowns.owned)
         return places, places[:0]
 
@@ -366,32 +348,15 @@ class StorageResidual:
 class StorageProblem:
     """The fluid balance in one substep.  The pressure at the start of the step is `forms.p_n`.
 
-    Parameters
-    ----------
-    forms
-        Compiled forms.
-    system
-        Vectors and matrices, with the assembled fluxes.
-    data
-        Quadrature points of the pieces.
-    contents
-        Material in the cells.
-    feeds
-        Sources and open sides.
-    flow
-        Function that assembles the outflow at (u, p).  Its argument states whether a substep starts.
-    dt
-        Time weight, s, of the rate at (u, p).
-    before
-        Outflow volumes from the rate of the previous substep.
-    softness : (m,)
-        Softness of the pieces, see `SoftnessAtPoints`.  It is 1 if no law can yield.
-    defect : (n,), m^d
-        Part of the volume defect in the active owned cells that is corrected by the end of the substep.
-    inertial
-        Function that returns the inertia forces (n, d), in N/m^3, on the fluid in the active owned cells, or None.
-    scale
-        Suctions (n,), Pa, at which the pores of the active owned cells drain, or None in saturated scenes.
+    `system`: vectors and matrices, with the assembled fluxes.
+    `flow`: function that assembles the outflow at (u, p).  Its argument states whether a substep starts.
+    `dt`: time weight, s, of the rate at (u, p).
+    `before`: outflow volumes from the rate of the previous substep.
+    `softness` (m,): softness of the pieces, see `SoftnessAtPoints`.  It is 1 if no law can yield.
+    `defect` (n,), m^d: part of the volume defect in the active owned cells that is corrected by the end of the substep.
+    `inertial`: function that returns the inertia forces (n, d), in N/m^3, on the fluid in the active owned cells, or
+    None.
+    `scale`: suctions (n,), Pa, at which the pores of the active owned cells drain, or None in saturated scenes.
     """
 
     def __init__(
@@ -503,8 +468,7 @@ class StorageProblem:
         return volumes / (self.forms.derivatives(self.data)[0] + self._contents.fixed_stress)
 
     def filling(self, error: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the errors (n,) of the water content for pressure errors (Pa), and the changes (n,) of this content.
-        """
+        """Return the errors (n,) of the water content for pressure errors (Pa), and the changes (n,) of this content."""
         capacity, _ = self.forms.drained(self.data)
         change = self.forms.change(self.data)[self.system.unknowns.owned]
         share = self.fill / self._contents.volume
@@ -531,8 +495,7 @@ class StorageProblem:
 
     @property
     def accuracy(self) -> float:
-        """Largest relative tolerance of linear solvers.  Dry cells store little fluid, so their errors must be small.
-        """
+        """Largest relative tolerance of linear solvers.  Dry cells store little fluid, so their errors must be small."""
         return SAME if self.forms.retains else 1.0
 
     def restrained(

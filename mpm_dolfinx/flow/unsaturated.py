@@ -50,22 +50,16 @@ def fitted(p: Sequence, tables: Sequence[Sequence], drop, scale, of: Functions) 
 
     Let k be the mean of k_r over the pressures between both sides.  Let x be the jump of k_r divided by k.  Let y be x
     times `drop`, divided by the pressure jump.  With `s(z) = sinh(z / 2) / (z / 2)`, the result is `k s(x + y) / (s(x)
-    s(y))`. The result is exact for steady flow with an exponential k_r (Baker 1995), and never exceeds the k_r of the
-    wetter side. Without gravity the result is k (Kirchhoff 1894).  For nearly equal pressures, k is the mean of the
+    s(y))`.  The result is exact for steady flow with an exponential k_r (Baker 1995), and never exceeds the k_r of the
+    wetter side.  Without gravity the result is k (Kirchhoff 1894).  For nearly equal pressures, k is the mean of the
     values on both sides.
 
-    Parameters
-    ----------
-    p
-        Pressures on both sides, Pa.
-    tables
-        Three values on each side: integral of k_r (Pa), k_r, derivative of k_r (1/Pa), see `retention.Conductance`.
-    drop
-        Pressure drop from the first side to the second due to the weight of the fluid, Pa.
-    scale
-        Characteristic suction of k_r, Pa.
-    of
-        Functions for the type of the arguments: arrays or UFL expressions.
+    `p`: pressures on both sides, Pa.
+    `tables`: three values on each side: integral of k_r (Pa), k_r, derivative of k_r (1/Pa), see
+    `retention.Conductance`.
+    `drop`: pressure drop from the first side to the second due to the weight of the fluid, Pa.
+    `scale`: characteristic suction of k_r, Pa.
+    `of`: functions for the type of the arguments: arrays or UFL expressions.
     """
     (phi0, k0, d0), (phi1, k1, d1) = tables
     jump = p[0] - p[1]
@@ -125,17 +119,11 @@ class Laws:
 class Relative:
     """Relative conductivities of cells as functions of the cell pressures.
 
-    Parameters
-    ----------
-    grid
-        Background grid.
-    retentions
-        Retention curves of the scene.
-
     Attributes
     ----------
     shares
-        Fractions (DG0) of a cell's mobility at k_r = 1: of soil without a retention curve, and of the soil of each curve.
+        Fractions (DG0) of a cell's mobility at k_r = 1: of soil without a retention curve, and of the soil of each
+        curve.
     """
 
     def __init__(self, grid: Grid, retentions: Retentions):

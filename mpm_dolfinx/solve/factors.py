@@ -138,14 +138,9 @@ def factorise(*preconditioners: PETSc.PC) -> None:
 class Gathered:
     """Preconditioner for PETSc: factors of a matrix on one process.
 
-    Parameters
-    ----------
-    x
-        Vector with an entry for each column of the matrix.
-    factors
-        Factors of the whole matrix.
-    rank
-        Process that holds the factors.
+    `x`: vector with an entry for each column of the matrix.
+    `factors`: factors of the whole matrix.
+    `rank`: process that holds the factors.
 
     `setUp` gathers a matrix. The factors are computed at the next solve, or by the function `factorise`, which lets the
     processes compute their factors at the same time.
@@ -191,10 +186,7 @@ class Gathered:
 class SingleFactors:
     """Factors of matrices on one process, computed on demand.
 
-    Parameters
-    ----------
-    name, symmetric
-        See `direct_solver`.
+    `name`, `symmetric`: see `direct_solver`.
     """
 
     def __init__(self, name: str, symmetric: bool):
@@ -284,18 +276,11 @@ def _lines(x: NDArray[np.float64]) -> NDArray[np.int64]:
 class BlockFactors:
     """Factors of matrices with one sparsity pattern, with a block for each node.
 
-    Parameters
-    ----------
-    rows, columns
-        The sparsity pattern, in compressed rows.
-    block, axis
-        Node and component of each unknown.
-    x : (n, d)
-        Position of each unknown, m.
-    dim
-        Number of components of a node.
-    symmetric
-        Whether the factors are U^T D U instead of L U.
+    `rows`, `columns`: the sparsity pattern, in compressed rows.
+    `block`, `axis`: node and component of each unknown.
+    `x` (n, d): position of each unknown, m.
+    `dim`: number of components of a node.
+    `symmetric`: whether the factors are U^T D U instead of L U.
     """
 
     def __init__(self, rows, columns, block, axis, x, dim: int, symmetric: bool):

@@ -61,18 +61,10 @@ Inverses = tuple[PETSc.PC, PETSc.PC]
 class BlockOperator:
     """Operator and preconditioner of one solve for PETSc, with scaled equations.
 
-    Parameters
-    ----------
-    momentum, storage
-        The matrices.
-    inverses
-        Approximations of K^-1 and P^-1.
-    work
-        Work vectors: two of displacements and two of pressures.
-    scale
-        Scales of the equations of both balances.
-    slopes
-        Derivative of the fluxes with respect to displacements, if the tangent includes it.
+    `inverses`: approximations of K^-1 and P^-1.
+    `work`: work vectors: two of displacements and two of pressures.
+    `scale`: scales of the equations of both balances.
+    `slopes`: derivative of the fluxes with respect to displacements, if the tangent includes it.
     """
 
     momentum: MomentumSystem
@@ -166,16 +158,11 @@ class BlockSolver:
     ) -> tuple[int, Inverses | None]:
         """Solve for (du, dp) with the residuals of both balances as right-hand side.
 
-        Parameters
-        ----------
-        scales : (parts,) and (parts,)
-            Scales of the momentum residual (N) and of the fluid residual (m^d) in each connected part.
-        rtol
-            Tolerance relative to the norm of both scaled residuals, for each part.
-        slopes
-            Derivative of the fluxes with respect to displacements, if the tangent includes it.
-        factors
-            Factors that already replace the cycles, or None.
+        `scales` (parts,) and (parts,): scales of the momentum residual (N) and of the fluid residual (m^d) in each
+        connected part.
+        `rtol`: tolerance relative to the norm of both scaled residuals, for each part.
+        `slopes`: derivative of the fluxes with respect to displacements, if the tangent includes it.
+        `factors`: factors that already replace the cycles, or None.
 
         Returns
         -------

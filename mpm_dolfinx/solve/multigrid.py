@@ -57,25 +57,17 @@ def multigrid_solver(
 
     GMRES also solves with tangents that are unsymmetric or, in buckling bodies, indefinite.
 
-    Parameters
-    ----------
-    A
-        Matrix, which may still be empty.
-    name
-        Prefix of the solver's PETSc options.
-    places : (n, d + 1)
-        Unknowns of this process: indices along the grid axes, and index of the component, all >= 0. Each component is
-        interpolated separately.
-    held : (m, d + 1)
-        Fixed degrees of freedom in cells of bodies, described like `places`. Interpolated displacements vanish there.
-    nodal
-        Whether the unknowns belong to nodes.
-    coarsest
-        Largest number of unknowns of the coarsest grid, which has a direct solver.
-    firmly
-        Whether to use the stronger smoother `FIRMLY`.
-    lines : (n,) along each axis, m
-        Grid lines, for cells of different sizes. Interpolation of displacements then uses the distances of nodes.
+    `A`: matrix, which may still be empty.
+    `name`: prefix of the solver's PETSc options.
+    `places` (n, d + 1): unknowns of this process: indices along the grid axes, and index of the component, all >= 0.
+    Each component is interpolated separately.
+    `held` (m, d + 1): fixed degrees of freedom in cells of bodies, described like `places`. Interpolated displacements
+    vanish there.
+    `nodal`: whether the unknowns belong to nodes.
+    `coarsest`: largest number of unknowns of the coarsest grid, which has a direct solver.
+    `firmly`: whether to use the stronger smoother `FIRMLY`.
+    `lines` (n,) along each axis, m: grid lines, for cells of different sizes. Interpolation of displacements then uses
+    the distances of nodes.
     """
     ksp = PETSc.KSP().create(A.comm)
     ksp.setType(PETSc.KSP.Type.GMRES)

@@ -115,20 +115,12 @@ def solve_substep(
 ) -> Rates | None:
     """Solve the equations of a substep for the functions (u, p) of the forms. Return the outflow rates at the end.
 
-    Parameters
-    ----------
-    solvers
-        Linear solvers for the unknowns of the active cells.
-    momentum, storage
-        The balances. `storage` is None without fluid.
-    ahead
-        Function that extrapolates (u, p) at active dofs and cells from the last steps, or None.
-    as_reset, key
-        See `OnGrid.as_reset`. Linear laws use the tangent at the reset until `key` changes.
-    report
-        Report of the step. The counts of the substep are added to this report.
-    kept
-        Data that the tangents of the step share.
+    `solvers`: linear solvers for the unknowns of the active cells.
+    `momentum`, `storage`: the balances. `storage` is None without fluid.
+    `ahead`: function that extrapolates (u, p) at active dofs and cells from the last steps, or None.
+    `as_reset`, `key`: see `OnGrid.as_reset`. Linear laws use the tangent at the reset until `key` changes.
+    `report`: report of the step. The counts of the substep are added to this report.
+    `kept`: data that the tangents of the step share.
 
     Raises
     ------
@@ -202,10 +194,7 @@ def note_pressures(
 class Newton:
     """Newton's method for the balances in one substep.
 
-    Parameters
-    ----------
-    solvers, momentum, storage, kept
-        See `solve_substep`.
+    `solvers`, `momentum`, `storage`, `kept`: see `solve_substep`.
     """
 
     def __init__(self, solvers: LinearSolvers, momentum: MomentumProblem, storage: StorageProblem | None, kept: Kept):

@@ -222,16 +222,10 @@ class LinearSolvers:
     ) -> int:
         """Solve for (du, dp) with the present residuals, and return the number of coupling iterations.
 
-        Parameters
-        ----------
-        kept
-            Data that the tangents of the step share.
-        rtol
-            Relative tolerance, for each connected part.
-        forces, exchanged : (parts,)
-            Scales of the residuals: forces (N) and exchanged fluid volume (m^d).
-        slope
-            Derivative of the fluxes with respect to displacements, if the tangent includes it.
+        `kept`: data that the tangents of the step share.
+        `rtol`: relative tolerance, for each connected part.
+        `forces`, `exchanged` (parts,): scales of the residuals: forces (N) and exchanged fluid volume (m^d).
+        `slope`: derivative of the fluxes with respect to displacements, if the tangent includes it.
         """
         slopes = () if slope is None else (slope,)
         if self._storage is None:

@@ -99,23 +99,15 @@ class Motion:
     ) -> tuple[State, int]:
         """Return the state at time t (s) after a solved step, and the number of inverted domains.
 
-        Parameters
-        ----------
-        state
-            State at the start of the step.
-        on_grid, data
-            The bodies on the grid, and their integration points at the start of the step.
-        loads
-            Loads at the end of the step.
-        net_inflow : (n,), m^d
-            Net inflow of fluid into the filled owned cells in the step. Without it the volume defect stays unchanged.
-        report
-            Report of the step, for the exception if a point leaves the grid.
-        stays
-            Whether points that hardly move may keep their pieces.
-        carried
-            Function that returns new velocities, see `Mass.carried`. Its argument (n,) is the motion of the points in
-            cell sizes, which is 0 for points that keep their pieces.
+        `state`: state at the start of the step.
+        `on_grid`, `data`: the bodies on the grid, and their integration points at the start of the step.
+        `loads`: loads at the end of the step.
+        `net_inflow` (n,), m^d: net inflow of fluid into the filled owned cells in the step. Without it the volume
+        defect stays unchanged.
+        `report`: report of the step, for the exception if a point leaves the grid.
+        `stays`: whether points that hardly move may keep their pieces.
+        `carried`: function that returns new velocities, see `Mass.carried`. Its argument (n,) is the motion of the
+        points in cell sizes, which is 0 for points that keep their pieces.
 
         Raises
         ------

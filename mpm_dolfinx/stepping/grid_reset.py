@@ -50,16 +50,11 @@ AtPlaces = Callable[[NDArray[np.integer], NDArray[np.float64]], NDArray[np.float
 class OnGrid(Keyed):
     """The bodies on the grid since its last reset.
 
-    Parameters
-    ----------
-    quadrature
-        Integration points of the scene.
-    momentum, storage
-        Forms, whose coefficients are set from the material in the cells. `storage` is None without fluid.
-    cut
-        The cut particle domains.
-    of_fluid
-        Whether the fixed-stress coefficient beta is 1/K_w, see `Scheme`.
+    `quadrature`: integration points of the scene.
+    `momentum`, `storage`: forms, whose coefficients are set from the material in the cells. `storage` is None without
+    fluid.
+    `cut`: the cut particle domains.
+    `of_fluid`: whether the fixed-stress coefficient beta is 1/K_w, see `Scheme`.
     """
 
     def __init__(
@@ -458,22 +453,11 @@ class OnGrid(Keyed):
 class System:
     """Vectors, matrices and solvers for one set of active cells.
 
-    Parameters
-    ----------
-    momentum, storage
-        Compiled forms. `storage` is None without fluid.
-    scheme
-        Coupling scheme.
-    on_grid
-        The bodies on the grid.
-    dofs
-        Local indices of the unknown components of displacement.
-    stiff
-        Whether plates or prescribed displacements have a penalty.
-    symmetric
-        Whether the tangent of the momentum is symmetric.
-    loads
-        Loads at the positions at which domains were cut.
+    `momentum`, `storage`: compiled forms. `storage` is None without fluid.
+    `dofs`: local indices of the unknown components of displacement.
+    `stiff`: whether plates or prescribed displacements have a penalty.
+    `symmetric`: whether the tangent of the momentum is symmetric.
+    `loads`: loads at the positions at which domains were cut.
     """
 
     def __init__(
@@ -514,18 +498,7 @@ class System:
 class Assembled(Keyed):
     """Data that are reused until pieces or stage change: penalties and fluxes, in the matrices of a system.
 
-    Parameters
-    ----------
-    momentum, storage
-        Compiled forms.
-    system
-        The matrices.
-    on_grid
-        The bodies on the grid.
-    stage
-        The conditions.
-    loads
-        Loads at the positions at which domains were cut.
+    `loads`: loads at the positions at which domains were cut.
     """
 
     def __init__(

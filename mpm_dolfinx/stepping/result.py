@@ -133,8 +133,7 @@ class Result:
 
     @cached_property
     def tool_forces(self) -> ByName[NDArray[np.float64]]:
-        """Forces (N) and moments (N m) of tools and contacts on bodies, by name: arrays (times, 3), in 3D (times, 6).
-        """
+        """Forces (N) and moments (N m) of tools and contacts on bodies, by name: arrays (times, 3), in 3D (times, 6)."""
         return self.outcome("tool_forces")
 
     @cached_property

@@ -63,20 +63,12 @@ class When(NamedTuple):
 class Scene:
     """A compiled scene, which does not change between steps.  Data that change are in the `State`.
 
-    Parameters
-    ----------
-    grid, bodies, materials, fluid, numerics
-        See `Simulation`.
-    weighs
-        Whether the scene has gravity.
-    pressure
-        Initial pore pressure, Pa, or a function of position.
-    extensions
-        User-defined terms in the balance of momentum, and in the storage of fluid.
-    initial
-        Initial stresses of bodies, see `initial_stress.by_body`.
-    velocity
-        Initial velocity, m/s, if bodies may have inertia, see `Simulation`.  Otherwise None.
+    `grid`, `bodies`, `materials`, `fluid`, `numerics`: see `Simulation`.
+    `weighs`: whether the scene has gravity.
+    `pressure`: initial pore pressure, Pa, or a function of position.
+    `extensions`: user-defined terms in the balance of momentum, and in the storage of fluid.
+    `initial`: initial stresses of bodies, see `initial_stress.by_body`.
+    `velocity`: initial velocity, m/s, if bodies may have inertia, see `Simulation`.  Otherwise None.
     """
 
     def __init__(

@@ -222,18 +222,11 @@ def stage(
 ) -> Stage:
     """Return a stage.
 
-    Parameters
-    ----------
-    bodies, materials
-        All bodies and materials of the scene.
-    momentum, fed
-        Forms, with the loads of all stages, and terms that act in the balance of fluid in all stages.
-    conditions
-        walls, conditions, gravity and inertia: see `Simulation`.
-    present
-        Whether each body is present.
-    later
-        Indices of bodies still to be added.
+    `bodies`, `materials`: all bodies and materials of the scene.
+    `momentum`, `fed`: forms, with the loads of all stages, and terms that act in the balance of fluid in all stages.
+    `conditions`: walls, conditions, gravity and inertia: see `Simulation`.
+    `present`: whether each body is present.
+    `later`: indices of bodies still to be added.
 
     Raises
     ------
