@@ -212,8 +212,8 @@ class RainedFaces(OpenFaces):
     """Faces on open sides, at least one of which has rain.
 
     Through a face with rain, the outflow is minus the rain.  The outflow is limited from below by the outflow at the
-    pond's pressure, and from above by the outflow at the driest pressure.  Seepage needs no active set at faces with
-    rain, so `seeps` is False.
+    pond's pressure, and from above by the outflow at the driest pressure.  The lower limit already accounts for
+    seepage, so faces with rain need no active set, and `seeps` is False.
     """
 
     rain: NDArray[np.float64]  # rain (m,), m^d/s; nan for faces without rain
@@ -274,7 +274,9 @@ class SideFeeds(Feeds):
     def _pond(
         self, sides: OpenSides, ponds: tuple[float | None, ...], dt: float
     ) -> tuple[OpenSides, NDArray[np.float64]]:
-        """Return the open sides with the inflow from the ponds added to the rain, and the largest volumes of the ponds."""
+        """Return the open sides with the inflow from the ponds as additional rain, and the largest volumes of the
+        ponds.
+        """
         depth, number = np.array([depth or 0.0 for depth in ponds]), sides.number
         size = np.linalg.norm(sides.area, axis=1)
         area = over_all(self._comm, sum_by(number, size, len(self._names)))

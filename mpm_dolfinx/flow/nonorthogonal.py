@@ -176,10 +176,9 @@ class NonorthogonalFlow(NamedTuple):
     weight: NDArray[np.float64] | None  # unit weight of the fluid (d,), N/m^3; None without gravity
 
     def __call__(self, p: NDArray[np.float64], bulk: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the additional outflows from filled cells (n,), and the corrections (m,) of cell pressures at open
-        sides.
+        """Return the additional outflows (n,) from filled cells, and the corrections (m,) of pressures at open sides.
 
-        The outflows go to other cells, and are in m^d/s.  The corrections are in Pa.
+        The outflows are in m^d/s.  The corrections, in Pa, apply to the pressures of the cells.
         `p` (c,), Pa: pressures of the local cells.
         `bulk`, Pa: bulk modulus of the fluid.
         """
@@ -194,7 +193,10 @@ class NonorthogonalFlow(NamedTuple):
 
 
 def off_middle(sides: OpenSides, grid: Grid) -> NDArray[np.bool_]:
-    """Return a mask (m,) of faces whose condition has faces with a mean offset along the side in the same cell."""
+    """Return a mask (m,) of faces that are offset along the side.
+
+    Offsets are averaged over the faces of one condition in one cell.
+    """
     faces, at = np.unique(sides.number * grid.num_local + sides.cells, return_inverse=True)
     size, off = np.sqrt(np.add.reduce(sides.area**2, axis=1)), _along(sides) / grid.sizes(sides.cells)
     mean = sum_by(at, (size[:, None] * off).T, len(faces)) / sum_by(at, size, len(faces))

@@ -3,7 +3,7 @@
 
 The damping matrix H is defined by sums over cells and axes for all pressures p and test functions q,
 
-    (H p, q) = sum of w D p D q,   D p = h ((p_+ - p) / d_+ - (p - p_-) / d_-),
+    (H p, q) = sum of w D p D q,   D p = h ((p_+ - p) / d_+ - (p - p_-) / d_-).
 
 Here w is the weight of a cell and axis, and h is the edge length of the cell along the axis.  The neighbours along the
 axis have the pressures p_+ and p_-.  The distances from their centroids to the cell's centroid are d_+ and d_-.  A cell

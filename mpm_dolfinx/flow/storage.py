@@ -14,8 +14,8 @@ mixed cells.  `nonorthogonal` corrects the fluxes if the two centroids are offse
 treats open sides.
 
 The factor `r = exp(p / K_w)` is the fluid density divided by the density rho_w at zero pressure.  In the storage term,
-r is taken at the pressure `(p_n + p) / 2`.  On a face, r is the logarithmic mean over both cells.  With this mean, `r
-[p+ - p-]` is the jump of the mass potential (`fluid_content`), and the mass that leaves a cell enters the neighbour.
+r is taken at the pressure `(p_n + p) / 2`.  On a face, r is the logarithmic mean over both cells.  With this mean,
+`r [p+ - p-]` is the jump of the mass potential (`fluid_content`), and the mass that leaves a cell enters the neighbour.
 The residual is the left side of the balance, divided by the r of the storage term.  The tangent neglects the difference
 between the r of a face and the r of the storage term.
 
@@ -25,10 +25,10 @@ The next steps correct fractions of this defect (`defect`), at a constant rate o
 
 If no fluid flows within a step, Q1 displacements with DG0 pressures violate the inf-sup condition: pressures that
 alternate from cell to cell have no effect.  Therefore jumps of the pressure increment of the step are stabilised by the
-term `max(0, tau d - dt kappa / d) A [p - p_n]`.  Here tau (1/Pa) is the strength of the stabilisation, and `d = d+ +
-d-`.  In this term, dt is the length of the step times the coefficient of Q(u, p) in `time_integration`.  The term
-raises the coefficient `dt kappa A / d` of a face to at least `tau d A`.  The term conserves fluid, and it is zero in
-steady states.
+term `max(0, tau d - dt kappa / d) A [p - p_n]`.  Here tau (1/Pa) is the strength of the stabilisation, and
+`d = d+ + d-`.  In this term, dt is the length of the step times the coefficient of Q(u, p) in `time_integration`.  The
+term raises the coefficient `dt kappa A / d` of a face to at least `tau d A`.  The term conserves fluid, and it is zero
+in steady states.
 
 For elastic soil, tau is a quarter of Silvester and Kechkar's patch value (Camargo, White and Borja 2021).  Soil in
 plastic flow needs a tau up to a hundred times larger.  The increase of tau acts on second differences only
@@ -157,9 +157,7 @@ class StorageForms:
         """Sources and open sides of all stages."""
 
     def change(self, data: PointData) -> NDArray[np.float64]:
-        """Return the changes (m^d) of the fluid volume in filled cells since the start of the step, as an array over
-        local cells.
-        """
+        """Return the changes (m^d) of the fluid volume in filled cells in the step, as an array over local cells."""
         b = self._sums
         b[data.places.filled] = 0.0
         self._change.assemble_vector(b, data)
@@ -271,7 +269,7 @@ class StorageSystem:
         return tuple(form and form.on(facets) for form in (fluxes.flux, fluxes.gravity))
 
     def places(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the grid positions of this process's unknowns, and an empty array, because no pressure is prescribed."""
+        """Return the grid positions of this process's unknowns, and an empty array for prescribed pressures."""
         places = self._forms.grid.cell_places(self.unknowns.owned)
         return places, places[:0]
 
@@ -464,11 +462,11 @@ class StorageProblem:
         return self._contents.fill
 
     def sealed(self, volumes: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the pressure rises (Pa) of cells if the outflows `volumes` (m^d) stay in the cells at fixed stress."""
+        """Return the pressure rises (Pa) of cells if the outflows `volumes` (m^d) stay in them at fixed stress."""
         return volumes / (self.forms.derivatives(self.data)[0] + self._contents.fixed_stress)
 
     def filling(self, error: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the errors (n,) of the water content for pressure errors (Pa), and the changes (n,) of this content."""
+        """Return the errors of the water content for pressure errors (Pa), and the changes of the water content."""
         capacity, _ = self.forms.drained(self.data)
         change = self.forms.change(self.data)[self.system.unknowns.owned]
         share = self.fill / self._contents.volume
@@ -501,10 +499,10 @@ class StorageProblem:
     def restrained(
         self, dp: NDArray[np.float64], previous: NDArray[np.float64] | float
     ) -> tuple[NDArray[np.float64], NDArray[np.float64] | float]:
-        """Return the limited pressure decreases (Pa), and the resulting changes of the suction's logarithm.
+        """Return the limited pressure decreases (Pa), and the resulting changes of the logarithm of the suction.
 
         `dp` (n,), Pa: pressure decreases in the Newton step.
-        `previous` (n,): change of the suction's logarithm in the previous iteration.
+        `previous` (n,): change of the logarithm of the suction in the previous iteration.
         """
         p = self._p[0][self.system.unknowns.owned]
         dp = restrained(p, dp, self._scale, previous)
@@ -609,8 +607,8 @@ class StorageProblem:
         """Assemble the derivatives `C = d/dp` and `B = d/du` of the residual at (u, p).
 
         `data`: quadrature points of the pieces, by default the points of the problem.
-        `of_suction`: cells (c,) and derivatives (c, n), m^(d-1), of their nodal forces with respect to p.  Only laws
-        that depend on suction have these derivatives.
+        `of_suction`: cells (c,), and derivatives (c, n), m^(d-1), of the nodal forces of these cells with respect to p.
+        Only laws that depend on suction have these derivatives.
         """
         forms = self.forms
         system = self.system

@@ -184,8 +184,7 @@ class Relative:
         outer: NDArray[np.float64],
         drop: NDArray[np.float64],
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return k_r (m,) between cells and sides, and the derivatives (m,) of `k_r (p - outer + drop)` with respect to
-        p.
+        """Return k_r (m,) between cells and sides, and `d[k_r (p - outer + drop)]/dp` (m,).
 
         `cells` (m,): owned cells.
         `normal` (m, d): normals of the sides.

@@ -255,7 +255,7 @@ class Cells:
 
     @cached_property
     def near_others(self) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Masks of local nodes at most two cells from nodes of several processes, and of local cells with shared nodes."""
+        """Masks of local nodes at most two cells from shared nodes, and of local cells with shared nodes."""
         holders = fem.Function(self._nodes)
         holders.x.array[:] = 1.0
         _compat.scatter_reverse_add(holders)
@@ -467,7 +467,7 @@ class Grid:
         return self.h[axis] if self.even else self._of_process.at.sizes[cells, axis]
 
     def between(self, cells: Any, others: Any, axis: Any) -> NDArray[np.float64]:
-        """Return the distances (n,), in m, between midpoints of local cells (n,) and of their neighbours along an axis."""
+        """Return the distances (n,), in m, from midpoints of local cells (n,) to their neighbours along an axis."""
         return self.h[axis] if self.even else (self.along(cells, axis) + self.along(others, axis)) / 2
 
     def volumes(self, cells: Any) -> NDArray[np.float64] | float:
@@ -531,15 +531,13 @@ class Grid:
         return np.rint(self.in_cells(x)).astype(np.int64)
 
     def widths_of(self, index: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the edge lengths (n, d), in m, of cells with indices (n, d) along the axes.  Equal cells give one row."""
+        """Return the edge lengths (n, d), in m, of cells with indices (n, d).  Equal cells give one row."""
         if self.even:
             return self._h
         return np.stack([w[i] for w, i in zip(self.widths, index.T, strict=True)], axis=-1)
 
     def next_plane(self, axis: int, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the next line (n,), in m, above coordinates x (n,) along an axis of unequal cells, or inf without such
-        a line.
-        """
+        """Return the next line (n,), in m, above coordinates x (n,) along an axis of unequal cells, or inf."""
         return np.append(self.lines[axis], np.inf)[self.lines[axis].searchsorted(x, side="right")]
 
     def cells_along(self, axis: int, x: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -639,9 +637,7 @@ class Grid:
 
     @property
     def copies(self) -> int:
-        """Number of copies of the box in the mesh.  It is one, but in `GridOfGroups` it is the number of contact
-        groups.
-        """
+        """Number of copies of the box in the mesh: one, or in `GridOfGroups` the number of contact groups."""
         return 1
 
     @property
@@ -714,9 +710,7 @@ class Grid:
         return self.partition.owner(np.array(np.unravel_index(number % self.cells, tuple(self.shape))))
 
     def gathered(self, rows: Sequence[tuple], width: int) -> tuple[NDArray, NDArray, NDArray]:
-        """Send rows (cells, positions, values) to the owners of the cells, and return the received rows with local
-        cells.
-        """
+        """Send rows (cells, positions, values) to the owners of the cells, and return the received rows."""
         empty = (np.empty(0, dtype=np.int64), np.empty((0, self.dim)), np.empty((0, width)))
         parts = [np.concatenate(column) for column in zip(empty, *rows, strict=True)]
         travel = Exchange(self.comm, self.owner(parts[0]))
@@ -757,7 +751,9 @@ class Grid:
         return np.array([*np.unravel_index(number, tuple(self.shape)), copy]).T.copy()
 
     def neighbours(self, cells: NDArray[np.integer]) -> NDArray[np.int64]:
-        """Return the local indices (n, d, 2) of neighbours of local cells, by axis and end, or -1 on other processes."""
+        """Return the local indices (n, d, 2) of neighbours of local cells, by axis and end.  Cells of other processes
+        have -1.
+        """
         index = self.cell_places(cells)
         out = np.full((len(cells), self.dim, 2), -1, dtype=np.int64)
         for axis in range(self.dim):
@@ -767,7 +763,7 @@ class Grid:
         return out
 
     def outside(self, x: NDArray[np.float64], tolerance: float = SAME) -> NDArray[np.bool_]:
-        """Return whether positions x, from the base, are outside the grid by more than `tolerance` cells and rounding."""
+        """Return whether positions x, from the base, are outside the grid by more than `tolerance` cells."""
         least = self.h if self.even else np.array([w[[0, -1]].min() for w in self.widths])  # at the sides
         tolerance = tolerance + rounding(np.array([self.lower, self.upper])) / least
         inside, cells = np.ones(len(x), dtype=bool), None if self.even else self.in_cells(x)

@@ -298,7 +298,7 @@ class LinearSolvers:
         self.solve_u.solve(self._rhs, self.du)
 
     def turn_round(self, parts: NDArray[np.bool_] | None = None) -> None:
-        """Reverse the Newton direction in some parts, or in all."""
+        """Reverse the Newton direction in some parts, or in all parts."""
         directions = [(self.du, self._momentum)] + ([(self.dp, self._storage)] if self._storage is not None else [])
         for direction, system in directions:
             if parts is None or parts.all():

@@ -225,7 +225,7 @@ class Motion:
     def _kept(
         self, values: NDArray[np.float64] | None, on_grid: OnGrid, keeps: NDArray[np.bool_]
     ) -> NDArray[np.float64] | None:
-        """Return the values only at nodes of cells whose points keep their pieces."""
+        """Return the values at nodes of cells whose points keep their pieces, and zeros at all other nodes."""
         if values is None:
             return None
         cut = on_grid.cut
@@ -296,7 +296,7 @@ class Motion:
         followed: Iterable[NDArray[np.float64]],
         deformed: Callable[[], NDArray[np.float64]],
     ) -> tuple[MaterialPoints, NDArray[np.bool_], int]:
-        """Return the points with new F and corners, which of them keep their pieces, and the number of inverted
+        """Return the points with new F and corners, a mask of points that keep their pieces, and the number of inverted
         domains.
 
         If Q1 cells would lock, F is scaled so that det F equals that of `deformed`. In yielded soil F is `deformed`,

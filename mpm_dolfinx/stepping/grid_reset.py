@@ -205,9 +205,7 @@ class OnGrid(Keyed):
 
     @contextmanager
     def as_reset(self, state: State) -> Iterator[QuadratureData]:
-        """Yield the integration points at the last reset. Inside this context, u is 0, and p has its values at the
-        reset.
-        """
+        """Yield the integration points at the last reset. In this context u is 0, and p has its values at the reset."""
         at = [(self._u.x.array, self._momentum.active.now.dofs)]
         if self._storage is not None:
             at += [(f.x.array, self.cells) for f in (self._storage.p, self._storage.p_n)]
@@ -296,8 +294,8 @@ class OnGrid(Keyed):
         return [self.cut.to_pieces(rows) for rows in values]
 
     def softness(self, state: State) -> NDArray[np.float64] | float:
-        """Return the elastic shear modulus of the pieces (m,) divided by their tangent shear modulus at the start of
-        the step.
+        """Return the elastic shear modulus of the pieces (m,) at the start of the step, divided by the tangent shear
+        modulus.
         """
         data = state.points.data
         return self.cut.to_cells(data["softness"]) if "softness" in data else 1.0
@@ -419,9 +417,7 @@ class OnGrid(Keyed):
         return (self.contents.total(moves) == 0).nonzero()[0]
 
     def valid(self, points: MaterialPoints, loads: Sequence[Loads]) -> NDArray[np.bool_]:
-        """Return a mask (n,) of points that hardly move, together with their connected part and parts in contact with
-        it.
-        """
+        """Return a mask (n,) of points whose connected part, and parts in contact with it, hardly move."""
         part, count = self.parts if self.cut.grid.copies == 1 else self._of_points(*self.parts_of_cells(loads))
         return self.cut.valid(points, part, count)[part]
 

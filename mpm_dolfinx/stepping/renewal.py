@@ -5,9 +5,9 @@ F of yielded soil is updated by increments, so its domains are used for integrat
 new domains fill the region of the old domains, and keep the surface and the contents of the region. Cells with a piece
 of a domain longer than `LONGEST` are filled anew:
 
-* A full cell is divided into four equal domains. * A cell that the surface crosses once is filled with quadrilaterals
-about the centroid of the filled part. `EDGES` edges replace the surface in the cell. Ends, sharp corners and area (in
-axisymmetry volume) do not change.
+* A full cell is divided into four equal domains.
+* A cell that the surface crosses once is filled with quadrilaterals about the centroid of the filled part. `EDGES`
+edges replace the surface in the cell. Ends, sharp corners and area (in axisymmetry volume) do not change.
 
 Remainders of old domains outside these cells become domains. Masses, volumes and the mass of the fluid are exact in
 each cell, as are mass-weighted sums of other point data, such as the logarithm of the elastic left Cauchy-Green tensor.

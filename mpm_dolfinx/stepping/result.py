@@ -133,14 +133,14 @@ class Result:
 
     @cached_property
     def tool_forces(self) -> ByName[NDArray[np.float64]]:
-        """Forces (N) and moments (N m) of tools and contacts on bodies, by name: arrays (times, 3), in 3D (times, 6)."""
+        """Forces (N) and moments (N m) of tools and contacts on bodies, by name: arrays (times, 3), or (times, 6) in
+        3D.
+        """
         return self.outcome("tool_forces")
 
     @cached_property
     def tool_travel(self) -> ByName[NDArray[np.float64]]:
-        """Displacement (times,), in m, of each load-controlled tool in addition to its prescribed displacement, by
-        name.
-        """
+        """Displacement (times,), in m, of each load-controlled tool beyond its prescribed displacement, by name."""
         return self.outcome("tool_travel")
 
     @cached_property
@@ -167,8 +167,7 @@ class Result:
         return ByName({name: np.array([row.get(name, none) for row in rows]) for name, none in like.items()})
 
     def to_dataframe(self):
-        """Return the histories as a pandas data frame with the columns of `history.csv`, and one row for each output
-        time.
+        """Return the histories as a pandas data frame with the columns of `history.csv`, and one row for each time.
 
         `attrs["units"]` of the frame contains the unit of each column. Raise ImportError if pandas is not installed.
         """

@@ -102,8 +102,8 @@ class Trend:
         """Return the changes (n, ...) in a time `seconds` (s), from the polynomial through the last states.
 
         `implicit`: whether the rate at the end of this time replaces the mean rate.
-        `first`, s: length of a first substep. If it is positive, the implicit change in this substep, times `seconds /
-        first`, is subtracted.
+        `first`, s: length of a first substep. If it is positive, the implicit change in this substep, times
+        `seconds / first`, is subtracted.
         """
         order, last = np.arange(1, len(self.lengths) + 1), self.lengths[0]
         ends, powers = -self.lengths.cumsum()[:, None] / last, (seconds / last) ** order * (order if implicit else 1)
