@@ -16,7 +16,7 @@ plane strain, forces refer to a thickness of 1 m.  In axisymmetry (`Grid`), forc
 
 from mpm_dolfinx.base import _environment  # noqa: F401 - first: it reports missing dependencies
 from mpm_dolfinx.base.errors import LeftGrid, NotConverged, Report
-from mpm_dolfinx.bodies.bodies import Body, mapped
+from mpm_dolfinx.bodies.bodies import Body, Later, Moving, mapped
 from mpm_dolfinx.bodies.boxes import box, shape
 from mpm_dolfinx.bodies.mesh_files import from_mesh
 from mpm_dolfinx.bodies.meshes import MeshBody
@@ -70,6 +70,7 @@ from mpm_dolfinx.probing.cell_fields import CellFields
 from mpm_dolfinx.probing.point_fields import PointFields
 from mpm_dolfinx.probing.probes import Probes, probes
 from mpm_dolfinx.simulation.simulation import Simulation
+from mpm_dolfinx.simulation.step_size import Adaptive
 from mpm_dolfinx.simulation.strength_reduction import Safety, factor_of_safety
 from mpm_dolfinx.simulation.tangent import Tangent
 from mpm_dolfinx.solve.numerics import Numerics
@@ -83,6 +84,7 @@ __all__ = [
     "COUPLINGS",
     "K0",
     "Acting",
+    "Adaptive",
     "Ball",
     "BarcelonaBasic",
     "Body",
@@ -107,6 +109,7 @@ __all__ = [
     "HalfSpace",
     "Hencky",
     "Inflow",
+    "Later",
     "Leaving",
     "LeftGrid",
     "LinearElastic",
@@ -115,6 +118,7 @@ __all__ = [
     "MeshBody",
     "ModifiedCamClay",
     "MohrCoulomb",
+    "Moving",
     "NeoHookean",
     "NotConverged",
     "Numerics",

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.base.validation import asked, at_places, instance, numbers
 from mpm_dolfinx.grid.grid import FACES, SIDES, Grid, begin_with, corner_bits, in_chunks
-from mpm_dolfinx.parallel.exchange import everywhere
+from mpm_dolfinx.parallel.exchange import together
 from mpm_dolfinx.points.cutting import centroids, domain_volumes, volumes
 from mpm_dolfinx.points.material_points import MaterialPoints
 
@@ -164,6 +164,29 @@ class Body:
         return boxes * ratio[:, None] ** (1 / self.dim)
 
 
+@dataclass(frozen=True, eq=False)
+class Later:
+    """A body that is absent until `Simulation.stage` adds it: `Simulation(grid, [ground, Later(fill)], ...)`."""
+
+    body: Body
+
+    def __post_init__(self):
+        instance("Later: body", self.body, Body)
+
+
+@dataclass(frozen=True, eq=False)
+class Moving:
+    """Initial motion of bodies with inertia: `Simulation(..., inertia=Moving((0, -1)))`.
+
+    Parameters
+    ----------
+    velocity : (d,) or callable x (n, d) -> (n, d), m/s
+        Initial velocity of all bodies, or a function of position.
+    """
+
+    velocity: ArrayLike | Callable[[NDArray], ArrayLike]
+
+
 def mapped(grid: Grid, body: Body, map: Callable[[NDArray[np.float64]], NDArray[np.float64]]) -> Body:
     """Return a body deformed by a map: its boxes become quadrilaterals or hexahedra with mapped corners.
 
@@ -247,7 +270,7 @@ def material_points(
         F=np.broadcast_to(np.eye(grid.stretches), (n, grid.stretches, grid.stretches)),
         volume0=domain_volumes(corners, True) if grid.axisymmetric else size.prod(axis=1),
         material=material,
-        pressure=everywhere(grid.comm, lambda: pressure_at(pressure, x + grid.base)),
+        pressure=together(grid.comm, lambda: pressure_at(pressure, x + grid.base)),
         x=x,
         origin=corners,
         reference=corners,

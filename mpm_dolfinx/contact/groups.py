@@ -93,19 +93,14 @@ def groups_of(contacts: Sequence[Contact], count: int) -> list[tuple[int, ...]]:
     return groups
 
 
-def contacts_of(conditions: Sequence[Any]) -> list[Contact]:
-    """Return the contacts among the conditions."""
-    return [one for one in conditions if isinstance(one, Contact)]
-
-
 def grouped(
-    grid: Grid, bodies: Sequence[Body], conditions: Sequence[Any], quadrature: str, other: dict[str, Any]
+    grid: Grid, bodies: Sequence[Body], contacts: Sequence[Contact], quadrature: str, other: dict[str, Any]
 ) -> Grid:
     """Return the grid of a scene.  In a scene with contacts, this grid has a copy for each group.
 
     Parameters
     ----------
-    conditions, quadrature
+    contacts, quadrature
         See `Simulation`.
     other
         Options that a scene with contacts must not use, by name.
@@ -115,7 +110,6 @@ def grouped(
     ValueError
         Contacts are invalid, or an option is not available with contacts.
     """
-    contacts = contacts_of(conditions)
     if not contacts:
         return grid
     if quadrature == "point":

@@ -23,7 +23,7 @@ from mpm_dolfinx.contact.shapes import DISTANCE, Distance
 from mpm_dolfinx.contact.tool import Pose, Tool
 from mpm_dolfinx.forms.unknowns import Unknowns
 from mpm_dolfinx.grid.grid import Grid
-from mpm_dolfinx.parallel.exchange import Exchange, everywhere
+from mpm_dolfinx.parallel.exchange import Exchange, together
 
 
 class Geometry(NamedTuple):
@@ -113,7 +113,7 @@ class ToolPairs(Pairs):
                 if isinstance(solid, Distance):
                     _check_distance(tool, x[rows] + self.grid.base, gap[rows], n[rows], h)
 
-        everywhere(self.grid.comm, ask)
+        together(self.grid.comm, ask)
         return Geometry(gap, n, second, x - carried, x - middle, shear)
 
     @property

@@ -167,7 +167,7 @@ class Convex(Placed):
             what = f"Convex: corners = {line(self.corners)}"
         else:
             try:
-                assert len(self._planes)
+                _ = self._planes
             except QhullError:
                 what = f"Convex: corners = {line(self.corners)} lie in one line or plane"
         if what:

@@ -28,7 +28,7 @@ from mpm_dolfinx.contact.law import ContactLaw
 from mpm_dolfinx.contact.pairs import ToolPairs
 from mpm_dolfinx.contact.problem import ContactProblem, Pushes, SubstepMotion, Touching
 from mpm_dolfinx.contact.tool import Pose, Tool, rotation
-from mpm_dolfinx.parallel.exchange import Exchange, everywhere, first, over_all
+from mpm_dolfinx.parallel.exchange import Exchange, first, over_all, together
 from mpm_dolfinx.points.material_points import MaterialPoints, middle
 
 BEGINS = 1e-2  # allowed penetration into a body at the start, and into prescribed sides, divided by the cell size
@@ -217,9 +217,7 @@ class Tools(Touching):
         loads = [tool.pushes(t) if t > start and not tool.free else np.nan for tool in self.tools]
         for number, (tool, pose) in enumerate(zip(self.tools, poses, strict=True)):
             before = self._pose(tool, start)
-            n = everywhere(
-                grid.comm, lambda tool=tool, pose=pose: tool.solid(grid.least).normal(pose.own(x)) @ pose.R.T
-            )
+            n = together(grid.comm, lambda tool=tool, pose=pose: tool.solid(grid.least).normal(pose.own(x)) @ pose.R.T)
             faces = free & (np.einsum("md,md->m", area, n) < -FACING * size * np.linalg.norm(n, axis=1))
             at = np.flatnonzero(faces)[~self._edge(tool, pose, x, area / np.maximum(size, TINY)[:, None], faces)]
             old = points.data[shear_name(self.names[number])][patches.at[at]] if tool.grips else np.zeros((len(at), d))
@@ -258,7 +256,7 @@ class Tools(Touching):
         for axis, e in enumerate(np.eye(grid.dim)):
             for half in (-0.5 * h, 0.5 * h):
                 shifted = pose.own(y + half * (e - n[:, [axis]] * n))
-                to = everywhere(grid.comm, lambda shifted=shifted: tool.solid(grid.least).normal(shifted) @ pose.R.T)
+                to = together(grid.comm, lambda shifted=shifted: tool.solid(grid.least).normal(shifted) @ pose.R.T)
                 edge |= np.einsum("md,md->m", n, to) >= -FACING
         if not over_all(grid.comm, int(edge.sum())):
             return edge
@@ -338,14 +336,14 @@ class Tools(Touching):
             gap += LEFT * h
             at = (gap < 0) & (gap > -most * h)
             own = pose.own(out[at])
-            n = everywhere(self.grid.comm, lambda tool=tool, own=own: tool.solid(h).normal(own))
+            n = together(self.grid.comm, lambda tool=tool, own=own: tool.solid(h).normal(own))
             out[at] -= free[at] * (gap[at, None] * n @ pose.R.T)
         return out
 
     def _gaps(self, tool: Tool, corners: NDArray[np.float64], t: float) -> NDArray[np.float64]:
         """Return the distances (n, 2^d), in m, of corners (n, 2^d, d) from a tool at time t (s)."""
         own = self._pose(tool, t).own(corners.reshape(-1, self.grid.dim))
-        gap = everywhere(self.grid.comm, lambda: tool.solid(self.grid.least).distance(own))
+        gap = together(self.grid.comm, lambda: tool.solid(self.grid.least).distance(own))
         return gap.reshape(corners.shape[:2])
 
     def _passed(self, tool: Tool, x: tuple[NDArray[np.float64], ...], times: tuple[float, ...]) -> str:
@@ -359,15 +357,15 @@ class Tools(Touching):
         done = np.zeros(len(y))
         on = np.arange(len(y))
         along = (end - y) / np.maximum(length, TINY)[:, None]
-        inside = everywhere(self.grid.comm, lambda: (tool.solid(h).distance(y) < 0) | (tool.solid(h).distance(end) < 0))
-        a, b = everywhere(self.grid.comm, lambda: (tool.solid(h).normal(y[inside]), tool.solid(h).normal(end[inside])))
+        inside = together(self.grid.comm, lambda: (tool.solid(h).distance(y) < 0) | (tool.solid(h).distance(end) < 0))
+        a, b = together(self.grid.comm, lambda: (tool.solid(h).normal(y[inside]), tool.solid(h).normal(end[inside])))
         crossed = x[1][inside][np.einsum("nd,nd->n", a, b) < 0][:1]  # inside, and the nearest side has changed
         if where := first(comm, "".join(np.array2string(place, precision=6) for place in crossed + self.grid.base)):
             return where
         on = on[~inside]
         while over_all(comm, len(on)):
             at = y[on] + done[on, None] * along[on]
-            gap = everywhere(self.grid.comm, lambda at=at: tool.solid(h).distance(at))
+            gap = together(self.grid.comm, lambda at=at: tool.solid(h).distance(at))
             inside = x[1][on[gap < -LEFT * h]][:1]  # the middles of thin domains slide along round tools
             if where := first(comm, "".join(np.array2string(place, precision=6) for place in inside + self.grid.base)):
                 return where
@@ -378,7 +376,7 @@ class Tools(Touching):
     def _deepest(self, tool: Tool, x: NDArray[np.float64], t: float) -> tuple[float, str]:
         """Return the largest penetration of positions x (m, d) into a tool, in cell sizes, and the position as text."""
         h, pose = self.grid.least, self._pose(tool, t)
-        gap = everywhere(self.grid.comm, lambda: tool.solid(h).distance(pose.own(x)))
+        gap = together(self.grid.comm, lambda: tool.solid(h).distance(pose.own(x)))
         deepest = over_all(self.grid.comm, float(gap.min(initial=np.inf)), MPI.MIN)
         place = (
             np.array2string(x[gap.argmin()] + self.grid.base, precision=6) if len(gap) and gap.min() == deepest else ""

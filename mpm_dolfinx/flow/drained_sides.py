@@ -36,7 +36,7 @@ from mpm_dolfinx.flow.fluxes import Conduction, OpenSides
 from mpm_dolfinx.flow.unsaturated import Relative
 from mpm_dolfinx.forms.point_forms import PointData
 from mpm_dolfinx.grid.grid import sum_by
-from mpm_dolfinx.parallel.exchange import everywhere, over_all
+from mpm_dolfinx.parallel.exchange import over_all, together
 
 THICK = np.sqrt(2)
 """Area of the largest plane section of a cube, divided by the area of a face.  Source: exact bound (Ball 1986).
@@ -108,7 +108,7 @@ class DrainedSides(Feeding):
         grid, rows = self._grid, []
         patches = wet.cut.surfaces(self.surfaces)
         for i, ((outlet, _), p) in enumerate(zip(self._outlets, patches, strict=True)):
-            given, n = everywhere(grid.comm, partial(outlet.through, wet.t, p.positions(wet.points))), len(p.x)
+            given, n = together(grid.comm, partial(outlet.through, wet.t, p.positions(wet.points))), len(p.x)
             columns = np.empty((n, 5 + grid.dim))
             for k, column in enumerate((i, *given)):
                 columns[:, k] = column

@@ -14,7 +14,7 @@ import ufl
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.caching import Latest
-from mpm_dolfinx.forms.point_forms import BATCH, CellSums, FormPoints, Places, PointData, PointExpression
+from mpm_dolfinx.forms.point_forms import BATCH, NONE, CellSums, FormPoints, Given, Places, PointData, PointExpression
 from mpm_dolfinx.grid.grid import Grid, sum_by
 
 
@@ -97,10 +97,10 @@ class ElementForces:
     def __init__(self, stress: ufl.core.expr.Expr, points: FormPoints):
         self._sums = CellSums(along_shapes(stress, points), points)
 
-    def assemble_vector(self, b: NDArray[np.float64], data: PointData) -> None:
+    def assemble_vector(self, b: NDArray[np.float64], data: PointData, given: Given = NONE) -> None:
         """Add the vector to the local array `b`.  Contributions to ghosts remain in the ghost entries."""
         dofs, at = data.places.dofs
-        b[dofs] += sum_by(at, self._sums(data).ravel(), len(dofs))
+        b[dofs] += sum_by(at, self._sums(data, given).ravel(), len(dofs))
 
 
 class Beside(NamedTuple):
@@ -150,9 +150,9 @@ class ElementMatrices:
         along = [part for T in beside.along for part in along_shapes(T, points)]
         self._sums = CellSums([*entries, *along, *beside.scalars], points)
 
-    def assemble_matrix(self, A: PETSc.Mat, data: PointData) -> NDArray[np.float64]:
+    def assemble_matrix(self, A: PETSc.Mat, data: PointData, given: Given = NONE) -> NDArray[np.float64]:
         """Add the matrix to `A`, without final assembly; return the further integrals (cells, quantities)."""
-        sums = self._sums(data)
+        sums = self._sums(data, given)
         insert(A, self._grid, data.places.filled, sums[:, self._entry])
         return sums[:, self._count :]
 
@@ -204,9 +204,9 @@ class StackedElementMatrices:
         self._values = PointExpression(ufl.as_vector(parts), points)
         self._sorted: Latest[list] = Latest()
 
-    def assemble_matrix(self, A: PETSc.Mat, data: PointData) -> NDArray[np.float64]:
+    def assemble_matrix(self, A: PETSc.Mat, data: PointData, given: Given = NONE) -> NDArray[np.float64]:
         """Add the matrix to `A`, without final assembly; return the further integrals (cells, quantities)."""
-        live, filled = self._values.live(data), data.places.filled
+        live, filled = self._values.live(data, given), data.places.filled
         sums = np.empty((len(filled), self._along * 2**self._d * self._d + self._scalars))
         for cells, points, missing in self._sorted(data.places.key, lambda: batches(data.places)):
             matrices, sums[cells] = self._of_batch(data, live, points.ravel(), missing)

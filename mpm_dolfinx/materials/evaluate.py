@@ -19,7 +19,7 @@ from ufl.algorithms.apply_derivatives import apply_derivatives
 from mpm_dolfinx.base.errors import NotConverged
 from mpm_dolfinx.base.tolerances import NEAR
 from mpm_dolfinx.forms.axes import block
-from mpm_dolfinx.forms.point_forms import FormPoints, PointData, PointExpression
+from mpm_dolfinx.forms.point_forms import NONE, FormPoints, PointData, PointExpression
 from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.materials.local_unknowns import LocalUnknowns
 from mpm_dolfinx.materials.skeleton import BY_SCENE, Skeleton
@@ -85,11 +85,11 @@ class LawAtPoints:
         own = self._local.known if self._local is not None else {}
         return {**self._given, **own}
 
-    def _solve(self, data: PointData, dt: float) -> None:
-        """Set the time since the start of the step, s, and solve for the local unknowns."""
+    def _evaluate(self, expression: PointExpression, data: PointData, dt: float = 0.0) -> NDArray[np.float64]:
+        """Return an expression at the points, with their local unknowns; dt: time since the last update, s."""
         self._by_scene["dt"].value = dt
-        if self._local is not None:
-            self._local.update(data, derive=False)
+        given = NONE if self._local is None else self._local.solve(data, derive=False)
+        return expression.evaluate(data, live=expression.live(data, given))
 
     def data(
         self, points: MaterialPoints, rows: NDArray[np.int64], values: dict[str, NDArray[np.float64]]
@@ -108,9 +108,7 @@ class LawAtPoints:
 
     def stress(self, data: PointData, dt: float = 0.0) -> NDArray[np.float64]:
         """Return the effective Cauchy stress (n, d, d), Pa; dt: time since the last update of the state, s."""
-        stress = self._stress
-        self._solve(data, dt)
-        return stress.evaluate(data)
+        return self._evaluate(self._stress, data, dt)
 
     @cached_property
     def _energy(self) -> PointExpression:
@@ -118,9 +116,7 @@ class LawAtPoints:
 
     def energy(self, data: PointData) -> NDArray[np.float64]:
         """Return the stored energy (n,) per reference volume, Pa, of a law with an energy."""
-        energy = self._energy
-        self._solve(data, 0.0)
-        return energy.evaluate(data)
+        return self._evaluate(self._energy, data)
 
     @cached_property
     def _out_of_plane(self) -> PointExpression | None:
@@ -133,7 +129,7 @@ class LawAtPoints:
             return self.stress(data)
         out = np.zeros((len(data.cells), 3, 3))
         out[:, :2, :2], across = self.stress(data), self._out_of_plane
-        out[:, 2, 2] = np.nan if across is None else across.evaluate(data)
+        out[:, 2, 2] = np.nan if across is None else self._evaluate(across, data)
         return out
 
     @cached_property
@@ -150,8 +146,7 @@ class LawAtPoints:
         if self.law.update is None:
             return []
         expression, shapes = self._update
-        self._solve(data, dt)
-        values = expression.evaluate(data)
+        values = self._evaluate(expression, data, dt)
         out = []
         start = 0
         for name, shape in shapes.items():
@@ -260,9 +255,8 @@ class SoftnessAtPoints:
         fields = {name: at[name] for name in ("F", *self._shapes)}
         dF = dF[:, : self._stretches, : self._stretches]
         data = PointData(self._points, at.places, at.volume, {"dF": dF, **fields})
-        if self._local is not None:
-            self._local.update(data)
-        weight, work = self._along.evaluate(data).T
+        given = NONE if self._local is None else self._local.solve(data)
+        weight, work = self._along.evaluate(data, live=self._along.live(data, given)).T
         elastic = 2 * shear * (weight + NEAR**4)
         return np.clip(elastic / np.maximum(work + 2 * shear * NEAR**4 / before, elastic / MOST), 1.0, MOST)
 

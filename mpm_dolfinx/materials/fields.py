@@ -26,7 +26,7 @@ from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.materials.evaluate import LawAtPoints, SoftnessAtPoints, knows_space, mean_size, sampled
 from mpm_dolfinx.materials.prestressed import AT_REST, stressed
 from mpm_dolfinx.materials.skeleton import BY_SCENE, DRIED, Fluid, Skeleton, constants_of
-from mpm_dolfinx.parallel.exchange import Exchange, everywhere, first, over_all
+from mpm_dolfinx.parallel.exchange import Exchange, first, over_all, together
 from mpm_dolfinx.points.material_points import ACROSS, MaterialPoints
 from mpm_dolfinx.pores.retention import Retentions, SaturationAt, scale_of
 from mpm_dolfinx.pores.retention import sampled as drained
@@ -140,7 +140,7 @@ class SceneMaterials:
         for i, m in zip(self._used, evaluated, strict=True):
             values = {name: getattr(m, name) for name in self._fields[i]}
             count, own = max(1, len(rows[i])), rows[i]
-            everywhere(grid.comm, partial(self._add_shapes, _expanded(m, values, count), seeded, len(points)))
+            together(grid.comm, partial(self._add_shapes, _expanded(m, values, count), seeded, len(points)))
             for name, value in values.items():
                 filled = np.zeros((len(points), *value.shape[1:]))
                 filled[own] = value[: len(own)]
@@ -173,7 +173,7 @@ class SceneMaterials:
     def check_cells(self) -> None:
         """Raise ValueError if cells are too large for a softening law.  Called after the cells are created or moved."""
         size = mean_size(self.grid)
-        everywhere(self.grid.comm, lambda: [m.check_cells(size) for m in self._evaluated])
+        together(self.grid.comm, lambda: [m.check_cells(size) for m in self._evaluated])
 
     @property
     def across(self) -> bool:
@@ -612,7 +612,7 @@ def _evaluated(grid: Grid, m: Skeleton, X: NDArray[np.float64], ids: NDArray[np.
             _check_local(made, m.at(X[::2]), names)
         return made
 
-    out = everywhere(grid.comm, at_points)
+    out = together(grid.comm, at_points)
     row = [(int(ids[0]), {name: getattr(out, name)[:1] for name in names})] if len(X) else []
     found = over_all(grid.comm, row) if names else []
     values = min(found, key=itemgetter(0))[1] if found else {}

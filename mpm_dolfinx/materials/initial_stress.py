@@ -21,7 +21,7 @@ from mpm_dolfinx.materials.fields import SceneMaterials
 from mpm_dolfinx.materials.prestressed import AT_REST
 from mpm_dolfinx.materials.skeleton import STANDARD_GRAVITY, Field
 from mpm_dolfinx.materials.trial import PLANE, SPACE
-from mpm_dolfinx.parallel.exchange import Exchange, everywhere, first, over_all
+from mpm_dolfinx.parallel.exchange import Exchange, first, over_all, together
 from mpm_dolfinx.points.material_points import MaterialPoints, unstretched
 
 EXACT, CLOSE = 1e-13, SAME  # errors relative to the largest initial stress: one ends Newton's method, one is accepted
@@ -163,7 +163,7 @@ class InitialStresses:
                     target[own] = self._at(stress, body, placed.map(lambda v, own=own: v[own]), [a[own] for a in above])
                 rows[own] = True
 
-        everywhere(materials.grid.comm, fill)
+        together(materials.grid.comm, fill)
         return stressed(materials, points, rows, target)
 
     def _at(self, stress: InitialStress, body: int, points: MaterialPoints, above: list[NDArray]) -> NDArray:

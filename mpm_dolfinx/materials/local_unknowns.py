@@ -28,10 +28,10 @@ from mpm_dolfinx.base.caching import Latest
 from mpm_dolfinx.base.errors import NotConverged
 from mpm_dolfinx.base.tolerances import EPSILON, SAME
 from mpm_dolfinx.base.validation import asked, instance, line
-from mpm_dolfinx.forms.point_forms import FormPoints, PointData, PointExpression
+from mpm_dolfinx.forms.point_forms import FormPoints, Given, PointData, PointExpression
 from mpm_dolfinx.materials.skeleton import BY_SCENE, Skeleton
 from mpm_dolfinx.materials.user_functions import call, named
-from mpm_dolfinx.parallel.exchange import everywhere, first
+from mpm_dolfinx.parallel.exchange import first, together
 
 MOST, HALVINGS = 60, 25  # largest numbers of Newton iterations, and of step halvings in all iterations together
 
@@ -39,7 +39,6 @@ MOST, HALVINGS = 60, 25  # largest numbers of Newton iterations, and of step hal
 class Solved(NamedTuple):
     """Solution of the local equations at n points."""
 
-    key: object  # identifies the points' data for which the equations were solved
     unknowns: NDArray[np.float64]  # (n, m)
     trial: NDArray[np.float64]  # trial values (n, k)
     derive: Callable[[], Derived]  # function that returns the derivatives
@@ -86,16 +85,13 @@ class LocalUnknowns:
         z = _parts(trial.values())
         self._trial, self._dt = PointExpression(ufl.as_vector(z), points), values["dt"]
         self._solved: Latest[Solved] = Latest()
-        self._derived: Latest[tuple[Solved, Derived]] = Latest()
+        self._derived: Latest[Derived] = Latest()
         self._of_energy = law.kirchhoff is None
         bends = self._of_energy and law.residual is not None
         self._equations = _Equations(law, points, trial, {name: values[name] for name in BY_SCENE}, bends)
         m, k = self._equations.count, len(z)
         shapes = {"unknowns": (m,), "trial": (k,), "slopes": (m, k)} | ({"bends": (m, k * k)} if bends else {})
-        at = {
-            what: points.follow(f"local {what}", s, lambda data, w=what: self._now(data, w))
-            for what, s in shapes.items()
-        }
+        at = {what: points.follow(f"local {what}", s) for what, s in shapes.items()}
         # component by component: in 3D products of tensors take ten times as long to compile
         off = [z[j] - at["trial"][j] for j in range(k)]
         y = [at["unknowns"][i] + sum(at["slopes"][i, j] * off[j] for j in range(k)) for i in range(m)]
@@ -106,8 +102,8 @@ class LocalUnknowns:
         self.values = given | _named(shapes, y)
         self.known = self.values if self._of_energy else given | _named(shapes, at["unknowns"])
 
-    def update(self, data: PointData, derive: bool = True) -> None:
-        """Solve for the local unknowns of the points at their present F; all processes must call it.
+    def solve(self, data: PointData, derive: bool = True) -> Given:
+        """Return values that forms of the points are given: unknowns at their present F; all processes must call it.
 
         derive: whether to differentiate by the trial values too.  `values` needs these derivatives; `known` does not.
 
@@ -117,29 +113,13 @@ class LocalUnknowns:
             The equations of a point have no solution.  The message states the first point without a solution.
         """
         trial = self._trial.evaluate(data)
-        self._solved((data.key, trial, float(self._dt.value)), lambda: self._equations.solve(data, trial), self._comm)
+        key = data.key, trial, float(self._dt.value)
+        solved = self._solved(key, lambda: self._equations.solve(data, trial), self._comm)
+        out = {"local unknowns": solved.unknowns, "local trial": solved.trial}
         if derive or self._of_energy:
-            self.derive(data)
-
-    def derive(self, data: PointData) -> None:
-        """Differentiate the last solution with respect to the trial values; all processes must call it."""
-        solved = self._at(data)
-        self._derived(solved.derive, lambda: (solved, solved.derive()), self._comm)
-
-    def _at(self, data: PointData) -> Solved:
-        solved = self._solved.value
-        if solved is None or solved.key is not data.key:
-            raise RuntimeError(f"{self._law.__name__}: local unknowns are used before they are solved")
-        return solved
-
-    def _now(self, data: PointData, what: str) -> NDArray[np.float64]:
-        solved = self._at(data)
-        if what not in Derived._fields:
-            return getattr(solved, what)
-        of, derived = self._derived.value or (None, None)
-        if of is not solved:
-            raise RuntimeError(f"{self._law.__name__}: derivatives of local unknowns are used before they are computed")
-        return getattr(derived, what)
+            derived = self._derived(solved.derive, solved.derive, self._comm)
+            out |= {"local slopes": derived.slopes, "local bends": derived.bends}
+        return out
 
 
 class _Equations:
@@ -167,7 +147,7 @@ class _Equations:
         if law.residual is None:
             return
         k = sum(_size(s) for s in self._trial.values())
-        y, z = (ufl.variable(own.follow(name, (size,), _given)) for name, size in (("unknowns", m), ("trial", k)))
+        y, z = (ufl.variable(own.follow(name, (size,))) for name, size in (("unknowns", m), ("trial", k)))
         given = {name: getattr(own, name) for name in self._names} | _named(self._unknowns, y) | self._by_scene
         residual = call(law.residual, **self._with_trial(_named(self._trial, z)), **given)
         found = named(f"{law.__name__}.residual", residual, self._unknowns)
@@ -178,7 +158,7 @@ class _Equations:
         self._slopes = PointExpression(ufl.as_vector([*steps, *(by_z[i, j] for i in range(m) for j in range(k))]), own)
         self._bends = None
         if bends:  # the second derivative of f along y = y* + Y (z - z*)
-            Y = own.follow("slopes", (m, k), _given)
+            Y = own.follow("slopes", (m, k))
             along = ufl.as_matrix([[_along(by_y, by_z, Y, m, (i,), j) for j in range(k)] for i in range(m)])
             by_y, by_z = ufl.diff(along, y), ufl.diff(along, z)
             each = product(range(m), range(k), range(k))
@@ -218,7 +198,7 @@ class _Equations:
             bends = -_solve(by_y, second.reshape(n, m, k * k))
             return Derived(slopes.reshape(n, m * k), bends.reshape(n, m * k * k))
 
-        return Solved(data.key, y, trial, derive)
+        return Solved(y, trial, derive)
 
     def _refuse(self, data: PointData, failed: NDArray[np.int64], why: str) -> None:
         """Raise NotConverged on all processes if any point has failed.  The message states the first failed point."""
@@ -241,14 +221,14 @@ class _Equations:
             return [found[of][0].reshape(n, _size(shape)) for of, shape in self._unknowns.items()]
 
         def derive() -> Derived:
-            each = everywhere(self._grid.comm, lambda: [self._slopes_of(of, found[of][1], n) for of in self._unknowns])
+            each = together(self._grid.comm, lambda: [self._slopes_of(of, found[of][1], n) for of in self._unknowns])
             slopes = np.concatenate(each, axis=1)
             self._refuse(data, np.flatnonzero(~np.isfinite(slopes).all(axis=(1, 2))), ".solution: is not finite")
             return Derived(slopes.reshape(n, self.count * k))
 
-        y = np.concatenate(everywhere(self._grid.comm, solution), axis=1)
+        y = np.concatenate(together(self._grid.comm, solution), axis=1)
         self._refuse(data, np.flatnonzero(~np.isfinite(y).all(axis=1)), ".solution: is not finite")
-        return Solved(data.key, y, trial, derive)
+        return Solved(y, trial, derive)
 
     @property
     def _title(self) -> str:
@@ -389,7 +369,3 @@ def _named(shapes: Mapping[str, tuple[int, ...]], vector) -> dict:
 
 def _nested(vector, index: NDArray[np.int64]):
     return [_nested(vector, row) for row in index] if index.ndim else vector[int(index)]
-
-
-def _given(data: PointData) -> NDArray[np.float64]:
-    raise RuntimeError("trial values and unknowns must be passed to each evaluation")

@@ -67,6 +67,11 @@ class SofteningDruckerPrager(DruckerPrager):
         if not callable(self.cohesion):
             _check(self, "residual", lambda v: (0 <= v) & (v <= self.cohesion), "in [0, cohesion]")
 
+    @property
+    def cone(self):
+        """Coefficients (..., 3): eta and xi of the yield function, and eta of the plastic potential."""
+        return np.stack(np.broadcast_arrays(self.eta, self.xi, self.eta_flow), axis=-1)
+
     def check_cells(self, cell_size: float) -> None:
         stiff = self.shear + self.bulk * self.eta * self.eta_flow
         least = self.xi * (self.cohesion - self.residual) * cell_size / stiff
@@ -77,29 +82,25 @@ class SofteningDruckerPrager(DruckerPrager):
             raise ValueError(f"{what} {cell_size:g} m, else the soil softens faster than it unloads")
 
     @staticmethod
-    def kirchhoff(
-        F, bulk, shear, eta, xi, eta_flow, cohesion, residual, slip, viscosity, plastic, hardened, dt, cell_size
-    ):
+    def kirchhoff(F, bulk, shear, cone, cohesion, residual, slip, viscosity, plastic, hardened, dt, cell_size):
         """Return the Kirchhoff stress (3, 3), Pa, as UFL."""
         trial = Trial(F, plastic)
         strength = cohesion, residual, slip / cell_size, viscosity / (dt + TINY)
-        return stress(trial, _softened(trial, bulk, shear, eta, xi, eta_flow, hardened, *strength), shear)
+        return stress(trial, _softened(trial, bulk, shear, cone, hardened, *strength), shear)
 
     @staticmethod
-    def update(
-        F, bulk, shear, eta, xi, eta_flow, cohesion, residual, slip, viscosity, plastic, hardened, dt, cell_size
-    ):
+    def update(F, bulk, shear, cone, cohesion, residual, slip, viscosity, plastic, hardened, dt, cell_size):
         """Return the state at the end of the step: UFL by name."""
         trial = Trial(F, plastic)
         strength = cohesion, residual, slip / cell_size, viscosity / (dt + TINY)
-        to = _softened(trial, bulk, shear, eta, xi, eta_flow, hardened, *strength)
+        to = _softened(trial, bulk, shear, cone, hardened, *strength)
         return {"plastic": metric(trial, to, bulk, plastic), "hardened": hardened + to["hardened"]}
 
 
-def _softened(trial: Trial, bulk, shear, eta, xi, eta_flow, hardened, cohesion, residual, strain, drag) -> dict:
+def _softened(trial: Trial, bulk, shear, cone, hardened, cohesion, residual, strain, drag) -> dict:
     """Like `drucker_prager.returned`, with softening; strain: plastic shear strain at which the cohesion is c_r."""
-    end = xi * strain  # in terms of `hardened`
-    moduli = trial, bulk, shear, eta, xi, eta_flow
+    end = cone[1] * strain  # in terms of `hardened`
+    moduli = trial, bulk, shear, *cone
     falling = returned(*moduli, cohesion, (residual - cohesion) / end, hardened, drag)
     left = returned(*moduli, residual, 0.0, hardened, drag)
     # soil in tension at the apex has the residual cohesion

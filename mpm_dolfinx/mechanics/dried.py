@@ -14,7 +14,7 @@ import ufl
 from numpy.typing import NDArray
 
 from mpm_dolfinx.forms.cell_matrices import along_shapes
-from mpm_dolfinx.forms.point_forms import CellSums, FormPoints
+from mpm_dolfinx.forms.point_forms import CellSums, FormPoints, Given
 from mpm_dolfinx.mechanics.mean_dilatation import MeanDilatation
 from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
 
@@ -49,12 +49,16 @@ class OfSuction:
         found = {number: of for number, of in enumerate(sums) if of is not None}
         self._free = {number: of for number, of in found.items() if number not in self._locked}
 
-    def rows(self, data: QuadratureData) -> list[tuple[NDArray[np.int32], NDArray[np.float64]]]:
-        """Return pairs of cells (c,) and derivatives (c, n), m^(d-1), of their nodal forces by their pressures."""
-        out = [(data.parts[number].places.filled, sums(data.parts[number])) for number, sums in self._free.items()]
+    def rows(self, data: QuadratureData, given: Sequence[Given]) -> list[tuple[NDArray[np.int32], NDArray[np.float64]]]:
+        """Return pairs of cells (c,) and derivatives (c, n), m^(d-1), of their nodal forces by their pressures.
+
+        given: values that the forms of each part are given.
+        """
+        parts = data.parts
+        out = [(parts[k].places.filled, of(parts[k], given[k])) for k, of in self._free.items()]
         if self._locked:
             width = 2 * self._width + 1
-            sums = [of(data.parts[number]) for number, of in self._locked.items()]
+            sums = [of(parts[k], given[k]) for k, of in self._locked.items()]
             cells, total, volume = self._dilatation.total(data, [_padded(values, width) for values in sums])
             by_volume, by_stress, slope = np.split(total, (self._width, 2 * self._width), axis=1)
             out.append((cells, by_stress + slope / volume * by_volume))

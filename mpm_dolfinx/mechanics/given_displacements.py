@@ -31,7 +31,7 @@ from mpm_dolfinx.forms.point_forms import FormPoints, PointData, PointForm
 from mpm_dolfinx.grid.grid import Grid, sum_by
 from mpm_dolfinx.mechanics.held_cells import HeldCells, HeldPoints, inner_cells
 from mpm_dolfinx.mechanics.rigid_motion import rigid_motion, turned
-from mpm_dolfinx.parallel.exchange import everywhere, first, over_all
+from mpm_dolfinx.parallel.exchange import first, over_all, together
 from mpm_dolfinx.parallel.messages import ConditionWarning, warn
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.points.parts import Parts
@@ -194,7 +194,7 @@ class GivenDisplacements(Acting):
 
     def _given(self, hold: Displacement, t: float, X: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the prescribed displacements (n, d), m, at reference positions X (n, d) of this process."""
-        return everywhere(self._grid.comm, lambda: hold.at(t, X))
+        return together(self._grid.comm, lambda: hold.at(t, X))
 
     def unknown(self, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:
         """Return reactions, by quantity and name of the condition, with every component equal to `value`."""

@@ -40,12 +40,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.base.caching import Latest
 from mpm_dolfinx.base.tolerances import ROUND_OFF
-from mpm_dolfinx.base.validation import at_places, check_names, flag, line, numbers
+from mpm_dolfinx.base.validation import at_places, numbers
 from mpm_dolfinx.conditions.acting import At, Loads
 from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.forms.point_forms import FormPoints, Places, PointData, PointForm
 from mpm_dolfinx.forms.unknowns import Unknowns, matrix, sum_ghosts
-from mpm_dolfinx.grid.grid import Grid, polynomial, sum_by
+from mpm_dolfinx.grid.grid import polynomial, sum_by
 from mpm_dolfinx.mechanics.ghost_penalty import kinks
 from mpm_dolfinx.points.cutting import spreads
 from mpm_dolfinx.points.material_points import MaterialPoints, middle
@@ -67,32 +67,6 @@ VELOCITY, RATE = "velocity", "F_rate"
 def resting(points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
     """Return velocity and rate of F, both zero, of points without motion."""
     return moving(points, np.zeros(points.x.shape[1]), 0.0)
-
-
-def checked_velocity(
-    grid: Grid, quadrature: str, inertia: bool | None, velocity: ArrayLike | Callable | None
-) -> ArrayLike | Callable | None:
-    """Return the initial velocity of a scene, zero by default, or None if the scene's argument `inertia` is None.
-
-    Raises
-    ------
-    ValueError
-        A velocity is given without inertia, or the scene does not support inertia.
-    """
-    if inertia is None:
-        if velocity is not None:
-            raise ValueError(f"velocity = {line(velocity)}: bodies have no inertia; a velocity requires inertia=True")
-        return None
-    flag("inertia", inertia)
-    if quadrature != "domain":
-        raise ValueError(f"inertia = {inertia} with quadrature {quadrature!r}, must be None")
-    if velocity is not None and not inertia:
-        raise ValueError(f"velocity = {line(velocity)}: no inertia at first; a velocity requires inertia=True")
-    if callable(velocity):
-        check_names("velocity", velocity, ("x",))
-    elif grid.axisymmetric and velocity is not None and np.ravel(velocity)[:1].any():
-        raise ValueError(f"velocity = {line(velocity)}, must be (0, v): axisymmetric bodies move along the axis")
-    return np.zeros(grid.dim) if velocity is None else velocity
 
 
 def moving(
@@ -179,7 +153,8 @@ class InertiaForms:
         self._u, self._flight, self._rate = u, fem.Function(V), fem.Constant(grid.mesh, 0.0)
         self.acceleration = self._rate * (u - self._flight)
         """Acceleration at u as UFL, m/s^2."""
-        self._midpoint = fem.Constant(grid.mesh, 0.0)
+        self.midpoint = fem.Constant(grid.mesh, 0.0)
+        """1 in a substep with a midpoint rule, else 0."""
         for seen in dict.fromkeys([points, *of_laws] if not grid.axisymmetric else []):  # axisymmetric bodies: no spin
             chords: Latest[tuple[NDArray, NDArray]] = Latest()
             seen.follow("gradient", (d, d), partial(self._seen, chords, 0))
@@ -198,7 +173,7 @@ class InertiaForms:
 
     def set_substep(self, inertia: Inertia | None, midpoint: bool) -> None:
         """Set the forms' acceleration, zero if inertia is None; midpoint: whether the substep uses a midpoint rule."""
-        self._midpoint.value = float(midpoint and inertia is not None)
+        self.midpoint.value = float(midpoint and inertia is not None)
         self._rate.value = 0.0 if inertia is None else inertia.rate
         if inertia is not None:
             self._flight.x.array[:] = inertia.flight
@@ -214,7 +189,7 @@ class InertiaForms:
         chords: the last result, shared by all forms at the same u; which: 0 for gradients, 1 for rotations.
         """
         G, d = data.gradients(self._u.x.array), self.grid.dim
-        if self._midpoint.value:
+        if self.midpoint.value:
             return chords(G, lambda: chord(G.reshape(-1, d, d)))[which].reshape(-1, d * d)
         return np.broadcast_to(np.eye(d).ravel(), G.shape) if which else G
 

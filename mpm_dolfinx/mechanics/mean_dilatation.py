@@ -36,19 +36,21 @@ from numpy.typing import NDArray
 from mpm_dolfinx.base.caching import Latest
 from mpm_dolfinx.forms.axes import block, embedded
 from mpm_dolfinx.forms.cell_matrices import Beside, insert
-from mpm_dolfinx.forms.point_forms import CellSums, FormPoints, PointData, PointExpression
+from mpm_dolfinx.forms.point_forms import CellSums, FormPoints, Given, PointData, PointExpression
 from mpm_dolfinx.grid.grid import Grid, sum_by
 from mpm_dolfinx.materials.skeleton import Skeleton
 from mpm_dolfinx.materials.user_functions import expression
 from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
 from mpm_dolfinx.points.material_points import ACROSS, with_ratio
 
+STRESS = "stress of the law"
+
 
 class SumsOfPart(NamedTuple):
     """Sums for theta and pi, in each cell, over one part of the scene's integration points: see `MeanDilatation`."""
 
     ratio: CellSums
-    stress: StressAtPoints
+    stress: PointExpression  # components of the stress P, and its derivative with respect to theta
 
 
 class FBar:
@@ -110,15 +112,17 @@ class FBar:
         sums over each cell.  Kernels that sum theta and pi over each cell, for `MeanDilatation`.
         """
         J_n, J = ufl.det(points.F), ufl.det(F)
-        P, slope = self._stress(law, F, Fbar, known)
-        sums = SumsOfPart(CellSums([ratio], points), StressAtPoints(P, slope / J_n, points))
+        P, slope = self.stresses(law, F, Fbar, known)
+        # evaluated once for both residual and pi
+        stress = PointExpression(ufl.as_vector([*(P[i] for i in np.ndindex(P.ufl_shape)), slope / J_n]), points)
+        sums, own = SumsOfPart(CellSums([ratio], points), stress), points.follow(STRESS, P.ufl_shape)
         P_F, P_theta, slope_F, slope_theta = self._slopes(law, F, Fbar, values)
         shared, share = self.pi * ufl.diff(J, F), 1 / J_n
         along = [share * T for T in (ufl.diff(J, F), slope_F, *([] if self.symmetric else [P_theta]))]
         beside = Beside(along, [share * slope_theta])
-        return sums.stress.P + shared, P_F + ufl.diff(shared, F), beside, sums
+        return (block(own) if self.grid.axisymmetric else own) + shared, P_F + ufl.diff(shared, F), beside, sums
 
-    def _stress(self, law: type[Skeleton], F, Fbar, values: Mapping[str, object]) -> tuple:
+    def stresses(self, law: type[Skeleton], F, Fbar, values: Mapping[str, object]) -> tuple:
         """Return the derivatives of psi(Fbar), or of the work of a law without energy, with respect to F and theta."""
         if law.kirchhoff is None:
             energy = expression(law.energy, [()], F=Fbar, **values)
@@ -127,12 +131,8 @@ class FBar:
         mean = ufl.tr(tau) / Fbar.ufl_shape[0]
         return _dev(tau, F) * ufl.inv(F).T, mean / self._theta
 
-    def by_pressure(self, law: type[Skeleton], F, Fbar, values: Mapping[str, object], p) -> list:
-        """Return the derivatives of both results of `_stress` with respect to a pressure p, a UFL variable."""
-        return [ufl.diff(of, p) for of in self._stress(law, F, Fbar, values)]
-
     def _slopes(self, law: type[Skeleton], F, Fbar, values: Mapping[str, object]) -> tuple:
-        """Return the derivatives of both results of `_stress` with respect to F and theta.
+        """Return the derivatives of both results of `stresses` with respect to F and theta.
 
         In 2D a law without an energy is differentiated with respect to Fbar only, which halves the time for tangents.
         With Fbar = s F,
@@ -141,7 +141,7 @@ class FBar:
 
         for F (d, d) and the (d, d) components of s F. In 3D this formula would take two minutes to compile.
         """
-        P, slope = self._stress(law, F, Fbar, values)
+        P, slope = self.stresses(law, F, Fbar, values)
         if law.kirchhoff is None or self.grid.dim == 3:
             return tuple(ufl.diff(of, by) for of in (P, slope) for by in (F, self._theta))
         d, n = range(F.ufl_shape[0]), Fbar.ufl_shape[0]
@@ -172,15 +172,20 @@ class MeanDilatation:
 
     fbar: the fields theta and pi.
     parts: sums over each part in which cells would lock, by index of the part, see `QuadratureData`.
+    dt: time since the start of the step, s.
+    suction: pressures on which stresses depend, or None.
     """
 
-    def __init__(self, fbar: FBar, parts: Mapping[int, SumsOfPart]):
+    def __init__(self, fbar: FBar, parts: Mapping[int, SumsOfPart], dt: fem.Constant, suction: fem.Function | None):
+        self._dt, self._suction = dt, suction
         self._grid, self._symmetric = fbar.grid, fbar.symmetric
         self.theta, self.pi = fbar.theta, fbar.pi
         self.numbers = list(parts)
         self._sums = list(parts.values())
         self._filled: Latest[Cells] = Latest()
         self._volume: Latest[NDArray[np.float64]] = Latest()
+        self._ratios: Latest[None] = Latest()
+        self._stresses: Latest[list[Given]] = Latest()
 
     def total(
         self, data: QuadratureData, sums: Sequence[NDArray[np.float64]]
@@ -188,22 +193,45 @@ class MeanDilatation:
         """Return the cells with F-bar, totals (cells, k) of `sums` over all parts, and the result of `_volume_of`."""
         return self._cells(data).filled, self._cells(data).total(sums), self._volume_of(data)
 
-    def update(self, data: QuadratureData, solve: Callable[[], None]) -> None:
-        """Set theta, the stresses and pi at the present displacement; solve: function that solves local unknowns."""
-        self._set_mean(self.theta, [of.ratio for of in self._sums], data)
-        solve()
-        self._set_mean(self.pi, [of.stress for of in self._sums], data)
+    def at(self, data: QuadratureData, motion: tuple, solve: Callable[[], Sequence[Given]]) -> list[Given]:
+        """Set theta and pi, and return the values that the forms of each part are given; all processes must call it.
 
-    def _set_mean(self, f: fem.Function, sums: Sequence[CellSums | StressAtPoints], data: QuadratureData) -> None:
+        motion: everything by which deformations change at the integration points `data`, a key for `Latest`; solve:
+        function that returns these values without stresses, see `LocalUnknowns`.
+        """
+
+        def given_stresses() -> list[Given]:
+            given, sums = [*solve()], []
+            for number, part, of in zip(self.numbers, self._parts(data), self._sums, strict=True):
+                values = of.stress.evaluate(part, live=of.stress.live(part, given[number]))
+                sums.append(sum_by(part.places.slots, part.volume * values[:, -1], len(part.places.filled))[:, None])
+                given[number] = {**given[number], STRESS: values[:, :-1]}
+            self._set_mean(self.pi, sums, data)
+            return given
+
+        self._set_ratios(data, motion)
+        suction = None if self._suction is None else self._suction.x.array.copy()
+        key = self._key(data), motion, float(self._dt.value), suction
+        return self._stresses(key, given_stresses, self._grid.comm)
+
+    def _set_ratios(self, data: QuadratureData, motion: tuple) -> None:
+        """Set theta; motion: see `at`."""
+
+        def ratios() -> None:
+            sums = [of.ratio(part) for of, part in zip(self._sums, self._parts(data), strict=True)]
+            self._set_mean(self.theta, sums, data)
+
+        self._ratios((self._key(data), motion), ratios)
+
+    def _set_mean(self, f: fem.Function, sums: Sequence[NDArray[np.float64]], data: QuadratureData) -> None:
         """Set f in each cell to the volume mean of a quantity over the pieces with F-bar.
 
-        sums: for each part of the scene's points, a function that sums quantity times volume in each cell.
+        sums: for each part of the scene's points, the sums (cells, 1) of quantity times volume in its cells.
         """
-        total = self._cells(data).total([of(part) for of, part in zip(sums, self._parts(data), strict=True)])
-        f.x.array[self._cells(data).filled] = total[:, 0] / self._volume_of(data)[:, 0]
+        f.x.array[self._cells(data).filled] = self._cells(data).total(sums)[:, 0] / self._volume_of(data)[:, 0]
 
     def assemble_matrix(self, A: PETSc.Mat, data: QuadratureData, sums: Sequence[NDArray[np.float64]]) -> None:
-        """Add the contribution of theta and pi at the last update to the tangent; the caller finalises the matrix.
+        """Add the contribution of theta and pi to the tangent; the caller finalises the matrix.
 
         sums: for each part, the integrals (cells, quantities) of `Beside` from `FBar.forms` over each cell.
         """
@@ -220,8 +248,9 @@ class MeanDilatation:
         matrices = b[:, :, None] * columns[:, None, :] + rows[:, :, None] * b[:, None, :]
         insert(A, self._grid, self._cells(data).filled, matrices)
 
-    def average(self, delta: NDArray[np.float64], data: QuadratureData) -> None:
-        """Scale the gradients Delta (n, d, d) of pieces with F-bar to their cells' volume ratios."""
+    def average(self, delta: NDArray[np.float64], data: QuadratureData, motion: tuple) -> None:
+        """Scale the gradients Delta (n, d, d) of pieces with F-bar to their cells' volume ratios; motion: see `at`."""
+        self._set_ratios(data, motion)
         for number in self.numbers:
             rows = data.rows[number]
             theta, own = self.theta.x.array[data.parts[number].cells], delta[rows]
@@ -235,9 +264,12 @@ class MeanDilatation:
         places = [part.places for part in self._parts(data)]
         return self._filled(tuple(p.key for p in places), lambda: Cells([p.filled for p in places]))
 
+    def _key(self, data: QuadratureData) -> tuple:
+        return tuple(part.key for part in self._parts(data))
+
     def _volume_of(self, data: QuadratureData) -> NDArray[np.float64]:
         """Return for each filled cell the total volume (cells, 1), m^d, of its pieces that use F-bar."""
-        key = tuple(part.key for part in self._parts(data))
+        key = self._key(data)
 
         def volumes() -> NDArray[np.float64]:
             sums = [sum_by(p.places.slots, p.volume, len(p.places.filled))[:, None] for p in self._parts(data)]
@@ -250,32 +282,6 @@ def _dev(tau, F):
     """Return the components (d, d) of the deviator of a UFL tensor, in the axes of F (d, d)."""
     d, mean = range(F.ufl_shape[0]), ufl.tr(tau) / tau.ufl_shape[0]
     return ufl.as_matrix([[tau[a, b] - mean if a == b else tau[a, b] for b in d] for a in d])
-
-
-class StressAtPoints:
-    """Stress P of a law and its derivative with respect to theta, evaluated once for both residual and pi.
-
-    P (d, d), slope: the stress and its derivative, as UFL; points: integration points of the part.
-    """
-
-    def __init__(self, P, slope, points: FormPoints):
-        shape, self._last = P.ufl_shape, Latest()
-        self._values = PointExpression(ufl.as_vector([*(P[i] for i in np.ndindex(shape)), slope]), points)
-        stress = points.follow("stress of the law", shape, self._stress)
-        self.P = block(stress) if points.grid.axisymmetric else stress
-        """The stress as UFL, with the values of the last evaluation."""
-
-    def __call__(self, data: PointData) -> NDArray[np.float64]:
-        """Evaluate stress and derivative; return the integrals (cells, 1) of the derivative over the points' cells."""
-        _, values = self._last(object(), lambda: (data.key, self._values.evaluate(data)))
-        return sum_by(data.places.slots, data.volume * values[:, -1], len(data.places.filled))[:, None]
-
-    def _stress(self, data: PointData) -> NDArray[np.float64]:
-        """Return the stresses (n, d^2), Pa, of the last evaluation."""
-        of, values = self._last.value or (None, None)
-        if of is not data.key:
-            raise RuntimeError("stresses at points are used before their evaluation")
-        return values[:, :-1]
 
 
 class Cells:

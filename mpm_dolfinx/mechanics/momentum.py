@@ -28,7 +28,7 @@ from mpm_dolfinx.base import _compat
 from mpm_dolfinx.conditions.acting import At, FormsOf, Loads
 from mpm_dolfinx.conditions.walls import wall_forces
 from mpm_dolfinx.forms.cell_matrices import Beside, ElementForces, ElementMatrices, StackedElementMatrices
-from mpm_dolfinx.forms.point_forms import CellSums, FormPoints
+from mpm_dolfinx.forms.point_forms import NONE, CellSums, FormPoints, Given
 from mpm_dolfinx.forms.unknowns import Unknowns, matrix, sum_ghosts, zero
 from mpm_dolfinx.forms.velocity import Velocity
 from mpm_dolfinx.grid.grid import among, sum_by
@@ -111,7 +111,7 @@ class MomentumForms:
         self.law_forms = [self._forms_of_law(*law, pressure, dried, symmetric, dt) for law in laws]
         """Forms of each part of the points."""
         locked = {number: part.means for number, part in enumerate(self.law_forms) if part.means is not None}
-        self.dilatation = MeanDilatation(self._fbar, locked) if locked else None
+        self.dilatation = MeanDilatation(self._fbar, locked, dt, pressure if dried else None) if locked else None
         sums = [part.dried for part in self.law_forms]
         self._of_suction = OfSuction(grid.dim, self.dilatation, sums) if dried else None
         self.velocity = Velocity(self.u)
@@ -166,7 +166,8 @@ class MomentumForms:
             P, A = law.first_piola(F, known), ufl.diff(law.first_piola(F, values), F)
         slopes = []
         if p is not None:
-            slopes = self._fbar.by_pressure(law, F, seen, values, p) if locks else _by_pressure(law, F, values, p)
+            stresses = self._fbar.stresses(law, F, seen, values) if locks else [law.first_piola(F, values)]
+            slopes = [ufl.diff(of, p) for of in stresses]
         sums = suction_sums(points, F, slopes, locks) if dried else None
         if pressure is not None:
             of_pressure = -points.biot * pressure * ufl.diff(ufl.det(F), F)
@@ -187,7 +188,7 @@ class MomentumForms:
 
     def of_suction(self, data: QuadratureData) -> list[tuple[NDArray[np.int32], NDArray[np.float64]]]:
         """Return derivatives of nodal forces with respect to cell pressures through suction, see `OfSuction.rows`."""
-        return [] if self._of_suction is None else self._of_suction.rows(data)
+        return [] if self._of_suction is None else self._of_suction.rows(data, self._given(data, derive=True))
 
     def set_contents(self, own: NDArray[np.int64], *contents: NDArray[np.float64]) -> ActiveSet:
         """Set contents of the owned cells (n,) with material (`GhostPenalty.set_contents`); return the active set."""
@@ -212,30 +213,48 @@ class MomentumForms:
     def internal(self, data: QuadratureData, loads: Sequence[Loads] = ()) -> NDArray[np.float64]:
         """Return the nodal forces, N, of the stresses at u and of `Loads.takes_up`, as a local array."""
 
-        def solve() -> None:
-            for forms, part in zip(self.law_forms, data.parts, strict=True):
-                if forms.local is not None:
-                    forms.local.update(part, derive=False)
+        given = self._nothing or self._given(data)
 
         def add(b: NDArray[np.float64]) -> None:
-            for forms, part in zip(self.law_forms, data.parts, strict=True):
-                forms.residual.assemble_vector(b, part)
+            for forms, part, values in zip(self.law_forms, data.parts, given, strict=True):
+                forms.residual.assemble_vector(b, part, values)
 
-        if self.dilatation is None:
-            solve()
-        else:
-            self.dilatation.update(data, solve)
         return self.summed(0, [add, *[one.takes_up for one in loads]])
 
     def assemble_tangent(self, K: PETSc.Mat, data: QuadratureData) -> None:
         """Add the tangent of the stresses at u to K; the caller finalises K."""
-        parts = list(zip(self.law_forms, data.parts, strict=True))
-        for forms, part in parts:
-            if forms.local is not None:
-                forms.local.derive(part)
-        sums = [forms.tangent.assemble_matrix(K, part) for forms, part in parts]
+        parts = zip(self.law_forms, data.parts, self._nothing or self._given(data, derive=True), strict=True)
+        sums = [forms.tangent.assemble_matrix(K, part, given) for forms, part, given in parts]
         if self.dilatation is not None:
             self.dilatation.assemble_matrix(K, data, sums)
+
+    def average(self, delta: NDArray[np.float64], data: QuadratureData) -> None:
+        """Scale the gradients Delta (m, d, d) of the pieces at u to the cell's volume ratio where F-bar is used."""
+        if self.dilatation is not None:
+            self.dilatation.average(delta, data, self._motion)
+
+    @property
+    def _motion(self) -> tuple:
+        """Everything by which deformations change for the same integration points, a key for `Latest`."""
+        return self.u.x.array[self.active.now.dofs], self.inertia and float(self.inertia.midpoint.value)
+
+    @cached_property
+    def _nothing(self) -> list[Given]:
+        """Result of `_given` if no law has local unknowns or F-bar, else an empty list."""
+        some = self.dilatation is not None or any(forms.local is not None for forms in self.law_forms)
+        return [] if some else [NONE] * len(self.law_forms)
+
+    def _given(self, data: QuadratureData, derive: bool = False) -> Sequence[Given]:
+        """Return the values at u that the forms of each part are given, and set theta and pi; see `LocalUnknowns`."""
+
+        def solve(derive: bool = False) -> list[Given]:
+            parts = zip(self.law_forms, data.parts, strict=True)
+            return [NONE if forms.local is None else forms.local.solve(part, derive) for forms, part in parts]
+
+        if self.dilatation is None:
+            return solve(derive)
+        given = self.dilatation.at(data, self._motion, solve)
+        return [{**a, **b} for a, b in zip(given, solve(derive), strict=True)] if derive else given
 
     def at_nodes(self, cells: NDArray[np.int32], values: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
         """Return nodal sums (k, nodes) of k quantities; values: for each, an array (cells, 2^d), or (cells, 1)."""
@@ -269,11 +288,6 @@ class MomentumForms:
         _compat.scatter_reverse_add(shared)
         shared.x.scatter_forward()
         return values[:: self.grid.dim] > 0
-
-
-def _by_pressure(law: type[Skeleton], F, values: Mapping[str, object], p) -> list:
-    """Return the derivative of a law's first Piola-Kirchhoff stress with respect to a pressure p, a UFL variable."""
-    return [ufl.diff(law.first_piola(F, values), p)]
 
 
 class MomentumSystem:

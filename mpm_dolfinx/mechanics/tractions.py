@@ -29,7 +29,7 @@ from mpm_dolfinx.conditions.conditions import Pressure, Traction
 from mpm_dolfinx.domains.cut_domains import Patches
 from mpm_dolfinx.forms.point_forms import FormPoints, Places, PointData, PointForm
 from mpm_dolfinx.grid.grid import SIDES, Grid
-from mpm_dolfinx.parallel.exchange import Exchange, everywhere, over_all
+from mpm_dolfinx.parallel.exchange import Exchange, over_all, together
 from mpm_dolfinx.points.material_points import MaterialPoints
 
 
@@ -54,7 +54,7 @@ class SideLoads(Acting):
         grid, patches = self._grid, place.cut.surfaces(self.surfaces)
         travel, places = self._placed(place.cut.key, lambda: owners(grid, patches), grid.comm)
         both = [(load, p) for (load, _), p in zip(self._loads, patches, strict=True)]
-        values = everywhere(grid.comm, lambda: [self._given(of, place.t, p.positions(place.points)) for of, p in both])
+        values = together(grid.comm, lambda: [self._given(of, place.t, p.positions(place.points)) for of, p in both])
         forces = [self._on(of, value, p, place.points) for (of, p), value in zip(both, values, strict=True)]
         return places, travel.send(np.concatenate(forces))
 

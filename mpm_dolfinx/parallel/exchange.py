@@ -125,22 +125,10 @@ def first(comm: MPI.Intracomm, message: str) -> str:
     return next(filter(None, comm.allgather(message)), "") if comm.size > 1 else message
 
 
-def everywhere(comm: MPI.Intracomm, ask: Callable[[], T]) -> T:
-    """Return the values of user functions on this process.  An error on one process is raised on all processes."""
-    message, value = "", None
-    try:
-        value = ask()
-    except ValueError as error:
-        message = str(error)
-    if message := first(comm, message):
-        raise ValueError(message)
-    return value
-
-
 def together(comm: MPI.Intracomm, action: Callable[[], T]) -> T:
-    """Return the result of an action on this process.  If the action fails on any process, all processes raise the
-    first error.
-    """
+    """Return the result of an action on this process.  If it fails on any process, all raise the first error."""
+    if comm.size == 1:
+        return action()
     value = error = None
     try:
         value = action()
@@ -154,13 +142,22 @@ def together(comm: MPI.Intracomm, action: Callable[[], T]) -> T:
 
 def at_root(comm: MPI.Intracomm, action: Callable[[], T]) -> T:
     """Return on every process the result of `action` on rank 0.  If `action` raises, all processes raise its error."""
-    value = error = None
-    if comm.rank == 0:
-        try:
-            value = action()
-        except Exception as raised:
-            error = raised
-    value, error = comm.bcast((value, error))
-    if error is not None:
-        raise error
+    return comm.bcast(together(comm, lambda: action() if comm.rank == 0 else None))
+
+
+def by_user(comm: MPI.Intracomm, name: str, action: Callable[[], T]) -> T:
+    """Return the result of a user's function `name`; an error on one process, or Ctrl-C, is raised on all processes.
+
+    Other processes raise a RuntimeError, because errors of user types may not be sent.
+    """
+    value = raised = None
+    try:
+        value = action()
+    except BaseException as error:
+        raised = error
+    where = first(comm, "" if raised is None else f"process {comm.rank}: {raised}")
+    if raised is not None:
+        raise raised
+    if where:
+        raise RuntimeError(f"{name} raised an error on {where}")
     return value

@@ -3,9 +3,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple, Protocol
+
+from mpi4py import MPI
 
 import numpy as np
 import scipy
@@ -14,7 +16,7 @@ from numpy.typing import NDArray
 from mpm_dolfinx.base.errors import Report, StepFailed
 from mpm_dolfinx.base.time_integration import Substep
 from mpm_dolfinx.base.validation import functions, line
-from mpm_dolfinx.parallel.exchange import first
+from mpm_dolfinx.parallel.exchange import by_user
 from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
 from mpm_dolfinx.stepping.scene import Scene
 from mpm_dolfinx.stepping.state import State
@@ -121,23 +123,20 @@ class Events:
 
     def _values(self) -> list[float]:
         """Return the values of the functions, with booleans as 1 or -1. An error on one process is raised on all."""
-        comm = self._simulation.scene.grid.comm
-        out = []
-        error = None
-        try:
-            out = [_number(k, event(self._simulation)) for k, event in enumerate(self._until)]
-        except BaseException as raised:  # also Ctrl-C
-            error = raised
-        where = first(comm, "" if error is None else f"process {comm.rank}: {error}")
-        if error is not None:
-            raise error
-        if where:
-            raise RuntimeError(f"until: a function raised an error on {where}")
-        given = comm.allgather(out)
-        for rank, other in enumerate(given):
-            if other != given[0]:
-                raise ValueError(f"until: {given[0]} on process 0, {other} on process {rank}, must be the same on all")
+        s, comm = self._simulation, self._simulation.scene.grid.comm
+        out = by_user(comm, "until: a function", lambda: [_number(k, of(s)) for k, of in enumerate(self._until)])
+        check_alike(comm, {f"until: function {k}": value for k, value in enumerate(out)})
         return out
+
+
+def check_alike(comm: MPI.Intracomm, given: Mapping[str, Any]) -> None:
+    """Raise ValueError if values differ between processes: the processes would wait for each other."""
+    texts = comm.allgather([line(value) for value in given.values()])
+    for k, name in enumerate(given):
+        for rank, text in enumerate(texts):
+            if text[k] != texts[0][k]:
+                what = f"{name} = {texts[0][k]} on process 0, {text[k]} on process {rank}"
+                raise ValueError(f"{what}, must be the same on all")
 
 
 def _crossed(before: Sequence[float], now: Sequence[float]) -> NDArray[np.bool_]:

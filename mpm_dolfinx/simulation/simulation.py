@@ -12,18 +12,17 @@ from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.base.errors import Report, StepFailed, raise_interrupt
 from mpm_dolfinx.base.validation import instance, line, numbers
-from mpm_dolfinx.bodies.bodies import Body, points_in_cells
+from mpm_dolfinx.bodies.bodies import Body, Later, Moving, points_in_cells
 from mpm_dolfinx.conditions.conditions import OnSide, Source, sorted_terms
 from mpm_dolfinx.conditions.names import ByName
 from mpm_dolfinx.conditions.unit_weights import under
 from mpm_dolfinx.conditions.walls import with_axis
 from mpm_dolfinx.contact.groups import grouped
 from mpm_dolfinx.diagnostics.resolution import check_stiff, warn_thin
-from mpm_dolfinx.diagnostics.scene_parts import check_axisymmetry, check_options, check_parts
+from mpm_dolfinx.diagnostics.scene_parts import check_axisymmetry, check_options, checked_parts, initial_velocity
 from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.materials.initial_stress import InitialStress, by_body
 from mpm_dolfinx.materials.skeleton import Fluid, Skeleton
-from mpm_dolfinx.mechanics.inertia import checked_velocity
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.probing.cell_fields import CellFields, cell_fields
 from mpm_dolfinx.probing.point_fields import PointFields, point_fields
@@ -35,7 +34,7 @@ from mpm_dolfinx.stepping.distribution import distribute
 from mpm_dolfinx.stepping.initial_state import balanced, begin_stage, first_state
 from mpm_dolfinx.stepping.result import Result
 from mpm_dolfinx.stepping.scene import Scene
-from mpm_dolfinx.stepping.stage import Condition, checked
+from mpm_dolfinx.stepping.stage import Condition, checked, contacts_of
 from mpm_dolfinx.stepping.state import State
 from mpm_dolfinx.stepping.step import step
 
@@ -46,7 +45,7 @@ class Simulation:
     Parameters
     ----------
     grid, bodies
-        Background grid, and seeded bodies.
+        Background grid, and seeded bodies. `Later(body)` is absent until a stage adds it.
     materials
         Materials; bodies refer to them by index.
     walls
@@ -72,15 +71,11 @@ class Simulation:
     terms
         User-defined terms in UFL. Functions are terms of the momentum balance, see `user_functions`; `OnSide` applies
         such a function to a side. A `Source` is a term of the fluid balance.
-    later
-        Indices of bodies that are absent until a stage adds them. Each index is listed once.
     numerics
         Quadrature, coupling, tolerance and time integration, see `Numerics`.
     inertia
-        True: bodies have inertia, and need no walls. False: quasi-static; a later stage may switch inertia on. None:
-        quasi-static in all stages. Inertia excludes `quadrature="point"`.
-    velocity : (d,) or callable x (n, d) -> (n, d), m/s
-        Initial velocity of bodies with inertia; by default zero.
+        True: bodies have inertia, and need no walls. `Moving`: they also have an initial velocity. False: quasi-static;
+        a later stage may switch inertia on. None: quasi-static in all stages. Inertia excludes `quadrature="point"`.
 
     Attributes
     ----------
@@ -99,7 +94,7 @@ class Simulation:
     def __init__(
         self,
         grid: Grid,
-        bodies: Sequence[Body],
+        bodies: Sequence[Body | Later],
         materials: Sequence[Skeleton],
         *,
         walls: Mapping[str, str],
@@ -109,22 +104,20 @@ class Simulation:
         pressure: float | Callable[[NDArray], ArrayLike] = 0.0,
         initial_stress: InitialStress | Mapping[int, InitialStress] | None = None,
         terms: Sequence[Callable | OnSide | Source] = (),
-        later: Sequence[int] = (),
         numerics: Numerics = DEFAULT,
-        inertia: bool | None = None,
-        velocity: ArrayLike | Callable[[NDArray], ArrayLike] | None = None,
+        inertia: bool | Moving | None = None,
     ):
         instance("numerics", numerics, Numerics)
         quadrature = numerics.quadrature
-        check_parts(grid, bodies, materials, later)
+        bodies, later = checked_parts(grid, bodies, materials)
         terms, sources = sorted_terms(terms)
         check_options(bodies, fluid, pressure, terms, sources, quadrature)
-        grid = grouped(grid, bodies, checked(conditions), quadrature, {"terms": terms, "sources": sources})
+        grid = grouped(grid, bodies, contacts_of(checked(conditions)), quadrature, {"terms": terms, "sources": sources})
         grid = grid.shared(points_in_cells(grid, bodies), keep=bool(len(terms) + len(sources)))
         check_stiff(grid, bodies)
         warn_thin(grid, bodies, with_axis(grid, walls), fluid is not None)
         check_axisymmetry(grid, bodies, quadrature)
-        velocity = checked_velocity(grid, quadrature, inertia, velocity)
+        velocity = initial_velocity(grid, quadrature, inertia)
         start = time.perf_counter()
         initial = by_body(initial_stress, bodies, later)
         self.scene = Scene(
@@ -300,7 +293,7 @@ class Simulation:
             All conditions from now on; by default the present ones. `[*simulation.conditions, more]` adds one. Every
             `Contact` remains in force, whether it is listed or not.
         add
-            Indices of bodies in `later`, such as a fill. They start without velocity, and without stress unless
+            Indices of bodies that are `Later`, such as a fill. They start without velocity, and without stress unless
             `initial_stress` lists them. A fill is placed on the present surface of the bodies that it touched when it
             was seeded. The opposite side of the fill remains where it was seeded.
         remove

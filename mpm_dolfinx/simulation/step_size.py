@@ -55,6 +55,37 @@ FIRST = 1e-3
 
 
 @dataclass(frozen=True)
+class Adaptive:
+    """Adaptive steps of a run with a tolerance and limits: `run(t_end, rtol=Adaptive(1e-3, max_step=60.0))`.
+
+    Parameters
+    ----------
+    rtol
+        Tolerance, see `run`.
+    first_step : s
+        First trial step of a new run, > 0.  The default is 18 rtol times the diffusion time of a cell, but at least
+        0.001 and at most 1 times the first output interval.  With inertia it is also at most the time in which a wave
+        crosses a cell.
+    max_step : s
+        Longest step, > 0.
+
+    Raises
+    ------
+    ValueError
+        A step is not positive.
+    """
+
+    rtol: float
+    first_step: float | None = None
+    max_step: float = inf
+
+    def __post_init__(self):
+        for name in ("first_step", "max_step"):
+            if (value := getattr(self, name)) is not None and value != inf:
+                numbers(name, value, test=lambda v: v > 0, allowed="> 0")
+
+
+@dataclass(frozen=True)
 class StepSize:
     """Rule for the length of a run's steps.
 
@@ -273,14 +304,12 @@ def cell_time(scene: Scene, points: MaterialPoints) -> float:
     return of_all / fastest**0.5 if fastest > 0 else inf
 
 
-def step_rule(times: Times, rtol, first_step, max_step: float, scene: Scene, points: MaterialPoints) -> StepSize:
+def step_rule(times: Times, rtol: float | Adaptive | None, scene: Scene, points: MaterialPoints) -> StepSize:
     """Return the rule for the steps of a run, see `run`; ValueError for invalid arguments."""
-    positive = {"test": lambda v: v > 0, "allowed": "> 0"}
     if rtol is None:
-        for name, value in {"first_step": first_step, "max_step": max_step if max_step != inf else None}.items():
-            if value is not None:
-                raise ValueError(f"{name} = {line(value)}, must be left out without rtol: steps are equal")
         return StepSize(times.interval, times.interval)
+    given = rtol if isinstance(rtol, Adaptive) else Adaptive(rtol)
+    rtol, longest = given.rtol, float(given.max_step)
     least = RESOLVED * scene.scheme.tolerance
     numbers("rtol", rtol, test=lambda v: (least <= v) & (v < 1), allowed=f"in [{least:g}, 1), >= {RESOLVED} tolerance")
     if scene.numerics.method == "backward-euler":
@@ -290,13 +319,12 @@ def step_rule(times: Times, rtol, first_step, max_step: float, scene: Scene, poi
     if (scene.momentum.own.rates or timed) and not scene.flows and not inertia:
         why = "without flow of fluid, velocities have no error estimate"
         raise ValueError(f"rtol = {line(rtol)}: {why}, must be left out")
-    longest = float(numbers("max_step", max_step, **positive)) if max_step != inf else inf
     first = times.after(times.start)[0] - times.start
     if len(scene.substeps) > 1:  # a scene without time derivatives has no such error
         # for a load that grows from zero the relative error is ERROR dt c_v / h^2
         first = min(first, max(FIRST * first, SAFETY * rtol / ERROR * diffusion_time(scene, points)))
     if inertia:  # bodies may be released or loaded suddenly
         first = min(first, cell_time(scene, points))
-    if first_step is not None:
-        first = float(numbers("first_step", first_step, **positive))
+    if given.first_step is not None:
+        first = float(given.first_step)
     return StepSize(min(first, longest), longest, float(rtol))

@@ -7,12 +7,10 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
+from functools import partial
 from inspect import signature
 from logging import INFO, WARNING
-from math import inf
 from typing import Any
-
-from mpi4py import MPI
 
 import numpy as np
 from tqdm import tqdm
@@ -25,12 +23,12 @@ from mpm_dolfinx.base.time_integration import EULER
 from mpm_dolfinx.base.tolerances import SAME
 from mpm_dolfinx.base.validation import flag, functions, instance, line
 from mpm_dolfinx.dynamics.energies import initial_energies
-from mpm_dolfinx.parallel.exchange import first
+from mpm_dolfinx.parallel.exchange import by_user
 from mpm_dolfinx.parallel.messages import ResolutionWarning, log, logger, warn
 from mpm_dolfinx.probing.probe_fields import probe_pressures, probe_stresses
 from mpm_dolfinx.probing.probes import Probes, check_there
-from mpm_dolfinx.simulation.events import Event, Events, Simulated, Step
-from mpm_dolfinx.simulation.step_size import StepSize, Times, measured, step_rule
+from mpm_dolfinx.simulation.events import Event, Events, Simulated, Step, check_alike
+from mpm_dolfinx.simulation.step_size import Adaptive, StepSize, Times, measured, step_rule
 from mpm_dolfinx.simulation.summary import imbalance, peak_memory
 from mpm_dolfinx.stepping.distribution import distribute
 from mpm_dolfinx.stepping.result import GaveUp, Result
@@ -60,10 +58,8 @@ def run(
     t_end: float,
     dt: float | None = None,
     *,
-    rtol: float | None = None,
+    rtol: float | Adaptive | None = None,
     t_eval: Sequence[float] | None = None,
-    first_step: float | None = None,
-    max_step: float = inf,
     until: Event | Sequence[Event] | None = None,
     probes: Probes | None = None,
     observe: Observer | Sequence[Observer] = (),
@@ -84,20 +80,17 @@ def run(
         Length of a step, and output interval, s, > 0; limited to t_end - t. With `rtol`, `dt` is only the output
         interval. With `rtol`, but without `dt` and `t_eval`, every step is an output.
     rtol
-        Tolerance of adaptive steps. The estimated error of the pore pressures stays below about `rtol` times the
-        larger of two changes: the largest since the start of the run, and the undrained change of the step. `rtol` is
-        at least ten times `tolerance`, and < 1. If no fluid flows, the steps are the output intervals. A term or law
-        that depends on velocity then raises ValueError, because its error cannot be estimated. With inertia the error
-        of the motion is limited too, relative to the largest motion since the start, see `motion_error`. In unsaturated
-        soil the error of the water content is limited too, relative to its largest change in a step so far. The
-        estimate is a fraction of a first-order step's error, see `solve.newton.ERROR`. The largest true error of a run
-        was 0.7 to 5 times the largest estimate. The ratio is largest directly after a jump of the load.
+        Tolerance of adaptive steps, or `Adaptive`: the tolerance with limits of the steps. The estimated error of the
+        pore pressures stays below about `rtol` times the larger of two changes: the largest since the start of the run,
+        and the undrained change of the step. `rtol` is at least ten times `tolerance`, and < 1. If no fluid flows, the
+        steps are the output intervals. A term or law that depends on velocity then raises ValueError, because its error
+        cannot be estimated. With inertia the error of the motion is limited too, relative to the largest motion since
+        the start, see `motion_error`. In unsaturated soil the error of the water content is limited too, relative to
+        its largest change in a step so far. The estimate is a fraction of a first-order step's error, see
+        `solve.newton.ERROR`. The largest true error of a run was 0.7 to 5 times the largest estimate. The ratio is
+        largest directly after a jump of the load.
     t_eval : (n,), s
         Output times, increasing, in (t, t_end]; t_end is always an output time. Steps end at output times.
-    first_step, max_step
-        First trial step of a new run, and longest step, s, > 0. Both require `rtol`. The default first step is 18 rtol
-        times the diffusion time of a cell, but at least 0.001 and at most 1 times the first output interval. With
-        inertia it is also at most the time in which a wave crosses a cell.
     until
         One function of the simulation, or several, that end the run before t_end. An event occurs within a step when a
         returned number changes its sign, or a returned boolean changes. A number that is zero at the start is no event.
@@ -134,7 +127,7 @@ def run(
     """
     comm = simulation.scene.grid.comm
     simulation.scene.check(simulation.state)
-    _check_alike(comm, {"t_end": t_end, "dt": dt, "rtol": rtol, "t_eval": t_eval, "max_step": max_step})
+    check_alike(comm, {"t_end": t_end, "dt": dt, "rtol": rtol, "t_eval": t_eval})
     if probes is not None and not isinstance(probes, Probes):
         raise ValueError(f"probes = {line(probes)}, must be a result of `probes`")
     observers = [observe] if callable(observe) else observe
@@ -155,7 +148,7 @@ def run(
     start = now if after is None else after.rows[0].t
     times = Times(start, now, t_end, dt, t_eval, rtol, after is not None)
     state = simulation.scene.followed(simulation.state)  # the first step depends on the size of the cells
-    rule = step_rule(times, rtol, first_step, max_step, simulation.scene, state.points)
+    rule = step_rule(times, rtol, simulation.scene, state.points)
     result, control = _histories(simulation, times, rule, probes, after)
     stopwatch, last = _Stopwatch(result), result.rows[-1].t
     events = Events(simulation, until)
@@ -168,7 +161,7 @@ def run(
             ended = replace(simulation.state.result, converged=converged)
             _note(simulation, stopwatch.read(ended).more(_row(simulation, probes)))
             for observer in observers:
-                _observe(observer, simulation, comm)
+                by_user(comm, f"observe: {line(observer)}", partial(observer, simulation))
             if checkpoint is not None:
                 _note(simulation, stopwatch.read(simulation.state.result))
                 checkpoint(simulation)
@@ -188,16 +181,6 @@ def run(
             simulation.state = replace(simulation.state, t=target)
             output(target == times.end)
     return _note(simulation, stopwatch.read(_measured(simulation)))
-
-
-def _check_alike(comm: MPI.Intracomm, given: dict[str, Any]) -> None:
-    """Raise ValueError if arguments differ between processes, which would then wait for each other."""
-    texts = comm.allgather([line(value) for value in given.values()])
-    for k, name in enumerate(given):
-        for rank, text in enumerate(texts):
-            if text[k] != texts[0][k]:
-                what = f"{name} = {texts[0][k]} on process 0, {text[k]} on process {rank}"
-                raise ValueError(f"{what}, must be the same on all")
 
 
 def _bar(start: float, now: float, end: float, shown: bool) -> tqdm:
@@ -227,20 +210,6 @@ def _takes_nothing(function: Callable) -> bool:
         return not signature(function).parameters
     except (TypeError, ValueError):
         return False
-
-
-def _observe(observer: Callable, simulation: Simulated, comm: MPI.Intracomm) -> None:
-    """Call an observer; an error on one process is raised on all, so that no process waits for the others."""
-    raised = None
-    try:
-        observer(simulation)
-    except BaseException as error:  # including Ctrl-C
-        raised = error
-    where = first(comm, "" if raised is None else f"process {comm.rank}")
-    if raised is not None:
-        raise raised
-    if where:
-        raise RuntimeError(f"observe: {line(observer)} raised an error on {where}")
 
 
 def _histories(

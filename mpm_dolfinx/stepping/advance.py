@@ -274,8 +274,7 @@ class Motion:
         if d > grid.dim:
             delta = np.pad(delta, ((0, 0), (0, 1), (0, 1)))
             delta[:, 2, 2] = pieces.places.stretch(nodal) if grid.axisymmetric else 1.0
-        if self._momentum.dilatation is not None:
-            self._momentum.dilatation.average(delta, data)
+        self._momentum.average(delta, data)
         columns = np.empty((len(F), d * d + 1))
         for part in in_chunks(len(F)):  # products of all pieces at once would take as much memory as a step
             product = delta[part] @ F[part]

@@ -30,7 +30,6 @@ from mpm_dolfinx.bodies.touching import check_apart
 from mpm_dolfinx.conditions.acting import Place
 from mpm_dolfinx.conditions.conditions import Quiet
 from mpm_dolfinx.conditions.unit_weights import warn_levels, warn_units, waters
-from mpm_dolfinx.contact.groups import contacts_of
 from mpm_dolfinx.domains.fitted import fitted_at
 from mpm_dolfinx.domains.pressure_transport import PiecePressures, at_start
 from mpm_dolfinx.dynamics.at_rest import balancing_tractions
@@ -41,14 +40,14 @@ from mpm_dolfinx.materials.initial_stress import strained
 from mpm_dolfinx.mechanics.inertia import resting
 from mpm_dolfinx.mechanics.momentum import MomentumProblem
 from mpm_dolfinx.mechanics.tractions import owners
-from mpm_dolfinx.parallel.exchange import everywhere, over_all
+from mpm_dolfinx.parallel.exchange import over_all, together
 from mpm_dolfinx.parallel.messages import ConditionWarning, log, warn
 from mpm_dolfinx.points.material_points import MaterialPoints, body_of
 from mpm_dolfinx.solve.newton import solve_substep
 from mpm_dolfinx.solve.schur import Kept, LinearSolvers, planned
 from mpm_dolfinx.stepping.balances import Start, at_rest
 from mpm_dolfinx.stepping.scene import Scene, When
-from mpm_dolfinx.stepping.stage import Condition, Stage, checked
+from mpm_dolfinx.stepping.stage import Condition, Stage, checked, contacts_of
 from mpm_dolfinx.stepping.state import State, Stay
 from mpm_dolfinx.stepping.step import set_up
 
@@ -348,7 +347,7 @@ def _changed(scene: Scene, points: MaterialPoints, fields: Mapping[str, ArrayLik
         if name not in data and (close := get_close_matches(name, data)):
             warn(comm, ConditionWarning, "%s: new data that no law reads; is %r meant?", what, close[0])
         data[name] = new.copy()
-    return everywhere(comm, lambda: scene.materials.changed("stage: fields", replace(points, data=data), fields))
+    return together(comm, lambda: scene.materials.changed("stage: fields", replace(points, data=data), fields))
 
 
 def pieces_at_start(scene: Scene, points: MaterialPoints) -> PiecePressures:
@@ -426,7 +425,6 @@ def balanced(scene: Scene, state: State) -> State:
             seen = [*seen[-DEPTH:], (w, forms.u.x.array.copy())]
             w, count = _mixed(unknowns, seen), count + 1
             forms.u.x.array[:] = w
-            forms.internal(start.data)  # sets the mean dilatation at w
             points = strained(materials, seeded.points, scene.motion.strained(seeded.points, start.on_grid, start.data))
     except StepFailed as error:
         scene.forget()

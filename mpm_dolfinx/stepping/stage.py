@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, get_args
@@ -28,7 +29,6 @@ from mpm_dolfinx.conditions.conditions import (
     Tied,
     Traction,
 )
-from mpm_dolfinx.conditions.names import named
 from mpm_dolfinx.conditions.sides import Sides
 from mpm_dolfinx.conditions.unit_weights import with_weight
 from mpm_dolfinx.conditions.walls import fixed_nodes, with_axis
@@ -69,6 +69,43 @@ def checked(conditions: Sequence[Condition]) -> Sequence[Condition]:
         twice = next(one for i, one in enumerate(conditions) if any(one is other for other in conditions[:i]))
         raise ValueError(f"conditions: {line(twice)} is given twice, must be given once")
     return conditions
+
+
+def contacts_of(conditions: Sequence[Any]) -> list[Contact]:
+    """Return the contacts among the conditions."""
+    return [one for one in conditions if isinstance(one, Contact)]
+
+
+def named(conditions: Sequence[Any]) -> dict[str, Any]:
+    """Return the conditions by name.  A default name consists of kind and side, and a number if necessary.
+
+    Raises
+    ------
+    ValueError
+        A name is invalid, or two conditions have an equal name.
+    """
+    given = [getattr(one, "name", None) for one in conditions]
+    for name, one in zip(given, conditions, strict=True):
+        if name is not None and not (isinstance(name, str) and re.fullmatch(r"[\w .-]+", name)):
+            raise ValueError(f"{line(one)}: name = {line(name)}, must consist of letters, digits, blanks and _ . -")
+        if name is not None and given.count(name) > 1:
+            raise ValueError(f"{line(one)}: name = {line(name)} is the name of another condition, must be unique")
+    out: dict[str, Any] = {}
+    for name, one in zip(given, conditions, strict=True):
+        base, count = name or _default(one), 1
+        name = base
+        while name in out or (name in given and one is not conditions[given.index(name)]):
+            count += 1
+            name = f"{base}_{count}"
+        out[name] = one
+    return out
+
+
+def _default(condition: Any) -> str:
+    """Return the default name of a condition, from its kind and side."""
+    kind = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", type(condition).__name__).lower()
+    side = getattr(condition, "side", None)
+    return kind if side is None else f"{kind}_{re.sub(r'[^A-Za-z0-9]+', '_', str(side))}"
 
 
 @dataclass(frozen=True, eq=False)

@@ -51,7 +51,7 @@ from mpm_dolfinx.conditions.conditions import RIGIDITY, Drained, Pressure, Rigid
 from mpm_dolfinx.conditions.walls import with_axis
 from mpm_dolfinx.forms.axes import block
 from mpm_dolfinx.forms.point_forms import PointMeasure
-from mpm_dolfinx.grid.grid import TURN, Grid, side
+from mpm_dolfinx.grid.grid import TURN, Grid, begin_with, side
 from mpm_dolfinx.materials.skeleton import Field, Fluid, Skeleton
 from mpm_dolfinx.materials.user_functions import call, compiling, term_of
 from mpm_dolfinx.materials.user_functions import form as form_of
@@ -107,10 +107,8 @@ class BiotFEM:
 
     Parameters
     ----------
-    lower, upper : (d,), m
-        Corners of the body; d = 2 (plane strain) or 3.
-    cells : (d,)
-        Number of cells along each axis, at least 1.
+    grid
+        The body, a box: `Grid` with equal cells, whose forms the model owns.
     material, fluid
         Skeleton without state, and pore fluid.  Steps may not converge for steep retention curves (n > 2.5, or with
         an air entry).
@@ -132,15 +130,11 @@ class BiotFEM:
     numerics
         Time integration, and tolerance of the residual.  The tolerance is relative to the loads, or to the first
         residual of a step if this residual is larger.
-    axisymmetric
-        As for `Grid`.
     """
 
     def __init__(
         self,
-        lower: ArrayLike,
-        upper: ArrayLike,
-        cells: Sequence[int],
+        grid: Grid,
         material: Skeleton,
         *,
         walls: Mapping[str, str],
@@ -151,8 +145,10 @@ class BiotFEM:
         terms: Sequence[Callable | Source] = (),
         element: str = "taylor-hood",
         numerics: Numerics = DEFAULT,
-        axisymmetric: bool = False,
     ):
+        begin_with("grid", grid)
+        if not grid.even:
+            raise ValueError("grid: cells of several sizes, must be equal in the reference")
         all_of("material", [material], Skeleton)
         all_of("fluid", [fluid] if fluid is not None else [], Fluid)
         instance("numerics", numerics, Numerics)
@@ -175,10 +171,10 @@ class BiotFEM:
                 f"{type(material).__name__}: the reference has no state and no local unknowns; only moduli, "
                 "conductivity and parameters of the law may be functions of position, other data must be numbers"
             )
-        self.grid = Grid(lower, upper, cells, axisymmetric=axisymmetric)
+        self.grid = grid
         self.material, self.fluid = material, fluid
         radius = ufl.SpatialCoordinate(self.grid.mesh)[0]
-        self._around = TURN * radius if axisymmetric else 1.0  # factor from plane to volume integrals
+        self._around = TURN * radius if grid.axisymmetric else 1.0  # factor from plane to volume integrals
         self.tolerance, self._t = numerics.tolerance, fem.Constant(self.grid.mesh, 0.0)
         self._substeps = substeps(numerics.method, fluid is not None or bool(terms))  # terms may depend on the velocity
         self.scale = float(np.max(material.at(self.grid.midpoints + self.grid.base).oedometric))
