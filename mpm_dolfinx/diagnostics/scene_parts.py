@@ -20,7 +20,7 @@ from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
 def checked_parts(
     grid: Grid, bodies: Sequence[Body | Later], materials: Sequence[Skeleton]
 ) -> tuple[list[Body], list[int]]:
-    """Return the bodies, and the indices of bodies that are absent at first; ValueError for invalid parts."""
+    """Return the bodies, and the indices of bodies that are absent at first. Raise ValueError for invalid parts."""
     begin_with("grid", grid)
     all_of("bodies", bodies, (Body, Later), 1)
     all_of("materials", materials, Skeleton, 1)
@@ -75,7 +75,9 @@ def check_axisymmetry(grid: Grid, bodies: Sequence[Body], quadrature: str) -> No
 
 
 def initial_velocity(grid: Grid, quadrature: str, inertia: bool | Moving | None) -> ArrayLike | Callable | None:
-    """Return the initial velocity, None without inertia in all stages; ValueError if the scene does not allow it."""
+    """Return the initial velocity, or None without inertia in all stages. Raise ValueError if the scene does not allow
+    it.
+    """
     if inertia is None:
         return None
     velocity = np.zeros(grid.dim)

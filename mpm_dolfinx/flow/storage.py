@@ -493,7 +493,8 @@ class StorageProblem:
 
     @property
     def accuracy(self) -> float:
-        """Largest relative tolerance of linear solvers.  Dry cells store little fluid, so their errors must be small."""
+        """Largest relative tolerance of linear solvers.  Errors must be small in dry cells, which store little fluid.
+        """
         return SAME if self.forms.retains else 1.0
 
     def restrained(

@@ -126,7 +126,9 @@ def first(comm: MPI.Intracomm, message: str) -> str:
 
 
 def together(comm: MPI.Intracomm, action: Callable[[], T]) -> T:
-    """Return the result of an action on this process.  If it fails on any process, all raise the first error."""
+    """Return the result of an action on this process.  If the action fails anywhere, all processes raise the first
+    error.
+    """
     if comm.size == 1:
         return action()
     value = error = None

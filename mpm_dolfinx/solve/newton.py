@@ -267,7 +267,7 @@ class Newton:
     def _augmented(self, errors: Errors) -> Errors:
         """Update contacts until no contact changes or a residual exceeds the tolerance, and return the errors.
 
-        Raise NotConverged after as many updates as Newton iterations are allowed.
+        The largest number of updates is the largest number of Newton iterations.
         """
         momentum = self._momentum
         count = 0

@@ -139,8 +139,7 @@ class Renewal:
     ) -> NDArray[np.float64]:
         """Return the pressures of new domains, so that their cells contain the fluid of the old domains.
 
-        All domains of a group have equal pressures: the mean of the old pressures, weighted by storage, or by volume
-        without storage.
+        Domains of a group have the mean of the old pressures, weighted by storage, or by volume without storage.
         """
         materials, pieces = self._materials, work.pieces
         bulk = materials.fluid.bulk
