@@ -31,7 +31,7 @@ SERIES = (120 * EPSILON) ** 0.25
 
 
 def change_of_content(alpha, a, storage, J, dp):
-    """Return the change of the fluid content in a step, per volume at the start of the step, as a UFL expression.
+    """Return the change of the fluid content in a step per volume at the start of the step, as UFL.
 
     `alpha`: Biot coefficient.
     `a`, `storage`: storage coefficients, in 1/Pa.  `a` refers to a porosity of one (see the module), `storage` to the
@@ -52,12 +52,18 @@ def change_at_points(alpha, a, storage, J, dp) -> NDArray[np.float64]:
 
 
 def mass_potential(p, bulk: float):
-    """Return the mass potentials pi (n,), in Pa, at pressures p (n,), in Pa.  `bulk` is K_w, in Pa."""
+    """Return the mass potentials pi (n,) at pressures p (n,), both in Pa.
+
+    `bulk`, Pa: bulk modulus K_w of water.
+    """
     return p if np.isinf(bulk) else bulk * np.expm1(p / bulk)
 
 
 def pressure_of(pi, bulk: float):
-    """Return the pressures (n,), in Pa, at mass potentials pi (n,), in Pa.  `bulk` is K_w, in Pa."""
+    """Return the pressures (n,) at mass potentials pi (n,), both in Pa.
+
+    `bulk`, Pa: bulk modulus K_w of water.
+    """
     return pi if np.isinf(bulk) else bulk * np.log1p(pi / bulk)
 
 
@@ -70,7 +76,7 @@ def mass_potential_form(p, compliance):
 
 
 def density_between(p0, p1, compliance):
-    """Return the mean density between two pressures, divided by the density at p = 0, as a UFL expression."""
+    """Return the mean density between two pressures as a UFL expression, divided by the density at p = 0."""
     return ufl.exp(compliance * (p0 + p1) / 2) * _sinhc(compliance * (p0 - p1) / 2)
 
 

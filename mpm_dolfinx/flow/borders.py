@@ -158,7 +158,7 @@ class Borders:
 
 @dataclass(frozen=True, eq=False)
 class BorderFaces:
-    """Faces between cells of different soil, with their conductivities; arrays over m faces."""
+    """Faces between cells of different soil, with their conductivities. Arrays have an entry for each of m faces."""
 
     borders: Borders
     mobility: Mobility  # mobility of the filled owned cells
@@ -191,7 +191,7 @@ class BorderFaces:
 
 @dataclass(frozen=True)
 class BorderFlows:
-    """Fluxes through faces between cells of different soil; arrays over m faces."""
+    """Fluxes through faces between cells of different soil. Arrays have an entry for each of m faces."""
 
     pair: NDArray[np.int64]  # local cells on both sides (2, m)
     flux: NDArray[np.float64]  # flux from the first to the second cell (m,), m^d/s

@@ -134,7 +134,7 @@ class DrainedSides(Feeding):
 
 @dataclass(frozen=True)
 class OpenFaces:
-    """Faces on open sides with their conductances; arrays over m faces."""
+    """Faces on open sides with their conductances.  Arrays have an entry for each of m faces."""
 
     at: NDArray[np.int64]  # index of the cell among the n active owned cells (m,)
     conductance: NDArray[np.float64]  # outflow per unit of the cell's mass potential (m,), m^d/(Pa s)
@@ -169,7 +169,7 @@ class OpenFaces:
 
 @dataclass(frozen=True)
 class UnsaturatedFaces(OpenFaces):
-    """Faces on open sides of unsaturated soil; `conductance` is the value at k_r = 1."""
+    """Faces on open sides of unsaturated soil.  The values of `conductance` are for saturated soil."""
 
     relative: Relative  # relative conductivities of the cells
     cells: NDArray[np.int32]  # cells behind the faces (m,)
@@ -199,7 +199,7 @@ class UnsaturatedFaces(OpenFaces):
         return self.conductance * self._through(fluid)[0]
 
     def derivative(self, fluid: Fluid) -> NDArray[np.float64]:
-        """Return the derivative (>= 0) of the outflow with respect to the pressure of the cell, in m^d/(Pa s)."""
+        """Return the derivative (>= 0) of the outflow with respect to the cell pressure, in m^d/(Pa s)."""
         return self.conductance * self._through(fluid)[1]
 
     def _through(self, fluid: Fluid) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -274,9 +274,7 @@ class SideFeeds(Feeds):
     def _pond(
         self, sides: OpenSides, ponds: tuple[float | None, ...], dt: float
     ) -> tuple[OpenSides, NDArray[np.float64]]:
-        """Return the open sides with the inflow from the ponds as additional rain, and the largest volumes of the
-        ponds.
-        """
+        """Return the open sides with the inflow from ponds as additional rain, and the volumes of the ponds."""
         depth, number = np.array([depth or 0.0 for depth in ponds]), sides.number
         size = np.linalg.norm(sides.area, axis=1)
         area = over_all(self._comm, sum_by(number, size, len(self._names)))

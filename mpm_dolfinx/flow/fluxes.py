@@ -108,7 +108,7 @@ class Conduction:
 
 @dataclass(frozen=True)
 class OpenSides:
-    """Open sides of the bodies; arrays over m faces.  Each face belongs to one owned cell."""
+    """Open sides of the bodies.  Arrays have an entry for each of m faces.  Each face belongs to one owned cell."""
 
     number: NDArray[np.int64]  # index of the condition (m,)
     cells: NDArray[np.int32]  # cell behind the face (m,)
@@ -154,12 +154,13 @@ class OpenSides:
         return mass_potential(outer, flow.bulk)
 
     def ahead(self, at: NDArray[np.int64], p: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return pressure differences (Pa) and slopes (Pa/m) from cells to drained sides, as an array (n, d, 2, 2).
+        """Return pressure differences (Pa) and slopes (Pa/m) from cells to drained sides.
 
-        The indices are: cell, axis, end of the cell along this axis, and 0 for the difference or 1 for the slope.  Ends
-        without a drained side have nan for both.
+        The result is an array (n, d, 2, 2).  Its indices are: cell, axis, end of the cell along this axis, and 0 for
+        the difference or 1 for the slope.  Ends without a drained side have nan for both.
 
-        `at` (m,): index of the cell of each face among the filled cells.  `p` (n,), Pa: pressures of the filled cells.
+        `at` (m,): index of the cell of each face among the filled cells.
+        `p` (n,), Pa: pressures of the filled cells.
         """
         out = np.full((len(p), self.normal.shape[1], 2, 2), np.nan)
         distance = np.add.reduce(self.offset * self.normal, axis=1)
@@ -187,7 +188,7 @@ class OpenSides:
 
 @dataclass(frozen=True)
 class PieceContents:
-    """Contributions of pieces to their owned cells; arrays over m pieces."""
+    """Contributions of pieces to their owned cells.  Arrays have an entry for each of m pieces."""
 
     cells: NDArray[np.int32]  # owned cell (m,)
     weight: NDArray[np.float64]  # volume (m,), m^d
@@ -267,11 +268,15 @@ class CellContents(Keyed):
         return self.total(self.weight * values) / self.volume
 
     def nodal(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return an array (n, d, 2^d) with the values of u (nodes, d) at the nodes of each filled cell."""
+        """Return the values (n, d, 2^d) of u (nodes, d) at the nodes of each filled cell."""
         return u[self._nodes].transpose(0, 2, 1)
 
     def motion(self, nodal: NDArray[np.float64], rests: NDArray[np.int64] | None = None) -> CellMotion:
-        """Return the motion of filled cells at centroids from displacements `nodal` (m).  Cells `rests` do not move."""
+        """Return the motion of filled cells at centroids.
+
+        `nodal`: displacements, in m.
+        `rests`: cells that do not move.
+        """
         hoop, d = None, self.grid.dim
         at_centroids = nodal @ self._shapes
         F, moved = self._unit + at_centroids[:, :, :d], at_centroids[:, :, d].copy()

@@ -165,7 +165,7 @@ class MixedCells:
     def paths(
         self, kappa: NDArray[np.float64], law: NDArray[np.int64], laws: int, shift: NDArray[np.float64] | None
     ) -> Paths:
-        """Return the flow paths (n, d, 2, ...) of the mixed cells, see `Paths`.
+        """Return the flow paths of the mixed cells, see `Paths`.
 
         `kappa` (m,), m^2/(Pa s): mobilities of all pieces at saturation.
         `law` (m,): index of the retention curve of each piece, < `laws`.
@@ -239,7 +239,7 @@ class MixedCells:
 def graded(
     contents: CellContents, offset: NDArray[np.float64], kappa: NDArray[np.float64], mean: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the mobilities (n, d) along the axes, divided by `mean`, of cells in which the mobility varies gradually.
+    """Return the mobilities (n, d) along the axes, divided by `mean`, in cells whose mobility varies gradually.
 
     Pieces conduct in series along the gradient of the mobility, and in parallel across this gradient.  For a gradient
     in any direction, the difference between arithmetic and harmonic mean is distributed over the axes.  The share of an

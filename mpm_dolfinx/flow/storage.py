@@ -157,7 +157,7 @@ class StorageForms:
         """Sources and open sides of all stages."""
 
     def change(self, data: PointData) -> NDArray[np.float64]:
-        """Return the changes (m^d) of the fluid volume in filled cells in the step, as an array over local cells."""
+        """Return the changes of the fluid volume in filled cells in the step, in m^d, as an array over local cells."""
         b = self._sums
         b[data.places.filled] = 0.0
         self._change.assemble_vector(b, data)
@@ -182,8 +182,7 @@ class StorageForms:
     def driven(
         self, assembled: FacetSum, active: NDArray[np.int64], force: NDArray[np.float64] | None
     ) -> NDArray[np.float64]:
-        """Return the outflow (c,) of active cells to other cells, in m^d/s, due to the pressures and the fluid's
-        weight.
+        """Return the outflow of active cells to other cells due to the pressures and the fluid's weight, in m^d/s.
 
         `force` (c, d), N/m^3: inertia force on the fluid in the local cells, or None.
         """
@@ -280,7 +279,7 @@ class StorageSystem:
             out.array_w[:] += slope(u)
 
     def between(self, pi: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the outflow to other cells, in m^d/s, due to the mass potentials pi (n,), in Pa."""
+        """Return the outflow to other cells due to the mass potentials pi, in m^d/s."""
         self._potentials.array_w[:] = pi
         return (self.T * self._potentials).array_r
 
@@ -493,8 +492,7 @@ class StorageProblem:
 
     @property
     def accuracy(self) -> float:
-        """Largest relative tolerance of linear solvers.  Errors must be small in dry cells, which store little fluid.
-        """
+        """Largest relative tolerance of linear solvers.  Dry cells store little fluid, so they need small errors."""
         return SAME if self.forms.retains else 1.0
 
     def restrained(
@@ -596,7 +594,7 @@ class StorageProblem:
         return out
 
     def net_inflow(self, rates: Rates) -> NDArray[np.float64]:
-        """Return the net inflow (n,) into each filled owned cell in the step by fluxes and sources, in m^d.
+        """Return the net inflow by fluxes and sources into each filled owned cell in the step, in m^d.
 
         Volumes refer to the density at mid-step.  `rates`: rates at the end of the substep.
         """

@@ -38,7 +38,7 @@ def check_follow(follow: Any, lines: Sequence[ArrayLike] | None) -> None:
 def lines_at(
     follow: Any, given: Sequence[NDArray[np.float64]], t: float, x: NDArray[np.float64] | None
 ) -> list[NDArray[np.float64]]:
-    """Return the lines (n,), in m, along each axis from a function `follow` of time t (s) and positions x (n, d), in m.
+    """Return the lines (m) along each axis from a function `follow` of time t (s) and positions x (n, d), in m.
 
     `given` are the lines with which the grid was created.  The number of lines along each axis, the first coordinate
     and the last coordinate must not change.
@@ -58,7 +58,7 @@ def lines_at(
 
 
 def carried(lines: Sequence[NDArray[np.float64]], shift: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """Return the lines (n,), in m, along each axis, after a displacement `shift` (d,), in m, of the smallest cells.
+    """Return the lines (m) along each axis after a displacement `shift` (d,), in m, of the smallest cells.
 
     The smallest cells move by a whole number of cells, rounded towards zero.  A tool therefore moves through them as
     through fixed cells.  Outside the smallest cells, the edge of the k-th cell from them (k = 1, 2, ...) is multiplied

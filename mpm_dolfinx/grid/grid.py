@@ -98,9 +98,10 @@ def sum_by(index: NDArray, values: NDArray[np.float64], size: int) -> NDArray[np
 def polynomial(
     coefficients: NDArray[np.float64], y: NDArray[np.float64], slot: NDArray[np.intp], without: int | None = None
 ) -> NDArray[np.float64]:
-    """Return the values (d, n) of a multilinear vector field at offsets y (d, n), in m, from the midpoints of cells.
+    """Return the values (d, n) of a multilinear vector field in cells.
 
     `coefficients` (d, k, cells): factors of the monomials, in the order of `Grid.monomials`.
+    `y` (d, n), m: offsets from the midpoints of the cells.
     `slot` (n,): index of each value's cell.
     `without`: an axis along which the field is constant, or None.
     """
@@ -131,7 +132,10 @@ def among(numbers: NDArray[np.integer], chosen: NDArray[np.integer]) -> NDArray[
 def values_at(
     chosen: NDArray[np.int64], numbers: NDArray[np.int64], values: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the values (n, k) of the numbers `chosen` (n,), given values of sorted `numbers` (m,), else 0."""
+    """Return the values (n, k) of the numbers `chosen` (n,), or 0 for numbers without values.
+
+    `numbers` (m,): sorted numbers that have the `values` (m, k).
+    """
     at = numbers.searchsorted(chosen)
     found = np.append(numbers, -1)[at] == chosen
     return np.concatenate([values, np.zeros((1, values.shape[1]))])[np.where(found, at, len(numbers))]
@@ -432,7 +436,7 @@ class Grid:
         return Spacing(lines, widths, finest, float(finest.min()), float(most.max()), snap)
 
     def move(self, lines: Mapping[str, NDArray[np.float64]] | None) -> None:
-        """Move the lines of a grid with `follow` to coordinates (n,), in m and from the base, by axis "x", "y", "z".
+        """Move the lines of a grid with `follow` to coordinates (n,) by axis "x", "y", "z", in m from the base.
 
         With None, the lines return to their initial coordinates.  Afterwards all coordinates of nodes, cells and mesh
         are exactly as in a new grid with these lines.
@@ -459,41 +463,39 @@ class Grid:
         return float(np.prod(self.h))
 
     def sizes(self, cells: Any) -> NDArray[np.float64]:
-        """Return the edge lengths (n, d), in m, of local cells.  Equal cells give one row (d,)."""
+        """Return the edge lengths (n, d) of local cells, in m.  Equal cells give one row (d,)."""
         return self._h if self.even else self._of_process.at.sizes[cells]
 
     def along(self, cells: Any, axis: Any) -> NDArray[np.float64]:
-        """Return the edge lengths (n,), in m, of local cells (n,) along an axis, or along one axis for each cell."""
+        """Return the edge lengths (n,) of local cells along an axis, in m.  Each cell may have another axis."""
         return self.h[axis] if self.even else self._of_process.at.sizes[cells, axis]
 
     def between(self, cells: Any, others: Any, axis: Any) -> NDArray[np.float64]:
-        """Return the distances (n,), in m, from midpoints of local cells (n,) to their neighbours along an axis."""
+        """Return the distances (n,) from midpoints of local cells to their neighbours along an axis, in m."""
         return self.h[axis] if self.even else (self.along(cells, axis) + self.along(others, axis)) / 2
 
     def volumes(self, cells: Any) -> NDArray[np.float64] | float:
-        """Return the volumes (n,), m^d, of local cells, in axisymmetry their areas.  Equal cells give one number."""
+        """Return the volumes (n,) of local cells in m^d, or their areas in axisymmetry.  Equal cells give a number."""
         return self.cell_volume if self.even else self._of_process.at.sizes[cells].prod(axis=-1)
 
     def smallest_faces(self, cells: Any) -> NDArray[np.float64] | float:
-        """Return the areas (n,), m^(d-1), of the smallest faces of local cells.  Equal cells give one number."""
+        """Return the areas (n,) of the smallest faces of local cells, in m^(d-1).  Equal cells give one number."""
         return self.volumes(cells) / self.sizes(cells).max(axis=-1)
 
     def sizes_of(self, number: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the edge lengths (n, d), in m, of cells by lexicographic indices (n,).  Equal cells give one row."""
+        """Return the edge lengths (n, d) of cells by lexicographic indices, in m.  Equal cells give one row."""
         if self.even:
             return self._h
         return self.widths_of(np.stack(np.unravel_index(number % self.cells, tuple(self.shape)), axis=-1))
 
     def sizes_at(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the edge lengths (..., d), in m, of the cells at positions x (..., d), in m.  Equal cells give one
-        row.
-        """
+        """Return the edge lengths (..., d) of cells at positions x, in m from the base.  Equal cells give one row."""
         if self.even:
             return self._h
         return self.widths_of(self.index_from_base(x.reshape(-1, self.dim))).reshape(x.shape)
 
     def in_cells(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Convert positions x (..., d), in m, from the base to cell index plus fraction of the cell along each axis."""
+        """Convert positions x (..., d), in m from the base, to cell index plus fraction of the cell along each axis."""
         if self.even:
             return (x - self.low) / self._h
         out = np.empty(x.shape)
@@ -509,7 +511,7 @@ class Grid:
         return np.abs(self.in_cells(y) - self.in_cells(x))
 
     def places(self, index: NDArray[np.integer], share: NDArray[np.float64] | float = 0.0) -> NDArray[np.float64]:
-        """Return positions (n, d), in m, from the base: lower corners of cells plus a fraction `share` of their edges.
+        """Return positions (n, d) in m from the base: lower corners of cells plus a fraction `share` of their edges.
 
         `index` (n, d): indices of cells along the axes.  Cells beyond a side have the size of the outermost cell.
         """
@@ -523,25 +525,25 @@ class Grid:
         return out
 
     def edge_in_forms(self) -> Any:
-        """Return the edge lengths (d,), in m, of a cell as a UFL coefficient, or as a constant if cells are equal."""
+        """Edge lengths (d,) of a cell as a UFL coefficient, in m, or as a constant if cells are equal."""
         return fem.Constant(self.mesh, self._h) if self.even else self._of_process.edges
 
     def nodes_along(self, x: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the indices (..., d) along the axes of nodes at positions x (..., d), in m and from the base."""
+        """Return the indices (..., d) along the axes of nodes at positions x, in m from the base."""
         return np.rint(self.in_cells(x)).astype(np.int64)
 
     def widths_of(self, index: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the edge lengths (n, d), in m, of cells with indices (n, d).  Equal cells give one row."""
+        """Return the edge lengths (n, d) of cells with indices (n, d), in m.  Equal cells give one row."""
         if self.even:
             return self._h
         return np.stack([w[i] for w, i in zip(self.widths, index.T, strict=True)], axis=-1)
 
     def next_plane(self, axis: int, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the next line (n,), in m, above coordinates x (n,) along an axis of unequal cells, or inf."""
+        """Return the next line (n,) above coordinates x (n,) along an axis of unequal cells, in m, or inf."""
         return np.append(self.lines[axis], np.inf)[self.lines[axis].searchsorted(x, side="right")]
 
     def cells_along(self, axis: int, x: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the indices of cells in the grid nearest to coordinates x, in m, along an axis of unequal cells."""
+        """Return the indices of cells in the grid nearest to coordinates x (m) along an axis of unequal cells."""
         return np.minimum(np.maximum(self.lines[axis].searchsorted(x, side="right") - 1, 0), self.shape[axis] - 1)
 
     mesh = of_cells("mesh")
@@ -584,8 +586,7 @@ class Grid:
         return self
 
     def better(self, x: NDArray[np.float64]) -> NDArray[np.int64] | None:
-        """Return boxes (ranks, 2, d) that distribute points at x (n, d), in m, more evenly than the present boxes, or
-        None.
+        """Return boxes (ranks, 2, d) that distribute points at x more evenly than the present boxes, or None.
 
         The points of all processes are counted.  If the imbalance of the present boxes is at most `UNEVEN`, the result
         is None.
@@ -685,7 +686,7 @@ class Grid:
         return self.axisymmetric and bool(self.lower[0] <= SAME * self.finest[0])
 
     def around(self, x: NDArray[np.float64]) -> NDArray[np.float64] | float:
-        """Return the factor from plane to volume integrals at x (n, d): 1, or in axisymmetry `2 pi r` (n,), in m."""
+        """Return the factor from plane to volume integrals at x (n, d): 1, or in axisymmetry `2 pi r` (n,) in m."""
         return TURN * x[:, 0] if self.axisymmetric else 1.0
 
     def number(self, index: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -693,11 +694,11 @@ class Grid:
         return np.ravel_multi_index(tuple(index.T), tuple(self.shape))
 
     def index(self, x: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the indices (n, d) of the nearest cells in the grid to true positions x (n, d), in m."""
+        """Return the indices (n, d) of the cells nearest to true positions x, in m."""
         return self.index_from_base(x - self.base)
 
     def index_from_base(self, x: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the indices (n, d) of the nearest cells in the grid to positions x (n, d), in m, from the base."""
+        """Return the indices (n, d) of the cells nearest to positions x, in m from the base."""
         if not self.even:
             return np.stack([self.cells_along(a, x[:, a]) for a in range(self.dim)], axis=1)
         i = np.floor((x - self.low) / self.h).astype(np.int64)
@@ -736,9 +737,9 @@ class Grid:
         return self.from_rows(other.node_numbers()[some], rows[some])
 
     def from_rows(self, nodes: NDArray[np.int64], rows: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return nodal values (unknowns,) from rows (n, d) of nodes (n,), which may be on any process.
+        """Return nodal values (unknowns,) from rows (n, d) of nodes, which may be on any process.
 
-        `nodes`: lexicographic indices.  The values of all other nodes are zero.
+        `nodes` (n,): lexicographic indices.  The values of all other nodes are zero.
         """
         new = self.node_numbers()
         store, fetch = (Exchange(self.comm, (node % self.comm.size).astype(np.int32)) for node in (nodes, new))
@@ -775,7 +776,7 @@ class Grid:
     def shape_gradients(
         self, cells: NDArray[np.int32], x: NDArray[np.float64], mixed: NDArray[np.float64] | None = None
     ) -> NDArray[np.float64]:
-        """Return the gradients (n, 2^d, d), 1/m, of the Q1 shape functions of local cells at points x.
+        """Return the gradients (n, 2^d, d) of the Q1 shape functions of local cells at points x, in 1/m.
 
         With `mixed`, used in 3D, gradients are means over subdomains about the points.  `mixed` (n, 3), m^2, are the
         means of the products of two offsets from the point, over each subdomain.
@@ -793,7 +794,7 @@ class Grid:
 
     @cached_property
     def monomials(self) -> NDArray[np.float64]:
-        """Coefficients (2^d, 2^d) of the Q1 shape functions about the midpoint of a cell; columns are functions.
+        """Coefficients (2^d, 2^d) of the Q1 shape functions about the midpoint of a cell.  Columns are functions.
 
         Row s has the factors of the monomial s, the product of the offsets along all axes whose bit is set in s.  For
         unequal cells, the offsets are divided by the edge lengths, see `over_edges`.
@@ -813,7 +814,7 @@ class Grid:
         return reduce(np.multiply, self._hats(cells, x))
 
     def at(self, cells: NDArray[np.int32], x: NDArray[np.float64], u: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the values of a Q1 field u (nodes, k) at points x (n, d), m, in local cells (n,)."""
+        """Return the values of a Q1 field u (nodes, k) at points x in local cells."""
         out = np.empty((len(x), u.shape[1]))
         for part in in_chunks(len(x)):
             N, at_nodes = self.shape_values(cells[part], x[part]), u[self.cell_nodes[cells[part]]]

@@ -86,7 +86,7 @@ def boxes(load: NDArray[np.float64], processes: int) -> NDArray[np.int64]:
 
 
 def better(load: NDArray[np.float64], of: NDArray[np.int64]) -> NDArray[np.int64] | None:
-    """Return the boxes (ranks, 2, d) of a new bisection, or None if they are hardly more even than the boxes `of`.
+    """Return the boxes (ranks, 2, d) of a new bisection, or None if they are hardly better than the boxes `of`.
 
     New boxes are returned if their imbalance is below `UNEVEN`, or below the imbalance of the boxes `of` divided by
     `UNEVEN`.  Otherwise each reset of the grid might distribute a few cells anew.
@@ -96,7 +96,7 @@ def better(load: NDArray[np.float64], of: NDArray[np.int64]) -> NDArray[np.int64
 
 
 def imbalance(load: NDArray[np.float64], of: NDArray[np.int64]) -> float:
-    """Return the largest load of the boxes `of` (ranks, 2, d), divided by the mean load, or 1 without loads."""
+    """Return the largest load of the boxes `of`, divided by the mean load.  It is 1 without loads."""
     each = np.array([load[tuple(map(slice, *box))].sum() for box in of])
     return float(each.max() / each.mean()) if each.any() else 1.0
 

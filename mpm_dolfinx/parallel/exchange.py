@@ -70,7 +70,7 @@ class Exchange:
         return self._transfer(rows, 1, self._sf.reduceBegin, self._sf.reduceEnd)
 
     def back(self, rows: NDArray) -> NDArray:
-        """Send back one answer for each received row, and return the answers for this process's rows in their order."""
+        """Send back one answer for each received row, and return the answers for this process's rows."""
         if self.comm.size == 1:
             return rows
         return self._transfer(rows, 0, self._sf.bcastBegin, self._sf.bcastEnd)

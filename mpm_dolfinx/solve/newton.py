@@ -83,7 +83,7 @@ AsReset = Callable[[], AbstractContextManager[QuadratureData]]
 
 @dataclass(frozen=True, eq=False)
 class Errors:
-    """Relative residuals of momentum and storage in the connected parts of the bodies; arrays (parts,)."""
+    """Relative residuals of momentum and storage. Arrays have an entry for each connected part of the bodies."""
 
     u: NDArray[np.float64]  # relative residual of momentum
     p: NDArray[np.float64]  # relative residual of storage

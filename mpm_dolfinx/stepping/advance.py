@@ -183,8 +183,8 @@ class Motion:
         return Trend(np.array([dt, *before.lengths[:2]]), np.concatenate([rates, before.rates[:, :2]], axis=1))
 
     def ahead(self, on_grid: OnGrid, state: State, seconds: float, first: float, implicit: bool) -> list[NDArray]:
-        """Return the expected displacements (active dofs,), in m, and with fluid also the expected pressures (active
-        cells,).
+        """Return the expected displacements (m) of active dofs, and with fluid also the expected pressures (Pa) of
+        active cells.
 
         Both are extrapolated from the trend over `seconds` (s), see `Trend.over`. If `first` > 0, the change in a first
         substep of this length (s), times `seconds / first`, is added. Domains move affinely. The value of a cell is the
@@ -235,7 +235,7 @@ class Motion:
     def pressures(
         self, on_grid: OnGrid, stage: Stage, t: float, nodal: NDArray[np.float64] | None = None
     ) -> NDArray[np.float64]:
-        """Return the pressures (n,) of the points, in Pa, from the pressures of the cells at time t (s).
+        """Return the pressures (Pa) of the points from the pressures of the cells at time t (s).
 
         `nodal` (nodes, d), m: displacement since the reset of the grid, if any.
         """
@@ -489,7 +489,7 @@ def untangled(
     grid: Grid,
     loads: Sequence[Loads],
 ) -> NDArray[np.float64]:
-    """Return the corners (n, 2^d, d), in m, after the inverted domains `bad` (n,) are re-initialised from F."""
+    """Return the corners (m) after the inverted domains `bad` are re-initialised from F."""
     at = bad.nonzero()[0]
     X = points.reference[bad]
     d = grid.dim

@@ -88,7 +88,10 @@ class Balances(NamedTuple):
     ahead: Callable[[], list[NDArray[np.float64]]] | None = None  # see `Motion.ahead`; None without a trend
 
     def flown(self, flight: Flight | None, substep: Substep, dt: float) -> Flight | None:
-        """Return the velocities at the end of a solved substep of a step of `dt` (s), or None without inertia."""
+        """Return the velocities at the end of a solved substep, or None without inertia.
+
+        `dt`, s: length of the step.
+        """
         if self.inertia is None:
             return None
         acceleration = self.inertia.acceleration(self.momentum.at)
@@ -156,7 +159,7 @@ def leads(scene: Scene, loads: Sequence[Loads]) -> bool:
 
 
 def going_on(scene: Scene, start: Start, acting: Acting) -> NDArray[np.float64] | None:
-    """Return the displacements (unknowns,), in m, extrapolated from the previous substep or step, as a local array.
+    """Return the displacements (m) extrapolated from the previous substep or step, as a local array.
 
     The result is None without previous motion, or if previous motion is a bad guess, see `leads`.
     """

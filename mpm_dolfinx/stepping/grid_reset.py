@@ -129,7 +129,7 @@ class OnGrid(Keyed):
 
     @cached_property
     def not_full(self) -> NDArray[np.int32]:
-        """Faces between active cells that have a ghost mass, because at least one of the two cells is not full."""
+        """Faces with a ghost mass: between two active cells, at least one of which is not full."""
         return self.facets[self.fill[self.cut.grid.facet_cells[self.facets]].min(axis=1) < FULL]
 
     @property
@@ -226,7 +226,7 @@ class OnGrid(Keyed):
         return self.cut.to_pieces(self._storage.p_n.x.array[self.cut.cells])
 
     def set_pressures(self, at_pieces: NDArray[np.float64]) -> None:
-        """Set the cell pressures at the start of a step from the pressures (m,), in Pa, of the pieces."""
+        """Set the cell pressures at the start of a step from the pressures (Pa) of the pieces."""
         p_n = self._storage.p_n.x
         p_n.array[self.cut.cells] = self.cut.pieces_to_cells(at_pieces)
         p_n.scatter_forward()
@@ -410,7 +410,7 @@ class OnGrid(Keyed):
         return Mobility(mean) if self._mixed is None else self._mixed.mobility(at_pieces, mean, None)
 
     def rests(self, state: State) -> NDArray[np.int64] | None:
-        """Return the filled owned cells in which all points keep their pieces, or None if no point keeps its pieces."""
+        """Return the filled owned cells in which all points keep their pieces, or None without such points."""
         if not state.stay:
             return None
         moves = self.cut.to_cells(~state.stay.keeps).astype(float)
@@ -430,7 +430,10 @@ class OnGrid(Keyed):
 
     @cached_property
     def parts(self) -> tuple[NDArray[np.int64], int]:
-        """Index (n,), from 0, of the connected part of each point, and the number of parts."""
+        """Index of the connected part of each point, from 0, and the number of parts.
+
+        The unknowns of a part are independent of all other parts.
+        """
         return self._of_points(*self.active.parts_of_cells)
 
     def _of_points(self, part: NDArray[np.int64], count: int) -> tuple[NDArray[np.int64], int]:

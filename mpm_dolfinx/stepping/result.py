@@ -113,34 +113,32 @@ class Result:
 
     @property
     def probe_stress(self) -> NDArray[np.float64]:
-        """Effective stresses (n, probes, 3, 3), in Pa, tension positive, or (n, 0, 3, 3) if not recorded."""
+        """Effective stresses (n, probes, 3, 3) with tension positive, in Pa, or (n, 0, 3, 3) if not recorded."""
         return self.rows.column("probe_stress")
 
     @cached_property
     def reactions(self) -> ByName[NDArray[np.float64]]:
-        """Force (times, d), in N, of each prescribed displacement on the bodies, by name."""
+        """Force (times, d) of each prescribed displacement on the bodies by name, in N."""
         return self.outcome("reactions")
 
     @cached_property
     def wall_reactions(self) -> ByName[NDArray[np.float64]]:
-        """Force (times, d), in N, of each wall of the grid on the bodies, see `Simulation`."""
+        """Force (times, d) of each wall of the grid on the bodies, in N, see `Simulation`."""
         return self.outcome("wall_reactions")
 
     @cached_property
     def outflows(self) -> ByName[NDArray[np.float64]]:
-        """Outflow (times,), in m^3/s, through each open side, by name."""
+        """Outflow (times,) through each open side by name, in m^3/s."""
         return self.outcome("outflows")
 
     @cached_property
     def tool_forces(self) -> ByName[NDArray[np.float64]]:
-        """Forces (N) and moments (N m) of tools and contacts on bodies, by name: arrays (times, 3), or (times, 6) in
-        3D.
-        """
+        """Forces (N) and moments (N m) of tools and contacts on bodies by name: arrays (times, 3), in 3D (times, 6)."""
         return self.outcome("tool_forces")
 
     @cached_property
     def tool_travel(self) -> ByName[NDArray[np.float64]]:
-        """Displacement (times,), in m, of each load-controlled tool beyond its prescribed displacement, by name."""
+        """Displacement (times,) of each load-controlled tool beyond its prescribed displacement by name, in m."""
         return self.outcome("tool_travel")
 
     @cached_property

@@ -212,7 +212,7 @@ class Scene:
             self.materials.retentions.weight.value = 0.0 if gravity is None else self.fluid.density * gravity
 
     def distributed(self, boxes: NDArray[np.int64]) -> Scene | None:
-        """Return an equal scene on a grid distributed by boxes (ranks, 2, d) (see `Partition`), or None if this is
+        """Return an equal scene on a grid distributed by boxes (ranks, 2, d), see `Partition`, or None if this is
         impossible.
 
         It is impossible if a function of position, such as a random field, does not return the same values when called
@@ -310,10 +310,11 @@ class Scene:
         return [one for one, possible in both if possible]
 
     def for_reset(self, state: State, renew: bool) -> tuple[State, int]:
-        """Return a state for a reset of the grid, with points on the owners of their cells, and the number of renewed
-        domains.
+        """Return a state for a reset of the grid, and the number of renewed domains.
 
-        A state in which all points keep their pieces is unchanged.  `renew`: whether renewal is allowed.
+        Points are on the owners of their cells.  A state in which all points keep their pieces is unchanged.
+
+        `renew`: whether renewal is allowed.
         """
         if state.stays:
             return state, 0

@@ -151,8 +151,9 @@ class Stage:
         return None
 
     def moved(self, grid: Grid, t: float, outcome: Outcome) -> NDArray[np.float64] | None:
-        """Return the displacement (d,), in m, at time t (s) of the tool that grid lines follow, or None without such a
-        tool.
+        """Return the displacement (d,) of the tool that grid lines follow, in m, or None without such a tool.
+
+        `t`, s: time of the displacement.
         """
         if (name := self.followed(grid)) is None:
             return None
@@ -177,7 +178,7 @@ class Stage:
             return [one.placed(place) for one in self.acting]
 
     def check_start(self, place: Place) -> None:
-        """Raise an error if this is the stage's first step, and the positions of bodies or tools do not allow it."""
+        """Raise an error before the stage's first step if the positions of bodies or tools do not allow it."""
         for one in self.acting if place.begins else ():
             one.check_start(place)
 
@@ -239,7 +240,7 @@ class Stage:
         return sum(m / 2 * float((v**2).sum()) for m, v in moving)
 
     def gravity_at(self, t: float) -> NDArray[np.float64] | None:
-        """Return the acceleration of gravity (d,), in m/s^2, at time t (s), or None without gravity."""
+        """Return the acceleration of gravity (d,) at time t (s), in m/s^2, or None without gravity."""
         gravity = self.conditions["gravity"]
         name = f"gravity at t = {t:g} s"
         d = self.free.shape[1]
