@@ -75,8 +75,9 @@ def check_axisymmetry(grid: Grid, bodies: Sequence[Body], quadrature: str) -> No
 
 
 def initial_velocity(grid: Grid, quadrature: str, inertia: bool | Moving | None) -> ArrayLike | Callable | None:
-    """Return the initial velocity, or None without inertia in all stages. Raise ValueError if the scene does not allow
-    it.
+    """Return the initial velocity, or None without inertia in all stages.
+
+    Raise ValueError if the scene does not allow inertia or this velocity.
     """
     if inertia is None:
         return None

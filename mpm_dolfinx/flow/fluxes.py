@@ -137,9 +137,11 @@ class OpenSides:
         return self.area / np.sqrt(np.add.reduce(self.area**2, axis=1, keepdims=True))
 
     def driven(self, at: NDArray[np.int64], flow: Conduction) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return two arrays (m,): outflow per unit of the cell's mass potential (m^d/(Pa s)), and inflow (m^d/s).
+        """Return the outflow per unit of the cell's mass potential, in m^d/(Pa s), and the inflow, in m^d/s, of each
+        face.
 
         The inflow is prescribed, or caused by the outside pressure and gravity.
+
         `at` (m,): indices of the cells among the filled cells.
         """
         shape = self.shape
@@ -149,7 +151,7 @@ class OpenSides:
         return conductance, self.given + conductance * self.outer(at, flow)
 
     def outer(self, at: NDArray[np.int64], flow: Conduction) -> NDArray[np.float64]:
-        """Return the mass potentials (m,), in Pa, at outside pressures minus hydrostatic drops from centroids."""
+        """Return the mass potentials (m,) at outside pressures minus hydrostatic drops from centroids, in Pa."""
         outer = self.pressure if flow.weight is None else self.pressure - flow.deformed(at, self.offset) @ flow.weight
         return mass_potential(outer, flow.bulk)
 

@@ -265,7 +265,7 @@ def graded(
 
 
 def mixed_cells(cut: CutDomains, soils: NDArray[np.float64], contents: CellContents) -> MixedCells | None:
-    """Return the owned cells with pieces of different conductivity, or None if no process has such cells.
+    """Return the owned cells with pieces of different conductivity, or None if no process has a mixed cell.
 
     `soils` (m, k): numbers that identify the soil of each piece.  Pieces with equal rows have equal conductivities.
     """

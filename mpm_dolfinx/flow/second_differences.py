@@ -32,12 +32,11 @@ def second_differences(
     centroid: NDArray[np.float64],
     opening: NDArray[np.float64],
 ) -> PETSc.Mat:
-    """Return the matrix H.  Its pattern depends on the active cells only.
+    """Return the matrix H.  The pattern of H depends on the active cells only.
 
     `unknowns`: pressure unknowns of the active cells.
-    `grid`: background grid.
-    `strength` (n, d), m^d/Pa: coefficient, >= 0, of each owned active cell and axis.  For alternating pressures,
-    damping of pressure jumps with this coefficient has the same effect.
+    `strength` (n, d), m^d/Pa: coefficient, >= 0, of each owned active cell and axis.  Alternating pressures are damped
+    as by a damping of pressure jumps with the same coefficient.
     `centroid` (c, d), m: centroids of the material in the local cells, relative to the midpoints of the cells.
     `opening` (c, d, 2): open fractions of the lower and upper faces of the local cells.  In axisymmetry they are
     multiplied by `Grid.around`.

@@ -175,7 +175,7 @@ class StorageForms:
         return [sums[:, 0], *[sums[:, start : start + count] for start in range(1, sums.shape[1], count)]]
 
     def drained(self, data: PointData) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return two arrays (n,): storage of cells due to saturation (m^d/Pa), and `int S d(chi p)/dp dV` (m^d)."""
+        """Return the storage of cells due to saturation (m^d/Pa), and the integral `int S d(chi p)/dp dV` (m^d)."""
         capacity, coupled = self._capacity(data).T
         return capacity, coupled
 
@@ -461,7 +461,9 @@ class StorageProblem:
         return self._contents.fill
 
     def sealed(self, volumes: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the pressure rises (Pa) of cells if the outflows `volumes` (m^d) stay in them at fixed stress."""
+        """Return the pressure rises (Pa) of cells at fixed stress, if the outflows `volumes` (m^d) do not leave the
+        cells.
+        """
         return volumes / (self.forms.derivatives(self.data)[0] + self._contents.fixed_stress)
 
     def filling(self, error: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -492,7 +494,7 @@ class StorageProblem:
 
     @property
     def accuracy(self) -> float:
-        """Largest relative tolerance of linear solvers.  Dry cells store little fluid, so they need small errors."""
+        """Largest relative tolerance of linear solvers.  Dry cells need small errors: they store little fluid."""
         return SAME if self.forms.retains else 1.0
 
     def restrained(

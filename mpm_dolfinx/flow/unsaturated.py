@@ -167,7 +167,7 @@ class Relative:
         return self._flows((faces, pair, force), lambda: faces.flows(pair, force), self._grid.comm)
 
     def uniform(self, facets: NDArray[np.int32]) -> NDArray[np.int32]:
-        """Return the facets with the same soil on both sides, among the `facets` between active cells."""
+        """Return the `facets` between active cells that have the same soil on both sides."""
         faces = self._borders.value
         return facets if faces is None else faces.borders.uniform
 

@@ -58,11 +58,11 @@ def lines_at(
 
 
 def carried(lines: Sequence[NDArray[np.float64]], shift: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """Return the lines (m) along each axis after a displacement `shift` (d,), in m, of the smallest cells.
+    """Return the lines (m) along each axis after the smallest cells have moved by `shift` (d,), in m.
 
     The smallest cells move by a whole number of cells, rounded towards zero.  A tool therefore moves through them as
-    through fixed cells.  Outside the smallest cells, the edge of the k-th cell from them (k = 1, 2, ...) is multiplied
-    by the k-th power of a common factor.  Cells still grow towards the sides, but faster or slower.
+    through fixed cells.  On each side of the smallest cells, the edge of the k-th cell (k = 1, 2, ...) is multiplied by
+    the k-th power of a common factor.  Cells still grow towards the sides, but faster or slower.
 
     Raises
     ------

@@ -30,7 +30,7 @@ ONE = 1 << 31  # Source: definition of the same order of the powers
 
 
 class Member(NamedTuple):
-    """An array in an archive: the start of its entries in the file, and data that identify the entries."""
+    """An array in an archive: where its entries start in the file, and data that identify the entries."""
 
     dtype: np.dtype
     shape: tuple[int, ...]
@@ -99,7 +99,7 @@ def write(comm: MPI.Intracomm, file: Path, arrays: Mapping[str, NDArray], rows: 
 
 
 def members(file: Path, names: Iterable[str]) -> dict[str, Member]:
-    """Return the arrays with these names in an archive.  Raise ValueError for compressed or incomplete arrays."""
+    """Return the named arrays in an archive.  Raise ValueError for compressed or incomplete arrays."""
     out = {}
     with open(file, "rb") as f, ZipFile(f) as archive:
         for name in names:

@@ -93,7 +93,7 @@ def solved(ksp: PETSc.KSP, name: str) -> int:
 
 
 def negative_pivots(solver: PETSc.KSP) -> int:
-    """Return the number of negative eigenvalues of a matrix, from the L D L^T factors of its direct solver."""
+    """Return the number of negative eigenvalues of a matrix from the L D L^T factors of a direct solver."""
     factors = solver.pc.getFactorMatrix()
     return factors.getMumpsInfog(12) if factors.comm.size > 1 else factors.getInertia()[0]
 

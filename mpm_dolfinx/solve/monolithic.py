@@ -105,14 +105,14 @@ class BlockOperator:
 
     @staticmethod
     def part(x: PETSc.Vec, u: PETSc.Vec, p: PETSc.Vec, scale_u: Scale = 1.0, scale_p: Scale = 1.0) -> None:
-        """Split x into displacements u and pressures p, and multiply them by the scales."""
+        """Split x into displacements u and pressures p, multiplied by their scales."""
         values = x.array_r
         np.multiply(values[: u.local_size], scale_u, out=u.array_w)
         np.multiply(values[u.local_size :], scale_p, out=p.array_w)
 
     @staticmethod
     def join(u: PETSc.Vec, p: PETSc.Vec, x: PETSc.Vec, scale_u: Scale = 1.0, scale_p: Scale = 1.0) -> None:
-        """Set x to the displacements u and the pressures p, multiplied by the scales."""
+        """Set x to the displacements u and the pressures p, multiplied by their scales."""
         values = x.array_w
         np.multiply(u.array_r, scale_u, out=values[: u.local_size])
         np.multiply(p.array_r, scale_p, out=values[u.local_size :])

@@ -277,10 +277,10 @@ class Newton:
         return errors
 
     def _begin(self, ahead: Callable | None) -> tuple[Errors, list[NDArray[np.float64]] | None]:
-        """Choose the start of Newton's method. Return its errors, and the previous (u, p) if the start differs from it.
+        """Choose the start of Newton's method. Return the errors at the start, and the previous (u, p) or None.
 
         The start is `ahead` if the square of its residual is small. Otherwise each part starts at its guess of least
-        residual.
+        residual. The result is None instead of the previous (u, p) if the start is the previous (u, p).
         """
         start = self._iterate()
         if ahead is not None:

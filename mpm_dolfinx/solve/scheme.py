@@ -69,5 +69,5 @@ class Scheme:
 
     @property
     def beta(self) -> float:
-        """Factor f in the fixed-stress coefficient, see `COUPLINGS`, or 1 in the scheme with `beta = 1 / K_w`."""
+        """Factor f in the fixed-stress coefficient, see `COUPLINGS`. It is 1 in the scheme with `beta = 1 / K_w`."""
         return COUPLINGS[self.coupling] or 1.0

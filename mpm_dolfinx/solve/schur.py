@@ -280,7 +280,7 @@ class LinearSolvers:
         x.array_w[:] *= scale
 
     def restrain(self, storage: StorageProblem, log_change: NDArray[np.float64] | float) -> NDArray[np.float64] | float:
-        """Limit the pressure decreases of the Newton direction (see `restrained`), and update its displacements."""
+        """Limit the pressure decreases of the Newton direction (see `restrained`), and update the displacements."""
         if not storage.forms.retains:
             return log_change
         dp, log_change = storage.restrained(self.dp.array_r, log_change)
@@ -292,7 +292,7 @@ class LinearSolvers:
         return log_change
 
     def _follow(self) -> None:
-        """Solve the balance of momentum for the displacements of the Newton direction, with its pressures."""
+        """Solve the balance of momentum for the displacements at the pressures of the Newton direction."""
         self._storage.B_momentum.multTranspose(self.dp, self._rhs)
         self._rhs.axpy(1.0, self._momentum.residual)
         self.solve_u.solve(self._rhs, self.du)
@@ -329,6 +329,6 @@ class LinearSolvers:
             self.solve_u.solve(self._momentum.residual, self.du)
 
     def solve_storage(self) -> PETSc.Vec:
-        """Solve for dp at fixed stress, and return it."""
+        """Solve for dp at fixed stress, and return dp."""
         self._solve_s.solve(self._storage.residual, self.dp)
         return self.dp

@@ -261,8 +261,8 @@ class Motion:
     def _deformed(self, cut: CutDomains, data: QuadratureData, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return F of the points after a step.
 
-        F is the mean of `(increment of F) F_n` over the pieces of the point. It is scaled so that det F is the mean of
-        det F over these pieces.
+        F is the mean of `(increment of F) F_n` over the pieces of the point, scaled so that det F is the mean of det F
+        over the pieces.
         """
         pieces = data.pieces
         grid = cut.grid

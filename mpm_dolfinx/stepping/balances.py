@@ -67,8 +67,8 @@ class Start(NamedTuple):
         return partial(self.matrices.mass.carried, self.state.points, (flight.start, flight.velocity))
 
     def moves(self, flights: Sequence[Flight | None], substep: Substep) -> tuple[float, float]:
-        """Return the error and the size of the motion in the step (see `motion_error`), or zeros if a run does not need
-        them.
+        """Return the error and the size of the motion in the step, see `motion_error`.  They are zero if a run does not
+        need them.
 
         `flights`: velocities after each substep.
         """
@@ -218,6 +218,6 @@ def balances(
 
 
 def pushed_back(scene: Scene, on_grid: OnGrid) -> NDArray[np.float64]:
-    """Return the inertia forces (n, d), in N/m^3, on the pore fluid in the filled owned cells."""
+    """Return the inertia forces (n, d) on the pore fluid in the filled owned cells, in N/m^3."""
     contents = on_grid.contents
     return -scene.fluid.density * scene.momentum.inertia.at(contents.filled, contents.shape_values)

@@ -205,7 +205,9 @@ class OnGrid(Keyed):
 
     @contextmanager
     def as_reset(self, state: State) -> Iterator[QuadratureData]:
-        """Yield the integration points at the last reset. In this context u is 0, and p has its values at the reset."""
+        """Yield the integration points at the last reset. Within this context u is 0, and p is the pressure at the
+        reset.
+        """
         at = [(self._u.x.array, self._momentum.active.now.dofs)]
         if self._storage is not None:
             at += [(f.x.array, self.cells) for f in (self._storage.p, self._storage.p_n)]
@@ -390,7 +392,7 @@ class OnGrid(Keyed):
 
     @property
     def heads(self) -> NDArray[np.float64]:
-        """Pressures (m,), in Pa, of unsaturated pieces minus the pressures of their cells."""
+        """Pressures (m,) of unsaturated pieces minus the pressures of their cells, in Pa."""
         return self._quadrature.materials.retentions.heads(self._places.lever)
 
     @cached_property

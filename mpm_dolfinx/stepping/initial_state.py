@@ -213,8 +213,9 @@ def _released(
 def _kept_at_rest(scene: Scene, state: State) -> State:
     """Return the state on the grid of the next step, with forces that keep its bodies at rest.
 
-    Bodies are in equilibrium under the loads of the present stage. A reset of the grid leaves a small imbalance, and
-    the forces balance it. With contact there are no such forces, because contact removes penetrations of the last step.
+    Bodies are in equilibrium under the loads of the present stage. A reset of the grid leaves a small imbalance, which
+    the forces balance. With contact the state has no such forces, because contact removes penetrations of the last
+    step.
     """
     start, forms = set_up(scene, state, 0.0), scene.momentum
     state, system = start.state, start.matrices.momentum

@@ -138,7 +138,7 @@ class Result:
 
     @cached_property
     def tool_travel(self) -> ByName[NDArray[np.float64]]:
-        """Displacement (times,) of each load-controlled tool beyond its prescribed displacement by name, in m."""
+        """Displacement (times,) of each load-controlled tool by name, in m, without its prescribed displacement."""
         return self.outcome("tool_travel")
 
     @cached_property
@@ -213,9 +213,10 @@ class Result:
 
 
 class GaveUp(RuntimeError):
-    """Error that ends a run because a step fails, even if it is shortened.
+    """Error that ends a run because a step fails, even after it is shortened.
 
-    The simulation is in the state of the last good step. A new run may continue it with other conditions or steps.
+    The simulation is in the state of the last good step. A new run may continue from this state with other conditions
+    or steps.
 
     Attributes
     ----------

@@ -212,11 +212,12 @@ class Scene:
             self.materials.retentions.weight.value = 0.0 if gravity is None else self.fluid.density * gravity
 
     def distributed(self, boxes: NDArray[np.int64]) -> Scene | None:
-        """Return an equal scene on a grid distributed by boxes (ranks, 2, d), see `Partition`, or None if this is
-        impossible.
+        """Return an equal scene on a grid distributed by boxes (ranks, 2, d), see `Partition`, or None if a scene
+        cannot move.
 
-        It is impossible if a function of position, such as a random field, does not return the same values when called
-        again. It is also impossible if user-defined terms may be defined on the present mesh.
+        Scenes with user-defined terms cannot move, because the terms may be defined on the present mesh.  A scene
+        cannot move either if a function of position, such as a random field, does not return the same values when
+        called again.
         """
         if self.extended:
             return None
@@ -246,7 +247,7 @@ class Scene:
         return stage(self.bodies, self.materials, self.momentum, fed, conditions, present, later)
 
     def check(self, state: State) -> None:
-        """Raise ValueError for an object that is not a state of this scene, with the materials of this scene."""
+        """Raise ValueError if an object is not a state of this scene with the materials of this scene."""
         if not isinstance(state, State) or state.stage.materials is not self.materials:
             raise ValueError(f"state = {line(state)}, must be a state of this simulation")
 

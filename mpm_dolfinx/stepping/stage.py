@@ -169,7 +169,7 @@ class Stage:
 
     @property
     def held(self) -> list[tuple[Any, Surface, Sequence[int]]]:
-        """Conditions that support faces, each with its faces and axes."""
+        """Conditions that support faces, each with faces and axes."""
         return [one for acting in self.acting for one in acting.held]
 
     def placed(self, place: Place) -> list[Loads]:

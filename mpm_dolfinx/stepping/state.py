@@ -196,7 +196,7 @@ class State:
 
     @property
     def as_cut(self) -> MaterialPoints:
-        """Points at the positions of their cut. If points do not keep their pieces, these are the present positions."""
+        """Points at the positions of their cut. Points that do not keep their pieces are at their present positions."""
         if self.stay is None:
             return self.points
         return self.stay.points if self.stay.keeps is None else self.stay.points.where(self.stay.keeps, self.points)
