@@ -81,11 +81,9 @@ def initial_velocity(grid: Grid, quadrature: str, inertia: bool | Moving | None)
     """
     if inertia is None:
         return None
-    velocity = np.zeros(grid.dim)
-    if isinstance(inertia, Moving):
-        velocity = inertia.velocity
-    else:
-        flag("inertia", inertia)
+    moves = isinstance(inertia, Moving)
+    flag("inertia", moves or inertia)
+    velocity = inertia.velocity if moves else np.zeros(grid.dim)
     if quadrature != "domain":
         raise ValueError(f"inertia = {line(inertia)} with quadrature {quadrature!r}, must be None")
     if callable(velocity):

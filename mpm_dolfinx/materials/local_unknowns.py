@@ -102,19 +102,19 @@ class LocalUnknowns:
         self.values = given | _named(shapes, y)
         self.known = self.values if self._of_energy else given | _named(shapes, at["unknowns"])
 
-    def solve(self, data: PointData, derive: bool = True) -> Given:
+    def solve(self, data: PointData, derive: bool = True, motion: tuple = ()) -> Given:
         """Return values that forms of the points are given: unknowns at their present F; all processes must call it.
 
         derive: whether to differentiate by the trial values too.  `values` needs these derivatives; `known` does not.
+        motion: everything except time by which trial values change for the same `data`, a key for `Latest`.
 
         Raises
         ------
         NotConverged
             The equations of a point have no solution.  The message states the first point without a solution.
         """
-        trial = self._trial.evaluate(data)
-        key = data.key, trial, float(self._dt.value)
-        solved = self._solved(key, lambda: self._equations.solve(data, trial), self._comm)
+        key = data.key, motion, float(self._dt.value)
+        solved = self._solved(key, lambda: self._equations.solve(data, self._trial.evaluate(data)), self._comm)
         out = {"local unknowns": solved.unknowns, "local trial": solved.trial}
         if derive or self._of_energy:
             derived = self._derived(solved.derive, solved.derive, self._comm)

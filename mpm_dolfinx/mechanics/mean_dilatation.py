@@ -50,7 +50,7 @@ class SumsOfPart(NamedTuple):
     """Sums for theta and pi, in each cell, over one part of the scene's integration points: see `MeanDilatation`."""
 
     ratio: CellSums
-    stress: PointExpression  # components of the stress P, and its derivative with respect to theta
+    stress: PointExpression  # components of P for the residual, and the derivative with respect to theta for pi
 
 
 class FBar:
@@ -113,7 +113,6 @@ class FBar:
         """
         J_n, J = ufl.det(points.F), ufl.det(F)
         P, slope = self.stresses(law, F, Fbar, known)
-        # evaluated once for both residual and pi
         stress = PointExpression(ufl.as_vector([*(P[i] for i in np.ndindex(P.ufl_shape)), slope / J_n]), points)
         sums, own = SumsOfPart(CellSums([ratio], points), stress), points.follow(STRESS, P.ufl_shape)
         P_F, P_theta, slope_F, slope_theta = self._slopes(law, F, Fbar, values)
@@ -173,11 +172,10 @@ class MeanDilatation:
     fbar: the fields theta and pi.
     parts: sums over each part in which cells would lock, by index of the part, see `QuadratureData`.
     dt: time since the start of the step, s.
-    suction: pressures on which stresses depend, or None.
     """
 
-    def __init__(self, fbar: FBar, parts: Mapping[int, SumsOfPart], dt: fem.Constant, suction: fem.Function | None):
-        self._dt, self._suction = dt, suction
+    def __init__(self, fbar: FBar, parts: Mapping[int, SumsOfPart], dt: fem.Constant):
+        self._dt = dt
         self._grid, self._symmetric = fbar.grid, fbar.symmetric
         self.theta, self.pi = fbar.theta, fbar.pi
         self.numbers = list(parts)
@@ -196,8 +194,8 @@ class MeanDilatation:
     def at(self, data: QuadratureData, motion: tuple, solve: Callable[[], Sequence[Given]]) -> list[Given]:
         """Set theta and pi, and return the values that the forms of each part are given; all processes must call it.
 
-        motion: everything by which deformations change at the integration points `data`, a key for `Latest`; solve:
-        function that returns these values without stresses, see `LocalUnknowns`.
+        motion: everything except time by which stresses change at the integration points `data`, a key for `Latest`.
+        solve: function that returns these values without stresses, see `LocalUnknowns`.
         """
 
         def given_stresses() -> list[Given]:
@@ -210,9 +208,7 @@ class MeanDilatation:
             return given
 
         self._set_ratios(data, motion)
-        suction = None if self._suction is None else self._suction.x.array.copy()
-        key = self._key(data), motion, float(self._dt.value), suction
-        return self._stresses(key, given_stresses, self._grid.comm)
+        return self._stresses((self._key(data), motion, float(self._dt.value)), given_stresses, self._grid.comm)
 
     def _set_ratios(self, data: QuadratureData, motion: tuple) -> None:
         """Set theta; motion: see `at`."""

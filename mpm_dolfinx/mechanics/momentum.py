@@ -111,7 +111,8 @@ class MomentumForms:
         self.law_forms = [self._forms_of_law(*law, pressure, dried, symmetric, dt) for law in laws]
         """Forms of each part of the points."""
         locked = {number: part.means for number, part in enumerate(self.law_forms) if part.means is not None}
-        self.dilatation = MeanDilatation(self._fbar, locked, dt, pressure if dried else None) if locked else None
+        self.dilatation = MeanDilatation(self._fbar, locked, dt) if locked else None
+        self._suction = pressure if dried else None
         sums = [part.dried for part in self.law_forms]
         self._of_suction = OfSuction(grid.dim, self.dilatation, sums) if dried else None
         self.velocity = Velocity(self.u)
@@ -235,8 +236,9 @@ class MomentumForms:
 
     @property
     def _motion(self) -> tuple:
-        """Everything by which deformations change for the same integration points, a key for `Latest`."""
-        return self.u.x.array[self.active.now.dofs], self.inertia and float(self.inertia.midpoint.value)
+        """Everything except time by which stresses change for the same integration points, a key for `Latest`."""
+        p = None if self._suction is None else self._suction.x.array.copy()
+        return self.u.x.array[self.active.now.dofs], self.inertia and float(self.inertia.midpoint.value), p
 
     @cached_property
     def _nothing(self) -> list[Given]:
@@ -247,13 +249,15 @@ class MomentumForms:
     def _given(self, data: QuadratureData, derive: bool = False) -> Sequence[Given]:
         """Return the values at u that the forms of each part are given, and set theta and pi; see `LocalUnknowns`."""
 
+        motion = self._motion
+
         def solve(derive: bool = False) -> list[Given]:
             parts = zip(self.law_forms, data.parts, strict=True)
-            return [NONE if forms.local is None else forms.local.solve(part, derive) for forms, part in parts]
+            return [NONE if forms.local is None else forms.local.solve(part, derive, motion) for forms, part in parts]
 
         if self.dilatation is None:
             return solve(derive)
-        given = self.dilatation.at(data, self._motion, solve)
+        given = self.dilatation.at(data, motion, solve)
         return [{**a, **b} for a, b in zip(given, solve(derive), strict=True)] if derive else given
 
     def at_nodes(self, cells: NDArray[np.int32], values: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
