@@ -212,12 +212,11 @@ class Scene:
             self.materials.retentions.weight.value = 0.0 if gravity is None else self.fluid.density * gravity
 
     def distributed(self, boxes: NDArray[np.int64]) -> Scene | None:
-        """Return an equal scene on a grid distributed by boxes (ranks, 2, d), see `Partition`, or None if a scene
-        cannot move.
+        """Return an equal scene on a grid distributed by boxes (ranks, 2, d), see `Partition`, or None.
 
-        Scenes with user-defined terms cannot move, because the terms may be defined on the present mesh.  A scene
-        cannot move either if a function of position, such as a random field, does not return the same values when
-        called again.
+        Scenes with user-defined terms give None, because the terms may be defined on the present mesh.  Scenes with a
+        function of position that does not return the same values when called again, such as a random field, give None
+        too.
         """
         if self.extended:
             return None
