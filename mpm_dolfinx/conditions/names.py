@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Names of conditions.  Results of a condition are found by its name."""
+"""Names of conditions, by which the results of the conditions are found."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ T = TypeVar("T")
 
 
 class ByName(dict[str, T]):
-    """Values of conditions.  Keys are the names of the conditions, in the order of the conditions."""
+    """Values of conditions by name, in the order of the conditions."""
 
     @property
     def array(self) -> NDArray[np.float64]:

@@ -1,16 +1,17 @@
 # SPDX-License-Identifier: MIT
 """Local unknowns of laws, determined by equations at each point.
 
-A law has unknowns y, trial values z(F) and residuals f(y, z).  Newton's method solves f = 0 at all points together, up
-to round-off.  The forms contain
+Some stresses have no closed formula.  A law then has unknowns y, trial values z(F) and residuals f(y, z) at each point.
+Newton's method solves f = 0 at all points together, up to round-off.  With the solution (y*, z*), the forms contain
 
-    y = y* + Y (z(F) - z*),     Y = -(df/dy)^-1 df/dz  at the solution (y*, z*),
+    y = y* + Y (z(F) - z*),     Y = -(df/dy)^-1 df/dz  at (y*, z*).
 
-At the solution, this y has the right value and the right derivative with respect to F.  UFL's derivative of a stress
-with respect to F includes the dependence through y.  It is therefore the consistent tangent, although the forms contain
-no iterations.  y*, z* and Y are coefficients at the points.  If the stress is not differentiated, y* is used in place
-of y.  If the law has an energy, the tangent is the second derivative of the energy.  The expression for y then has a
-second-order term, whose coefficients also follow from f = 0.  A law in numpy returns y(z) and dy/dz.
+At the solution, this y has the right value and the right derivative with respect to F.  UFL's derivative of a stress is
+therefore the consistent tangent, although the forms contain no iterations.  y*, z* and Y are coefficients at the
+points.  Expressions that are not differentiated use y* in place of y.
+
+If the law has an energy, the tangent is the second derivative of the energy, and the expression for y has a
+second-order term.  A law in numpy returns y(z) and dy/dz.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ from mpm_dolfinx.materials.skeleton import BY_SCENE, Skeleton
 from mpm_dolfinx.materials.user_functions import call, named
 from mpm_dolfinx.parallel.exchange import first, together
 
-MOST, HALVINGS = 60, 25  # largest numbers of Newton iterations, and of step halvings in all iterations together
+MOST, HALVINGS = 60, 25  # largest numbers of Newton iterations, and of halvings of steps in all iterations together
 
 
 class Solved(NamedTuple):
@@ -54,16 +55,9 @@ class Derived(NamedTuple):
 class LocalUnknowns:
     """The local unknowns of a law at some points, as coefficients of forms.
 
-    Parameters
-    ----------
-    law
-        Class of the law.
-    points
-        The points, with the law's parameters and state.
-    F
-        Deformation gradient (d, d) of the law, as UFL.
-    values
-        UFL values of the law's parameters and state, and of the scene's constants `BY_SCENE`.
+    law: class of the law.
+    points: the points, with the law's parameters and state.
+    F: deformation gradient (d, d) of the law, as UFL.
 
     Attributes
     ----------
@@ -71,7 +65,7 @@ class LocalUnknowns:
         The unknowns by name, as UFL that depends on F, and `trial`.
     known
         Like `values`, but independent of F, for expressions that are not differentiated with respect to F.  The kernels
-        of such expressions need not compute trial values.  For laws with an energy, `known` equals `values`.
+        of such expressions need no trial values.  For laws with an energy, `known` equals `values`.
     """
 
     def __init__(self, law: type[Skeleton], points: FormPoints, F, values: Mapping[str, object]):
@@ -103,15 +97,12 @@ class LocalUnknowns:
         self.known = self.values if self._of_energy else given | _named(shapes, at["unknowns"])
 
     def solve(self, data: PointData, derive: bool = True, motion: tuple = ()) -> Given:
-        """Return values that forms of the points are given: unknowns at their present F; all processes must call it.
+        """Solve for the local unknowns at the present F, and return values for the forms.  All processes must call it.
 
-        derive: whether to differentiate by the trial values too.  `values` needs these derivatives; `known` does not.
-        motion: everything except time by which trial values change for the same `data`, a key for `Latest`.
+        derive: whether to differentiate with respect to the trial values, which `values` needs.
+        motion: key for `Latest`, which changes whenever trial values of the same `data` change, except with time.
 
-        Raises
-        ------
-        NotConverged
-            The equations of a point have no solution.  The message states the first point without a solution.
+        derive: whether to differentiate with respect to the trial values, which `values` needs.
         """
         key = data.key, motion, float(self._dt.value)
         solved = self._solved(key, lambda: self._equations.solve(data, self._trial.evaluate(data)), self._comm)
@@ -123,7 +114,7 @@ class LocalUnknowns:
 
 
 class _Equations:
-    """The equations f(y, z) = 0 of a law, as functions of data at the points."""
+    """The equations f(y, z) = 0 of a law at points."""
 
     def __init__(
         self,
@@ -165,11 +156,11 @@ class _Equations:
             self._bends = PointExpression(ufl.as_vector([_along(by_y, by_z, Y, m, (i, j), l) for i, j, l in each]), own)
 
     def _with_trial(self, values: dict) -> dict:
-        """Return the trial values by the argument names of the law's equations."""
+        """Return the trial values by the names of the arguments of the law's equations."""
         return {"trial": values} if self._law.trial is not None else values
 
     def solve(self, data: PointData, trial: NDArray[np.float64]) -> Solved:
-        """Return the solution at points with trial values (n, k); all processes must call it."""
+        """Return the solution at points with trial values (n, k).  All processes must call this method."""
         if self._law.residual is None:
             return self._in_numpy(data, trial)
         m, n = self.count, len(trial)
@@ -201,7 +192,7 @@ class _Equations:
         return Solved(y, trial, derive)
 
     def _refuse(self, data: PointData, failed: NDArray[np.int64], why: str) -> None:
-        """Raise NotConverged on all processes if any point has failed.  The message states the first failed point."""
+        """Raise NotConverged on all processes if any point has failed."""
         messages = [f"{self._law.__name__}{why} at {data.x[i] + data.points.grid.base}" for i in failed[:1]]
         if message := first(self._grid.comm, "".join(messages)):
             raise NotConverged(message)
@@ -235,14 +226,7 @@ class _Equations:
         return f"{self._law.__name__}.solution"
 
     def _checked(self, found, n: int) -> dict:
-        """Return the checked result of `solution` at n points: unknowns and their derivatives as real arrays.
-
-        Raises
-        ------
-        ValueError
-            The result is not a dict of pairs with the unknowns' names and shapes, or a derivative is with respect to a
-            name that is not in `trial`.
-        """
+        """Return the unknowns and their derivatives in the result of `solution`, or raise ValueError."""
         instance(f"{self._title}: its result", found, dict)
         for of, pair in found.items():
             if not (isinstance(pair, (tuple, list)) and len(pair) == 2 and isinstance(pair[1], dict)):
@@ -263,15 +247,15 @@ class _Equations:
         return out
 
     def _slope(self, of: str, by: str, given, n: int) -> NDArray[np.float64]:
-        """Return the derivative (n, ..., ...) of an unknown by a trial value; given: array or callable."""
+        """Return the derivative (n, ..., ...) of an unknown with respect to a trial value."""
         what = f"{self._title}: derivative of {of} with respect to {by}"
         value = asked(what, "a function without arguments that gives it", given) if callable(given) else given
         return _real(what, value, (n, *self._unknowns[of], *self._trial[by]))
 
     def _slopes_of(self, of: str, given: Mapping[str, object], n: int) -> NDArray[np.float64]:
-        """Return the derivatives (n, m, k) of one unknown with m components with respect to all k trial components.
+        """Return the derivatives (n, m, k) of one unknown with respect to all trial values.
 
-        given: derivatives by name of the trial value; missing derivatives are zero.
+        given: derivatives by name of the trial value.  Missing derivatives are zero.
         """
         m, parts = _size(self._unknowns[of]), []
         for by, shape in self._trial.items():
@@ -281,12 +265,12 @@ class _Equations:
 
 
 def _along(by_y, by_z, Y, m: int, i: tuple[int, ...], j: int):
-    """Return the derivative of component i with respect to component j of z, along y = y* + Y (z - z*), as UFL."""
+    """Return the derivative of component i with respect to component j of z as UFL."""
     return by_z[(*i, j)] + sum(by_y[(*i, a)] * Y[a, j] for a in range(m))
 
 
 def _real(name: str, value, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    """Return a value as an array of real numbers; raise ValueError for a wrong shape or type."""
+    """Return a value as an array of real numbers with this shape."""
     try:
         value = np.asarray(value)
     except ValueError as error:  # rows of different lengths
@@ -299,9 +283,9 @@ def _real(name: str, value, shape: tuple[int, ...]) -> NDArray[np.float64]:
 
 
 def _newton(system, y: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Solve f(y) = 0 at all points, in place, by Newton's method with a line search; return indices of failed points.
+    """Solve f(y) = 0 in place, and return the indices of points without a solution.
 
-    system: function of r point indices and of the y (r, m) of these points.  It stores y, and returns f, df/dy and
+    system: function of r point indices and of the y (r, m) of these points.  It stores y, and returns f, df/dy and the
     norms of f.
     """
     rows, failed = np.arange(len(y)), np.zeros(len(y), dtype=bool)
@@ -313,7 +297,7 @@ def _newton(system, y: NDArray[np.float64]) -> NDArray[np.int64]:
         step[solved & failed[rows]] = 0.0  # a solution, which may not be unique
         failed[rows] &= ~solved
         close = (np.abs(step) <= SAME * np.maximum(1.0, np.abs(old))).all(axis=1) | solved
-        y[rows] = old - step  # for close points this is the solution
+        y[rows] = old - step  # the solution at points that are close
         on = ~(close | failed[rows])
         rows, step, old, norm = (values[on] for values in (rows, step, old, norm))
         length = np.ones(int(on.sum()))
@@ -333,7 +317,7 @@ def _newton(system, y: NDArray[np.float64]) -> NDArray[np.int64]:
 
 
 def _solve(A: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return A^-1 b (n, m, k) for matrices A (n, m, m); the result is not finite for a singular matrix."""
+    """Return A^-1 b for matrices A, not finite if A is singular."""
     with np.errstate(all="ignore"):
         if A.shape[1] == 1:
             return b / A
@@ -358,7 +342,7 @@ def _size(shape: tuple[int, ...]) -> int:
 
 
 def _named(shapes: Mapping[str, tuple[int, ...]], vector) -> dict:
-    """Return tensors of the given shapes, by name.  The components of a tensor are consecutive in a UFL vector."""
+    """Return tensors by name from the components of a UFL vector."""
     out, start = {}, 0
     for name, shape in shapes.items():
         index = np.arange(start, start + _size(shape)).reshape(shape)

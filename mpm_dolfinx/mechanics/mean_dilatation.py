@@ -1,23 +1,23 @@
 # SPDX-License-Identifier: MIT
 """F-bar: one volume ratio per cell, against volumetric locking of nearly incompressible skeletons.
 
-Four volume constraints per cell suppress the bending modes of a Q1 quadrilateral, with errors of up to 50 % at nu =
-0.499. F-bar scales the law's deformation gradient so that its volume ratio in the step is theta, a mean over the cell,
+Without F-bar, four volume constraints per cell suppress the bending modes of a Q1 quadrilateral, with errors of up to
+50 % at nu = 0.499.  F-bar scales the deformation gradient F that the law receives.  The scaled gradient Fbar has the
+volume ratio theta in the step, which is a mean over the cell:
 
     Fbar = (theta J_n / det F)^(1/3) F,     theta = sum w det(Delta) / sum w   over the locking pieces of the cell.
 
-Here w is the volume of a piece.  Delta = I + grad u is the deformation gradient of the step, with F = Delta F_n and
-J_n = det F_n.  The scaling acts along all three axes: in plane strain the points store an out-of-plane stretch, as in a
-slice of the body.  The material decides whether cells would lock (`Skeleton.nearly_incompressible`). In a cell of
-several materials, only the materials that would lock use Fbar. With the law's energy psi and Psi = psi(Fbar) / J_n, the
-energy sum w Psi has the derivative
+Here w is the volume of a piece, Delta = I + grad u is the deformation gradient of the step, F = Delta F_n, and
+J_n = det F_n.  The scaling acts along all three axes, so that points in plane strain store an out-of-plane stretch.  In
+a cell of several materials, only the nearly incompressible materials use Fbar (`Skeleton.nearly_incompressible`).  With
+the law's energy psi and Psi = psi(Fbar) / J_n, the energy sum w Psi has the derivative
 
     sum w [dPsi/dF : dF + pi d(det Delta)],   pi = (sum w dPsi/dtheta) / (sum w).
 
 The residual has the additional term with pi.  The tangent of the residual at fixed theta and pi is symmetric.  The
-derivatives with respect to theta and pi add a matrix of rank two in each cell (Simo, Taylor and Pister 1985). Coombs et
-al. (2018) used incremental F-bar in the material point method. For a law without an energy, P(Fbar) : dFbar replaces
-dPsi. The points store Fbar.  The next step starts from a J_n computed from the particle domains in the cell
+derivatives with respect to theta and pi add a matrix of rank two in each cell (Simo, Taylor and Pister 1985).  Coombs
+et al. (2018) used incremental F-bar in the material point method.  For a law without an energy, P(Fbar) : dFbar
+replaces dPsi.  The points store Fbar.  The next step starts from the volume ratios of the particle domains
 (`cell_ratios`).
 """
 
@@ -47,16 +47,16 @@ STRESS = "stress of the law"
 
 
 class SumsOfPart(NamedTuple):
-    """Sums for theta and pi, in each cell, over one part of the scene's integration points: see `MeanDilatation`."""
+    """Sums over one part of the integration points in each cell, for theta and pi, see `MeanDilatation`."""
 
     ratio: CellSums
     stress: PointExpression  # components of P for the residual, and the derivative with respect to theta for pi
 
 
 class FBar:
-    """F-bar modification of laws, with the step's volume ratio theta and the conjugate mean stress pi of each cell.
+    """F-bar modification of laws, with theta and pi of each cell as fields.
 
-    grid: background grid; symmetric: whether the tangents of all laws are symmetric.
+    symmetric: whether the tangents of all laws are symmetric.
     """
 
     def __init__(self, grid: Grid, symmetric: bool):
@@ -66,7 +66,7 @@ class FBar:
         self._theta = ufl.variable(self.theta)
 
     def of(self, points: FormPoints, F):
-        """Return Fbar (3, 3) as a UFL variable; (2, 2) for laws that accept only F (2, 2)."""
+        """Return Fbar (3, 3) as a UFL variable, or (2, 2) for laws that accept only F (2, 2)."""
         ratio = self._theta * ufl.det(points.F) / ufl.det(F)
         if self.grid.stretches == 2 and ACROSS not in points.functions:
             return ufl.variable(ufl.sqrt(ratio) * F)
@@ -86,30 +86,21 @@ class FBar:
         values: Mapping[str, object],
         known: Mapping[str, object],
     ) -> tuple:
-        """Return the stress and the cell sums of points with one law, whose Q1 cells would lock without F-bar.
+        """Return the stress and the cell sums of points with a law that uses F-bar.
 
-        Parameters
-        ----------
-        law
-            Class of the part's law.
-        points
-            Integration points of the part, with the field F (d, d): deformation gradient at the start of the step.
-        F
-            Deformation gradient (d, d), a UFL variable.
-        Fbar
-            F-bar modification of F, see `of`.
-        ratio
-            det Delta, with Delta F_n = F.
-        values
-            UFL values of the law's parameters, state and local unknowns.
-        known
-            The same values for expressions that are not differentiated, see `LocalUnknowns`.
+        points: integration points with the law, with the field F at the start of the step.
+        F: deformation gradient (d, d), a UFL variable.
+        Fbar: result of `of`.
+        ratio: det Delta, with Delta F_n = F.
+        values: UFL values of the law's parameters, state and local unknowns.
+        known: the same values for expressions that are not differentiated, see `LocalUnknowns`.
 
         Returns
         -------
-        The first Piola-Kirchhoff stress, Pa, as UFL of F, theta and pi, for the residual.  The derivative (d, d, d, d),
-        Pa, of this stress with respect to F, for the tangent.  Further UFL integrands of the tangent (`Beside`), for
-        sums over each cell.  Kernels that sum theta and pi over each cell, for `MeanDilatation`.
+        The first Piola-Kirchhoff stress, in Pa, as UFL of F, theta and pi, for the residual.
+        The derivative (d, d, d, d) of this stress with respect to F, in Pa, for the tangent.
+        Further integrals over each cell for the tangent (`Beside`).
+        Kernels that sum theta and pi over each cell, for `MeanDilatation`.
         """
         J_n, J = ufl.det(points.F), ufl.det(F)
         P, slope = self.stresses(law, F, Fbar, known)
@@ -122,7 +113,7 @@ class FBar:
         return (block(own) if self.grid.axisymmetric else own) + shared, P_F + ufl.diff(shared, F), beside, sums
 
     def stresses(self, law: type[Skeleton], F, Fbar, values: Mapping[str, object]) -> tuple:
-        """Return the derivatives of psi(Fbar), or of the work of a law without energy, with respect to F and theta."""
+        """Return the derivatives of psi(Fbar) with respect to F and theta."""
         if law.kirchhoff is None:
             energy = expression(law.energy, [()], F=Fbar, **values)
             return ufl.diff(energy, F), ufl.diff(energy, self._theta)
@@ -154,7 +145,7 @@ class FBar:
         s = sum(Fbar[a, b] * G[a, b] for a in d for b in d) / len(d)
 
         def by_F(part, by_theta):
-            """Return dtau/dF for one component of tau; part(a, b): dtau/dFbar; by_theta: dtau/dtheta."""
+            """Return dtau/dF for one component of tau, from dtau/dFbar and dtau/dtheta."""
             return ufl.as_matrix([[s * part(a, b) - theta * by_theta * G[a, b] for b in d] for a in d])
 
         mean_theta = ufl.tr(tau_theta) / n
@@ -167,9 +158,8 @@ class FBar:
 
 
 class MeanDilatation:
-    """The volume ratio theta of the step in each cell, and its work-conjugate mean stress pi, for F-bar.
+    """The volume ratio theta and the mean stress pi of each cell, for F-bar.
 
-    fbar: the fields theta and pi.
     parts: sums over each part in which cells would lock, by index of the part, see `QuadratureData`.
     dt: time since the start of the step, s.
     """
@@ -188,13 +178,13 @@ class MeanDilatation:
     def total(
         self, data: QuadratureData, sums: Sequence[NDArray[np.float64]]
     ) -> tuple[NDArray[np.int32], NDArray[np.float64], NDArray[np.float64]]:
-        """Return the cells with F-bar, totals (cells, k) of `sums` over all parts, and the result of `_volume_of`."""
+        """Return the cells with F-bar, the totals of `sums` over all parts, and the result of `_volume_of`."""
         return self._cells(data).filled, self._cells(data).total(sums), self._volume_of(data)
 
     def at(self, data: QuadratureData, motion: tuple, solve: Callable[[], Sequence[Given]]) -> list[Given]:
-        """Set theta and pi, and return the values that the forms of each part are given; all processes must call it.
+        """Set theta and pi, and return values for the forms of each part.  All processes must call this method.
 
-        motion: everything except time by which stresses change at the integration points `data`, a key for `Latest`.
+        motion: key for `Latest`, which changes whenever stresses at the points `data` change, except with time.
         solve: function that returns these values without stresses, see `LocalUnknowns`.
         """
 
@@ -211,7 +201,7 @@ class MeanDilatation:
         return self._stresses((self._key(data), motion, float(self._dt.value)), given_stresses, self._grid.comm)
 
     def _set_ratios(self, data: QuadratureData, motion: tuple) -> None:
-        """Set theta; motion: see `at`."""
+        """Set theta, with the key `motion` of the method `at`."""
 
         def ratios() -> None:
             sums = [of.ratio(part) for of, part in zip(self._sums, self._parts(data), strict=True)]
@@ -220,14 +210,14 @@ class MeanDilatation:
         self._ratios((self._key(data), motion), ratios)
 
     def _set_mean(self, f: fem.Function, sums: Sequence[NDArray[np.float64]], data: QuadratureData) -> None:
-        """Set f in each cell to the volume mean of a quantity over the pieces with F-bar.
+        """Set f in each cell to a mean over the pieces with F-bar.
 
-        sums: for each part of the scene's points, the sums (cells, 1) of quantity times volume in its cells.
+        sums: for each part of the points, the sums (cells, 1) of the quantity times the volume.
         """
         f.x.array[self._cells(data).filled] = self._cells(data).total(sums)[:, 0] / self._volume_of(data)[:, 0]
 
     def assemble_matrix(self, A: PETSc.Mat, data: QuadratureData, sums: Sequence[NDArray[np.float64]]) -> None:
-        """Add the contribution of theta and pi to the tangent; the caller finalises the matrix.
+        """Add the contribution of theta and pi to the tangent, without final assembly.
 
         sums: for each part, the integrals (cells, quantities) of `Beside` from `FBar.forms` over each cell.
         """
@@ -245,7 +235,7 @@ class MeanDilatation:
         insert(A, self._grid, self._cells(data).filled, matrices)
 
     def average(self, delta: NDArray[np.float64], data: QuadratureData, motion: tuple) -> None:
-        """Scale the gradients Delta (n, d, d) of pieces with F-bar to their cells' volume ratios; motion: see `at`."""
+        """Scale the gradients Delta of pieces with F-bar to the volume ratios of their cells."""
         self._set_ratios(data, motion)
         for number in self.numbers:
             rows = data.rows[number]
@@ -264,7 +254,7 @@ class MeanDilatation:
         return tuple(part.key for part in self._parts(data))
 
     def _volume_of(self, data: QuadratureData) -> NDArray[np.float64]:
-        """Return for each filled cell the total volume (cells, 1), m^d, of its pieces that use F-bar."""
+        """Return the total volume, in m^d, of the pieces with F-bar in each filled cell."""
         key = self._key(data)
 
         def volumes() -> NDArray[np.float64]:
@@ -275,20 +265,20 @@ class MeanDilatation:
 
 
 def _dev(tau, F):
-    """Return the components (d, d) of the deviator of a UFL tensor, in the axes of F (d, d)."""
+    """Return the components (d, d) of the deviator of a UFL tensor."""
     d, mean = range(F.ufl_shape[0]), ufl.tr(tau) / tau.ufl_shape[0]
     return ufl.as_matrix([[tau[a, b] - mean if a == b else tau[a, b] for b in d] for a in d])
 
 
 class Cells:
-    """Cells with pieces of any part.  filled: these cells; where: indices of each part's cells in `filled`."""
+    """The cells with pieces that use F-bar, with indices of the cells of each part."""
 
     def __init__(self, of_parts: Sequence[NDArray[np.int32]]):
         self.filled = np.unique(np.concatenate(of_parts))
         self.where = [np.searchsorted(self.filled, cells) for cells in of_parts]
 
     def total(self, values: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
-        """Return the sums (cells, quantities) over the parts in the cells `filled`; values: one array for each part."""
+        """Return the sums (cells, quantities) over all parts."""
         if len(values) == 1:
             return values[0]
         out = np.zeros((len(self.filled), values[0].shape[1]))
