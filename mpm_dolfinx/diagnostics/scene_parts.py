@@ -20,7 +20,7 @@ from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
 def checked_parts(
     grid: Grid, bodies: Sequence[Body | Later], materials: Sequence[Skeleton]
 ) -> tuple[list[Body], list[int]]:
-    """Return the bodies, and the indices of bodies that are absent at first; ValueError for invalid parts."""
+    """Return the bodies, and the indices of bodies that are absent at first. Raise ValueError for invalid parts."""
     begin_with("grid", grid)
     all_of("bodies", bodies, (Body, Later), 1)
     all_of("materials", materials, Skeleton, 1)
@@ -53,7 +53,7 @@ def check_options(
 
 
 def check_axisymmetry(grid: Grid, bodies: Sequence[Body], quadrature: str) -> None:
-    """Raise an error for point quadrature on grids that do not support it.  Warn about narrow holes around the axis."""
+    """Raise an error for point quadrature on grids that do not support it. Warn about narrow holes around the axis."""
     if quadrature == "point" and (grid.axisymmetric or grid.follow is not None):  # fine cells would become empty
         raise ValueError("quadrature = 'point', must be 'domain' in axisymmetry, and on grid lines that follow")
     if not grid.has_axis:
@@ -75,7 +75,10 @@ def check_axisymmetry(grid: Grid, bodies: Sequence[Body], quadrature: str) -> No
 
 
 def initial_velocity(grid: Grid, quadrature: str, inertia: bool | Moving | None) -> ArrayLike | Callable | None:
-    """Return the initial velocity, None without inertia in all stages; ValueError if the scene does not allow it."""
+    """Return the initial velocity, or None without inertia in all stages.
+
+    Raise ValueError if the scene does not allow inertia or this velocity.
+    """
     if inertia is None:
         return None
     moves = isinstance(inertia, Moving)
@@ -91,7 +94,7 @@ def initial_velocity(grid: Grid, quadrature: str, inertia: bool | Moving | None)
 
 
 def _functions_of(terms):
-    """Return the functions of terms in bodies and on sides.  An invalid list is returned unchanged."""
+    """Return the functions of terms in bodies and on sides."""
     if isinstance(terms, str) or not isinstance(terms, Sequence):
         return terms
     return [term.term if isinstance(term, OnSide) else term for term in terms]

@@ -84,7 +84,7 @@ def renew(A: PETSc.Mat) -> None:
 def solved(ksp: PETSc.KSP, name: str) -> int:
     """Return the number of iterations of a solver's last solve. Raise NotConverged if this solve failed.
 
-    The line search judges results after the largest number of iterations, or with an indefinite tangent.
+    With an indefinite tangent, or after the largest number of iterations, the line search judges the result.
     """
     count, reason = ksp.getIterationNumber(), ksp.getConvergedReason()
     if reason < 0 and reason not in TOLERABLE:
@@ -93,7 +93,7 @@ def solved(ksp: PETSc.KSP, name: str) -> int:
 
 
 def negative_pivots(solver: PETSc.KSP) -> int:
-    """Return the number of negative eigenvalues of a matrix, from the L D L^T factors of its direct solver."""
+    """Return the number of negative eigenvalues of a matrix from the L D L^T factors of a direct solver."""
     factors = solver.pc.getFactorMatrix()
     return factors.getMumpsInfog(12) if factors.comm.size > 1 else factors.getInertia()[0]
 
@@ -109,7 +109,7 @@ def displacement_solver(A: PETSc.Mat, name: str, unknowns: Unknowns, how: str, s
 
 
 def _set_gathered(ksp: PETSc.KSP, A: PETSc.Mat, factors: NodalFactors | SingleFactors, rank: int) -> None:
-    """Make a solver use factors on the process `rank`."""
+    """Make a solver use factors on one process."""
     ksp.pc.setType(PETSc.PC.Type.PYTHON)
     ksp.pc.setPythonContext(Gathered(A.createVecRight(), factors, rank))
 
@@ -126,17 +126,12 @@ def factorise(*preconditioners: PETSc.PC) -> None:
 class Gathered:
     """Preconditioner for PETSc: factors of a matrix on one process.
 
-    Parameters
-    ----------
-    x
-        Vector with an entry for each column of the matrix.
-    factors
-        Factors of the whole matrix.
-    rank
-        Process that holds the factors.
+    `x`: vector with an entry for each column of the matrix.
+    `factors`: factors of the whole matrix.
+    `rank`: process that holds the factors.
 
-    `setUp` gathers a matrix. The factors are computed at the next solve, or by the function `factorise`. This function
-    gathers all matrices first, so that the processes compute their factors at the same time.
+    `setUp` gathers a matrix. The factors are computed at the next solve, or by the function `factorise`, which lets the
+    processes compute their factors at the same time.
     """
 
     def __init__(self, x: PETSc.Vec, factors: NodalFactors | SingleFactors, rank: int):
@@ -179,10 +174,7 @@ class Gathered:
 class SingleFactors:
     """Factors of matrices on one process, computed on demand.
 
-    Parameters
-    ----------
-    name, symmetric
-        See `direct_solver`.
+    `name`, `symmetric`: see `direct_solver`.
     """
 
     def __init__(self, name: str, symmetric: bool):
@@ -264,7 +256,7 @@ def dissection(x: NDArray[np.float64]) -> NDArray[np.int64]:
 
 
 def _lines(x: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return the index (n,) of the grid line of each coordinate (n,). Only lines with nodes are counted."""
+    """Return the index of the grid line of each coordinate, among the lines with nodes."""
     values, at = np.unique(x, return_inverse=True)
     return np.cumsum(np.diff(values, prepend=values[:1]) > SAME * (values[-1:] - values[:1]))[at]
 
@@ -272,18 +264,11 @@ def _lines(x: NDArray[np.float64]) -> NDArray[np.int64]:
 class BlockFactors:
     """Factors of matrices with one sparsity pattern, with a block for each node.
 
-    Parameters
-    ----------
-    rows, columns
-        The sparsity pattern, in compressed rows.
-    block, axis
-        Node and component of each unknown.
-    x : (n, d)
-        Position of each unknown, m.
-    dim
-        Number of components of a node.
-    symmetric
-        Whether the factors are U^T D U instead of L U.
+    `rows`, `columns`: the sparsity pattern, in compressed rows.
+    `block`, `axis`: node and component of each unknown.
+    `x` (n, d): position of each unknown, m.
+    `dim`: number of components of a node.
+    `symmetric`: whether the factors are U^T D U instead of L U.
     """
 
     def __init__(self, rows, columns, block, axis, x, dim: int, symmetric: bool):

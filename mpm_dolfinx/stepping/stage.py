@@ -140,7 +140,7 @@ class Stage:
         return [*self.surfaces, *(one.outside for one in self.acting if one.outside is not None)]
 
     def of(self, *kinds: type) -> dict[str, Any]:
-        """Return the conditions of the given classes, by name."""
+        """Return the conditions of some classes, by name."""
         return {name: one for name, one in self.named.items() if isinstance(one, kinds)}
 
     def followed(self, grid: Grid) -> str | None:
@@ -151,7 +151,10 @@ class Stage:
         return None
 
     def moved(self, grid: Grid, t: float, outcome: Outcome) -> NDArray[np.float64] | None:
-        """Return the displacement (d,), in m, at time t (s) of the tool that grid lines follow, or None without it."""
+        """Return the displacement (d,) of the tool that grid lines follow, in m, or None without such a tool.
+
+        `t`, s: time of the displacement.
+        """
         if (name := self.followed(grid)) is None:
             return None
         tool = self.given[name]
@@ -166,7 +169,7 @@ class Stage:
 
     @property
     def held(self) -> list[tuple[Any, Surface, Sequence[int]]]:
-        """Conditions that support faces, each with its faces and axes."""
+        """Conditions that support faces, each with faces and axes."""
         return [one for acting in self.acting for one in acting.held]
 
     def placed(self, place: Place) -> list[Loads]:
@@ -175,7 +178,7 @@ class Stage:
             return [one.placed(place) for one in self.acting]
 
     def check_start(self, place: Place) -> None:
-        """Raise an error if this is the stage's first step, and the positions of bodies or tools do not allow it."""
+        """Raise an error before the stage's first step if the positions of bodies or tools do not allow it."""
         for one in self.acting if place.begins else ():
             one.check_start(place)
 
@@ -203,7 +206,7 @@ class Stage:
         return QUANTITIES + OF_RAIN + MOTIONS
 
     def unknown(self, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return the results of conditions before the first step, by quantity and name.  All are equal to `value`."""
+        """Return the results of conditions before the first step, by quantity and name, all equal to `value`."""
         d = self.free.shape[1]
         out = {quantity: {} for quantity in QUANTITIES}
         out["wall_reactions"] = {wall: np.full(d, value) for wall in SIDES[d]}
@@ -230,14 +233,14 @@ class Stage:
         }
 
     def kinetic(self, outcome: Outcome) -> float:
-        """Return the kinetic energy (J) of free tools.  `outcome`: results of conditions, with velocities of tools."""
+        """Return the kinetic energy (J) of free tools from the results of conditions."""
         d, tools = self.free.shape[1], self.of(Tool)
         moving = [(tools[name].mass, v) for name, v in outcome.get("tool_velocity", {}).items() if name in tools]
         moving += [(tools[name].inertia(d), v) for name, v in outcome.get("tool_spin", {}).items() if name in tools]
         return sum(m / 2 * float((v**2).sum()) for m, v in moving)
 
     def gravity_at(self, t: float) -> NDArray[np.float64] | None:
-        """Return the acceleration of gravity (d,), in m/s^2, at time t (s), or None without gravity."""
+        """Return the acceleration of gravity (d,) at time t (s), in m/s^2, or None without gravity."""
         gravity = self.conditions["gravity"]
         name = f"gravity at t = {t:g} s"
         d = self.free.shape[1]
@@ -257,18 +260,11 @@ def stage(
 ) -> Stage:
     """Return a stage.
 
-    Parameters
-    ----------
-    bodies, materials
-        All bodies and materials of the scene.
-    momentum, fed
-        Forms, with the loads of all stages, and terms that act in the balance of fluid in all stages.
-    conditions
-        walls, conditions, gravity and inertia: see `Simulation`.
-    present
-        Whether each body is present.
-    later
-        Indices of bodies still to be added.
+    `bodies`, `materials`: all bodies and materials of the scene.
+    `momentum`, `fed`: forms, with the loads of all stages, and terms that act in the balance of fluid in all stages.
+    `conditions`: walls, conditions, gravity and inertia: see `Simulation`.
+    `present`: whether each body is present.
+    `later`: indices of bodies still to be added.
 
     Raises
     ------
@@ -320,10 +316,7 @@ def stage(
 
 
 def _check_inertia(by_name: Mapping[str, Any], inertia: bool) -> None:
-    """Raise ValueError in a stage with inertia for conditions that do not support inertia.
-
-    In a quasi-static stage, raise ValueError for conditions that require inertia.
-    """
+    """Raise ValueError for conditions that a stage with, or without, inertia does not allow."""
     for name, one in by_name.items():
         if isinstance(one, Quiet) and not inertia:
             raise ValueError(f"{name}: bodies have no inertia, must be given with inertia=True")
