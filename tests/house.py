@@ -5,8 +5,8 @@ A number is *structure* where it cannot be another one: see `structure` below. I
 or the string below it, names one of two things:
 
     Source: an equation, a paper (with its year), a definition, a format, or an exact bound, see `SOURCE`;
-    Halving this value changes the result of scene "name" in tests/plateaus.py by a (relative), doubling it by b, and
-    finer cells by c.
+    The result of scene "name" in tests/plateaus.py changes by the fraction a with half this value, by b with twice this
+    value, and by c with finer cells.
 
 One of a and b is not zero, so the number affects the scene; both are below c. `python tests/plateaus.py` measures
 them again. All other numbers are *ad hoc*.
@@ -25,8 +25,8 @@ SOURCE = re.compile(
     re.DOTALL,
 )
 PLATEAU = re.compile(
-    r'\bHalving this value changes the result of scene "(\w+)" in tests/plateaus.py by ([\d.e+-]+) \(relative\), '
-    r"doubling it by ([\d.e+-]+), and finer cells by ([\d.e+-]*[\d])"
+    r'\bThe result of scene "(\w+)" in tests/plateaus.py changes by the fraction ([\d.e+-]+) with half this value, '
+    r"by ([\d.e+-]+) with twice this value, and by ([\d.e+-]*[\d]) with finer cells"
 )
 UNITS = {60, 90, 100, 180, 360, 1000, 1e6, 1024, 86400}
 """Per cent, degrees, and the like."""

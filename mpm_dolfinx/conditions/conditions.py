@@ -396,16 +396,15 @@ HOLD = 3e2
 
 The penalty acts on means over cells.  The displacement error is the change of traction in the step (without its
 rotation), divided by the stiffness.  The error does not accumulate, because each step measures it from the prescribed
-position.  If a body is much stiffer than the penalty, multipliers remove the error, see `HoldLoads.augment`.
-Halving this value changes the result of scene "soil" in tests/plateaus.py by 5.9e-05 (relative), doubling it by
-2.0e-05, and finer cells by 3.0e-02.
+position.  If a body is much stiffer than the penalty, multipliers remove the error, see `HoldLoads.augment`.  The
+result of scene "soil" in tests/plateaus.py changes by the fraction 5.9e-05 with half this value, by 2.0e-05 with twice
+this value, and by 3.0e-02 with finer cells.
 """
 YIELDING = 0.1
 """Factor on the elastic modulus in the penalty of laws with state variables.
 
-Yielding soil is much softer than elastic soil.
-Halving this value changes the result of scene "soil" in tests/plateaus.py by 6.5e-05 (relative), doubling it by
-1.9e-05, and finer cells by 3.0e-02.
+Yielding soil is much softer than elastic soil. The result of scene "soil" in tests/plateaus.py changes by the fraction
+6.5e-05 with half this value, by 1.9e-05 with twice this value, and by 3.0e-02 with finer cells.
 """
 
 

@@ -33,9 +33,8 @@ SOFT = 0.1
 """Weight of the motion d of the corners.
 
 Volume errors may alternate between the domains of a regular lattice.  To first order, no motion of the corners reduces
-such errors, so the weight is needed.
-Halving this value changes the result of scene "flow" in tests/plateaus.py by 2.5e-04 (relative), doubling it by
-1.4e-04, and finer cells by 9.2e-02.
+such errors, so the weight is needed.  The result of scene "flow" in tests/plateaus.py changes by the fraction 2.5e-04
+with half this value, by 1.4e-04 with twice this value, and by 9.2e-02 with finer cells.
 """
 
 

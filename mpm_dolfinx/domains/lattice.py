@@ -43,8 +43,8 @@ FAST = 10
 """Fraction of a wave with a length of two domains that the filter removes for each crossed cell, at most the whole
 wave.
 
-Halving this value changes the result of scene "cycles" in tests/plateaus.py by 1.5e-04 (relative), doubling it by
-3.4e-04, and finer cells by 6.2e-03.
+The result of scene "cycles" in tests/plateaus.py changes by the fraction 1.5e-04 with half this value, by 3.4e-04 with
+twice this value, and by 6.2e-03 with finer cells.
 """
 THIRD = (-1, 3, -3, 1)
 MARGIN = len(THIRD) - 1

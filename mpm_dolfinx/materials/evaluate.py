@@ -212,8 +212,8 @@ def mean_size(grid: Grid) -> float:
 MOST = 100.0
 """Upper limit of the softness, because softness is infinite in perfectly plastic flow.
 
-Halving this value changes the result of scene "soil" in tests/plateaus.py by 4.0e-03 (relative), doubling it by
-5.0e-03, and finer cells by 3.0e-02.
+The result of scene "soil" in tests/plateaus.py changes by the fraction 4.0e-03 with half this value, by 5.0e-03 with
+twice this value, and by 3.0e-02 with finer cells.
 """
 
 

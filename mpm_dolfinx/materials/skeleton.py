@@ -46,8 +46,9 @@ nu = 0.499: -10.3 % without F-bar, -0.02 % with F-bar.
 """
 
 SEPARATION = 1e-4
-"""Relative difference added to equal eigenvalues, for finite derivatives.  Halving this value changes the result of
-scene "beam" in tests/plateaus.py by 1.8e-09 (relative), doubling it by 7.2e-09, and finer cells by 1.5e-02.
+"""Relative difference added to equal eigenvalues, for finite derivatives.  The result of scene "beam" in
+tests/plateaus.py changes by the fraction 1.8e-09 with half this value, by 7.2e-09 with twice this value, and by 1.5e-02
+with finer cells.
 """
 
 

@@ -49,12 +49,13 @@ INNER = 1e-3  # momentum tolerance / storage error; it is small because unconver
 MOMENTUM_STEPS = 10
 REBALANCED = 6  # largest number of iterations if contacts change, divided by the number if they do not
 LOOSEST = 1e-2
-"""Largest ratio of the residual after a linear solve to the residual before this solve. Halving this value changes the
-result of scene "soil" in tests/plateaus.py by 2.2e-11 (relative), doubling it by 6.0e-12, and finer cells by 3.0e-02.
+"""Largest ratio of the residual after a linear solve to the residual before this solve. The result of scene "soil" in
+tests/plateaus.py changes by the fraction 2.2e-11 with half this value, by 6.0e-12 with twice this value, and by 3.0e-02
+with finer cells.
 """
 SOLVED = 0.05
-"""Residual after the last linear solve, divided by the tolerance.  Halving this value changes the result of scene
-"soil" in tests/plateaus.py by 4.0e-12 (relative), doubling it by 3.1e-11, and finer cells by 3.0e-02.
+"""Residual after the last linear solve, divided by the tolerance.  The result of scene "soil" in tests/plateaus.py
+changes by the fraction 4.0e-12 with half this value, by 3.1e-11 with twice this value, and by 3.0e-02 with finer cells.
 """
 SETTLED = 1e-2  # residual below which slip of contacts may end; above it the contact area still changes
 ERROR = 1 / 20

@@ -57,8 +57,8 @@ time step. Twenty undrained cycles of a beam of 5 cells leave spurious stresses 
 orders of pressures in space are therefore below 2, and below 1.75 at rates of 0.2 and above. The order in time is
 unaffected.
 
-Halving this value changes the result of scene "beam" in tests/plateaus.py by 1.7e-03 (relative), doubling it by
-2.8e-03, and finer cells by 1.5e-02.
+The result of scene "beam" in tests/plateaus.py changes by the fraction 1.7e-03 with half this value, by 2.8e-03 with
+twice this value, and by 1.5e-02 with finer cells.
 """
 
 
