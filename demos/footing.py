@@ -494,12 +494,12 @@ def report(runs: dict[str, Push]) -> dict:
             "pressure": float(run.at_end.pressure.max() / COHESION),
             "heave": float(run.at_end.top[:, 1].max() / WIDTH),
             "balance": max(result.balance for result in run.results),
-            **{count: run.total(count) for count in ("steps", "cuts", "newton", "rederived", "wall")},
+            **{count: run.total(count) for count in ("steps", "cuts", "newton", "reinitialised", "wall")},
         }
         print(
             f"{name:>12}, V = {RATES[name]:<5g}: q/c {found['load']:.2f}, p up to {found['pressure']:.2g} c, "
             f"heave {found['heave']:.2f} B, fluid balance {found['balance']:.0e}, {found['steps']} steps, "
-            f"{found['cuts']} cuts, {found['rederived']} inverted domains, {found['wall']:.0f} s"
+            f"{found['cuts']} cuts, {found['reinitialised']} inverted domains, {found['wall']:.0f} s"
         )
     at_rest, depth = runs["intermediate"], runs["fast"].settlement[-1]
     left = np.abs(at_rest.frames[-1].pressure).max() / COHESION

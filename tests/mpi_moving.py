@@ -75,7 +75,7 @@ if __name__ == "__main__":
     again = make()
     run(again, T_END, after=mpm.resume(again, file))
     resumed = state(again)
-    grids.UNEVEN = np.inf
+    grids.IMBALANCE = np.inf
     still = make()
     fixed = run(still, T_END)
     left = state(still)

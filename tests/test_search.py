@@ -104,10 +104,10 @@ def test_firmness_resists_shear_as_elastic_soil_does_and_neither_turns_nor_shift
     h = s.scene.grid.h
     slopes = np.prod(2 * h / 3) * 3 / h**2  # squared, of a node's shape function, integrated
     exact = 1e6 * (slopes + slopes.sum())[axis[inner]]
-    assert inner.sum() > 8 and m.firm.getDiagonal().array_r[inner] == pytest.approx(exact)
+    assert inner.sum() > 8 and m.elastic_shear.getDiagonal().array_r[inner] == pytest.approx(exact)
     crossed = x[:, [1, 0, *range(2, dim)]] * [1, 1, *[0] * (dim - 2)]
     for field in (crossed * ([-1, 1, 0][:dim]), crossed, np.ones_like(x)):  # uniform stress: no force inside
-        forces = m.firm * m.unknowns.gather_owned(field[np.arange(len(at)), axis])
+        forces = m.elastic_shear * m.unknowns.gather_owned(field[np.arange(len(at)), axis])
         assert np.abs(forces.array_r[inner]).max() < 1e-9 * 1e6
 
 
@@ -135,7 +135,7 @@ def steps_taken(monkeypatch, dt: float, **values) -> int:
     """Return the Newton steps of three steps of dt of pushed ground with other constants of the search."""
     with monkeypatch.context() as patched:
         for name, value in values.items():
-            patched.setattr(newton if name == "FIRM" else search, name, value)
+            patched.setattr(newton if name == "SHIFT" else search, name, value)
         s = pushed()
         return sum(s.step(dt).newton for _ in range(3))
 
@@ -179,14 +179,14 @@ def test_firmer_tangents_save_newton_steps_where_soil_yields_for_the_first_time(
     # single steps differ by a factor of two with the last digits of the linear solvers (38 or 67), sums do not
     steps = (2.0, 2.5, 3.0, 3.5, 4.0, 5.0)
     firm = sum(pushed().step(dt).newton for dt in steps)
-    monkeypatch.setattr(newton, "FIRM", 0.0)
+    monkeypatch.setattr(newton, "SHIFT", 0.0)
     assert firm < 0.9 * sum(pushed().step(dt).newton for dt in steps)
 
 
 def test_a_firmer_tangent_leads_to_the_same_equilibrium(monkeypatch):
     found = []
     for firm in (1.0, 0.0):
-        monkeypatch.setattr(newton, "FIRM", firm)
+        monkeypatch.setattr(newton, "SHIFT", firm)
         s = pushed()
         for _ in range(3):
             s.step(0.25)

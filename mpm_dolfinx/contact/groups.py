@@ -52,7 +52,7 @@ class Contact:
             numbers(f"Contact: {name}", value, test=lambda v: (v >= 0) & (v < np.inf), allowed=">= 0 and finite")
 
     @property
-    def grips(self) -> bool:
+    def frictional(self) -> bool:
         """Whether the contact resists slip."""
         return self.friction > 0 or self.adhesion > 0
 

@@ -20,7 +20,7 @@ class Rough(Protocol):
 
     friction: float
     adhesion: float
-    grips: bool
+    frictional: bool
 
 
 def pressure_name(name: str) -> str:
@@ -57,7 +57,7 @@ class Origin:
             whole[whole == 0] = 1.0
             means = [sum_by(at, area * column, n) / whole for column in (push[rows], *shear[rows].T)]
             data[pressure_name(name)] = means[0]
-            if contact.grips:
+            if contact.frictional:
                 data[shear_name(name)] = np.stack(means[1:], axis=1)
         return replace(points, data=data)
 

@@ -109,7 +109,7 @@ class ContactLaw:
         h, of_pairs = (self.grid.sizes(cells).min(axis=-1) for cells in (self.cell, pairs.cell))
         self._size = h
         self._stiffness, self._hold = STIFF / of_pairs * pairs.resistance, GRIP / h * self.mean(pairs.resistance)
-        self.grips = any(contact.grips for contact in contacts)
+        self.frictional = any(contact.frictional for contact in contacts)
 
     def begins(self) -> ContactState:
         """Return the initial state: pressures of the previous step, and stick everywhere."""
@@ -178,7 +178,7 @@ class ContactLaw:
             own = own - touch.push[:, None, None] * at.curvature
         own = pairs.area[:, None, None] * own
         D = scipy.sparse.bsr_matrix((own, np.arange(m), np.arange(m + 1)), shape=(m * d, m * d)).tocsr()
-        if not self.grips:
+        if not self.frictional:
             return D
         # means of displacements and pressures over the pairs of each condition
         share = pairs.area / self.area[self.of]
@@ -198,7 +198,7 @@ class ContactLaw:
         out = across * at.n
         if at.curvature is not None:
             out = out - touch.push[:, None] * np.einsum("mij,mj->mi", at.curvature, v)
-        if self.grips:
+        if self.frictional:
             mean = self.mean(v)
             if adjoint:
                 out = out + touch.stiff[:, None] * at.n * (touch.by_pressure * mean).sum(axis=1)[self.of, None]

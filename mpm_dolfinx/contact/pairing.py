@@ -134,8 +134,8 @@ class Contacts(Touching):
             n = -patches.area(seen)[row]
             n /= np.linalg.norm(n, axis=1, keepdims=True)
             old = np.zeros((len(row), d))
-            if self.contacts[number].grips:
-                old = _turned(points.data[shear_name(self.names[number])][at], n)
+            if self.contacts[number].frictional:
+                old = _rotated(points.data[shear_name(self.names[number])][at], n)
             pressure = points.data[pressure_name(self.names[number])][at]
             resistances = np.minimum(own[at], now.resistance[other])
             place = (i + grid.comm.rank * len(self._faces)) * PLACES + row
@@ -316,7 +316,7 @@ def _ranks(setting: Setting) -> NDArray[np.int64]:
     return np.argsort(sorted(range(len(keys)), key=keys.__getitem__))[part]
 
 
-def _turned(shear: NDArray[np.float64], n: NDArray[np.float64]) -> NDArray[np.float64]:
+def _rotated(shear: NDArray[np.float64], n: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return shear tractions, rotated by the smallest angle into the planes with normals n."""
     flat = shear - np.einsum("md,md->m", shear, n)[:, None] * n
     size = np.maximum(np.linalg.norm(flat, axis=1), TINY)

@@ -103,14 +103,14 @@ class Touching(Acting):
     def __init__(self, setting: Setting, given: Mapping[str, Rough]):
         self.grid, self._materials = setting.grid, setting.materials
         self.names = tuple(given)
-        self._grips = [one.grips for one in given.values()]
-        self.symmetric = not any(self._grips)
+        self._frictional = [one.frictional for one in given.values()]
+        self.symmetric = not any(self._frictional)
 
     def kept(self, n: int) -> dict[str, dict[str, NDArray[np.float64]]]:
         """Return zero contact pressures of n points, and zero shear tractions for contacts that resist slip."""
         out = {name: {pressure_name(name): np.zeros(n)} for name in self.names}
-        for name, grips in zip(self.names, self._grips, strict=True):
-            out[name] |= {shear_name(name): np.zeros((n, self.grid.dim))} if grips else {}
+        for name, frictional in zip(self.names, self._frictional, strict=True):
+            out[name] |= {shear_name(name): np.zeros((n, self.grid.dim))} if frictional else {}
         return out
 
     def unknown(self, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:
@@ -251,7 +251,7 @@ class ContactProblem(Loads):
         key, of = np.unique(cell, return_inverse=True)
         m = len(cell)
         together = scipy.sparse.identity(m)
-        if self.now.law.grips:
+        if self.now.law.frictional:
             all_of = scipy.sparse.csr_matrix((np.ones(m), (of, np.arange(m))), shape=(len(key), m))
             together = all_of.T @ all_of
         all_of = scipy.sparse.kron(together, np.ones((d, d)), format="csr")
@@ -349,7 +349,7 @@ class ContactProblem(Loads):
         """See `Loads`.  Each condition, one for each contact and cell, may change between stick and slip."""
         changed, w = False, self._apart_by(self.now.law, at) if self.pushed else None
         motion = self.found(at).motion
-        if self.now.law.grips:
+        if self.now.law.frictional:
             state, changed = self.now.law.choose(self.now.state, self.found(at).touch, sticks)
             self.now = self.now._replace(state=state)
         if self.pushed:

@@ -226,7 +226,7 @@ class Tool:
         return out
 
     @property
-    def grips(self) -> bool:
+    def frictional(self) -> bool:
         """Whether the tool resists slip."""
         return self.friction > 0 or self.adhesion > 0
 

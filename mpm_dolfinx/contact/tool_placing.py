@@ -213,7 +213,11 @@ class Tools(Touching):
             n = together(grid.comm, lambda tool=tool, pose=pose: tool.solid(grid.least).normal(pose.own(x)) @ pose.R.T)
             faces = free & (np.einsum("md,md->m", area, n) < -FACING * size * np.linalg.norm(n, axis=1))
             at = np.flatnonzero(faces)[~self._edge(tool, pose, x, area / np.maximum(size, TINY)[:, None], faces)]
-            old = points.data[shear_name(self.names[number])][patches.at[at]] if tool.grips else np.zeros((len(at), d))
+            old = (
+                points.data[shear_name(self.names[number])][patches.at[at]]
+                if tool.frictional
+                else np.zeros((len(at), d))
+            )
             vectors = [x[at], pose.put(before.own(x[at])), old @ (pose.R @ before.R.T).T]
             pressure = points.data[pressure_name(self.names[number])][patches.at[at]]
             scalars = [np.full(len(at), number), size[at], resistances[at], pressure]

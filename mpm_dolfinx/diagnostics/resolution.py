@@ -28,14 +28,14 @@ width.
 """
 
 
-def warn_overfilled(cut: CutDomains, bodies: Sequence[Body]) -> Callable[..., Any] | None:
+def warn_overlaps(cut: CutDomains, bodies: Sequence[Body]) -> Callable[..., Any] | None:
     """Warn about the fullest cell if domains overlap.  Return the next check, or None after a warning."""
     grid, points = cut.grid, cut.points
     volume = cut.to_cells(points.volume0 * points.J) * cut.pieces_to_cells(cut.pieces.fraction)
     fill = sum_by(cut.cells, cut.plane(volume)[0], grid.num_owned)[cut.cells] / grid.volumes(cut.cells)
     most = over_all(grid.comm, float(fill.max(initial=0.0)), MPI.MAX)
     if not cut.domains or most <= FULL:
-        return warn_overfilled
+        return warn_overlaps
     number = over_all(grid.comm, int(grid.cell_number[cut.cells[fill.argmax()]]) if most in fill else -1, MPI.MAX)
     found, x = bodies_in(cut, bodies, number)
     bodies_text = f"bodies {', '.join(map(str, found))}" if len(found) > 1 else f"domains of body {found[0]}"
@@ -66,7 +66,7 @@ FINE = 0.1
 """Smallest lost fraction of a cell's deformation that counts.  Cells with stiffness ratios below 2.1 lose less."""
 
 
-def warn_smeared(
+def warn_mixed(
     cut: CutDomains, bodies: Sequence[Body], materials: SceneMaterials, least: float = LOSS
 ) -> Callable[..., Any]:
     """Warn about the soft material that loses the largest fraction of its deformation in cells with stiffer materials.
@@ -93,7 +93,7 @@ def warn_smeared(
         found.append((share[i], i, np.where(of == i, loss, 0.0), contrast))
     share, i, loss, contrast = max(found, key=lambda row: row[0])
     if share <= least:
-        return partial(warn_smeared, materials=materials, least=least)
+        return partial(warn_mixed, materials=materials, least=least)
     most = over_all(grid.comm, float(loss.max(initial=0.0)), MPI.MAX)
     at = np.flatnonzero(loss == most)[:1]
     cell = over_all(grid.comm, int(grid.cell_number[at].max(initial=-1)), MPI.MAX)
@@ -103,7 +103,7 @@ def warn_smeared(
     what += "deforms about %.0f %% too little under a load across the layers; place interfaces on grid lines, or use "
     what += "smaller cells"
     warn(grid.comm, ResolutionWarning, what, " and ".join(map(str, those)), x, i, contrast_most, 100 * share)
-    return partial(warn_smeared, materials=materials, least=AGAIN * share)
+    return partial(warn_mixed, materials=materials, least=AGAIN * share)
 
 
 def _losses(cut: CutDomains, volume: NDArray[np.float64], modulus: NDArray[np.float64]) -> tuple[NDArray, ...]:

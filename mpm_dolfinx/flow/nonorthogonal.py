@@ -98,7 +98,7 @@ class Gradients:
         self._known = np.flatnonzero(((sides.shape > 0) & ~sides.seeps)[self._faces])
         self._contents, self._sides = contents, sides
 
-    def _sealed(self, contents: CellContents, sides: OpenSides) -> NDArray[np.float64]:
+    def _no_flow(self, contents: CellContents, sides: OpenSides) -> NDArray[np.float64]:
         """Return the area vectors of no-flow sides in the filled cells, divided by the areas of cell faces."""
         grid, share = contents.grid, contents.open[contents.filled]
         out = -(share[:, :, 1] - share[:, :, 0])
@@ -111,7 +111,7 @@ class Gradients:
     def _units(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the gradients for a unit pressure difference to a neighbour, and to an open side."""
         known, d = self._known, self._separation.shape[2]
-        at, sealed = self._at[known], self._sealed(self._contents, self._sides)[self.rows]
+        at, no_flow = self._at[known], self._no_flow(self._contents, self._sides)[self.rows]
         size = np.linalg.norm(self._sides.area, axis=1)[self._faces[known]]
         weight = SIDES * size / sum_by(at, size, len(self.rows))[at]
         offset = self._sides.offset[self._faces[known]]
@@ -120,8 +120,8 @@ class Gradients:
         to_cells = self._inside[:, :, None] * self._separation / squared[:, :, None]
         distance = np.einsum("md,md->m", offset, self._sides.normal[self._faces[known]])
         to_sides = (weight / np.maximum(distance**2, near[at]))[:, None] * offset
-        size = np.linalg.norm(sealed, axis=1, keepdims=True)
-        closed = np.divide(sealed, np.sqrt(np.maximum(size, size**2)), out=np.zeros_like(sealed), where=size > 0)
+        size = np.linalg.norm(no_flow, axis=1, keepdims=True)
+        closed = np.divide(no_flow, np.sqrt(np.maximum(size, size**2)), out=np.zeros_like(no_flow), where=size > 0)
         A = np.einsum("nki,nkj->nij", to_cells, self._separation) + closed[:, :, None] * closed[:, None, :]
         for i, j in np.ndindex(d, d):
             A[:, i, j] += sum_by(at, to_sides[:, i] * offset[:, j], len(A))

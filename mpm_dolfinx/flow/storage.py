@@ -460,7 +460,7 @@ class StorageProblem:
         """Volume fraction of material in each cell.  It is the weight of the cell's pressure error."""
         return self._contents.fill
 
-    def sealed(self, volumes: NDArray[np.float64]) -> NDArray[np.float64]:
+    def undrained(self, volumes: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the pressure rises (Pa) of cells at fixed stress, if the outflows `volumes` (m^d) do not leave the
         cells.
         """

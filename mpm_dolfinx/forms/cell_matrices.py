@@ -36,7 +36,7 @@ def shape_gradients(points: FormPoints) -> list:
     return out
 
 
-def shape_hoops(points: FormPoints) -> list:
+def shape_over_radius(points: FormPoints) -> list:
     """Return the means of N / r over each piece as UFL, for the shape functions N."""
     grid, hoop = points.grid, points.functions["hoop"]
     h, out = grid.edge_in_forms(), []
@@ -52,7 +52,7 @@ def along_shapes(T, points: FormPoints) -> list:
     if not points.grid.axisymmetric:
         return [ufl.dot(T, g)[i] for g in gradients for i in range(d)]
     out = []
-    for g, h in zip(gradients, shape_hoops(points), strict=True):
+    for g, h in zip(gradients, shape_over_radius(points), strict=True):
         radial, axial = (T[i, 0] * g[0] + T[i, 1] * g[1] for i in range(d))
         out += [radial + T[2, 2] * h, axial]
     return out
@@ -139,13 +139,13 @@ class ElementMatrices:
         self._grid, dim = points.grid, points.grid.dim
         rows, columns, self._entry = _entries(2**dim * dim, symmetric)
         gradients, entries = shape_gradients(points), []
-        hoops = shape_hoops(points) if points.grid.axisymmetric else []
+        over_radius = shape_over_radius(points) if points.grid.axisymmetric else []
         for row, column in zip(rows, columns, strict=True):
             (v, i), (u, j) = divmod(row, dim), divmod(column, dim)
             block = ufl.as_matrix([[tangent[int(i), k, int(j), l] for l in range(dim)] for k in range(dim)])
             entries.append(ufl.dot(gradients[v], ufl.dot(block, gradients[u])))
             if points.grid.axisymmetric:
-                entries[-1] += _of_hoops(tangent, gradients, hoops, (int(v), int(i)), (int(u), int(j)))
+                entries[-1] += _circumferential(tangent, gradients, over_radius, (int(v), int(i)), (int(u), int(j)))
         self._count = len(entries)
         along = [part for T in beside.along for part in along_shapes(T, points)]
         self._sums = CellSums([*entries, *along, *beside.scalars], points)
@@ -157,7 +157,7 @@ class ElementMatrices:
         return sums[:, self._count :]
 
 
-def _of_hoops(tangent, gradients: list, hoops: list, row: tuple[int, int], column: tuple[int, int]):
+def _circumferential(tangent, gradients: list, over_radius: list, row: tuple[int, int], column: tuple[int, int]):
     """Return the contribution of circumferential strains to one entry of an element matrix, as UFL.
 
     row, column: node and axis of v, and node and axis of u.
@@ -166,11 +166,11 @@ def _of_hoops(tangent, gradients: list, hoops: list, row: tuple[int, int], colum
     (u, j) = column
     out = 0
     if i == 0:
-        out += hoops[v] * sum(tangent[2, 2, j, l] * gradients[u][l] for l in range(2))
+        out += over_radius[v] * sum(tangent[2, 2, j, l] * gradients[u][l] for l in range(2))
     if j == 0:
-        out += sum(tangent[i, k, 2, 2] * gradients[v][k] for k in range(2)) * hoops[u]
+        out += sum(tangent[i, k, 2, 2] * gradients[v][k] for k in range(2)) * over_radius[u]
     if i == j == 0:
-        out += hoops[v] * tangent[2, 2, 2, 2] * hoops[u]
+        out += over_radius[v] * tangent[2, 2, 2, 2] * over_radius[u]
     return out
 
 

@@ -26,7 +26,7 @@ from mpm_dolfinx.base.tolerances import NEAR, SAME
 from mpm_dolfinx.base.validation import flag, instance, line, numbers
 from mpm_dolfinx.grid.following import check_follow
 from mpm_dolfinx.grid.lines import MOST, checked, equal, rounding
-from mpm_dolfinx.grid.partition import UNEVEN, Partition, better, boxes, destinations
+from mpm_dolfinx.grid.partition import IMBALANCE, Partition, better, boxes, destinations
 from mpm_dolfinx.parallel.exchange import Exchange, over_all
 
 SIDES = {
@@ -588,12 +588,12 @@ class Grid:
     def better(self, x: NDArray[np.float64]) -> NDArray[np.int64] | None:
         """Return boxes (ranks, 2, d) that distribute points at x more evenly than the present boxes, or None.
 
-        The points of all processes are counted.  If the imbalance of the present boxes is at most `UNEVEN`, the result
-        is None.
+        The points of all processes are counted.  If the imbalance of the present boxes is at most `IMBALANCE`, the
+        result is None.
         """
         number = self.number(self.index_from_base(x))
         counts = over_all(self.comm, np.bincount(self.owner(number), minlength=self.comm.size))
-        if counts.max() <= UNEVEN * counts.mean():
+        if counts.max() <= IMBALANCE * counts.mean():
             return None
         load = np.bincount(number, minlength=self.cells).astype(float)
         return better(over_all(self.comm, load).reshape(self.shape), self.partition.boxes)

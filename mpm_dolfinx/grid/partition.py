@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-UNEVEN = 1.2
+IMBALANCE = 1.2
 """Largest allowed imbalance: largest number of points of a process, divided by the mean.
 
 With a larger imbalance, cells are distributed anew.  The results of a scene do not depend on this limit.  Source:
@@ -88,11 +88,11 @@ def boxes(load: NDArray[np.float64], processes: int) -> NDArray[np.int64]:
 def better(load: NDArray[np.float64], of: NDArray[np.int64]) -> NDArray[np.int64] | None:
     """Return the boxes (ranks, 2, d) of a new bisection, or None if they are hardly better than the boxes `of`.
 
-    New boxes are returned if their imbalance is below `UNEVEN`, or below the imbalance of the boxes `of` divided by
-    `UNEVEN`.  Otherwise each reset of the grid might distribute a few cells anew.
+    New boxes are returned if their imbalance is below `IMBALANCE`, or below the imbalance of the boxes `of` divided by
+    `IMBALANCE`.  Otherwise each reset of the grid might distribute a few cells anew.
     """
     new = boxes(load, len(of))
-    return new if imbalance(load, new) < max(UNEVEN, imbalance(load, of) / UNEVEN) else None
+    return new if imbalance(load, new) < max(IMBALANCE, imbalance(load, of) / IMBALANCE) else None
 
 
 def imbalance(load: NDArray[np.float64], of: NDArray[np.int64]) -> float:

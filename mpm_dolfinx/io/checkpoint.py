@@ -39,7 +39,7 @@ from mpm_dolfinx.stepping.distribution import distribute_by
 from mpm_dolfinx.stepping.result import Result
 from mpm_dolfinx.stepping.state import NODAL, State, Stay, StepControl, Trend
 
-FORMAT, VERSION = "mpm_dolfinx checkpoint", 15  # Source: the format of the files
+FORMAT, VERSION = "mpm_dolfinx checkpoint", 16  # Source: the format of the files
 FOREIGN = "not a checkpoint of mpm_dolfinx, must be one"
 ZIP = b"PK\3\4"  # first bytes of a numpy archive
 POINTS, PIECES = "points/id", "pieces/id"

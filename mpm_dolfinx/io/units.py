@@ -31,7 +31,7 @@ FIELDS = {
     "history.csv: one row for each output time": {
         "t, wall": "s, time in the scene; wall time so far",
         "steps, newton, coupling": "numbers of steps, of Newton iterations and of coupling iterations so far",
-        "cuts, rederived": "numbers of steps that had to be reduced, and of inverted domains re-initialised from F",
+        "cuts, reinitialised": "numbers of steps that had to be reduced, and of inverted domains re-initialised from F",
         "balance, residual": "-, largest relative error so far: of the fluid balance; of the equations",
         "p_min, p_max": "Pa, smallest and largest pore pressure of the material points",
         "x_0, y_0, z_0": "m, current position of probe 0; likewise for the other probes",

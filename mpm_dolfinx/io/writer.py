@@ -40,7 +40,7 @@ if TYPE_CHECKING:  # meshio takes long to import, so functions import it
 VTK_CELLS = {2: ("quad", [0, 1, 3, 2]), 3: ("hexahedron", [0, 1, 3, 2, 4, 5, 7, 6])}
 """Cell type of a particle domain in VTK, and order of its corners in VTK, by dimension."""
 WRITABLE = "in a writable folder with free space; `after=simulation.result` continues the run"
-COUNTS = ("steps", "newton", "coupling", "cuts", "rederived", "balance", "residual", "wall")
+COUNTS = ("steps", "newton", "coupling", "cuts", "reinitialised", "balance", "residual", "wall")
 
 
 class Writer:

@@ -116,7 +116,7 @@ class SceneMaterials:
         self.symmetric = all(m.symmetric for m in used)
         """Whether the tangents of all materials are symmetric."""
         moduli = [m.oedometric for m in evaluated], [m.shear for m in evaluated]
-        self.uneven = any(most > 2 * least for least, most in (_ends(grid, of) for of in moduli))
+        self.varied = any(most > 2 * least for least, most in (_ends(grid, of) for of in moduli))
         """Whether stiffness differs between points by more than a factor of two."""
         self.conducts = any(m.conductivity_law or np.any(np.asarray(m.conductivity) > 0) for m in evaluated) or any(
             callable(m.conductivity) for m in used

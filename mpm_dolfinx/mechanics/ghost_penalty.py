@@ -79,7 +79,7 @@ class GhostPenalty:
         Mean modulus of the penalty in each cell, Pa, see `stiffness`.
     shear
         Mean shear modulus in each cell, Pa, with zero for laws without a state.
-    firmness
+    elastic_shear
         Form that regularises tangents: elastic shear stiffness of the cells times their volume fraction.
     fill, beside
         Volume fraction of each cell, and the largest volume fraction of its neighbours.
@@ -96,7 +96,7 @@ class GhostPenalty:
         self.form = kinks(grid, V, GHOST / 3 * self._scale() * around("+"), 1)
         dx = ufl.Measure("dx", domain=grid.mesh, subdomain_id=_compat.SUBDOMAIN, metadata={"quadrature_degree": 2})
         strains = [ufl.sym(ufl.grad(w)) for w in (du, v)]
-        self.firmness = FacetForm(2 * self.fill * self.shear * around * ufl.inner(*strains) * dx, grid.comm)
+        self.elastic_shear = FacetForm(2 * self.fill * self.shear * around * ufl.inner(*strains) * dx, grid.comm)
 
     def _scale(self):
         """Return the strength of a face times the mean modulus of both cells, as UFL."""

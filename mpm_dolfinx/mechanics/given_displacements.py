@@ -30,7 +30,7 @@ from mpm_dolfinx.conditions.conditions import HOLD, Displacement, holding, resis
 from mpm_dolfinx.forms.point_forms import FormPoints, PointData, PointForm
 from mpm_dolfinx.grid.grid import Grid, sum_by
 from mpm_dolfinx.mechanics.held_cells import HeldCells, HeldPoints, inner_cells
-from mpm_dolfinx.mechanics.rigid_motion import rigid_motion, turned
+from mpm_dolfinx.mechanics.rigid_motion import rigid_motion, rotated
 from mpm_dolfinx.parallel.exchange import first, over_all, together
 from mpm_dolfinx.parallel.messages import ConditionWarning, warn
 from mpm_dolfinx.points.material_points import MaterialPoints
@@ -161,7 +161,7 @@ class GivenDisplacements(Acting):
                 given[0] = in_step((t - ends[0]) / (ends[1] - ends[0]), given[1], given[0], given[2])
             start, to = (p.origin(points) + given[k] for k in (1, 0))
             given = np.concatenate(given[1:], axis=1)
-            R = turned(self._grid.comm, p.area0, now, to) if len(axes) == d else np.eye(d)  # of the traction
+            R = rotated(self._grid.comm, p.area0, now, to) if len(axes) == d else np.eye(d)  # of the traction
             force, gap = np.einsum("ij,njk,nk->ni", R, stress[at, :d, :d], p.area(points)), to - now
             own = p.area0[:, None] * moduli[at]
             values = np.column_stack([np.full(len(gap), number), p.area0, own, gap, given, p.area(cut.points), force])
@@ -197,9 +197,9 @@ class GivenDisplacements(Acting):
         held = loads.held
         data = loads.data
         force = loads.pull(at.nodal)
-        told = {number for number, what in self._warned if what == ARTEFACT}
+        reported = {number for number, what in self._warned if what == ARTEFACT}
         axis = data["direction"].argmax(axis=1)
-        for number, x in held.beyond(loads.row, axis, force, loads.reached(at), told):
+        for number, x in held.beyond(loads.row, axis, force, loads.reached(at), reported):
             why = "the reaction is an artefact; does another condition also hold the side, or is the step too large?"
             self._warn(number, ARTEFACT, x + self._grid.base, why)
         number, force = held.number[loads.row], (loads.share.sum(axis=1) * force)[:, None] * data["direction"]
@@ -301,8 +301,8 @@ class HoldLoads(Loads):
         count = len(self._acting.held) * self._d * at.parts.count
         weight = np.where(means, self.data["stiffness"][:, 0], 0.0)
         gap = np.where(means, self._asked - self._along(at.nodal), 0.0)
-        ways = gap, np.abs(self.held.way[self.row, axis])
-        sums = np.stack([sum_by(side, weight * way, count) for way in ways])
+        paths = gap, np.abs(self.held.path[self.row, axis])
+        sums = np.stack([sum_by(side, weight * path, count) for path in paths])
         lacks, goes = np.abs(over_all(self.data.points.grid.comm, sums))
         least = np.where(np.isinf(self._lacked), 1 / HOLD, NEAR)
         more = (least * goes < lacks) & (lacks < self._lacked / 2) & (goes > 0)

@@ -51,7 +51,7 @@ class HeldPoints(NamedTuple):
     modulus: NDArray[np.float64]  # (n,) penalty modulus times area, N; up to `undrained`: at the last reset
     tension: NDArray[np.float64]  # (n,) norm of the stress times area, N
     resistance: NDArray[np.float64]  # (n,) resisting modulus times area, N
-    firm: NDArray[np.float64]  # (n,) confined modulus times area, N, with a limited contribution of the fluid
+    confined: NDArray[np.float64]  # (n,) confined modulus times area, N, with a limited contribution of the fluid
     undrained: NDArray[np.float64]  # (n,) undrained confined modulus times area, N
     x: NDArray[np.float64]  # (n, d) position, m
     gap: NDArray[np.float64]  # (n, d) prescribed position minus present position, m
@@ -109,7 +109,7 @@ class HeldCells:
     limit : (2, k, d)
         Largest plausible force, N, of each of k penalties on means: limit[0] for the skeleton, limit[1] for undrained
         soil.  limit[1] applies if the side is at its prescribed position.  Larger forces are numerical artefacts.
-    way
+    path
         Increment (d,) of the prescribed displacement in the step, m, for each penalty.
     """
 
@@ -147,7 +147,7 @@ class HeldCells:
         self.moments = {name: both(mean(values), values) for name, values in moments.items()}
         against = p.modulus + TENSE * p.tension
         flat = normal**2 > (1 - ALIGNED**2) * (normal**2).sum(axis=1, keepdims=True)
-        modulus = np.where(flat, total(p.firm)[:, None], total(p.modulus)[:, None])
+        modulus = np.where(flat, total(p.confined)[:, None], total(p.modulus)[:, None])
         each = np.where(flat[at], EVERYWHERE * p.resistance[:, None], WEAK * against[:, None])
         h = [grid.sizes(cells).min(axis=-1, keepdims=True) for cells in (cell, p.cell)]
         self.stiffness = both(HOLD / h[0] * modulus, each / h[1])
@@ -161,7 +161,7 @@ class HeldCells:
         self._slope, self._along = both(slope, slope[at]), both(along, along[at])
         self._given, self._rise = both(given, given[at]), both(rise, rise[at])
         self._x = both(x, x[at])
-        self.way = np.diff(self._given.reshape(-1, 2, grid.dim), axis=1)[:, 0]
+        self.path = np.diff(self._given.reshape(-1, 2, grid.dim), axis=1)[:, 0]
 
     def rows(self, axis: int, given: NDArray[np.bool_], free: NDArray[np.bool_]) -> tuple:
         """Return the penalties on one component, with their stiffness, gap and distribution of the force to nodes.
@@ -224,7 +224,7 @@ class HeldCells:
         return at_wall & (among(key, asked[found]) & some & ~stuck).any(axis=1)
 
     def beyond(
-        self, row: NDArray, axis: NDArray, force: NDArray, reached: NDArray[np.bool_], told: Collection[int]
+        self, row: NDArray, axis: NDArray, force: NDArray, reached: NDArray[np.bool_], reported: Collection[int]
     ) -> list[tuple[int, NDArray[np.float64]]]:
         """Return the conditions with too large forces, and the position of the largest force of each.
 
@@ -236,12 +236,12 @@ class HeldCells:
         axis (k,): axis of each component.
         force (k,), in N: force of each component.
         reached (k,): whether each component is at its prescribed position.
-        told: indices of conditions that have been reported already; they are excluded.
+        reported: indices of conditions that have been reported already; they are excluded.
         """
         grid = self.grid
         comm = grid.comm
-        untold = ~np.isin(self.number[row], list(told))
-        row, axis, force, reached = (values[untold] for values in (row, axis, force, reached))
+        unreported = ~np.isin(self.number[row], list(reported))
+        row, axis, force, reached = (values[unreported] for values in (row, axis, force, reached))
         limit = np.concatenate([self.limit, np.zeros((2, len(self.number) - self.limit.shape[1], grid.dim))], axis=1)
         limit = limit[reached.astype(int), row, axis]
         far = np.unique(self.number[row[np.abs(force) > np.where(limit > 0, limit, np.inf)]])

@@ -331,9 +331,10 @@ class MomentumSystem:
         at_walls[held // d] = True
         near = at_walls[forms.grid.cell_nodes[forms.grid.facet_cells[facets]]].any(axis=(1, 2))
         self._ghost = forms.ghost.on(facets, facets[near])
-        self.firm, self._firmness = None, None  # None in scenes without yielding
+        self.elastic_shear, self._elastic_shear = None, None  # None in scenes without yielding
         if not forms.elastic:
-            self.firm, self._firmness = matrix(self.unknowns, self.unknowns, 3**d * d), forms.ghost.firmness.on(cells)
+            self.elastic_shear = matrix(self.unknowns, self.unknowns, 3**d * d)
+            self._elastic_shear = forms.ghost.elastic_shear.on(cells)
 
     @property
     def round_off(self) -> NDArray[np.float64]:
@@ -384,10 +385,10 @@ class MomentumSystem:
             for one in (self._ghost, *loads):
                 one.penalty(penalty, penalty is self.held_penalty)
             penalty.assemble()
-        if self.firm is not None:
-            zero(self.firm)
-            self._firmness.assemble_matrix(self.firm)
-            self.firm.assemble()
+        if self.elastic_shear is not None:
+            zero(self.elastic_shear)
+            self._elastic_shear.assemble_matrix(self.elastic_shear)
+            self.elastic_shear.assemble()
 
 
 class MomentumProblem:
@@ -570,12 +571,12 @@ class MomentumProblem:
         return self.forms.of_suction(data or self.data)
 
     def assemble_tangent(
-        self, data: QuadratureData | None = None, firmness: NDArray[np.float64] | float = 0.0
+        self, data: QuadratureData | None = None, shift: NDArray[np.float64] | float = 0.0
     ) -> PETSc.Mat:
         """Return the tangent at u, regularised by a fraction of the elastic shear stiffness.
 
         data: integration points, by default the points of the problem.
-        firmness: this fraction, as one number or as one number for each connected part.
+        shift: this fraction, as one number or as one number for each connected part.
         """
         K = self.system.K
         # the first sum gives K its full sparsity pattern, because PETSc does not always notice a later change
@@ -592,12 +593,12 @@ class MomentumProblem:
                 K.axpy(1.0, zeros, pattern.UNKNOWN)
             if (coupling := one.coupling(self.at)) is not None:
                 K.axpy(1.0, coupling, pattern.SUBSET_NONZERO_PATTERN)
-        shares = firmness + np.zeros(self.system.parts.count)
+        shares = shift + np.zeros(self.system.parts.count)
         if (shares == shares[:1]).all():
             if shares.any():
-                K.axpy(shares[0], self.system.firm, pattern.SUBSET_NONZERO_PATTERN)
+                K.axpy(shares[0], self.system.elastic_shear, pattern.SUBSET_NONZERO_PATTERN)
             return K
-        firm = self.system.firm.copy()
-        firm.diagonalScale(self.system.unknowns.gather_owned(shares[self.system.of_parts.of]))
-        K.axpy(1.0, firm, pattern.SUBSET_NONZERO_PATTERN)
+        elastic_shear = self.system.elastic_shear.copy()
+        elastic_shear.diagonalScale(self.system.unknowns.gather_owned(shares[self.system.of_parts.of]))
+        K.axpy(1.0, elastic_shear, pattern.SUBSET_NONZERO_PATTERN)
         return K

@@ -49,10 +49,10 @@ def rigid_motion(
     size = np.sqrt(over_all(comm, float((weight[:, 0] * (arm**2).sum(axis=1)).sum())) / moments[0])
     left = []  # sums of squared gaps: second entry for the best translation, last entry for the best rigid motion
     for iteration in range(ITERATIONS):
-        turned = _apply(turn, arm)
-        off = gap - np.einsum("nd,nd->n", e, shift + turned - arm)
+        rotated = _apply(turn, arm)
+        off = gap - np.einsum("nd,nd->n", e, shift + rotated - arm)
         left.append(over_all(comm, float(weight[:, 0] @ off**2)))
-        slope = np.concatenate([e, _spin(turned, e) / max(size, TINY)], axis=1)
+        slope = np.concatenate([e, _spin(rotated, e) / max(size, TINY)], axis=1)
         normal = over_all(comm, np.concatenate([slope.T @ (weight * slope), [slope.T @ (weight[:, 0] * off)]]))
         part = slice(None) if iteration else slice(d)  # first without rotation
         step = np.zeros(len(normal) - 1)
@@ -65,7 +65,7 @@ def rigid_motion(
     return shift + _apply(turn, x - centre) - (x - centre)
 
 
-def turned(
+def rotated(
     comm: MPI.Intracomm, weight: NDArray[np.float64], x: NDArray[np.float64], to: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return the rotation nearest to a motion of weighted positions (Kabsch 1976).

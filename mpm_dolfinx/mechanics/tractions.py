@@ -125,10 +125,10 @@ class PressureForms:
         V = u.function_space
         # n da = det(Delta) Delta^-T n_n da_n (Nanson) at the present iterate
         delta = ufl.variable(ufl.Identity(grid.stretches) + p.grad(u))
-        turned = ufl.diff(ufl.det(delta), delta)
+        rotated = ufl.diff(ufl.det(delta), delta)
         if grid.axisymmetric:
-            turned = ufl.as_matrix([[turned[i, j] for j in (0, 1)] for i in (0, 1)])
-        pushed = ufl.inner(turned * p.push, p.value(ufl.TestFunction(V))) * p.dx
+            rotated = ufl.as_matrix([[rotated[i, j] for j in (0, 1)] for i in (0, 1)])
+        pushed = ufl.inner(rotated * p.push, p.value(ufl.TestFunction(V))) * p.dx
         self.work, self.slope = PointForm(pushed, p), PointForm(-ufl.derivative(pushed, u, ufl.TrialFunction(V)), p)
 
 

@@ -192,7 +192,7 @@ class StepSize:
         """
         error, motion = report.moves
         motion = max(control.motion or 0.0, motion)
-        allowed = self.rtol * max(*control.change, report.sealed)
+        allowed = self.rtol * max(*control.change, report.undrained)
         wrong, filled = report.fills
         errors = [
             (report.error, allowed),

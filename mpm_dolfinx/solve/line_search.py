@@ -40,7 +40,7 @@ finite.
 """
 WORK = 0.5
 """Largest ratio of the work at the end of a step to the work at its start (Matthies and Strang 1979)."""
-FIRM = 0.1
+SHIFT = 0.1
 """Fraction (<= 1) of the elastic shear stiffness in the tangent of yielding soil, divided by the relative residual.
 
 A footing on 9 cells takes 291 Newton steps with 0.05, 293 with 0.1, and 293 with 0.2. Pushed ground takes 42 Newton

@@ -42,7 +42,7 @@ from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
 from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.parts import relative
 from mpm_dolfinx.solve.factors import negative_pivots
-from mpm_dolfinx.solve.line_search import FIRM, Halving, Search
+from mpm_dolfinx.solve.line_search import SHIFT, Halving, Search
 from mpm_dolfinx.solve.schur import Kept, LinearSolvers
 
 INNER = 1e-3  # momentum tolerance / storage error; it is small because unconverged rotations change volumes
@@ -130,10 +130,10 @@ def solve_substep(
     """
     newton = Newton(solvers, momentum, storage, kept)
     in_turn = solvers.scheme.richardson and storage is not None
-    serves = report.newton > 0 and momentum.smooth
+    reusable = report.newton > 0 and momentum.smooth
     follows = not report.history or max(report.history[0]) ** 2 <= solvers.plan.keep  # first residual small
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):  # the residual shows a failed solve
-        errors = newton.alternate() if in_turn else newton.newton(as_reset, key, serves, ahead if follows else None)
+        errors = newton.alternate() if in_turn else newton.newton(as_reset, key, reusable, ahead if follows else None)
         took = newton.report
     report.newton, report.coupling = report.newton + took.newton, report.coupling + took.coupling
     report.history += took.history
@@ -176,15 +176,15 @@ def note_pressures(
     forms, owned = storage.forms, storage.system.unknowns.owned
     start, before, p = (f.x.array[owned] for f in (forms.p_n, forms.p_before, forms.p))
     before = before if len(rates) > 1 else p
-    error, sealed = np.zeros((2, len(p)))
+    error, undrained = np.zeros((2, len(p)))
     first, second = before - start, p - before
     if len(rates) > 1:
         error = ERROR * np.abs(solvers.filtered(seconds * (rates[1].cells - rates[0].cells)))
-        sealed = storage.sealed(seconds * rates[0].cells + (dt - seconds) * rates[1].cells)
-    largest = [np.abs(storage.fill * values).max(initial=0.0) for values in (error, sealed)]
+        undrained = storage.undrained(seconds * rates[0].cells + (dt - seconds) * rates[1].cells)
+    largest = [np.abs(storage.fill * values).max(initial=0.0) for values in (error, undrained)]
     filling = storage.filling(error) if forms.retains else (error[:0], error[:0])
     largest += [values.max(initial=0.0) for values in filling]
-    report.error, report.sealed, *fills = over_all(storage.forms.grid.comm, np.array(largest), MPI.MAX).tolist()
+    report.error, report.undrained, *fills = over_all(storage.forms.grid.comm, np.array(largest), MPI.MAX).tolist()
     report.fills = tuple(fills)
     changes = storage.fill * np.abs([p - start, first, second])
     report.change, report.first, second, *ends = of_bodies(owned, np.concatenate([changes, [-start, start, -p, p]]))
@@ -210,16 +210,16 @@ class Newton:
         if storage is not None:
             self._vectors.append((storage.forms.p.x, active.cells))
 
-    def newton(self, as_reset: AsReset, key: Hashable, serves: bool, ahead: Callable | None) -> Errors:
+    def newton(self, as_reset: AsReset, key: Hashable, reusable: bool, ahead: Callable | None) -> Errors:
         """Solve the balances by Newton's method.
 
         A tangent is reused while the iterations converge, and with linear laws over many steps.
 
-        `serves`: whether the tangent of the previous substep may be reused.
+        `reusable`: whether the tangent of the previous substep may be reused.
         `ahead`: see `solve_substep`.
         """
         errors, other = self._begin(ahead)
-        fresh = self._linear or not serves
+        fresh = self._linear or not reusable
         if other is not None:
             try:
                 return self._stable(self._iterations(errors, as_reset, key, fresh))
@@ -250,7 +250,7 @@ class Newton:
             if fresh and self._linear and not self.report.newton:
                 self._solvers.tangent(key, lambda: self._linearise_as_reset(as_reset))
             elif fresh:
-                self._linearise(np.where(eases, 0.0, FIRM * np.minimum(1.0, errors.u)))
+                self._linearise(np.where(eases, 0.0, SHIFT * np.minimum(1.0, errors.u)))
             self.report.coupling += self._direction(errors, slow)
             if self._storage is not None:
                 log_change = self._solvers.restrain(self._storage, log_change)
@@ -423,10 +423,10 @@ class Newton:
         self.report.history.append(tuple(largest.tolist()))
         return Errors(u, p, forces, exchanged, forces if start is None else start, fluid)
 
-    def _linearise(self, firmness: NDArray[np.float64] | float = 0.0) -> None:
+    def _linearise(self, shift: NDArray[np.float64] | float = 0.0) -> None:
         """Set the tangent at the present (u, p), for this step only."""
         self._solvers.tangent.clear()
-        self._solvers.linearise(self._momentum, self._storage, self._kept, firmness=firmness)
+        self._solvers.linearise(self._momentum, self._storage, self._kept, shift=shift)
 
     def _linearise_as_reset(self, as_reset: AsReset) -> bool:
         """Set the tangent at the last reset of the grid, which may belong to an earlier step."""

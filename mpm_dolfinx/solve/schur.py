@@ -50,7 +50,7 @@ def planned(scheme: Scheme, momentum: MomentumSystem, storage: StorageSystem | N
         unknowns.global_size,
         unknowns.dim,
         wet=storage is not None,
-        yields=momentum.firm is not None,
+        yields=momentum.elastic_shear is not None,
         locks=momentum.locks,
         symmetric=symmetric,
         processes=unknowns.comm.size,
@@ -167,18 +167,18 @@ class LinearSolvers:
         storage: StorageProblem | None,
         kept: Kept | None = None,
         data: QuadratureData | None = None,
-        firmness: NDArray[np.float64] | float = 0.0,
+        shift: NDArray[np.float64] | float = 0.0,
     ) -> bool:
         """Assemble the tangents at (u, p), and factorise them.
 
         `kept`: data that the tangents of the step share.
         `data`: integration points, by default the points of the problems.
-        `firmness`: fraction of the elastic shear stiffness that is added, as one number or one for each connected part.
+        `shift`: fraction of the elastic shear stiffness that is added, as one number or one for each connected part.
         """
         kept = kept or Kept()
         with _compat.Timer("tangent"):
             first = not self._momentum.K.assembled
-            momentum.assemble_tangent(data, firmness)
+            momentum.assemble_tangent(data, shift)
             if first and not self.plan.symmetric and self.du.comm.size == 1:
                 renew(self._momentum.K)
             if storage is not None:

@@ -404,10 +404,10 @@ class Motion:
         share = -np.expm1(-TAKES_IN * cut.moved(points, part, count))[part]
         weight = points.volume0 * ~none
         total, whole = over_all(cut.grid.comm, sum_by(part, np.array([weight * defect, weight]), count))
-        mean = np.divide(total, whole, out=np.zeros(count), where=whole > 0) * self._sealed(state, on_grid, pieces)
+        mean = np.divide(total, whole, out=np.zeros(count), where=whole > 0) * self._undrained(state, on_grid, pieces)
         return {"owed": defect, "due": np.where(none | keeps, 0.0, mean[part] + share * (defect - mean[part]))}
 
-    def _sealed(self, state: State, on_grid: OnGrid, pieces: PointData) -> NDArray[np.bool_]:
+    def _undrained(self, state: State, on_grid: OnGrid, pieces: PointData) -> NDArray[np.bool_]:
         """Return a mask of connected parts without open sides and without sources."""
         cut, (part, count) = on_grid.cut, on_grid.parts
         fed = [one.fed(cut, pieces) for one in state.stage.feeding]

@@ -36,7 +36,7 @@ class Result:
     cuts, rejected
         Numbers of reduced steps. `cuts` counts steps without convergence. `rejected` counts steps with a large error.
         In runs with equal steps, `rejected` counts steps with a jump of pressure.
-    rederived
+    reinitialised
         Number of inverted domains that were re-initialised from F.
     renewed
         Number of particle domains replaced by renewal, division or merging.
@@ -67,7 +67,7 @@ class Result:
     coupling: int = 0
     cuts: int = 0
     rejected: int = 0
-    rederived: int = 0
+    reinitialised: int = 0
     renewed: int = 0
     renewals: int = 0
     balance: float = 0.0
@@ -192,7 +192,7 @@ class Result:
             steps=self.steps + 1,
             newton=self.newton + report.newton,
             coupling=self.coupling + report.coupling,
-            rederived=self.rederived + report.rederived,
+            reinitialised=self.reinitialised + report.reinitialised,
             renewed=self.renewed + report.renewed,
             renewals=self.renewals + (report.renewed > 0),
             balance=max(self.balance, report.balance),

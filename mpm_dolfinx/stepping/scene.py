@@ -24,7 +24,7 @@ from mpm_dolfinx.bodies.bodies import Body, material_points
 from mpm_dolfinx.conditions.acting import Loads
 from mpm_dolfinx.conditions.conditions import OnSide
 from mpm_dolfinx.conditions.unit_weights import other_gravity, weighed
-from mpm_dolfinx.diagnostics.resolution import warn_overfilled, warn_smeared
+from mpm_dolfinx.diagnostics.resolution import warn_mixed, warn_overlaps
 from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.domains.renewed_faces import SeededFaces
 from mpm_dolfinx.flow.sources import Sources
@@ -124,7 +124,7 @@ class Scene:
         keeps_volumes = numerics.keep_volumes and numerics.quadrature == "domain" and scene.evolves
         self.motion = Motion(scene, bodies, self.momentum, self.storage, keeps_volumes)
         # checks that remain to be made; they affect only the log
-        self._looks = (warn_overfilled, *[partial(warn_smeared, materials=scene)] * scene.uneven)
+        self._looks = (warn_overlaps, *[partial(warn_mixed, materials=scene)] * scene.varied)
         self._assembled: Latest[Assembled] = Latest()
         self._on_grid: Latest[OnGrid] = Latest(self._assembled)
         self._systems: Latest[System] = Latest()
