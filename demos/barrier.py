@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
 """A bank of clay loses strength and slides against a rigid barrier: run-out, and force on the barrier.
 
-By symmetry, half of the bank is computed. This half is H = 10 m high and 10 m long, has a vertical side, and stands on
-a rough floor. The clay is undrained. Its strength c decreases within ten minutes from 0.3 to 0.07 gamma H, where gamma
-is the unit weight. The bank is stable while c > 0.26 gamma H. A viscous stress (a term in UFL) limits the velocity and
-vanishes at rest. Inertia is neglected. A wall with an adhesion of c / 2 stops the clay.
+By symmetry, half of the bank is computed, H = 10 m high and 10 m long. The bank has a vertical side and stands on a
+rough floor. The clay is undrained. The strength c of the clay decreases within ten minutes from 0.3 to 0.07 gamma H,
+where gamma is the unit weight. The bank is stable while c > 0.26 gamma H. A viscous stress (a term in UFL) limits the
+velocity and vanishes at rest. Inertia is neglected. A wall with an adhesion of c / 2 stops the clay.
 
 The final force on the wall is compared with limit analysis (Culmann 1866). After the slide, the shear stress on any
 plane is at most c. Consider a plane through the foot of the wall, with inclination theta and length l. The clay between

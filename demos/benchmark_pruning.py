@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Cost of each feature of a scene, measured with a pair of scenes: one with the feature, and one without.
 
-The scene is a square block of 1 m between smooth walls. Its load is so small that the active cells do not change. The
+The scene is a square block of 1 m between smooth walls. The load is so small that the active cells do not change. The
 feature has almost no effect. Examples are a gravity of zero, a conductivity of 1e-30 m/s, and a plastic law far from
 yield. `settlement` is the relative difference between the final settlements of the two scenes. In the pair "mean
 dilatation" (F-bar), the two scenes have different Poisson ratios and therefore different settlements.

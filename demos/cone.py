@@ -4,9 +4,9 @@
 The cone has a tip angle of 60 degrees and an adhesion of 0.3 s_u, where s_u is the strength of the clay. The shaft
 behind the cone is a second tool, which is smooth, so the force on the cone is known separately. The scene is
 axisymmetric. The clay is undrained and follows Tresca's law, or with --mises von Mises's law with the strength s_u in
-pure shear. Its shear modulus is G = 100 s_u. The resistance is F / (pi R^2 s_u), with the force F on the cone and the
-radius R of the shaft. It is compared with a formula for a deep cone in Tresca clay with equal initial stresses in all
-directions (Lu, Randolph, Hu and Bugarski 2004, Geotechnique 54):
+pure shear. The shear modulus of the clay is G = 100 s_u. The resistance is F / (pi R^2 s_u), with the force F on the
+cone and the radius R of the shaft. The resistance is compared with a formula for a deep cone in Tresca clay with equal
+initial stresses in all directions (Lu, Randolph, Hu and Bugarski 2004, Geotechnique 54):
 
     N_c = 3.4 + 1.6 ln(G / s_u) + 1.3 alpha,
 

@@ -3,7 +3,7 @@
 
 The scenes are a cantilever (the poroelastic beam, undeformed and bent) and a footing on a column. The linear systems of
 Newton's first step are solved to a relative true residual of 1e-8. Only the product of conductivity and step length
-matters. This product ranges from 1e-23 m (1e-14 m/s, 1e-9 s) to 1e11 m (1e2 m/s, 1e9 s). The bulk modulus K_w of the
+matters. The product ranges from 1e-23 m (1e-14 m/s, 1e-9 s) to 1e11 m (1e2 m/s, 1e9 s). The bulk modulus K_w of the
 water ranges from 1e4 Pa to infinity.
 
 Three schemes are compared. An iteration of each scheme consists of one solve of the storage and one solve of the

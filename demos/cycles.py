@@ -2,11 +2,11 @@
 """Residual stress of an elastic body after load cycles and after a rotation by 360 degrees.
 
 The drained beam of `poroelastic_beam.py` is loaded and unloaded repeatedly. The beam is elastic, so its stress must
-vanish after unloading. Grid displacements have kinks at grid lines. Particle domains must not follow these kinks.
-Otherwise their stress would accumulate with every grid line that they cross, as at the points of standard MPM.
+vanish after unloading. Grid displacements have kinks at grid lines. Particle domains must not follow these kinks. If
+they did, stress would accumulate at every grid line that a domain crosses, as at the points of standard MPM.
 
-A block is stretched between two fixed sides and then rotated by 360 degrees. Its final stresses must equal the stresses
-before the rotation.
+A block is stretched between two fixed sides and then rotated by 360 degrees. The stresses after and before the rotation
+must be equal.
 
 The undrained beam has singular edges at the clamp. At a distance r from an edge the stress grows as `r^(x - 1)`, where
 x = 0.595 is the root of `cos(pi x / 2) = x` (Williams 1952). Near the edges the rms stress and the residual stress

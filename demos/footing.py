@@ -2,9 +2,9 @@
 """A strip footing is pushed into saturated soil, to a depth of its width, at three rates.
 
 The footing is rough and rigid, and has the width B. By symmetry half of the footing is computed, as a prescribed
-displacement on a part of the soil's top. The soil is a weightless layer, 2.5 B thick, on rough rock. It follows Drucker
-and Prager's law with cohesion c, and drains at its free top. The dimensionless velocity of the footing is V = v B /
-c_v, with the velocity v and the coefficient of consolidation c_v.
+displacement on a part of the soil's top. The soil is a weightless layer, 2.5 B thick, on rough rock. The soil follows
+Drucker and Prager's law with cohesion c, and drains at its free top. The dimensionless velocity of the footing is V = v
+B / c_v, with the velocity v and the coefficient of consolidation c_v.
 
 A smooth, impervious wall bounds the soil at 8 B from the middle of the footing. With a wall at 16 B, loads change by
 less than 1 % at any depth and rate. With a wall at 4 B, drained loads are up to 8 % too large before the limit load.
@@ -16,7 +16,7 @@ capacity is `q = (2 + pi) s_u` (Prandtl 1921), with the undrained strength s_u. 
 associated flow it is `q = c N_c`, with `N_c = (exp(pi tan(phi)) tan^2(45 deg + phi/2) - 1) / tan(phi)`. The footing has
 --cells cells over its width, and about twice as many in a second run.
 
-In the deep push the soil does not dilate. Its undrained strength is s_u = xi c, with the coefficient xi of the cohesion
+In the deep push the soil does not dilate. The undrained strength is s_u = xi c, with the coefficient xi of the cohesion
 in the yield function. A footing at depth D carries (1 + 0.27 sqrt(D/B)) times the undrained load of a footing at the
 surface (fit to bounds of limit analysis, Salgado et al. 2004). The drained capacity at the surface lies between the
 capacity for the reduced friction of Davis (1968) and c N_c.

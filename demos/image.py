@@ -7,9 +7,9 @@ stiff as black tissue, and less permeable. A rigid permeable plate compresses th
 eighth of its height. No water flows into the holes. The demo runs on one process.
 
 `modulus` is the error of the drained modulus (stress / strain under a small load). The reference has one Taylor-Hood
-element per pixel. Its elements in holes have a millionth of the stiffness of black tissue. `drained` is the difference
-of the final settlement of the saturated tissue from that of dry tissue. Both errors decrease with the size of the
-pixels.
+element per pixel. The elements in holes have a millionth of the stiffness of black tissue. `drained` is the difference
+of the final settlement of the saturated tissue from that of dry tissue. The errors `modulus` and `drained` decrease
+with the size of the pixels.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """A rigid cylinder is pressed into a saturated gel and stays there; the force relaxes as the gel drains.
 
-The scene is in plane strain, and by symmetry half of the gel is computed. This half is 5 m wide and high, lies on a
-smooth base, and drains at its side, far from the cylinder.
+The scene is in plane strain, and by symmetry half of the gel is computed, 5 m wide and high. The gel lies on a smooth
+base, and drains at its side, far from the cylinder.
 
 * At first no water has flowed, and the gel is incompressible. By Hertz's theory the pressure under the cylinder is
 

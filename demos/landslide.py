@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 """A slope at rest loses strength, slides and comes to rest: speed, energies, and run-out with and without inertia.
 
-A slope of 2:1, H = 10 m high, stands on a layer of 5 m. Both are Mohr-Coulomb soil, with the friction angle phi = 20
-degrees and the cohesion c = 0.05 gamma H (unit weight gamma). The slope settles under its weight without inertia. Its
-factor of safety is 1.4. Then its strength is suddenly divided by 1.6.
+A slope of 2:1, H = 10 m high, stands on a layer of 5 m. Slope and layer are Mohr-Coulomb soil, with the friction angle
+phi = 20 degrees and the cohesion c = 0.05 gamma H (unit weight gamma). The slope settles under its weight without
+inertia. The factor of safety of the slope is 1.4. Then its strength is suddenly divided by 1.6.
 
 With inertia the slope accelerates until its shape is stable, and then moves on until friction stops it. Without
 inertia, as in the demo `slope`, a viscous stress controls the motion. The slope then stops at the first stable shape,

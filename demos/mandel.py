@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: MIT
 """Mandel's slab is compressed between rigid plates; the pore pressure in its middle rises before it decreases.
 
-A saturated slab between rigid, smooth, impervious plates carries a force from the first step on. Its free sides drain
-and soften first, so the plates load the middle more. The pressure in the middle therefore rises above its initial value
-p0 = force / (2a). By symmetry a quarter of the slab is computed, a = 1 m wide and 1 m high, in plane strain. Poisson's
-ratio is 0.2, and water and grains are incompressible. The mean strain is 1e-5, so small-strain theory is accurate.
-Displacements are linear in y, so few cells over the height suffice. The reduced time is `T = c t / a²`, with `c = kappa
-(K + 4G/3)`. Here t is the time, kappa the mobility, K the bulk modulus and G the shear modulus. Source: Mandel (1953);
-Abousleiman et al. (1996), Géotechnique 46. The demo runs on one process.
+A saturated slab between rigid, smooth, impervious plates carries a force from the first step on. The free sides of the
+slab drain and soften first, so the plates load the middle more. The pressure in the middle therefore rises above its
+initial value p0 = force / (2a). By symmetry a quarter of the slab is computed, a = 1 m wide and 1 m high, in plane
+strain. Poisson's ratio is 0.2, and water and grains are incompressible. The mean strain is 1e-5, so small-strain theory
+is accurate. Displacements are linear in y, so few cells over the height suffice. The reduced time is `T = c t / a²`,
+with `c = kappa (K + 4G/3)`. Here t is the time, kappa the mobility, K the bulk modulus and G the shear modulus. Source:
+Mandel (1953); Abousleiman et al. (1996), Géotechnique 46. The demo runs on one process.
 
 Errors:
 

@@ -6,8 +6,9 @@ the end of the ramp (--ramp), and then remains constant. The ends of the beam ar
 impervious. The beam is in plane strain, or equivalently 0.1 m deep between smooth walls (--dim 3). At first the pore
 water carries a part of the load. The beam drains and sags by a third of its length.
 
-Two other solutions are drawn. One is Euler-Bernoulli's small-strain beam without water. The other (--reference) is a
-finite-strain Biot solution with body-fitted Taylor-Hood elements, in steps of a quarter of --dt.
+Two other solutions are drawn. The first solution is Euler-Bernoulli's small-strain beam without water. The second
+solution (--reference) is a finite-strain Biot solution with body-fitted Taylor-Hood elements, in steps of a quarter of
+--dt.
 """
 
 from __future__ import annotations

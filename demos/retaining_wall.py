@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Active and passive pressure on a rigid retaining wall that tilts about its toe, away from the sand or into it.
 
-The weightless sand lies on a rough floor and carries a surcharge q. Its friction angle phi and its dilation angle are
-30 degrees. The friction angle of the wall is delta. The wall tilts until a wedge of the sand flows. The effect of a
-cohesion c is removed: c cot(phi) is added to q and to the normal pressure on the wall. The normal pressure is then K q,
-with
+The weightless sand lies on a rough floor and carries a surcharge q. The friction angle phi and the dilation angle of
+the sand are 30 degrees. The friction angle of the wall is delta. The wall tilts until a wedge of the sand flows. The
+effect of a cohesion c is removed: c cot(phi) is added to q and to the normal pressure on the wall. The normal pressure
+is then K q, with
 
     K = (1 ± sin(phi) cos(w)) / (1 ∓ sin(phi)) exp(± w tan(phi)),    w = asin(sin(delta) / sin(phi)) ± delta,
 

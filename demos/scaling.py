@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: MIT
 """Cost of a step: time of each part, memory, and messages, for different numbers of material points and processes.
 
-Two saturated bodies move slowly through the grid. One is the beam of `poroelastic_beam.py` in 2D, with direct solvers,
-in a background box six times as large. The other is a cube of 1 m in 3D, sheared and compressed, with multigrid. Each
-run is a new process, or several processes under mpirun (--processes 1 2). The first step compiles and fills the caches.
-Then single steps are measured, and the fastest step is used, because other work on the machine only adds time. Time is
-processor time, divided among the parts of a step in proportion to their wall time. On several processes, it is the
-largest time of all processes, including waiting. Memory is the peak since the start of the process. If the demo itself
-is started by mpirun, all runs share its processes, and memory is the peak of all runs so far.
+Two saturated bodies move slowly through the grid. The first body is the beam of `poroelastic_beam.py` in 2D, with
+direct solvers, in a background box six times as large. The second body is a cube of 1 m in 3D, sheared and compressed,
+with multigrid. Each run is a new process, or several processes under mpirun (--processes 1 2). The first step compiles
+and fills the caches. Then single steps are measured, and the fastest step is used, because other work on the machine
+only adds time. Time is processor time, divided among the parts of a step in proportion to their wall time. On several
+processes, the time is the largest time of all processes, including waiting. Memory is the peak since the start of the
+process. If the demo itself is started by mpirun, all runs share its processes, and memory is the peak of all runs so
+far.
 
 The exponent of a part is the slope of log(time) against log(points), fitted by least squares to the larger half of the
 sizes. `kB a point` is the slope of the memory against the number of points, fitted to all sizes by least squares of

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Factor of safety of a slope, and run-out after a larger loss of strength.
 
-A slope of 2:1, H = 10 m high, stands on a layer of 5 m. Both are Mohr-Coulomb soil without dilation, with the friction
-angle phi = 20 degrees and the cohesion c = 0.05 gamma H (unit weight gamma).
+A slope of 2:1, H = 10 m high, stands on a layer of 5 m. Slope and layer are Mohr-Coulomb soil without dilation, with
+the friction angle phi = 20 degrees and the cohesion c = 0.05 gamma H (unit weight gamma).
 
 1. The factor of safety is the largest divisor of c and tan(phi) for which the slope is stable. `mpm.factor_of_safety`
    reduces the strength of the slope at rest, and checks whether the viscous stress decays. The best log-spiral

@@ -7,12 +7,13 @@ pressure outside. The weight is a term in UFL, with the buoyant unit weight `gam
 is the porosity, rho_s the density of the grains, and rho_w the density of the water. Inertia is neglected. The demo
 runs on one process.
 
-1. Critical strength. The soil has no friction and does not drain. Its strength c is reduced by 1 % in each step. A
-   vertical side of height H is stable while gamma' H / c < 3.78. Limit analysis gives 3.76 to 3.79 (Pastor, Thai and
-   Francescato 2000), and the critical slip circle 3.83 (Fellenius 1927). The bank has failed when its crest settles 20
-   times as much in a step as in the first steps. With a factor of 10 or 40 instead of 20, the result changes by 1 %.
-   With 10 cells over the height the bank fails at gamma' H / c = 3.93, which is 3.9 % too large. With 20 cells it fails
-   at 3.85, which is 1.9 % too large. The error is of first order in the cell size, and the extrapolated value is 3.78.
+1. Critical strength. The soil has no friction and does not drain. The strength c of the soil is reduced by 1 % in each
+   step. A vertical side of height H is stable while gamma' H / c < 3.78. Limit analysis gives 3.76 to 3.79 (Pastor,
+   Thai and Francescato 2000), and the critical slip circle 3.83 (Fellenius 1927). The bank has failed when its crest
+   settles 20 times as much in a step as in the first steps. With a factor of 10 or 40 instead of 20, the result changes
+   by 1 %. With 10 cells over the height the bank fails at gamma' H / c = 3.93, which is 3.9 % too large. With 20 cells
+   it fails at 3.85, which is 1.9 % too large. The error is of first order in the cell size, and the extrapolated value
+   is 3.78.
 2. Run-out. The consolidated bank, with friction, loses its cohesion within T = 10 minutes, far faster than it drains.
    The bank slumps. In front of the initial toe, the water carries more than half of the soil's weight. At rest the bank
    is twice as long as before. Then the excess pressure drains. The final inclination of the slope is 23.5 degrees, and

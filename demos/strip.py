@@ -3,11 +3,11 @@
 
 A layer between smooth walls, on a smooth, impervious base, carries a dead load q on a fifth of its drained surface. By
 symmetry half of the layer is computed, as wide as its height H. The soil is elastic (Hencky, nu = 0) with Young's
-modulus E and porosity 0.6. Its conductivity `k0 10^(5 (J - 1))` decreases as pores close, with the volume ratio J.
-Grains and water are incompressible. The reduced time is `T = k0 E t / (gamma_w H²)`, with the time t and the unit
-weight gamma_w of water. The load increases until T = 0.01. Source: Carter, Small and Booker (1977), as in Abaqus'
-benchmark 1.14.3. With q = E/2 (--load 0.5) the pores under the strip close at T = 0.37. The law has no stiffness of the
-grains, so the run fails at this time.
+modulus E and porosity 0.6. The conductivity of the soil, `k0 10^(5 (J - 1))` with the volume ratio J, decreases as
+pores close. Grains and water are incompressible. The reduced time is `T = k0 E t / (gamma_w H²)`, with the time t and
+the unit weight gamma_w of water. The load increases until T = 0.01. Source: Carter, Small and Booker (1977), as in
+Abaqus' benchmark 1.14.3. With q = E/2 (--load 0.5) the pores under the strip close at T = 0.37. The law has no
+stiffness of the grains, so the run fails at this time.
 
 The references for q/E = 0.25 are results of Taylor-Hood elements, extrapolated in time, and in the cell size from 20,
 40 and 80 cells. The extrapolated settlements differ from the settlements on 40 cells by 0.6 % at T = 0.01, and by 0.2 %

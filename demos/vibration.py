@@ -6,11 +6,11 @@
    are graded towards the corners of the clamp. The first axial frequency is exactly c / (4 L) = 17.67767 Hz, with the
    axial wave velocity c and the length L. The computed frequencies are fitted to the motion of the tip over three
    periods.
-2. A free bar of length L has the law `P = E (F - 1)`, with the first Piola-Kirchhoff stress P. It vibrates with strains
-   of A = 5 % and moves over fifty cells in 25 periods. In the exact solution the ends oscillate about the uniform
-   motion by `(A L / pi) sin(pi c t / L)`, without loss of energy. In each step dt, SDIRK2 loses the fraction `gamma^4
-   y^4 / (1 + gamma^2 y^2)^2` of the energy. Here y is omega dt, with the angular frequency omega, and gamma is the
-   coefficient of SDIRK2. The remaining loss is due to grid resets.
+2. A free bar of length L has the law `P = E (F - 1)`, with the first Piola-Kirchhoff stress P. The bar vibrates with
+   strains of A = 5 % and moves over fifty cells in 25 periods. In the exact solution the ends oscillate about the
+   uniform motion by `(A L / pi) sin(pi c t / L)`, without loss of energy. In each step dt, SDIRK2 loses the fraction
+   `gamma^4 y^4 / (1 + gamma^2 y^2)^2` of the energy. Here y is omega dt, with the angular frequency omega, and gamma is
+   the coefficient of SDIRK2. The remaining loss is due to grid resets.
 """
 
 from __future__ import annotations
