@@ -16,8 +16,8 @@ a surface crosses several times. The edge between cone and shaft has a radius of
 
 The cone is also pushed into saturated ("wet") clay, so fast that the clay is undrained. Then the cone stops, and the
 excess pressure at the edge between cone and shaft dissipates. The fraction of the excess pressure that remains is
-compared with the curve of Teh and Houlsby (1991, Geotechnique 41) for a deep cone. The time factor of this curve is `T*
-= c_v t / (R^2 sqrt(G / s_u))`, with the coefficient of consolidation c_v and the time t. Near the surface pressures
+compared with the curve of Teh and Houlsby (1991, Geotechnique 41) for a deep cone. The time factor of this curve is
+`T* = c_v t / (R^2 sqrt(G / s_u))`, with the coefficient of consolidation c_v and the time t. Near the surface pressures
 dissipate faster. Half of the pressure has dissipated at T* = 0.03 if the tip is three radii deep, and at T* = 0.08 if
 the tip is five radii deep.
 

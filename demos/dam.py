@@ -10,8 +10,8 @@ faces.
 Checks:
 
 * `flow`: outflow of a rectangular dam, divided by the exact outflow. The dam is L = 9.6 m wide, with water levels of H1
-  = 10 m and H2 = 2 m at its sides, and hydrostatic suction above these levels. Without suction, the exact flow is `k
-  (H1^2 - H2^2) / (2 L)` (Dupuit, Charny), with the conductivity k. With suction, Kirchhoff's potential replaces the
+  = 10 m and H2 = 2 m at its sides, and hydrostatic suction above these levels. Without suction, the exact flow is
+  `k (H1^2 - H2^2) / (2 L)` (Dupuit, Charny), with the conductivity k. With suction, Kirchhoff's potential replaces the
   head. The potential is the integral of the relative permeability over the head.
 * `steady`: inflow of the dam divided by its outflow, before the reservoir falls.
 * `drained`: outflow of a column, divided by the outflow by finite elements on cells of a quarter of the size. The free

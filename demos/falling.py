@@ -2,10 +2,10 @@
 """A box slides, a ball rolls and a second ball bounces down an incline, compared with the motion of rigid bodies.
 
 The incline has an angle of b = 30 degrees to the grid. The friction coefficient is mu = 0.3. In the time t a rigid box
-slides by `g t^2 (sin(b) - mu cos(b)) / 2`, with gravity g. A rigid disc rolls by `g t^2 sin(b) / 3`, if mu > tan(b) /
-3. A second disc falls on the incline from a height of its radius, bounces and rotates. Box and discs are stiff rubber,
-and touch only the incline. The final energy is the work of gravity, minus the energy that friction and elastic waves
-dissipate. The demo needs gmsh.
+slides by `g t^2 (sin(b) - mu cos(b)) / 2`, with gravity g. A rigid disc rolls by `g t^2 sin(b) / 3`, if
+`mu > tan(b) / 3`. A second disc falls on the incline from a height of its radius, bounces and rotates. Box and discs
+are stiff rubber, and touch only the incline. The final energy is the work of gravity, minus the energy that friction
+and elastic waves dissipate. The demo needs gmsh.
 """
 
 from __future__ import annotations
@@ -50,8 +50,7 @@ def scene(cells: int) -> tuple[mpm.Simulation, list[np.ndarray]]:
 
 
 def fall(s: mpm.Simulation, parts: list[np.ndarray], dt: float) -> tuple[mpm.Result, np.ndarray, list]:
-    """Release the bodies, and return the result, the paths (times, 7), and the corners of the domains at some times, in
-    m.
+    """Release the bodies, and return the result, the paths (times, 7), and the corners of the domains at some times.
 
     Each row of the paths has the time, in s, and the positions (x, y) of three centres of mass, in m.
     """

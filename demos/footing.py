@@ -3,8 +3,8 @@
 
 The footing is rough and rigid, and has the width B. By symmetry half of the footing is computed, as a prescribed
 displacement on a part of the soil's top. The soil is a weightless layer, 2.5 B thick, on rough rock. The soil follows
-Drucker and Prager's law with cohesion c, and drains at its free top. The dimensionless velocity of the footing is V = v
-B / c_v, with the velocity v and the coefficient of consolidation c_v.
+Drucker and Prager's law with cohesion c, and drains at its free top. The dimensionless velocity of the footing is
+`V = v B / c_v`, with the velocity v and the coefficient of consolidation c_v.
 
 A smooth, impervious wall bounds the soil at 8 B from the middle of the footing. With a wall at 16 B, loads change by
 less than 1 % at any depth and rate. With a wall at 4 B, drained loads are up to 8 % too large before the limit load.

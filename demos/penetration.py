@@ -17,7 +17,7 @@ depth. After each quarter of a diameter, new points are therefore seeded around 
 is lower for one or two steps. Errors refer to the mean of N in the last steps of each quarter. `spread` is the range of
 N in these steps, divided by their mean.
 
-A smooth bar is also pushed through saturated ("wet") clay by one diameter, at three rates V = v D / c_v, with the
+A smooth bar is also pushed through saturated ("wet") clay by one diameter, at three rates `V = v D / c_v`, with the
 velocity v and the coefficient of consolidation c_v. The pressure on the top is that of water, so the clay starts
 without effective stress. Wet clay is seeded only once. Domains longer than a cell are replaced by new domains
 (renewal).

@@ -9,8 +9,8 @@ is then K q, with
     K = (1 ± sin(phi) cos(w)) / (1 ∓ sin(phi)) exp(± w tan(phi)),    w = asin(sin(delta) / sin(phi)) ± delta,
 
 where the upper sign is for passive pressure (Prandtl, Sokolovskii). The flowing sand consists of a zone at the wall, a
-fan about the crest of the wall, and Rankine's zone. Without wall friction, K is Rankine's `(1 ± sin(phi)) / (1 ∓
-sin(phi))`. Coulomb's solution is the critical wedge with a plane slip surface.
+fan about the crest of the wall, and Rankine's zone. Without wall friction, K is Rankine's
+`(1 ± sin(phi)) / (1 ∓ sin(phi))`. Coulomb's solution is the critical wedge with a plane slip surface.
 
 The moment about the toe also gives K. A tilting wall opens no gap at its toe. A translating wall opens a gap at its
 toe, in which no force acts. Without the force on the lowest of ten cells, the active thrust is a tenth too small. The

@@ -3,10 +3,10 @@
 
 A column of 1 m between smooth walls, impervious at its foot, carries a load p0 from the first step on. At first the
 incompressible pore water carries the whole load. As water drains, the load is transferred to the skeleton. The pore
-pressure p at depth z and time t follows `dp/dt = c_v d²p/dz²`. The coefficient of consolidation is `c_v = kappa (K +
-4G/3)`, with the mobility kappa, the bulk modulus K and the shear modulus G. The load strains the skeleton by 1e-5, so
-small-strain theory is accurate. The reduced time is `T_v = c_v t / height²`. Source: Terzaghi (1923); series in
-Verruijt, Theory and Problems of Poroelasticity (2016). The demo runs on one process.
+pressure p at depth z and time t follows `dp/dt = c_v d²p/dz²`. The coefficient of consolidation is
+`c_v = kappa (K + 4G/3)`, with the mobility kappa, the bulk modulus K and the shear modulus G. The load strains the
+skeleton by 1e-5, so small-strain theory is accurate. The reduced time is `T_v = c_v t / height²`. Source: Terzaghi
+(1923); series in Verruijt, Theory and Problems of Poroelasticity (2016). The demo runs on one process.
 
 Errors are the largest |p - exact| / p0 at the centroids of all cells, at T_v = 0.1, 0.5 and 1, and the relative error
 of the `settlement` at T_v = 0.5. Steps are equal, or adaptive with --rtol.

@@ -3,12 +3,12 @@
 
 Modified Cam Clay is tested at three overconsolidation ratios R, drained and undrained, from the isotropic stress p_0.
 The parameters of Modified Cam Clay are M, lambda and kappa. The mean and the deviatoric Kirchhoff stress are P and Q.
-The mean and the deviatoric Cauchy stress are p and q. The size of the yield surface is P_c. During yield, `Q = M sqrt(P
-(P_c - P))`. In an undrained test the volume is constant, so the test ends at `P = P_cs = p_0 (R/2)^(1 - kappa/lambda)`
-and `Q = M P_cs`. In a drained test the stress path is `q = 3 (p - p_0)`, and ends at `q = M p`. Tests of Mohr-Coulomb
-sand, in compression and in extension, end at `t_1 (1 + sin(phi)) - t_3 (1 - sin(phi)) = 2 c cos(phi)`, with the
-friction angle phi, the cohesion c, and the largest and smallest principal Kirchhoff stresses t_1 and t_3. Errors are
-relative, and refer to the final states.
+The mean and the deviatoric Cauchy stress are p and q. The size of the yield surface is P_c. During yield,
+`Q = M sqrt(P (P_c - P))`. In an undrained test the volume is constant, so the test ends at
+`P = P_cs = p_0 (R/2)^(1 - kappa/lambda)` and `Q = M P_cs`. In a drained test the stress path is `q = 3 (p - p_0)`, and
+ends at `q = M p`. Tests of Mohr-Coulomb sand, in compression and in extension, end at
+`t_1 (1 + sin(phi)) - t_3 (1 - sin(phi)) = 2 c cos(phi)`, with the friction angle phi, the cohesion c, and the largest
+and smallest principal Kirchhoff stresses t_1 and t_3. Errors are relative, and refer to the final states.
 
 With --cost N, blocks of N x N cells are compressed until all of their soil yields. The laws are Drucker-Prager,
 Mohr-Coulomb and Cam Clay. The laws are timed in turn, one step each. The demo prints the processor time of a step,
