@@ -40,7 +40,9 @@ def run(name: str, options: str) -> tuple[mpm.Result, float]:
         probes = mpm.probes(simulation.bodies, np.add(probe, [0, bottom]))
         return simulation.run(o.t_end, **beam.output_times(o), probes=probes), simulation.jit
     cells = [round(beam.LENGTH / o.h), round(beam.HEIGHT / o.h)]
-    fem = BiotFEM([0, 0], [beam.LENGTH, beam.HEIGHT], cells, beam.material(o), element=name, **beam.physics(o))
+    fem = BiotFEM(
+        mpm.Grid([0, 0], [beam.LENGTH, beam.HEIGHT], cells), beam.material(o), element=name, **beam.physics(o)
+    )
     return fem.run(o.t_end, o.dt, probes=probe), fem.jit
 
 

@@ -178,7 +178,7 @@ def reference(o: Namespace) -> tuple[np.ndarray, np.ndarray]:
     """Return the tip deflection in a load cycle, in m, by finite elements, and the load, in Pa."""
     case = options(o.h[-1], o.load)
     size = [0, 0], [beam.LENGTH, beam.HEIGHT], beam.REFERENCE_CELLS
-    fem = BiotFEM(*size, beam.material(case), **conditions(case))
+    fem = BiotFEM(mpm.Grid(*size), beam.material(case), **conditions(case))
     result = fem.run(1.0, 1 / o.steps, probes=np.array([[beam.LENGTH, beam.HEIGHT / 2]]))
     return np.array(result.displacement)[:, 0, 1], o.load * (1 - np.abs(2 * (np.array(result.t) % 1) - 1))
 

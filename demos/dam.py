@@ -162,7 +162,9 @@ def drained(cells: int, days: float = 100.0) -> tuple[float, float]:
     simulation.run(days * DAY, days * DAY / 50, progress=False)
     # stiff elements: they start without stress, under their weight
     hard = replace(LOAM, bulk=1e12, shear=5e11)
-    fem = BiotFEM([0, 0], [h, 10], [1, 4 * cells], hard, gravity=lambda t: (0, -9.81), element="q1-dg0", **scene)
+    fem = BiotFEM(
+        mpm.Grid([0, 0], [h, 10], [1, 4 * cells]), hard, gravity=lambda t: (0, -9.81), element="q1-dg0", **scene
+    )
     full = fem.water()
     fem.run(days * DAY, days * DAY / 100, probes=[[0, 10]])
     return float(start - simulation.cells().water.sum()) / h, (full - fem.water()) / h

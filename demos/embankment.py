@@ -88,13 +88,12 @@ def run(h: float = 0.5, steps: int = 6) -> Bund:
     bodies = [mpm.box(grid, [0, 0], [WIDTH, CLAY]), *[lift(grid, k) for k in range(LIFTS)]]
     simulation = mpm.Simulation(
         grid,
-        bodies,
+        [bodies[0], *map(mpm.Later, bodies[1:])],
         [SOFT, SAND],
         walls={"left": "x", "right": "x", "bottom": "xy"},
         fluid=mpm.Fluid(),
         terms=[weight],
         conditions=[mpm.Drained("top")],
-        later=range(1, LIFTS + 1),
     )
     out = Bund()
     probes = mpm.probes(bodies, [[0.0, CLAY - 1e-6], [CREST + SLOPE * LIFTS, CLAY - 1e-6]])

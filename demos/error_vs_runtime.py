@@ -118,7 +118,9 @@ def beam_runs(drained: bool, quick: bool) -> Iterator[tuple[str, str, Run]]:
 def beam_fem(time: str, element: str, cells: tuple[int, int]) -> tuple[mpm.Result, float]:
     """Return the finite element result for the beam, and the compile time, in s."""
     o = beam.arguments(time.split())
-    fem = BiotFEM([0, 0], [beam.LENGTH, beam.HEIGHT], cells, beam.material(o), element=element, **beam.physics(o))
+    fem = BiotFEM(
+        mpm.Grid([0, 0], [beam.LENGTH, beam.HEIGHT], cells), beam.material(o), element=element, **beam.physics(o)
+    )
     return fem.run(o.t_end, o.dt, probes=[[beam.LENGTH, beam.HEIGHT / 2]]), fem.jit
 
 
@@ -154,7 +156,7 @@ def scene_runs(
 
     def elements(n: int, m: int, element: str) -> Run:
         def run():
-            fem = BiotFEM([0, 0], size, (n if width < 0 else width, n), material, element=element, **physics)
+            fem = BiotFEM(mpm.Grid([0, 0], size, (n if width < 0 else width, n)), material, element=element, **physics)
             result = fem.run(time[0], time[0] / m, probes=[[0, size[1]]])
             return abs(result.displacement[-1][0, 1] / exact - 1), result, fem.jit
 

@@ -87,7 +87,7 @@ def judge(row: Row, make: Make, bound: float, rtol: float | None = None) -> Row:
             warnings.simplefilter("always", mpm.ResultWarning)
             scene = make()
             dt = scene.end / scene.steps
-            steps = {"dt": dt} if rtol is None else {"rtol": rtol, "max_step": dt, "t_eval": [scene.end]}
+            steps = {"dt": dt} if rtol is None else {"rtol": mpm.Adaptive(rtol, max_step=dt), "t_eval": [scene.end]}
             result = scene.simulation.run(scene.end, **steps, probes=scene.probes, progress=False)
         row.outcome = "recovered" if result.cuts else "converged"
     except (mpm.GaveUp, ValueError) as refusal:

@@ -108,7 +108,7 @@ def modulus(tissue: Tissue) -> tuple[float, float, float]:
     points = simulation.run(RAMP, RAMP, probes=top, progress=False).displacement[-1][0, 1]
     n = len(tissue.grey)
     plate = mpm.RigidPlate("top", SMALL * EDGE)
-    elements = BiotFEM([0, 0], [EDGE, EDGE], [n, n], tissue.law(1e-6), walls=WALLS, conditions=[plate])
+    elements = BiotFEM(mpm.Grid([0, 0], [EDGE, EDGE], [n, n]), tissue.law(1e-6), walls=WALLS, conditions=[plate])
     elements.step(1.0)
     moved = elements.displacement(np.array([[EDGE / 2, EDGE]]))[0, 1]
     factor = np.where(tissue.grey < HOLES, 0.0, CONTRAST**tissue.grey).mean()

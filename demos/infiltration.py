@@ -103,7 +103,7 @@ def by_elements(cells: int, dt: float) -> tuple[list[float], list[float]]:
     walls, pull = {"left": "x", "right": "x", "bottom": "y"}, lambda t: (0, -9.81)
     scene = {"conditions": DRY["sides"], "pressure": DRY["pressure"], "walls": walls, "gravity": pull}
     size = [0, 0], [1 / cells, 1], [1, cells]
-    fem = BiotFEM(*size, DRY["soil"], fluid=mpm.Fluid(), element="q1-dg0", **scene)
+    fem = BiotFEM(mpm.Grid(*size), DRY["soil"], fluid=mpm.Fluid(), element="q1-dg0", **scene)
     start, middles = fem.water(), (np.indices((1, cells)).reshape(2, -1).T + 0.5) / cells
     places, waters = [], []
     for hour, (depth, water) in FRONT.items():

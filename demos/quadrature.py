@@ -48,7 +48,9 @@ def main(argv: list[str] | None = None) -> dict:
     o = parser.parse_args(argv)
     with common.results(o) as out:
         ten = options(o.h, 10)
-        fem = BiotFEM([0, 0], [beam.LENGTH, beam.HEIGHT], beam.REFERENCE_CELLS, beam.material(ten), **beam.physics(ten))
+        fem = BiotFEM(
+            mpm.Grid([0, 0], [beam.LENGTH, beam.HEIGHT], beam.REFERENCE_CELLS), beam.material(ten), **beam.physics(ten)
+        )
         exact = float(fem.run(1.0, 0.1, probes=PROBE).displacement[-1][0, 1])
         runs = {q: [tip(o.h, n, q) for n in o.steps] for q in ("domain", "point")}
         tips = {q: [u for u, _ in run] for q, run in runs.items()}

@@ -49,7 +49,7 @@ def struck(h: float, way: str, steps: int = 80) -> tuple[np.ndarray, np.ndarray,
         shape = x[:, 0] ** 2 if axis else np.sin(np.pi * x[:, 0] / (2 * LENGTH))
         return 1e-3 * shape[:, None] * np.eye(2)[axis]
 
-    s = mpm.Simulation(grid, [beam], [BEAM], walls={"left": "xy"}, inertia=True, velocity=velocity)
+    s = mpm.Simulation(grid, [beam], [BEAM], walls={"left": "xy"}, inertia=mpm.Moving(velocity))
     period, tip = 1 / EXACT[way], mpm.probes([beam], [[LENGTH, DEPTH / 2 + 2 * h]])
     result = s.run(3 * period, period / steps, probes=tip, progress=False)
     t, u = result.t, result.displacement[:, 0, axis]
@@ -75,7 +75,7 @@ def flown(cells: int, periods: int, steps: int) -> dict[str, np.ndarray]:
         return np.stack([speed + AMPLITUDE * np.cos(np.pi * (x[:, 0] - low)), 0 * x[:, 1]], axis=1)
 
     walls = {"bottom": "y", "top": "y"}
-    s = mpm.Simulation(grid, [body], [law], walls=walls, inertia=True, velocity=velocity)
+    s = mpm.Simulation(grid, [body], [law], walls=walls, inertia=mpm.Moving(velocity))
     end = mpm.probes([body], [[low, h / 2]])
     result = s.run(2.0 * periods, 2.0 / steps, probes=end, energies=True, progress=False)
     t, e = result.t, result.energies

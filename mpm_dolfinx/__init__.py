@@ -1,22 +1,27 @@
 # SPDX-License-Identifier: MIT
-"""Poromechanics on FEniCSx with material points and finite volumes, implicit and iteratively coupled.
+"""Large-deformation poromechanics on FEniCSx, with material points for the skeleton and finite volumes for the fluid.
 
-A `Simulation` contains a `Grid`, bodies (`box`, `shape`, `mapped`, `from_mesh`, `polygon`), and materials: `Hencky`,
-`NeoHookean`, `LinearElastic`, `DruckerPrager`, `SofteningDruckerPrager`, `MohrCoulomb`, `ModifiedCamClay`,
-`BarcelonaBasic`, or your own `Skeleton`.  It has a `Fluid`, and conditions on the sides of the bodies: `Traction`,
-`Pressure`, `Displacement`, `RigidPlate`, `Drained`, `Inflow`, `water`.  A rigid `Tool` has the shape `HalfSpace`,
-`Ball`, `Convex` or `Cone`.  `run` returns a `Result` with records of `probes`.  A `Writer` writes results to files;
-`one_file` joins these files.  `resume` continues a run from a `Checkpoint`.  `stage` changes the scene between two
-runs.  `factor_of_safety` reduces the strength until failure.  For terms in UFL see
-`mpm_dolfinx.materials.user_functions`.
+A `Simulation` has these parts:
 
-Units are SI, or other consistent units, see `Fluid`.  Stress is positive in tension, pore pressure in compression.  In
-plane strain, forces refer to a thickness of 1 m.  In axisymmetry (`Grid`), forces refer to the full circumference.
+* a `Grid`, and bodies from `box`, `shape`, `mapped`, `from_mesh` or `polygon`;
+* materials: `Hencky`, `NeoHookean`, `LinearElastic`, `DruckerPrager`, `SofteningDruckerPrager`, `MohrCoulomb`,
+  `ModifiedCamClay`, `BarcelonaBasic`, or your own `Skeleton`;
+* a pore `Fluid`, and conditions on sides: `Traction`, `Pressure`, `Displacement`, `RigidPlate`, `Drained`, `Inflow`;
+* rigid tools (`Tool`) with the shape `HalfSpace`, `Ball`, `Convex` or `Cone`.
+
+`Simulation.run` returns a `Result`, with records at `probes`.  A `Writer` writes results to files, and `one_file` joins
+these files.  `resume` continues a run from a `Checkpoint`.  `Simulation.stage` changes the scene between two runs.
+`factor_of_safety` reduces the strength until the bodies fail.  `mpm_dolfinx.materials.user_functions` describes terms
+in UFL.
+
+Units are SI units, or other consistent units (see `Fluid`).  Stress is positive in tension, and pore pressure is
+positive in compression.  In plane strain, forces refer to a thickness of 1 m.  In axisymmetry, forces refer to the full
+circumference.
 """
 
 from mpm_dolfinx.base import _environment  # noqa: F401 - first: it reports missing dependencies
 from mpm_dolfinx.base.errors import LeftGrid, NotConverged, Report
-from mpm_dolfinx.bodies.bodies import Body, mapped
+from mpm_dolfinx.bodies.bodies import Body, Later, Moving, mapped
 from mpm_dolfinx.bodies.boxes import box, shape
 from mpm_dolfinx.bodies.mesh_files import from_mesh
 from mpm_dolfinx.bodies.meshes import MeshBody
@@ -70,6 +75,7 @@ from mpm_dolfinx.probing.cell_fields import CellFields
 from mpm_dolfinx.probing.point_fields import PointFields
 from mpm_dolfinx.probing.probes import Probes, probes
 from mpm_dolfinx.simulation.simulation import Simulation
+from mpm_dolfinx.simulation.step_size import Adaptive
 from mpm_dolfinx.simulation.strength_reduction import Safety, factor_of_safety
 from mpm_dolfinx.simulation.tangent import Tangent
 from mpm_dolfinx.solve.numerics import Numerics
@@ -83,6 +89,7 @@ __all__ = [
     "COUPLINGS",
     "K0",
     "Acting",
+    "Adaptive",
     "Ball",
     "BarcelonaBasic",
     "Body",
@@ -107,6 +114,7 @@ __all__ = [
     "HalfSpace",
     "Hencky",
     "Inflow",
+    "Later",
     "Leaving",
     "LeftGrid",
     "LinearElastic",
@@ -115,6 +123,7 @@ __all__ = [
     "MeshBody",
     "ModifiedCamClay",
     "MohrCoulomb",
+    "Moving",
     "NeoHookean",
     "NotConverged",
     "Numerics",

@@ -5,8 +5,8 @@ A number is *structure* where it cannot be another one: see `structure` below. I
 or the string below it, names one of two things:
 
     Source: an equation, a paper (with its year), a definition, a format, or an exact bound, see `SOURCE`;
-    Halving this value changes the result of scene "name" in tests/plateaus.py by a (relative), doubling it by b, and
-    finer cells by c.
+    The result of scene "name" in tests/plateaus.py changes by the fraction a with half this value, by b with twice this
+    value, and by c with finer cells.
 
 One of a and b is not zero, so the number affects the scene; both are below c. `python tests/plateaus.py` measures
 them again. All other numbers are *ad hoc*.
@@ -25,8 +25,8 @@ SOURCE = re.compile(
     re.DOTALL,
 )
 PLATEAU = re.compile(
-    r'\bHalving this value changes the result of scene "(\w+)" in tests/plateaus.py by ([\d.e+-]+) \(relative\), '
-    r"doubling it by ([\d.e+-]+), and finer cells by ([\d.e+-]*[\d])"
+    r'\bThe result of scene "(\w+)" in tests/plateaus.py changes by the fraction ([\d.e+-]+) with half this value, '
+    r"by ([\d.e+-]+) with twice this value, and by ([\d.e+-]*[\d]) with finer cells"
 )
 UNITS = {60, 90, 100, 180, 360, 1000, 1e6, 1024, 86400}
 """Per cent, degrees, and the like."""
@@ -277,6 +277,16 @@ def _changes(node: ast.AST, functions: set[str]) -> bool:
     return False
 
 
+def guards() -> list[str]:
+    """Return asserts and RuntimeErrors, which guard an order of calls if users and solvers are not their cause."""
+    found = []
+    for module in modules():
+        for node in module.nodes:
+            if isinstance(node, ast.Assert) or (isinstance(node, ast.Raise) and "RuntimeError(" in ast.unparse(node)):
+                found.append(f"{module.where}:{node.lineno} {ast.unparse(node)}")
+    return found
+
+
 def rooms(name: str) -> list[str]:
     """Return the modules that use the name of a class, without modules that only export it."""
     return [m.where for m in modules() if m.path.name != "__init__.py" and name in m.used]
@@ -303,6 +313,7 @@ def measures() -> dict[str, float]:
         "parameters of the longest list": parameters()[0][0],
         "assignments of three and more values": len(packed()),
         "changes of hidden state": len(hidden()),
+        "asserts and RuntimeErrors": len(guards()),
         "files that name a condition's class, most": max(len(rooms(name)) for name in CONDITIONS),
     }
 
@@ -313,6 +324,7 @@ def main(arguments: list[str]) -> None:
         print(f"{value:9g}  {name}")
     if "--list" in arguments:
         every = {"ad hoc": ad_hoc(), "inline": inline(), "hidden": hidden(), "packed": packed()}
+        every["guards"] = guards()
         every["sourced"] = [f"{where} {name}: {said}" for where, name, said in named() if sourced(said)]
         every["parameters"] = [f"{n} {what}" for n, what in parameters()[:10]]
         every["conditions"] = [f"{name}: {', '.join(rooms(name))}" for name in CONDITIONS]

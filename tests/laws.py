@@ -37,9 +37,8 @@ class LawAtPoints:
             fields[name] = np.broadcast_to(state[name], (n, *np.shape(start)))
         cells = np.arange(n, dtype=np.int32) % self.grid.num_owned
         data = self.points.at(cells, self.grid.midpoints[cells], np.ones(n), F=F, **fields)
-        if self.local is not None:
-            self.local.update(data)
-        return expression.evaluate(data)
+        given = {} if self.local is None else self.local.solve(data)
+        return expression.evaluate(data, live=expression.live(data, given))
 
     def kirchhoff(self, F, state=None):
         """Return the in-plane Kirchhoff stress (n, d, d), Pa."""

@@ -95,7 +95,7 @@ def scene(cells):
 
 def reference(cells):
     """Return the block by Taylor-Hood elements."""
-    return BiotFEM([0, 0], [1, 1], (cells, cells), SOIL, **PHYSICS)
+    return BiotFEM(mpm.Grid([0, 0], [1, 1], (cells, cells)), SOIL, **PHYSICS)
 
 
 def rms(values):

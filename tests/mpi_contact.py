@@ -14,7 +14,7 @@ soil = mpm.Hencky(bulk=4e6 / 3, shear=1e6, conductivity=1e-5)
 above = ([0, 0.7], [1.3, 1.2])
 simulation = mpm.Simulation(
     grid,
-    bodies,
+    [*bodies[:2], mpm.Later(bodies[2])],
     [soil],
     fluid=mpm.Fluid(),
     walls={"bottom": "xy"},
@@ -24,7 +24,6 @@ simulation = mpm.Simulation(
         mpm.Displacement("top", lambda t, X: (0.01 * t, -0.03 * t), region=above),
         mpm.Contact([1, 2], 0, friction=0.2),
     ],
-    later=[2],
 )
 simulation.run(0.5, 0.5, progress=False)
 simulation.stage(

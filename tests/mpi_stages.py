@@ -13,7 +13,7 @@ bodies = [mpm.box(grid, low, high) for low, high in boxes]
 soil = mpm.Hencky(bulk=1e6, shear=6e5, conductivity=1e-5)
 walls = {"left": "x", "right": "x", "bottom": "y"}
 options = {"fluid": mpm.Fluid(), "walls": walls, "gravity": (0, -9.81), "conditions": [mpm.Drained("top")]}
-simulation = mpm.Simulation(grid, bodies, [soil], later=[2], **options)
+simulation = mpm.Simulation(grid, [*bodies[:2], mpm.Later(bodies[2])], [soil], **options)
 simulation.run(1.0, 0.5, progress=False)
 push = mpm.Displacement("top", lambda t, X: (0, -0.02 * (t - 1)), region=((0.0, 0.0), (0.31, 0.5)))
 simulation.stage(add=[2], remove=[1], conditions=[*simulation.conditions, push], reset_displacement=True)

@@ -18,8 +18,7 @@ simulation = mpm.Simulation(
     walls={"bottom": "xy"},
     conditions=[tool, mpm.Contact(0, 1, friction=0.2)],
     gravity=(1.0, -9.81),
-    inertia=True,
-    velocity=lambda x: np.stack([np.where(x[:, 1] > 0.43, 0.3, 0.0), 0 * x[:, 1]], axis=1),
+    inertia=mpm.Moving(lambda x: np.stack([np.where(x[:, 1] > 0.43, 0.3, 0.0), 0 * x[:, 1]], axis=1)),
 )
 result = simulation.run(0.05, 0.01, energies=True, progress=False)
 points = simulation.points

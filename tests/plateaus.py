@@ -148,8 +148,8 @@ def main(arguments: list[str]) -> None:
         began = time.time()
         found = moved(where, name, scene)
         half, twice, cells = (f"{value:.1e}" for value in found)
-        where = f'Halving this value changes the result of scene "{scene}" in tests/plateaus.py'
-        told = f"{where} by {half} (relative), doubling it by {twice}, and finer cells by {cells}."
+        where = f'The result of scene "{scene}" in tests/plateaus.py changes by the fraction {half}'
+        told = f"{where} with half this value, by {twice} with twice this value, and by {cells} with finer cells."
         print(f"{number} {told}  {time.time() - began:.0f} s", flush=True)
 
 

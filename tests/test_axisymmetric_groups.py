@@ -106,7 +106,7 @@ def test_discs_that_strike_each_other_keep_their_momentum():
     def velocity(x):
         return np.column_stack([0 * x[:, 0], np.where(x[:, 1] > 1.62, -1.0, 1.0)])
 
-    s = mpm.Simulation(grid, bodies, [SOIL], walls=walls, conditions=conditions, inertia=True, velocity=velocity)
+    s = mpm.Simulation(grid, bodies, [SOIL], walls=walls, conditions=conditions, inertia=mpm.Moving(velocity))
     mass, momenta, forces = s.scene.materials.density(s.points) * s.points.volume0 * s.points.J, [], []
     for _ in range(40):
         s.step(2.5e-3)

@@ -155,7 +155,7 @@ def test_a_thick_cylinder_is_widened_as_the_exact_one_at_second_order():
         print(f"{cells} cells: error of the inner and the outer displacement", found / exact - 1)
     assert errors[2] < 3e-4 and rates(errors[::2])[0] / 2 > 1.8
     loads = [mpm.Pressure("left", load)]
-    fem = BiotFEM([0.5, 0], [1, 0.1], [8, 1], ELASTIC, walls=walls, conditions=loads, axisymmetric=True)
+    fem = BiotFEM(mpm.Grid([0.5, 0], [1, 0.1], [8, 1], axisymmetric=True), ELASTIC, walls=walls, conditions=loads)
     assert fem.run(1, 0.5, probes=probes).displacement[-1][:, 0] == pytest.approx(exact, rel=1e-6)
 
 
@@ -381,7 +381,7 @@ def test_water_under_a_load_flows_as_in_finite_elements():
         "conditions": [load, mpm.Drained("top")],
     }
     probes = [[0, 0.5], [1, 1.0]]
-    fem = BiotFEM([0, 0], [1, 1], [12, 12], soil, axisymmetric=True, **common)
+    fem = BiotFEM(mpm.Grid([0, 0], [1, 1], [12, 12], axisymmetric=True), soil, **common)
     truth = np.array(fem.run(20, 4, probes=probes).displacement)[:, :, 1]
     grid = plane((1.0, 1.125), (16, 18))
     body = mpm.box(grid, [0, 0], [1, 1])

@@ -14,7 +14,7 @@ def run(arguments="", cells=(40, 12), probe=((1.0, 0.15),)):
     o = demo.arguments(arguments.split())
     simulation, bottom = demo.scene(o)
     result = simulation.run(o.t_end, o.dt, probes=mpm.probes(simulation.bodies, np.add(probe, [0, bottom])))
-    fem = BiotFEM([0, 0], [demo.LENGTH, demo.HEIGHT], cells, demo.material(o), **demo.physics(o))
+    fem = BiotFEM(mpm.Grid([0, 0], [demo.LENGTH, demo.HEIGHT], cells), demo.material(o), **demo.physics(o))
     return result, fem.run(o.t_end, o.dt, probes=probe)
 
 
@@ -96,7 +96,7 @@ def test_the_drained_tip_holds_for_hundreds_of_steps(load, monkeypatch):
     simulation, bottom = demo.scene(o)
     probe = mpm.probes(simulation.bodies, [[1.0, bottom + 0.15]])
     tips = np.array(simulation.run(16.0, o.dt, probes=probe).displacement)[20:, 0, 1]
-    fem = BiotFEM([0, 0], [1, 0.3], demo.REFERENCE_CELLS, demo.material(o), **demo.physics(o))
+    fem = BiotFEM(mpm.Grid([0, 0], [1, 0.3], demo.REFERENCE_CELLS), demo.material(o), **demo.physics(o))
     exact = fem.run(1.0, o.dt, probes=[[1.0, 0.15]]).displacement[-1][0, 1]
     assert np.abs(tips / exact - 1).max() < 1e-3
 
@@ -107,7 +107,7 @@ def test_the_undrained_tip_is_that_of_sealed_finite_elements_and_does_not_creep(
     result = simulation.run(o.t_end, o.dt, probes=mpm.probes(simulation.bodies, [[1.0, bottom + 0.15]]))
     sealed = demo.physics(o)
     sealed["conditions"] = sealed["conditions"][:1]
-    fem = BiotFEM([0, 0], [1, 0.3], (40, 12), demo.material(o), **sealed)
+    fem = BiotFEM(mpm.Grid([0, 0], [1, 0.3], (40, 12)), demo.material(o), **sealed)
     exact = fem.run(0.06, o.dt, probes=[[1.0, 0.15]]).displacement[-1][0, 1]
     tips = np.array(result.displacement)[3:, 0, 1]
     assert tips[0] == pytest.approx(exact, rel=6e-3)

@@ -170,7 +170,8 @@ def heap(wet=False):
     soil = mpm.Hencky(bulk=E / 3, shear=E / 2, porosity=0.4, conductivity=1e-5, grain_density=2000)
     walls, contact = {"bottom": "y", "left": "x", "right": "x"}, mpm.Contact([1, 2, 3], 0, friction=0.2)
     conditions = [contact, *[mpm.Drained("bottom", region=([0, 0], [1, 0]))] * wet]
-    given = {"gravity": [0, -10.0], "later": [2, 3], "fluid": mpm.Fluid() if wet else None}
+    given = {"gravity": [0, -10.0], "fluid": mpm.Fluid() if wet else None}
+    bodies[2:] = map(mpm.Later, bodies[2:])
     return mpm.Simulation(grid, bodies, [soil], walls=walls, conditions=conditions, **given)
 
 

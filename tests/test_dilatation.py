@@ -45,7 +45,9 @@ def test_nearly_incompressible_beams_do_not_lock(nu):
     load = mpm.Traction("top", lambda t: (0, -54e3 * min(1, t)), region=((0.05, -np.inf), (1.0, np.inf)))
 
     def reference(n):
-        fem = BiotFEM([0, 0], [1, 0.3], (n, 3 * n // 10), skeleton(nu), walls={"left": "xy"}, conditions=[load])
+        fem = BiotFEM(
+            mpm.Grid([0, 0], [1, 0.3], (n, 3 * n // 10)), skeleton(nu), walls={"left": "xy"}, conditions=[load]
+        )
         return fem.run(1.0, 0.1, probes=[[1.0, 0.15]]).displacement[-1][0, 1]
 
     assert tip == pytest.approx(2 * reference(60) - reference(30), rel=1e-2)
@@ -54,7 +56,7 @@ def test_nearly_incompressible_beams_do_not_lock(nu):
 def test_water_in_a_nearly_incompressible_beam_has_its_pressure():
     """The corner-based volume ratio expelled water in each step: up to thirty times the pressure, steps never grew."""
     wet = Beam(extreme_soil(nu=0.499), WATER)
-    fem = BiotFEM([0, 0], wet.size, (20, 8), wet.material, walls={"left": "xy"}, **wet.physics())
+    fem = BiotFEM(mpm.Grid([0, 0], wet.size, (20, 8)), wet.material, walls={"left": "xy"}, **wet.physics())
     reference = fem.run(0.2, 0.02, probes=[[1.0, 0.2]])
     result = wet().simulation.run(0.2, 0.02)
     assert result.rows[-1].pressure == pytest.approx(reference.rows[-1].pressure, rel=0.1)
@@ -160,8 +162,9 @@ def sagging(*materials, far=False, later=False, quadrature="domain", **options):
     load = mpm.Traction("top", lambda t: (0, -54e3 * t), region=((0.05, 0.9), (1.0, 1.0)))
     walls = {"left": "xy", "bottom": "xy"}
     numerics = mpm.Numerics(quadrature=quadrature, tolerance=1e-11)
-    options |= {"later": [1] if later else [], "numerics": numerics}
-    s = mpm.Simulation(grid, bodies, materials, walls=walls, conditions=[load], **options)
+    options |= {"numerics": numerics}
+    parts = [bodies[0], *map(mpm.Later if later else lambda body: body, bodies[1:])]
+    s = mpm.Simulation(grid, parts, materials, walls=walls, conditions=[load], **options)
     probe = mpm.probes(bodies, [[1.0, 0.78]])
     if later:
         s.run(0.5, 0.25, probes=probe)
@@ -209,7 +212,7 @@ def test_a_coupled_nearly_incompressible_beam_follows_finite_elements():
     load = mpm.Traction("top", lambda t: (0, -54e3 * min(1, t / 0.06)), region=((0.05, -np.inf), (1.0, np.inf)))
     ends = [mpm.Drained("left"), mpm.Drained("right")]
     scene = {"walls": {"left": "xy"}, "conditions": [load, *ends], "fluid": mpm.Fluid()}
-    fem = BiotFEM([0, 0], [1, 0.3], (40, 12), skeleton(0.45), **scene)
+    fem = BiotFEM(mpm.Grid([0, 0], [1, 0.3], (40, 12)), skeleton(0.45), **scene)
     exact = fem.run(0.1, 0.02, probes=[[1.0, 0.15]]).displacement[-1][0, 1]
     assert result.displacement[-1][0, 1] == pytest.approx(exact, rel=1e-2)
     assert result.balance < 1e-8

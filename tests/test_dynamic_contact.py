@@ -43,7 +43,7 @@ def bars(n, speed=0.05, drift=0.0):
         return np.stack([drift + np.where(x[:, 0] < low + 1, speed, -speed), 0 * x[:, 1]], axis=1)
 
     contacts, walls = [mpm.Contact(0, 1)], {"bottom": "y", "top": "y"}
-    return mpm.Simulation(grid, both, [BAR], walls=walls, conditions=contacts, inertia=True, velocity=velocity)
+    return mpm.Simulation(grid, both, [BAR], walls=walls, conditions=contacts, inertia=mpm.Moving(velocity))
 
 
 def fitted(n):
@@ -109,7 +109,7 @@ def incline(angle, aslant, friction=0.3, speed=0.0, n=4, length=0.5):
         block = mpm.box(grid, foot, foot + np.array([0.3, 0.2]))
     floor = mpm.Tool(mpm.HalfSpace(tuple(foot), tuple(normal)), friction=friction)
     gravity = G * (np.sin(angle) * e - np.cos(angle) * normal)
-    options = {"walls": {}, "conditions": [floor], "gravity": gravity, "inertia": True, "velocity": speed * e}
+    options = {"walls": {}, "conditions": [floor], "gravity": gravity, "inertia": mpm.Moving(speed * e)}
     return mpm.Simulation(grid, [block], [STIFF], **options), e
 
 

@@ -41,7 +41,7 @@ def test_energies_of_a_column_that_vibrates_under_its_weight_on_a_base_that_move
 def test_a_block_that_falls_gains_what_its_weight_does():
     grid = mpm.Grid([0, 0], [1, 4], [5, 20])
     block = mpm.box(grid, [0.3, 3.1], [0.7, 3.5])
-    s = mpm.Simulation(grid, [block], [SOIL], walls={}, gravity=(0, -9.81), inertia=True, velocity=(0.1, 0.3))
+    s = mpm.Simulation(grid, [block], [SOIL], walls={}, gravity=(0, -9.81), inertia=mpm.Moving((0.1, 0.3)))
     e = s.run(0.5, 0.05, energies=True, progress=False).energies
     drop = RHO * 0.4**2 * 9.81 * (9.81 / 8 - 0.15)
     assert e["external"][-1] == pytest.approx(drop, rel=1e-9)
@@ -67,7 +67,7 @@ def test_soil_that_yields_dissipates_what_is_lost():
     grid = mpm.Grid([0, 0], [2.4, 1.2], [16, 8])
     wall = mpm.box(grid, [0.6, 0], [1.2, 0.9])
     velocity = lambda x: np.stack([2 * x[:, 1], 0 * x[:, 1]], axis=1)  # noqa: E731
-    s = mpm.Simulation(grid, [wall], [CLAY], walls={"bottom": "xy"}, inertia=True, velocity=velocity)
+    s = mpm.Simulation(grid, [wall], [CLAY], walls={"bottom": "xy"}, inertia=mpm.Moving(velocity))
     result = s.run(0.25, 0.01, energies=True, progress=False)
     e = result.energies
     assert (np.diff(e["dissipated"]) > -1e-3 * e["kinetic"][0]).all() and e["dissipated"][-1] > 0.3 * e["kinetic"][0]

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from helpers import rates
 
+import mpm_dolfinx as mpm
 from mpm_dolfinx.verification.biot_fem import BiotFEM
 
 # ---- Mandel: in space, against the exact solution of what backward Euler leaves of the equation ----
@@ -74,7 +75,7 @@ def test_the_plate_stays_even_and_settles_as_exact():
 def finite_elements():
     """Return the displacement (2,) of the tip at alpha = 1 and 5 by Taylor-Hood's elements, converged to 1e-5."""
     body = [cantilever.LENGTH, cantilever.HEIGHT]
-    fem = BiotFEM([0, 0], body, [40, 4], cantilever.RUBBER, **cantilever.PHYSICS)
+    fem = BiotFEM(mpm.Grid([0, 0], body, [40, 4]), cantilever.RUBBER, **cantilever.PHYSICS)
     result = fem.run(5, 0.5, probes=[[body[0], body[1] / 2]])
     return {alpha: result.displacement[round(2 * alpha)][0] for alpha in (1, 5)}
 

@@ -96,7 +96,7 @@ def test_a_beam_whose_moduli_vary_follows_finite_elements():
     s, probe = beam(material=soft_end, fluid=False, ramp=1.0)
     tip = s.run(1.0, 0.25, probes=probe).displacement[-1]
     load = mpm.Traction("top", lambda t: (0, -54e3 * min(1, t)), region=((0.05, -np.inf), (1.0, np.inf)))
-    fem = BiotFEM([0, 0], [1, 0.3], (40, 12), soft_end, walls={"left": "xy"}, conditions=[load])
+    fem = BiotFEM(mpm.Grid([0, 0], [1, 0.3], (40, 12)), soft_end, walls={"left": "xy"}, conditions=[load])
     exact = fem.run(1.0, 0.25, probes=[[1.0, 0.15]]).displacement[-1]
     assert tip == pytest.approx(exact, rel=4e-3)
 
@@ -114,7 +114,7 @@ def test_oblique_fibres_on_the_points_follow_finite_elements():
     s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [1, 1])], [tissue], **scene)
     place = [[0.5, 1.0]]
     u = s.run(1.0, 0.25, probes=mpm.probes(s.bodies, place)).displacement[-1]
-    exact = BiotFEM([0, 0], [1, 1], (16, 16), tissue, **scene).run(1.0, 0.25, probes=place).displacement[-1]
+    exact = BiotFEM(mpm.Grid([0, 0], [1, 1], (16, 16)), tissue, **scene).run(1.0, 0.25, probes=place).displacement[-1]
     assert np.abs(u - exact).max() < 4e-3 * np.abs(exact).max() and abs(exact[0, 0]) > 0.02
     assert s.points.data["direction"].shape == (len(s.points), 2)
 
@@ -172,9 +172,9 @@ def test_consolidation_with_a_conductivity_law_follows_finite_elements(law):
     settlement = np.array(s.run(50, 2.5, probes=mpm.probes(s.bodies, [[0.025, 1.0]])).displacement)[1:, 0, 1]
     scene |= {"walls": {"left": "x", "right": "x", "bottom": "y"}, "fluid": mpm.Fluid()}
     exact, constant = (
-        np.array(BiotFEM([0, 0], [0.05, 1], (1, 40), m, **scene).run(50, 2.5, probes=[[0.025, 1]]).displacement)[
-            1:, 0, 1
-        ]
+        np.array(
+            BiotFEM(mpm.Grid([0, 0], [0.05, 1], (1, 40)), m, **scene).run(50, 2.5, probes=[[0.025, 1]]).displacement
+        )[1:, 0, 1]
         for m in (soil, replace(soil, conductivity_law=None))
     )
     # one takes the flow over the geometry of a step's start, the other over that of its end: first order in the step
@@ -391,7 +391,7 @@ CASES = {
     "negative conductivity": (
         lambda: column(material=replace(SOFT, conductivity_law=lambda J: 1 - 2 * J)).step(1.0), "k = -1 at .* >= 0"),
     "state in the reference": (
-        lambda: BiotFEM([0, 0], [1, 1], (2, 2), Damaged(1, 1), walls={}), "the reference has no state"),
+        lambda: BiotFEM(mpm.Grid([0, 0], [1, 1], (2, 2)), Damaged(1, 1), walls={}), "the reference has no state"),
 }  # fmt: skip
 
 

@@ -212,7 +212,7 @@ def test_functions_are_asked_at_true_places_and_results_are_there(tmp_path):
     drained = mpm.Drained("top", lambda t, x: at("drained", 100.0)(x))
     s = mpm.Simulation(
         grid,
-        [body, fill],
+        [body, mpm.Later(fill)],
         [soil],
         fluid=mpm.Fluid(),
         walls={"left": "x", "right": "x", "bottom": "y"},
@@ -221,7 +221,6 @@ def test_functions_are_asked_at_true_places_and_results_are_there(tmp_path):
         pressure=at("pressure", 100.0),
         initial_stress={0: at("stress", [-1e3, -2e3, -1e3])},
         terms=[lambda points, v: -1e3 * (points.position[0] - low[0]) * points.value(v)[1] * points.dx],
-        later=[1],
     )
     probes = mpm.probes([body, fill], np.add(low, [[0.3, 0.4]]))
     writer = mpm.Writer(s, tmp_path, grid=True)

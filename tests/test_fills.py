@@ -44,10 +44,10 @@ def embankment(slope, lifts=6):
 
         return mpm.mapped(grid, mpm.box(grid, [(length - n) / 2, 6 + k], [(length + n) / 2, 7 + k]), taper)
 
-    bodies = [mpm.box(grid, [0, 0], [length, 6]), *map(lift, range(lifts))]
+    bodies = [mpm.box(grid, [0, 0], [length, 6]), *[mpm.Later(lift(k)) for k in range(lifts)]]
     walls = {"left": "x", "right": "x", "bottom": "xy"}
     options = {"gravity": (0, -9.81), "fluid": mpm.Fluid(), "conditions": [mpm.Drained("top")]}
-    return mpm.Simulation(grid, bodies, [SOFT], walls=walls, later=range(1, lifts + 1), **options), length - base
+    return mpm.Simulation(grid, bodies, [SOFT], walls=walls, **options), length - base
 
 
 @pytest.mark.parametrize("slope", [1.0, 1.25, 2.0])
@@ -78,7 +78,7 @@ def settled(dim=2, per_cell=2, quadrature="domain", until=1.0, **options):
     half = mpm.Traction("top", [0] * (dim - 1) + [-8e4], region=([0] * dim, [2, *[4] * (dim - 1)]))
     walls = {name: "xyz"[:dim] for name in ("left", "right", "bottom", *["front", "back"][: 2 * dim - 4])}
     options = {"conditions": [half], "numerics": mpm.Numerics(quadrature=quadrature)} | options
-    s = mpm.Simulation(grid, [ground, fill], [SOFT], walls=walls, later=[1], gravity=[0.0] * dim, **options)
+    s = mpm.Simulation(grid, [ground, mpm.Later(fill)], [SOFT], walls=walls, gravity=[0.0] * dim, **options)
     if until:
         s.run(until, 0.5, progress=False)
     return s
@@ -114,7 +114,7 @@ def test_a_fill_between_walls_of_a_pit_follows_all_of_them():
     parts = [([0, 0], [4, 1]), ([0, 1], [1, 2]), ([3, 1], [4, 2]), ([1, 1], [3, 2])]
     bodies = [mpm.box(grid, *part) for part in parts]
     walls = {"left": "x", "right": "x", "bottom": "xy"}
-    s = mpm.Simulation(grid, bodies, [SOFT], walls=walls, later=[3], gravity=(0, -3 * 9.81))
+    s = mpm.Simulation(grid, [*bodies[:3], mpm.Later(bodies[3])], [SOFT], walls=walls, gravity=(0, -3 * 9.81))
     s.run(1.0, 0.5, progress=False)
     s.stage(add=[3])
     pit = np.concatenate([s.points.corners[s.points.id < len(s.points) - len(bodies[3])].reshape(-1, 2)])
@@ -129,9 +129,9 @@ def test_a_fill_between_walls_of_a_pit_follows_all_of_them():
 def test_what_has_risen_into_a_fill_makes_it_thinner_or_is_refused_with_how_far():
     def risen(height, bottom=1.0):
         grid = mpm.Grid([0, 0], [2.0, 3.0], [4, 6])
-        bodies = [mpm.box(grid, [0, 0], [2, 1]), mpm.box(grid, [0, bottom], [2, bottom + 0.5])]
+        bodies = [mpm.box(grid, [0, 0], [2, 1]), mpm.Later(mpm.box(grid, [0, bottom], [2, bottom + 0.5]))]
         lift = [mpm.Displacement("top", lambda t, X: (0, height * t))]
-        s = mpm.Simulation(grid, bodies, [SOFT], walls={"bottom": "y", "left": "x"}, conditions=lift, later=[1])
+        s = mpm.Simulation(grid, bodies, [SOFT], walls={"bottom": "y", "left": "x"}, conditions=lift)
         s.run(1.0, 0.25, progress=False)
         return s
 
@@ -178,12 +178,12 @@ def test_a_run_resumed_after_a_fill_came_has_the_same_bits(quadrature, tmp_path)
 
 def test_what_a_stage_gave_the_points_must_be_given_anew_when_a_body_comes():
     grid = mpm.Grid([0, 0], [1, 1], [4, 4])
-    bodies = [mpm.box(grid, [0, 0], [1, 0.5]), mpm.box(grid, [0, 0.5], [1, 1])]
-    s = mpm.Simulation(grid, bodies, [SOFT], walls={"bottom": "xy"}, later=[1])
+    bodies = [mpm.box(grid, [0, 0], [1, 0.5]), mpm.Later(mpm.box(grid, [0, 0.5], [1, 1]))]
+    s = mpm.Simulation(grid, bodies, [SOFT], walls={"bottom": "xy"})
     s.stage(fields={"damage": np.arange(len(s.points))})
     with pytest.raises(
         ValueError, match=r"stage: add: body 1: its points have no 'damage', must be given for all points"
     ):
         s.stage(add=[1])
-    s.stage(add=[1], fields={"damage": np.arange(sum(map(len, bodies)))})
+    s.stage(add=[1], fields={"damage": np.arange(sum(map(len, s.bodies)))})
     assert (s.points.data["damage"] == np.arange(len(s.points))).all()

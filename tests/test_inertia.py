@@ -55,9 +55,7 @@ def turning(h=0.25, drift=(0.3, 0.2), numerics=TIGHT, **options):
         off = x - centre
         return np.stack([drift[0] - off[:, 1], drift[1] + off[:, 0]], axis=1)
 
-    return mpm.Simulation(
-        grid, [body], [BLOCK], walls={}, inertia=True, velocity=velocity, numerics=numerics, **options
-    )
+    return mpm.Simulation(grid, [body], [BLOCK], walls={}, inertia=mpm.Moving(velocity), numerics=numerics, **options)
 
 
 def test_a_block_that_turns_and_flies_keeps_its_momenta_and_energy():
@@ -120,7 +118,7 @@ def flown(cells, speed=0.23, periods=1.1, amplitude=0.05, per_period=2):
         return np.stack([speed + amplitude * np.cos(np.pi * (x[:, 0] - low)), 0 * x[:, 1]], axis=1)
 
     walls = {"bottom": "y", "top": "y"}
-    s = mpm.Simulation(grid, [body], [bar], walls=walls, inertia=True, velocity=velocity, numerics=TIGHT)
+    s = mpm.Simulation(grid, [body], [bar], walls=walls, inertia=mpm.Moving(velocity), numerics=TIGHT)
     start = momenta(s)[0]
     for _ in range(round(2 * periods / dt)):
         s.step(dt)
@@ -144,7 +142,7 @@ def test_frequencies_of_a_clamped_beam_are_those_of_spectral_elements():
         beam = mpm.box(grid, [0, 0.2], [1, 0.5])
         law = mpm.LinearElastic(bulk=1e7 / 3, shear=5e6, grain_density=4000.0, porosity=0.5)
         velocity = lambda x: np.stack([0 * x[:, 0], 1e-3 * x[:, 0]], axis=1)  # noqa: E731
-        s = mpm.Simulation(grid, [beam], [law], walls={"left": "xy"}, inertia=True, velocity=velocity)
+        s = mpm.Simulation(grid, [beam], [law], walls={"left": "xy"}, inertia=mpm.Moving(velocity))
         s.step(1e-4)
         _, made = s.scene.last
         M = csr(made.mass.M)
@@ -259,7 +257,7 @@ def breathing(n):
     law = mpm.LinearElastic(bulk=1e7 / 1.2, shear=1e7 / 2.6, grain_density=2000.0, porosity=0.5)
     velocity = lambda x: np.stack([1e-3 * x[:, 0], 0 * x[:, 0]], axis=1)  # noqa: E731
     walls = {"bottom": "y", "top": "y"}
-    s = mpm.Simulation(grid, [body], [law], walls=walls, inertia=True, velocity=velocity)
+    s = mpm.Simulation(grid, [body], [law], walls=walls, inertia=mpm.Moving(velocity))
     s.step(1e-5)
     _, made = s.scene.last
     M = csr(made.mass.M)
@@ -277,7 +275,7 @@ def test_a_cylinder_breathes_as_bessel_says():
 def test_a_ring_falls_as_stones_do(hole):
     grid = mpm.Grid([0, 0], [1, 4], [5, 20], axisymmetric=True)
     ring = mpm.box(grid, [hole, 3.1], [0.7, 3.5])
-    s = mpm.Simulation(grid, [ring], [BLOCK], walls={}, gravity=(0, -9.81), inertia=True, velocity=(0, 1.0))
+    s = mpm.Simulation(grid, [ring], [BLOCK], walls={}, gravity=(0, -9.81), inertia=mpm.Moving((0, 1.0)))
     start = s.points.x.copy()
     s.run(0.4, 0.05, progress=False)
     assert s.points.x - start == pytest.approx(np.broadcast_to([0, 0.4 - 9.81 * 0.08], start.shape), abs=1e-8)
@@ -344,9 +342,9 @@ def test_water_that_flows_freely_does_not_make_a_column_unstable():
 
 def test_a_fill_comes_at_rest():
     grid = mpm.Grid([0, 0], [1, 2], [4, 8])
-    bodies = [mpm.box(grid, [0, 0], [1, 0.5]), mpm.box(grid, [0, 0.5], [1, 1])]
+    bodies = [mpm.box(grid, [0, 0], [1, 0.5]), mpm.Later(mpm.box(grid, [0, 0.5], [1, 1]))]
     walls = {"left": "x", "right": "x"}
-    s = mpm.Simulation(grid, bodies, [BLOCK], walls=walls, later=[1], inertia=True, velocity=(0, 0.1))
+    s = mpm.Simulation(grid, bodies, [BLOCK], walls=walls, inertia=mpm.Moving((0, 0.1)))
     s.stage(add=[1])
     fill = s.points.id >= len(bodies[0])
     assert (s.points.data["velocity"][fill] == 0).all() and (s.points.data["velocity"][~fill, 1] == 0.1).all()
@@ -368,11 +366,10 @@ def test_a_resumed_flight_has_the_same_bits(tmp_path):
 @pytest.mark.parametrize(
     ("options", "names"),
     [
-        ({"velocity": (1, 0)}, "velocity"),
-        ({"inertia": False, "velocity": (1, 0)}, "no inertia at first"),
+        ({"inertia": (1, 0)}, "inertia = "),
         ({"inertia": 1}, "inertia"),
-        ({"inertia": True, "velocity": (1, 0, 0)}, "velocity"),
-        ({"inertia": True, "velocity": lambda X: X}, "velocity"),
+        ({"inertia": mpm.Moving((1, 0, 0))}, "velocity"),
+        ({"inertia": mpm.Moving(lambda X: X)}, "velocity"),
         ({"inertia": True, "numerics": mpm.Numerics(quadrature="point")}, "quadrature"),
         (
             {"inertia": True, "conditions": [mpm.Tool(mpm.HalfSpace((0, 2), (0, -1)), load=1.0, direction=(0, -1))]},
@@ -405,10 +402,10 @@ def test_steps_by_error_meet_it():
     """
     c, period = 188.712839, 40 / 188.712839
     velocity = lambda x: np.stack([0 * x[:, 0], 1e-2 * np.sin(np.pi * x[:, 1] / 20)], axis=1)  # noqa: E731
-    found, fine = [], column(n=6, velocity=velocity)
+    found, fine = [], column(mpm.Moving(velocity), n=6)
     fine.run(2 * period, period / 120, progress=False)
     for rtol in (2e-2, 5e-3):
-        s = column(n=6, velocity=velocity)
+        s = column(mpm.Moving(velocity), n=6)
         result = s.run(2 * period, rtol=rtol, progress=False)
         off = np.abs(s.points.displacement - fine.points.displacement).max() / (1e-2 * 20 / np.pi / c)
         found.append((off / rtol, result.steps))
@@ -442,7 +439,7 @@ def in_frame(length=1.0, mass=1.0, time=1.0, order=(0, 1), sign=(1, 1), wet=Fals
     grid = mpm.Grid([0, 0], size, np.array([16, 12])[order])
     body = mpm.box(grid, low, high)
     options = {"fluid": water} if wet else {}
-    s = mpm.Simulation(grid, [body], [law], walls={}, inertia=True, velocity=velocity, numerics=TIGHT, **options)
+    s = mpm.Simulation(grid, [body], [law], walls={}, inertia=mpm.Moving(velocity), numerics=TIGHT, **options)
     for _ in range(3):
         s.step(0.1 * time)
     rows = np.lexsort(np.round(own(s.points.reference.mean(axis=1)), 6).T)
@@ -470,7 +467,7 @@ def test_a_body_far_away_changes_nothing():
         off = x - centre
         return np.where(x[:, :1] < 2.4, np.stack([0.3 - off[:, 1], 0.2 + off[:, 0]], axis=1), [[-0.1, 0.05]])
 
-    both = mpm.Simulation(grid, bodies, [BLOCK, stiff], walls={}, inertia=True, velocity=velocity, numerics=TIGHT)
+    both = mpm.Simulation(grid, bodies, [BLOCK, stiff], walls={}, inertia=mpm.Moving(velocity), numerics=TIGHT)
     for s in (alone, both):
         for _ in range(4):
             s.step(0.05)

@@ -19,7 +19,7 @@ LAWS = {
 }
 
 
-def ground(law="hencky", dim=2, off=0.13, level=2.0, axisymmetric=False, **options):
+def ground(law="hencky", dim=2, off=0.13, level=2.0, axisymmetric=False, later=False, **options):
     """Return two layers, 3 m, whose interface and surface are off the grid lines, with a phreatic level in them."""
     width = [2.0] if dim == 2 else [1.0, 1.0]
     grid = mpm.Grid([0] * dim, [*width, 4.0], [*(round(2 * w) for w in width), 8], axisymmetric=axisymmetric)
@@ -27,6 +27,8 @@ def ground(law="hencky", dim=2, off=0.13, level=2.0, axisymmetric=False, **optio
         mpm.box(grid, [*[0.0] * (dim - 1), low], [*width, high], material=m)
         for m, (low, high) in enumerate([(0.0, 1 + off), (1 + off, 3 + off)])
     ]
+    if later:
+        bodies[1] = mpm.Later(bodies[1])
     every = {"left": "x", "right": "x", "front": "y", "back": "y", "bottom": "xyz"[dim - 1]}
     walls = {name: axes for name, axes in every.items() if dim == 3 or name not in ("front", "back")}
     materials = [LAWS[law](1e7, **WATER), LAWS[law](6e6, **{**WATER, "porosity": 0.3})]
@@ -175,7 +177,7 @@ def test_clay_is_at_its_own_pressure_and_overconsolidation_everywhere():
 def test_a_fill_has_the_stress_that_it_is_given_and_else_none():
     for given in (None, mpm.K0(1.0)):
         more = {} if given is None else {1: given}
-        s = ground(off=0.0, initial_stress={0: mpm.K0(0.5), **more}, later=[1], level=0.0)
+        s = ground(off=0.0, initial_stress={0: mpm.K0(0.5), **more}, later=True, level=0.0)
         s.stage(add=[1])
         stress = s.point_fields().effective_stress[s.points.id >= 16 * 4]
         y = s.points.x[s.points.id >= 16 * 4, 1]

@@ -287,7 +287,7 @@ def test_one_line_says_what_is_wrong():
         column(fluid=False, material=Misnamed(bulk=1e6, shear=1e6))
     assert "\n" not in str(caught.value)
     with pytest.raises(ValueError, match="the reference has no state"):
-        BiotFEM([0, 0], [1, 1], (2, 2), SOIL, walls={})
+        BiotFEM(mpm.Grid([0, 0], [1, 1], (2, 2)), SOIL, walls={})
     half = type("Half", (Stiffening,), {"residual": None})
     with pytest.raises(ValueError, match="Half: has unknowns and 0 of residual and solution; with unknowns it must"):
         column(fluid=False, material=half(bulk=1e6, shear=1e6))

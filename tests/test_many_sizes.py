@@ -376,7 +376,7 @@ def test_a_beam_bends_and_drains_on_graded_lines_as_on_equal_ones():
     beam = mpm.box(grid, [0, bottom], [poroelastic_beam.LENGTH, top])
     graded = mpm.Simulation(grid, [beam], [poroelastic_beam.material(o)], **poroelastic_beam.physics(o))
     size = [poroelastic_beam.LENGTH, poroelastic_beam.HEIGHT]
-    fem = BiotFEM([0, 0], size, (40, 12), poroelastic_beam.material(o), **poroelastic_beam.physics(o))
+    fem = BiotFEM(mpm.Grid([0, 0], size, (40, 12)), poroelastic_beam.material(o), **poroelastic_beam.physics(o))
     exact = np.array(fem.run(o.t_end, o.dt, probes=[[1.0, 0.15]]).displacement)[1:, 0, 1]
     for s in (equal, graded):
         result = s.run(o.t_end, o.dt, probes=mpm.probes(s.bodies, [[1.0, bottom + 0.15]]), progress=False)

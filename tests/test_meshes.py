@@ -373,7 +373,7 @@ def test_a_fill_of_a_mesh_lies_on_the_settled_ground():
     fill = mpm.from_mesh(grid, box_mesh("triangle", (9, 4), (0, 0), (0.8, 1), place=trapezoid))
     walls = {"left": "x", "right": "x", "bottom": "y"}
     load = mpm.Traction("top", (0, -1e5), region=((0, 0), (0.8, 0.5)))
-    s = mpm.Simulation(grid, [ground, fill], [SOIL], walls=walls, conditions=[load], later=[1])
+    s = mpm.Simulation(grid, [ground, mpm.Later(fill)], [SOIL], walls=walls, conditions=[load])
     s.run(1.0, 0.25, progress=False)
     top = surface([ground], "top")
     settled = s.points.corners[top.id][:, :, 1].max(axis=1).min()

@@ -50,8 +50,7 @@ def swinging_apart(n, t_end, amplitude=0.05):
         [SOIL],
         walls=walls,
         terms=[pushed(force)],
-        inertia=True,
-        velocity=velocity,
+        inertia=mpm.Moving(velocity),
     )
     s.run(t_end, 1 / n, progress=False)
     X = s.points.reference

@@ -119,9 +119,7 @@ def test_a_beam_under_a_pressure_that_follows_it_agrees_with_finite_elements(wet
     s, probe = pressed_beam(60, load, scene)
     tip = s.run(*steps, probes=probe).displacement[-1][0]
     fem = BiotFEM(
-        [0, 0],
-        [1, 0.3],
-        (40, 12),
+        mpm.Grid([0, 0], [1, 0.3], (40, 12)),
         SOFT,
         walls={"left": "xy"},
         conditions=[*load, *scene.pop("conditions", [])],

@@ -16,7 +16,7 @@ SIZE, TIP = ([0, 0], [1, 0.3]), [[1.0, 0.15]]
 
 def test_a_lightly_loaded_beam_follows_beam_theory():
     load = mpm.Traction("top", (0, -10.0))
-    fem = BiotFEM(*SIZE, (24, 8), SOFT, walls={"left": "xy"}, conditions=[load])
+    fem = BiotFEM(mpm.Grid(*SIZE, (24, 8)), SOFT, walls={"left": "xy"}, conditions=[load])
     tip = fem.run(1.0, 1.0, probes=TIP).displacement[-1][0, 1]
     bending = euler_bernoulli(np.array([1.0]), 10.0, 1.0, 1e7, 0.3**3 / 12)[0]
     shear = 10.0 / (2 * 5 / 6 * 5e6 * 0.3)
@@ -28,7 +28,7 @@ def test_both_elements_converge_to_one_answer():
     for element, cells in {"taylor-hood": (20, 6), "q1-dg0": (67, 20)}.items():
         drained = [mpm.Drained("left"), mpm.Drained("right")]
         options = dict(walls={"left": "xy"}, fluid=mpm.Fluid(), conditions=[top_load(), *drained])
-        fem = BiotFEM(*SIZE, cells, SOFT, element=element, **options)
+        fem = BiotFEM(mpm.Grid(*SIZE, cells), SOFT, element=element, **options)
         result = fem.run(0.2, 0.02, probes=TIP)
         assert result.converged and result.residual <= 1e-8
         tips[element] = result.displacement[-1][0, 1]
@@ -39,7 +39,7 @@ def test_both_elements_converge_to_one_answer():
 def test_one_dimensional_consolidation_follows_terzaghi(element):
     options = dict(walls={"left": "x", "right": "x", "bottom": "y"}, fluid=mpm.Fluid(bulk=np.inf))
     load, drained = mpm.Traction("top", (0, -100.0)), [mpm.Drained("top")]
-    fem = BiotFEM([0, 0], [0.1, 1], (1, 40), SOFT, element=element, conditions=[load, *drained], **options)
+    fem = BiotFEM(mpm.Grid([0, 0], [0.1, 1], (1, 40)), SOFT, element=element, conditions=[load, *drained], **options)
     t = 0.5 / (SOFT.conductivity / 9810 * SOFT.oedometric)
     result = fem.run(t, t / 100, probes=[[0.05, 1.0]])
     settlement = -result.displacement[-1][0, 1] / (100 / SOFT.oedometric)
@@ -60,7 +60,7 @@ def test_a_term_of_the_velocity_and_a_spring_make_a_dry_block_creep_exactly():
 
     walls = {"left": "x", "right": "x", "bottom": "y"}
     top = mpm.Traction("top", (0, -load))
-    fem = BiotFEM([0, 0], [1, 1], (2, 2), SOFT, walls=walls, conditions=[top], terms=[damper, stiffer])
+    fem = BiotFEM(mpm.Grid([0, 0], [1, 1], (2, 2)), SOFT, walls=walls, conditions=[top], terms=[damper, stiffer])
     result = fem.run(20.0, 0.5, probes=[[0.5, 1.0]])
     exact = load / (2 * modulus) * (1 - np.exp(-2 * modulus * 20.0 / eta))
     assert -result.displacement[-1][0, 1] == pytest.approx(exact, rel=2e-3)
@@ -68,9 +68,9 @@ def test_a_term_of_the_velocity_and_a_spring_make_a_dry_block_creep_exactly():
 
 def test_terms_that_the_reference_cannot_take_are_refused_in_a_line():
     def reference(**options):
-        return BiotFEM([0, 0], [1, 1], (2, 2), SOFT, walls={"left": "xy"}, **options)
+        return BiotFEM(mpm.Grid([0, 0], [1, 1], (2, 2)), SOFT, walls={"left": "xy"}, **options)
 
-    with pytest.raises(ValueError, match="drained sides or sources without fluid"):
+    with pytest.raises(ValueError, match="drained sides and sources must be given with a fluid"):
         reference(terms=[mpm.Source(lambda points, q: q * points.dx)])
     with pytest.raises(ValueError, match=r"terms = .*, must be a list of functions"):
         reference(terms=5)
@@ -85,7 +85,7 @@ def test_a_modulus_that_jumps_between_cells_is_that_of_each_cell():
     law = mpm.LinearElastic(bulk=lambda X: stiff(X) / 3, shear=lambda X: stiff(X) / 2)
     load = mpm.Traction("top", (0, -1.0))
     walls = {"left": "x", "right": "x", "bottom": "y"}
-    column = BiotFEM([0, 0], [0.5, 1], [1, 2], law, walls=walls, conditions=[load])
+    column = BiotFEM(mpm.Grid([0, 0], [0.5, 1], [1, 2]), law, walls=walls, conditions=[load])
     column.step(1.0)
     assert column.displacement(np.array([[0.25, 1.0]]))[0, 1] == pytest.approx(-0.5e-6 - 0.125e-6, rel=1e-6)
 
@@ -93,7 +93,7 @@ def test_a_modulus_that_jumps_between_cells_is_that_of_each_cell():
 def elements(cells, soil, conditions, pressure, element="q1-dg0", **options):
     """Return a column of 1 m of elements between smooth walls, and heights of pressures in its middle."""
     scene = {"walls": {"left": "x", "right": "x", "bottom": "y"}, "fluid": mpm.Fluid(), "element": element, **options}
-    fem = BiotFEM([0, 0], [1 / cells, 1], (1, cells), soil, conditions=conditions, pressure=pressure, **scene)
+    fem = BiotFEM(mpm.Grid([0, 0], [1 / cells, 1], (1, cells)), soil, conditions=conditions, pressure=pressure, **scene)
     return fem, (np.arange(cells) + 0.5) / cells
 
 

@@ -186,8 +186,8 @@ def test_clay_that_flies_and_stretches_keeps_its_momentum_and_tells_its_energy()
     block = mpm.box(grid, [-0.3, -0.3], [0.3, 0.3])
     clay = mpm.DruckerPrager(5e5, 1e4, friction=0.0, dilation=0.0, cohesion=50.0, porosity=0.4, grain_density=2700.0)
     motion = np.array([[2.5, -1.0], [1.0, -2.5]])
-    options = {"walls": {}, "inertia": True, "numerics": mpm.Numerics(renewal=True)}
-    s = mpm.Simulation(grid, [block], [clay], velocity=lambda x: [1.0, 0.5] + x @ motion.T, **options)
+    options = {"walls": {}, "inertia": mpm.Moving(lambda x: [1.0, 0.5] + x @ motion.T)}
+    s = mpm.Simulation(grid, [block], [clay], numerics=mpm.Numerics(renewal=True), **options)
     before = momenta(s, s.state.points)
     result = s.run(0.5, 0.02, energies=True, progress=False)
     after, e = momenta(s, s.state.points), result.energies

@@ -121,4 +121,4 @@ def test_other_couplings_find_the_same_seepage(coupling):
 def test_the_reference_refuses_seepage_faces():
     options = {"walls": {"bottom": "xy"}, "fluid": mpm.Fluid(), "conditions": [mpm.Drained("top", seepage=True)]}
     with pytest.raises(ValueError, match="drained: seepage = True, must be False"):
-        BiotFEM([0, 0], [1, 1], [2, 2], SOIL, **options)
+        BiotFEM(mpm.Grid([0, 0], [1, 1], [2, 2]), SOIL, **options)

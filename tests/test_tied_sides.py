@@ -55,7 +55,7 @@ def test_a_layer_of_finite_width_shakes_as_an_infinite_one(width):
         return amplitude * np.cos(w * up / [C_S, C_P]) / np.cos(w * HEIGHT / np.array([C_S, C_P]))
 
     base = mpm.Displacement("bottom", lambda t: amplitude * np.sin(w * t))
-    s = layer(n, width, base, inertia=True, velocity=lambda x: w * shape(x))
+    s = layer(n, width, base, inertia=mpm.Moving(lambda x: w * shape(x)))
     exact, off = shape(s.points.x), []
 
     def look(s):
@@ -78,7 +78,7 @@ def test_a_pulse_that_leaves_on_one_side_enters_on_the_other():
         return np.stack([1e-2 * np.cos(2 * np.pi * x[:, 0] / (width * h)), 0 * x[:, 0]], axis=1)
 
     walls = {"bottom": "y", "top": "y"}
-    s = mpm.Simulation(grid, [body], [SOIL], walls=walls, conditions=[TIED], inertia=True, velocity=velocity)
+    s = mpm.Simulation(grid, [body], [SOIL], walls=walls, conditions=[TIED], inertia=mpm.Moving(velocity))
     before = s.points.data["velocity"].copy()
     s.run(width * h / C_P, h / C_P, progress=False)
     assert s.points.data["velocity"] == pytest.approx(before, abs=0.01 * np.abs(before).max())

@@ -155,7 +155,7 @@ def test_finite_elements_take_the_same_unit_weight():
         load = mpm.Traction("top", (0, -LOAD * unit.stress))
         options = {"walls": {"left": "x", "right": "x", "bottom": "y"}, "conditions": [load, mpm.Drained("top")]}
         size = np.array([0.2, 1.0]) * unit.length
-        fem = BiotFEM([0, 0], size, [1, 8], unit.soil(), fluid=water, **options)
+        fem = BiotFEM(mpm.Grid([0, 0], size, [1, 8]), unit.soil(), fluid=water, **options)
         fem.run(10 * unit.time, 10 * unit.time, probes=[size / 2])
         pressures.append(fem.pressure(np.array([[0.0, 0.0]]))[0] / unit.stress)
     assert pressures[1] == pytest.approx(pressures[0], rel=1e-6)

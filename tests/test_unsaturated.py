@@ -435,10 +435,10 @@ def test_a_dry_column_swings_with_the_mass_of_its_water():
     grid = mpm.Grid([0, 0], [0.05, 1.1], [1, 22])
     felt = p * 1e3**-3
     period = 4 * np.sqrt((0.6 * 2650 + 400 * (0.3 + 0.7 * 1e3**-3)) / (1e7 + 4 / 3 * 5e6))
-    scene = {"fluid": mpm.Fluid(), "walls": {"left": "x", "right": "x", "bottom": "y"}, "pressure": p, "inertia": True}
+    scene = {"fluid": mpm.Fluid(), "walls": {"left": "x", "right": "x", "bottom": "y"}, "pressure": p}
     scene |= {"initial_stress": lambda x: np.full((len(x), 3), felt)}
     speed = lambda x: np.stack([0 * x[:, 0], 1e-3 * np.sin(np.pi * x[:, 1] / 2)], axis=1)  # noqa: E731
-    s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [0.05, 1])], [soil], velocity=speed, **scene)
+    s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [0.05, 1])], [soil], inertia=mpm.Moving(speed), **scene)
     top = mpm.probes(s.bodies, [[0.025, 1.0]])
     result = s.run(0.6 * period, period / 80, progress=False, probes=top)
     t, u = result.t, result.displacement[:, 0, 1]

@@ -33,13 +33,13 @@ def pulse(t, length=0.05):
     return np.sin(np.pi * t / length) ** 2 * (0 < t < length)
 
 
-def layer(n, conditions, **options):
+def layer(n, conditions, inertia=True, **options):
     """Return a layer on a grid that it may move on, held along y on both sides as if it went on there."""
     h = HEIGHT / n
     grid = mpm.Grid([0, 0], [3 * h, HEIGHT + 3 * h], [3, n + 3])
     body = mpm.box(grid, [0.5 * h, (1 + OFF) * h], [2.5 * h, HEIGHT + (1 + OFF) * h])
     level = [mpm.Displacement(side, (0, 0), "y") for side in ("left", "right")]
-    return mpm.Simulation(grid, [body], [SOIL], walls={}, inertia=True, conditions=[*conditions, *level], **options)
+    return mpm.Simulation(grid, [body], [SOIL], walls={}, inertia=inertia, conditions=[*conditions, *level], **options)
 
 
 @pytest.mark.parametrize(("axis", "c", "scene"), [(1, C_P, column), (0, C_S, layer)], ids=["pressure", "shear"])
@@ -111,7 +111,7 @@ def test_a_pulse_in_a_block_leaves_through_all_of_its_sides():
         return np.stack([1e-2 * np.cos(np.pi * np.minimum(r, 0.3) / 0.6) ** 2, 0 * r], axis=1)
 
     conditions = [mpm.Quiet(side) for side in sides]
-    s = mpm.Simulation(grid, [body], [SOIL], walls={}, inertia=True, velocity=velocity, conditions=conditions)
+    s = mpm.Simulation(grid, [body], [SOIL], walls={}, inertia=mpm.Moving(velocity), conditions=conditions)
     first = speed(s)
     for _ in range(40):
         s.step(1 / n / C_P)
@@ -173,7 +173,7 @@ def test_a_base_moves_as_it_should_and_bodies_with_it():
         return amplitude * np.cos(w * (top - x[:, 1]) / C_S) / np.cos(w * HEIGHT / C_S)
 
     for steps in (20, 40):
-        s = layer(n, [sway], velocity=lambda x: np.stack([w * shape(x), 0 * x[:, 0]], axis=1))
+        s = layer(n, [sway], mpm.Moving(lambda x: np.stack([w * shape(x), 0 * x[:, 0]], axis=1)))
         exact, errors = shape(s.points.x), []
         ends = [s.points.x[:, 1].argmin(), s.points.x[:, 1].argmax()]
         for _ in range(steps):

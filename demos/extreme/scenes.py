@@ -136,7 +136,9 @@ class Beam:
 @cache
 def finite_elements(beam: Beam, element: str) -> np.ndarray:
     """Return the tip displacement (2,) of the beam by finite elements, in m."""
-    fem = BiotFEM([0, 0], beam.size, beam.truth, beam.material, walls={"left": "xy"}, element=element, **beam.physics())
+    fem = BiotFEM(
+        mpm.Grid([0, 0], beam.size, beam.truth), beam.material, walls={"left": "xy"}, element=element, **beam.physics()
+    )
     return tip(fem.run(beam.end, beam.end / beam.steps, probes=[[beam.size[0], beam.size[1] / 2]]))
 
 

@@ -13,7 +13,7 @@ soils = [
 ]
 simulation = mpm.Simulation(
     grid,
-    [clay, bank],
+    [clay, mpm.Later(bank)],
     soils,
     fluid=mpm.Fluid(),
     walls={"left": "x", "right": "x", "bottom": "xy"},
@@ -21,7 +21,6 @@ simulation = mpm.Simulation(
     gravity=(0, -9.81),
     pressure=mpm.hydrostatic(0),
     initial_stress=mpm.K0(0.6),
-    later=[1],
 )
 simulation.run(t_end=1, dt=1)  # the clay at rest
 seepage = [mpm.Drained(side, seepage=True) for side in ("slope", "crest")]  # water may leave here, but not enter

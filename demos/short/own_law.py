@@ -26,3 +26,4 @@ walls = {"left": "x", "right": "x", "bottom": "y"}
 simulation = mpm.Simulation(grid, [block], [tissue], walls=walls, conditions=[press])
 simulation.run(t_end=1, dt=0.25)
 print(f"force: {-simulation.reactions['press'][1]:.1f} N/m")
+mpm.plot(simulation, "displacement").figure.savefig("own_law.png", bbox_inches="tight")

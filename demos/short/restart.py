@@ -23,3 +23,4 @@ second = scene()  # in the same script, started anew
 before = mpm.resume(second, "run.ckpt")
 result = second.run(t_end=200, dt=10, after=before)
 print(f"difference: {abs(second.points.x - whole.points.x).max():g} m at t = {result.t[-1]:g} s")
+mpm.plot(second, "pressure").figure.savefig("restart.png", bbox_inches="tight")

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Factor of safety of a slope by strength reduction: 10 m high, 2:1, c = 7.8 kPa and phi = 20 degrees."""
 
+import matplotlib.pyplot as plt
+
 import mpm_dolfinx as mpm
 
 grid = mpm.Grid(lower=[0, -5], upper=[46, 12], cells=[46, 17])  # m
@@ -19,3 +21,8 @@ walls = {"left": "x", "right": "x", "bottom": "xy"}
 simulation = mpm.Simulation(grid, [ground], [soil], walls=walls, gravity=(0, -9.81))
 safety = mpm.factor_of_safety(simulation, rtol=0.02)
 print(f"factor of safety: {safety.factor:.2f}")
+for factor, overload in sorted(safety.overloads.items()):  # falls to zero in trials that come to rest
+    plt.semilogy(range(1, len(overload) + 1), overload, "o-", label=f"trial factor {factor:.3f}")
+plt.gca().set(xlabel="step of the trial", ylabel="overload (-)", xticks=range(1, 6))
+plt.legend()
+plt.savefig("slope_stability.png", bbox_inches="tight")

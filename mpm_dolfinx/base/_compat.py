@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Wrappers of every function of dolfinx that differs between the supported releases (0.5.2 and 0.9 to 0.11).
 
-No other module of the package asks for the version.  Branches marked OLD are for release 0.5.  Remove a branch when no
-supported release needs it.
+No other module of the package asks for the version.  Branches marked OLD are for release 0.5, and can be removed when
+no supported release needs them.
 """
 
 from __future__ import annotations
@@ -105,7 +105,7 @@ def petsc_vec(u: fem.Function) -> PETSc.Vec:
 
 
 def num_cells(msh: mesh.Mesh) -> tuple[int, int]:
-    """Return two numbers: of owned cells on this process, and of cells on this process, ghosts included."""
+    """Return the number of owned cells on this process, and the number of cells including ghosts."""
     index_map = msh.topology.index_map(msh.topology.dim)
     return index_map.size_local, index_map.size_local + index_map.num_ghosts
 
@@ -132,7 +132,7 @@ seconds: Counter[str] = Counter()
 
 
 class Timer:
-    """Context that adds its wall time to an entry of `seconds`.  Timers of dolfinx 0.9 would resolve only 10 ms."""
+    """Context that adds its wall time to an entry of `seconds`.  Timers of dolfinx 0.9 resolve only 10 ms."""
 
     def __init__(self, part: str):
         self._part = part
@@ -148,14 +148,10 @@ class Timer:
 class CompiledForm:
     """A UFL form over cells or interior facets, compiled once and integrated over any list of entities.
 
-    A cell may occur several times in the list.  The kernel is called once for each entry.  Ghost cells are not allowed,
-    because dolfinx 0.5 silently skips them.  The list becomes mesh tags for release 0.5, and entities for later
-    releases.
+    The kernel is called once for each entry of the list, so a cell may occur several times.  Ghost cells are not
+    allowed, because dolfinx 0.5 silently skips them.
 
-    Parameters
-    ----------
-    form
-        Form whose integrals are all of one type, and have the subdomain id `SUBDOMAIN`.
+    `form`: form whose integrals are all of one type, and have the subdomain id `SUBDOMAIN`.
     """
 
     def __init__(self, form: ufl.Form):
@@ -183,7 +179,7 @@ class CompiledForm:
         return self._last if OLD else self._last._cpp_object
 
     def bind(self, entities: NDArray[np.int32]):
-        """Set the cells or interior facets of the integral, and return the form for them.  Cells may occur repeatedly.
+        """Set the cells or interior facets of the integral, and return the form for them.
 
         Later calls do not change the returned form.  `assemble_vector` and `assemble_matrix` accept it.
         """
@@ -219,25 +215,31 @@ class CompiledForm:
         return self.form
 
     def packed(self, form=None) -> dict:
-        """Return the coefficients as dolfinx packs them.  Each array has one row for each entity."""
+        """Return the coefficients as dolfinx packs them, with one row for each entity."""
         form = form or self.form
         return cpp.fem.pack_coefficients(form)
 
     def assemble_vector(self, b: NDArray[np.float64], rows: NDArray[np.float64] | None = None, form=None) -> None:
-        """Add the vector to `b`, without communication.  The coefficients of the entities are `rows`, or `packed()`."""
+        """Add the vector to `b`, without communication.
+
+        `rows`: coefficients of the entities, by default `packed()`.
+        """
         form = form or self.form
         packed = self.packed(form) if rows is None else dict.fromkeys(self._keys, rows)
         cpp.fem.assemble_vector(b, form, cpp.fem.pack_constants(form), packed)
 
     def assemble_matrix(self, A: PETSc.Mat, rows: NDArray[np.float64] | None = None, form=None) -> None:
-        """Add the matrix, in unrolled dofs, to `A` without final assembly.  `rows`: see `assemble_vector`."""
+        """Add the matrix, in unrolled dofs, to `A` without final assembly.
+
+        `rows`: coefficients of the entities, by default `packed()`.
+        """
         form = form or self.form
         packed = self.packed(form) if rows is None else dict.fromkeys(self._keys, rows)
         cpp.fem.petsc.assemble_matrix(A, form, cpp.fem.pack_constants(form), packed, [], unrolled=True)
 
     @cached_property
     def _keys(self) -> list[tuple]:
-        """Keys of the coefficients.  In dolfinx 0.11 they are indices of the integrals, else subdomain ids."""
+        """Keys of the coefficients: indices of the integrals in dolfinx 0.11, else subdomain ids."""
         return [(fem.IntegralType.cell, key) for _, key in self.packed()] or [(fem.IntegralType.cell, SUBDOMAIN)]
 
 

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Compilation of dolfinx's forms and function spaces.  It prints no log, survives aborted runs, and reports errors in a
-line.
+"""Compilation of dolfinx's forms and function spaces, without log lines, and with errors in one line.
 
 FFCx marks a library by a `.c` file in the cache before compiling it.  Other programs wait ten seconds for a marked
-library.  After an aborted run the mark remains, and all later runs fail.  This module compiles each library in a
-separate folder, and moves the complete library into the cache.  Incomplete or broken libraries in the cache are
+library.  After an aborted run the mark remains, and all later runs fail.  This module therefore compiles each library
+in a separate folder, and moves the complete library into the cache.  Incomplete or broken libraries in the cache are
 compiled again.
 """
 
@@ -39,15 +38,15 @@ from mpm_dolfinx.parallel.exchange import at_root, first
 WORKSHOP = ".mpm_dolfinx-"
 """Prefix of the folders in which libraries are compiled."""
 ABANDONED = 600.0
-"""Age, in s, above which a mark of another program is ignored.  The mark is a `.c` file without a `.c.cached` file."""
+"""Age, in s, above which a mark of another program is ignored.  A mark is a `.c` file without a `.c.cached` file."""
 DAY = 86400.0  # Source: definition
 logger = logging.getLogger("mpm_dolfinx")
 _settings = jit.get_options if hasattr(jit, "get_options") else jit.get_parameters  # OLD
 _ffcx_settings = ffcx.get_options if hasattr(ffcx, "get_options") else ffcx.get_parameters  # OLD
 _replacements: dict[Path, Path] = {}
-"""Temporary folders of this run, by the cache folder that each replaces.  These cache folders are not writable."""
+"""Temporary folders of this run, by the cache folder that each replaces.  The cache folders are not writable."""
 _warnings: dict[Path, str] = {}
-"""Warnings still to be issued, by temporary folder.  The first compilation in a folder issues its warning."""
+"""Pending warnings by temporary folder.  The first compilation in a folder issues its warning."""
 
 
 @contextmanager
@@ -153,7 +152,7 @@ def _complete(make: Callable, folder: Path, messages: list[str]) -> Callable:
 
 @cache
 def _loaded(name: str, library: Path) -> ModuleType:
-    """Return the module of a library.  FFCx's loader would list the whole cache, for each form of each scene."""
+    """Return the module of a library.  FFCx's loader would list the whole cache for each form."""
     spec = spec_from_file_location(name, library)
     module = module_from_spec(spec)
     spec.loader.exec_module(module)
@@ -168,8 +167,7 @@ def _library(place: Path, name: str) -> Path | None:
 def _is_complete(place: Path, name: str) -> bool:
     """Return whether the cache holds a complete library, and its files `.c` and `.c.cached`.
 
-    Python's loader does not notice that a library is truncated.  The run would end with a bus error at the first
-    missing page.
+    Python's loader does not notice a truncated library.  The run would end with a bus error.
     """
     library = _library(place, name)
     if library is None or not all((place / f"{name}{end}").exists() for end in (".c", ".c.cached")):
@@ -201,7 +199,7 @@ def _publish(workshop: Path, folder: Path) -> None:
 
 @contextmanager
 def _replaced(**functions: Callable) -> Iterator[None]:
-    """Replace functions of FFCx's module by functions with the same names, within this context."""
+    """Replace functions of FFCx's module within this context."""
     before = {name: getattr(libraries, name) for name in functions}
     for name, function in functions.items():
         setattr(libraries, name, function)
@@ -214,7 +212,7 @@ def _replaced(**functions: Callable) -> Iterator[None]:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Context without setuptools' log lines about compiler calls.  Afterwards the root logger is as before."""
+    """Context without setuptools' log lines about compiler calls."""
     root = logging.getLogger()
     level, handlers = root.level, root.handlers[:]
     root.addFilter(_is_wanted)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Check of the environment before other imports.  An error names the missing packages and the remedy in one line."""
+"""Check of the environment before other imports. An error names the missing packages and the remedy."""
 
 from __future__ import annotations
 

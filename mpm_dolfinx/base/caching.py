@@ -21,7 +21,7 @@ class Latest(Generic[T]):
 
     The cache is empty during the computation of a value, so an exception leaves no incomplete value behind.
 
-    derived: caches of values that depend on this value.  They are emptied together with this cache.
+    `derived`: caches of values that depend on this value.  They are emptied together with this cache.
     """
 
     def __init__(self, *derived: Latest) -> None:
@@ -29,11 +29,11 @@ class Latest(Generic[T]):
         self._derived = derived
 
     def __call__(self, key: Any, make: Callable[[], T], comm: MPI.Intracomm = MPI.COMM_SELF) -> T:
-        """Return the value for a key.  It is computed again if the key differs from the last key.
+        """Return the value for a key.  The value is computed again if the key differs from the last key.
 
-        key: all data on which the value depends: numbers, objects, arrays that never change, or tuples of these
-        make: function that computes the value
-        comm: processes that compute the value together; if one of them needs a new value, all compute it
+        `key`: all data on which the value depends: numbers, objects, arrays that never change, or tuples of these
+        `make`: function that computes the value
+        `comm`: processes that compute the value together.  If one of them needs a new value, all compute it.
         """
         other = self._entry is None or not (self._entry[0] is key or same(self._entry[0], key))
         if other if comm.size == 1 else over_all(comm, other) > 0:
@@ -58,7 +58,7 @@ class Latest(Generic[T]):
 
 
 class Keyed:
-    """Base class of objects for which a token stands in cache keys.  Caches therefore do not keep the objects alive."""
+    """Base class of objects for which a token stands in cache keys.  Caches then do not keep the objects alive."""
 
     @cached_property
     def key(self) -> object:

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Fluid content of the pores: the quantity stored in the fluid balance.
 
-Per reference volume, the content zeta changes by (d zeta = alpha dJ + S J dp).  Here alpha is Biot's coefficient, J the
-volume ratio, and p the pore pressure.  The storage coefficient S = n / K_w + (alpha - n) / K_s contains the bulk moduli
-K_w of water and K_s of grains.  The porosity is n = 1 - (1 - n0) / J, where n0 is the porosity at J = 1.  Therefore (S
-J = a J + b) is linear in J, with a = S(n = 1), and
+Let alpha be Biot's coefficient, J the volume ratio, and p the pore pressure.  Per reference volume, the content zeta
+changes by (d zeta = alpha dJ + S J dp).  The storage coefficient S = n / K_w + (alpha - n) / K_s contains the bulk
+moduli K_w of water and K_s of grains.  The porosity is n = 1 - (1 - n0) / J, where n0 is the porosity at J = 1.
+Therefore S J = a J + b is linear in J, with a = S(n = 1), and
 
     d zeta = (alpha / rho) d[(J + b / a) rho],    rho = exp(a p / alpha).
 
@@ -13,8 +13,9 @@ computed as alpha times the change of this mass, divided by rho at the mean pres
 second-order accurate for any path.  If no fluid flows, the change is exactly zero in a step of any size.
 
 Fluxes between cells conserve mass.  A fluid of density rho_w exp(p / K_w) has the mass flux -rho_w kappa grad pi, with
-kappa = conductivity / unit weight.  The mass potential is pi = K_w (exp(p / K_w) - 1) (Kirchhoff's transformation).
-The density between pressures p- and p+ is rho_w times the logarithmic mean (pi+ - pi-) / (p+ - p-).
+the mobility kappa (conductivity divided by unit weight) and the mass potential pi = K_w (exp(p / K_w) - 1) (Kirchhoff's
+transformation).  The density between the pressures p- and p+ is rho_w times the logarithmic mean (pi+ - pi-) / (p+ -
+p-).
 """
 
 from __future__ import annotations
@@ -30,19 +31,13 @@ SERIES = (120 * EPSILON) ** 0.25
 
 
 def change_of_content(alpha, a, storage, J, dp):
-    """Return the change of the fluid content in a step, per volume at the start of the step, as a UFL expression.
+    """Return the change of the fluid content in a step per volume at the start of the step, as UFL.
 
-    Parameters
-    ----------
-    alpha
-        Biot coefficient.
-    a, storage
-        Storage coefficients, in 1/Pa.  `a` refers to a porosity of one (see the module), `storage` to the start of the
-        step.
-    J
-        Volume ratio of the step.
-    dp
-        Change of the pore pressure, Pa.
+    `alpha`: Biot coefficient.
+    `a`, `storage`: storage coefficients, in 1/Pa.  `a` refers to a porosity of one (see the module), `storage` to the
+    start of the step.
+    `J`: volume ratio of the step.
+    `dp`: change of the pore pressure, Pa.
     """
     z = a * dp / (2 * alpha)
     return _change(alpha, a, storage, J, dp, ufl.cosh(z), _sinhc(z))
@@ -57,22 +52,31 @@ def change_at_points(alpha, a, storage, J, dp) -> NDArray[np.float64]:
 
 
 def mass_potential(p, bulk: float):
-    """Return the mass potentials pi (n,), in Pa, at pressures p (n,), in Pa.  `bulk` is K_w, in Pa."""
+    """Return the mass potentials pi (n,) at pressures p (n,), both in Pa.
+
+    `bulk`, Pa: bulk modulus K_w of water.
+    """
     return p if np.isinf(bulk) else bulk * np.expm1(p / bulk)
 
 
 def pressure_of(pi, bulk: float):
-    """Return the pressures (n,), in Pa, at mass potentials pi (n,), in Pa.  `bulk` is K_w, in Pa."""
+    """Return the pressures (n,) at mass potentials pi (n,), both in Pa.
+
+    `bulk`, Pa: bulk modulus K_w of water.
+    """
     return pi if np.isinf(bulk) else bulk * np.log1p(pi / bulk)
 
 
 def mass_potential_form(p, compliance):
-    """Return the mass potential (Pa) at p as a UFL expression.  `compliance` is (1 / K_w), in 1/Pa."""
+    """Return the mass potential (Pa) at p as a UFL expression.
+
+    `compliance`: 1 / K_w, in 1/Pa.
+    """
     return p * density_between(p, 0.0, compliance)
 
 
 def density_between(p0, p1, compliance):
-    """Return the mean density between two pressures, divided by the density at p = 0, as a UFL expression."""
+    """Return the mean density between two pressures as a UFL expression, divided by the density at p = 0."""
     return ufl.exp(compliance * (p0 + p1) / 2) * _sinhc(compliance * (p0 - p1) / 2)
 
 

@@ -18,7 +18,7 @@ def _none(*shape: int) -> NDArray[np.float64]:
 
 
 class Row(NamedTuple):
-    """Quantities at one output time.  An array is empty if the quantity was not requested or there is no fluid."""
+    """Quantities at one output time.  The array of a quantity that was not recorded is empty."""
 
     t: float  # time, s
     displacement: NDArray[np.float64] = _none(0, 0)  # of the probes (m, d), m
@@ -34,7 +34,7 @@ COLUMNS = tuple(name for name in Row._fields if name != "outcome")
 
 
 class _Columns:
-    """Storage of the histories: an array (capacity, ...) per quantity, and the outcomes.  `used` rows are filled."""
+    """Storage of the histories: one array for each quantity, and the outcomes."""
 
     def __init__(self, arrays: dict[str, NDArray[np.float64]], outcomes: list[Any]):
         self.arrays, self.outcomes = arrays, outcomes
@@ -44,7 +44,7 @@ class _Columns:
         return len(self.outcomes)
 
     def reshaped(self, count: int, capacity: int, shapes: dict[str, tuple[int, ...]]) -> _Columns:
-        """Return the first `count` rows in larger arrays with this capacity and these row shapes.  The rest is nan."""
+        """Copy the first rows into new arrays with more room, filled up with nan."""
         out = {}
         for name, shape in shapes.items():
             out[name] = np.full((capacity, *shape), np.nan)
@@ -76,7 +76,7 @@ class Rows(Sequence[Row]):
 
     @classmethod
     def of_columns(cls, columns: dict[str, NDArray[np.float64]], outcomes: Sequence[Any]) -> Rows:
-        """Return rows from values (n, ...) by name, and from outcomes (n,).  Raise ValueError if they do not match."""
+        """Return rows from values (n, ...) by name, and from n outcomes.  Raise ValueError if their numbers differ."""
         if columns.keys() != set(COLUMNS):
             raise ValueError(f"the columns are {', '.join(columns)}, must be {', '.join(COLUMNS)}")
         if {len(values) for values in columns.values()} != {len(outcomes)}:

@@ -12,13 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 SYMMETRIC = {"xx": (0, 0), "yy": (1, 1), "zz": (2, 2), "xy": (0, 1), "xz": (0, 2), "yz": (1, 2)}
-"""Indices of the components of a symmetric tensor.  Tables of plane strain have the first four components."""
+"""Indices of the components of a symmetric tensor.  Tables of plane strain have only the first four components."""
 
 Outcome = Mapping[str, Mapping[str, NDArray[np.float64]]]
 
 
 class Histories(Protocol):
-    """Results at the probes at one output time, or at all output times.  In the latter case the first axis is time."""
+    """Results at the probes at one output time, or at all output times.  With all times, the first axis of arrays is
+    time.
+    """
 
     t: Any
     displacement: NDArray[np.float64]
@@ -34,7 +36,7 @@ def components(tensors: NDArray[np.float64], dim: int) -> dict[str, NDArray[np.f
 
 
 def columns(of: Histories, outcome: Outcome) -> dict[str, tuple[Any, str]]:
-    """Return the values and the unit of each column by name, for one output time or for all."""
+    """Return the values and the unit of each column by name."""
     dim, rank = of.displacement.shape[-1], np.ndim(of.t)
     out = {"t": (of.t, "s")}
     for k, name in enumerate(("p_min", "p_max")[: of.pressure.shape[-1]]):
@@ -60,7 +62,7 @@ def columns(of: Histories, outcome: Outcome) -> dict[str, tuple[Any, str]]:
 
 
 def _axes(dim: int, size: int) -> list[str]:
-    """Return the suffixes of the `dim` components of a force and, if `size` is larger, of its moments."""
+    """Return the suffixes of the components of a force, and of its moments."""
     axes = ["_x", "_y", "_z"][:dim]
     return axes + {0: [], 1: ["_moment"], 3: [f"_moment{axis}" for axis in axes]}[size - dim]
 
@@ -113,7 +115,7 @@ def data_set(of: Histories, outcome: Outcome, about: dict[str, Any]):
 
 
 def _library(name: str) -> ModuleType:
-    """Return an optional library.  Raise ImportError with a message of one line if the library is not installed."""
+    """Return an optional library, or raise ImportError with a message of one line."""
     try:
         return import_module(name)
     except ImportError as error:

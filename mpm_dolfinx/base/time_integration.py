@@ -2,16 +2,17 @@
 """Time integration: the substeps (stages) of a time step.  The finite element reference solution also uses them.
 
 Without inertia the momentum balance has no time derivative.  The fluid content zeta of a cell satisfies zeta' + Q(u, p)
-= 0 with the net outflow Q.  The subscript n denotes the start of a step.  The two methods are
+= 0 with the displacement u, the pressure p, and the net outflow Q.  The subscript n denotes the start of a step, the
+numbers 1 and 2 the ends of its substeps, and dt its length.  The two methods are
 
     backward-euler   zeta(u, p) - zeta_n + dt Q(u, p) = 0,
     sdirk2           zeta(u1, p1) - zeta_n + gamma dt Q(u1, p1) = 0                               loads at t + gamma dt,
                      zeta(u2, p2) - zeta_n + gamma dt Q(u2, p2) + (1 - gamma) dt Q(u1, p1) = 0    loads at t + dt.
 
 With gamma = 1 - 1 / sqrt(2), `sdirk2` is Alexander's method (1977).  It is second-order and L-stable.  The rate at the
-start of the step is not used, because a transfer between grids makes this rate noisy.  The step ends with the values
-(u2, p2).  After a jump of the loads, one long step overshoots by a fifth of the change, but two half steps do not, see
-`step_size`.  The error of a step is estimated from the rates of the two substeps: see `solve.newton.note_pressures`.
+start of the step is not used, because a transfer between grids makes this rate noisy.  After a jump of the loads, one
+long step overshoots by a fifth of the change, but two half steps do not, see `step_size`.  The error of a step is
+estimated from the rates of the two substeps: see `solve.newton.note_pressures`.
 """
 
 from __future__ import annotations
@@ -42,14 +43,15 @@ METHODS = {
 def in_step(
     share: float, start: NDArray[np.float64], now: NDArray[np.float64], end: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the displacement to prescribe at the end of the first substep, for a second-order velocity at this time.
+    """Return the displacement to prescribe at the end of the first substep.
 
     The method divides the displacement in the substep by its length (`share` dt), and so obtains the velocity v.  With
-    the exact displacement, v is first-order accurate, and accelerations do not converge.  Here v is the slope of the
-    parabola through three displacements, and the result is (`start` + `share` dt v).
+    the exact displacement, v is first-order accurate, and accelerations do not converge.  Therefore v is the slope of
+    the parabola through three displacements, and the result is (`start` + `share` dt v).
 
-    `share` is the end of the substep as a fraction of the step.  The three displacements are `start` at the start of
-    the step, `now` at the end of the substep, and `end` at the end of the step.
+    `share`: end of the substep as a fraction of the step.
+    `start`, `now`, `end`: displacements at the start of the step, at the end of the substep, and at the end of the
+    step.
     """
     return start + ((2 * share - 1) * (now - start) - share**2 * (end - start)) / (share - 1)
 

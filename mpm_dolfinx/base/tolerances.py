@@ -23,7 +23,7 @@ NEAR = 8 * float(np.finfo(np.float32).eps)
 Source: epsilon of single precision (IEEE 754), times 8 for a few operations.
 """
 TINY = float(np.finfo(float).tiny) / EPSILON
-"""Lower bound of divisors, or a number added to divisors.  With it, a number below (1 / epsilon) has finite quotients.
+"""Lower bound of divisors, or a number added to divisors.  Quotients of numbers below (1 / epsilon) are then finite.
 Source: IEEE 754.
 """
 FOREVER = 1 / EPSILON**2

@@ -10,7 +10,7 @@ t
 X : (n, d), m
     Reference positions of n places.
 x : (n, d), m
-    Positions of these n places at the start of the step, for example to prescribe a water level.
+    Positions of the n places at the start of the step, for example to prescribe a water level.
 
 If a function has a single parameter with another name, this parameter receives the time.  With several parameters,
 other names raise an error.  Parameters with a default receive no argument, unless all parameters have one.  Material
@@ -64,16 +64,10 @@ def numbers(
 ) -> NDArray[np.float64]:
     """Return a value as an array of floats.
 
-    Parameters
-    ----------
-    name
-        Name of the object, for the message.
-    shapes
-        Allowed shapes; None allows any shape.  By default only a scalar is allowed.
-    allowed
-        Description of the allowed values, for the message.
-    test
-        Condition that each number, or all numbers together, must meet.
+    `name`: name of the object, for the message.
+    `shapes`: allowed shapes; None allows any shape.  By default only a scalar is allowed.
+    `allowed`: description of the allowed values, for the message.
+    `test`: condition that each number, or all numbers together, must meet.
 
     Raises
     ------
@@ -157,7 +151,7 @@ def path(name: str, value) -> Path:
 
 @contextmanager
 def on_disk(name: str, allowed: str) -> Iterator[None]:
-    """Context that adds the object and the remedy to an OSError, for example to that of a missing folder."""
+    """Context that adds the object and the remedy to an OSError, for example for a missing folder."""
     try:
         yield
     except OSError as error:
@@ -270,9 +264,10 @@ def at_places(what: str, allowed: str, function: Callable, name: str, places: ND
 def given(
     what: str, value, t: float, side: Places | None = None, dim: int = 0, *, among: Sequence[str] = NAMES, number=True
 ) -> NDArray[np.float64]:
-    """Return a value at time t.  Its shape is () or (m,) for m places; if `dim` > 0 it may also be (d,) or (m, d).
+    """Return a value at time t.
 
-    If a function of position returns one vector, the result contains this vector for each place, (m, d).
+    For m places, the shape is () or (m,).  If `dim` > 0, it may also be (d,) or (m, d).  If a function of position
+    returns one vector, the result (m, d) repeats this vector for each place.
 
     Parameters
     ----------

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""Seeded bodies: boxes, meshes, polygons, fills; their faces, and contact between seeded bodies."""
+"""Seeded bodies: boxes, meshes, polygons and fills, with their faces and the contact between them."""

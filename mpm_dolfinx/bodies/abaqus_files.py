@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Reader of Abaqus (and CalculiX) input files.  It returns a meshio mesh with placed instances, sets and surfaces.
+"""Reader of input files of Abaqus and CalculiX, with placed instances, element sets and surfaces.
 
-meshio's reader keeps only the nodes of the last part, and ignores the placement of instances.
+meshio's own reader keeps only the nodes of the last part, and ignores the placement of instances.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from mpm_dolfinx.bodies.mesh_cells import Block
 PLANE = re.compile(r"(?:(?:C|DC|DCC|EC)?(?:PE|PS|PEG|AX|GAX|2D)|AC(?:2D|AX)|S|STRI|DS|M3D|SFM3D|R3D)(3|4|6|8|9)(?!\d)")
 SOLID = re.compile(r"(?:(?:C|DC|DCC|EC|AC|Q)3D|SC)(4|5|6|8|10|13|15|20|27)(?![\dV])")
 LINE = re.compile(r"(?:T2D|T3D|R2D|RAX|DC1D|AC1D)(2|3)|(?:B|PIPE|SAX)[23]?([123])")
-"""Pattern of the types of line elements.  The first group is the number of nodes, the second is the order of a beam."""
+"""Pattern of line elements.  The first group is the number of nodes.  The second group is the order of a beam."""
 NO_CELL = ("SPRING", "DASHPOT", "MASS", "ROTARY", "CONN", "GAP", "JOINT", "HEATCAP", "DCOUP", "ITS", "DIST", "FRAME")
 """Name prefixes of elements without volume or area."""
 KINDS = {
@@ -45,7 +45,7 @@ MAKES = ("NGEN", "NFILL", "NCOPY", "NMAP", "ELGEN", "ELCOPY", "SYSTEM", "SYMMETR
 
 @dataclass
 class _Set:
-    """A set of elements.  Each entry has an instance's name or "", and element numbers or the name of another set."""
+    """A set of elements of one or several instances."""
 
     name: str
     internal: bool
@@ -54,7 +54,7 @@ class _Set:
 
 @dataclass
 class _Scope:
-    """Definitions inside a part, or outside all parts.  Keys of sets and surfaces are names in capitals."""
+    """Definitions inside a part, or outside all parts."""
 
     name: str = ""
     nodes: list[tuple[NDArray[np.int64], NDArray[np.float64]]] = field(default_factory=list)  # numbers (n,), x (n, 3)
@@ -72,7 +72,7 @@ class _Scope:
 
 @dataclass
 class _Placed:
-    """Definitions of a part, and the placement of one of its instances if there are instances."""
+    """Definitions of a part, and the placement of one instance."""
 
     scope: _Scope
     name: str = ""
@@ -80,7 +80,7 @@ class _Placed:
     rotation: tuple[float, ...] = ()
 
     def places(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return positions x (n, 3) after placement, that is, after a translation and then a rotation."""
+        """Return positions after placement: first a translation, then a rotation."""
         x = x + self.shift
         if not self.rotation:
             return x
@@ -92,7 +92,7 @@ class _Placed:
 
 
 def is_abaqus(file: Path) -> bool:
-    """Return whether a file has the suffix `.inp` and Abaqus keywords.  AVS files have this suffix but no keywords."""
+    """Return whether a file with the suffix `.inp` has Abaqus keywords.  AVS files have the same suffix."""
     if file.suffix.lower() != ".inp" or not file.is_file():
         return False
     with file.open(errors="replace") as lines:
@@ -100,12 +100,12 @@ def is_abaqus(file: Path) -> bool:
 
 
 def read(file: Path) -> meshio.Mesh:
-    """Return the mesh of an input file.  Element sets and instances become parts; surfaces become sides."""
+    """Return the mesh of an input file, with element sets and instances as parts, and surfaces as sides."""
     return _assembled(_placed(file))
 
 
 def _keywords(file: Path) -> Iterator[tuple[str, dict[str, str], list[str]]]:
-    """Yield each keyword of the file and of included files, with options and data lines."""
+    """Yield all keywords of a file and of the files it includes."""
     keyword, rows = "", []
     with file.open(errors="replace") as lines:
         for line in map(str.strip, lines):
@@ -122,7 +122,7 @@ def _keywords(file: Path) -> Iterator[tuple[str, dict[str, str], list[str]]]:
 
 
 def _keyword(file: Path, line: str, rows: list[str]) -> Iterator[tuple[str, dict[str, str], list[str]]]:
-    """Yield a keyword with its options and data lines, or the keywords of an included file."""
+    """Yield one keyword, or all keywords of an included file."""
     name, *words = line.lstrip("*").split(",")
     pairs = [word.partition("=")[::2] for word in words if word.strip()]
     options = {key.strip().upper(): value.strip().strip('"') for key, value in pairs}
@@ -138,7 +138,7 @@ def _keyword(file: Path, line: str, rows: list[str]) -> Iterator[tuple[str, dict
 
 
 def _placed(file: Path) -> list[_Placed]:
-    """Return the definitions outside of parts, and then all instances.  Without instances, return all parts instead."""
+    """Return the definitions outside of parts, and all instances (or all parts without instances)."""
     whole = _Scope()
     scope = whole
     parts = {}
@@ -170,7 +170,7 @@ def _placed(file: Path) -> list[_Placed]:
 
 
 def _define(scope: _Scope, keyword: str, options: dict[str, str], rows: list[str]) -> None:
-    """Add the nodes, elements, sets or surfaces of one keyword to a scope.  Other keywords are ignored."""
+    """Add the nodes, elements, sets or surfaces of one keyword to a scope."""
     if keyword == "NODE" and rows:
         if options.get("SYSTEM", "R").upper() != "R":
             raise ValueError(f"*NODE, SYSTEM={options['SYSTEM']}: coordinates must be Cartesian")
@@ -260,9 +260,9 @@ def _assembled(placed: list[_Placed]) -> meshio.Mesh:
 def _unique(
     numbers: list[NDArray[np.int64]], what: str, x: NDArray[np.float64] | None = None
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return node or element numbers in ascending order, and the permutation that sorts them.
+    """Return the sorted node or element numbers, and the permutation that sorts these numbers.
 
-    Raise ValueError for a repeated number.  Only a node may be repeated, and only at the same position x (n, 3), in m.
+    A repeated number raises ValueError, except for nodes at equal positions.
     """
     numbers = np.concatenate([np.empty(0, np.int64), *numbers])
     order = np.argsort(numbers, kind="stable")
@@ -276,7 +276,7 @@ def _unique(
 
 
 def _groups(placed: list[_Placed], cells: list, numbers: list) -> dict[str, list[NDArray[np.int64]]]:
-    """Return the cells of element sets and surfaces by name.  Facets of surfaces are appended to `cells`."""
+    """Return the cells of element sets and surfaces by name."""
     chosen: dict[str, list[tuple[int, NDArray[np.int64]]]] = {}
     seen = [
         [key for key, found in one.scope.sets.items() if not (found.internal and key.startswith("_"))] for one in placed
@@ -303,7 +303,7 @@ def _groups(placed: list[_Placed], cells: list, numbers: list) -> dict[str, list
 def _members(
     placed: list[_Placed], k: int, key: str, above: tuple[str, ...] = ()
 ) -> list[tuple[int, NDArray[np.int64]]]:
-    """Return pairs for a set: index of an instance or part in `placed`, and the numbers of its elements in the set."""
+    """Return the elements of a set: the index of each instance or part, and its element numbers."""
     out = []
     if key not in placed[k].scope.sets or key in above:
         known = ", ".join(found.name for found in placed[k].scope.sets.values()) or "none"
@@ -317,7 +317,7 @@ def _members(
 
 
 def _surfaces(placed: list[_Placed], cells: list, numbers: list) -> Iterator[tuple[str, str, NDArray[np.int64]]]:
-    """Return the facets of surfaces as (name, cell type, nodes).  An entry without a face number means all faces."""
+    """Return the name, cell type and nodes of the facets of each surface."""
     out: dict[tuple[str, str], list[NDArray[np.int64]]] = {}
     for k, one in enumerate(placed):
         for name, pairs in one.scope.surfaces.values():

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Seeded bodies: reference geometry of their particle domains, and the material points seeded in them."""
+"""Seeded bodies: the reference geometry of their particle domains, and their material points."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.base.validation import asked, at_places, instance, numbers
 from mpm_dolfinx.grid.grid import FACES, SIDES, Grid, begin_with, corner_bits, in_chunks
-from mpm_dolfinx.parallel.exchange import everywhere
+from mpm_dolfinx.parallel.exchange import together
 from mpm_dolfinx.points.cutting import centroids, domain_volumes, volumes
 from mpm_dolfinx.points.material_points import MaterialPoints
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Body:
-    """A seeded body: the reference geometry of all its particle domains, which is the same on every process.
+    """A seeded body: the reference geometry of all its particle domains, the same on every process.
 
-    Each domain is the image of a box under `map`, see `mapped`.  Subclasses define `spacing`: the edge lengths of the
-    boxes, in m.  Its shape is (n, d), or (d,) if all boxes are equal.  In a `RowsBody`, it contains the smallest edge
-    lengths (d,).  Arrays over all domains are not stored, so that large bodies can be processed in chunks.
+    Each domain is the image of a box under `map`.  Subclasses define the edge lengths `spacing` of the boxes, in m.
+    Their shape is (n, d), or (d,) if all boxes are equal.  A `RowsBody` has the smallest edge lengths (d,).  Large
+    bodies are processed in chunks, so no array over all domains is stored.
     """
 
     material: int = 0  # index in the scene's list of materials
@@ -85,29 +85,29 @@ class Body:
         return tuple(SIDES[self.dim])
 
     def named(self, name: str) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the domains (n,) and face indices (n,) of faces on the side `name`, in ascending order of domains."""
+        """Return the faces on the side `name`, as domains (n,) in ascending order and face indices (n,)."""
         return self.facing(*SIDES[self.dim][name]) if name in self.names else (np.empty(0, np.int64),) * 2
 
     def facing(self, axis: int, end: int, least: float = 0.0) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return domains (n,) and face indices (n,) of the surface faces at the lower (0) or upper (1) end of an axis.
+        """Return the surface faces at the lower (0) or upper (1) end of an axis, as domains (n,) and face indices (n,).
 
-        In unstructured bodies, the outward unit normals of these faces have their largest component towards this end.
-        This component exceeds `least`.
+        In unstructured bodies, the unit normals of these faces have their largest component, above `least`, towards
+        this end.
         """
         row = self._with_face(axis, end)
         return row, np.full(len(row), 2 * axis + end)
 
     def _with_face(self, axis: int, end: int) -> NDArray[np.int64]:
-        """Return the domains (n,), in ascending order, whose face at an end of an axis lies on the surface."""
+        """Return the domains whose face at an end of an axis lies on the surface."""
         rows = [part.start + np.flatnonzero(self.sides_of(part)[:, axis, end]) for part in in_chunks(len(self))]
         return np.concatenate([np.empty(0, np.int64), *rows])
 
     def across(self, axis: int) -> tuple[float, float]:
-        """Return two means over the body: number of domains in a row along an axis, and their edge length in m."""
+        """Return the mean number of domains along an axis, and their mean edge length in m."""
         return len(self) / max(1, len(self._with_face(axis, 0))), float(self.spacing[axis])
 
     def outer(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the domains (n,) and face indices (n,) of all surface faces, sorted by face index."""
+        """Return all surface faces, as domains (n,) and face indices (n,), sorted by face index."""
         rows = [self._with_face(axis, end) for axis in range(self.dim) for end in (0, 1)]
         return np.concatenate(rows), np.repeat(np.arange(len(rows)), list(map(len, rows)))
 
@@ -130,11 +130,7 @@ class Body:
         return images.reshape(X.shape)
 
     def bend(self, chosen: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the distances (n,), in m, of chosen domains' straight edges from the curved images of their box edges.
-
-        Each domain has the largest distance between midpoints of both kinds of edges.  Straight edges of two domains
-        that follow one curve may be apart by this distance.
-        """
+        """Return how far the straight edges of chosen domains are from the curved images of their box edges, in m."""
         out = np.zeros(len(chosen))
         if self.map is None:
             return out
@@ -156,7 +152,7 @@ class Body:
         return float(len(self) * self.spacing.prod())
 
     def size(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
-        """Return edge lengths (n, d), in m, of chosen domains' boxes, scaled uniformly to the domains' volumes."""
+        """Return the edge lengths (n, d), in m, of chosen boxes, scaled uniformly to the volumes of their domains."""
         boxes = self.boxes(chosen)
         if self.aligned:
             return boxes
@@ -164,8 +160,31 @@ class Body:
         return boxes * ratio[:, None] ** (1 / self.dim)
 
 
+@dataclass(frozen=True, eq=False)
+class Later:
+    """A body that is absent until `Simulation.stage` adds it: `Simulation(grid, [ground, Later(fill)], ...)`."""
+
+    body: Body
+
+    def __post_init__(self):
+        instance("Later: body", self.body, Body)
+
+
+@dataclass(frozen=True, eq=False)
+class Moving:
+    """Initial motion of bodies with inertia: `Simulation(..., inertia=Moving((0, -1)))`.
+
+    Parameters
+    ----------
+    velocity : (d,) or callable x (n, d) -> (n, d), m/s
+        Initial velocity of all bodies, or a function of position.
+    """
+
+    velocity: ArrayLike | Callable[[NDArray], ArrayLike]
+
+
 def mapped(grid: Grid, body: Body, map: Callable[[NDArray[np.float64]], NDArray[np.float64]]) -> Body:
-    """Return a body deformed by a map: its boxes become quadrilaterals or hexahedra with mapped corners.
+    """Return a body deformed by a map: its boxes become quadrilaterals or hexahedra.
 
     Regions, probes, and the positions X in functions for materials and displacements refer to the shape before all
     maps.  Contact, overlap, loads and the check for flat sides use the mapped shape.  Sides keep their names.
@@ -206,7 +225,7 @@ def mapped(grid: Grid, body: Body, map: Callable[[NDArray[np.float64]], NDArray[
 
 
 def check_inside(grid: Grid, body: Body, name: str = "body") -> Body:
-    """Return the body; raise ValueError if it is not inside the grid.  `mapped` has already checked mapped bodies."""
+    """Return the body, or raise ValueError for a body outside the grid."""
     count, where = 0, None
     for part in in_chunks(len(body) if body.map is None else 0):
         lower = body.lower_of(part) - grid.base
@@ -222,7 +241,7 @@ def check_inside(grid: Grid, body: Body, name: str = "body") -> Body:
 
 
 def pressure_at(pressure: float | Callable[[NDArray], ArrayLike], x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the pore pressures (n,), in Pa, that a number or a function of position gives at x (n, d), in m."""
+    """Return the pore pressures (n,), in Pa, at positions x (n, d), from a number or a function of position."""
     if callable(pressure) and len(x):
         allowed = f"a finite number, or one for each of {len(x)} places"
         given = at_places("pressure", allowed, pressure, "x", x)
@@ -233,7 +252,7 @@ def pressure_at(pressure: float | Callable[[NDArray], ArrayLike], x: NDArray[np.
 def material_points(
     grid: Grid, bodies: Sequence[Body], pressure: float | Callable[[NDArray], ArrayLike] = 0.0
 ) -> MaterialPoints:
-    """Return the material points of the bodies on this process, with the pore pressures of `pressure_at`."""
+    """Return the material points of the bodies on this process."""
     starts, own = np.cumsum([0, *map(len, bodies)])[:-1], [_own(grid, body) for body in bodies]
     rows, corners = [rows for rows, _ in own], np.concatenate([corners for _, corners in own])
     ids = np.concatenate([start + row for start, row in zip(starts, rows, strict=True)])
@@ -247,7 +266,7 @@ def material_points(
         F=np.broadcast_to(np.eye(grid.stretches), (n, grid.stretches, grid.stretches)),
         volume0=domain_volumes(corners, True) if grid.axisymmetric else size.prod(axis=1),
         material=material,
-        pressure=everywhere(grid.comm, lambda: pressure_at(pressure, x + grid.base)),
+        pressure=together(grid.comm, lambda: pressure_at(pressure, x + grid.base)),
         x=x,
         origin=corners,
         reference=corners,
@@ -255,7 +274,7 @@ def material_points(
 
 
 def _own(grid: Grid, body: Body) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the domains (n,) whose centroids lie in cells of this process, and their corners (n, 2^d, d), in m."""
+    """Return the domains whose centroids lie in cells of this process, and the corners of these domains."""
     rows, corners = [np.empty(0, dtype=np.int64)], [np.empty((0, 2**grid.dim, grid.dim))]
     for part in in_chunks(len(body)):
         of_part = body.corners(part) - grid.base
@@ -286,7 +305,7 @@ def check_bodies(grid: Grid, bodies: Sequence[Body]) -> None:
 
 
 def check_different(bodies: Sequence[Body]) -> None:
-    """Raise an error for a repeated body, because conditions would count its faces twice, but act on one copy only."""
+    """Raise an error for a repeated body, because conditions would count its faces twice."""
     for j, body in enumerate(bodies):
         for i in range(j):
             if bodies[i] is body:

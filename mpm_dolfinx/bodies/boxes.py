@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Bodies of boxes on a regular lattice.  A few numbers describe any number of boxes."""
+"""Bodies of boxes on a regular lattice, described by a few numbers."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class LatticeBody(Body):
         return len(self.count)
 
     def _index(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the lattice indices (n, d) of the chosen domains."""
+        """Return the lattice indices of the chosen domains."""
         if self.filled is not None:
             numbers = self.filled[chosen]
         elif isinstance(chosen, slice):
@@ -45,7 +45,7 @@ class LatticeBody(Body):
         return np.stack(np.unravel_index(numbers, self.count), axis=-1)
 
     def _at(self, index: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the positions (..., d), in m, of lattice corners with indices (..., d)."""
+        """Return the positions, in m, of lattice corners."""
         return self.origin + index * self.spacing
 
     def lower_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.float64]:
@@ -55,7 +55,7 @@ class LatticeBody(Body):
     def reference(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
         """Return the reference positions (n, 2^d, d), in m, of corners of the chosen domains, before the map.
 
-        Domains have bitwise equal coordinates at a shared corner, so that rounding opens no gaps far from the origin.
+        A corner has bitwise equal coordinates in all its domains, so rounding opens no gaps between domains.
         """
         return self._at(self._index(chosen)[:, None] + corner_bits(self.dim))
 
@@ -73,7 +73,7 @@ class LatticeBody(Body):
         return out
 
     def _with_face(self, axis: int, end: int) -> NDArray[np.int64]:
-        """Return the domains (n,), in ascending order, whose face at an end of an axis lies on the surface."""
+        """Return the domains whose face at an end of an axis lies on the surface."""
         if self.filled is not None:
             return super()._with_face(axis, end)
         along = [np.arange(n) for n in self.count]
@@ -95,13 +95,13 @@ class LatticeBody(Body):
         return self._at(low), self._at(high + 1)
 
     def neighbour(self, rows: NDArray[np.int64], step: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the domains (n,) of the body that lie at lattice steps (n, d) from the domains `rows` (n,)."""
+        """Return the domains (n,) at a number of lattice steps (n, d) from the domains `rows` (n,)."""
         number = np.ravel_multi_index(tuple((self._index(rows) + step).T), self.count)
         return number if self.filled is None else np.searchsorted(self.filled, number)
 
     @property
     def lattice(self) -> tuple[int, ...]:
-        """Number of lattice boxes along each axis within the body's bounding box.  Some of these boxes may be empty."""
+        """Number of lattice boxes along each axis of the body's bounding box, including empty boxes."""
         low, high = self._ends
         return tuple(high - low + 1)
 
@@ -110,19 +110,19 @@ class LatticeBody(Body):
         return self._index(rows) - self._ends[0]
 
     def nodes(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the lexicographic node indices (n, 2^d) of the corners of domains.  Shared corners have one index."""
+        """Return the node indices (n, 2^d) of the corners of domains.  A shared corner has one index."""
         corners = self.places(rows)[:, None] + corner_bits(self.dim)
         return np.ravel_multi_index(tuple(np.moveaxis(corners, 2, 0)), tuple(np.add(self.lattice, 1)))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RowsBody(LatticeBody):
-    """A body of boxes on a lattice with rows of different widths.  `spacing` (d,) has the smallest widths, in m."""
+    """A body of boxes on a lattice with rows of different widths."""
 
     rows: tuple[NDArray[np.float64], ...]  # coordinates of the rows' boundaries along each axis (count + 1,), m
 
     def _at(self, index: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the positions (..., d), in m, of lattice corners with indices (..., d)."""
+        """Return the positions, in m, of lattice corners."""
         return np.stack([rows[i] for rows, i in zip(self.rows, np.moveaxis(index, -1, 0), strict=True)], axis=-1)
 
     def boxes(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
@@ -135,7 +135,7 @@ class RowsBody(LatticeBody):
         return self.lower_of(chosen) + 0.5 * self.boxes(chosen)
 
     def across(self, axis: int) -> tuple[float, float]:
-        """Return two means over the body: number of domains in a row along an axis, and their edge length in m."""
+        """Return the mean number of domains along an axis, and their mean edge length in m."""
         low, high = self.bounds
         return super().across(axis)[0], float(high[axis] - low[axis]) / self.lattice[axis]
 
@@ -145,13 +145,13 @@ class RowsBody(LatticeBody):
         return sum(float(self.boxes(part).prod(axis=1).sum()) for part in in_chunks(len(self)))
 
     def corner_rows(self, axis: int) -> NDArray[np.float64]:
-        """Return the coordinates (n,), in m, of the boundaries of the rows that the body occupies along an axis."""
+        """Return the coordinates, in m, of the boundaries of the body's rows along an axis."""
         low, high = self._ends
         return self.rows[axis][low[axis] : high[axis] + 2]
 
 
 def _rows(grid: Grid, axis: int, low: float, high: float, per_cell: int) -> NDArray[np.float64]:
-    """Return row boundaries from `low` to `high`, in m.  A cell has `per_cell` rows, a part of a cell fewer rows."""
+    """Return the boundaries of rows from `low` to `high`, in m, with `per_cell` rows in each whole cell."""
     lines = grid.lines[axis] + grid.base[axis]
     tolerance = SAME * grid.finest[axis]
     ends = np.concatenate([[low], lines[(lines > low + tolerance) & (lines < high - tolerance)], [high]])
@@ -162,7 +162,7 @@ def _rows(grid: Grid, axis: int, low: float, high: float, per_cell: int) -> NDAr
 
 
 def _rounded(rows: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return numbers of rows as integers >= 1.  Small rounding errors of coordinates do not change these integers."""
+    """Return numbers of rows as integers >= 1, unaffected by rounding errors of coordinates."""
     return np.maximum(1, np.rint(NEAR * np.rint(rows / NEAR))).astype(np.int64)
 
 
@@ -173,14 +173,14 @@ def _lattice(rows: list[NDArray[np.float64]], **more: Any) -> RowsBody:
 
 
 def box(grid: Grid, lower: ArrayLike, upper: ArrayLike, per_cell: int = 2, material: int = 0) -> Body:
-    """Seed the box [lower, upper] with a lattice of points whose domains fill it exactly; return the body.
+    """Seed the box [lower, upper] with a lattice of points whose domains fill it exactly, and return the body.
 
     Parameters
     ----------
     grid
         Background grid.
     lower, upper : (d,), m
-        Corners of the box, inside the grid; need not lie on grid lines.
+        Corners of the box, inside the grid.  They need not lie on grid lines.
     per_cell
         Points per cell and direction, >= 1, rounded to fit the box.  In grids of unequal cells, domains end at grid
         lines.  With 1 point, bodies deflect too much and creep.  A warning names slender bodies.  In 3D, scenes

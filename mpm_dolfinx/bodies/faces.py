@@ -35,10 +35,10 @@ TANGENTIAL = {d: np.array([[a for a in range(d) if a != axis] for axis in range(
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Faces of particle domains on one side of the bodies, which are the same on every process.
+    """Faces of particle domains on one side of the bodies.
 
-    The free part of a face is the part that touches no other body.  It is divided into polygons of up to four corners.
-    Arrays have m rows, one for each polygon.
+    Every process has the same faces.  Parts of faces that touch another body are left out.  The remaining part of a
+    face is divided into polygons of up to four corners.  Arrays have a row for each of m polygons.
     """
 
     id: NDArray[np.int64]  # identifier of the material point (m,), ascending
@@ -53,7 +53,7 @@ class Surface:
         return len(self.id)
 
     def off_axis(self) -> Surface:
-        """Return the surface without the faces on the axis of revolution.  They have no area."""
+        """Return the surface without the faces on the axis of revolution, which have no area."""
         off = self.places()[:, :, 0].max(axis=1, initial=0.0) > SAME * self.whole0
         if off.all():
             return self
@@ -91,7 +91,7 @@ class Surface:
         return interpolate(domain, self.xi.reshape(-1, self.xi.shape[2])).reshape(self.xi.shape)
 
     def reference(self, at: NDArray[np.int64], xi: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the reference positions (n, d), in m, at local coordinates xi (n, d) of domains in rows `at` (n,)."""
+        """Return the reference positions (n, d), in m, at local coordinates xi (n, d) in the domains of polygons."""
         return np.clip(interpolate(self.before[at], xi), *self.region)
 
     @cached_property
@@ -124,9 +124,9 @@ Region = tuple[ArrayLike, ArrayLike]
 
 
 def limits(region: Region | None, dim: int) -> NDArray[np.float64]:
-    """Return the lower and upper corners (2, d) of a region, in m.  They are infinite if there is no region.
+    """Return the lower and upper corners (2, d) of a region, in m, or infinite corners without a region.
 
-    Equal regions give equal bytes (`tobytes`), so that these bytes can be used as a key.
+    Equal regions give equal bytes (`tobytes`), which serve as a key.
     """
     if region is None:
         return np.repeat([[-np.inf], [np.inf]], dim, axis=1)
@@ -140,7 +140,7 @@ def surface(
 ) -> Surface:
     """Return the faces on a side of the active bodies, without the parts that touch other bodies.
 
-    Contact between bodies is determined from their seeded shapes after the maps.  Touching bodies stick permanently.
+    The seeded shapes after the maps determine which bodies touch.  Touching bodies stick permanently.
 
     Parameters
     ----------
@@ -175,7 +175,7 @@ def surface(
 
 
 def joined(surfaces: Sequence[Surface]) -> Surface:
-    """Return the faces of surfaces of different bodies as one surface."""
+    """Return the surfaces of different bodies as one surface."""
     names = [f.name for f in fields(Surface) if f.name != "region"]
     rows = {name: np.concatenate([getattr(one, name) for one in surfaces]) for name in names}
     order = np.argsort(rows["id"], kind="stable")
@@ -183,14 +183,14 @@ def joined(surfaces: Sequence[Surface]) -> Surface:
 
 
 def _face_corners(body: Body, row: NDArray[np.int64], face: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return the reference positions (n, 2^(d-1), d), in m, of the corners of faces."""
+    """Return the reference positions, in m, of the corners of faces."""
     return np.take_along_axis(body.reference(row), FACES[body.dim][face][:, :, None], axis=1)
 
 
 def _in_region(
     body: Body, row: NDArray[np.int64], face: NDArray[np.int64], region: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the faces of a body that may intersect a box (2, d) of reference positions."""
+    """Return the faces of a body that may intersect a box of reference positions."""
     x = _face_corners(body, row, face)
     low, high = x.min(axis=1), x.max(axis=1)
     size = high - low
@@ -209,11 +209,7 @@ def _limited(
     t: NDArray[np.float64],
     region: NDArray[np.float64],
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Limit n parts of k faces to a region.  Return the face (m,) and the corners xi of each limited part.
-
-    `row` and `face` (k,) are domains and indices of the faces.  `part` (n,) is the face of each part, and `t` (n, 4, 2)
-    are the part's corners in face coordinates.  For xi see `Surface`.
-    """
+    """Limit parts of faces to a region, and return each limited part with its face."""
     dim, three = body.dim, (t[:, 2] == t[:, 3]).all(axis=1)
     X = _face_corners(body, row[part], face[part])
     bent = np.zeros(len(X), dtype=bool)
@@ -240,16 +236,13 @@ def _limited(
 
 
 def _along_axes(X: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return whether faces with corners X (n, 4, 3), in m, are rectangles with edges along the axes."""
+    """Return whether faces are rectangles with edges along the axes."""
     edges = X[:, [1, 2, 3, 3]] - X[:, [0, 0, 2, 1]]
     return ((np.abs(edges) > rounding(X)).sum(axis=2) == 1).all(axis=1)
 
 
 def _interval(X: NDArray[np.float64], region: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the lower and upper face coordinates (n, 2) that bound the part of each face inside a region.
-
-    X (n, 2^(d-1), d), in m, are reference corners of edges, or of rectangles with edges along the axes.
-    """
+    """Return the face coordinates that bound the part of each face inside a region."""
     low, high = np.zeros((len(X), 2)), np.ones((len(X), 2))
     for k in range(X.shape[2] - 1):
         edge = X[:, 1 << k] - X[:, 0]
@@ -263,7 +256,7 @@ def _interval(X: NDArray[np.float64], region: NDArray[np.float64]) -> tuple[NDAr
 def _clipped(
     X: NDArray[np.float64], t: NDArray[np.float64], region: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Clip parts t (n, 4, 2) of faces X (n, 4, 3) to a region.  Return triangles, and the part of each triangle."""
+    """Clip parts of faces to a region, and return the triangles that are left."""
     places = np.einsum("npk,nkd->npd", weights(t.reshape(-1, 2)).reshape(*t.shape[:2], 4), X)
     three = (t[:, 2] == t[:, 3]).all(axis=1)[:, None]  # in triangles, the middle is a corner
     middle = np.where(three, places[:, 2], places.mean(axis=1))
@@ -279,11 +272,7 @@ def _clipped(
 
 
 def _free(own: Faces, others: Sequence[Faces]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the face (n,) and corners (n, 4, 2), in face coordinates, of n parts of faces that touch no other body.
-
-    A part is a rectangle if the edges of its face are parallel to the edges of all covering faces.  Otherwise it is a
-    triangle with a repeated last corner.
-    """
+    """Return the parts of faces that touch no other body, as rectangles or as triangles with a repeated last corner."""
     on = [covers(own, other) for other in others]
     if not on:
         return np.arange(len(own.row)), np.tile(BITS, (len(own.row), 1, 1)).astype(float)
@@ -308,7 +297,7 @@ def interpolate(corners: NDArray[np.float64], xi: NDArray[np.float64]) -> NDArra
 def on_face(
     corners: NDArray[np.float64], face: NDArray[np.int64], x: NDArray[np.float64], xi: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return xi (n, 3) with the tangential components of positions x (n, 3), in m, that are projected onto faces."""
+    """Return xi (n, 3) with the tangential components of positions x (n, 3), in m, projected onto faces."""
     quads = np.take_along_axis(corners, FACES[3][face][:, :, None], axis=1)
     normal = face_vectors(corners, face)
     t, _ = local(quads, x[:, None], normal)

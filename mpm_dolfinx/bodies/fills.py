@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Placement of fills onto the displaced surface of their neighbours.  Fills are bodies added in a later stage."""
+"""Fills: bodies that are added in a later stage, onto the displaced surface of their neighbours."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ INSIDE = 0.05  # fraction of a domain's shortest edge; deeper penetration into a
 
 @dataclass
 class Contact:
-    """Contact between a side of a seeded fill and a body.  It consists of n pairs of faces."""
+    """Contact between a seeded fill and a body, as pairs of faces."""
 
     side: tuple[int, int]  # (axis, end) of the fill
     own: Faces  # faces of the fill on this side
@@ -47,14 +47,14 @@ class Contact:
         return self.own.row[face][:, None], self.own.index[face]
 
     def given(self) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
-        """Return which corners (n, 4) of the fill's faces touch the body, and displacements of the body there (m)."""
+        """Return which corners of the fill's faces touch the body, and the displacements of the body there."""
         face, by = self.cover.face, self.cover.by
         s, _ = local(self.other.corners[by], self.own.corners[face], self.other.outward[by])
         on = np.abs(s - 0.5).max(axis=2) <= 0.5 + np.maximum(self.cover.slack, SAME)[:, None]
         return on, weights(np.clip(s, 0, 1).reshape(-1, 2)).reshape(*s.shape[:2], 4) @ self.moved
 
     def misfit(self, u: NDArray[np.float64]) -> float:
-        """Return the largest distance, in m, of the body's corners from the fill after displacements u of the fill."""
+        """Return the largest distance, in m, between the corners of the body and the displaced fill."""
         on = (np.abs(self.cover.t - 0.5) <= 0.5).all(axis=2)
         share = weights(np.clip(self.cover.t, 0, 1).reshape(-1, 2)).reshape(*on.shape, 4)
         off = share @ u[self.corners()] - self.moved
@@ -140,7 +140,7 @@ def _contacts(grid: Grid, bodies: Sequence[Body], other: int, fill: Body, points
 
 
 def _follow(grid: Grid, body: Body, corners: NDArray[np.float64], contacts: Sequence[Contact]) -> NDArray[np.float64]:
-    """Return the displacements (n, 2^d, d), in m, of a fill's corners.  Touching sides follow the neighbours."""
+    """Return the displacements, in m, with which a fill's corners follow its neighbours."""
     number = body.nodes(np.arange(len(body)))
     nodes, node = np.unique(number, return_inverse=True)
     node = node.reshape(number.shape)
@@ -167,7 +167,7 @@ def _follow(grid: Grid, body: Body, corners: NDArray[np.float64], contacts: Sequ
 
 
 def _springs(body: Body, node: NDArray[np.int64], count: int) -> csr_array:
-    """Return the stiffness matrix (count, count) of springs along the edges of a body's domains."""
+    """Return the stiffness matrix of springs along the edges of a body's domains."""
     X, ends = body.reference(), [(FACES[body.dim][2 * axis], FACES[body.dim][2 * axis + 1]) for axis in range(body.dim)]
     a, b = (np.concatenate([node[:, pair[k]].ravel() for pair in ends]) for k in (0, 1))
     length = np.concatenate([((X[:, f] - X[:, g]) ** 2).sum(axis=2).ravel() for f, g in ends])
@@ -177,7 +177,7 @@ def _springs(body: Body, node: NDArray[np.int64], count: int) -> csr_array:
 
 
 def _between(K: csr_array, fixed: NDArray[np.bool_], u: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return displacements (n,) along an axis: u at fixed nodes, equilibrium of springs K at all other nodes."""
+    """Return the displacements along an axis of springs with prescribed displacements at some nodes."""
     out, free = u.copy(), np.flatnonzero(~fixed)
     if len(free):
         held = np.flatnonzero(fixed)
@@ -201,7 +201,7 @@ def _between(K: csr_array, fixed: NDArray[np.bool_], u: NDArray[np.float64]) -> 
 
 
 def _check_shape(grid: Grid, fill: int, corners: NDArray, u: NDArray) -> None:
-    """Raise an error if a displaced domain of the fill loses nearly all its volume, or leaves the grid."""
+    """Raise an error if a displaced domain of the fill is nearly flat, or leaves the grid."""
     now = corners + u
     ratio = volumes(now) / volumes(corners)
     k = int(np.argmin(ratio))
@@ -221,10 +221,7 @@ def _check_shape(grid: Grid, fill: int, corners: NDArray, u: NDArray) -> None:
 def _penetration(
     grid: Grid, bodies: Sequence[Body], other: int, corners: NDArray, points: MaterialPoints, misfit: float
 ) -> tuple[float, float, NDArray[np.float64]]:
-    """Return how deep a body penetrates the fill, in m, the gap between both in cells, and the position (d,), in m.
-
-    At least one of depth and gap is zero.
-    """
+    """Return the depth of a body in the fill, in m, the gap between both in cells, and the position."""
     start = _start(bodies, other)
     rows = np.flatnonzero((points.id >= start) & (points.id < start + len(bodies[other])))
     both = [(c, INSIDE / 2 * np.ptp(c, axis=1).min(axis=1) + misfit) for c in (points.corners[rows], corners)]

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Reader of gmsh files of format 4.1.  It returns a meshio mesh with all physical groups of each entity.
+"""Reader of gmsh files of format 4.1, with all physical groups of each entity.
 
-meshio's reader keeps only the first group of an entity, and fails for entities without a group.
+meshio's own reader keeps only the first group of an entity, and fails for entities without a group.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ TYPES = {
     **{12: ("hexahedron27", 27), 13: ("wedge18", 18), 14: ("pyramid14", 14), 15: ("vertex", 1), 16: ("quad8", 8)},
     **{17: ("hexahedron20", 20), 18: ("wedge15", 15), 19: ("pyramid13", 13)},
 }
-"""Name in meshio and number of nodes of each gmsh element type.  Nodes of an element remain in gmsh's sequence."""
+"""Name in meshio and number of nodes of each gmsh element type, with the nodes in gmsh's sequence."""
 
 
 class _Numbers:
@@ -36,7 +36,7 @@ class _Numbers:
         self._bytes, self._words = BytesIO(section), iter(() if binary else section.split())
 
     def take(self, count: int, kind: str = "i") -> NDArray:
-        """Return the next `count` numbers.  `kind` is "i" for the type int, "u" for size_t, "d" for double."""
+        """Return the next numbers, of the type int ("i"), size_t ("u") or double ("d")."""
         dtype, out = np.dtype({"i": "<i4", "u": "<u8", "d": "<f8"}[kind]), float if kind == "d" else np.int64
         if self._binary:
             return np.frombuffer(self._bytes.read(count * dtype.itemsize), dtype).astype(out)
@@ -44,7 +44,7 @@ class _Numbers:
 
 
 def version(file: Path) -> str:
-    """Return the version of the gmsh format of a file, or "" for other files."""
+    """Return the version of a file in gmsh's format, or "" for files in other formats."""
     if not file.is_file():
         return ""
     with file.open("rb") as opened:
@@ -92,7 +92,7 @@ def _section(data: bytes, name: str) -> bytes:
 
 
 def _names(data: bytes) -> dict[str, NDArray[np.int64]]:
-    """Return for each name an array (k, 2) with tag and dimension of the k physical groups of this name."""
+    """Return the tags and dimensions of the physical groups of each name."""
     out: dict[str, list[tuple[int, int]]] = {}
     if b"$PhysicalNames" in data:
         for line in _section(data, "PhysicalNames").decode(errors="replace").splitlines()[1:]:
@@ -102,7 +102,7 @@ def _names(data: bytes) -> dict[str, NDArray[np.int64]]:
 
 
 def _groups(numbers: _Numbers) -> Iterator[tuple[tuple[int, int], list[int]]]:
-    """Yield (dimension, tag) of each entity, and the tags of its physical groups."""
+    """Yield each entity with the tags of its physical groups."""
     for dim, count in enumerate(numbers.take(4, "u")):
         for _ in range(count):
             (tag,) = numbers.take(1)
@@ -115,7 +115,7 @@ def _groups(numbers: _Numbers) -> Iterator[tuple[tuple[int, int], list[int]]]:
 
 
 def _nodes(numbers: _Numbers) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the tags (n,) and positions (n, 3), in m, of the nodes."""
+    """Return the tags of the nodes, and their positions in m."""
     tags, x = [np.empty(0, np.int64)], [np.empty((0, 3))]
     for _ in range(numbers.take(4, "u")[0]):
         dim, _, parametric = numbers.take(3)
@@ -127,7 +127,7 @@ def _nodes(numbers: _Numbers) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
 
 
 def _elements(numbers: _Numbers) -> Iterator[tuple[int, int, str, NDArray[np.int64]]]:
-    """Yield the dimension and tag of each entity, and the cell type and node tags (n, k) of its elements."""
+    """Yield the elements of each entity."""
     for _ in range(numbers.take(4, "u")[0]):
         dim, entity, kind = map(int, numbers.take(3))
         if kind not in TYPES:

@@ -2,9 +2,9 @@
 """Cell types of meshes: their facets, and their division into particle domains.
 
 A triangle is divided into three quadrilaterals.  A tetrahedron is divided into four hexahedra with plane faces.  Each
-vertex of the cell thus has one domain.  Each corner of the domain is this vertex or the mean of several vertices.  A
-wedge is divided like its triangle.  A pyramid is divided like two tetrahedra.  Two neighbouring cells divide their
-common facet alike.  The exception is a quadrilateral facet of a hexahedron, because a hexahedron is not divided.
+vertex of the cell thus has one domain.  The corners of this domain are means of vertices.  A wedge is divided like its
+triangle.  A pyramid is divided like two tetrahedra.  Hexahedra are not divided.  Two neighbouring cells divide their
+common facet alike, except for quadrilateral facets of hexahedra.
 """
 
 from __future__ import annotations
@@ -49,15 +49,15 @@ class Block(NamedTuple):
 
 
 def edges(kind: str) -> list[tuple[int, int]]:
-    """Return both vertices of each edge of a cell type.  Vertices have indices as in `LOOPS`.  Edges occur once."""
+    """Return both vertices of each edge of a cell type, with vertex indices as in `LOOPS`."""
     around = [pair for loop in LOOPS[kind] for pair in zip(loop, (*loop[1:], loop[0]), strict=True)]
     return sorted({tuple(sorted(pair)) for pair in around})
 
 
 def distinct(rows: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return two index arrays for groups of equal rows of an array (n, k): first row of each group, group of each row.
+    """Group the equal rows of an array (n, k), and return the first row of each group and the group of each row.
 
-    Groups are sorted by the values of their rows.  `np.unique` compares rows as objects, and takes five times as long.
+    The groups are sorted by the values of their rows.
     """
     order = np.lexsort(rows.T[::-1])
     new = np.append(True, (np.diff(rows[order], axis=0) != 0).any(axis=1))[: len(rows)]
@@ -75,7 +75,7 @@ class Part:
 
 
 def _of_simplices(kind: str, *simplices: tuple[int, ...]) -> list[Part]:
-    """Return the parts of a cell that is a union of simplices."""
+    """Return the particle domains of a cell that is a union of simplices."""
     d, out = len(simplices[0]) - 1, []
     bits = corner_bits(d)
     for simplex in simplices:
@@ -91,7 +91,7 @@ def _of_simplices(kind: str, *simplices: tuple[int, ...]) -> list[Part]:
 
 
 def _wedge() -> list[Part]:
-    """Return the parts of a wedge.  They are the extruded parts of a triangle."""
+    """Return the particle domains of a wedge, which are the extruded domains of a triangle."""
     out, quads = [], LOOPS["wedge"][2:]
     for part in _of_simplices("triangle", (0, 1, 2)):
         corners = [tuple(v + end for v in of) for end in (0, 3) for of in part.corners]
@@ -101,7 +101,7 @@ def _wedge() -> list[Part]:
 
 
 def _whole(dim: int) -> list[Part]:
-    """Return the only part of a quadrilateral or hexahedron: the whole cell."""
+    """Return the only particle domain of a quadrilateral or hexahedron: the whole cell."""
     return [Part(tuple((k,) for k in range(2**dim)), tuple(map(tuple, FACES[dim].tolist())))]
 
 
@@ -117,7 +117,7 @@ PARTS = {
 
 @dataclass(frozen=True, eq=False)
 class Polytopes:
-    """Convex mesh cells of any types.  Arrays have a row for each of n cells."""
+    """Convex mesh cells of any types."""
 
     x: NDArray[np.float64]  # vertices (n, k, d), m, padded by repeating the last one
     normals: NDArray[np.float64]  # normals of facets (n, f, d), padded by zeros
@@ -126,7 +126,7 @@ class Polytopes:
 
     @classmethod
     def of(cls, x: NDArray[np.float64], cells: dict[str, NDArray[np.int64]]) -> Polytopes:
-        """Return all cells as polytopes.  `x` (nodes, d), in m: nodes.  `cells`: nodes (n, k) of cells by type."""
+        """Return all cells as polytopes, from the nodes `x` (nodes, d), in m, and the nodes of cells by type."""
         d = x.shape[1]
         most = [max(len(of) for of in parts) for parts in zip(*(_shape(kind) for kind in cells), strict=True)]
         rows = [_polytopes(d, kind, x[nodes], *most) for kind, nodes in cells.items()]
@@ -156,7 +156,7 @@ class Polytopes:
         return left, depth[left]
 
     def _planes(self):
-        """Yield functions that return the normals (m, d) of planes that may separate pairs of cells."""
+        """Yield functions that return the normals of planes that may separate pairs of cells."""
         for f in range(self.normals.shape[1]):
             yield lambda i, j, f=f: self.normals[i, f]
             yield lambda i, j, f=f: self.normals[j, f]
@@ -167,7 +167,7 @@ class Polytopes:
 
 
 def _crossed(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the cross products (n, 3) of edges.  They are zero for edges that are parallel within rounding."""
+    """Return the cross products of edges, which are zero for edges that are parallel within rounding."""
     out = np.cross(a, b)
     size = np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1)
     return np.where((np.linalg.norm(out, axis=1) > SAME * size)[:, None], out, 0.0)
@@ -179,7 +179,7 @@ def _shape(kind: str) -> tuple[range, list, list]:
 
 
 def _polytopes(dim: int, kind: str, x: NDArray[np.float64], vertices: int, facets: int, edges: int) -> tuple:
-    """Return arrays of `Polytopes` for cells x (n, k, d) of a type, padded to `vertices`, `facets` and `edges`."""
+    """Return the arrays of `Polytopes` for cells of one type."""
     _, loops, ends = _shape(kind)
     corners = np.concatenate([x, np.repeat(x[:, -1:], vertices - x.shape[1], axis=1)], axis=1)
     normals, warp = np.zeros((len(x), facets, dim)), np.zeros(len(x))

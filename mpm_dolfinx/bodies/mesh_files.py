@@ -48,11 +48,11 @@ def from_mesh(
 ) -> MeshBody:
     """Seed a body from a mesh whose cells become particle domains, and return the body.
 
-    Sides have the names of groups of the mesh's facets.  Such groups are Abaqus surfaces, facet tags, or gmsh's
+    Sides have the names of groups of facets in the mesh.  Groups of facets are Abaqus surfaces, facet tags, or gmsh's
     physical groups of lines (in 2D) or surfaces (in 3D).  Bodies from two parts of a mesh share the faces between the
     parts.  Shared faces are no surface while both bodies are active.  Vertices of the mesh are reference positions.
-    The points form no lattice, so the filter of short waves does not act.  If there are several processes, the first
-    process reads the mesh, and each machine has a copy of the domains in a temporary file.
+    The points form no lattice, so the filter of short waves does not act.  On several processes, the first process
+    reads the mesh, and each machine has a copy of the domains in a temporary file.
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ def from_mesh(
         The file is missing or unreadable, the kind of mesh is not supported, or the part is unknown.  Cells are flat,
         inverted, non-convex, repeated or overlapping.  Vertices are outside the grid.  Nodes are hanging or duplicate.
     OSError
-        A temporary file cannot be written.  Such files are used only on several processes.
+        A temporary file cannot be written.  Only runs on several processes write one.
     """
     import meshio
 
@@ -118,7 +118,7 @@ def _file(file: Path) -> meshio.Mesh:
 
 
 def _of_meshio(grid: Grid, mesh: meshio.Mesh | Path, names: Mapping[str, int], tags: str | None, name: str) -> Mesh:
-    """Convert a meshio mesh or a mesh file.  `tags` is the name of the cell data with the tags of parts and sides."""
+    """Convert a meshio mesh, or a mesh file that meshio reads."""
     from mpm_dolfinx.bodies import mesh_readers
 
     if isinstance(mesh, Path):
@@ -163,7 +163,7 @@ def _of_meshio(grid: Grid, mesh: meshio.Mesh | Path, names: Mapping[str, int], t
 
 
 def _positions(dim: int, points: Any) -> NDArray[np.float64]:
-    """Return the positions (n, 2 or 3), in m, of the vertices of a mesh."""
+    """Return the positions of the vertices of a mesh, in m."""
     x = np.asarray(points, dtype=float)
     if not len(x):
         raise ValueError("mesh: has no vertices, must have cells to fill a body")
@@ -194,10 +194,7 @@ def _check_nodes(rows: NDArray[np.int64], count: int) -> None:
 
 
 def _edge_node_distance(x: NDArray[np.float64], rows: NDArray[np.int64], kind: str) -> float:
-    """Return the largest distance, in m, between the edge nodes of second-order cells and the midpoints of edges.
-
-    Edge nodes follow the vertices in the row of a cell, in an order that depends on the format.
-    """
+    """Return the largest distance, in m, of edge nodes of second-order cells from edge midpoints."""
     first, second = np.array(edges(kind)).T
     corners = x[rows[:, AS_LATTICE.get(kind, range(1 + second.max()))]]
     middles = (corners[:, first] + corners[:, second]) / 2
@@ -215,10 +212,7 @@ def _warn_curved(name: str, count: int, off: float) -> None:
 def _merged(
     cells: dict[str, NDArray[np.int64]], parts: dict[str, dict[str, NDArray[np.int64]]]
 ) -> tuple[dict[str, NDArray[np.int64]], dict[str, dict[str, NDArray[np.int64]]]]:
-    """Remove repetitions of cells that belong to several parts.  Return the cells, and their indices for each part.
-
-    gmsh's format 2.2 repeats a cell for each of its physical groups.
-    """
+    """Return the cells without gmsh's repetitions for several physical groups, and the cells of each part."""
     cells = dict(cells)
     for kind, rows in cells.items():
         first, same = distinct(np.sort(rows, axis=1))
@@ -245,7 +239,7 @@ def _groups(
     names: Mapping[str, int],
     tags: str | None,
 ) -> Iterator[tuple[str, NDArray[np.bool_]]]:
-    """Yield the name of each group of cells, and which cells (count,) of a meshio block belong to it."""
+    """Yield each group of cells with its name, and which cells of a block belong to the group."""
     known = {name: int(tag) for name, (tag, d) in _pairs(mesh.field_data) if int(d) == dim} | dict(names)
     families = getattr(mesh, "cell_tags", None) or {}  # in MED files: names of groups for each number
     for key in (tags,) if tags is not None else TAGS:
@@ -268,7 +262,7 @@ def _groups(
 
 
 def _pairs(field_data: Mapping[str, Any]) -> Iterator[tuple[str, NDArray]]:
-    """Yield gmsh's physical groups as (name, (tag, dimension)).  Several groups may have one name."""
+    """Yield the name, tag and dimension of each physical group of gmsh."""
     for name, value in field_data.items():
         if np.shape(value)[-1:] == (2,):
             for pair in np.reshape(value, (-1, 2)):
@@ -296,7 +290,7 @@ def numbered(tags: NDArray[np.int64], names: Mapping[str, int]) -> Iterator[tupl
 
 
 def _plane(dim: int, x: NDArray[np.float64], cells: Mapping[str, NDArray[np.int64]]) -> NDArray[np.float64]:
-    """Return the first `dim` coordinates of vertices (nodes, 2 or 3).  In 2D, all cells must have the same z."""
+    """Return the first `dim` coordinates of vertices, and check that 2D cells have equal z."""
     used = np.unique(np.concatenate([np.empty(0, np.int64), *(rows.ravel() for rows in cells.values())]))
     if not np.isfinite(x[used]).all():
         invalid = used[~np.isfinite(x[used]).all(axis=1)][0]
@@ -308,7 +302,7 @@ def _plane(dim: int, x: NDArray[np.float64], cells: Mapping[str, NDArray[np.int6
 
 
 def _of_dolfinx(grid: Grid, mesh, cell_tags, facet_tags, names: Mapping[str, int]) -> Callable[[], Mesh]:
-    """Gather a dolfinx mesh on rank 0.  Return a function that converts the mesh on this rank.
+    """Gather a dolfinx mesh on rank 0, and return a function that converts the mesh there.
 
     Cells are sorted by position, so the result does not depend on the partition of the mesh.
     """
@@ -341,12 +335,7 @@ def _of_dolfinx(grid: Grid, mesh, cell_tags, facet_tags, names: Mapping[str, int
 
 
 def _of_rows(dim: int, kind: str, rows: list[tuple], curved: bool, names: Mapping[str, int]) -> Mesh:
-    """Convert a dolfinx mesh.
-
-    `rows`: from each process, indices of nodes, positions of nodes, nodes of cells, tags of cells, tags of facets, and
-    distance of edge nodes from edge midpoints, in m.
-    `curved`: whether cells are of second order.
-    """
+    """Convert the gathered nodes, cells and tags of a dolfinx mesh."""
     number, x, cells, tag, side, off = map(np.concatenate, zip(*rows, strict=True))
     if curved:
         _warn_curved("mesh", len(cells), off.max())
@@ -364,13 +353,13 @@ def _of_rows(dim: int, kind: str, rows: list[tuple], curved: bool, names: Mappin
 
 
 def _as_meshio(nodes: NDArray[np.int32], kind: str) -> NDArray[np.int32]:
-    """Return the nodes (n, k) of dolfinx cells, with vertices in meshio's order."""
+    """Return the nodes of dolfinx cells, with vertices in meshio's order."""
     order = AS_LATTICE.get(kind, [])
     return np.concatenate([nodes[:, order], nodes[:, len(order) :]], axis=1)
 
 
 def _tag_of(tags, entities: NDArray[np.int32]) -> NDArray[np.int64]:
-    """Return the tags of entities on this process.  Entities without a tag have 0."""
+    """Return the tags of entities on this process, or 0 for entities without a tag."""
     found = np.zeros(entities.shape, dtype=np.int64)
     if tags is not None and len(tags.indices):
         at = np.minimum(np.searchsorted(tags.indices, entities), len(tags.indices) - 1)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Mesh files are read by meshio.  Data that meshio silently loses or misplaces are corrected, or cause an error."""
+"""Mesh files are read by meshio.  Data that meshio loses or misplaces are corrected, or cause an error."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def read(file: Path) -> meshio.Mesh:
 
 
 def _bulk(file: Path) -> meshio.Mesh:
-    """Return the mesh of a Nastran file.  meshio needs a header, which is added if it is missing."""
+    """Return the mesh of a Nastran file, also of a file without the header that meshio needs."""
     text = file.read_text(errors="replace")
     if re.search(r"^BEGIN\s+BULK", text, re.MULTILINE | re.IGNORECASE):
         return meshio.read(file, "nastran")
@@ -56,7 +56,7 @@ def check_systems(mesh: meshio.Mesh) -> None:
 
 
 def sets_of(mesh: meshio.Mesh) -> dict[str, list]:
-    """Return the cell indices of sets.  Indices start at 0 in each block, unlike meshio's indices for FLAC3D files."""
+    """Return the cell indices of sets, which start at 0 in each block."""
     flac = {name: rows for name, rows in mesh.cell_sets.items() if re.match("(zone|face):", name)}
     count = [len(block.data) for block in mesh.cells]
     start = np.cumsum([0, *count[:-1]])

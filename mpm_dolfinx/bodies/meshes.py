@@ -2,10 +2,8 @@
 """Bodies from meshes: each mesh cell becomes one or more particle domains.
 
 `mesh_cells` divides cells into domains.  Domains that are too large for the grid are divided further, evenly in their
-local coordinates.
-
-The first process reads and divides a mesh.  Each machine then has one file with all domains.  The processes of the
-machine map this file into memory.  A process loads only the domains that it needs, such as the domains of its points.
+local coordinates.  The first process reads and divides a mesh, and each machine has one file with all domains.  The
+processes of a machine map the file into memory, and load only the domains that they need.
 """
 
 from __future__ import annotations
@@ -38,7 +36,7 @@ SMALL = 0.2  # fraction of the desired domain size; smaller domains cause a warn
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """A mesh on one process.  In the nodes of quadrilaterals and hexahedra, the first axis varies fastest."""
+    """A mesh on one process, with the nodes of quadrilaterals and hexahedra such that the first axis varies fastest."""
 
     x: NDArray[np.float64]  # positions of nodes (nodes, d), m
     cells: Mapping[str, NDArray[np.int64]]  # cell type -> nodes (n, k)
@@ -61,7 +59,7 @@ class Mesh:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class MeshBody(Body):
-    """A body seeded from a mesh.  The boxes of its domains are bounding boxes.  Its arrays may be read-only."""
+    """A body seeded from a mesh.  The boxes of its domains are bounding boxes."""
 
     vertices: NDArray[np.float64]  # corners of the domains before all maps (n, 2^d, d), m
     surface: NDArray[np.bool_]  # whether a face lies on the surface of the body (n, d, 2)
@@ -111,13 +109,13 @@ class MeshBody(Body):
         return tuple(self.tagged)
 
     def named(self, name: str) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the domains (n,) and face indices (n,) of faces on the side `name`, in ascending order of domains."""
+        """Return the faces on the side `name`, as domains (n,) in ascending order and face indices (n,)."""
         if name not in self.tagged:
             return (np.empty(0, np.int64),) * 2
         return np.nonzero(self.tagged[name].reshape(len(self), 2 * self.dim))
 
     def facing(self, axis: int, end: int, least: float = 0.0) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the domains (n,) and face indices (n,) of the surface faces in a direction; see `Body.facing`."""
+        """Return the surface faces at an end of an axis; see `Body.facing`."""
         row, face = self.outer()
         outward = face_vectors(self.corners(row), face)
         along = np.abs(outward).argmax(axis=1) == axis
@@ -125,7 +123,7 @@ class MeshBody(Body):
         return row[along], face[along]
 
     def across(self, axis: int) -> tuple[float, float]:
-        """Return the body's extent along an axis divided by the mean edge length of domains, and this length in m."""
+        """Return the approximate number of domains along an axis, and their mean edge length in m."""
         edge = float(np.concatenate([self.boxes(part)[:, axis] for part in in_chunks(len(self))]).mean())
         return float(np.ptp(self.vertices[:, :, axis])) / edge, edge
 
@@ -139,7 +137,7 @@ class MeshBody(Body):
 
 
 def _numbered(vertices: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return the node indices (n, 2^d) of the corners of domains (n, 2^d, d), in m."""
+    """Return the node indices of the corners of domains."""
     x = vertices.reshape(-1, vertices.shape[2])
     pairs = cKDTree(x).query_pairs(NEAR * np.ptp(vertices, axis=1).min(), output_type="ndarray")
     graph = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(x), len(x)))
@@ -210,10 +208,9 @@ def _divided(grid: Grid, mesh: Mesh, part: str | None, per_cell: int, name: str)
 
 
 def _domains(mesh: Mesh, cells: Mapping[str, NDArray[np.int64]]) -> list[tuple[NDArray, NDArray, NDArray]]:
-    """Return tuples for n domains: corners (n, 2^d, d), facets of the mesh (n, 2d, 2^(d-1)), cells of the mesh (n,).
+    """Return the corners of the particle domains, the mesh facet of each face, and the cell of each domain.
 
-    Facets are the nodes of the mesh facet that contains each face.  Nodes ascend; -1 precedes the nodes of a triangle.
-    A face inside a cell has only -1.
+    A facet is given by its nodes, with -1 before the nodes of a triangle.  A face inside a cell has only -1.
     """
     d = mesh.x.shape[1]
     start = 0
@@ -232,7 +229,7 @@ def _domains(mesh: Mesh, cells: Mapping[str, NDArray[np.int64]]) -> list[tuple[N
 
 
 def _check_repeated(mesh: Mesh, cells: Mapping[str, NDArray[np.int64]], name: str) -> None:
-    """Raise an error for repeated cells, because the weight and stiffness of such cells would count twice."""
+    """Raise an error for repeated cells, because their weight and stiffness would count twice."""
     for kind, nodes in cells.items():
         first, same = distinct(np.sort(nodes, axis=1))
         count = np.bincount(same)
@@ -250,11 +247,7 @@ def _check_sides(
     shared: NDArray[np.bool_],
     name: str,
 ) -> None:
-    """Raise an error if both cells of a facet lie on one side of this facet.
-
-    `facet` is the facet of each face of `domains`.  `shared` (m,) tells which facets belong to two cells.  Outward
-    vectors of both cells do not cancel if the cells lie on one side.
-    """
+    """Raise an error if both cells of a `shared` facet lie on one side of this facet."""
     d, size = domains.shape[2], len(facets)
     outward = np.stack([face_vectors(domains, face) for face in range(2 * d)], axis=1).reshape(-1, d)
     of = facet.ravel()
@@ -276,13 +269,9 @@ def _check_overlaps(
 ) -> None:
     """Raise an error for overlapping cells.
 
-    Each facet inside the mesh has a cell on both sides.  The number of cells that cover a position therefore changes
-    only across the surface.  If any cells overlap, at least one overlapping cell is at the surface.  It is therefore
-    sufficient to check the cells at the surface.
+    The number of cells that cover a position changes only across the surface of the mesh.  If any cells overlap, at
+    least one of them is at the surface, so only the cells `outer` at the surface are checked.
 
-    `x` (nodes, d), in m: positions of the nodes.
-    `cells`: nodes of the cells by cell type.
-    `outer` (k,): cells with a facet on the surface.
     `neighbours` (n, 2): pairs of cells that share a facet.
     """
     corners = [x[nodes] for nodes in cells.values()]
@@ -310,10 +299,7 @@ def _check_overlaps(
 def _box_overlaps(
     boxes: NDArray[np.float64], size: NDArray[np.float64], outer: NDArray[np.int64], slack: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return n pairs of cells with overlapping bounding boxes as two arrays (n,).  The first has cells of `outer`.
-
-    Boxes are grouped by size, in octaves.  In one group, small boxes would be searched with the largest box's radius.
-    """
+    """Return pairs of cells with overlapping bounding boxes.  The first cell of a pair is one of `outer`."""
     octave, middle = np.frexp(size.max(axis=1))[1], (boxes[:, 0] + boxes[:, 1]) / 2
     of = [[rows[octave[rows] == k] for k in np.unique(octave[rows])] for rows in (outer, np.arange(len(boxes)))]
     largest = [[size[rows].max(axis=0) for rows in groups] for groups in of]
@@ -332,7 +318,7 @@ def _box_overlaps(
 
 
 def _oriented(domains: NDArray[np.float64], keys: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Swap the first two axes of left-handed domains.  Return all domains, and the facets (keys) of their faces."""
+    """Make left-handed domains right-handed, and return all domains with the facets of their faces."""
     d, left = domains.shape[2], volumes(domains) < 0
     bits, face = corner_bits(d), np.arange(2 * d)
     swapped = (bits[:, [1, 0, *range(2, d)]] << np.arange(d)).sum(axis=1)
@@ -343,7 +329,7 @@ def _oriented(domains: NDArray[np.float64], keys: NDArray[np.int64]) -> tuple[ND
 
 
 def _check_convex(domains: NDArray[np.float64], name: str) -> None:
-    """Raise an error for cells that are flat, inverted or not convex.  Corners and simplices of domains are checked."""
+    """Raise an error for cells that are flat, inverted or not convex."""
     d, bits = domains.shape[2], corner_bits(domains.shape[2])
     size = np.ptp(domains, axis=1).prod(axis=1)
     ends = np.arange(2**d)[:, None] ^ (1 << np.arange(d))
@@ -359,7 +345,7 @@ def _check_convex(domains: NDArray[np.float64], name: str) -> None:
 
 
 def _facets(keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the different facets (m, k), and the facet index (n, 2d) of each face.  It is 0 for faces inside cells."""
+    """Return the different facets, and the facet of each face.  Faces inside cells have the facet 0."""
     rows = np.concatenate([np.full((1, keys.shape[2]), -1), keys.reshape(-1, keys.shape[2])])
     first, facet = distinct(rows)
     return rows[first], facet[1:].reshape(keys.shape[:2])
@@ -378,10 +364,9 @@ def _in_side(facets: NDArray[np.int64], named: Sequence[NDArray[np.int64]]) -> N
 def _split(
     grid: Grid, domains: NDArray[np.float64], per_cell: int
 ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.bool_]]:
-    """Divide domains that are too large.  Return three arrays for the n new domains.
+    """Divide domains that are too large.  Return the new domains, their original domains, and their outer faces.
 
-    These are the corners (n, 2^d, d) of the new domains, in m, the index (n,) of each original domain, and a mask of
-    faces.  The mask (n, d, 2) tells which faces of a new domain lie on faces of the original domain.
+    Outer faces of a new domain lie on faces of the original domain.
     """
     d = grid.dim
     bits = corner_bits(grid.dim)
@@ -406,7 +391,7 @@ def _split(
 
 
 def _check_conforming(body: MeshBody, name: str) -> None:
-    """Raise an error if surface faces of a body touch each other, because conditions would act on such faces."""
+    """Raise an error if surface faces of a body touch each other, because conditions would act there."""
     own = Faces.around(body)
     cover = covers(own, own)
     if len(cover.face):

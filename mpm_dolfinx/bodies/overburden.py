@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Overburden: weight of the domains vertically above positions in the bodies.
 
-Vertical lines enter and leave domains through faces.  In 3D each face is divided into triangles about its middle, as in
-the cut of domains by the grid.  Domains that share a face therefore leave no gap, and do not overlap.
+Vertical lines enter and leave domains through faces.  In 3D, each face is divided into triangles about its middle.
+Domains that share a face therefore leave no gap, and do not overlap.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def overburden(
 
 
 def _along(corners: NDArray, unit_weight: NDArray, x: NDArray, places: NDArray) -> tuple[NDArray, NDArray]:
-    """Return overburden stresses, in Pa, and ground levels, in m, for x, on vertical lines at `places` (k, d-1)."""
+    """Return overburden stresses and ground levels for positions x, on vertical lines at `places`."""
     low, high = corners[..., :-1].min(axis=1), corners[..., :-1].max(axis=1)
     half = (high - low).max(initial=0.0) / 2
     across, line = np.unique(places, axis=0, return_inverse=True)
@@ -68,10 +68,10 @@ def _along(corners: NDArray, unit_weight: NDArray, x: NDArray, places: NDArray) 
 
 
 def _hits(corners: NDArray, at: NDArray) -> Iterator[tuple[NDArray, NDArray, NDArray]]:
-    """Yield for each face the vertical lines (k,) that cross it, the heights (k,) of crossings, in m, and signs (k,).
+    """Yield the crossings of vertical lines with the faces of domains, each line with its own domain.
 
-    Line i is at the horizontal coordinates `at[i]` (d-1,).  Only its crossings of one domain are found; this domain has
-    the corners `corners[i]` (2^d, d).  A rising line has the sign 1 where it leaves the domain, and -1 where it enters.
+    Each face yields the lines that cross the face, the heights of the crossings, in m, and signs.  The sign is 1 where
+    a rising line leaves the domain, and -1 where the line enters.
     """
     d = corners.shape[2]
     for face, turn in zip(FACES[d], FACE_SIGNS, strict=False):

@@ -81,7 +81,7 @@ def polygon(
 
 
 def _outline(name: str, corners: ArrayLike) -> NDArray[np.float64]:
-    """Return the corners (n, 2) of an outline, in m.  Raise ValueError if two neighbouring corners coincide."""
+    """Return the corners of an outline, or raise ValueError if two neighbouring corners coincide."""
     allowed = "at least 3 corners of 2 finite coordinates each, without equal neighbours"
     x = numbers(f"polygon: {name}", corners, None, allowed=allowed)
     if x.ndim != 2 or x.shape[1] != 2 or len(x) < 3 or not np.any(np.roll(x, -1, axis=0) != x, axis=1).all():
@@ -90,7 +90,7 @@ def _outline(name: str, corners: ArrayLike) -> NDArray[np.float64]:
 
 
 def _check_simple(outlines: Sequence[NDArray[np.float64]]) -> None:
-    """Raise an error for outlines that touch or cross themselves or each other, and for holes outside the polygon."""
+    """Raise an error for outlines that cross themselves or each other, and for holes outside the polygon."""
     a, stop = np.concatenate(outlines), np.cumsum([len(x) for x in outlines])
     after = np.concatenate([np.roll(rows, -1) for rows in np.split(np.arange(len(a)), stop[:-1])])
     b = a[after]
@@ -115,12 +115,12 @@ def _check_simple(outlines: Sequence[NDArray[np.float64]]) -> None:
 
 
 def _areas(a: NDArray[np.float64], b: NDArray[np.float64], c: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the signed areas (n,) of the parallelograms (b - a, c - a); positive if c is to the left of edge ab."""
+    """Return the signed areas of the parallelograms (b - a, c - a), positive for counterclockwise corners."""
     return cross_in_plane(b - a, c - a)
 
 
 def _inside(x: NDArray[np.float64], outline: NDArray[np.float64]) -> bool:
-    """Return whether a position x (2,) is inside a polygon: a ray from x then crosses an odd number of edges."""
+    """Return whether a position is inside a polygon."""
     a, b = outline - x, np.roll(outline, -1, axis=0) - x
     crosses = (a[:, 1] > 0) != (b[:, 1] > 0)
     return bool((crosses & ((cross_in_plane(a, b) > 0) == (b[:, 1] > a[:, 1]))).sum() % 2)
@@ -128,7 +128,7 @@ def _inside(x: NDArray[np.float64], outline: NDArray[np.float64]) -> bool:
 
 @contextmanager
 def _gmsh() -> Iterator:
-    """Provide gmsh with a separate model.  Afterwards restore the user's gmsh state and handler of Ctrl-C."""
+    """Provide gmsh with a separate model, and restore the user's gmsh state afterwards."""
     main = current_thread() is main_thread()  # other threads may not set handlers
     handler = signal.getsignal(signal.SIGINT)
     try:
@@ -161,7 +161,7 @@ def _gmsh() -> Iterator:
 
 
 def _filled(loops: Sequence[tuple[NDArray[np.float64], Sequence[str]]], size: float) -> Mesh:
-    """Return the mesh of a polygon with holes.  It has quadrilaterals of edge length `size` (m) and a few triangles."""
+    """Return the mesh of a polygon with holes, mostly of quadrilaterals with edge length `size`."""
     extent = np.ptp(loops[0][0], axis=0).max()
     origin = extent * np.round(loops[0][0][0] / extent, -2)  # gmsh aborts at large coordinates
     with _gmsh() as gmsh:

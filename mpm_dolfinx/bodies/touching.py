@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Contact between seeded bodies: covered parts of faces, and distances between domains.
 
-Faces are quadrilaterals in space.  In plane strain they have unit width along the third axis.
+Faces are quadrilaterals in space.  In plane strain, a face is an edge with unit width along the third axis.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ BITS = corner_bits(2)  # Source: definition
 
 @dataclass
 class Faces:
-    """Faces of a body after its map.  Arrays have a row for each of m faces."""
+    """Faces of a body after its map."""
 
     row: NDArray[np.int64]  # domain of the face (m,)
     index: NDArray[np.int64]  # indices of the face's corners in the domain (m, 4)
@@ -51,7 +51,7 @@ class Faces:
         return cls.of(body, *body.outer())
 
     def edge(self) -> NDArray[np.float64]:
-        """Return the length (n,), in m, of the shortest edge of each face.  Unit width in plane strain is no edge."""
+        """Return the length (n,), in m, of the shortest edge of each face, without the unit width in plane strain."""
         c = self.corners
         pairs = [(1, 0), (3, 2), (2, 0), (3, 1)] if (self.index[:, 0] != self.index[:, 2]).any() else [(1, 0)]
         return np.min([np.linalg.norm(c[:, i] - c[:, j], axis=1) for i, j in pairs], axis=0)
@@ -59,9 +59,9 @@ class Faces:
 
 @dataclass
 class Cover:
-    """Pairs of faces in contact.  Arrays have a row for each of n pairs.
+    """Pairs of faces in contact: a covered face, and a covering face that lies on the covered face.
 
-    The covering face lies on the covered face.  Face coordinates run from 0 to 1 along two edges of the covered face.
+    Face coordinates run from 0 to 1 along two edges of the covered face.
     """
 
     face: NDArray[np.int64]  # the covered face (n,)
@@ -79,10 +79,7 @@ class Cover:
 
 
 def face_vectors(corners: NDArray[np.float64], face: NDArray[np.int64] | int) -> NDArray[np.float64]:
-    """Return the outward area vectors (n, d), in m^(d-1), of one face of each domain (n, 2^d, d).
-
-    `face` contains the face indices (n,), or is one face index for all domains.
-    """
+    """Return the outward area vectors (n, d), in m^(d-1), of one face of each domain (n, 2^d, d)."""
     dim = corners.shape[2]
     x = corners[np.arange(len(corners))[:, None], FACES[dim][face]]
     if dim == 2:
@@ -99,7 +96,7 @@ def weights(t: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def near(a: NDArray[np.float64], b: NDArray[np.float64], distance: float = 0.0) -> tuple[NDArray, NDArray]:
-    """Return two index arrays (n,) of polytopes a (k, c, d), b (l, c, d) with boxes within about `distance`, in m."""
+    """Return pairs of polytopes a (k, c, d) and b (l, c, d) with bounding boxes within about `distance`, in m."""
     if not (len(a) and len(b)):
         return (np.empty(0, dtype=np.int64),) * 2
     low, high = np.maximum(a.min(axis=(0, 1)), b.min(axis=(0, 1))), np.minimum(a.max(axis=(0, 1)), b.max(axis=(0, 1)))
@@ -118,7 +115,7 @@ def near(a: NDArray[np.float64], b: NDArray[np.float64], distance: float = 0.0) 
 
 
 def covers(own: Faces, other: Faces) -> Cover:
-    """Return the contacts between faces of one body and opposite faces of another body."""
+    """Return the contacts between faces of one body and faces of another body."""
     i, j = near(own.corners, other.corners)
     n, m = (f.outward / np.maximum(np.linalg.norm(f.outward, axis=1, keepdims=True), TINY) for f in (own, other))
     opposite = np.einsum("nd,nd->n", n[i], m[j]) < -0.5
@@ -154,14 +151,15 @@ def covers(own: Faces, other: Faces) -> Cover:
 
 
 def _parallelograms(corners: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return faces (n, 4, 3) with moved last corners, so that all faces are parallelograms."""
+    """Return faces whose last corners are moved so that all faces are parallelograms."""
     return np.stack([*(corners[:, k] for k in range(3)), corners[:, 1] + corners[:, 2] - corners[:, 0]], axis=1)
 
 
 def local(corners: NDArray, x: NDArray, normal: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the face coordinates (n, c, 2) of positions x (n, c, 3), and the normal distances (n, c) from the faces.
 
-    `corners` (n, 4, 3) are the corners of the faces.  `normal` (n, 3) are the unit normals of the faces.
+    `corners` (n, 4, 3): corners of the faces.
+    `normal` (n, 3): unit normals of the faces.
     """
     t = np.full((*x.shape[:2], 2), 0.5)
     c0, c1, c2, c3 = (corners[:, k, None] for k in range(4))
@@ -179,7 +177,7 @@ def local(corners: NDArray, x: NDArray, normal: NDArray) -> tuple[NDArray[np.flo
 
 
 def covered(count: int, cover: Cover) -> NDArray[np.float64]:
-    """Return the covered fraction (n,) of each face, that is, its covered area in face coordinates."""
+    """Return the covered fraction (n,) of the area of each face."""
     s, owner = within(*_triangles(cover.t, cover.face), np.zeros(2), np.ones(2))
     return sum_by(owner, _areas(s), count)
 
@@ -187,7 +185,7 @@ def covered(count: int, cover: Cover) -> NDArray[np.float64]:
 def uncovered_triangles(
     own: Faces, cover: Cover, faces: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return face (n,) and corners (n, 3, 2), in face coordinates, of triangles that cover free parts of `faces`."""
+    """Divide the uncovered parts of `faces` into triangles, and return the face and corners (n, 3, 2) of each."""
     corners = own.corners[faces]
     normal = own.outward[faces] / np.linalg.norm(own.outward[faces], axis=1, keepdims=True)
     whole, _ = local(_parallelograms(corners), corners, normal)
@@ -227,7 +225,7 @@ def uncovered_triangles(
 
 
 def within(s: NDArray, owner: NDArray, low: NDArray, high: NDArray) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Clip triangles (3, 2, n) to boxes from `low` to `high`, (2,) or (n, 2).  Return parts, and each part's owner."""
+    """Clip triangles (3, 2, n) to boxes from `low` to `high`.  Return the clipped parts, and the owner of each part."""
     low, high = (np.broadcast_to(x, (s.shape[2], 2)) for x in (low, high))
     index = np.arange(s.shape[2])
     for axis in (0, 1):
@@ -237,7 +235,7 @@ def within(s: NDArray, owner: NDArray, low: NDArray, high: NDArray) -> tuple[NDA
 
 
 def _triangles(quads: NDArray, owner: NDArray) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Divide each quadrilateral (n, 4, 2) into two.  Return the triangles (3, 2, 2n) and the face (owner) of each."""
+    """Divide each quadrilateral into two triangles, and return the triangles with their faces."""
     both = [quads[:, list(simplex)].transpose(1, 2, 0) for simplex in kuhn_simplices(2)]
     return np.concatenate(both, axis=2).astype(float), np.tile(owner, 2)
 
@@ -248,7 +246,7 @@ def _areas(s: NDArray) -> NDArray[np.float64]:
 
 
 def split(s: NDArray, owner: NDArray, axis: int, plane) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-    """Divide triangles (3, e, n) at a plane normal to an axis.  Return parts and owners below it, then above it."""
+    """Divide triangles (3, e, n) at a plane normal to an axis.  Return parts and owners below, then above the plane."""
     plane = np.broadcast_to(plane, len(owner))
     low, high = s[:, axis].min(axis=0) < plane, s[:, axis].max(axis=0) > plane
     both = np.flatnonzero(low & high)
@@ -261,7 +259,8 @@ def split(s: NDArray, owner: NDArray, axis: int, plane) -> tuple[NDArray, NDArra
 def uncovered(
     count: int, face: NDArray[np.int64], low: NDArray[np.float64], high: NDArray[np.float64], slack: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return the face (m,), lower corner and upper corner (m, 2) of rectangles that fill uncovered parts of faces.
+    """Divide the uncovered parts of faces into rectangles, and return the face, lower and upper corner of each
+    rectangle.
 
     `count`: number of faces.
     `face` (n,): index of the face that each box covers in part.
@@ -324,7 +323,7 @@ def uncovered(
 
 
 def separation(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the gaps (n,) between convex domains a and b (n, 2^d, d), in m.  A negative gap is a depth of overlap.
+    """Return the gaps (n,), in m, between convex domains a and b (n, 2^d, d).  Overlapping domains have negative gaps.
 
     Domains overlap unless a plane separates them.  It is sufficient to try planes parallel to a face of either domain.
     In 3D, planes parallel to one edge of each domain must also be tried.
@@ -341,7 +340,7 @@ def separation(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.flo
 
 
 def _between_planes(a: NDArray, b: NDArray, normals: Iterable[NDArray]) -> NDArray[np.float64]:
-    """Return the largest distances (n,), in m, of two parallel planes with any of `normals` that separate a and b."""
+    """Return the largest distance, in m, between two parallel planes with one of `normals` that separate a and b."""
     out, size = np.full(len(a), -np.inf), np.ptp(a, axis=1).max(axis=1)
     for n in normals:
         length = np.linalg.norm(n, axis=1)
@@ -353,7 +352,7 @@ def _between_planes(a: NDArray, b: NDArray, normals: Iterable[NDArray]) -> NDArr
 
 
 def solids(body: Body) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return convex domains (n, 2^d, d) of a body, one for a box, and the tolerances (n,) of overlaps, both in m."""
+    """Return the convex domains (n, 2^d, d) of a body, and the tolerances (n,) of their overlaps, both in m."""
     low, high = body.bounds
     size, edge = high - low, body.spacing.min()
     if body.aligned and np.isclose(size.prod(), body.volume_of_boxes, rtol=SAME, atol=0):
@@ -379,7 +378,7 @@ def meeting(
     b: tuple[NDArray[np.float64], NDArray[np.float64]],
     in_cells: Callable[[NDArray[np.float64]], NDArray[np.float64]],
 ) -> tuple[float, float, NDArray[np.float64]]:
-    """Return the largest overlap of two bodies, in m, the smallest gap, in cells, and the position (d,), in m.
+    """Return the largest overlap of two bodies, in m, the smallest gap, in cells, and the position of either, in m.
 
     Touching bodies have overlap 0 and gap 0.  The gap of distant bodies is inf.  `a` and `b` are the domains of the
     bodies with their tolerances, see `solids`.  `in_cells` divides positions by the cell size.
@@ -417,14 +416,14 @@ def check_apart(grid: Grid, bodies: Sequence[Body], present: Sequence[bool]) -> 
 
 
 def _inside(x: NDArray[np.float64], domains: NDArray[np.float64]) -> bool:
-    """Return whether a position (d,), in m, lies in one of the domains (n, 2^d, d), in m."""
+    """Return whether a position lies in one of the domains."""
     point = np.broadcast_to(x, (1, *domains.shape[1:]))
     which, _ = near(domains, point)
     return bool((separation(domains[which], np.repeat(point, len(which), axis=0)) <= 0).any())
 
 
 def warn_near(grid: Grid, names: str, gap: float, x: NDArray[np.float64]) -> None:
-    """Warn about bodies with a gap smaller than a cell.  Such bodies share nodes of the grid, and therefore stick."""
+    """Warn about bodies with a gap smaller than a cell, because such bodies share nodes and stick."""
     if 0 < gap < 1:
         where = "%s: %.2g cells apart at %s, but they stick, because they share nodes of the grid"
         warn(

@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: MIT
 """Interface of all loads in the momentum balance: tractions, prescribed displacements, tools, weight, user conditions.
 
-The method `acting(setting)` of a condition returns an `Acting`.  `flow/feeding.py` treats conditions on the fluid.
-
-A condition acts on three levels: stage, substep and assembly.  An `Acting` is created once in a stage, and contains the
-loaded faces.  Its method `placed` returns the `Loads` of a substep, for the current position of these faces.  At each
-assembly, `Loads` add forces to the residual and stiffness to the tangent.  The step and the momentum balance call only
-this interface.  They name no particular condition.
+Conditions of one kind act on three levels: stage, substep and assembly.  The method `acting(setting)` of a condition
+returns an `Acting`, which is created once in a stage and contains the loaded faces.  Its method `placed` returns the
+`Loads` of a substep, for the current position of these faces.  At each assembly, `Loads` add forces to the residual and
+stiffness to the tangent.  The step and the momentum balance call only this interface.  `flow/feeding.py` treats
+conditions on the fluid.
 """
 
 from __future__ import annotations
@@ -46,12 +45,7 @@ MOTIONS = ("tool_velocity", "tool_rotation", "tool_spin")
 
 
 class FormsOf:
-    """Compiled forms of the conditions of a scene.  Each kind of form is compiled at the first use.
-
-    grid: background grid
-    u, m: displacement increment of the step
-    velocity: velocity of the bodies in a substep
-    """
+    """Compiled forms of the conditions of a scene, each compiled at its first use."""
 
     def __init__(self, grid: Grid, u: fem.Function, velocity: Velocity):
         self.grid, self.u = grid, u
@@ -59,7 +53,7 @@ class FormsOf:
         self._made: dict[Callable, Any] = {}
 
     def __call__(self, make: Callable[..., T], *more) -> T:
-        """Return the forms `make(grid, u, *more)` of a class `make`.  They are compiled once for each class."""
+        """Return the forms `make(grid, u, *more)` of a class `make`, which are compiled once."""
         if make not in self._made:
             self._made[make] = make(self.grid, self.u, *more)
         return self._made[make]
@@ -121,7 +115,7 @@ class Shares(NamedTuple):
 
 
 class At(NamedTuple):
-    """Numbering of the unknowns, displacement increment u of the step (local array, in m), and connected parts."""
+    """Numbering of the unknowns, displacement increment u of the step, in m, and connected parts."""
 
     unknowns: Unknowns
     u: NDArray[np.float64]
@@ -152,25 +146,28 @@ class Loads:
     couples: bool = False
     """Whether the tangent couples nodes of different cells."""
     touches: bool = False
-    """Whether the condition is a contact with a tool or another body, from which bodies may separate."""
+    """Whether the condition is a contact, which may open."""
     key: Any = None
     """Key of all data on which the penalty and the pattern depend, except for the positions of faces."""
 
     def joined(self, substeps: Sequence[Any]) -> Loads:
-        """Return the loads with a pattern that contains the condition's patterns in all substeps of the step."""
+        """Return the loads with a pattern for all substeps of the step."""
         return self
 
     def begun(self, shares: Shares, earlier: Any) -> Loads:
-        """Return the loads of a substep with inertia.  `earlier` is the result of `flown` in the previous substep."""
+        """Return the loads of a substep with inertia.
+
+        `earlier`: result of `flown` in the previous substep.
+        """
         return self
 
     def flown(self, at: At) -> Any:
         """Return the data of this converged substep that the next substep with inertia needs."""
 
     def rubbing(self, at: At, v: NDArray[np.float64]) -> tuple[float, float]:
-        """Return two powers (in W) at u on this process: dissipation by slip, and correction of the external power.
+        """Return the dissipation by slip, and a correction of the external power, both in W, at u on this process.
 
-        The uncorrected external power is that of the forces in `push` at the nodal velocities v, a local array, in m/s.
+        Without the correction, the external power is that of the forces in `push` at the nodal velocities v, in m/s.
         """
         return 0.0, 0.0
 
@@ -178,7 +175,7 @@ class Loads:
         """Add forces that are constant during the substep."""
 
     def pulls(self, b: NDArray[np.float64]) -> None:
-        """Add the constant part of the penalty forces.  The scale of residuals omits this part."""
+        """Add the constant part of the penalty forces, which the scale of residuals leaves out."""
 
     def loads(self, b: NDArray[np.float64]) -> None:
         """Add forces that depend on u."""
@@ -187,23 +184,23 @@ class Loads:
         """Add resisting forces at u, with the sign of the internal forces."""
 
     def takes_up(self, b: NDArray[np.float64]) -> None:
-        """Add forces at u that count as internal forces.  The scale of residuals includes these forces."""
+        """Add forces at u that count as internal forces, also in the scale of residuals."""
 
     def penalty(self, A: PETSc.Mat, walls: bool) -> None:
         """Add the matrix of forces that are linear in u.  `walls`: whether to add rows of components that walls fix."""
 
     def pulling(self, at: At, v: NDArray[np.float64]) -> float:
-        """Return the power (in W) of `pulls` and `penalty` at u on this process.  `v`: nodal velocities, m/s."""
+        """Return the power, in W, of `pulls` and `penalty` at u and the nodal velocities v on this process."""
         return 0.0
 
     def tangent(self, K: PETSc.Mat) -> None:
         """Add the derivative of `resists` minus `loads` at u, without final assembly."""
 
     def push(self, at: At, residual: PETSc.Vec, on: Unknowns) -> None:
-        """Subtract forces at u from the residual of unknowns or fixed components.  The residual's scale omits them."""
+        """Subtract forces at u from the residual, but not from its scale."""
 
     def inertia(self, at: At) -> PETSc.Vec | None:
-        """Return the inertia forces (in N) at u, or None.  The residual and its scale include these forces."""
+        """Return the inertia forces at u, in N, or None without inertia."""
 
     def pattern(self, unknowns: Unknowns) -> PETSc.Mat | None:
         """Return a zero matrix with the entries that `coupling` adds to the pattern of cells, or None."""
@@ -212,7 +209,7 @@ class Loads:
         """Return the negative derivative of the forces in `push`, without the part that `tangent` adds."""
 
     def settle(self, at: At, sticks: bool) -> bool:
-        """Update which points slip at u, and return whether any changed.  `sticks` tells whether points may stick."""
+        """Update which points slip at u, and return whether any changed.  `sticks`: whether points may stick again."""
         return False
 
     def augment(self, at: At) -> bool:
@@ -231,18 +228,18 @@ class Loads:
         return self
 
     def counted(self, at: At) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return flat local dofs (n,) on walls, and loads (n,), in N, at these dofs that wall reactions exclude."""
+        """Return local dofs (n,) on walls, and loads (n,), in N, at these dofs that wall reactions leave out."""
         return np.empty(0, dtype=np.int64), np.empty(0)
 
     def within_reach(self) -> NDArray[np.int64]:
-        """Return lexicographic indices (n, 2) of cells on this process that the condition may couple in the step."""
+        """Return the pairs (n, 2) of lexicographic cells on this process that the condition may couple in the step."""
         return np.empty((0, 2), dtype=np.int64)
 
     def touching(self) -> tuple | None:
-        """Return arrays of initial constraints: cells and cells of the other body (n,), positions and directions (n,
-        d).
+        """Return the initial constraints of this condition.
 
-        The cells of the other body are None if this body does not deform.
+        Each constraint has cells (n,), opposite cells (n,), positions (n, d) and directions (n, d).
+        Opposite cells belong to another body in contact.  They are None without a second deforming body.
         """
 
     @property
@@ -251,12 +248,12 @@ class Loads:
         return np.empty(0, dtype=np.int32)
 
     def rounding(self, of_cells: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return rounding errors (cells,), in N, of forces in local cells.  `of_cells`: errors without it."""
+        """Return the rounding errors (cells,), in N, of forces in local cells.  `of_cells`: errors of other forces."""
         return of_cells
 
     @property
     def rounding_beside(self) -> float:
-        """Rounding error of the forces, N, in the cells of other bodies in contact."""
+        """Rounding errors of the forces, in N, in the cells of other bodies in contact."""
         return 0.0
 
     def outcome(self, at: At) -> dict[str, dict[str, NDArray[np.float64]]]:
@@ -272,7 +269,7 @@ class Loads:
         return self
 
     def near(self, points: MaterialPoints, corners: NDArray[np.float64]) -> NDArray[np.bool_] | bool:
-        """Return which corners (n, 2^d, d), in m, are near a contact after a step.  These follow the Q1 field alone."""
+        """Return which corners (n, 2^d, d) are near a contact after a step.  Such corners follow the Q1 field alone."""
         return False
 
     def outside(
@@ -280,35 +277,34 @@ class Loads:
     ) -> NDArray[np.float64]:
         """Return the corners (n, 2^d, d), in m, after they are moved out of forbidden regions.
 
-        `free` (n, 2^d, d) tells which components no other condition prescribes.  By default only small penetrations are
-        corrected.  With `everywhere`, penetrations of any depth are corrected.
+        `free` (n, 2^d, d): whether no other condition prescribes a component.
+        `everywhere`: whether to correct penetrations of any depth, not only small ones.
         """
         return corners
 
     def under_held(
         self, ids: NDArray[np.int64], tracked: NDArray[np.float64], volume: NDArray[np.float64], corners: NDArray
     ) -> NDArray[np.float64]:
-        """Return new corners (n, 2^d, d), in m, of re-initialised domains.  On prescribed sides these are tracked
-        corners.
+        """Return the corners (n, 2^d, d), in m, of re-initialised domains, with tracked corners on prescribed sides.
 
-        A domain with a face on a prescribed side becomes a prism of equal volume.  `ids` (n,) identify the points.
-        `tracked` are the tracked corners, and `corners` the corners initialised from F.  `volume` (n,), in m^d, are the
-        volumes of the domains.
+        A domain with a face on a prescribed side becomes a prism of equal volume.
+
+        `ids` (n,): identifiers of the points.
+        `tracked`: tracked corners.
+        `volume` (n,), in m^d: volumes of the domains.
+        `corners`: corners that are initialised from F.
         """
         return corners
 
     def check_end(self, points: MaterialPoints, before: MaterialPoints) -> None:
-        """Raise an error if points lie in forbidden regions after a step.  `before` are the points at its start."""
+        """Raise an error if points lie in forbidden regions after a step.
+
+        `before`: points at the start of the step.
+        """
 
 
 class Acting:
-    """All conditions of one kind in a stage.
-
-    Parameters
-    ----------
-    setting
-        Data that all conditions of the stage share.
-    """
+    """All conditions of one kind in a stage."""
 
     conditions: ClassVar[tuple[type, ...]] = ()
     """Classes of conditions of this kind."""

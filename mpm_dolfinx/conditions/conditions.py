@@ -9,12 +9,12 @@ maps (`mapped`).  Reference areas are areas of the seeded shape, after the maps.
 A new kind of condition is a class in a separate file.  Its method `acting` adds terms to the momentum balance
 (`conditions/acting.py`).  Its method `feeding` adds terms to the fluid balance (`flow/feeding.py`).
 
-Values may be functions of time t, reference positions X and current positions x.  The parameter names of a function
-decide which of these arguments the function receives, see `validation`.
+A value may be a function of time t, reference positions X and current positions x.  The package passes the arguments
+that the function names, see `validation`.
 
-An invalid condition raises a ValueError when the condition, a scene or a stage is created.  An invalid value of a
-function raises the error in the step that needs the value.  A condition is equal only to itself, because values and
-regions may be arrays or functions.
+An invalid condition raises a ValueError when the condition, a scene or a stage is created.  A function with an invalid
+value raises the error in a step.  A condition is equal only to itself, because values and regions may be arrays or
+functions.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ class Traction(Condition):
 
 @dataclass(frozen=True, eq=False)
 class Pressure(Condition):
-    """Pressure on a side of the bodies.  It is always normal to the moving surface, and refers to the current area.
+    """Pressure on a side of the bodies, always normal to the moving surface, per current area.
 
     The pressure is added to tractions.  Skeleton and pore fluid carry it together.  For water that also enters the
     pores, a `Drained` must also prescribe the pore pressure.  A uniform pressure has a potential if the loaded surface
@@ -128,11 +128,12 @@ class Pressure(Condition):
 class Quiet(Condition):
     """Quiet (absorbing) boundary of bodies with inertia (Lysmer and Kuhlemeyer 1969).
 
-    The traction resists the velocity.  It is the velocity times the impedance of the material: (rho c_p) along the
-    normal, (rho c_s) in the tangent plane.  Here rho is the density; c_p and c_s are the speeds of compression and
-    shear waves.  Waves along the normal are absorbed.  Of waves at 30 degrees to the normal, up to 4 % of the energy is
-    reflected (nu = 0.2 to 0.4).  If the side was fixed in an earlier stage without inertia, it keeps the tractions of
-    this stage.  Bodies with weight need the earlier stage, because these tractions carry their weight.
+    The traction resists the velocity.  Along the normal, the traction is (rho c_p) times the velocity, with the density
+    rho and the speed c_p of compression waves.  In the tangent plane, the traction is (rho c_s) times the velocity,
+    with the speed c_s of shear waves.  Waves along the normal are absorbed.  Waves at 30 degrees to the normal are
+    reflected with up to 4 % of their energy (nu = 0.2 to 0.4).  If the side was fixed in an earlier stage without
+    inertia, it keeps the tractions of the earlier stage.  Bodies with weight need such a stage, because the kept
+    tractions carry their weight.
 
     Parameters
     ----------
@@ -205,7 +206,7 @@ class Source:
 
 
 def sorted_terms(terms: Sequence[Callable | OnSide | Source]) -> tuple[list[Callable | OnSide], list[Callable]]:
-    """Return two lists of the user's terms: terms of the momentum balance, and terms of the fluid balance."""
+    """Return the user's terms of the momentum balance, and the user's terms of the fluid balance."""
     if isinstance(terms, (str, bytes)) or not isinstance(terms, Sequence):
         raise ValueError(f"terms = {line(terms)}, must be a list of functions, OnSide and Source")
     sources = [term.term for term in terms if isinstance(term, Source)]
@@ -223,16 +224,16 @@ class Through(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Drained(Condition):
-    """Side of the bodies with a prescribed pore pressure.  The side moves with the bodies.
+    """Side of the bodies with a prescribed pore pressure.
 
-    `outflows` of the simulation are the flow through the side.
+    The side moves with the bodies.  `outflows` of the simulation are the flow through the side.
 
     Parameters
     ----------
     side
         Side of the bodies, as for `Traction`.
     pressure : float or callable (t, X, x) -> float, Pa
-        Pore pressure outside, finite.  Below a water level: lambda t, x: 9810 * np.maximum(level(t) - x[:, 1], 0).
+        Finite pore pressure outside.  Below a water level: lambda t, x: 9810 * np.maximum(level(t) - x[:, 1], 0).
     region : ((d,), (d,)), m
         Box of reference positions.  The parts of faces inside the box are drained.
     seepage
@@ -270,7 +271,7 @@ class Drained(Condition):
 
 
 class Flux(Condition):
-    """Base class of conditions with a flux (m/s) through a side.  The flux is a number or a function of t, X, x."""
+    """Base class of conditions with a flux, in m/s, through a side."""
 
     side: str
     flux: float | Callable[..., ArrayLike]
@@ -321,9 +322,9 @@ class Rain(Flux):
     Rain infiltrates until the pressure at the side reaches `ponding`.  The excess runs off.  Water evaporates at the
     prescribed rate until the pressure at the side falls to `driest`.  Water can also seep out of the side.  `outflows`
     of the simulation are the flow through the side.  `simulation.outcome("runoff")` is the run-off, in m^3/s (m^2/s in
-    plane strain).  Three further outcomes are volumes since the condition began, in m^3 (m^2).  `outcome("flowed")` is
-    the outflow through each open side, `outcome("ran_off")` its run-off and seepage, and `outcome("ponded")` the ponded
-    water.
+    plane strain).  Three further outcomes are volumes since the condition began, in m^3 (m^2 in plane strain).
+    `outcome("flowed")` is the outflow through each open side.  `outcome("ran_off")` is the run-off and seepage.
+    `outcome("ponded")` is the ponded water.
 
     Parameters
     ----------
@@ -367,8 +368,8 @@ class Rain(Flux):
 class Tied(Condition):
     """Two opposite sides of a box with equal displacements, as in ground that repeats itself beyond the box.
 
-    At equal heights, the two sides have equal displacements, and equal and opposite forces, with and without inertia.
-    A wave that leaves the box at one side enters at the other.  No water flows through these sides.
+    At equal heights, forces on both sides are equal and opposite, with and without inertia.  A wave that leaves the box
+    at one side enters at the opposite side.  No water flows through tied sides.
 
     Parameters
     ----------
@@ -394,31 +395,31 @@ HOLD = 3e2
 """Penalty stiffness for prescribed displacements, times cell size, divided by the `holding` modulus.
 
 The penalty acts on means over cells.  The displacement error is the change of traction in the step (without its
-rotation), divided by the stiffness.  This error does not accumulate, because each step measures it from the prescribed
-position.  If a body is much stiffer than the penalty, multipliers remove the error, see `HoldLoads.augment`.
-
-Halving this value changes the result of scene "soil" in tests/plateaus.py by 5.9e-05 (relative), doubling it by
-2.0e-05, and finer cells by 3.0e-02.
+rotation), divided by the stiffness.  The error does not accumulate, because each step measures it from the prescribed
+position.  If a body is much stiffer than the penalty, multipliers remove the error, see `HoldLoads.augment`.  The
+result of scene "soil" in tests/plateaus.py changes by the fraction 5.9e-05 with half this value, by 2.0e-05 with twice
+this value, and by 3.0e-02 with finer cells.
 """
 YIELDING = 0.1
-"""Factor on the elastic modulus in the penalty of laws with state variables.  Yielding soil is much softer than elastic
-soil.  Halving this value changes the result of scene "soil" in tests/plateaus.py by 6.5e-05 (relative), doubling it by
-1.9e-05, and finer cells by 3.0e-02.
+"""Factor on the elastic modulus in the penalty of laws with state variables.
+
+Yielding soil is much softer than elastic soil. The result of scene "soil" in tests/plateaus.py changes by the fraction
+6.5e-05 with half this value, by 1.9e-05 with twice this value, and by 3.0e-02 with finer cells.
 """
 
 
 def resistance(material: Skeleton) -> NDArray[np.float64]:
-    """Return the reference modulus, Pa, of a side: the oedometric modulus, limited to 4G, its value at nu = 1/3."""
+    """Return the reference modulus, in Pa, of a side: the oedometric modulus, but at most 4G, its value at nu = 1/3."""
     return np.minimum(material.oedometric, 4 * material.shear)
 
 
 def holding(material: Skeleton) -> NDArray[np.float64]:
-    """Return the reference modulus, Pa, of the penalty for prescribed displacements.
+    """Return the reference modulus, in Pa, of the penalty for prescribed displacements.
 
     A Q1 field with constant volumetric strain in each cell cannot follow a curved side.  The penalty converts the
-    difference between field and side into pressure.  It must therefore not be stiff compared with the shear stiffness.
-    In an undrained cavity, a penalty of 300 (lambda + 2G) gives up to 1.9 times the exact pressure.  A penalty of 30
-    (4G) gives 1.01 times the exact pressure.
+    difference between field and side into pressure, so it must not be stiff compared with the shear stiffness.  In an
+    undrained cavity, a penalty of 300 (lambda + 2G) gives up to 1.9 times the exact pressure.  A penalty of 30 (4G)
+    gives 1.01 times the exact pressure.
     """
     return (YIELDING if material.state else 1.0) * resistance(material)
 
@@ -440,8 +441,8 @@ class Displacement(Condition):
         Prescribed components, such as "y".  By default all d components are prescribed.
     region : ((d,), (d,)), m
         Box of reference positions.  The displacement is prescribed on faces inside the box.  If the box ends within a
-        cell, this cell also has a node outside the box.  The node is prescribed if the box covers more than half of the
-        cell, otherwise free.
+        cell, the cell also has a node outside the box.  This node is prescribed if the box covers more than half of the
+        cell.
 
     Raises
     ------
@@ -471,7 +472,7 @@ class Displacement(Condition):
 
 @dataclass(frozen=True, eq=False)
 class _OfPlate(Traction):
-    """Uniform traction of a plate.  Its error messages name the plate."""
+    """Uniform traction of a plate."""
 
     def at(self, t: float, dim: int, side: Places | None = None) -> NDArray[np.float64]:
         return self.value(t)
@@ -481,9 +482,9 @@ class _OfPlate(Traction):
 class RigidPlate(Condition):
     """Rigid, smooth plate on a flat side of the bodies.  All faces have an equal displacement normal to the side.
 
-    A penalty on the slope of the faces, (kappa/2 int (grad_t x_n)^2 dA), keeps the plate flat and prevents tilting.
-    Here x_n is the position along the normal, grad_t the gradient along the side, and kappa the stiffness from
-    `RIGIDITY`.  The penalty does not resist a uniform displacement, so the plate transfers the total force exactly.
+    The penalty energy (kappa/2 int (grad_t x_n)^2 dA) keeps the plate flat and prevents tilting.  Here x_n is the
+    position along the normal, grad_t is the gradient along the side, and kappa is the stiffness from `RIGIDITY`.  The
+    penalty does not resist a uniform displacement, so the plate transfers the total force exactly.
 
     Parameters
     ----------
@@ -512,7 +513,7 @@ class RigidPlate(Condition):
             numbers("RigidPlate: force", self.force)
 
     def traction(self, area: float, inward: NDArray[np.float64]) -> Traction:
-        """Return the plate's traction: the force along `inward` (d,), divided by the reference `area`, m^(d-1)."""
+        """Return the plate's traction: the force along `inward` (d,), divided by the reference `area`, in m^(d-1)."""
 
         def even(t: float) -> NDArray[np.float64]:
             return inward * self._given("force", t) / area

@@ -16,7 +16,7 @@ ALLOWED = "two columns of at least two rows, with increasing times in s and fini
 
 
 class Record:
-    """Recorded motion along a direction.  It is a function of time (s) that returns the displacement (d,), in m.
+    """Recorded motion along a direction, as a function of time (s) that returns the displacement (d,), in m.
 
     Recorded values are interpolated linearly in time and integrated exactly.  The motion is zero before the first
     recorded time.  After the last recorded time the velocity is constant.
@@ -85,17 +85,17 @@ class Record:
         return self._within(self._of[0], t) * (t <= self.end)
 
     def _within(self, value: scipy.interpolate.PPoly, t: float) -> NDArray[np.float64]:
-        """Return a quantity (d,) at time t.  It is zero before the record, and constant after it."""
+        """Return a quantity at time t, which is zero before the record and constant after the record."""
         return self.direction * (float(value(min(t, self.end))) if t >= value.x[0] else 0.0)
 
 
 def _linear(t: NDArray[np.float64], values: NDArray[np.float64]) -> scipy.interpolate.PPoly:
-    """Return the piecewise linear interpolant of values (n,) at times t (n,), in s."""
+    """Return the piecewise linear interpolant of values at times t, in s."""
     return scipy.interpolate.PPoly(np.stack([np.diff(values) / np.diff(t), values[:-1]]), t)
 
 
 def _read(record: str | os.PathLike) -> NDArray[np.float64]:
-    """Return the columns of a file as an array (n, 2)."""
+    """Return the two columns of a file."""
     file = path("Record", record)
     with on_disk(f"Record: {file}", "a file that can be read"):
         text = file.read_text()

@@ -21,8 +21,7 @@ from mpm_dolfinx.parallel.exchange import over_all
 class Sides:
     """Finder of the faces on which a condition acts.  Conditions on the same faces share one `Surface`.
 
-    grid, bodies: background grid, and all bodies of the scene
-    present: whether each body is active in the stage
+    `present`: whether each body is active in the stage.
     """
 
     def __init__(self, grid: Grid, bodies: Sequence[Body], present: Sequence[bool]):
@@ -32,7 +31,7 @@ class Sides:
         self._found: dict[tuple[str, bytes], Surface] = {}
 
     def of(self, condition) -> Surface:
-        """Return the faces of a condition's side in its region.  Raise ValueError if there are none."""
+        """Return the faces of a condition's side in its region, or raise ValueError without faces."""
         found = self._of(condition.side, condition.region)
         if not len(found):
             where = " in the region" if condition.region is not None else ""
@@ -58,10 +57,7 @@ class Sides:
         The last prescribed node also moves half a cell of the side beyond it.  If the region covers at most half of the
         cell in which it ends, the faces therefore end where the region enters this cell.  On a side inclined to the
         grid, the faces end half a cell before the end of the region.  Both rules apply only if the side continues
-        outside the region, and no condition in `others` applies there.
-
-        condition: the prescribed displacement
-        others: other prescribed displacements that have a component in common with it
+        outside the region, and none of the conditions `others` with a common component applies there.
         """
         faces, d = self.of(condition), self.grid.dim
         box, X = faces.region.copy(), faces.X
@@ -74,7 +70,7 @@ class Sides:
         neighbours = [self.of(other).X for other in others]
 
         def along(boxes: NDArray[np.float64], axis: int, x: float) -> NDArray[np.bool_]:
-            """Return which boxes (n, 2, d) are adjacent to the faces, and contain the coordinate x along an axis."""
+            """Return which boxes are adjacent to the faces, and contain the coordinate x along an axis."""
             across = np.arange(d) != axis
             low, high = X[:, 0].min(axis=0) - near, X[:, 1].max(axis=0) + near
             beside = ((boxes[:, 0] < high) & (boxes[:, 1] > low))[:, across].all(axis=1)
@@ -93,10 +89,7 @@ class Sides:
         return shorter if len(shorter) else faces  # the region is narrower than a cell
 
     def _beyond_nodes(self, side: Surface, at_end: NDArray[np.bool_], axis: int, x: float, sign: int) -> float:
-        """Return the length, in m, by which to shorten a region that ends at x along a reference axis, see `held`.
-
-        `at_end` (faces,) tells which faces of the side contain x.  `sign` is the direction out of the region.
-        """
+        """Return the length, in m, by which to shorten a region that ends at x along a reference axis."""
         faces = np.flatnonzero(at_end)
         X, places = side.corners[faces][:, :, axis], side.places()[faces]
         way, moved = X - X.mean(axis=1, keepdims=True), places - places.mean(axis=1, keepdims=True)
@@ -117,7 +110,7 @@ class Sides:
     def check_moves(self, one, holds: Iterable[Displacement], free: NDArray[np.bool_]) -> None:
         """Raise ValueError if prescribed displacements or a wall fix all displacement components on a condition's side.
 
-        `holds` are the prescribed displacements of the stage.  `free` (nodes, d) tells which components no wall fixes.
+        `free` (nodes, d): whether no wall fixes a component.
         """
         faces, grid = self.of(one), self.grid
         for hold in holds:
@@ -141,7 +134,7 @@ class Sides:
         return self._found[key]
 
     def all(self) -> Surface:
-        """Return all surface faces of all contact groups.  Faces between groups count: groups may separate."""
+        """Return all surface faces of all contact groups, including faces between groups."""
         start = np.cumsum([0, *(len(body) for body in self.bodies[:-1])])
         copy = np.broadcast_to(self.grid.copy(start), len(self.bodies))
         return joined([self.around(np.flatnonzero(copy == group).tolist()) for group in np.unique(copy)])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Unit weight of the fluid, from the gravity of the scene.  The weight converts hydraulic conductivity to mobility."""
+"""Unit weight of the fluid, from the gravity of the scene, which converts hydraulic conductivity to mobility."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Gravity = ArrayLike | Callable[[float], ArrayLike] | None
 
 
 def under(fluid: Fluid | None, gravity: Gravity) -> Fluid | None:
-    """Return the fluid.  If the scene's gravity (in m/s^2) is constant, conductivities refer to this gravity."""
+    """Return the fluid, with conductivities for the scene's gravity if this gravity is constant."""
     if fluid is None or fluid.gravity is not None or gravity is None or callable(gravity):
         return fluid
     strength = float(np.linalg.norm(numbers("gravity", gravity, None, allowed="finite numbers")))
@@ -34,7 +34,7 @@ def under(fluid: Fluid | None, gravity: Gravity) -> Fluid | None:
 
 
 def weighed(value, fluid: Fluid | None):
-    """Return a water pressure.  If it has no unit weight, it gets that of the pore fluid."""
+    """Return a water pressure, with the unit weight of the pore fluid if it has none."""
     by_fluid = isinstance(value, OfWater) and value.given is None and fluid is not None
     return replace(value, given=fluid.unit_weight) if by_fluid else value
 
@@ -46,7 +46,7 @@ def waters(conditions: Mapping[str, Any]) -> list[tuple[str, Any]]:
 
 
 def with_weight(condition: T, fluid: Fluid | None) -> T:
-    """Return the condition with unit weights for all its water pressures, see `weighed`."""
+    """Return the condition with unit weights for all its water pressures."""
     new = {
         name: weighed(value, fluid)
         for name, value in getattr(condition, "__dict__", {}).items()
@@ -73,9 +73,10 @@ def warn_units(comm: MPI.Intracomm, fluid: Fluid, gravity: Gravity) -> None:
 def warn_levels(comm: MPI.Intracomm, fluid: Fluid | None, gravity: Gravity, levels: Sequence[tuple[str, Any]]) -> None:
     """Warn about each water level whose unit weight differs from that of the pore fluid.
 
-    In a dry scene with gravity, warn about levels whose default unit weight is not that of water under this gravity.
+    A dry scene with gravity has no pore fluid.  The function then warns about levels whose default unit weight is not
+    that of water under this gravity.
 
-    `levels` has a name and a water pressure for each level.
+    `levels`: name and water pressure of each level.
     """
     g = 0.0 if gravity is None or callable(gravity) else float(np.linalg.norm(gravity))
     if fluid is None:
@@ -94,8 +95,9 @@ def warn_levels(comm: MPI.Intracomm, fluid: Fluid | None, gravity: Gravity, leve
 def other_gravity(fluid: Fluid, gravity: Sequence[NDArray[np.float64]]) -> float | None:
     """Return the last value of `gravity`, in m/s^2, or None if conductivities are converted with this gravity.
 
-    `gravity` has vectors, in m/s^2, at the start of a step and at times in it.  A varying gravity is returned only if
-    the last value is above 9.81 m/s^2.
+    A varying gravity is returned only if its last value is above 9.81 m/s^2.
+
+    `gravity`: vectors, in m/s^2, at the start of a step and at times in the step.
     """
     first, last = gravity[0], float(np.linalg.norm(gravity[-1]))
     rests = all(np.array_equal(first, g) for g in gravity) and last > 0

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Walls of the grid: the displacement components that walls fix, and the forces of walls on bodies.
 
-In all functions, `walls` has the fixed components of each wall by name.
+The argument `walls` of a function gives the fixed components of each wall by name.
 """
 
 from __future__ import annotations
@@ -70,11 +70,10 @@ def wall_forces(
     """Return the force (d,), in N, of each wall by name.  All processes must call this function.
 
     If several walls fix a component of a node, the wall normal to this component carries the force.  If none of these
-    walls is normal to the component, they share the force equally.  The axis of revolution has no area and no radial
-    force.
+    walls is normal to the component, they share the force equally.  The axis of revolution has no radial force.
 
-    dofs (n,): flat local degrees of freedom; they may occur repeatedly, and free ones are ignored
-    forces (n,), N: forces on these degrees of freedom
+    `dofs` (n,): flat local degrees of freedom, possibly repeated; free ones are ignored.
+    `forces` (n,), in N: forces on these degrees of freedom.
     """
     d, sides = grid.dim, SIDES[grid.dim]
     node, component = np.divmod(dofs, d)

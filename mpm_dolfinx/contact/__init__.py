@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""Contact: rigid tools, and groups of bodies that slide and separate."""
+"""Contact of bodies with rigid tools, and between groups of bodies that slide and separate."""

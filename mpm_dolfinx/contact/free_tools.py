@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: MIT
 """Free tools: rigid tools with a mass, which are moved by weight, loads and contact forces.
 
-Let q be the motion of a tool in a step: its displacement and, in 2D, its rotation.  The equation of motion has the form
-of that for nodes (`mechanics/inertia.py`): `m (q - q^) / (g dt)^2 = l - sum A^T f`.  Here m are mass and moment of
-inertia, and q^ is the motion without forces in the step.  g is the time weight of the substep's rate, and dt is the
-length of the step.  l are load and weight, and f are the contact forces on the points.  `A q` is the displacement of
-the contact positions on the tool.  The columns of A are e_x, e_y, and `e_z x r` with the lever arm r.
+The motion q of a tool in a step is its displacement and, in 2D, its rotation.  The equation of motion has the form of
+that for nodes (`mechanics/inertia.py`): `m (q - q^) / (g dt)^2 = l - sum A^T f`.  Here m contains the mass and the
+moment of inertia, and q^ is the motion without forces in the step.  The length of the step is dt, and g is the time
+weight of the substep's rate.  The vector l contains loads and weight, and f are the contact forces on the points.  The
+product `A q` is the displacement of the contact positions on the tool.  The columns of A are e_x, e_y, and `e_z x r`
+with the lever arm r.
 
-The unknowns q are eliminated (static condensation).  Let D be minus the derivative of f with respect to the
-displacement w of the points, and let dw be the increment of w.  Forces rotate with the tool, so f changes by
+The unknowns q are eliminated (static condensation).  Let w be the displacements of the points, and let dw be their
+increment.  D is minus the derivative of f with respect to w.  Forces rotate with the tool, so f changes by
 `(D A + E) dq`, where E has the columns 0, 0, `e_z x f`.  The force on the tool changes by the product of dq with
-==
 
     A^T D A + [[0, e_z x F], [(e_z x F)^T, sum r . f]],     F = sum f.
 
@@ -18,7 +18,7 @@ Let S be the sum of this matrix and `m / (g dt)^2`.  Newton's method then gives
 
     dq = S^-1 (l - sum A^T f - m (q - q^) / (g dt)^2 + sum (A^T D + E^T) dw).
 
-Forces on the points are therefore `f + (D A + E) S^-1 (...)`.  Minus the derivative of these forces is
+The forces on the points are therefore `f + (D A + E) S^-1 (...)`.  Minus the derivative of these forces is
 `D - (D A + E) S^-1 (A^T D + E^T)`.
 """
 
@@ -38,7 +38,7 @@ from mpm_dolfinx.mechanics.inertia import Flight
 
 
 class FreeMotion(NamedTuple):
-    """Motion of free tools, linearised about relative displacements w of contact pairs.  For symbols see the module."""
+    """Motion of free tools as a linear function of the relative displacements of contact pairs."""
 
     w: NDArray[np.float64]  # relative displacements of the pairs (m, d), m
     motion: NDArray[np.float64]  # motion of the tools at w (k, q), m and rad
@@ -121,32 +121,28 @@ class FreeTools(ContactProblem):
         return found._replace(balanced=found.touch.force + self._pulled(found, self._equation(found).shift))
 
     def _moved(self, found: Found, q: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return `A q` (m, d), the displacements of contact positions that motions q (k, q) of the tools cause."""
+        """Return the displacements `A q` of the contact positions on the tools."""
         d, of = self.grid.dim, q[self.pairs.number]
         return of[:, :d] + of[:, d:] * across(found.at.arm) if d == 2 else of
 
     def _pulled(self, found: Found, q: NDArray[np.float64], adjoint: bool = False) -> NDArray[np.float64]:
-        """Return `(D A + E) q` (m, d), in N, for motions q (k, q) of the tools.  `adjoint`: D is replaced by `D^T`."""
+        """Return the forces `(D A + E) q` for motions q of the tools, with `D^T` in place of D if `adjoint`."""
         out = self.now.law.slope(found.touch, found.at, self._moved(found, q), adjoint)
         d = self.grid.dim
         return out + q[self.pairs.number, d:] * across(found.touch.force) if d == 2 else out
 
     def _onto(self, found: Found, force: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the generalised forces `A^T f` (m, q) on the tools from the contact forces f (m, d), in N."""
+        """Return the generalised forces `A^T f` on the tools."""
         moment = (across(found.at.arm) * force).sum(axis=1, keepdims=True)[:, : self.grid.dim == 2]
         return np.hstack([force, moment])
 
     def _sizes(self, found: Found, force: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return upper bounds (m, q) of the generalised forces on the tools.
-
-        `force` (m, d), in N, contains magnitudes of the contact forces.  The bound of a moment is lever arm times
-        force, because the moment itself is only a rounding error for a smooth disc.
-        """
+        """Return upper bounds of the generalised forces on the tools, with lever arm times force for a moment."""
         moment = np.linalg.norm(found.at.arm, axis=1) * np.linalg.norm(force, axis=1)
         return np.hstack([force, moment[:, None][:, : self.grid.dim == 2]])
 
     def _motion(self, w: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the motions (k, q) of tools at relative displacements w (m, d), in m, from the last linearisation."""
+        """Return the motions of tools at given relative displacements, from the last linearisation."""
         last = self.now.linear
         law = self.now.law
         dw = w - last.w
@@ -159,13 +155,13 @@ class FreeTools(ContactProblem):
         return last.motion + last.shift + np.einsum("kij,kj->ki", last.inverse, on[:, 1:])
 
     def _free_motion(self, w: NDArray[np.float64], motion: NDArray[np.float64]) -> FreeMotion:
-        """Return the motion of tools, linearised about `motion` (k, q) and relative displacements w (m, d), in m."""
+        """Return the linearised motion of the tools."""
         found = self._find_at(w, motion)
         equation = self._equation(found)
         return FreeMotion(w, motion, equation.shift, equation.inverse, found)
 
     def _equation(self, found: Found) -> MotionEquation:
-        """Return the equation of motion of the tools, linearised about the contact `found`."""
+        """Return the linearised equation of motion of the tools."""
         law = self.now.law
         d = self.grid.dim
         motions = self._guides.transpose(2, 0, 1)
@@ -196,7 +192,7 @@ class FreeTools(ContactProblem):
 
     @property
     def _loaded(self) -> NDArray[np.int64]:
-        """Indices of the free tools, see `_loaded` of `ContactProblem`."""
+        """Indices of the free tools."""
         return np.flatnonzero(self._free_tools)
 
     def coupling(self, at: At) -> PETSc.Mat:
@@ -221,7 +217,7 @@ class FreeTools(ContactProblem):
         return changed
 
     def augment(self, at: At) -> bool:
-        """See `Loads`.  The tools must be in equilibrium too."""
+        """See `Loads`.  The augmentation ends only if the tools are in equilibrium too."""
         if super().augment(at):
             return True
         found = self.found(at)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Groups of bodies.  Groups may touch without sticking, because each group has a separate copy of the grid."""
+"""Groups of bodies that may touch without sticking, because each group has its own copy of the grid."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Contact:
     """Two groups of bodies in contact, with slip and separation.
 
     Bodies of one group stick where they touch.  Groups cannot penetrate each other, but may slide and separate.
-    No fluid passes between them.  In a scene with contacts, each body must belong to a group, and each pair of groups
+    No fluid passes between groups.  In a scene with contacts, each body must belong to a group, and each pair of groups
     must have one contact.  The forces on the bodies of `one` are in `tool_forces` of the simulation.
 
     Parameters
@@ -78,7 +78,7 @@ class Contact:
 
 
 def groups_of(contacts: Sequence[Contact], count: int) -> list[tuple[int, ...]]:
-    """Return the groups in a scene of `count` bodies, sorted by first body.  Raise ValueError for invalid groups."""
+    """Return the groups in a scene of `count` bodies, sorted by first body."""
     pairs = [contact.groups(count) for contact in contacts]
     groups = sorted({group for pair in pairs for group in pair})
     for one, other in combinations(groups, 2):
@@ -93,19 +93,14 @@ def groups_of(contacts: Sequence[Contact], count: int) -> list[tuple[int, ...]]:
     return groups
 
 
-def contacts_of(conditions: Sequence[Any]) -> list[Contact]:
-    """Return the contacts among the conditions."""
-    return [one for one in conditions if isinstance(one, Contact)]
-
-
 def grouped(
-    grid: Grid, bodies: Sequence[Body], conditions: Sequence[Any], quadrature: str, other: dict[str, Any]
+    grid: Grid, bodies: Sequence[Body], contacts: Sequence[Contact], quadrature: str, other: dict[str, Any]
 ) -> Grid:
-    """Return the grid of a scene.  In a scene with contacts, this grid has a copy for each group.
+    """Return the grid of a scene, which has a copy for each group if there are contacts.
 
     Parameters
     ----------
-    conditions, quadrature
+    contacts, quadrature
         See `Simulation`.
     other
         Options that a scene with contacts must not use, by name.
@@ -115,7 +110,6 @@ def grouped(
     ValueError
         Contacts are invalid, or an option is not available with contacts.
     """
-    contacts = contacts_of(conditions)
     if not contacts:
         return grid
     if quadrature == "point":

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Contact history of material points: pressures and shear tractions that one step passes to the next."""
+"""Contact history of material points: pressures and shear tractions that are kept from step to step."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 
 
 class Rough(Protocol):
-    """Shear strength of a tool or contact: Coulomb's coefficient, adhesion in Pa, and whether it resists slip."""
+    """Shear strength of a tool or contact: friction coefficient, and adhesion in Pa."""
 
     friction: float
     adhesion: float
@@ -35,7 +35,7 @@ def shear_name(name: str) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Origin:
-    """The material point and the contact of each of n pairs, before `exchange` sends the pairs to owners of cells."""
+    """The material point and the contact of each contact pair, on the process of the point."""
 
     exchange: Exchange  # sends the pairs to the owners of their cells
     point: NDArray[np.int64]  # index of the material point on this process (n,)
@@ -45,7 +45,7 @@ class Origin:
     def means(
         self, contacts: Mapping[str, Rough], points: MaterialPoints, push: NDArray, shear: NDArray
     ) -> MaterialPoints:
-        """Return the points with area-weighted means of their pairs' pressures `push` and tractions `shear`, in Pa."""
+        """Return the points with the mean contact pressures and shear tractions of their pairs, in Pa."""
         push = self.exchange.back(push)
         shear = self.exchange.back(shear)
         data = dict(points.data)
@@ -63,7 +63,7 @@ class Origin:
 
 
 def joined(both: Sequence[Origin], kept: Sequence[NDArray[np.bool_]]) -> tuple[Origin, NDArray[np.int64]]:
-    """Return one `Origin` of all pairs flagged in `kept`, and the order (n,) in which its exchange delivers them."""
+    """Merge the flagged pairs of two `Origin`, and return the order (n,) in which the exchange delivers the pairs."""
     columns, start = [], 0
     comm = both[0].exchange.comm
     for of, rows in zip(both, kept, strict=True):

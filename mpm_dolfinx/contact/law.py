@@ -1,27 +1,27 @@
 # SPDX-License-Identifier: MIT
 """Contact law: pressure, Coulomb friction and adhesion, with one condition for each contact and cell.
 
-At a position with gap g, the contact pressure and its energy per area are
+At a position with gap g, the contact pressure p and its energy psi per area are
 
     p = <lambda - k g>,     psi = p^2 / (2 k).
 
-<...> is the positive part.  The stiffness k is limited so that a Q1 field can follow curved surfaces.  The multiplier
-lambda has one value for each contact and cell.  Its initial value is the pressure after the previous step.
-Augmentation (Uzawa's method) updates lambda until the mean penetration in each cell is below `DEPTH` cell sizes.  The
-shear traction t depends on means over the pairs in a cell: the slip s in the step, and the shear traction t_n after the
-previous step.  Radial return gives
+<...> is the positive part, and k is a penalty stiffness.  The stiffness is limited so that a Q1 field can follow curved
+surfaces.  The multiplier lambda has one value for each contact and cell.  It starts from the pressure after the
+previous step.  Augmentation (Uzawa's method) updates lambda until the mean penetration in each cell is below `DEPTH`
+cell sizes.
+
+The shear traction t depends on means over the pairs in a cell: the slip s in the step, and the shear traction t_n after
+the previous step.  Radial return gives
 
     t = P (t_n - k_t s),     |t| <= mu p + min(adhesion, 10 p).
 
-P is the projection on the tangent plane, and mu is Coulomb's coefficient.  Sticking contact is elastic with stiffness
-k_t.
+P is the projection on the tangent plane, mu is Coulomb's coefficient, and k_t is the elastic stiffness in stick.
 
-The set of slipping cells is updated after Newton steps (active-set method).  If it were updated in each residual, cells
-would alternate between stick and slip, because slip has no stiffness.  All cells start in stick, whatever their
-traction.  A cell with reversed slip returns to stick only near equilibrium.  It may slip again later.  A sticking cell
-that opens is set to slip.  If this cell had returned from slip to stick before, it slips until the pairs are updated or
-the substep ends.  This rule is needed at first contact under a round tool, where mean normals are inclined.  Shear
-alone could otherwise open and close cells again and again.
+The set of slipping cells is updated after Newton steps (active-set method).  An update in each residual would make
+cells alternate between stick and slip, because slip has no stiffness.  All cells start in stick.  A cell with reversed
+slip returns to stick only near equilibrium, and may slip again later.  A sticking cell that opens is set to slip.  A
+cell that has returned to stick once and then opens slips until the pairs are updated or the substep ends.  Without this
+rule, shear could open and close cells again and again at first contact under a round tool.
 """
 
 from __future__ import annotations
@@ -44,9 +44,9 @@ from mpm_dolfinx.parallel.exchange import first, over_all
 STIFF = 100.0
 """The stiffness k is this factor times the modulus from `resistance`, divided by the cell size."""
 GRIP = 6.0
-"""The stiffness k_t is this factor times the modulus from `resistance`, divided by the cell size.  With a larger k_t,
-spurious shear tractions would alternate between cells.  The nodal forces of such tractions cancel, so that nothing
-would resist them.
+"""The stiffness k_t is this factor times the modulus from `resistance`, divided by the cell size.
+
+With a larger k_t, spurious shear tractions would alternate between cells without any resistance from the nodes.
 """
 DEPTH = 5e-4  # allowed mean penetration, divided by the cell size
 SLIVER = 0.25  # fraction of a cell's face; penetrations of smaller contact areas are reduced in proportion
@@ -59,7 +59,7 @@ RAMP = 10.0  # largest ratio of adhesion to normal pressure
 
 @dataclass(frozen=True, eq=False)
 class ContactState:
-    """State of the contact iterations, except displacements.  k conditions exist, one for each contact and cell."""
+    """State of the contact iterations, except displacements."""
 
     pressure: NDArray[np.float64]  # multiplier lambda (k,), Pa
     slip: NDArray[np.float64]  # direction of slip, zero in stick (k, d)
@@ -71,13 +71,13 @@ class ContactState:
 
     @property
     def slips(self) -> NDArray[np.bool_]:
-        """Which conditions slip (k,)."""
+        """Whether each condition (k,) slips."""
         return self.slip.any(axis=1)
 
 
 @dataclass(frozen=True, eq=False)
 class Touch:
-    """Forces and their derivatives for m contact pairs and k conditions at given displacements."""
+    """Contact forces and their derivatives at given displacements."""
 
     force: NDArray[np.float64]  # force on the points (m, d), N
     push: NDArray[np.float64]  # pressure (m,), Pa
@@ -92,10 +92,7 @@ class Touch:
 
 
 class ContactLaw:
-    """Contact pressures, shear tractions and their derivatives in a substep.
-
-    `names` are the names of the `contacts`.  `pairs` are the possible contact pairs.
-    """
+    """Contact pressures, shear tractions and their derivatives in a substep."""
 
     def __init__(self, names: Sequence[str], contacts: Sequence[Rough], pairs: Pairs):
         self.grid = pairs.grid
@@ -137,7 +134,7 @@ class ContactLaw:
         return state.updates[self.of, 0] * self._stiffness
 
     def touch(self, state: ContactState, at: Geometry) -> Touch:
-        """Return the forces of pairs with the geometry `at`, and the derivatives of these forces."""
+        """Return the forces of the pairs and the derivatives of these forces."""
         stiffness = self.stiffness(state)
         push = np.maximum(0.0, state.pressure[self.of] - stiffness * at.gap)
         # gaps within rounding count as contact, because light bodies penetrate less than 1e-8 cells
@@ -156,12 +153,7 @@ class ContactLaw:
     def _friction(
         self, state: ContactState, n: NDArray, slip: NDArray, old: NDArray, pressure: NDArray, on: NDArray
     ) -> tuple:
-        """Return the fields of `Touch` from `sticks` to `by_pressure`.
-
-        `n` (k, d): mean normal of the pairs of each condition.
-        `slip` (k, d), in m: mean slip of these pairs in the step.
-        `old` (k, d), in Pa: mean shear traction of these pairs before the step.
-        """
+        """Return the fields of `Touch` from `sticks` to `by_pressure`, from means over the pairs of each condition."""
         P = np.eye(n.shape[1]) - n[:, :, None] * n[:, None, :]
         hold = np.where(self.strength.any(axis=1), self._hold, 0.0) * on
         (mu, adhesion), slips = self.strength.T, state.slips
@@ -177,7 +169,7 @@ class ContactLaw:
         return ~slips & on, trial, shear, most, grip, by_pressure
 
     def tangent(self, touch: Touch, at: Geometry) -> scipy.sparse.csr_matrix:
-        """Return D (m d, m d), minus the derivative of forces by w.  The rotation of shear tractions is neglected."""
+        """Return the matrix D (m d, m d), minus the derivative of the contact forces with respect to w."""
         pairs = self.pairs
         d = self.grid.dim
         m = len(self.pairs.cell)
@@ -201,7 +193,7 @@ class ContactLaw:
         return (D + wide.T @ (grip @ wide + by_pressure @ (mean @ slope))).tocsr()
 
     def slope(self, touch: Touch, at: Geometry, v: NDArray, adjoint: bool = False) -> NDArray[np.float64]:
-        """Return `D v` (m, d) for v (m, d) and D of `tangent`.  `adjoint`: return `D^T v` instead."""
+        """Return the product `D v` of the matrix D of `tangent` with v (m, d), or `D^T v` if `adjoint`."""
         area, across = self.pairs.area[:, None], (touch.stiff * (at.n * v).sum(axis=1))[:, None]
         out = across * at.n
         if at.curvature is not None:
@@ -216,7 +208,10 @@ class ContactLaw:
         return area * out
 
     def choose(self, state: ContactState, touch: Touch, sticks: bool) -> tuple[ContactState, bool]:
-        """Update which conditions slip.  Return the state and whether any changed.  `sticks` allows return to stick."""
+        """Update which conditions slip, and return the new state and whether any condition changed.
+
+        `sticks`: whether slipping conditions may return to stick.
+        """
         before = state.slips
         left = ~before & ~touch.sticks & state.stuck.any(axis=1)
         parts = state.parts | (left & state.resticks)
@@ -233,10 +228,11 @@ class ContactLaw:
         return replace(state, slip=slip, resticks=resticks, parts=parts, stuck=stuck), changed
 
     def augmented(self, state: ContactState, touch: Touch, largest: Callable[[NDArray], NDArray]) -> ContactState:
-        """Return the state after an augmentation.  Raise NotConverged if there have been too many augmentations.
+        """Return the state after an augmentation, or raise NotConverged after too many augmentations.
 
-        lambda is set to the contact pressures in connected parts with too large penetrations.  `largest` is a function
-        of values (k,), which returns the largest value (k,) in the connected part of each condition.
+        Only connected parts of the bodies with too large penetrations are augmented.
+
+        `largest`: function that returns the largest of values (k,) in the connected part of each condition.
         """
         # small parts of faces in a cell cannot correct their penetration alone, but follow their neighbours
         x = self.pairs.x
@@ -283,8 +279,8 @@ class ContactLaw:
     def tractions(self, touch: Touch, at: Geometry) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the pressures (m,) and shear tractions (m, d), in Pa, of the pairs.
 
-        In stick, pairs keep their deviations from the cell's mean shear traction, because repeated averaging would
-        cause creep.
+        In stick, a pair keeps its deviation from the mean shear traction in its cell.  Repeated averaging would cause
+        creep.
         """
         off = (at.shear - self.mean(at.shear)[self.of]) * touch.sticks[self.of, None]
         return touch.push, touch.shear[self.of] + off

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Contacts between groups in a stage: pairs of opposite positions on their surfaces.
-
-`problem` has the contact equations.
-"""
+"""Contacts between groups in a stage: pairs of opposite positions on the surfaces of two groups."""
 
 from __future__ import annotations
 
@@ -42,17 +39,17 @@ REACH = 2.0
 CLEAR = 0.5
 """Gap, divided by the cell size, above which faces cannot touch before the next update of the pairs."""
 DEEP = 0.25
-"""Penetration, divided by the cell size, above which a position lies behind a thin body and is not paired."""
+"""Penetration, divided by the cell size, above which a position is taken to lie behind a thin body."""
 CANDIDATES = {2: 8, 3: 24}
-"""Number of nearest points on the other surface whose faces may contain the opposite position."""
+"""Number of nearest points on the surface of another group whose faces may contain the opposite position."""
 BESIDE = 0.6
-"""Distance from the other surface, divided by the cell size, below which domain corners follow the Q1 field alone."""
+"""Distance from another group, divided by the cell size, below which domain corners follow the Q1 field alone."""
 PLACES = 1 << 32
 """Upper bound of the number of quadrature points of a process on a surface."""
 
 
 class Facets(NamedTuple):
-    """Quadrature points of all processes on the faces of one group.  Arrays have a row for each of n points."""
+    """Quadrature points of all processes on the faces of one group."""
 
     x: NDArray[np.float64]  # position (n, d), m
     face: NDArray[np.int64]  # row of the face in its `Surface` (n,)
@@ -64,7 +61,7 @@ class Facets(NamedTuple):
 
 
 class Pairs(NamedTuple):
-    """Pairs of a point on one surface and the opposite position on the other surface.  Arrays have m rows."""
+    """Pairs of a point on one surface and the opposite position on another surface."""
 
     row: NDArray[np.int64]  # index of the point among the quadrature points of this process (m,)
     facet: NDArray[np.int64]  # index in `Facets` of a point on the opposite face (m,)
@@ -73,7 +70,7 @@ class Pairs(NamedTuple):
 
 
 class Contacts(Touching):
-    """The contacts between groups in a stage.  `setting` is the stage's data.  `contacts` has contacts by name."""
+    """The contacts between groups in a stage."""
 
     conditions, title = (Contact,), "contacts"
 
@@ -113,11 +110,7 @@ class Contacts(Touching):
         present: MaterialPoints,
         cell_pairs: Callable[[], NDArray[np.int64]],
     ) -> tuple[ContactLaw, Origin]:
-        """Return the contact law and the origin of pairs that were found for the points `seen`.
-
-        `points`: points at the start of the step, with the contact history.
-        `present`: points at their current positions.
-        """
+        """Return the contact law and the origin of pairs that were found for the points `seen`."""
         grid = self.grid
         d = self.grid.dim
         rows = []
@@ -164,14 +157,11 @@ class Contacts(Touching):
         )
 
     def _opposite_all(self, cut: CutDomains, points: MaterialPoints) -> list[tuple[Facets, Pairs]]:
-        """Return the facets and pairs of each contact, see `_opposite`."""
+        """Return the facets and pairs of each contact."""
         return [self._opposite(cut, own, other, points) for _, own, other, _ in self._faces]
 
     def _cells_within_reach(self, cut: CutDomains, found: Sequence[tuple[Facets, Pairs]]) -> NDArray[np.int64]:
-        """Return all pairs of cells (n,) that contact pairs may join in the step, as integers `first * cells + second`.
-
-        These are the pairs of cells of the initial contact pairs, and all pairs of neighbouring cells on both surfaces.
-        """
+        """Return all pairs of cells that contact pairs may join in the step, as integers `first * cells + second`."""
         grid = self.grid
         keys = []
         count = self.grid.all_cells
@@ -189,7 +179,7 @@ class Contacts(Touching):
         return np.unique(np.concatenate(keys))
 
     def _facets(self, cut: CutDomains, faces: Surface, points: MaterialPoints) -> Facets:
-        """Return the quadrature points of all processes on the faces, at the current positions of the points."""
+        """Return the quadrature points of all processes on the faces."""
         patches, d = cut.surface(faces), self.grid.dim
         index = FACES[d][faces.face[patches.face]]
         now, then = (
@@ -210,7 +200,7 @@ class Contacts(Touching):
     def _opposite(
         self, cut: CutDomains, faces: Surface, others: Surface, points: MaterialPoints
     ) -> tuple[Facets, Pairs]:
-        """Return the facets of the other group, and the pairs of points on `faces` with these facets."""
+        """Pair the points on `faces` with facets of the group of `others`, and return the facets and the pairs."""
         patches = cut.surface(faces)
         facets = self._facets(cut, others, points)
         d = self.grid.dim
@@ -236,17 +226,14 @@ class Contacts(Touching):
         return facets, Pairs(row[order], other[order], t[order], gap[order])
 
     def _under(self, facets: Facets, chosen: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the cells (n,) just inside the chosen facets at positions x (n, d).
-
-        If such a cell contains no quadrature point of the face, the cell of the facet's own point is returned instead.
-        """
+        """Return the cells just inside the chosen facets at positions x, or the cells of the facets' own points."""
         grid, inside = self.grid, x - NEAR * self.grid.least * facets.outward[chosen]
         number = grid.number(grid.index_from_base(inside)) + facets.cell[chosen] // grid.cells * grid.cells
         keys = np.unique(facets.face * grid.all_cells + facets.cell)
         return np.where(np.isin(facets.face[chosen] * grid.all_cells + number, keys), number, facets.cell[chosen])
 
     def near(self, cut: CutDomains, points: MaterialPoints, corners: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return which corners (n, 2^d, d) are near another group.  `points`: points at the start of the step."""
+        """Return which corners (n, 2^d, d) of domains are near another group; `points` are those before the step."""
         out, largest = np.zeros(corners.shape[:2], dtype=bool), BESIDE * self.grid.sizes_at(corners).max(axis=-1)
         largest = np.broadcast_to(largest, corners.shape[:2])
         for _, *pair, _ in self._faces:
@@ -258,17 +245,11 @@ class Contacts(Touching):
         return out
 
     def _sizes(self, x: NDArray[np.float64]) -> NDArray[np.float64] | float:
-        """Return the shortest edges (...) of the cells at positions x (..., d), in m.  Equal cells give one number."""
+        """Return the shortest edges of the cells at positions x, in m."""
         return self.grid.least if self.grid.even else self.grid.sizes_at(x).min(axis=-1)
 
     def check_end(self, cut: CutDomains, points: MaterialPoints, before: MaterialPoints) -> None:
-        """Raise an error if groups overlap after a step, or may have passed through each other in the step.
-
-        Raises
-        ------
-        NotConverged
-            The message gives the position.  A shorter step may succeed.
-        """
+        """Raise NotConverged if groups overlap after a step, or may have passed through each other in the step."""
         h, comm = self._sizes(before.corners), self.grid.comm
         moved = points.corners - before.corners
         low, high = (
@@ -287,7 +268,7 @@ class Contacts(Touching):
             raise ValueError(f"{message}, at the start t = {place.start:g} s, must be apart or touch")
 
     def _too_deep(self, cut: CutDomains, points: MaterialPoints) -> str:
-        """Return a message with depth and position of an overlap of groups, or "" without an overlap."""
+        """Return a message about an overlap of groups, or "" without an overlap."""
         h, comm = self.grid.least, self.grid.comm
         for number, faces, others, _ in self._faces:
             _, pairs = self._opposite(cut, faces, others, points)
@@ -300,10 +281,7 @@ class Contacts(Touching):
 
 
 class ContactLoads(ContactProblem):
-    """Contact loads between groups.  The contact pairs follow the motion of the bodies.
-
-    `cut` has the cut particle domains.  For the other parameters see `ContactProblem`.
-    """
+    """Contact loads between groups, with pairs that follow the motion of the bodies."""
 
     def __init__(self, contacts: Contacts, cut: CutDomains, law: ContactLaw, origin: Origin, again, cell_pairs):
         super().__init__(law, origin, again=again, cell_pairs=cell_pairs)
@@ -323,11 +301,7 @@ class ContactLoads(ContactProblem):
 
 
 def _ranks(setting: Setting) -> NDArray[np.int64]:
-    """Return the rank (points,) of the connected part of each point.  Parts are ranked by surface area, then by extent.
-
-    The order of two parts is therefore the same in all stages.  It does not depend on other parts, nor on the order of
-    the bodies.
-    """
+    """Return the rank of the connected part of each point, by surface area and extent, the same in all stages."""
     grid, bodies = setting.grid, setting.sides.bodies
     corners = np.concatenate([body.corners() for body in bodies])
     copy = np.asarray(grid.copy(np.arange(len(corners))))
@@ -343,21 +317,21 @@ def _ranks(setting: Setting) -> NDArray[np.int64]:
 
 
 def _turned(shear: NDArray[np.float64], n: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return shear tractions (m, d), rotated by the smallest angle into the planes with normals n (m, d)."""
+    """Return shear tractions, rotated by the smallest angle into the planes with normals n."""
     flat = shear - np.einsum("md,md->m", shear, n)[:, None] * n
     size = np.maximum(np.linalg.norm(flat, axis=1), TINY)
     return flat * (np.linalg.norm(shear, axis=1) / size)[:, None]
 
 
 def _on(corners: NDArray[np.float64], t: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the positions (m, d) at face coordinates t (m, 2) in [0, 1] on faces (m, 2^(d-1), d)."""
+    """Return the positions at face coordinates t in [0, 1] on faces."""
     if corners.shape[2] == 2:
         return corners[:, 0] + t[:, :1] * (corners[:, 1] - corners[:, 0])
     return np.einsum("mk,mkd->md", weights(t), corners)
 
 
 def _along(corners: NDArray, x: NDArray, n: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return face coordinates (m, 2), and distances (m,) from x, in m, where lines from x along n intersect faces."""
+    """Return where lines from x along n intersect faces: face coordinates, and distances from x in m."""
     if corners.shape[2] == 2:  # as in `Faces`, with unit width along a third axis
         corners = np.dstack([corners[:, BITS[:, 0]], np.broadcast_to(BITS[:, 1], (len(x), 4))])
         x, n = np.column_stack([x, np.full(len(x), 0.5)]), np.column_stack([n, np.zeros(len(x))])

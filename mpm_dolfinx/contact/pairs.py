@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Contact pairs: a quadrature point on a surface, and the opposite position on a tool or another group of bodies.
 
-The relative displacement of a pair is `w = B u`.  The columns of B belong to the nodes of the point's cell.  In pairs
-between groups, they also belong to the nodes of the cell on the other side.  A position on a tool moves with the tool.
+The displacement w of the point relative to the opposite position is `w = B u`, where u are the nodal displacements.
+The columns of B belong to the nodes of the point's cell.  In pairs between groups, they also belong to the nodes of the
+cell with the opposite position.  A position on a tool moves with the tool.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from mpm_dolfinx.contact.shapes import DISTANCE, Distance
 from mpm_dolfinx.contact.tool import Pose, Tool
 from mpm_dolfinx.forms.unknowns import Unknowns
 from mpm_dolfinx.grid.grid import Grid
-from mpm_dolfinx.parallel.exchange import Exchange, everywhere
+from mpm_dolfinx.parallel.exchange import Exchange, together
 
 
 class Geometry(NamedTuple):
@@ -54,18 +55,18 @@ class Pairs:
     def at(self, w: NDArray[np.float64], motion: NDArray[np.float64]) -> Geometry:
         """Return the geometry at the relative displacements w (m, d), in m.
 
-        `motion` (contacts,) are the displacements of tools, in m, that loads cause in the step.  With free tools, its
-        shape is (contacts, q), with displacements in m and rotations in rad.
+        `motion` (contacts,), in m: displacements of tools that loads cause in the step.  With free tools, its shape is
+        (contacts, q), with displacements in m and rotations in rad.
         """
         raise NotImplementedError
 
     @property
     def largest_coordinate(self) -> NDArray[np.float64] | float:
-        """Largest coordinates (m,), in m, from which the gaps of pairs are computed, or one value for all pairs."""
+        """Largest coordinates, in m, from which the gaps are computed, for the rounding errors of the gaps."""
         return self.grid.reach
 
     def other_side(self) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
-        """Return lexicographic cells (m,) of opposite positions and shape functions (m, 2^d), or None on tools."""
+        """Return the cells (m,) and shape functions (m, 2^d) at the opposite positions, or None with a tool."""
         return None
 
     def operator(self, unknowns: Unknowns) -> PETSc.Mat:
@@ -78,7 +79,7 @@ class Pairs:
 
 @dataclass(frozen=True, eq=False)
 class ToolPairs(Pairs):
-    """Contact pairs between tools and points on a surface.  Shear tractions are rotated with the tool."""
+    """Contact pairs between tools and points on a surface."""
 
     tools: Sequence[Tool]  # (contacts,)
     poses: Sequence[Pose]  # poses of tools at the end of the substep, without motion by loads in the step (contacts,)
@@ -113,19 +114,19 @@ class ToolPairs(Pairs):
                 if isinstance(solid, Distance):
                     _check_distance(tool, x[rows] + self.grid.base, gap[rows], n[rows], h)
 
-        everywhere(self.grid.comm, ask)
+        together(self.grid.comm, ask)
         return Geometry(gap, n, second, x - carried, x - middle, shear)
 
     @property
     def largest_coordinate(self) -> NDArray[np.float64]:
-        """See `Pairs`.  User functions are evaluated at true positions, which determine the rounding error."""
+        """See `Pairs`.  User functions are evaluated at true positions."""
         true = np.array([callable(tool.shape) for tool in self.tools])[self.number]
         return np.where(true, np.abs([self.grid.lower, self.grid.upper]).max(), self.grid.reach)
 
 
 @dataclass(frozen=True, eq=False)
 class FacePairs(Pairs):
-    """Contact pairs of points on the surface of one group with positions, along their normals, on another group."""
+    """Contact pairs of points on one group with positions on another group, along the normals of the points."""
 
     other: NDArray[np.int64]  # lexicographic cell of the other side (m,)
     y: NDArray[np.float64]  # opposite position in the undeformed grid (m, d), m
@@ -144,14 +145,14 @@ class FacePairs(Pairs):
 
 
 def shape_values_in(grid: Grid, cells: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return Q1 shape functions (m, 2^d) of lexicographic cells (m,) of any process at positions x (m, d), in m."""
+    """Return the Q1 shape functions (m, 2^d) of lexicographic cells (m,) at positions x (m, d), in m."""
     index = np.stack(np.unravel_index(cells % grid.cells, tuple(grid.shape)), axis=1)
     off = grid.in_cells(x) - index - 0.5
     return np.prod(0.5 + off[:, None] * grid.signs, axis=2)
 
 
 def on_owners(grid: Grid, cells: NDArray[np.int64]) -> NDArray[np.int32]:
-    """Return the local indices of lexicographic cells of any process, on the processes that own them."""
+    """Return the local indices of lexicographic cells, on the processes that own the cells."""
     return grid.locals[Exchange(grid.comm, grid.owner(cells)).send(cells)]
 
 
@@ -164,7 +165,7 @@ def at_nodes(
 ) -> PETSc.Mat:
     """Return the matrix (m d, unknowns) with entries `value` (m, 2^d) at the nodes of a cell, for each component.
 
-    `other` are lexicographic cells of any process.  With `other`, values (m, 2 * 2^d) include the nodes of these cells.
+    With a second lexicographic cell `other` (m,), `value` (m, 2 * 2^d) includes the nodes of this cell.
     """
     d = grid.dim
     numbers = unknowns.map.indices.reshape(-1, d)
@@ -182,7 +183,10 @@ def at_nodes(
 
 
 def petsc_matrix(rows: scipy.sparse.csr_matrix, columns: int, comm: MPI.Intracomm, own: bool = False) -> PETSc.Mat:
-    """Return the matrix with `rows` on this process and `columns` local columns.  `own`: column indices are local."""
+    """Return the PETSc matrix with `rows` on this process and `columns` local columns.
+
+    `own`: whether column indices are local.
+    """
     rows.sort_indices()  # PETSc requires it
     start = int(comm.exscan(columns) or 0) if own and comm.size > 1 else 0
     csr = [values.astype(PETSc.IntType) for values in (rows.indptr, rows.indices + start)]
@@ -192,7 +196,7 @@ def petsc_matrix(rows: scipy.sparse.csr_matrix, columns: int, comm: MPI.Intracom
 
 
 def _check_distance(tool: Tool, x: NDArray, gap: NDArray, n: NDArray, h: float) -> None:
-    """Raise an error if a user function is no signed distance near the tool, that is, if its slope there is not 1."""
+    """Raise an error if a user's function is no signed distance, because its slope near the tool is not 1."""
     size = np.linalg.norm(n, axis=1)
     wrong = np.flatnonzero((np.abs(gap) < h) & (np.abs(size - 1) > DISTANCE))
     if len(wrong):

@@ -4,8 +4,8 @@
 A pair consists of a quadrature point on a surface and the opposite position on a tool or another group (`pairs`).  The
 pairs have the relative displacements `w = B u` and the forces `f(w)`.  The nodal forces are `B^T f(w)`.  Forces on both
 bodies are therefore equal and opposite within rounding.  If both sides deform, the pairs are first determined at the
-start of the step.  After convergence, the pairs are updated at the new positions, and the step is solved again.  This
-is repeated until an update changes the gaps by less than `DEPTH` cells.
+start of the step.  After convergence, the pairs are updated at the new positions, and the step is solved again.  The
+updates end when gaps change by less than `DEPTH` cells.
 
 A load-controlled tool has one more unknown: its displacement a along the direction e of the load.  Let `f(w - a e)` be
 the forces on points.  Let D be minus the derivative of these forces with respect to w, and let `s = e . D e`.  Newton's
@@ -13,7 +13,8 @@ method solves `e . f = load` together with the equilibrium of the bodies, by
 
     da = (e . D dw + load - e . f) / s.
 
-Forces are therefore `f + (D e) (load - e . f) / s`.  Minus the derivative of these forces is `D - (D e) (e . D) / s`.
+The forces are therefore `f + (D e) (load - e . f) / s`.  Minus the derivative of these forces is
+`D - (D e) (e . D) / s`.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ FOLLOWS = 8  # largest number of updates of the pairs in a step
 
 @dataclass(frozen=True, eq=False)
 class Pushes:
-    """Prescribed loads on k load-controlled tools."""
+    """Prescribed loads on load-controlled tools."""
 
     names: Sequence[str]  # names of the tools, for error messages
     start: NDArray[np.float64]  # displacement that the load caused before the step (k,), m
@@ -57,10 +58,9 @@ class Pushes:
 
 @dataclass(frozen=True, eq=False)
 class LinearMotion:
-    """Linearised displacements of k load-controlled tools in the step, as functions of relative displacements w'.
+    """Displacements of load-controlled tools in a step, as a linear function of relative displacements w'.
 
-    The displacements are `motion + shift + sum slope . (w' - w)`.  The sum is over the pairs of a tool.  Newton's
-    method uses this linear function.
+    The displacements are `motion + shift + sum slope . (w' - w)`.  The sum is over the pairs of a tool.
     """
 
     w: NDArray[np.float64]  # relative displacements of the pairs (m, d), m
@@ -79,7 +79,7 @@ class Found(NamedTuple):
 
 
 class Current(NamedTuple):
-    """Contact law and material points of the current pairs, state of the iterations, and motions of tools."""
+    """Current contact pairs with their law, material points, state of the iterations, and tool motions."""
 
     law: ContactLaw
     origin: Origin
@@ -88,7 +88,7 @@ class Current(NamedTuple):
 
 
 class SubstepMotion(NamedTuple):
-    """Motion of tools in a substep: time weight `own` (s) of the substep, poses of tools, `Flight` of free tools."""
+    """Motion of tools in a substep."""
 
     own: float
     poses: Any
@@ -96,7 +96,7 @@ class SubstepMotion(NamedTuple):
 
 
 class Touching(Acting):
-    """Contact conditions of one kind in a stage.  `given` are the stage's tools or contacts between groups, by name."""
+    """Contact conditions of one kind in a stage: tools, or contacts between groups."""
 
     linear = False
 
@@ -107,7 +107,7 @@ class Touching(Acting):
         self.symmetric = not any(self._grips)
 
     def kept(self, n: int) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return zero histories of n points: pressures (n,) and, for contacts that resist slip, tractions (n, d)."""
+        """Return zero contact pressures of n points, and zero shear tractions for contacts that resist slip."""
         out = {name: {pressure_name(name): np.zeros(n)} for name in self.names}
         for name, grips in zip(self.names, self._grips, strict=True):
             out[name] |= {shear_name(name): np.zeros((n, self.grid.dim))} if grips else {}
@@ -129,8 +129,8 @@ class ContactProblem(Loads):
     pushes
         Prescribed loads on the tools.
     again
-        Function of displacements (a local array, in m).  It returns the law and the origin of the pairs that are found
-        at these displacements, see `FacePairs`.
+        Function of displacements (a local array, in m), which finds the pairs at these displacements.  It returns the
+        law and the origin of the pairs, see `FacePairs`.
     cell_pairs
         Function that returns all pairs of cells, as integers `first * cells + second`, that contact pairs may join.
     """
@@ -172,12 +172,12 @@ class ContactProblem(Loads):
 
     @property
     def _loaded(self) -> NDArray[np.int64]:
-        """Indices of the tools that loads move.  Each of these tools couples all nodes under it."""
+        """Indices of the tools that loads move."""
         return np.flatnonzero(~np.isnan(self.pushes.load)) if self.pushed else np.empty(0, dtype=np.int64)
 
     @cached_property
     def key(self) -> tuple[NDArray[np.int32], ...]:
-        """The cells under each tool that loads move.  These cells depend on the length of the step."""
+        """The cells under each tool that loads move."""
         return tuple(np.unique(self.pairs.cell[self.pairs.number == number]) for number in self._loaded)
 
     def joined(self, substeps: Sequence[ContactProblem]) -> ContactProblem:
@@ -196,7 +196,7 @@ class ContactProblem(Loads):
         return self._found((self.now, at.unknowns, at.u[at.unknowns.owned]), find, self.grid.comm)
 
     def _apart_by(self, law: ContactLaw, at: At) -> NDArray[np.float64]:
-        """Return the relative displacements w (m, d), in m, of the pairs of a law."""
+        """Return the relative displacements of the pairs of a law, in m."""
         B, w = self._B(law, at.unknowns)
         B.mult(at.unknowns.gather_owned(at.u[at.unknowns.owned]), w)
         return w.array_r.reshape(-1, self.grid.dim).copy()
@@ -229,7 +229,7 @@ class ContactProblem(Loads):
         B.multTransposeAdd(w, residual, residual)
 
     def pattern(self, unknowns: Unknowns) -> PETSc.Mat | None:
-        """Return a zero matrix with the entries that `coupling` may have outside the pattern of cells, or None."""
+        """Return a zero matrix with the entries that `coupling` adds to the pattern of cells, or None."""
         out = self._pattern_of_pairs(unknowns) if self._cell_pairs is not None else None
         for cells in self.key:
             B, own = at_nodes(self.grid, unknowns, cells, np.ones((len(cells), 2**self.grid.dim))), unknowns.vector()
@@ -259,7 +259,7 @@ class ContactProblem(Loads):
         return petsc_matrix(all_of, m * d, grid.comm, own=True).PtAP(B)
 
     def coupling(self, at: At) -> PETSc.Mat:
-        """Return minus the derivative of the forces at u."""
+        """Return minus the derivative of the contact forces at u."""
         collect_garbage(self.grid.comm)  # with friction in 3D, pairs in 12 cells fill 60 MB in each iteration
         where, touch, *_ = found = self.found(at)
         law = self.now.law
@@ -276,7 +276,7 @@ class ContactProblem(Loads):
         return K
 
     def _nodal(self, unknowns: Unknowns, values: NDArray[np.float64]) -> PETSc.Vec:
-        """Return `B^T v` for values v (m, d) at the pairs."""
+        """Return the nodal forces `B^T v` for values v at the pairs."""
         B, w = self._B(self.now.law, unknowns)
         w.array_w[:] = values.ravel()
         out = unknowns.vector()
@@ -284,10 +284,7 @@ class ContactProblem(Loads):
         return out
 
     def _motion(self, w: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the displacements of tools that loads cause at w (m, d), in m, from the last linearisation.
-
-        The shape is (tools,).  Before the first substep of free tools, it is (tools, q).
-        """
+        """Return the displacements of tools that loads cause, from the last linearisation."""
         if not self.pushed:
             return np.zeros(len(self.now.law.contacts)) if self.pushes is None else np.zeros_like(self.pushes.start)
         linear, h = self.now.linear, self.grid.least
@@ -297,7 +294,7 @@ class ContactProblem(Loads):
         return np.clip(linear.motion + linear.shift + more, -h, h)
 
     def _linearised(self, w: NDArray[np.float64], motion: NDArray[np.float64]) -> LinearMotion:
-        """Return displacements of tools, linearised about `motion` (tools,) and relative displacements w (m, d)."""
+        """Return the linearised displacements of the tools."""
         law, of = self.now.law, self.pairs.number
         at, touch, *_ = found = self._find_at(w, motion)
         _, slope, _ = self._reactions(found)
@@ -307,7 +304,7 @@ class ContactProblem(Loads):
         return LinearMotion(w, motion, shift, by[of, None] * slope)
 
     def _reactions(self, found: Found) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Return three arrays (tools,) of reactions along loads: values (N), derivatives (N/m), rounding errors (N)."""
+        """Return the reactions of tools along their loads, with their derivatives and rounding errors."""
         law, e = self.now.law, self.pushes.direction[self.pairs.number]
         slope = law.slope(found.touch, found.at, e)
         both = (e * found.touch.force).sum(axis=1), (e * slope).sum(axis=1)
@@ -316,7 +313,7 @@ class ContactProblem(Loads):
         return reaction, slope, law.by_contact(off[:, None])[:, 0]
 
     def _seek(self, found: Found) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Return displacements (tools,), in m, at which one point would bear the load, and which tools touch bodies."""
+        """Return the displacements of tools at which one point would bear the load, and which tools touch bodies."""
         law, state = self.now.law, self.now.state
         of = self.pairs.number
         along, k = (found.at.n * self.pushes.direction[of]).sum(axis=1), law.stiffness(state)
@@ -329,7 +326,7 @@ class ContactProblem(Loads):
         return over_all(self.grid.comm, nearest, MPI.MIN), touches
 
     def _shift(self, found: Found) -> NDArray[np.float64]:
-        """Return the Newton increments (tools,), in m, of the tool displacements that bring reactions to the loads."""
+        """Return the Newton increments of tool displacements that bring reactions to the loads."""
         reaction, slope, _ = self._reactions(found)
         off = np.nan_to_num(self.pushes.load - reaction)
         far, touches = self._seek(found)
@@ -337,7 +334,7 @@ class ContactProblem(Loads):
         return np.divide(off, slope, out=seeks, where=slope > 0)
 
     def _begins(self) -> NDArray[np.float64]:
-        """Return guesses (tools,), in m, of tool displacements.  Tools move at most until a point bears the load."""
+        """Return guesses of tool displacements.  Tools move at most until a point bears the load."""
         motion = np.zeros(len(self.now.law.contacts))
         still = np.zeros_like(self.pairs.x)
         h = self.grid.least
@@ -349,7 +346,7 @@ class ContactProblem(Loads):
         return motion
 
     def settle(self, at: At, sticks: bool) -> bool:
-        """See `Loads`.  Conditions change between stick and slip; there is one for each contact and cell."""
+        """See `Loads`.  Each condition, one for each contact and cell, may change between stick and slip."""
         changed, w = False, self._apart_by(self.now.law, at) if self.pushed else None
         motion = self.found(at).motion
         if self.now.law.grips:
@@ -360,9 +357,9 @@ class ContactProblem(Loads):
         return changed
 
     def augment(self, at: At) -> bool:
-        """Augment the pressures if mean penetrations at u are too large.  Return whether contact forces changed.
+        """Augment the contact pressures if mean penetrations are too large, and return whether contact forces changed.
 
-        If penetrations are small enough, move tools whose reaction differs from the load.
+        If penetrations are small enough, tools whose reaction differs from the load are moved.
         """
         found = self.found(at)
         law, state = self.now.law, self.now.state
@@ -390,7 +387,7 @@ class ContactProblem(Loads):
         return True
 
     def follow(self, at: At) -> bool:
-        """Update the pairs at u.  Return whether the update changes the equilibrium."""
+        """Update the pairs at u, and return whether the update changes the equilibrium."""
         if self._again is None:
             return False
         new, late = self._continued(Current(*self._again(at.u), self.now.state), at)
@@ -405,10 +402,7 @@ class ContactProblem(Loads):
         return bool(late.any())
 
     def _continued(self, new: Current, at: At) -> tuple[Current, NDArray[np.bool_]]:
-        """Return the contact with pairs found at u, and in which parts (parts,) gaps change by more than `DEPTH` cells.
-
-        Pairs that are open before and after the update are ignored.  Parts after `FOLLOWS` updates are also ignored.
-        """
+        """Return the contact with updated pairs, and in which parts of the bodies gaps change by more than `DEPTH`."""
         found = self.found(at)
         law, state = self.now.law, self.now.state
         pairs = new.law.pairs
@@ -441,10 +435,10 @@ class ContactProblem(Loads):
         return origin.means(contacts, points, *law.tractions(found.touch, found.at))
 
     def rubbing(self, at: At, v: NDArray[np.float64]) -> tuple[float, float]:
-        """See `Loads`.  Only tools do external work.  Work of elastic slip counts as dissipation.
+        """See `Loads`.  Only tools do external work.  The work of elastic slip counts as dissipation.
 
-        This part of the dissipation is negative on unloading.  Work of contact pressures does not count as dissipation,
-        because velocities of substeps jump where a gap closes.
+        This dissipation is negative on unloading.  The work of contact pressures does not count as dissipation, because
+        velocities of substeps jump where a gap closes.
         """
         law = self.now.law
         found = self.found(at)
@@ -458,11 +452,11 @@ class ContactProblem(Loads):
         return -float((shear * (moves - tool)).sum()), more
 
     def tool_velocity(self, at: At) -> NDArray[np.float64] | float:
-        """Return the velocities (m, d), in m/s, of contact positions on tools, or zero if both sides deform."""
+        """Return the velocities (m, d), in m/s, of contact positions on tools, or zero between groups."""
         return 0.0
 
     def outcome(self, at: At) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """See `Loads`.  Results are forces (N) and moments (N m) on bodies, and displacements of tools by loads (m).
+        """See `Loads`.  Results are forces (N) and moments (N m) on bodies, and tool displacements (m) due to loads.
 
         The forces and moments of each contact are one array: (3,), or (6,) in 3D.
         """
@@ -497,14 +491,14 @@ class ContactProblem(Loads):
 
     @property
     def rounding_beside(self) -> float:
-        """Rounding error, in N, of forces in the cells on the other side of pairs, if this side deforms."""
+        """Rounding error, in N, of forces in the cells with the opposite positions."""
         if self.pairs.other_side() is None:
             return 0.0
         return over_all(self.grid.comm, float(self.now.law.rounding(self.now.state).max(initial=0.0)), MPI.MAX)
 
 
 def _merged(both: Sequence[Any], kept: Sequence[NDArray[np.bool_]], order: NDArray[np.int64]) -> Any:
-    """Merge two `Pairs` or two `ContactState`.  The result has the rows flagged in `kept`, in the order `order`."""
+    """Merge the flagged rows of two `Pairs` or two `ContactState` in a given order."""
     names = (f.name for f in fields(both[1]) if f.name != "grid")
     columns = {name: [getattr(of, name)[rows] for of, rows in zip(both, kept, strict=True)] for name in names}
     return replace(both[1], **{name: np.concatenate(rows)[order] for name, rows in columns.items()})

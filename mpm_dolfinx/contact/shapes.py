@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Shapes of rigid tools in their initial position.  They return signed distances, in m, positive outside the tool."""
+"""Shapes of rigid tools in their initial position, as signed distances in m that are positive outside the tool."""
 
 from __future__ import annotations
 
@@ -38,14 +38,14 @@ def _flat(y: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _across(offset: NDArray[np.float64]) -> tuple[NDArray, NDArray, NDArray]:
-    """Return the lengths (n,), in m, of vectors (n, d), their directions, and second derivatives of lengths, in 1/m."""
+    """Return the lengths of vectors, their directions, and the second derivatives of the lengths."""
     r = np.maximum(np.linalg.norm(offset, axis=1), TINY)
     e = offset / r[:, None]
     return r, e, (np.eye(offset.shape[1]) - e[:, :, None] * e[:, None, :]) / r[:, None, None]
 
 
 class Uniform(NamedTuple):
-    """Uniform solid in 2D: centroid (d,), in m, and squared radius of gyration about the centroid, in m^2."""
+    """Centroid and squared radius of gyration of a uniform solid in 2D."""
 
     centroid: NDArray[np.float64]
     gyration: float
@@ -61,7 +61,7 @@ def unit_vector(name: str, value: ArrayLike) -> NDArray[np.float64]:
 
 
 class Placed:
-    """Base class of shapes.  The first field of each shape is a position (d,), or positions (n, d), in m."""
+    """Base class of shapes whose first field is a position or several positions."""
 
     @property
     def dim(self) -> int:
@@ -88,7 +88,7 @@ class HalfSpace(Placed):
     point : (d,), m
         A position on the plane.
     outward : (d,)
-        Normal of the plane, of any length, pointing out of the tool towards the bodies.
+        Normal of the plane, of any length.  It points out of the tool towards the bodies.
     """
 
     point: ArrayLike
@@ -167,7 +167,7 @@ class Convex(Placed):
             what = f"Convex: corners = {line(self.corners)}"
         else:
             try:
-                assert len(self._planes)
+                _ = self._planes
             except QhullError:
                 what = f"Convex: corners = {line(self.corners)} lie in one line or plane"
         if what:
@@ -187,7 +187,7 @@ class Convex(Placed):
         return self._each(y).max(axis=1)
 
     def normal(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the gradients (n, d) of the distance.  At equal distances from planes, return their mean normal."""
+        """Return the gradients (n, d) of the distance.  Where planes are equally near, return their mean normal."""
         each = self._each(y)
         near = each >= each.max(axis=1, keepdims=True) - ROUNDED * np.abs(each).max(axis=1, keepdims=True)
         return near @ self._planes[:, :-1] / near.sum(axis=1, keepdims=True)
@@ -198,7 +198,7 @@ class Convex(Placed):
 
 
 def uniform(shape: Ball | Convex) -> Uniform:
-    """Return the centroid and squared radius of gyration of a disc, or of a polygon divided into triangles."""
+    """Return the centroid and the squared radius of gyration of a disc or polygon."""
     if isinstance(shape, Ball):
         return Uniform(np.array(shape.centre, dtype=float), shape.radius**2 / 2)
     hull = ConvexHull(np.asarray(shape.corners, dtype=float))
@@ -238,7 +238,7 @@ class Cone(Placed):
         return unit_vector("Cone: axis", self.axis)
 
     def _polar(self, y: NDArray[np.float64]) -> tuple:
-        """Return heights (n,) above the tip, in m, and the results of `_across` for the offsets from the axis."""
+        """Return the heights above the tip, in m, and the results of `_across` for the offsets from the axis."""
         z = (y - self.tip) @ self._axis
         return z, *_across(y - self.tip - z[:, None] * self._axis)
 
@@ -266,10 +266,10 @@ class Cone(Placed):
 
 @dataclass(frozen=True, eq=False)
 class Distance:
-    """A shape given by a user's signed distance function.  Derivatives are finite differences.
+    """A shape given by a user's signed distance function.
 
-    The function is evaluated at true positions, not at positions relative to the base of the grid.  Increments are
-    powers of two, because adding a power of two to a position causes almost no rounding error.
+    The function is evaluated at true positions, not at positions relative to the base of the grid.  Derivatives are
+    finite differences over powers of two, because adding a power of two to a position causes almost no rounding error.
     """
 
     function: Callable[[NDArray[np.float64]], ArrayLike]  # signed distance, m
@@ -281,7 +281,7 @@ class Distance:
         return self._at(y + self.base)
 
     def _at(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the signed distances (n,), in m, at true positions y."""
+        """Return the signed distances at true positions, in m."""
         if not len(y):  # user functions may fail for no positions
             return np.zeros(0)
         allowed = f"a finite number for each of {len(y)} places (m, {y.shape[1]})"
@@ -293,7 +293,7 @@ class Distance:
         return self._slopes(y + self.base, _power_of_two(CENTRAL * self.size))
 
     def _slopes(self, y: NDArray[np.float64], step: float) -> NDArray[np.float64]:
-        """Return the gradients (n, d) of the distance at true positions y, by central differences over `step`, in m."""
+        """Return the gradients of the distance at true positions, by central differences."""
         slopes = [(self._at(y + e) - self._at(y - e)) / (2 * step) for e in step * np.eye(y.shape[1])]
         return np.stack(slopes, axis=1)
 

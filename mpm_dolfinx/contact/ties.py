@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Tied sides: two opposite sides of a box have equal displacements, as if the ground repeated itself beyond the box.
 
-The penalty energy `k/2 int (u_one - u_other)^2 dA` resists differences of the displacements at equal heights.
-Displacements are measured from the seeded positions, so errors do not accumulate.  Forces on both sides are equal and
-opposite.
+The energy `k/2 int (u_one - u_other)^2 dA` resists differences between the displacements u_one and u_other of both
+sides at equal heights.  The penalty stiffness is k.  Displacements are measured from the seeded positions, so errors do
+not accumulate.  Forces on both sides are equal and opposite.
 """
 
 from __future__ import annotations
@@ -34,8 +34,9 @@ from mpm_dolfinx.grid.grid import Grid
 class Tie:
     """Two opposite tied sides, and their pairs of faces at equal heights.
 
-    For each face of one side, `partner` (n,) is the index of the opposite face, and `offset` (n, d), in m, is the
-    vector to the opposite face.  `axis` is the axis normal to the sides.
+    `partner` (n,): index of the opposite face of each face of one side.
+    `offset` (n, d), in m: vector to the opposite face.
+    `axis`: axis normal to the sides.
     """
 
     def __init__(self, tied: Tied, one: Surface, other: Surface):
@@ -134,7 +135,7 @@ class TieLoads(Loads):
         self._operator: Latest[PETSc.Mat] = Latest()
 
     def _B(self, unknowns: Unknowns) -> PETSc.Mat:
-        """Return the matrix B, which maps the unknowns to differences of displacements (m d,), in m."""
+        """Return the matrix B, which maps the unknowns to differences of displacements."""
         return self._operator((unknowns,), lambda: self._difference(unknowns), self._grid.comm)
 
     def push(self, at: At, residual: PETSc.Vec, on: Unknowns) -> None:

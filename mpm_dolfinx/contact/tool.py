@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Rigid tools in contact with the bodies: shape, strength of the contact, prescribed motion and loads."""
+"""Rigid tools in contact with the bodies: their shape, contact strength, prescribed motion and loads."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ ONTO = 100  # largest number of projections onto the surface
 
 
 class Pose(NamedTuple):
-    """Pose of a tool: rotation R (d, d) about `centre` (d,), then translation by `shift` (d,), both in m."""
+    """Pose of a tool: a rotation about `centre` (d,), in m, followed by a translation."""
 
     R: NDArray[np.float64]
     centre: NDArray[np.float64]
     shift: NDArray[np.float64]
 
     def own(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return positions x (m, d) in the frame of the tool, in which the tool is in its initial position."""
+        """Return positions in the frame of the tool, in which the tool is in its initial position."""
         y = x - self.shift
         return y + (y - self.centre) @ (self.R - np.eye(len(self.R)))  # exact without rotation
 
@@ -35,7 +35,7 @@ class Pose(NamedTuple):
         return y + self.shift + (y - self.centre) @ (self.R - np.eye(len(self.R))).T
 
     def moved(self, by_forces: NDArray[np.float64]) -> Pose:
-        """Return the pose after a motion `by_forces`: displacement (d,), in m, and possibly rotation, in rad."""
+        """Return the pose after a further motion: displacement (d,), in m, and possibly rotation, in rad."""
         d = len(self.R)
         R = rotation(by_forces[d]) @ self.R if by_forces[d:].any() else self.R
         return Pose(R, self.centre, self.shift + by_forces[:d])
@@ -47,7 +47,7 @@ def rotation(angle: float) -> NDArray[np.float64]:
 
 
 def motion_by_forces(outcome: Mapping[str, Mapping[str, NDArray]], name: str) -> NDArray[np.float64]:
-    """Return the motion of a tool due to forces from an outcome: displacement, in m, and possibly rotation, in rad."""
+    """Return the displacement, in m, and possibly the rotation, in rad, of a tool due to forces."""
     angle = outcome.get("tool_rotation", {})
     by_forces = outcome["tool_travel"][name]
     return np.append(by_forces, angle[name]) if name in angle else by_forces
@@ -97,8 +97,8 @@ class Tool:
     spin
         Initial angular velocity of a free tool, rad/s, counterclockwise.
     name
-        Name of the tool in results; by default "tool".  The field NAME_pressure of points is the contact pressure.
-        In a later stage, a tool of equal name takes over this pressure.
+        Name of the tool in results; by default "tool".  The field NAME_pressure of points is the contact pressure.  In
+        a later stage, a tool of equal name takes over this pressure.
 
     Raises
     ------
@@ -147,7 +147,7 @@ class Tool:
             self.pushes(0.0)
 
     def _check_free(self) -> None:
-        """Raise an error for an invalid mass, and for other invalid arguments of a free tool."""
+        """Raise an error for an invalid mass, or other invalid arguments of a free tool."""
         if self.mass is None:
             of_free = {"velocity": self.velocity is None, "moment": self.moment is None, "spin": self.spin == 0}
             for name in [name for name, absent in of_free.items() if not absent][:1]:
@@ -182,11 +182,11 @@ class Tool:
         return np.eye(dim) if self.direction is None else np.outer(along, along)
 
     def _uniform(self, dim: int) -> Uniform | None:
-        """Return the centroid and the squared radius of gyration of a free disc or polygon, or None for other tools."""
+        """Return the centroid and squared radius of gyration of a free disc or polygon, or None."""
         return uniform(self.shape) if self.free and dim == 2 and isinstance(self.shape, (Ball, Convex)) else None
 
     def inertia(self, dim: int) -> float:
-        """Return the moment of inertia about the centre, in kg m^2.  It is infinite for a tool that does not rotate."""
+        """Return the moment of inertia about the centre, in kg m^2, or infinity for a tool that does not rotate."""
         if self.moment is not None:
             return float(self.moment)
         of = self._uniform(dim)
@@ -197,7 +197,7 @@ class Tool:
         return self.free and np.isfinite(self.inertia(dim))
 
     def pushes(self, t: float) -> float:
-        """Return the load at time t (s), in N, or nan without a load."""
+        """Return the load at time t (s), in N, or nan for a tool without a load."""
         if self.load is None:
             return np.nan
         value = float(self._given("load", t))
@@ -206,7 +206,7 @@ class Tool:
         return value
 
     def _given(self, name: str, t: float, dim: int = 0) -> NDArray[np.float64]:
-        """Return the value of an attribute at time t (s).  It is a number, or with `dim` > 0 possibly a vector (d,)."""
+        """Return the value of an attribute at time t, in s: a number, or possibly a vector if `dim` > 0."""
         return given(f"{line(self)}: {name} at t = {t:g} s", getattr(self, name), t, None, dim)
 
     def along(self, dim: int) -> NDArray[np.float64]:
@@ -273,8 +273,8 @@ class Tool:
     def pose(self, t: float, dim: int, by_forces: NDArray[np.float64] | float = 0.0) -> Pose:
         """Return the pose at time t (s).
 
-        `by_forces` is the displacement that the load causes, in m.  For a free tool, it is a vector of displacement
-        (d,), in m, and possibly rotation, in rad.
+        `by_forces`, in m: displacement that the load causes.  For a free tool, it is a vector of the displacement (d,),
+        in m, and possibly the rotation, in rad.
         """
         shift = self._given("displacement", t, dim)
         if shift.ndim == 0 and shift:

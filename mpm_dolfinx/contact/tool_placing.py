@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Tools of a stage: their poses, the contact pairs in a step, and checks for penetration.
-
-`problem` has the contact equations.
-"""
+"""Tools of a stage: their poses, the contact pairs in a step, and checks for penetration."""
 
 from __future__ import annotations
 
@@ -28,7 +25,7 @@ from mpm_dolfinx.contact.law import ContactLaw
 from mpm_dolfinx.contact.pairs import ToolPairs
 from mpm_dolfinx.contact.problem import ContactProblem, Pushes, SubstepMotion, Touching
 from mpm_dolfinx.contact.tool import Pose, Tool, rotation
-from mpm_dolfinx.parallel.exchange import Exchange, everywhere, first, over_all
+from mpm_dolfinx.parallel.exchange import Exchange, first, over_all, together
 from mpm_dolfinx.points.material_points import MaterialPoints, middle
 
 BEGINS = 1e-2  # allowed penetration into a body at the start, and into prescribed sides, divided by the cell size
@@ -39,17 +36,17 @@ FACING = 0.5  # smallest cosine between the normal of a face that faces the tool
 
 
 def _box(x: NDArray[np.float64]) -> list[tuple[NDArray[np.float64], MPI.Op]]:
-    """Return both corners (d,) of the box around x (n, d), each with the MPI operation that combines processes."""
+    """Return both corners of the box around x, each with the MPI operation that combines processes."""
     return [(x.min(axis=0, initial=np.inf), MPI.MIN), (x.max(axis=0, initial=-np.inf), MPI.MAX)]
 
 
 def motion_count(dim: int) -> int:
-    """Return the number q of motions of a free tool: d displacements, and in 2D a rotation."""
+    """Return the number of motions of a free tool: d displacements, and in 2D a rotation."""
     return dim + (dim == 2)
 
 
 class LoadMotion(NamedTuple):
-    """Displacements (k,), in m, by loads of k tools in a step.  With free tools: motions (k, q), in m and rad."""
+    """Displacements of tools that loads cause in a step.  Free tools also have rotations."""
 
     start: float  # start of the step, s
     end: float  # end of the step, s
@@ -57,13 +54,13 @@ class LoadMotion(NamedTuple):
     after: NDArray[np.float64]  # displacements at the end (k,), m
 
     def at(self, t: float) -> NDArray[np.float64]:
-        """Return the displacements at time t in the step (s), by linear interpolation."""
+        """Return the displacements at time t (s), by linear interpolation in the step."""
         share = (t - self.start) / (self.end - self.start) if self.end > self.start else 1.0
         return self.before + share * (self.after - self.before)
 
 
 class Tools(Touching):
-    """The tools of a stage, with their motion in a step.  `setting` is the stage's data.  `tools` has tools by name."""
+    """The tools of a stage, with their motion in a step."""
 
     conditions, title = (Tool,), "tools"
 
@@ -99,7 +96,7 @@ class Tools(Touching):
 
     @property
     def masses(self) -> NDArray[np.float64]:
-        """Masses (kg) and moments of inertia (kg m^2) of free tools, as an array (tools, q).  Other tools have 0."""
+        """Masses (kg) and moments of inertia (kg m^2) of free tools, as an array (tools, q), zero for other tools."""
         d = self.grid.dim
         out = np.array([np.full(motion_count(d), float(tool.mass or 0)) for tool in self.tools])
         for row, tool in zip(out, self.tools, strict=True):
@@ -109,7 +106,7 @@ class Tools(Touching):
 
     @property
     def guides(self) -> NDArray[np.float64]:
-        """Projections (tools, q, q) onto the motions that free tools can perform, in axisymmetry along the axis."""
+        """Projections (tools, q, q) onto the motions that free tools can perform."""
         d = self.grid.dim
         out = np.zeros((len(self.tools), motion_count(d), motion_count(d)))
         out[:, d:, d:] = np.reshape(self.turning, (-1, 1, 1))
@@ -130,7 +127,7 @@ class Tools(Touching):
         return out
 
     def going(self, by_loads: LoadMotion, end: float | None = None) -> Tools:
-        """Return the tools with the motion that loads cause in a step.  `end` (s): end of a step with inertia."""
+        """Return the tools with the motion that loads cause in a step."""
         tools = copy(self)
         tools.by_loads, tools._end = by_loads, end
         return tools
@@ -140,11 +137,7 @@ class Tools(Touching):
         return self._pose(self.tools[number], t)
 
     def _posed(self, tool: Tool, start: float, t: float) -> Pose:
-        """Return the pose of a tool at time t (s), the end of a substep.
-
-        With inertia, `in_step` corrects a prescribed pose after the first of two substeps.  Velocities are then
-        second-order accurate.
-        """
+        """Return the pose of a tool at the end of a substep, corrected for second-order velocities with inertia."""
         pose = self._pose(tool, t)
         if self._end is None or not start < t < self._end or tool.free:
             return pose
@@ -158,7 +151,7 @@ class Tools(Touching):
         return pose._replace(shift=shift, R=rotation(angle) @ before.R)
 
     def _pose(self, tool: Tool, t: float) -> Pose:
-        """Return the pose of a tool at time t (s).  Raise ValueError for motions that axisymmetry excludes."""
+        """Return the pose of a tool at time t, or raise ValueError for motions that axisymmetry excludes."""
         pose = tool.pose(t, self.grid.dim, self.by_loads.at(t)[self.tools.index(tool)])
         if self.grid.axisymmetric and (pose.shift[0] or pose.R[0, 1]):
             what = f"moves by {pose.shift}{' and rotates' * bool(pose.R[0, 1])} at t = {t:g} s"
@@ -179,13 +172,13 @@ class Tools(Touching):
         return out
 
     def _before(self, place: Place) -> NDArray[np.float64]:
-        """Return displacements (tools,), in m, by loads before a step.  With free tools, return motions (tools, q)."""
+        """Return the displacements of tools due to loads before a step, with rotations of free tools."""
         if self.free:
             return self._of_free(place.before, "tool_travel", "tool_rotation")
         return np.array([place.before["tool_travel"][name] for name in self.names], dtype=float)
 
     def _of_free(self, before: Outcome, along: str, around: str) -> NDArray[np.float64]:
-        """Return the displacements and rotations (tools, q) of free tools, or their rates.  Other tools have zeros."""
+        """Return the displacements and rotations of free tools, or the rates of both."""
         d = self.grid.dim
         out = np.zeros((len(self.names), motion_count(d)))
         for row, name in zip(out, self.names, strict=True):
@@ -194,7 +187,7 @@ class Tools(Touching):
         return out
 
     def placed(self, place: Place) -> Loads:
-        """Return the contact loads of tools in a substep.  Without inertia, free tools keep their position."""
+        """Return the contact loads of tools in a substep."""
         before = self._before(place)
         tools = self.going(LoadMotion(place.start, place.t, before, before), place.start + place.dt * place.inertia)
         if not (self.free and place.inertia):  # an initial stress is balanced without inertia
@@ -217,9 +210,7 @@ class Tools(Touching):
         loads = [tool.pushes(t) if t > start and not tool.free else np.nan for tool in self.tools]
         for number, (tool, pose) in enumerate(zip(self.tools, poses, strict=True)):
             before = self._pose(tool, start)
-            n = everywhere(
-                grid.comm, lambda tool=tool, pose=pose: tool.solid(grid.least).normal(pose.own(x)) @ pose.R.T
-            )
+            n = together(grid.comm, lambda tool=tool, pose=pose: tool.solid(grid.least).normal(pose.own(x)) @ pose.R.T)
             faces = free & (np.einsum("md,md->m", area, n) < -FACING * size * np.linalg.norm(n, axis=1))
             at = np.flatnonzero(faces)[~self._edge(tool, pose, x, area / np.maximum(size, TINY)[:, None], faces)]
             old = points.data[shear_name(self.names[number])][patches.at[at]] if tool.grips else np.zeros((len(at), d))
@@ -244,13 +235,8 @@ class Tools(Touching):
     ) -> NDArray[np.bool_]:
         """Return which positions that face a tool lie within half a cell of an edge of the tool.
 
-        Edges beyond which the body ends are ignored.  The last loaded node also represents half a cell outside the
-        edge.  Half a cell inside the edge has therefore no contact.  A tool narrower than a cell keeps its whole
-        contact.
-
-        `x` (n, d), in m: positions on the surface.
-        `unit` (n, d): outward unit normals at these positions.
-        `faces` (n,): whether the surface at each position faces the tool.
+        The last loaded node also represents half a cell outside the edge, so half a cell inside has no contact.  Edges
+        beyond which the body ends are ignored.  A tool narrower than a cell keeps its whole contact.
         """
         grid, (y, n) = self.grid, (x[faces], unit[faces])
         h = grid.sizes_at(y)
@@ -258,7 +244,7 @@ class Tools(Touching):
         for axis, e in enumerate(np.eye(grid.dim)):
             for half in (-0.5 * h, 0.5 * h):
                 shifted = pose.own(y + half * (e - n[:, [axis]] * n))
-                to = everywhere(grid.comm, lambda shifted=shifted: tool.solid(grid.least).normal(shifted) @ pose.R.T)
+                to = together(grid.comm, lambda shifted=shifted: tool.solid(grid.least).normal(shifted) @ pose.R.T)
                 edge |= np.einsum("md,md->m", n, to) >= -FACING
         if not over_all(grid.comm, int(edge.sum())):
             return edge
@@ -338,18 +324,18 @@ class Tools(Touching):
             gap += LEFT * h
             at = (gap < 0) & (gap > -most * h)
             own = pose.own(out[at])
-            n = everywhere(self.grid.comm, lambda tool=tool, own=own: tool.solid(h).normal(own))
+            n = together(self.grid.comm, lambda tool=tool, own=own: tool.solid(h).normal(own))
             out[at] -= free[at] * (gap[at, None] * n @ pose.R.T)
         return out
 
     def _gaps(self, tool: Tool, corners: NDArray[np.float64], t: float) -> NDArray[np.float64]:
-        """Return the distances (n, 2^d), in m, of corners (n, 2^d, d) from a tool at time t (s)."""
+        """Return the distances of corners from a tool at time t, in m."""
         own = self._pose(tool, t).own(corners.reshape(-1, self.grid.dim))
-        gap = everywhere(self.grid.comm, lambda: tool.solid(self.grid.least).distance(own))
+        gap = together(self.grid.comm, lambda: tool.solid(self.grid.least).distance(own))
         return gap.reshape(corners.shape[:2])
 
     def _passed(self, tool: Tool, x: tuple[NDArray[np.float64], ...], times: tuple[float, ...]) -> str:
-        """Return, as text, a position whose path between two times (s) crosses a tool, or "" without a crossing.
+        """Return, as text, a position whose path between two times crosses a tool, or "" without a crossing.
 
         Straight paths from x[0] to x[1] are searched in steps of the distance to the tool (sphere tracing: Hart 1996).
         """
@@ -359,15 +345,15 @@ class Tools(Touching):
         done = np.zeros(len(y))
         on = np.arange(len(y))
         along = (end - y) / np.maximum(length, TINY)[:, None]
-        inside = everywhere(self.grid.comm, lambda: (tool.solid(h).distance(y) < 0) | (tool.solid(h).distance(end) < 0))
-        a, b = everywhere(self.grid.comm, lambda: (tool.solid(h).normal(y[inside]), tool.solid(h).normal(end[inside])))
+        inside = together(self.grid.comm, lambda: (tool.solid(h).distance(y) < 0) | (tool.solid(h).distance(end) < 0))
+        a, b = together(self.grid.comm, lambda: (tool.solid(h).normal(y[inside]), tool.solid(h).normal(end[inside])))
         crossed = x[1][inside][np.einsum("nd,nd->n", a, b) < 0][:1]  # inside, and the nearest side has changed
         if where := first(comm, "".join(np.array2string(place, precision=6) for place in crossed + self.grid.base)):
             return where
         on = on[~inside]
         while over_all(comm, len(on)):
             at = y[on] + done[on, None] * along[on]
-            gap = everywhere(self.grid.comm, lambda at=at: tool.solid(h).distance(at))
+            gap = together(self.grid.comm, lambda at=at: tool.solid(h).distance(at))
             inside = x[1][on[gap < -LEFT * h]][:1]  # the middles of thin domains slide along round tools
             if where := first(comm, "".join(np.array2string(place, precision=6) for place in inside + self.grid.base)):
                 return where
@@ -376,9 +362,9 @@ class Tools(Touching):
         return ""
 
     def _deepest(self, tool: Tool, x: NDArray[np.float64], t: float) -> tuple[float, str]:
-        """Return the largest penetration of positions x (m, d) into a tool, in cell sizes, and the position as text."""
+        """Return the largest penetration of positions x into a tool, in cell sizes, and the position as text."""
         h, pose = self.grid.least, self._pose(tool, t)
-        gap = everywhere(self.grid.comm, lambda: tool.solid(h).distance(pose.own(x)))
+        gap = together(self.grid.comm, lambda: tool.solid(h).distance(pose.own(x)))
         deepest = over_all(self.grid.comm, float(gap.min(initial=np.inf)), MPI.MIN)
         place = (
             np.array2string(x[gap.argmin()] + self.grid.base, precision=6) if len(gap) and gap.min() == deepest else ""
@@ -387,7 +373,7 @@ class Tools(Touching):
 
 
 class ToolLoads(ContactProblem):
-    """Contact loads of tools in a substep.  `tools` has their motion in the step.  `place` has positions and times."""
+    """Contact loads of tools in a substep."""
 
     def __init__(self, tools: Tools, place: Place):
         super().__init__(*tools.contact(place))

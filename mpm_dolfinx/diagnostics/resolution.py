@@ -23,7 +23,9 @@ from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
 from mpm_dolfinx.points.material_points import body_of
 
 FULL = 1.2
-"""Largest filling of a cell without a warning.  Intact domains reach 1.08 when a footing sinks by half its width."""
+"""Largest volume fraction in a cell without a warning.  Intact domains reach 1.08 when a footing sinks by half its
+width.
+"""
 
 
 def warn_overfilled(cut: CutDomains, bodies: Sequence[Body]) -> Callable[..., Any] | None:
@@ -57,12 +59,11 @@ def bodies_in(cut: CutDomains, bodies: Sequence[Body], cell: int) -> tuple[list[
 
 
 LOSS = 0.03
-"""A warning is issued if a soft material loses more than this fraction of its deformation in cells with stiffer ones.
-"""
+"""Fraction of its deformation that a soft material may lose in cells with a stiffer material without a warning."""
 AGAIN = 2.0
 """Factor by which the lost fraction must grow before the next warning.  Moving interfaces change the lost fraction."""
 FINE = 0.1
-"""Smallest lost fraction of a cell's deformation that counts.  Cells with stiffness contrasts below 2.1 lose less."""
+"""Smallest lost fraction of a cell's deformation that counts.  Cells with stiffness ratios below 2.1 lose less."""
 
 
 def warn_smeared(
@@ -70,10 +71,7 @@ def warn_smeared(
 ) -> Callable[..., Any]:
     """Warn about the soft material that loses the largest fraction of its deformation in cells with stiffer materials.
 
-    Parameters
-    ----------
-    least
-        Smallest lost fraction, in [0, 1], for which the function warns.
+    `least`: smallest lost fraction, in [0, 1], for which the function warns.
 
     Returns
     -------
@@ -109,7 +107,7 @@ def warn_smeared(
 
 
 def _losses(cut: CutDomains, volume: NDArray[np.float64], modulus: NDArray[np.float64]) -> tuple[NDArray, ...]:
-    """Return three arrays (n,) for owned cells: loss times volume (m^d), ratio of moduli, and softest piece.
+    """Return the loss times volume (m^d), the ratio of moduli, and the softest piece of each owned cell.
 
     With moduli M and volume fractions s in a cell, layers in series have the compliance `sum (s / M)`.  Equal strain in
     the cell gives the compliance `1 / sum (s M)` instead.  The loss is the difference of both compliances, divided by
@@ -136,12 +134,12 @@ SLENDER_WET = 2  # length divided by thickness from which on a wet body counts a
 
 
 def warn_thin(grid: Grid, bodies: Sequence[Body], walls: Mapping[str, str], wet: bool) -> None:
-    """Warn about each slender body that can bend, and has one point per cell and too few points over its thickness.
+    """Warn about each slender body that can bend, with one point per cell and too few points over its thickness.
 
     The increment of stress is constant in a cut domain.  In a single step, n points over the thickness therefore give
-    `1 - 1/n^2` of the bending stiffness.  In several steps they give more (`domain_slopes`).  A body with one point
-    over its thickness carries no moment.  It creeps from step to step, because only the stress increment of a step
-    resists bending.  Measurements show that saturated bodies (`wet`) lose more stiffness, and continue to creep.
+    `1 - 1/n^2` of the bending stiffness, and more in several steps (`domain_slopes`).  A body with one point over its
+    thickness carries no moment.  It creeps from step to step, because only the stress increment of a step resists
+    bending. Measurements show that saturated bodies (`wet`) lose more stiffness, and continue to creep.
     """
     few, slender = (FEW_WET, SLENDER_WET) if wet else (FEW, SLENDER)
     for i, body in enumerate(bodies):
@@ -161,9 +159,9 @@ def warn_thin(grid: Grid, bodies: Sequence[Body], walls: Mapping[str, str], wet:
 def check_stiff(grid: Grid, bodies: Sequence[Body]) -> None:
     """Raise ValueError for 3D bodies with one domain in each cell, if domains end at grid lines along two axes.
 
-    Displacements that alternate from node to node along both axes then have no mean gradient in any piece.  They thus
-    have no stiffness, however they vary along the third axis.  In 2D each component has a single field of this kind,
-    and walls prevent this field.
+    Displacements that alternate from node to node along both axes then have no mean gradient in any piece.  They have
+    no stiffness for any variation along the third axis.  In 2D each component has a single field of this kind, and
+    walls prevent this field.
     """
     for i, body in enumerate(bodies if grid.dim == 3 else ()):
         low, between = np.array([[np.inf], [-np.inf]]) * np.ones(grid.dim)  # of domains; the highest end inside a cell
@@ -186,7 +184,7 @@ def check_stiff(grid: Grid, bodies: Sequence[Body]) -> None:
 
 
 def _edge(grid: Grid, body: Body, axis: int) -> float:
-    """Return the edge length (m) along an axis of the cells in which a body lies, or the mean for unequal cells."""
+    """Return the mean edge length (m) of the body's cells along an axis."""
     if grid.even:
         return grid.h[axis]
     low, high = body.bounds
@@ -194,7 +192,7 @@ def _edge(grid: Grid, body: Body, axis: int) -> float:
 
 
 def _bends(grid: Grid, bodies: Sequence[Body], i: int, axis: int, walls: Mapping[str, str], slender: float) -> bool:
-    """Return whether a body is thin along an axis, without walls or other bodies at both sides normal to this axis."""
+    """Return whether a body is thin along an axis, and free to bend along this axis."""
     body = bodies[i]
     size = body.bounds[1] - body.bounds[0]
     if size.max() < slender * size[axis]:

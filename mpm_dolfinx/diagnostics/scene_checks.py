@@ -23,24 +23,17 @@ def check_held(
 ) -> None:
     """Raise an error if a connected part of the bodies can move as a rigid body.
 
-    Parameters
-    ----------
-    active
-        Cells of this process that contain pieces of domains.
-    free : (nodes, d)
-        Whether no wall fixes a displacement component.
-    holds
-        Constraints by prescribed displacements, tools and contact.  Each has cells (n,), lexicographic cells (n,) of
-        the other part or None, positions (n, d) in m, and directions (n, d).  A constrained part constrains the other
-        part.
-    each
-        Whether to check each connected part, not only all parts together.
+    `active`: cells of this process that contain pieces of domains.
+    `free` (nodes, d): whether no wall fixes a displacement component.
+    `holds`: constraints by prescribed displacements, tools and contact. Each is a tuple of the constrained cells (n,),
+    the cells (n,) of the part in contact or None, positions (n, d) in m, and directions (n, d). The cells of the part
+    in contact are lexicographic indices. Of two parts in contact, a constrained part constrains the other part.
+    `each`: whether to check each connected part, not only all parts together.
 
     Raises
     ------
     ValueError
-        If a part can move as a rigid body.  The message gives the place and the number of free rigid-body modes of the
-        part.
+        If a part can move as a rigid body. The message gives the place and the number of rigid-body modes of the part.
     """
     grid = active.grid
     part, count = active.parts_of_cells if each else (active.contains.astype(np.int64), 1)
@@ -89,7 +82,7 @@ def check_held(
 
 
 def _extents(active: ActiveSet, part: NDArray[np.int64], count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the centres (count, d) and the largest edges (count,) of the bounding boxes of parts, both in m."""
+    """Return the centres and the largest edges of the bounding boxes of parts."""
     grid = active.grid
     low, high = np.full((2, count, grid.dim), np.inf)  # `high` has a negative sign
     for sign, ends in ((1, low), (-1, high)):

@@ -6,23 +6,28 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from mpm_dolfinx.base.tolerances import NEAR
-from mpm_dolfinx.base.validation import all_of, chosen, functions, instance, line, numbers
-from mpm_dolfinx.bodies.bodies import Body, check_bodies
+from mpm_dolfinx.base.validation import all_of, check_names, flag, functions, instance, line, numbers
+from mpm_dolfinx.bodies.bodies import Body, Later, Moving, check_bodies
 from mpm_dolfinx.conditions.conditions import OnSide
 from mpm_dolfinx.grid.grid import Grid, begin_with
 from mpm_dolfinx.materials.skeleton import Fluid, Skeleton
 from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
 
 
-def check_parts(grid: Grid, bodies: Sequence[Body], materials: Sequence[Skeleton], later: Sequence[int]) -> None:
-    """Raise an error for invalid grid, bodies or materials, bodies outside the grid, or invalid `later` indices."""
+def checked_parts(
+    grid: Grid, bodies: Sequence[Body | Later], materials: Sequence[Skeleton]
+) -> tuple[list[Body], list[int]]:
+    """Return the bodies, and the indices of bodies that are absent at first. Raise ValueError for invalid parts."""
     begin_with("grid", grid)
-    all_of("bodies", bodies, Body, 1)
+    all_of("bodies", bodies, (Body, Later), 1)
     all_of("materials", materials, Skeleton, 1)
+    later = [i for i, body in enumerate(bodies) if isinstance(body, Later)]
+    bodies = [body.body if isinstance(body, Later) else body for body in bodies]
     check_bodies(grid, bodies)
-    chosen("later", later, range(len(bodies)), "indices of the bodies")
+    return bodies, later
 
 
 def check_options(
@@ -48,7 +53,7 @@ def check_options(
 
 
 def check_axisymmetry(grid: Grid, bodies: Sequence[Body], quadrature: str) -> None:
-    """Raise an error for point quadrature on grids that do not support it.  Warn about narrow holes around the axis."""
+    """Raise an error for point quadrature on grids that do not support it. Warn about narrow holes around the axis."""
     if quadrature == "point" and (grid.axisymmetric or grid.follow is not None):  # fine cells would become empty
         raise ValueError("quadrature = 'point', must be 'domain' in axisymmetry, and on grid lines that follow")
     if not grid.has_axis:
@@ -69,8 +74,27 @@ def check_axisymmetry(grid: Grid, bodies: Sequence[Body], quadrature: str) -> No
         warn(grid.comm, ResolutionWarning, what, inner[k], x[k].mean(axis=0), h)
 
 
+def initial_velocity(grid: Grid, quadrature: str, inertia: bool | Moving | None) -> ArrayLike | Callable | None:
+    """Return the initial velocity, or None without inertia in all stages.
+
+    Raise ValueError if the scene does not allow inertia or this velocity.
+    """
+    if inertia is None:
+        return None
+    moves = isinstance(inertia, Moving)
+    flag("inertia", moves or inertia)
+    velocity = inertia.velocity if moves else np.zeros(grid.dim)
+    if quadrature != "domain":
+        raise ValueError(f"inertia = {line(inertia)} with quadrature {quadrature!r}, must be None")
+    if callable(velocity):
+        check_names("velocity", velocity, ("x",))
+    elif grid.axisymmetric and np.ravel(velocity)[:1].any():
+        raise ValueError(f"velocity = {line(velocity)}, must be (0, v): axisymmetric bodies move along the axis")
+    return velocity
+
+
 def _functions_of(terms):
-    """Return the functions of terms in bodies and on sides.  An invalid list is returned unchanged."""
+    """Return the functions of terms in bodies and on sides."""
     if isinstance(terms, str) or not isinstance(terms, Sequence):
         return terms
     return [term.term if isinstance(term, OnSide) else term for term in terms]

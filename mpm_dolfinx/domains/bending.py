@@ -3,16 +3,18 @@
 
 In bending the true strain varies linearly over a cell, but the strain of a Q1 field jumps at the grid lines.  Particle
 domains that follow the Q1 field acquire a sawtooth strain.  When the motion reverses, other grid lines cross the body,
-and the sawtooth remains as stress.  The corner displacement therefore contains second differences along each axis,
+and the sawtooth remains as stress.  The displacement u of a corner at the position x is therefore
 
     u(x) = sum_i N_i(x) [u_i - 1/2 sum_a t_a (1 - t_a) D_a],
 
 where N_i are the shape functions, u_i are the nodal displacements, and t_a is the position along axis a in the cell,
-from 0 to 1.  This field is exact for quadratic displacements, equal to Q1 at the nodes, and continuous.  D_a belongs to
-the cell edge along axis a that ends at node i.  D_a is the smaller, in absolute value, of the second differences at
-both ends of this edge, or zero if their signs differ.  If only one end has a second difference, D_a is this difference.
-If cell sizes vary, D_a is the squared edge length times the second derivative of a parabola through three nodes.
-Physical kinks, for example at the boundary of two materials, are kept.
+from 0 to 1.  D_a is a second difference of nodal displacements along axis a.  The field u is exact for quadratic
+displacements, equal to Q1 at the nodes, and continuous.
+
+D_a belongs to the cell edge along axis a that ends at node i.  Each end of the edge has a second difference.  D_a is
+the smaller of both in absolute value, or zero if their signs differ.  If only one end has a second difference, D_a is
+this difference.  If cell sizes vary, D_a is the squared edge length times the second derivative of a parabola through
+three nodes.  Physical kinks, for example at the boundary of two materials, are kept.
 """
 
 from __future__ import annotations
@@ -52,16 +54,16 @@ def followed(
 
 
 def _at(u: NDArray[np.float64], nodes: NDArray[np.int32]) -> NDArray[np.float64]:
-    """Return the values (d, k, n) of a nodal field u (nodes, d) at `nodes` (n, k)."""
+    """Return the values of a nodal field at `nodes`."""
     return u.take(u.shape[1] * nodes.T[None] + np.arange(u.shape[1])[:, None, None])
 
 
 def _second_differences(
     grid: Grid, cells: NDArray[np.int32], u: NDArray[np.float64], filled: NDArray[np.bool_]
 ) -> list[NDArray[np.float64]]:
-    """Return for each axis the second differences D_a, in m, along the edges of owned cells.
+    """Return the second differences along the edges of owned cells, for each axis.
 
-    D_a is a polynomial in the other coordinates, with coefficients (d, 2^(d-1), cells) as in `polynomial`.
+    Each difference is a polynomial in the coordinates along the other axes, with coefficients as in `polynomial`.
     """
     d = grid.dim
     bits = corner_bits(grid.dim)

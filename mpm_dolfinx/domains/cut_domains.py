@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Particle domains cut by the grid: their pieces, owners of the cells, and transfer of values between processes."""
+"""Particle domains cut by the grid: their pieces, and the exchange of values with the owners of the cells."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from mpm_dolfinx.points.cutting import Pieces, cut, cut_faces
 from mpm_dolfinx.points.material_points import MaterialPoints, middle
 
 STILL = 3e-4
-"""Largest motion of corners, divided by the cell size, for which a cut remains valid.  Larger motions need a new cut.
+"""Largest motion of corners, divided by the cell size, for which a cut remains valid.
 
-Compared with a new cut in every step, pressures in a consolidating column of ten cells change by 7e-5 of the load.  The
+With a new cut in every step, pressures in a consolidating column of ten cells change by 7e-5 of the load, and the
 settlement changes by 3e-5 of its value.  Both changes are proportional to STILL.
 """
 
@@ -38,10 +38,9 @@ class Patches:
     grid
         Background grid.
     faces, row : (n,)
-        Surface faces of the bodies, and index in these faces of each point's face.  The faces may be parts of seeded
-        faces.
+        Surface faces of the bodies, or parts of them, and the index of each point's face among these faces.
     face, at : (n,)
-        Index of the face, and index of the material point.
+        Index of the face in its domain, and index of the material point.
     cell : (n,)
         Lexicographic index of the cell.
     x, xi : (n, d)
@@ -73,7 +72,7 @@ class Patches:
         if renewed is not None:
             around = np.where(renewed.old, around, 1.0)  # areas of renewed faces are already areas of rings
         self.area0 = self._share0 * around
-        """Reference areas (n,), in m^(d-1).  In axisymmetry, these are areas of rings, in m^2."""
+        """Reference areas (n,), in m^(d-1), or areas of rings in axisymmetry, in m^2."""
 
     @cached_property
     def X(self) -> NDArray[np.float64]:
@@ -94,7 +93,7 @@ class Patches:
         return lambda name: self.X if name == "X" else self.now(points) + self.base
 
     def area(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the current outward area vectors (n, d), in m^(d-1), or in axisymmetry of rings, in m^2."""
+        """Return the current outward area vectors (n, d), in m^(d-1), or in m^2 for rings in axisymmetry."""
         share = self._share0 / self._whole0
         if self._grid.axisymmetric:
             share = share * self._grid.around(self.now(points))
@@ -131,27 +130,27 @@ class CutDomains(Keyed):
         self.pieces_to_cells = exchange.send
         """Function that sends values of the pieces to the owners of their cells."""
         self.to_pieces = exchange.back
-        """Function that sends values of the pieces from the owners of their cells to the processes of the points."""
+        """Function that returns values of the pieces from the owners of their cells to the processes of the points."""
         self.cells, self.x = grid.locals[exchange.send(pieces.cell)], exchange.send(pieces.x)
         """For each of m pieces: the owned cell (m,) that contains it, and its centroid (m, d), in m."""
         self.mixed = exchange.send(pieces.mixed) if grid.dim == 3 and domains else None
-        """In 3D: means over each piece of products of the offsets from its centroid, see `Pieces`."""
+        """In 3D: mean products of coordinates in each piece, see `Pieces`."""
         self.hoop = exchange.send(pieces.hoop) if grid.axisymmetric else None
         """In axisymmetry: moments (m, 4) of the pieces in the plane, see `Pieces`."""
         self._faces = exchange.send(pieces.faces) if faces else None
         pieces.faces, pieces.mixed = pieces.faces[:0].copy(), pieces.mixed[:0].copy()
         self.pieces = pieces
-        """Pieces of this process's points, without areas and mean products.  Only integrals over cells need these."""
+        """Pieces of this process's points, without areas and mean products."""
 
     def faces(self) -> NDArray[np.float64]:
-        """Return areas (m, d, 2), in m^(d-1), of pieces on cell faces.  Call it once, because they are then deleted."""
+        """Return areas (m, d, 2), in m^(d-1), of pieces on cell faces, and delete them here."""
         faces, self._faces = self._faces, None
         return faces
 
     def moved(self, points: MaterialPoints, part: NDArray[np.int64], count: int) -> NDArray[np.float64]:
-        """Return for each connected part (count,) the largest motion of corners since the cut, in cell sizes.
+        """Return the largest motion of corners since the cut, in cell sizes, for each connected part (count,).
 
-        `part` (n,) is the index of the part to which each point belongs.
+        `part` (n,): index of the connected part of each point.
         """
         far = self.grid.cells_between(self.points.corners, points.corners).max(axis=(1, 2))
         largest = np.zeros(count) if count > 1 else far.max(initial=0.0, keepdims=True)
@@ -160,15 +159,15 @@ class CutDomains(Keyed):
         return over_all(self.grid.comm, largest, MPI.MAX)
 
     def valid(self, points: MaterialPoints, part: NDArray[np.int64], count: int) -> NDArray[np.bool_]:
-        """Return whether the cut is still valid for each connected part (count,), see `moved` and `STILL`."""
+        """Return whether the cut is still valid for each connected part (count,)."""
         return self.moved(points, part, count) <= STILL
 
     def to_cells(self, values: NDArray) -> NDArray:
-        """Send values (n, ...) of points to owners of their pieces' cells.  Return values (m, ...) of owned pieces."""
+        """Send values (n, ...) of points to the owners of the cells, and return the values (m, ...) of owned pieces."""
         return self.pieces_to_cells(values[self.pieces.point])
 
     def plane(self, volume: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return volumes (m,) and centroids (m, d) of pieces; in axisymmetry areas and centroids of their sections."""
+        """Return the volumes (m,) and centroids (m, d) of pieces, or areas and centroids of sections in axisymmetry."""
         if not self.grid.axisymmetric:
             return volume, self.x
         return volume / (TURN * self.hoop[:, 3]), self.grid.midpoints[self.cells] + self.hoop[:, :2]
@@ -180,10 +179,7 @@ class CutDomains(Keyed):
         return means.T.copy().reshape(len(self.points), *values.shape[1:])
 
     def in_plane(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return for each point the volume mean over its pieces, or in axisymmetry the area mean in the plane.
-
-        In axisymmetry, `values` (m,) refer to the centroids of the pieces' areas in the plane.
-        """
+        """Return for each point the volume mean over its pieces, in axisymmetry the area mean over their sections."""
         if not self.grid.axisymmetric:
             return self.mean(values)
         area = self.pieces.fraction / self.pieces.hoop[:, 3]
@@ -193,13 +189,13 @@ class CutDomains(Keyed):
     def surface(self, faces: Surface) -> Patches:
         """Return the quadrature points on a surface, for faces whose points are on this process.
 
-        The cell of a quadrature point contains the position just under the surface, and a piece of the domain.  Shape
-        functions of this cell are extended to the surface, so that loads act on nodes with stiffness.
+        The cell of a quadrature point contains the position just under the surface, and a piece of the domain.  Loads
+        therefore act on nodes with stiffness.
         """
         return self.surfaces([faces])[0]
 
     def surfaces(self, several: Sequence[Surface]) -> list[Patches]:
-        """Return the quadrature points of several surfaces.  They are cut together, which takes as long as one cut."""
+        """Return the quadrature points of several surfaces, which are cut together to save time."""
         if new := [faces for faces in dict.fromkeys(several) if faces not in self._patches]:
             self._patches.update(zip(new, self._cut_surfaces(new), strict=True))
         return [self._patches[faces] for faces in several]
@@ -238,14 +234,14 @@ class CutDomains(Keyed):
         return out
 
     def displacement(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return values (n, d) of a Q1 field u (nodes, d) at the points.  The cut must be without `domains`."""
+        """Return the values (n, d) of a Q1 field u (nodes, d) at the points.  The cut must be without `domains`."""
         exchange, cells = self._followed
         return exchange.back(self.grid.at(cells, exchange.send(self._tracked), u))
 
     def followed(self, u: NDArray[np.float64], filled: NDArray[np.bool_]) -> Iterator[NDArray[np.float64]]:
-        """Yield two fields (n, 2^d, d) at the corners, in m: the Q1 field u (nodes, d), and its quadratic correction.
+        """Yield the Q1 field u (nodes, d) at the corners (n, 2^d, d), then its quadratic correction, both in m.
 
-        `filled` (cells,) tells which local cells contain material.
+        `filled` (cells,): whether local cells contain material.
         """
         exchange, cells = self._followed
         moved = followed(self.grid, cells, exchange.send(self._tracked), u, filled)
@@ -253,19 +249,19 @@ class CutDomains(Keyed):
 
     @property
     def _tracked(self) -> NDArray[np.float64]:
-        """Positions (n, d), in m, of all corners, or of the points without `domains`."""
+        """Positions of all corners, or of the points without `domains`, in m."""
         return self.points.corners.reshape(-1, self.grid.dim) if self.domains else self.points.x
 
     @cached_property
     def _followed(self) -> tuple[Exchange, NDArray[np.int32]]:
-        """Exchange that sends `_tracked` positions to owners of their cells, and local indices (m,) of these cells."""
+        """Exchange that sends `_tracked` positions to the owners of their cells, and these cells."""
         grid, at = self.grid, np.arange(len(self.points))
         cell = self.cells_at(at.repeat(2**grid.dim) if self.domains else at, self._tracked)
         exchange = Exchange(grid.comm, grid.owner(cell))
         return exchange, grid.locals[exchange.send(cell)]
 
     def total_displacement(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return total displacements (m, d), in m, of the pieces' centroids, computed from the domains' corners."""
+        """Return the total displacements (m, d), in m, of the pieces' centroids."""
         pieces = self.pieces
         now, then = (c - c.mean(axis=1, keepdims=True) for c in (points.corners, points.origin))
         stretch = np.linalg.solve(then.swapaxes(1, 2) @ then, then.swapaxes(1, 2) @ now)  # affine fit to the corners
@@ -279,7 +275,7 @@ class CutDomains(Keyed):
         return self._filled_cell(at, x + NEAR * (self.points.x[at] - x))
 
     def _filled_cell(self, at: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the cells (n,) of positions x.  A domain without a piece there gives the cell of its largest piece."""
+        """Return the cells of positions x, or the cell of the domain's largest piece where it has no piece."""
         pieces, cells = self.pieces, self.grid.all_cells
         cell = self.grid.number(self.grid.index_from_base(x)) + self.grid.copy(self.points.id[at])
         key, keys = at * cells + cell, pieces.point * cells + pieces.cell
@@ -292,7 +288,7 @@ class CutDomains(Keyed):
         return cell
 
     def _largest(self) -> NDArray[np.int64]:
-        """Return the index of the largest piece of each point (n,)."""
+        """Return the index of the largest piece of each point."""
         order = np.lexsort((self.pieces.fraction, self.pieces.point))
         return order[np.cumsum(np.bincount(self.pieces.point, minlength=len(self.points))) - 1]
 

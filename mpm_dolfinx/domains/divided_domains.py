@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Parts of seeded domains after division and merging: their intervals, identifiers, corners and faces.
 
-A part is the image of a box [a, b] under the bilinear or trilinear map of its domain, in the reference configuration
-and in the deformed one. Coordinates count seeded domains: a whole domain is the interval [0, 1] along each axis.
-Intervals are dyadic: a division bisects an interval, and two parts merge if they are the halves of one interval. On the
-lattice of a box, whole domains merge as well, to [0, 2], [0, 4], and so on.
+A part is the image of a box [a, b] under the bilinear or trilinear map of its domain, both in the reference
+configuration and in the deformed one.  A whole domain is the interval [0, 1] along each axis.  A division bisects an
+interval, and two parts merge if they are the halves of one interval.  On the lattice of a box, whole domains merge as
+well, to [0, 2], [0, 4], and so on.
 """
 
 from __future__ import annotations
@@ -32,8 +32,6 @@ class SeededDomains:
 
     The identifier of a part follows from its domain and its interval.  It is a number for `material_points.body_of`
     with an odd index in the body.  Renewed points have even indices.
-
-    `bodies`: all bodies of the scene.
     """
 
     def __init__(self, bodies: Sequence[Body]):
@@ -45,7 +43,7 @@ class SeededDomains:
         self._codes = int((most // (len(bodies) * int(self.starts[-1] + 1))) ** (1 / self._dim))
 
     def known(self, part: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return which intervals (n, d, 2) are so large that 64-bit integers identify them."""
+        """Return which intervals (n, d, 2) are large enough to be identified by 64-bit integers."""
         return (self._code(part) < self._codes).all(axis=1)
 
     def of(self, root: NDArray[np.int64], part: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -59,7 +57,7 @@ class SeededDomains:
 
     @staticmethod
     def _code(part: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return a number (n, d) for each dyadic interval.  It is even for sizes up to 1, and odd for larger sizes."""
+        """Return a number for each interval, which is even for sizes up to 1, and odd for larger sizes."""
         size = np.ptp(part, axis=2)
         code = np.where(size <= 1, 2 * (1 + part[..., 0]) / size, 2 * np.log2(size) - 1)
         return np.rint(code).astype(np.int64)
@@ -79,7 +77,10 @@ class SeededDomains:
         return out, lower - step
 
     def places(self, root: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return body and lattice index (n, 1 + d) of seeded domains.  Without a lattice, the body is -1 - id."""
+        """Return the body and lattice index (n, 1 + d) of seeded domains.
+
+        For a domain without a lattice, the body is -1 - id.
+        """
         out = np.zeros((len(root), 1 + self._dim), dtype=np.int64)
         body = body_of(root, self.starts)
         for i in np.unique(body):
@@ -91,12 +92,12 @@ class SeededDomains:
         return out
 
     def sizes(self, grid: Grid, points: MaterialPoints) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return two arrays (n, d), in cells: edge lengths of domains now, and of their seeded domains at seeding."""
+        """Return the edge lengths (n, d) of domains now, and of their seeded domains at seeding, both in cells."""
         root = roots(points)[0]
         return _lengths(grid.in_cells(points.corners)), self._seeded((root,), lambda: self._as_seeded(grid, root))
 
     def _as_seeded(self, grid: Grid, root: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the edge lengths (n, d) of domains in cells at seeding.  Renewed domains have nan."""
+        """Return the edge lengths of domains at seeding, in cells, or nan for renewed domains."""
         seeded, body = np.full((len(root), self._dim), np.nan), body_of(root, self.starts)
         for i in range(len(self.bodies)):
             at = (body == i) & (root < self.starts[-1])
@@ -108,8 +109,8 @@ class SeededDomains:
     def from_middle(self, places: NDArray[np.int64], axis: int) -> NDArray[np.float64]:
         """Return the indices (n,) of rows of the lattice along an axis, counted from the middle of the body.
 
-        Rows merge in pairs, which are therefore the same in a mirrored scene.  The result is nan for the middle row of
-        an odd number of rows, which has no pair, and for domains that are not on a lattice.
+        The pairs of rows that merge are therefore the same in a mirrored scene.  The result is nan for domains without
+        a lattice, and for the middle row of an odd number of rows, which has no pair.
         """
         out = np.full(len(places), np.nan)
         for i in np.unique(places[places[:, 0] >= 0, 0]):
@@ -138,7 +139,7 @@ class SeededDomains:
 
 
 def _lengths(corners: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the lengths (n, d) of the mean edges of domains with corners (n, 2^d, d)."""
+    """Return the lengths of the mean edges of domains."""
     x, d = np.ascontiguousarray(corners.transpose(1, 2, 0)), corners.shape[2]  # numpy is fast along the last axis
     faces = [np.add.reduce(x[at]) for at in FACES[d]]
     edges = [high - low for low, high in zip(faces[::2], faces[1::2], strict=True)]
@@ -165,12 +166,12 @@ def merged(lower: NDArray[np.float64], upper: NDArray[np.float64], axis: int) ->
 
 
 def beyond_corners(points: MaterialPoints, axisymmetric: bool) -> NDArray[np.float64]:
-    """Return the factor (n, k, k) of F that corners do not determine.  F is the corners' gradient times this factor."""
+    """Return the factor (n, k, k) of F that the corners do not determine."""
     return np.linalg.inv(gradient(points.corners, points.reference, axisymmetric)) @ points.F
 
 
 def halved(points: MaterialPoints, axis: int, domains: SeededDomains, axisymmetric: bool) -> MaterialPoints:
-    """Return both halves (2n,) of n points: first all lower halves, then all upper halves.
+    """Return the halves (2n,) of n points: first all lower halves, then all upper halves.
 
     The volumes of both halves add up to the volume of the point, both at rest and deformed.
     """
@@ -217,7 +218,7 @@ def _placed(
     of: tuple[NDArray[np.int64], NDArray[np.float64]],
     beyond: NDArray[np.float64],
 ) -> MaterialPoints:
-    """Return points with new corners, identifiers and parts `of`.  F follows from the corners and `beyond_corners`."""
+    """Return points with new corners, identifiers and parts, and F from the corners."""
     root, part = of
     is_whole = whole(part)
     data = {ROOT: np.where(is_whole, -1, root), PART: np.where(is_whole[:, None, None], 0.0, part)}
@@ -228,7 +229,7 @@ def _placed(
 def with_defect(new: MaterialPoints, old: MaterialPoints, into: NDArray[np.int64]) -> MaterialPoints:
     """Return new points with a volume defect such that soil and fluid fill the same volume as before.
 
-    `into`: index of the old point of each new point; if points were merged, index of the new point of each old point.
+    `into`: index of the old point of each new point, or of the new point of each old point if points were merged.
     """
     if "owed" not in new.data:
         return new

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Deformation gradients of particle domains and volume ratios of cells, which follow from corner positions alone."""
+"""Deformation gradients of particle domains and volume ratios of cells, computed from corner positions."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from mpm_dolfinx.points.material_points import MaterialPoints, cofactor, determi
 def gradient(
     corners: NDArray[np.float64], reference: NDArray[np.float64], axisymmetric: bool = False
 ) -> NDArray[np.float64]:
-    """Return the deformation gradients F (n, d, d) of particle domains.  F is a mean over the simplices of the domain.
+    """Return the deformation gradients F (n, d, d) of particle domains, as means over the simplices of each domain.
 
-    In 2D the diagonals determine F, and det F is the ratio of the areas.  In 3D F is scaled so that det F is the ratio
-    of the volumes.  For a twisted hexahedron, the determinant of the unscaled mean differs from this ratio by a
-    second-order term.  In axisymmetry F has the shape (n, 3, 3).  The circumferential stretch is the ratio of the
-    centroid radii, and det F is the ratio of the ring volumes.
+    In 2D the diagonals of the domain determine F, and det F is the current area divided by the reference area.  In 3D F
+    is scaled so that det F is the current volume divided by the reference volume.  In axisymmetry F has the shape (n,
+    3, 3).  The circumferential stretch is then the ratio of the centroid radii, and det F is the ratio of the ring
+    volumes.
 
     `corners`, `reference` (n, 2^d, d), in m: current corners, and reference corners.
     """
@@ -44,10 +44,7 @@ def gradient(
 def _of_hexahedra(
     corners: NDArray[np.float64], reference: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the mean F (n, 3, 3) over the simplices, and the reference volumes V (n,), in m^3.
-
-    `F = sum_k x_k dV/dX_k / V`, where the sum is over the corners k.  The last axis of the local arrays is the point.
-    """
+    """Return the mean F over the simplices of hexahedra, and the reference volumes."""
     x, X = (np.ascontiguousarray((y - y[:, :1]).transpose(1, 2, 0)) for y in (corners, reference))
     slope = _slopes(X)
     volume = (X * slope).sum(axis=(0, 1)) / 3
@@ -55,7 +52,7 @@ def _of_hexahedra(
 
 
 def _slopes(X: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the derivatives (8, 3, n), in m^2, of hexahedron volumes with respect to corners X (8, 3, n), in m."""
+    """Return the derivatives of hexahedron volumes with respect to the corners."""
     slope = np.zeros_like(X)
     for face, sign in zip(FACES[3], FACE_SIGNS, strict=True):
         p, q, r, s = X[face]
@@ -71,9 +68,9 @@ def _slopes(X: NDArray[np.float64]) -> NDArray[np.float64]:
 def volume_slopes(
     corners: NDArray[np.float64], axisymmetric: bool = False
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the volumes (n,) of domains, in m^d, and their derivatives (n, 2^d, d) by the corners, in m^(d-1).
+    """Return the volumes (n,) of domains, in m^d, and their derivatives (n, 2^d, d) with respect to the corners.
 
-    In axisymmetry the domains are rings.  Volumes are integrals of `pi r^2 dz`, in m^3, and derivatives are in m^2.
+    In axisymmetry the domains are rings.  Their volumes are integrals of `pi r^2 dz`, in m^3.
     """
     now = domain_volumes(corners, axisymmetric)
     if corners.shape[2] == 3:
@@ -95,10 +92,10 @@ def cell_ratios(
     """Return the volume ratios (m,) of the pieces of a cut at the start of a step.
 
     With F-bar, the volume ratio of a cell is the current volume of its domains, computed from the corners, divided by
-    their reference volume.  This ratio does not depend on the path of deformation.  Differences between the volume
-    ratios of domains in a cell do no work.  If the ratio of a cell were updated by increments only, it could drift from
-    the volume of the domains, and no force would oppose this drift.  Without F-bar, pieces have the ratio of their
-    point.  In cells with yielded soil they also do, because corner volumes are meaningless near plastic flow.
+    their reference volume.  Differences between the volume ratios of domains in a cell do no work.  If the ratio of a
+    cell were updated by increments only, it could drift from the volume of the domains without any opposing force.
+    Pieces have the ratio of their point without F-bar, and in cells with yielded soil, where corner volumes are
+    meaningless.
 
     `cut`: cut particle domains.
     `points`: points at the start of the step.

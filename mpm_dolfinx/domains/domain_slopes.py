@@ -3,13 +3,13 @@
 
 The gradient F of a point is the mean over its domain.  In bending the gradient varies across the domain.  With one
 value for each domain, and n domains over the thickness, the bending stiffness is too small by the fraction `1/n^2`.  At
-a piece of the domain the gradient is therefore
+a piece with the local coordinates xi in its domain, the gradient is therefore
 
     F(xi) = F (1 + e),   F e = sum_a D_a (xi_a - mean of xi_a over the reference volume).
 
-The local coordinates xi of the domain are in units of its edge lengths.  The slopes D_a are a least-squares fit to the
-gradients F of neighbours across faces.  Only neighbours of the same material are used.  Then e is corrected so that the
-sum of `int dV / det F` over the pieces is the reference volume of the domain.  The fit reproduces linear fields on any
+The sum is over the axes a, and xi is in units of the domain's edge lengths.  The slopes D_a are a least-squares fit to
+the gradients F of neighbours of the same material across faces.  Then e is corrected so that the sum of
+`int dV / det F` over the pieces is the reference volume of the domain.  The fit reproduces linear fields on any
 mesh, and uniform fields stay uniform.
 """
 
@@ -36,13 +36,7 @@ from mpm_dolfinx.points.material_points import MaterialPoints, body_of, cofactor
 
 
 class Neighbours:
-    """Neighbours of domains across shared faces, including neighbours on other processes.
-
-    `comm`: communicator of the processes.
-    `bodies`: all bodies of the scene.
-    `points`: material points of this process.
-    `chosen` (n,): whether to find the neighbours of each point.
-    """
+    """Neighbours of the `chosen` domains across shared faces, including neighbours on other processes."""
 
     def __init__(self, comm: MPI.Intracomm, bodies: Sequence[Body], points: MaterialPoints, chosen: NDArray[np.bool_]):
         dim = bodies[0].dim
@@ -62,7 +56,8 @@ class Neighbours:
         self._partner = partner.reshape(-1, 2 * dim).T.copy()  # index of the opposite face; -1 if there is none
 
     def at_neighbours(self, own: NDArray[np.float64], faces: Sequence[NDArray[np.float64]]) -> Callable[[int], tuple]:
-        """Return a function of a face index.  It returns neighbours' data (c, k), face centres, and which exist.
+        """Return a function of a face index, which returns data and face centres of neighbours, and which neighbours
+        exist.
 
         `own` (c, k): c data columns of the points.
         `faces`: centres (d, k), in m, of the points' faces, for each face index.
@@ -85,11 +80,7 @@ class Neighbours:
 
 
 class LinearGradients:
-    """Deformation gradients at the pieces of the domains in a scene.
-
-    `comm`: communicator of the processes.
-    `bodies`: all bodies of the scene.
-    """
+    """Deformation gradients at the pieces of the domains in a scene."""
 
     def __init__(self, comm: MPI.Intracomm, bodies: Sequence[Body]):
         self._comm, self._bodies = comm, bodies
@@ -98,13 +89,13 @@ class LinearGradients:
     def at_pieces(
         self, cut: CutDomains, F: NDArray[np.float64], elastic: NDArray[np.bool_], soils: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return `linear_gradients` that vary only in domains of `elastic` points (n,).  All processes must call it."""
+        """Return `linear_gradients` that vary only in domains of `elastic` points.  All processes must call it."""
         make = partial(Neighbours, self._comm, self._bodies, cut.points, elastic)
         return linear_gradients(self._neighbours((cut.points.id, elastic), make, self._comm), cut, F, soils)
 
 
 def _seeded_faces(bodies: Sequence[Body], ids: NDArray[np.int64], seeded: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Return a key (k, 2d, 1) for each face of the seeded domains `ids` (k,).  Both domains at a face have one key."""
+    """Return a key for each face of seeded domains, which is equal in both domains at the face."""
     dim, starts = bodies[0].dim, np.cumsum([0, *map(len, bodies)])
     of, key = np.where(seeded, body_of(ids, starts), -1), np.zeros((len(ids), 2 * dim), dtype=np.int64)
     for i, body in enumerate(bodies):
@@ -120,11 +111,10 @@ def _seeded_faces(bodies: Sequence[Body], ids: NDArray[np.int64], seeded: NDArra
 def _faces_of_parts(
     comm: MPI.Intracomm, bodies: Sequence[Body], points: MaterialPoints, seeded: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    """Return a key (n, 2d, 2) for each face of domains and of parts of domains.
+    """Return a key for each face of domains and of parts of domains.
 
-    The key of a face on a lattice consists of its lower corner, its normal and its size, in units of the smallest part
-    in the scene.  Parts of domains that are not on a lattice have neighbours only in their domain.  Other whole domains
-    keep the keys `seeded` of their faces.
+    On a lattice, the key consists of the lower corner, the normal and the size of the face.  Other whole domains keep
+    the keys `seeded`.  Other parts have neighbours only in their domain.
     """
     dim, part = bodies[0].dim, is_part(points)
     root, ends = roots(points)
@@ -149,7 +139,7 @@ def _faces_of_parts(
 
 
 def _pairs(key: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return for each row of keys (n, k) the index (n,) of the other equal row, or -1."""
+    """Return for each row of keys the index of the other equal row, or -1."""
     order, out = np.lexsort(key.T), np.full(len(key), -1)
     same = np.logical_and.reduce(key[order[1:]] == key[order[:-1]], axis=1).nonzero()[0]
     out[order[same]], out[order[same + 1]] = order[same + 1], order[same]
@@ -198,7 +188,7 @@ def linear_gradients(
 def _slopes(
     neighbours: Neighbours, cut: CutDomains, F: NDArray[np.float64], soils: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the derivatives `dF/dxi` (d, k, k, r), and the inverse edge matrices (d, d, r) of domains, in 1/m."""
+    """Return the derivatives of F with respect to xi, and the inverse edge matrices of domains."""
     rows = neighbours.rows
     d, k = cut.grid.dim, F.shape[1]
     corners = cut.points.corners[rows].transpose(1, 2, 0).copy()

@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: MIT
-"""Particle domains of yielded soil keep the volumes of their points.
+"""Correction of the corners of yielded particle domains, so that the domains keep the volumes of their points.
 
 The volume ratio of a point is a mean over its cell.  The corners of its domain, however, follow a field that varies in
-the cell, and edges stay straight.  In elastic soil F and the volume ratios of cells follow from the corners.  In
-yielded soil F is updated by increments.  The volumes of domains and of points would therefore drift apart, and domains
-would overlap.  After a step the corners of yielded domains therefore move by the vectors d that minimise
+the cell.  In elastic soil, F and the volume ratios of cells are computed from the corners.  In yielded soil, F is
+updated by increments.  The volumes of domains and of points would therefore drift apart, and domains would overlap.
+After a step the corners of yielded domains therefore move by the vectors d that minimise
 
     sum_p V_p e_p^2 + SOFT^2 sum_p V_p mean |d / h|^2,  V_p e_p = V_p - V - dV/dx d.
 
-V_p is the volume of a point, and V is the volume of its domain.  The mean is over the domain's corners, and h are the
-edges of cells.  Both sums are integrals over the soil, so a 3D slice moves as in plane strain.  Shared corners move
-together.  Corners of elastic domains and held corners do not move.  Kugelstadt et al. (2019) correct densities of cells
-in this way.
+The sums are over the points p.  V_p is the volume of a point, V is the volume of its domain, and dV/dx is the
+derivative of V with respect to the corners.  The relative volume error after the motion is e_p.  The mean is over the
+domain's corners, and h are the edges of cells.  Shared corners move together.  Corners of elastic domains and held
+corners do not move.  Kugelstadt et al. (2019) correct densities of cells in this way.
 """
 
 from __future__ import annotations
@@ -30,9 +30,12 @@ from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.parallel.exchange import to_root
 
 SOFT = 0.1
-"""Weight of the motion d.  It is needed because no motion reduces, to first order, errors e that alternate between
-the domains of a regular lattice.  Halving this value changes the result of scene "flow" in tests/plateaus.py by 2.5e-04
-(relative), doubling it by 1.4e-04, and finer cells by 9.2e-02."""
+"""Weight of the motion d of the corners.
+
+Volume errors may alternate between the domains of a regular lattice.  To first order, no motion of the corners reduces
+such errors, so the weight is needed.  The result of scene "flow" in tests/plateaus.py changes by the fraction 2.5e-04
+with half this value, by 1.4e-04 with twice this value, and by 9.2e-02 with finer cells.
+"""
 
 
 class Domains(NamedTuple):
@@ -48,7 +51,7 @@ class Domains(NamedTuple):
 
 
 def with_volumes(grid: Grid, domains: Domains) -> NDArray[np.float64]:
-    """Return the corners (n, 2^d, d), in m, after the correction.  One process computes the correction."""
+    """Return the corners (n, 2^d, d), in m, after the correction."""
     root = to_root(grid.comm, len(domains.ids))
     rows = Domains(*map(root.send, domains))
     motion = np.zeros_like(rows.corners)
@@ -59,7 +62,7 @@ def with_volumes(grid: Grid, domains: Domains) -> NDArray[np.float64]:
 
 
 def _motion(grid: Grid, domains: Domains) -> NDArray[np.float64]:
-    """Return the motion (n, 2^d, d), in m, of the corners of all domains."""
+    """Return the motion of the corners of all domains, in m."""
     d, yielded = grid.dim, domains.yielded
     number = _joined(domains.body, domains.number, domains.corners, NEAR * grid.least)
     count = int(number.max(initial=-1)) + 1
@@ -83,10 +86,9 @@ def _motion(grid: Grid, domains: Domains) -> NDArray[np.float64]:
 def _joined(
     body: NDArray[np.int64], number: NDArray[np.int64], x: NDArray[np.float64], tolerance: float
 ) -> NDArray[np.int64]:
-    """Return an index (n, 2^d) for each corner x (n, 2^d, d), in m, of domains.  Corners that coincide have one index.
+    """Return an index for each corner of domains, which is equal for corners that coincide.
 
-    Two corners of one `body` (n,) coincide if their seeded indices `number` are equal, or if their coordinates differ
-    by at most about `tolerance`, in m.
+    Corners of one body coincide if their seeded indices are equal, or if they are closer than about `tolerance`, in m.
     """
     keys = [body.repeat(x.shape[1])]
     for column in x.reshape(-1, x.shape[2]).T:

@@ -1,21 +1,22 @@
 # SPDX-License-Identifier: MIT
 """Lattice of the seeded corners of a body, and a third-difference filter of their displacements.
 
-Nodes cannot represent a displacement wave of the corners with a wavelength of two domains.  No nodal force therefore
-resists such a wave.  Corners that cross grid lines excite these waves, and the waves would grow from one load cycle to
-the next.  The filter damps them when the grid is reset.  It replaces the displacement d of the corners from their
-reference positions, for each axis a in turn, by
+Nodes cannot represent a displacement wave of the corners with a wavelength of two domains, so no nodal force resists
+such a wave.  Corners that cross grid lines excite these waves, which would grow from one load cycle to the next.  The
+filter damps them when the grid is reset.  It replaces the displacement d of the corners from their reference positions,
+for each axis a in turn, by
 
     d - D_a^T (s / 64) D_a d.
 
-The result is the mean over all orders of the axes.  D_a is the third difference of four corners in a row along axis a.
-If the domains in a row have different widths, D_a is the divided difference, scaled to the same sum of absolute
-weights.  The factor is `s = min(1, FAST c)`, where c is the number of cells that the corners have crossed since the
-last grid reset.  Bodies that hardly move are thus not filtered.  Quadratic fields remain unchanged, even at the
-surface.  A wave with a length of two domains is reduced by the fraction s.  A wave with a length of eight domains is
-reduced by 0.003 s.  Domains that have separated from their neighbours are not filtered.  Yielded soil is not filtered
-either, because its deformation is irreversible, and its kinks are physical.  The filter does not move corners held by a
-wall, a prescribed displacement, a plate or another body.
+D_a is the third difference of four corners in a row along axis a.  If the domains in a row have different widths, D_a
+is the divided difference, scaled to the same sum of absolute weights.  The factor is `s = min(1, FAST c)`, where c is
+the number of cells that the corners have crossed since the last grid reset.  Bodies that hardly move are thus not
+filtered.  The result is the mean over all orders of the axes.
+
+Quadratic fields remain unchanged, even at the surface.  A wave with a length of two domains is reduced by the fraction
+s, and a wave with a length of eight domains by 0.003 s.  The filter leaves out domains that have separated from their
+neighbours, and yielded soil, whose kinks are physical.  It does not move corners held by a wall, a prescribed
+displacement, a plate or another body.
 """
 
 from __future__ import annotations
@@ -39,10 +40,11 @@ from mpm_dolfinx.parallel.exchange import Exchange
 from mpm_dolfinx.points.material_points import MaterialPoints
 
 FAST = 10
-"""Fraction of a wave with a length of two domains that the filter removes for each crossed cell.  At most the whole
-wave is removed.
-Halving this value changes the result of scene "cycles" in tests/plateaus.py by 1.5e-04 (relative), doubling it by
-3.4e-04, and finer cells by 6.2e-03.
+"""Fraction of a wave with a length of two domains that the filter removes for each crossed cell, at most the whole
+wave.
+
+The result of scene "cycles" in tests/plateaus.py changes by the fraction 1.5e-04 with half this value, by 3.4e-04 with
+twice this value, and by 6.2e-03 with finer cells.
 """
 THIRD = (-1, 3, -3, 1)
 MARGIN = len(THIRD) - 1
@@ -50,11 +52,11 @@ MARGIN = len(THIRD) - 1
 
 
 class Lattice:
-    """Lattice of the domain corners of an active body, and the held corners.  Bodies from meshes are not filtered.
+    """Lattice of the domain corners of an active body, and the held corners.
 
     `start`: identifier of the body's first point.
-    `given`: for each condition, the faces on which it prescribes displacements, and the prescribed axes.
-    `contacts`: for faces that touch other bodies, the domain (m,), and the indices (m, 4) of the face's corners in it.
+    `given`: for each condition, the faces with prescribed displacements, and the prescribed axes.
+    `contacts`: faces that touch other bodies, as the domain (m,) and the corner indices (m, 4) of each face.
     """
 
     def __init__(
@@ -93,7 +95,7 @@ class Lattice:
         return self.held_of(ids)[0]
 
     def held_of(self, ids: NDArray[np.int64]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Return the result of `given`, and which corners (m, 2^d) of the domains touch other bodies."""
+        """Return which displacement components of corners are prescribed, and which corners touch other bodies."""
 
         def held() -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
             number = self.nodes(ids)
@@ -106,7 +108,7 @@ class Lattice:
         return self._numbers(ids, lambda: self._body.nodes(ids - self._start))
 
     def corners_of_parts(self, points: MaterialPoints) -> NDArray[np.int64]:
-        """Return the indices (m,) of the body's corners that are corners of parts of domains, see `divided_domains`."""
+        """Return the indices (m,) of the body's corners that are corners of parts of domains."""
         own = is_part(points).nonzero()[0]
         root, part = (of[own] for of in roots(points))
         own = ((root >= self._start) & (root < self._stop)).nonzero()[0]
@@ -155,14 +157,10 @@ def _at_sites(
     values: NDArray[np.float64],
     tolerance: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], slice, Callable[[NDArray[np.float64]], NDArray[np.float64]]]:
-    """Return values at the sites of a lattice (..., k), which is distributed over the processes in slabs of layers.
+    """Return values at the sites of a lattice, which is distributed over the processes in slabs of layers.
 
-    Also return the range of first layers of third differences in this process's slab, and a function that converts
-    values at all sites of the slab to rows.
-
-    `shape`: number of lattice sites along each axis.
-    `number` (m,): lexicographic index of the site of each row of values (m, k).
-    `tolerance` (k,): largest difference between rows of a site; if domains differ by more, the site is nan.
+    The function also returns the range of layers of this process, and a function that converts values at sites to rows.
+    Sites have nan where their rows of values differ by more than `tolerance`.
     """
     across, starts = int(np.prod(shape[1:])), np.arange(comm.size + 1) * shape[0] // comm.size
     layer = number // across
@@ -196,11 +194,7 @@ def _filtered(
     thirds: Sequence[NDArray[np.float64]] | None,
     axes: Sequence[int] | None = None,
 ) -> NDArray[np.float64]:
-    """Return values on a box (..., k) of sites, filtered along some axes, by default along all.  Missing sites are nan.
-
-    Filters along two axes do not commute where s varies.  The mean over all orders of the axes makes the result
-    independent of rotations by right angles.
-    """
+    """Return the values on a box of sites, filtered along some axes, by default along all."""
     if axes is None:
         axes = tuple(axis for axis, count in enumerate(d.shape[:-1]) if count >= len(THIRD))
     if not axes:
@@ -211,10 +205,7 @@ def _filtered(
 
 
 def _divided(x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the weights (4, n - 3) of third differences at positions (n,).  The absolute weights add up to 8.
-
-    Third differences of quadratic functions are zero.
-    """
+    """Return the weights of third differences at positions (n,), whose absolute values add up to 8."""
     rows = np.stack([x[k : max(k, len(x) - 3 + k)] for k in range(len(THIRD))])
     distances = rows[:, None] - rows[None]
     weights = 1 / np.where(np.eye(len(THIRD), dtype=bool)[:, :, None], 1.0, distances).prod(axis=1)
@@ -224,7 +215,7 @@ def _divided(x: NDArray[np.float64]) -> NDArray[np.float64]:
 def _along(
     d: NDArray[np.float64], crossed: NDArray[np.float64], axis: int, weights: NDArray[np.float64] | None = None
 ) -> NDArray[np.float64]:
-    """Return values on a box (..., k), filtered along one axis.  `weights`: see `_divided`; None for equal widths."""
+    """Return the values on a box of sites, filtered along one axis."""
     out, count = d.copy(), d.shape[axis]
     along, cells = out.swapaxes(axis, 0), crossed.swapaxes(axis, 0)
     share = np.minimum(1.0, FAST * (cells[1 : count - 2] + cells[2 : count - 1]) / 2)
@@ -239,7 +230,10 @@ def _along(
 def lattices(
     bodies: Sequence[Body], present: Sequence[bool], given: Sequence[tuple[Surface, Iterable[int]]]
 ) -> list[Lattice]:
-    """Return the lattices of the active bodies.  `given`: faces with prescribed displacements, and their axes."""
+    """Return the lattices of the active bodies.
+
+    `given`: faces with prescribed displacements, and their prescribed axes.
+    """
     start = np.cumsum([0, *map(len, bodies)])
     around = {i: Faces.around(body) for i, body in enumerate(bodies) if present[i]}
     out = []
@@ -260,7 +254,10 @@ def given(lattices: Sequence[Lattice], points: MaterialPoints) -> NDArray[np.boo
 
 
 def seeded(lattices: Sequence[Lattice], points: MaterialPoints) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Return indices (n, 2^d) of corners in bodies, or -1 in renewed domains, and which corners touch other bodies."""
+    """Return the indices (n, 2^d) of corners in bodies, and which corners touch other bodies.
+
+    Corners of renewed domains have the index -1.
+    """
     numbers, touching = np.full(points.corners.shape[:2], -1), np.zeros(points.corners.shape[:2], dtype=bool)
     for lattice in lattices:
         rows = lattice.rows(points)
@@ -274,7 +271,8 @@ def filtered(
 ) -> NDArray[np.float64]:
     """Return the change of the corners (n, 2^d, d), in m, by the filter.
 
-    `then` are the points at the last grid reset.  `free` (n,) tells which points are filtered.
+    `then`: points at the last grid reset.
+    `free` (n,): whether points are filtered.
     """
     out, cells = np.zeros(points.corners.shape), crossed(grid, points, then, free)
     for lattice in lattices:

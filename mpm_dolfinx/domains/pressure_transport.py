@@ -1,20 +1,18 @@
 # SPDX-License-Identifier: MIT
 """Conservative, second-order remap of the pore pressure from one grid to the next.
 
-In each cell the pressure is reconstructed as `p + s . (x - c)` about the centroid c of the cell's storage.  Along an
-axis, s is van Leer's mean of the slopes at both ends of the cell.  The slope at an end is that towards the neighbour
-across an open face, or towards the pressure on a drained side.  If one of both slopes is missing, s is zero.  Then s is
-scaled so that the pressure in the cell stays between the extremes of cell, neighbours and drained sides.
+In each cell the pressure at the position x is reconstructed as `p + s . (x - c)`, with the cell pressure p, the slope
+s, and the centroid c of the cell's storage.  Along an axis, s is van Leer's mean of the slopes at both ends of the
+cell.  At an open face, the slope follows from the pressure of the neighbour.  At a drained side, the slope follows from
+the pressure on the side.  If an end is neither open nor drained, s is zero.  Then s is scaled so that the pressure in
+the cell stays between the extremes of cell, neighbours and drained sides.
 
 A piece of a particle domain receives the pressure at its centroid and moves with the domain.  Then the domain is cut
 again.  A cell may contain a fraction of the domain before and after the cut.  The smaller of both fractions keeps its
-pressure.  A further fraction in the cell receives the mean pressure of the fractions that left other cells.  The
-centroids of the
-pieces are remapped in the same way.  The error of the remapped centroid, times the mean slope of the domain, corrects
-the pressure.  The fractions of a domain add up to one, and the corrections add up to zero, so the remap is
-conservative.  Without motion, the remap changes nothing.
-
-Point pressures for output are reconstructed up to no-flow sides, see `up_to_surface`.  They are not transported.
+pressure.  Any further fraction in the cell receives the mean pressure of the fractions that left other cells.  The
+centroids of the pieces are remapped in the same way.  The error of the remapped centroid, times the mean slope of the
+domain, corrects the pressure.  The corrections of a domain add up to zero, so the remap is conservative.  Without
+motion, the remap changes nothing.
 """
 
 from __future__ import annotations
@@ -65,7 +63,10 @@ class PiecePressures:
         return self._each(exchange.send)._ordered()
 
     def potentials(self, bulk: float) -> PiecePressures:
-        """Return mass potentials (see `fluid_content`) instead of pressures.  `bulk`, in Pa: the fluid's modulus."""
+        """Return mass potentials (see `fluid_content`) instead of pressures.
+
+        `bulk`, in Pa: bulk modulus of the fluid.
+        """
         pi, bounds = mass_potential(self.pressure, bulk), mass_potential(self.bounds, bulk)
         slope = np.exp(self.pressure / bulk)[:, None] * self.slope
         return replace(self, pressure=pi, slope=slope, bounds=bounds)
@@ -77,12 +78,12 @@ class PiecePressures:
         return replace(self, pressure=self.pressure - even, slope=self.slope - slope, bounds=bounds)
 
     def of(self, ids: NDArray[np.int64], kept: bool = True) -> PiecePressures:
-        """Return the pieces of the points with these ids.  Without `kept`, return the pieces of all others."""
+        """Return the pieces of the points with the given ids, or all other pieces if `kept` is false."""
         rows = np.isin(self.id, ids) == kept
         return self._each(lambda values: values[rows])
 
     def joined(self, other: PiecePressures) -> PiecePressures:
-        """Return these pieces and the pieces `other` of points new on the grid.  All must be pieces to be moved."""
+        """Return these pieces and the pieces `other` of points that are new on the grid."""
         pairs = {name: (getattr(self, name), values) for name, values in other.arrays.items()}
         return PiecePressures(**{name: np.concatenate(both) for name, both in pairs.items()})._ordered()
 
@@ -95,7 +96,7 @@ class PiecePressures:
 
 
 def at_start(points: MaterialPoints) -> PiecePressures:
-    """Return one piece with uniform pressure for each point, for points that were in no cell before."""
+    """Return one piece with uniform pressure for each point that was in no cell before."""
     n, p = len(points), points.pressure
     cell = np.full(n, -1)
     slope = np.zeros_like(points.x)
@@ -127,7 +128,7 @@ class Reconstruction:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the slopes (n, d), in Pa/m, and the bounds (n, 2), in Pa, of the pressures in cells.
 
-        `origin` (n, d), in m, is the position to which the cell's pressure refers, relative to the cell's midpoint.
+        `origin` (n, d), in m: position to which the cell's pressure refers, relative to the cell's midpoint.
         """
         cells, p, centroid, *_ = pressures
         jump, one_sided, _, drained = self._differences(pressures)
@@ -142,10 +143,7 @@ class Reconstruction:
         return slope * scale[:, None], p[cells, None] + np.array([low, high]).T
 
     def _differences(self, pressures: CellPressures) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-        """Return four arrays (n, d, 2) by axis and end of cells.
-
-        They are pressure differences in Pa, slopes in Pa/m, and masks of neighbours and of drained sides.
-        """
+        """Return pressure differences and slopes at cell ends, and which ends have neighbours or drained sides."""
         cells, p, centroid, faces, outer = pressures
         neighbours, own = self._neighbour[cells], cells[:, None, None]
         axis, end = np.arange(self.grid.dim)[:, None], np.arange(2)
@@ -163,10 +161,9 @@ class Reconstruction:
     ) -> NDArray[np.float64]:
         """Return pressures (m,), in Pa, at positions in owned cells, with second-order accuracy even at the surface.
 
-        In a cell at a no-flow side, the slope is the smaller of two slopes.  One is the slope in the next cell inside,
-        the other is the linear extrapolation of the slopes inside.  Linear fields are exact, and steep slopes are not
-        continued.  Pressures stay between the extremes of cell, neighbours and drained sides, and of the reconstructed
-        value at the surface.
+        In a cell at a no-flow side, the slope is the smaller of two slopes: that in the next cell inside, and the
+        linear extrapolation of the slopes inside.  Pressures stay between the extremes of cell, neighbours and drained
+        sides, and of the reconstructed value at the surface.
 
         `x` (m, d), in m: positions relative to the midpoints of their cells.
         `slot` (m,): index of the cell of each position in `pressures.cells`.
@@ -189,7 +186,7 @@ class Reconstruction:
         return p[cells[slot]] + share_within(increment, low, high, slot)[slot] * increment
 
     def _everywhere(self, cells: NDArray[np.int64], slope: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return slopes (n, d) of owned cells as an array over all local cells, with ghosts."""
+        """Return the slopes of owned cells as an array over all local cells, with ghosts."""
         out = self._slope.x.array.reshape(-1, self.grid.dim)
         out[cells] = slope
         self._slope.x.scatter_forward()
@@ -205,7 +202,7 @@ def van_leer(one_sided: NDArray[np.float64]) -> NDArray[np.float64]:
 def share_within(
     increment: NDArray[np.float64], low: NDArray[np.float64], high: NDArray[np.float64], slot: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Return for each cell the largest factor (n,) <= 1 that keeps increments in the cell within [`low`, `high`]."""
+    """Return the largest factor (n,) <= 1 of each cell that keeps increments in the cell within [`low`, `high`]."""
     bound, share = np.where(increment > 0, high[slot], low[slot]), np.ones(len(low))
     excessive = (np.abs(increment) > np.abs(bound)).nonzero()[0]
     np.minimum.at(share, slot[excessive], bound[excessive] / increment[excessive])
@@ -213,12 +210,12 @@ def share_within(
 
 
 def _bounds_of(jump: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the smallest (<= 0) and largest (>= 0) difference (n,) to neighbours, from all differences (n, d, 2)."""
+    """Return the smallest and largest difference to neighbours, at most 0 and at least 0."""
     return np.minimum(jump.min(axis=(1, 2)), 0), np.maximum(jump.max(axis=(1, 2)), 0)
 
 
 def transport(old: PiecePressures, points: MaterialPoints, new: Pieces) -> NDArray[np.float64]:
-    """Return the pressures (n,), in Pa, of new pieces, or mass potentials (`fluid_content`) if `old` has potentials."""
+    """Return the pressures (n,), in Pa, of new pieces, or their mass potentials if `old` has potentials."""
     n = len(points)
     if not n:
         return np.empty(0)
@@ -251,7 +248,7 @@ def transport(old: PiecePressures, points: MaterialPoints, new: Pieces) -> NDArr
 
 
 def _limited(correction, pressure, old: PiecePressures, owner, new: Pieces) -> NDArray[np.float64]:
-    """Return factors (m,) of corrections that keep pressures within bounds.  All pieces of a domain have one factor."""
+    """Return factors of the corrections, one for each domain, that keep pressures within bounds."""
     first, new_first = (of.searchsorted(np.arange(of[-1] + 1)) for of in (owner, new.point))
     low, high = np.minimum.reduceat(old.bounds[:, 0], first), np.maximum.reduceat(old.bounds[:, 1], first)
     margin = np.where(correction > 0, high[new.point] - pressure, low[new.point] - pressure)
@@ -266,13 +263,13 @@ def halved_pieces(
     storage: tuple[NDArray[np.float64], NDArray[np.float64]],
     bulk: float,
 ) -> PiecePressures:
-    """Return one piece for each new point.  Its pressure follows from the mean slope in its old point.
+    """Return one piece for each new point.  The pressure of the piece follows from the mean slope in its old point.
 
     `pieces`: pieces of the n old points.
     `points`: old points, and m new points.
     `into` (m,): old point of each new point.
     `storage` (n,), (m,), in 1/Pa: storage coefficients of old points, and of new points.
-    `bulk`, in Pa: K_w.
+    `bulk`, in Pa: bulk modulus of the fluid.
     """
     (old, new), n = points, len(points[0])
     order = np.argsort(into, kind="stable")
@@ -330,13 +327,13 @@ def joined_pieces(
 def _missing(
     held: NDArray[np.float64], store: NDArray[np.float64], potential: NDArray[np.float64], of: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Return the change (n,), in Pa, of potentials (m,) for which points `of` (m,) contain the fluid `held` (n,)."""
+    """Return the change of potentials, in Pa, for which each point contains the fluid `held`."""
     (total, now), n = sum_by(of, np.array([store, store * potential]), len(held)), len(held)
     return np.divide(held - now, total, out=np.zeros(n), where=total > 0)
 
 
 def _outermost(bounds: NDArray[np.float64], of: NDArray[np.int64], n: int) -> NDArray[np.float64]:
-    """Return the smallest lower and largest upper bounds (n, 2), in Pa, of rows (m, 2) with equal indices `of` (m,)."""
+    """Return the smallest lower and the largest upper bounds of rows with equal indices."""
     out = np.stack([np.full(n, np.inf), np.full(n, -np.inf)], axis=1)
     np.minimum.at(out[:, 0], of, bounds[:, 0])
     np.maximum.at(out[:, 1], of, bounds[:, 1])

@@ -25,18 +25,27 @@ from mpm_dolfinx.points.polygons import NONE, Polygons
 from mpm_dolfinx.points.surface_in_cells import BOX, EDGES, RING, Region, resampled
 
 GAP = 0.01
-"""Largest gap, divided by the cell size, at which faces of two domains count as one surface.  Halving this value
-changes the result of scene "flow" in tests/plateaus.py by 2.5e-05 (relative), doubling it by 0.0e+00, and
-finer cells by 9.0e-02."""
+"""Largest gap, divided by the cell size, at which faces of two domains count as one surface.
+
+The result of scene "flow" in tests/plateaus.py changes by the fraction 2.5e-05 with half this value, by 0.0e+00 with
+twice this value, and by 9.0e-02 with finer cells.
+"""
 CRUMB = NEAR
-"""Smallest area of a part of a domain, divided by the area of its cell.  If a part is smaller, other parts receive its
-mass and its seeded faces.  Source: `NEAR`."""
+"""Smallest area of a part of a domain, divided by the area of its cell.
+
+Other parts receive the mass and the seeded faces of smaller parts.  Source: `NEAR`.
+"""
 SMALL = (0.5 / EDGES) ** 2
-"""Smallest area of a part of an old domain that remains in a cell, divided by the cell area.  A cell with a smaller
-part is renewed too.  Source: definition, a square with half the length of a surface edge (`EDGES` edges in a cell)."""
+"""Smallest area of a part of an old domain that remains in a cell, divided by the cell area.
+
+A cell with a smaller part is renewed too.  Source: definition, a square with half the length of a surface edge
+(`EDGES` edges in a cell).
+"""
 COVERED = 0.25
-"""Largest difference between the area of the pieces in a renewed cell and its filled area, in cell areas.  Source:
-definition, the area of a new domain in a full cell, which is divided into four."""
+"""Largest difference between the area of the pieces in a renewed cell and its filled area, in cell areas.
+
+Source: definition, the area of a new domain in a full cell, which is divided into four.
+"""
 SIDE = np.array([2, 1, 3, 0])
 """Index of the face at each edge of the ring of a domain's corners."""
 START, END = np.array([2, 1, 0, 3]), np.array([0, 3, 1, 2])
@@ -44,7 +53,7 @@ START, END = np.array([2, 1, 0, 3]), np.array([0, 3, 1, 2])
 
 
 class Parts(NamedTuple):
-    """Parts of the surface.  Each part is in one cell.  Arrays have a row for each of m parts."""
+    """Parts of the surface, each in one cell."""
 
     row: NDArray[np.int64]  # index of the face in `OuterFaces` (m,)
     cell: NDArray[np.int64]  # cell (m,)
@@ -55,7 +64,7 @@ class Parts(NamedTuple):
 
 @dataclass(frozen=True)
 class OuterFaces:
-    """Faces of domains on the surface of the bodies.  Arrays have a row for each of n faces."""
+    """Faces of domains on the surface of the bodies."""
 
     point: NDArray[np.int64]  # material point (n,)
     face: NDArray[np.int64]  # index of the face in its domain (n,)
@@ -65,7 +74,7 @@ class OuterFaces:
 
 
 class New(NamedTuple):
-    """New particle domains.  Arrays have a row for each of n domains."""
+    """New particle domains."""
 
     corners: NDArray[np.float64]  # (n, 4, 2), m
     group: NDArray[np.int64]  # index of the group (n,); domains of a group receive values from the same pieces
@@ -75,7 +84,7 @@ class New(NamedTuple):
 
 
 def ring_lengths(grid: Grid, x: NDArray[np.float64]) -> NDArray[np.float64] | float:
-    """Return the factor (> 0) from lengths in the plane to areas at x (n, 2), in m, see `Grid.around`."""
+    """Return the factor (> 0) from lengths in the plane to areas at positions x (n, 2), in m, see `Grid.around`."""
     return np.maximum(grid.around(x), TURN * EPSILON * grid.least) if grid.axisymmetric else 1.0
 
 
@@ -131,12 +140,12 @@ class RefilledCells:
         """Whether each point (n,) loses its domain or a part of it."""
 
     def _volume(self, cells: NDArray[np.int64]) -> NDArray[np.float64] | float:
-        """Return the areas (n,), in m^2, of cells (n,), or one number for equal cells."""
+        """Return the areas of cells, in m^2, or one number for equal cells."""
         return self.grid.sizes_of(cells).prod(axis=-1)
 
     @cached_property
     def _areas(self) -> NDArray[np.float64]:
-        """Areas (m,), in m^2, of the pieces of domains, or in axisymmetry of the pieces' sections in the plane."""
+        """Areas of the pieces of domains, or in axisymmetry of their sections, in m^2."""
         pieces = self.pieces
         whole = np.abs(volumes(self.points.corners))
         if not self.grid.axisymmetric:
@@ -145,16 +154,13 @@ class RefilledCells:
         return area * (whole / sum_by(pieces.point, area, len(whole)))[pieces.point]
 
     def _at(self, cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Return which points (n,) have a piece in any of the cells."""
+        """Return which points have a piece in any of the cells."""
         out = np.zeros(len(self.points), dtype=bool)
         out[self.pieces.point[cells[self.cell]]] = True
         return out
 
     def _excluded(self, flowed: NDArray[np.bool_], signs: tuple[NDArray, NDArray]) -> NDArray[np.bool_]:
-        """Return which cells cannot be renewed.
-
-        They contain points that have not `flowed`, points of two bodies, or faces whose conditions prevent renewal.
-        """
+        """Return which cells cannot be renewed, because of unyielded soil, two bodies, or conditions on faces."""
         of, cell = self.pieces.point, self.cell
         parts = self.parts
         low, high = np.full(self.cells, np.iinfo(np.int64).max), np.full(self.cells, -1)
@@ -214,7 +220,7 @@ class RefilledCells:
         return Parts(row, grid.number(index.T), (s[:, :2] - index).transpose(2, 0, 1), s[:, 2].T, side)
 
     def _chains(self, excluded: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], Region]:
-        """Return which cells the surface crosses, and the filled region of the cells that the surface crosses once.
+        """Return which cells the surface crosses, and the filled region of each cell that it crosses once.
 
         Cells that the surface crosses more than once are added to `excluded`.
         """
@@ -253,12 +259,12 @@ class RefilledCells:
     # ---- new domains ----------------------------------------------------------------------------
 
     def _group(self, cells: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return for each cell the group of its new domains, which is the index of the cell among the renewed cells."""
+        """Return the group of the new domains in each cell: the index of the cell among the renewed cells."""
         number = np.cumsum(self.chosen) - 1
         return number[cells]
 
     def _place(self, cells: NDArray[np.int64], y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the positions (n, k, 2), in m, of local coordinates y (n, k, 2), from 0 to 1, in cells (n,)."""
+        """Return the positions of local coordinates y, from 0 to 1, in cells."""
         index = np.stack(np.unravel_index(cells % self.grid.cells, tuple(self.grid.shape)), axis=1)
         return self.grid.places(np.broadcast_to(index[:, None], y.shape), y)
 
@@ -298,11 +304,7 @@ class RefilledCells:
         lower: NDArray[np.float64],
         upper: NDArray[np.float64],
     ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return the keys (n,) of edges in cells (n,), and the reference positions (n, 2, 2), in m, of the edges' ends.
-
-        The key of an edge is the key of the surface part nearest to the middle of the edge.  Reference positions of
-        the ends come from the parts nearest to the ends.
-        """
+        """Return the keys of edges in cells, and the reference positions of their ends, from the nearest surface."""
         first = np.searchsorted(parts.cell[order], cells, side="left")
         stop = np.searchsorted(parts.cell[order], cells, side="right")
         edge, at = ranges(first, stop - first)
@@ -321,12 +323,12 @@ class RefilledCells:
         return key, np.stack([self._seeded_at(*one) for one in found[1:]], axis=1)
 
     def _seeded(self, row: NDArray[np.int64], t: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the seeded areas (n,), in m^(d-1), of parts of faces between two coordinates t (n, 2) on each face."""
+        """Return the seeded areas of parts of faces."""
         return self._face_areas[row] * self._share(row, t)
 
     @cached_property
     def _face_areas(self) -> NDArray[np.float64]:
-        """Seeded areas of faces, increased so that remaining parts of a face also represent its other parts."""
+        """Seeded areas of faces, increased so that the remaining parts represent the whole face."""
         parts, left = self.parts, self._left
         of, share = self.faces.point[parts.row], self._share(parts.row, parts.t)
         remains = np.isin(of * self.cells + parts.cell, self.pieces.point[left] * self.cells + self.cell[left])
@@ -336,7 +338,7 @@ class RefilledCells:
         return area * np.divide(whole, there, out=np.ones(len(area)), where=there > 0)
 
     def _share(self, row: NDArray[np.int64], t: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the fractions (n,) of faces between two coordinates t (n, 2) on each face."""
+        """Return the fraction of each face that lies between two coordinates t on the face."""
         share = np.ptp(t, axis=1)
         if self.grid.axisymmetric:
             corners, face = self.points.corners[self.faces.point[row]], self.faces.face[row]
@@ -345,7 +347,7 @@ class RefilledCells:
         return share
 
     def _seeded_at(self, row: NDArray[np.int64], t: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the reference positions (n, 2), in m, at coordinates t (n,) on faces, from 0 (start) to 1 (end)."""
+        """Return the reference positions at coordinates t on faces, from 0 (start) to 1 (end)."""
         face = self.faces.face[row]
         flipped = START[face] != FACES[2][face, 0]
         share = np.where(flipped, 1 - t, t)[:, None]
@@ -360,7 +362,7 @@ class RefilledCells:
         area: NDArray[np.float64],
         ends: NDArray[np.float64],
     ) -> New:
-        """Return new domains in cells (n,).  If the surface runs along a cell's side, faces there are surface faces."""
+        """Return the new domains in cells that the surface crosses."""
         parts = self.parts
         on = np.flatnonzero(parts.side != NONE)
         place = 4 * parts.cell[on] + parts.side[on]
@@ -397,13 +399,13 @@ class RefilledCells:
 
     @cached_property
     def _left(self) -> NDArray[np.int64]:
-        """Pieces (n,) of removed domains outside the renewed cells, without crumbs."""
+        """Pieces of removed domains outside the renewed cells, without parts smaller than `CRUMB`."""
         left = np.flatnonzero(self.affected[self.pieces.point] & ~self.chosen[self.cell])
         return left[self._areas[left] > CRUMB * self._volume(self.cell[left])]
 
     @cached_property
     def remainders(self) -> tuple[New, NDArray[np.int64]]:
-        """New domains in pieces of removed domains outside renewed cells, and these pieces.  One piece is one group."""
+        """New domains in the pieces of removed domains outside renewed cells, and these pieces."""
         pieces, points = self.pieces, self.points
         left = self._left
         rings, of = _convex(points.corners[pieces.point[left]], self._volume(self.cell[left]))
@@ -449,7 +451,7 @@ class RefilledCells:
     # ---- transfer of values ---------------------------------------------------------------------
 
     def slopes(self, values: NDArray[np.float64], group: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return slopes (n, 2, k), in 1/m, of point values (points, k) in new domains, from least squares in a cell."""
+        """Return the slopes (n, 2, k), in 1/m, of point values (points, k) in new domains, from least squares."""
         pieces, grid = self.pieces, self.grid
         weight = pieces.fraction * self.points.volume0[pieces.point]
         whole = np.maximum(sum_by(self.cell, weight, self.cells), TINY)
@@ -482,7 +484,7 @@ class RefilledCells:
         return piece, groups, share / whole[pieces.point[piece]]  # includes the mass of dropped parts
 
     def pairs(self, corners: NDArray[np.float64], group: NDArray[np.int64]) -> tuple[NDArray, NDArray, NDArray]:
-        """Return index pairs of old and new domains, and the fraction of the old mass that each new domain receives."""
+        """Return pairs of old and new domains, and the fraction of the old mass that each new domain receives."""
         piece, groups, share = self.into
         order = np.argsort(group, kind="stable")
         first, stop = (np.searchsorted(group[order], groups, side=side) for side in ("left", "right"))
@@ -529,16 +531,13 @@ def no_faces(n: int) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np
 
 
 def ring_share(r0: NDArray[np.float64], r1: NDArray[np.float64], t: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return radii (n,) at coordinates t (n,) on faces from radius r0 to r1 (n,), divided by the mean radius."""
+    """Return the radii (n,) at coordinates t (n,) on faces from radius r0 to r1, divided by the mean radius."""
     mean = (r0 + r1) / 2
     return np.divide(r0 + t * (r1 - r0), mean, out=np.ones(len(t)), where=mean > 0)
 
 
 def _convex(corners: NDArray[np.float64], volume: NDArray[np.float64] | float) -> tuple[Polygons, NDArray[np.int64]]:
-    """Divide domains (n, 4, 2) into convex polygons.  Return the polygons, and the index of each polygon's domain.
-
-    The polygons have the face index of each edge.  `volume` (n,), in m^2, is the area of the cell of each domain.
-    """
+    """Divide domains into convex polygons, and return the polygons with the domain of each."""
     ring = corners[:, RING]
     edge = np.tile(SIDE, (len(ring), 1))
     away = np.roll(ring, -1, axis=1) - ring

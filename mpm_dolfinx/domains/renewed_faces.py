@@ -22,8 +22,9 @@ AREA = "renewed areas"
 ENDS = "renewed ends"
 """Names of point data for the faces of the point's domain.
 
-PARENT is the key of the seeded face, or -1.  AREA is the seeded area, in m^(d-1).  ENDS are the reference positions of
-the ends, in m.
+PARENT: key of the seeded face, or -1.
+AREA: seeded area, in m^(d-1).
+ENDS: reference positions of the ends, in m.
 """
 
 
@@ -31,8 +32,8 @@ ROOT = "seeded domain"
 PART = "part of the seeded domain"
 """Names of point data for parts of seeded domains.
 
-ROOT is the identifier of the seeded domain that has the lower corner of the part, or -1.  PART are the ends (n, d, 2)
-of the part.
+ROOT: identifier of the seeded domain that has the lower corner of the part, or -1.
+PART: lower and upper ends (n, d, 2) of the part.
 """
 
 
@@ -63,7 +64,10 @@ def is_part(points: MaterialPoints) -> NDArray[np.bool_]:
 
 
 def roots(points: MaterialPoints) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return `ROOT` (n,) and `PART` (n, d, 2) of all points.  A whole domain has its own identifier and [0, 1]."""
+    """Return `ROOT` (n,) and `PART` (n, d, 2) of all points.
+
+    A whole domain has its own identifier as `ROOT`, and the interval [0, 1] along each axis.
+    """
     part, (n, d) = is_part(points), points.x.shape
     if not part.any():
         return points.id, np.broadcast_to([0.0, 1.0], (n, d, 2))
@@ -79,7 +83,9 @@ def faces_of_parts(
 
     Returns
     -------
-    Index of the face (n,), index of the point (n,), and lower and upper ends (n, d) of the part in its seeded domain.
+    Index (n,) of the face for each part.
+    Index (n,) of the point for each part.
+    Lower and upper ends (n, d) of each part in its seeded domain.
     """
     at = is_part(points).nonzero()[0]
     root, part = (of[at] for of in roots(points))
@@ -93,7 +99,7 @@ def faces_of_parts(
 
 
 def on_parts(faces: Surface, points: MaterialPoints) -> tuple[Surface, NDArray[np.int64]]:
-    """Return a surface together with its faces on parts of domains, and for each row the index of the given face.
+    """Return a surface together with its faces on parts of domains, and the given face of each row.
 
     Polygons of the surface on seeded domains are clipped to the parts.  These polygons must be rectangles in local
     coordinates.
@@ -119,11 +125,7 @@ def on_parts(faces: Surface, points: MaterialPoints) -> tuple[Surface, NDArray[n
 
 
 class SeededFaces:
-    """Outer faces of the bodies of a scene in 2D: the seeded faces, and the faces that represent them now.
-
-    `grid`: background grid.
-    `bodies`: all bodies of the scene.
-    """
+    """Outer faces of the bodies of a scene in 2D: the seeded faces, and the faces that represent them now."""
 
     def __init__(self, grid: Grid, bodies: Sequence[Body]):
         self.bodies = bodies
@@ -173,7 +175,7 @@ class SeededFaces:
         return out
 
     def signatures(self, surfaces: Sequence[Surface]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return keys of outer faces, and the index of each face's set of conditions, or -1 if the face must stay."""
+        """Return the keys of outer faces, and the index of each face's set of conditions, or -1 if it must stay."""
         key = self.seeded.key
         kind = np.zeros((len(key), len(surfaces)), dtype=np.int8)
         barred = np.zeros(len(key), dtype=bool)
@@ -189,7 +191,7 @@ class SeededFaces:
 
 @dataclass(frozen=True)
 class RenewedFaces:
-    """Faces of renewed domains on surfaces.  Arrays have a row for each of m faces."""
+    """Faces of renewed domains on surfaces."""
 
     row: NDArray[np.int64]  # index of the seeded face among the faces of all surfaces (m,)
     at: NDArray[np.int64]  # index of the point (m,)
@@ -200,7 +202,7 @@ class RenewedFaces:
     old: NDArray[np.bool_] | None = None  # in the result of `of`: which positions lie on seeded faces (n,)
 
     def of(self, number: NDArray[np.int64]) -> RenewedFaces:
-        """Return the renewed faces with indices `number` (n,).  Rows of seeded faces (index < 0) are `old`."""
+        """Return the renewed faces with indices `number` (n,).  Negative indices belong to seeded faces (`old`)."""
         old, at = number < 0, np.maximum(number, 0)
         if not len(self.row):
             return RenewedFaces(*(np.zeros((len(number), *v.shape[1:]), v.dtype) for v in self._columns), old)
@@ -253,7 +255,7 @@ def renewed_faces(points: MaterialPoints, several: Sequence[Surface]) -> Renewed
 
 
 def _within(ends: NDArray[np.float64], region: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return two fractions (n,) of the lengths of edges (n, 2, 2) at which edges enter and leave a region (2, 2)."""
+    """Return the fractions of edge lengths at which edges enter and leave a region."""
     low, high = np.zeros(len(ends)), np.ones(len(ends))
     edge_vector = ends[:, 1] - ends[:, 0]
     slack = SAME * np.abs(edge_vector).max(axis=1)

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""Waves and shaking: quiet boundaries, energies, error of a step."""
+"""Waves and shaking: quiet boundaries, energies, and the error of a step with inertia."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Reactions of sides at rest, which act as tractions after a body is released."""
+"""Tractions that replace the reactions of sides at rest when a body is released."""
 
 from __future__ import annotations
 
@@ -27,18 +27,17 @@ def balancing_tractions(
     forces: NDArray[np.float64],
     held: NDArray[np.bool_],
 ) -> dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]:
-    """Return for each side at rest the ids (n,) of its points, and tractions (n, d), Pa, that replace its reactions.
+    """Return the points and the tractions that replace the reactions of each side at rest.
 
-    Tractions are forces per reference area, computed from the stresses.  On a connected part, the resultant and the
-    moment of the tractions may differ from the resultant and the moment of the reactions.  Rigid-body fields of
-    tractions remove these differences.
+    Tractions are forces per reference area, computed from the stresses.  Rigid-body fields of tractions are added, so
+    that each connected part receives the resultant and the moment of its reactions.
 
-    cut, points: cut particle domains, and material points.
-    stresses: total stresses (faces, k, k), Pa, on the sides, by name of the side.
-    surfaces: the sides, by name.
+    stresses: total stresses (faces, k, k), in Pa, on each side.
     parts: connected parts of the bodies.
-    forces (nodes, d), N: reactions of the sides at the owned nodes of this process, zero at other nodes.
+    forces (nodes, d), in N: reactions of the sides at the owned nodes of this process, zero at other nodes.
     held (nodes, d): which displacement components remain fixed.
+
+    Returns for each side the ids (n,) of its points and the tractions (n, d), in Pa.
     """
     grid, d = cut.grid, cut.grid.dim
     patches = cut.surfaces(list(surfaces.values()))
@@ -75,9 +74,9 @@ def balancing_tractions(
 
 
 def _rigid(arm: NDArray[np.float64], free: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return rigid-body fields (k, n, d) at positions (n, d), m: translations along free axes, and rotations.
+    """Return the rigid-body fields (k, n, d) for the lever arms of n points.
 
-    Rotations are left out if any axis is fixed.
+    If any axis is fixed, there are no rotations.
     """
     n, d = arm.shape
     fields = [np.broadcast_to(e, (n, d)) for e in np.eye(d)[free]]

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Energies of bodies with inertia, and the work of forces on them.
 
-The work of forces f in a step is `dt sum b_i f_i . v_i` over its substeps, with the weights b_i of the time
-integration. The work of all forces is the work of loads minus the work of stresses, viscous resistance and friction.
-Without renewal, the work of all forces minus the change of kinetic energy is the numerical dissipation of method and
-grid resets.
+In a step, forces f do the work `dt sum b_i f_i . v_i`.  The sum extends over the substeps i, with their velocities v_i
+and the weights b_i of the time integration.  The total work is the work of loads minus the work of stresses, viscous
+resistance and friction.  If no domains are renewed, the total work minus the change of kinetic energy is the numerical
+dissipation.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 
 
 def stored(materials: SceneMaterials, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
-    """Return the kinetic and elastic energies, J, of points; all processes must call it."""
+    """Return the kinetic and elastic energies of points, in J.  All processes must call this function."""
     mass = materials.present_density(points) * points.volume0 * points.J
     v, L = points.data[VELOCITY], velocity_gradients(points)
     moments = spreads(points.corners, materials.grid.axisymmetric)
@@ -34,9 +34,10 @@ def stored(materials: SceneMaterials, points: MaterialPoints) -> dict[str, NDArr
 def initial_energies(
     materials: SceneMaterials, points: MaterialPoints, kinetic: float, renews: bool
 ) -> dict[str, NDArray[np.float64]]:
-    """Return the energies, J, at the start, see `Result.energies`.  `internal` is the work of the stresses.
+    """Return the energies at the start, in J, see `Result.energies`.
 
-    kinetic: kinetic energy of free tools, J; renews: whether domains may be renewed.
+    kinetic: kinetic energy of free tools, in J.
+    renews: whether domains may be renewed.
     """
     works = dict.fromkeys(("internal", "viscous", "friction", "external", *["renewal"] * renews), 0.0)
     return _named(stored(materials, points), works, 0.0, kinetic)
@@ -50,11 +51,11 @@ def after(
     seconds: Sequence[float],
     powers: Sequence[Mapping[str, float]],
 ) -> dict[str, NDArray[np.float64]]:
-    """Return the energies, J, after a step, from the energies before the step.
+    """Return the energies after a step, in J.
 
-    kinetic: kinetic energy of free tools, J.
-    seconds: time weights of the substeps, s.
-    powers: powers of the substeps on this process, in W, see `MomentumProblem.powers`.
+    kinetic: kinetic energy of free tools, in J.
+    seconds: time weights of the substeps, in s.
+    powers: powers in each substep on this process, in W, see `MomentumProblem.powers`.
     """
     counted = seconds[-len(powers) :] @ np.array([list(of.values()) for of in powers])
     work = zip(powers[0], over_all(materials.grid.comm, counted), strict=True)
@@ -68,7 +69,7 @@ def after(
 def after_renewal(
     materials: SceneMaterials, energy: Mapping, old: MaterialPoints, new: MaterialPoints, renewed: int
 ) -> Mapping[str, NDArray[np.float64]]:
-    """Return the energies, J, after renewal of domains; `renewal` is the total energy lost by renewals."""
+    """Return the energies after a renewal of domains, in J.  `renewal` is the total energy lost by renewals."""
     if not renewed:
         return energy
     now = stored(materials, new)

@@ -17,17 +17,18 @@ from mpm_dolfinx.solve.schur import LinearSolvers
 def motion_error(
     solvers: LinearSolvers, K: PETSc.Mat, mass: Mass, flights: Sequence[Flight], seconds: float, own: float
 ) -> tuple[float, float]:
-    """Return the estimated error and the size of a step's motion, each the square root of twice an energy, J^(1/2).
+    """Return the estimated error and the size of the motion of a step, in J^(1/2).
 
-    The substeps end with the velocities v1, v2 and accelerations a1, a2.  The difference from a first-order step is
-    `seconds * (a2 - a1)` in velocities, and `seconds * (v2 - v1)` in displacements.  The estimate is `ERROR` times this
-    difference.  The error of a resolved mode of angular frequency omega in a step dt is 0.081 omega dt times this
-    difference.  A solve with the substep's matrix bounds the estimate for unresolved modes (Hosea and Shampine 1996).
+    The substeps end with the velocities v1, v2 and accelerations a1, a2.  A first-order step differs by
+    `seconds * (a2 - a1)` in velocity, and by `seconds * (v2 - v1)` in displacement.  The estimate is `ERROR` times this
+    difference.  The error of a resolved mode is 0.081 omega dt times this difference, with the angular frequency omega
+    and the step dt.  A solve with the matrix of the substep bounds the estimate for unresolved modes (Hosea and
+    Shampine 1996).
 
-    solvers, K, mass: linear solvers, momentum tangent and mass of the last substep.
+    K, mass: momentum tangent and mass of the last substep.
     flights: states of motion after the two substeps.
-    seconds: weight, s, of the first substep's rate in the last substep.
-    own: weight, s, of the last substep's rate in the last substep.
+    seconds: weight of the first substep's rate in the last substep, in s.
+    own: weight of the last substep's rate in the last substep, in s.
     """
     first, last = flights
     rate, M = 1 / own**2, mass.M

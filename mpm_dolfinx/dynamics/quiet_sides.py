@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Quiet boundaries that absorb waves.
 
-The traction is `t = t_0 - Z (v - 2 v_in)`, with the impedance `Z = rho c_p n n + rho c_s (I - n n)`.  t_0 is the
-constant traction at rest.  v is the velocity of the side, and v_in is the velocity of an incoming wave.  n is the
-normal, rho is the density, and c_p and c_s are the speeds of compression and shear waves (Lysmer and Kuhlemeyer 1969;
-incoming waves: Joyner and Chen 1975).  Impedances use small-strain moduli of undrained soil.
+A quiet side exerts the traction `t = t_0 - Z (v - 2 v_in)`.  t_0 is the constant traction at rest.  v is the velocity
+of the side, and v_in is the velocity of an incoming wave (Joyner and Chen 1975).  The impedance is
+`Z = rho c_p n n + rho c_s (I - n n)`, with the normal n, the density rho, and the speeds c_p of compression waves and
+c_s of shear waves (Lysmer and Kuhlemeyer 1969).  Impedances use small-strain moduli of undrained soil.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ from mpm_dolfinx.grid.grid import Grid
 
 
 def traction_name(name: str) -> str:
-    """Return the name of the point field with the traction (n, d), Pa, of a quiet side at rest."""
+    """Return the name of the point field that holds the traction of a quiet side at rest."""
     return f"{name}_traction"
 
 
 class QuietForms:
     """Forms at points on quiet sides.
 
-    The field `across` is the tangential impedance, kg/m^2/s.  The field `along` is the normal impedance minus the
-    tangential impedance.  The field `force` is the constant traction at rest plus the traction of incoming waves, Pa.
+    The field `across` is the tangential impedance, in kg/m^2/s.  The field `along` is the normal impedance minus the
+    tangential impedance.  The field `force` is the traction at rest plus the traction of incoming waves, in Pa.
     """
 
     def __init__(self, grid: Grid, u: fem.Function, velocity: Velocity):
@@ -85,11 +85,11 @@ class QuietSides(Acting):
         return [faces for _, faces in self._sides.values()]
 
     def kept(self, n: int) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return initial point fields of n points: zero tractions at rest."""
+        """Return initial fields of n points, with zero tractions at rest."""
         return {name: {traction_name(name): np.zeros((n, self._grid.dim))} for name in self._sides}
 
     def placed(self, place: Place) -> Loads:
-        """Return the loads on the present surface."""
+        """Return the loads on the sides in their present position."""
         rows, d = [], self._grid.dim
         points = place.points
         rho, shear = self._materials.present_density(points), self._materials.table(points, lambda m: m.shear)
@@ -111,7 +111,7 @@ class QuietSides(Acting):
 
 
 class QuietLoads(Loads):
-    """Quiet sides in a substep."""
+    """Loads of the quiet sides in a substep."""
 
     varies = True
 
@@ -119,7 +119,7 @@ class QuietLoads(Loads):
         self._forms, self._data = forms, data
 
     def dead(self, b: NDArray[np.float64]) -> None:
-        """Add constant tractions, and tractions of incoming waves."""
+        """Add the constant tractions and the tractions of incoming waves."""
         self._forms.stays.assemble_vector(b, self._data)
 
     def resists(self, b: NDArray[np.float64]) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Renewal of particle domains with inertia.  New masses keep centres of mass, new velocities keep momenta."""
+"""Masses and velocities of renewed particle domains, which keep centres of mass and momenta."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from mpm_dolfinx.mechanics.inertia import RATE, VELOCITY, velocity_gradients
 from mpm_dolfinx.points.cutting import Pieces, cut
 
 MOTION = VELOCITY, RATE
-"""Names of point data: velocity and rate of F."""
+"""Names of the point data for the velocity and for the rate of F."""
 
 
 class Momenta(NamedTuple):
-    """Momenta of groups of pieces; arrays over the groups."""
+    """Momenta of groups of pieces, as arrays over the groups."""
 
     mass: NDArray[np.float64]  # (groups,), kg
     centre: NDArray[np.float64]  # centre of mass (groups, 2), m
@@ -32,9 +32,11 @@ class Momenta(NamedTuple):
     ) -> Momenta:
         """Return the momenta of `count` groups.
 
-        piece, group (k,): index in `pieces` and group of each of k pieces.
-        mass (k,), kg: mass of each piece.
-        v (n, 2), m/s, L (n, 2, 2), 1/s: velocities and velocity gradients of n domains.
+        piece (k,): index in `pieces` of each piece.
+        group (k,): group of each piece.
+        mass (k,), in kg: mass of each piece.
+        v (n, 2), in m/s: velocity of each domain.
+        L (n, 2, 2), in 1/s: velocity gradient of each domain.
         """
         of, x = pieces.point[piece], pieces.x[piece]
         second = pieces.second[piece]
@@ -52,13 +54,15 @@ class Momenta(NamedTuple):
 def velocities(
     work: RefilledCells, corners: NDArray, x: NDArray, group: NDArray, masses: tuple[NDArray, NDArray]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the velocities of new domains, and their gradients: corrected means of the old domains' affine fields.
+    """Return the velocities and the velocity gradients of new domains.
 
-    The means are over the overlap with the old domains.  The correction is a rigid motion of each group of domains,
-    which restores the momentum and the angular momentum of the group.
+    They are means of the affine velocity fields of the old domains over the overlap.  A rigid motion of each group of
+    domains then restores the momentum and the angular momentum of the group.
 
-    corners (n, 4, 2), m, x (n, 2), m, group (n,): corners, position and group of each new domain.
-    masses: masses of the old points and of the new points, kg.
+    corners (n, 4, 2), in m: corners of each new domain.
+    x (n, 2), in m: position of each new domain.
+    group (n,): group of each new domain.
+    masses: masses of the old points and masses of the new points, in kg.
     """
     points = work.points
     n, count = len(x), int(group.max()) + 1
@@ -80,13 +84,15 @@ def velocities(
 
 
 def centred(work: RefilledCells, group: NDArray, x: NDArray, mass: NDArray, old: NDArray) -> NDArray[np.float64]:
-    """Return masses (n,), kg, of new domains at x (n, 2), m, with which each renewed cell keeps its centre of mass.
+    """Return masses of new domains, in kg, that keep the centre of mass of each renewed cell.
 
-    Each renewed cell is a group.  Each domain outside these cells is a group of its own, and keeps its mass.  A mass
-    changes by at most half.  If this limit applies, the centre of mass moves.
+    Each domain outside renewed cells keeps its mass.  A mass changes by at most half; a cell that reaches this limit
+    does not keep its centre of mass.
 
     group (n,): group of each new domain.
-    old (points,): masses of the old domains.
+    x (n, 2), in m: position of each new domain.
+    mass (n,), in kg: mass of each new domain before the change.
+    old (points,), in kg: masses of the old domains.
     """
     cells, inside = int(work.chosen.sum()), group < work.chosen.sum()
     received = _received(work, old)
@@ -105,13 +111,13 @@ def centred(work: RefilledCells, group: NDArray, x: NDArray, mass: NDArray, old:
 
 
 def _received(work: RefilledCells, mass: NDArray[np.float64]) -> tuple[NDArray, NDArray, NDArray]:
-    """Return the pieces of removed domains, their groups, and their masses (k,), from the masses of the points."""
+    """Return the pieces of the removed domains, their groups and their masses."""
     piece, groups, share = work.into
     return piece, groups, share * mass[work.pieces.point[piece]]
 
 
 def _centre(group: NDArray, mass: NDArray, values: NDArray, count: int) -> tuple[NDArray, NDArray]:
-    """Return the mass (count,) of each group, and the mass-weighted mean (count, k) of values (n, k) in the group."""
+    """Return the mass and the mass-weighted mean of `values` in each group."""
     whole = np.bincount(group, mass, count)
     columns = [np.bincount(group, mass * column, count) for column in values.T]
     return whole, np.stack(columns, axis=1) / np.where(whole > 0, whole, 1.0)[:, None]

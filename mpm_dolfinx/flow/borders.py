@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Fluxes through faces between cells of different unsaturated soil, and through faces of cells with several soils.
+"""Fluxes of unsaturated soil through faces between cells of different soil, and through faces of cells with several
+soils.
 
-`series` computes the fluxes through these faces.  All other faces have two-point fluxes in UFL.
+`series` computes the conductivities of these faces. All other faces have two-point fluxes in UFL.
 """
 
 from __future__ import annotations
@@ -27,20 +28,11 @@ from mpm_dolfinx.forms.unknowns import Unknowns, with_ghosts
 class Borders:
     """Faces between cells of different soil, and faces of cells with several soils, at the last grid reset.
 
-    Parameters
-    ----------
-    contents
-        Material in the cells.
-    cells : (m,)
-        Cell of each piece.
-    soils : (m, k)
-        Numbers that identify the soil of each piece.  Pieces with equal rows have equal conductivities.
-    law : (m,)
-        Index of the retention curve of each piece.
-    facets
-        Facets of this process between two active cells.
-    mixed
-        Cells with several soils, or None.
+    `cells` (m,): cell of each piece.
+    `soils` (m, k): numbers that identify the soil of each piece.  Pieces with equal rows have equal conductivities.
+    `law` (m,): index of the retention curve of each piece.
+    `facets`: facets of this process between two active cells.
+    `mixed`: cells with several soils, or None.
     """
 
     def __init__(
@@ -66,7 +58,7 @@ class Borders:
         first, other = grid.facet_cells[facets].T
         differ = (known[first] != known[other]).any(axis=1) | (known[first, 0] > 0)
         self.facets, self.uniform = facets[differ], facets[~differ]
-        """Two arrays of facets of this process: facets between cells of different soil, and all other facets."""
+        """Facets of this process between cells of different soil, and all other facets."""
         offset = grid.midpoints[grid.facet_cells[self.facets]]
         offset = offset[:, 1] - offset[:, 0]
         self._axis = np.abs(offset).argmax(axis=1)
@@ -81,7 +73,8 @@ class Borders:
     ) -> BorderFaces:
         """Return the faces with their current conductivities.
 
-        `laws`: relative conductivities as functions of pressure, see `Laws`.  `contents`: material in the cells.
+        `laws`: relative conductivities as functions of pressure, see `Laws`.
+        `contents`: material in the cells.
         `flow`: conductivities of the filled owned cells.
         `places` (c, d), m: vectors from the midpoints of local cells to the pressure positions of these cells.
         `moved` (c, d), m: displacements of the cells in the step.
@@ -134,7 +127,9 @@ class Borders:
         outer: NDArray[np.float64],
         drop: NDArray[np.float64],
     ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]]:
-        """Yield indices (k,) of faces at owned mixed cells, and results of `Relative.through_sides` for these faces."""
+        """Yield the indices (k,) of faces at owned mixed cells, and the result of `Relative.through_sides` for these
+        faces.
+        """
         rows = np.flatnonzero(self.mixed[cells] >= 0)
         if not len(rows):
             return
@@ -150,7 +145,7 @@ class Borders:
         yield rows, *np.divide(found, across, out=np.zeros_like(found), where=across > 0)
 
     def _from_others(self, paths: Paths) -> Paths:
-        """Return the flow paths in all cells at these faces.  The paths in ghost cells come from their owners."""
+        """Return the flow paths in all cells at these faces, ghost cells included."""
         if self.grid.comm.size == 1:
             return paths
         columns = [values.reshape(len(self._cells), np.prod(values.shape[1:])) for values in paths]
@@ -163,7 +158,7 @@ class Borders:
 
 @dataclass(frozen=True, eq=False)
 class BorderFaces:
-    """Faces between cells of different soil, with their conductivities; arrays over m faces."""
+    """Faces between cells of different soil, with their conductivities. Arrays have an entry for each of m faces."""
 
     borders: Borders
     mobility: Mobility  # mobility of the filled owned cells
@@ -177,7 +172,11 @@ class BorderFaces:
     bulk: float  # bulk modulus of the fluid, Pa
 
     def flows(self, p: NDArray[np.float64], force: NDArray[np.float64] | None) -> BorderFlows:
-        """Return the fluxes at pressures p (2, m), in Pa.  `force` (c, d), N/m^3: inertia force in local cells."""
+        """Return the fluxes through the faces.
+
+        `p` (2, m), Pa: pressures on both sides of each face.
+        `force` (c, d), N/m^3: inertia force in local cells.
+        """
         weight = (
             self.weight
             if force is None
@@ -192,7 +191,7 @@ class BorderFaces:
 
 @dataclass(frozen=True)
 class BorderFlows:
-    """Fluxes through faces between cells of different soil; arrays over m faces."""
+    """Fluxes through faces between cells of different soil. Arrays have an entry for each of m faces."""
 
     pair: NDArray[np.int64]  # local cells on both sides (2, m)
     flux: NDArray[np.float64]  # flux from the first to the second cell (m,), m^d/s
@@ -204,7 +203,9 @@ class BorderFlows:
             np.add.at(out, cells, sign * self.flux)
 
     def add_slopes(self, A: PETSc.Mat, unknowns: Unknowns) -> None:
-        """Add the derivatives of the outflows with respect to the pressures to a matrix, without final assembly."""
+        """Add the derivatives of the outflows with respect to the pressures to a matrix. The matrix is not yet
+        assembled.
+        """
         if not len(self.flux):
             return
         number = unknowns.map.indices[self.pair]

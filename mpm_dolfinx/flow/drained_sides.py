@@ -1,16 +1,19 @@
 # SPDX-License-Identifier: MIT
 """Flow through the sides of bodies: drained sides, seepage faces, rain, prescribed inflows.
 
-The outflow of a cell through a face is prescribed, or it is `T r [p - p_out + rho_w g . (x_out - x)]`.  Here p is the
-pressure at the centroid x of the cell's material.  The outside pressure p_out applies at the centroid x_out of the
-face.  T is `A kappa / d` with the area A of the face, the mobility kappa, and the distance d from x to the face.  The
-mobility is the conductivity divided by the unit weight of the fluid.  The factor r is the density of the fluid divided
-by the density at zero pressure.  At a seepage face, fluid can only leave.  A primal-dual active-set method
-(Hintermueller, Ito and Kunisch 2002) opens faces with outflow and closes all other faces.  The method is applied at the
-start of the substep and after each solution (`SideFeeds.settle`).  Infiltration is the rain, but at most the inflow at
-the pressure of the pond.  Evaporation is at most the outflow at the driest pressure.  In addition to the rain, a pond
-of volume V supplies the inflow `V / dt` in a step of length dt, uniformly over its side.  Infiltration, ponding and
-run-off add up to the rain within rounding.
+Through a drained face, the outflow of a cell is `T r [p - p_out + rho_w g . (x_out - x)]`.  Here p is the pressure at
+the centroid x of the cell's material, and p_out is the outside pressure at the centroid x_out of the face.  The
+transmissibility T is `A kappa / d`, with the area A of the face, the mobility kappa, and the distance d from x to the
+face.  The mobility is the conductivity divided by the unit weight of the fluid.  The factor r is the density of the
+fluid divided by the density at zero pressure.
+
+At a seepage face, fluid can only leave.  A primal-dual active-set method (Hintermueller, Ito and Kunisch 2002) opens
+faces with outflow and closes all other faces.  The method is applied at the start of the substep and after each
+solution (`SideFeeds.settle`).
+
+Infiltration is the rain, but at most the inflow at the pressure of the pond.  Evaporation is at most the outflow at the
+driest pressure.  A pond of volume V supplies the additional inflow `V / dt` in a step of length dt, uniformly over its
+side.  Infiltration, ponding and run-off add up to the rain within rounding.
 """
 
 from __future__ import annotations
@@ -33,26 +36,21 @@ from mpm_dolfinx.flow.fluxes import Conduction, OpenSides
 from mpm_dolfinx.flow.unsaturated import Relative
 from mpm_dolfinx.forms.point_forms import PointData
 from mpm_dolfinx.grid.grid import sum_by
-from mpm_dolfinx.parallel.exchange import everywhere, over_all
+from mpm_dolfinx.parallel.exchange import over_all, together
 
 THICK = np.sqrt(2)
 """Area of the largest plane section of a cube, divided by the area of a face.  Source: exact bound (Ball 1986).
 
 Let a convex body of volume V in a cell of edge length h lie on one side of a plane.  The distance from the body's
-centroid to the plane is at least `V / ((d + 1) THICK h^(d-1))`.  A face bounds only a part of the cell's material if it
-is closer than this to the material's centroid, or behind the centroid.  Such a face must not drain the whole cell.
+centroid to the plane is at least `V / ((d + 1) THICK h^(d-1))`.  A face that is closer to the centroid of the cell's
+material, or behind the centroid, bounds only a part of the material.  Such a face must not drain the whole cell.
 """
 
 
 class DrainedSides(Feeding):
     """Drained sides, prescribed inflows and rain of a stage.
 
-    Parameters
-    ----------
-    setting
-        Data that all conditions of the stage share.
-    outlets
-        Conditions by name.
+    `setting`: data that all conditions of the stage share.
 
     Raises
     ------
@@ -89,17 +87,17 @@ class DrainedSides(Feeding):
         return {name: np.array(value) for name, rain in zip(self._names, self._rains, strict=True) if rain}
 
     def empty(self) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return zeros as the volumes of outflow, run-off and ponds before the first step, or {} without rain."""
+        """Return volumes of zero before the first step, or {} without rain."""
         if not any(self._rains):
             return {}
         return {"flowed": self.unknown(0.0), "ran_off": self.dry(0.0), "ponded": self.dry(0.0)}
 
     def fed(self, cut: CutDomains, pieces: PointData) -> NDArray[np.int64]:
-        """Return the indices of points whose domains have faces on open sides; indices may be repeated."""
+        """Return the indices of points whose domains have faces on open sides.  Indices may be repeated."""
         return np.concatenate([patch.at for patch in cut.surfaces(self.surfaces)])
 
     def placed(self, wet: Wet) -> SideFeeds:
-        """Return the flow through the open sides in a substep, with pressures and inflows at the end of the substep."""
+        """Return the flow through the open sides in a substep."""
         if self.varies:
             return SideFeeds(self._sides(wet), wet, self._names, self._ponds)
         key = (wet.cut.key, wet.contents.key, wet.points)
@@ -110,7 +108,7 @@ class DrainedSides(Feeding):
         grid, rows = self._grid, []
         patches = wet.cut.surfaces(self.surfaces)
         for i, ((outlet, _), p) in enumerate(zip(self._outlets, patches, strict=True)):
-            given, n = everywhere(grid.comm, partial(outlet.through, wet.t, p.positions(wet.points))), len(p.x)
+            given, n = together(grid.comm, partial(outlet.through, wet.t, p.positions(wet.points))), len(p.x)
             columns = np.empty((n, 5 + grid.dim))
             for k, column in enumerate((i, *given)):
                 columns[:, k] = column
@@ -136,7 +134,7 @@ class DrainedSides(Feeding):
 
 @dataclass(frozen=True)
 class OpenFaces:
-    """Faces on open sides with their conductances; arrays over m faces."""
+    """Faces on open sides with their conductances.  Arrays have an entry for each of m faces."""
 
     at: NDArray[np.int64]  # index of the cell among the n active owned cells (m,)
     conductance: NDArray[np.float64]  # outflow per unit of the cell's mass potential (m,), m^d/(Pa s)
@@ -145,7 +143,7 @@ class OpenFaces:
     offset: NDArray[np.float64]  # vector from the centroid of the cell's material to the face (m, d), m
 
     def outflow(self, fluid: Fluid) -> NDArray[np.float64]:
-        """Return the outflow (m,) through each face, in m^d/s, as if all faces were open in both directions."""
+        """Return the outflow (m,) through each face, in m^d/s.  All faces are treated as open in both directions."""
         return self.conductance * fluid.pi[self.at] - self.inflow
 
     def open_by(self, fluid: Fluid) -> NDArray[np.float64]:
@@ -157,9 +155,8 @@ class OpenFaces:
     def nonorthogonal(
         self, fluid: Fluid, difference: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64] | float, NDArray[np.float64] | float]:
-        """Return the non-orthogonal correction: a flow (m^d/s) and a fraction of the two-point flux.
+        """Return the two terms of the non-orthogonal correction: a flow (m^d/s), and a fraction of the two-point flux.
 
-        Both are added to the two-point flux.
         `difference` (m,), Pa: correction of the cell pressure at each face.
         """
         return np.where(self.seeps, 0.0, self.open_by(fluid) * difference * fluid.density[self.at]), 0.0
@@ -172,7 +169,7 @@ class OpenFaces:
 
 @dataclass(frozen=True)
 class UnsaturatedFaces(OpenFaces):
-    """Faces on open sides of unsaturated soil; `conductance` is the value at k_r = 1."""
+    """Faces on open sides of unsaturated soil.  The values of `conductance` are for saturated soil."""
 
     relative: Relative  # relative conductivities of the cells
     cells: NDArray[np.int32]  # cells behind the faces (m,)
@@ -182,16 +179,16 @@ class UnsaturatedFaces(OpenFaces):
     drop: NDArray[np.float64]  # hydrostatic pressure drop from the centroid to the face (m,), Pa
 
     def outflow(self, fluid: Fluid) -> NDArray[np.float64]:
-        """Return the outflow (m,) through each face, in m^d/s, as if all faces were open in both directions."""
+        """Return the outflow (m,) through each face, in m^d/s.  All faces are treated as open in both directions."""
         return self.open_by(fluid) * (fluid.pi[self.at] - self.outer) - self.inflow
 
     def nonorthogonal(
         self, fluid: Fluid, correction: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64] | float, NDArray[np.float64] | float]:
-        """Return the non-orthogonal correction: zero flow, and a fraction in [-1, 1] of the two-point flux.
+        """Return the two terms of the non-orthogonal correction: zero flow, and a fraction of the two-point flux.
 
-        Conductivities change by orders of magnitude in a step, so the correction must be proportional to the flux.
-        The limits -1 and 1 keep the correction from emptying the soil.
+        The correction is proportional to the flux, because conductivities change by orders of magnitude in a step.  The
+        fraction is limited to [-1, 1], so that the correction does not empty the soil.
         """
         difference = fluid.pi[self.at] - self.outer
         share = np.divide(correction, difference, out=np.zeros_like(correction), where=difference != 0).clip(-1, 1)
@@ -202,11 +199,11 @@ class UnsaturatedFaces(OpenFaces):
         return self.conductance * self._through(fluid)[0]
 
     def derivative(self, fluid: Fluid) -> NDArray[np.float64]:
-        """Return the derivative (>= 0) of the outflow with respect to the pressure of the cell, in m^d/(Pa s)."""
+        """Return the derivative (>= 0) of the outflow with respect to the cell pressure, in m^d/(Pa s)."""
         return self.conductance * self._through(fluid)[1]
 
     def _through(self, fluid: Fluid) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return two arrays (m,): k_r of the faces, and `d[k_r (p - outside + drop)]/dp` with the cell pressure p."""
+        """Return the relative conductivities of the faces, and the derivatives of the fluxes."""
         return self.relative.through_sides(self.cells, self.normal, fluid.p[self.at], self.outside, self.drop)
 
 
@@ -214,9 +211,9 @@ class UnsaturatedFaces(OpenFaces):
 class RainedFaces(OpenFaces):
     """Faces on open sides, at least one of which has rain.
 
-    Through a face with rain, the outflow is minus the rain.  This outflow is at least the outflow at the pond's
-    pressure, and at most the outflow at the driest pressure.  The lower limit includes seepage, so `seeps` is False at
-    faces with rain.
+    Through a face with rain, the outflow is minus the rain.  The outflow is limited from below by the outflow at the
+    pond's pressure, and from above by the outflow at the driest pressure.  The lower limit already accounts for
+    seepage, so faces with rain need no active set, and `seeps` is False.
     """
 
     rain: NDArray[np.float64]  # rain (m,), m^d/s; nan for faces without rain
@@ -233,13 +230,13 @@ class RainedFaces(OpenFaces):
     def nonorthogonal(
         self, fluid: Fluid, difference: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64] | float, NDArray[np.float64] | float]:
-        """Return the non-orthogonal correction, which is zero on faces with rain."""
+        """Return the non-orthogonal correction.  Faces with rain have none."""
         return tuple(
             np.where(np.isnan(self.rain), values, 0.0) for values in self.pond.nonorthogonal(fluid, difference)
         )
 
     def driven(self, fluid: Fluid) -> NDArray[np.float64]:
-        """Return the outflow (m,) through each face due to inertia forces, in m^d/s.  It is zero on faces with rain."""
+        """Return the outflow (m,) through each face due to inertia forces, in m^d/s.  Faces with rain have none."""
         return np.where(np.isnan(self.rain), super().driven(fluid), 0.0)
 
     def open_by(self, fluid: Fluid) -> NDArray[np.float64]:
@@ -255,8 +252,10 @@ class RainedFaces(OpenFaces):
 class SideFeeds(Feeds):
     """Flow through open sides in a substep.
 
-    `sides`: faces of the open sides; `sides.number` are indices in `names` and `ponds`.  `wet`: data of the substep.
-    `names`: names of the conditions.  `ponds`, m: largest depth of the pond of each condition, or None without rain.
+    `sides`: faces of the open sides.  `sides.number` are indices in `names` and `ponds`.
+    `wet`: data of the substep.
+    `names`: names of the conditions.
+    `ponds`, m: largest depth of the pond of each condition, or None without rain.
     """
 
     def __init__(self, sides: OpenSides, wet: Wet, names: tuple[str, ...], ponds: tuple[float | None, ...]):
@@ -275,11 +274,7 @@ class SideFeeds(Feeds):
     def _pond(
         self, sides: OpenSides, ponds: tuple[float | None, ...], dt: float
     ) -> tuple[OpenSides, NDArray[np.float64]]:
-        """Return the open sides with the effect of the present ponds, and the largest volumes of the ponds, in m^d.
-
-        The rain of the returned sides includes the inflow that the ponds supply.
-        `ponds`, m: largest depth of each pond.  `dt`, s: time in which a pond supplies its whole volume.
-        """
+        """Return the open sides with the inflow from ponds as additional rain, and the volumes of the ponds."""
         depth, number = np.array([depth or 0.0 for depth in ponds]), sides.number
         size = np.linalg.norm(sides.area, axis=1)
         area = over_all(self._comm, sum_by(number, size, len(self._names)))
@@ -291,7 +286,7 @@ class SideFeeds(Feeds):
 
     @property
     def _ponded(self) -> NDArray[np.float64]:
-        """Volume (m^d) of the pond of each condition at the start of the step."""
+        """Volume (m^d) of each condition's pond at the start of the step."""
         volumes = self._before.get("ponded", {})
         return np.array([float(volumes.get(name, 0.0)) for name in self._names])
 
@@ -316,7 +311,7 @@ class SideFeeds(Feeds):
         return UnsaturatedFaces(at, conductance, sides.given, self._seeps, offset, *rest)
 
     def begin(self, at: OpenFaces, fluid: Fluid, difference: NDArray[np.float64]) -> None:
-        """See `Feeds`.  Seepage faces open unless their flux (without non-orthogonal correction) is an inflow."""
+        """Open all seepage faces whose two-point flux is not an inflow, see `Feeds`."""
         self._flows = at.outflow(fluid) >= 0
         self._nonorthogonal, self._share = at.nonorthogonal(fluid, difference)
 
@@ -346,7 +341,9 @@ class SideFeeds(Feeds):
         return {name: np.array(sums[i]) for i, name in enumerate(self._names)}
 
     def run_off(self, at: OpenFaces, fluid: Fluid) -> dict[str, NDArray[np.float64]]:
-        """Return the run-off (m^d/s), rain that neither infiltrates nor fills a pond, by name of the condition."""
+        """Return the run-off, in m^d/s, by name of the condition.  Run-off is rain that neither infiltrates nor fills a
+        pond.
+        """
         if not any(self._rains):
             return {}
         excess = np.maximum(self._fallen, 0.0) + np.minimum(self._through(at, fluid), 0.0)  # nan without rain
@@ -355,7 +352,7 @@ class SideFeeds(Feeds):
         return {name: np.array(runs[i]) for i, name in enumerate(self._names) if self._rains[i]}
 
     def passing(self, at: OpenFaces, fluid: Fluid) -> dict[str, NDArray[np.float64]]:
-        """Return two rates (2,) (m^d/s) for each condition: outflow through its sides, and rain on these sides."""
+        """Return two rates (2,) for each condition: outflow through its sides, and rain on its sides, in m^d/s."""
         if not any(self._rains):
             return {}
         both = np.stack([self._through(at, fluid), np.nan_to_num(self._fallen)])
@@ -382,7 +379,7 @@ class SideFeeds(Feeds):
         return out
 
     def _if_open(self, at: OpenFaces, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return values (m,) of faces, with zeros at closed seepage faces."""
+        """Return the values of the faces, with zeros at closed seepage faces."""
         return np.where(self._flows | ~at.seeps, values, 0.0) if self.settles else values
 
     def _through(self, at: OpenFaces, fluid: Fluid) -> NDArray[np.float64]:

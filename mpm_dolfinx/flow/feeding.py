@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Interface of the conditions on the pore fluid: drained sides, inflows, rain, sources.
 
-The method `feeding(setting)` of a condition returns a `Feeding`, which has the faces and is created once in a stage.
-`Feeding.placed` returns the `Feeds` of a substep.  At each assembly of the residual, `Feeds` add flow rates to the
-outflow of the cells.  `conditions/acting.py` has the corresponding interface for the momentum balance.
+The method `feeding(setting)` of a condition returns a `Feeding`, which is created once in a stage.  `Feeding.placed`
+returns the `Feeds` of a substep.  At each assembly of the residual, the `Feeds` add their flow rates to the outflow of
+the cells.  `conditions/acting.py` has the corresponding interface for the momentum balance.
 """
 
 from __future__ import annotations
@@ -56,8 +56,8 @@ class Leaving(NamedTuple):
 class Feeds:
     """Flow rates of the conditions of one kind in a substep.  Methods other than `leaving` add nothing by default.
 
-    Arrays have one entry for each of the n active owned cells.  `at` is the result of `conducting` for the current
-    displacements.
+    Arrays have one entry for each of the n active owned cells.  The argument `at` is the result of `conducting` for the
+    current displacements.
     """
 
     linear: bool = True
@@ -68,10 +68,13 @@ class Feeds:
     """Faces with an outside pressure or a prescribed flux."""
 
     def conducting(self, flow: Conduction) -> Any:
-        """Return data that depend on conductivities and motion of cells.  They are reused until these change."""
+        """Return the data that depend on conductivities and on the motion of cells."""
 
     def begin(self, at: Any, fluid: Fluid, difference: NDArray[np.float64]) -> None:
-        """Start a substep.  `difference` (m,), Pa: correction of cell pressures at `sides`, see `nonorthogonal`."""
+        """Start a substep.
+
+        `difference` (m,), Pa: correction of the cell pressures at `sides`, see `nonorthogonal`.
+        """
 
     def leaving(self, at: Any, fluid: Fluid) -> Leaving:
         """Return the outflow from the cells."""
@@ -131,15 +134,15 @@ class Feeding:
         raise NotImplementedError
 
     def fed(self, cut: CutDomains, pieces: PointData) -> NDArray[np.int64]:
-        """Return the indices of points at which bodies may gain or lose fluid; indices may be repeated."""
+        """Return the indices of points at which bodies may gain or lose fluid.  Indices may be repeated."""
         return np.empty(0, dtype=np.int64)
 
     def unknown(self, value: float) -> dict[str, NDArray[np.float64]]:
-        """Return the outflows before the first step, see `Feeds.outflows`.  All are equal to `value`."""
+        """Return the outflows before the first step, all equal to `value`."""
         return {}
 
     def dry(self, value: float) -> dict[str, NDArray[np.float64]]:
-        """Return the run-offs before the first step, see `Feeds.run_off`.  All are equal to `value`."""
+        """Return the run-offs before the first step, all equal to `value`."""
         return {}
 
     def empty(self) -> dict[str, dict[str, NDArray[np.float64]]]:

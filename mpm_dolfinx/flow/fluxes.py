@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: MIT
 """Two-point fluxes of the pore fluid through the covered parts of cell faces, and damping of pressure jumps.
 
-The material in the cells enters the forms through coefficients, which are set at each grid reset.  In a moving body the
-fluxes through the deformed cells are pulled back to the start of the step.  The mobility kappa of a cell (conductivity
-/ unit weight) becomes `J F^-1 kappa F^-T`.  Here F is `I + grad u` at the centroid of the cell's material, and J is
-`det F`.  `drained_sides` computes the fluxes through open sides.  `StorageProblem` in `storage` adds these to the
-fluxes between cells.
+The coefficients of the forms describe the material in the cells, and are set at each grid reset.  In a moving body, the
+fluxes through the deformed cells are pulled back to the start of the step.  Let kappa be the mobility of a cell
+(conductivity divided by unit weight), `F = I + grad u` the deformation gradient at the centroid of the cell's material,
+and `J = det F`.  The pulled-back mobility is `J F^-1 kappa F^-T`.  `drained_sides` computes the fluxes through open
+sides.
 """
 
 from __future__ import annotations
@@ -91,23 +91,24 @@ class Conduction:
         return across if hoop is None else across * hoop[at]
 
     def distance_ratio(self, at: NDArray[np.int64], normal: NDArray, offset: NDArray) -> NDArray[np.float64]:
-        """Return the ratio (m,) of two distances of each face: from the centroid, and from the pressure position.
+        """Return the distance of the centroid from each face, divided by the distance of the pressure position (m,).
 
         See `layers` for pressure positions.
-        `normal` (m, d): normals of the faces.  `offset` (m, d), m: vectors from the centroids to the faces.
+        `normal` (m, d): normals of the faces.
+        `offset` (m, d), m: vectors from the centroids to the faces.
         """
         distance = (offset * normal).sum(axis=1)
         shifted = distance - (self.mobility.shift[at] * normal).sum(axis=1)
         return np.divide(distance, shifted, out=np.ones(len(distance)), where=shifted > 0)
 
     def deformed(self, at: NDArray[np.int64], vector: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the images (m, d) of vectors in cells `at` under the deformation gradients of these cells."""
+        """Map vectors (m, d) in cells `at` by the deformation gradients of these cells."""
         return vector if self.motion is None else (self.motion.F[at] @ vector[:, :, None])[:, :, 0]
 
 
 @dataclass(frozen=True)
 class OpenSides:
-    """Open sides of the bodies; arrays over m faces.  Each face belongs to one owned cell."""
+    """Open sides of the bodies.  Arrays have an entry for each of m faces.  Each face belongs to one owned cell."""
 
     number: NDArray[np.int64]  # index of the condition (m,)
     cells: NDArray[np.int32]  # cell behind the face (m,)
@@ -136,9 +137,11 @@ class OpenSides:
         return self.area / np.sqrt(np.add.reduce(self.area**2, axis=1, keepdims=True))
 
     def driven(self, at: NDArray[np.int64], flow: Conduction) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return two arrays (m,): outflow per unit of the cell's mass potential (m^d/(Pa s)), and inflow (m^d/s).
+        """Return the outflow per unit of the cell's mass potential, in m^d/(Pa s), and the inflow, in m^d/s, of each
+        face.
 
         The inflow is prescribed, or caused by the outside pressure and gravity.
+
         `at` (m,): indices of the cells among the filled cells.
         """
         shape = self.shape
@@ -148,17 +151,18 @@ class OpenSides:
         return conductance, self.given + conductance * self.outer(at, flow)
 
     def outer(self, at: NDArray[np.int64], flow: Conduction) -> NDArray[np.float64]:
-        """Return the mass potentials (m,), in Pa, at outside pressures minus hydrostatic drops from centroids."""
+        """Return the mass potentials (m,) at outside pressures minus hydrostatic drops from centroids, in Pa."""
         outer = self.pressure if flow.weight is None else self.pressure - flow.deformed(at, self.offset) @ flow.weight
         return mass_potential(outer, flow.bulk)
 
     def ahead(self, at: NDArray[np.int64], p: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return pressure differences (Pa) and slopes (Pa/m) from cells to drained sides, as an array (n, d, 2, 2).
+        """Return pressure differences (Pa) and slopes (Pa/m) from cells to drained sides.
 
-        The indices are: cell, axis, end of the cell along this axis, and 0 for the difference or 1 for the slope.  Ends
-        without a drained side have nan for both.
+        The result is an array (n, d, 2, 2).  Its indices are: cell, axis, end of the cell along this axis, and 0 for
+        the difference or 1 for the slope.  Ends without a drained side have nan for both.
 
-        `at` (m,): index of the cell of each face among the filled cells.  `p` (n,), Pa: pressures of the filled cells.
+        `at` (m,): index of the cell of each face among the filled cells.
+        `p` (n,), Pa: pressures of the filled cells.
         """
         out = np.full((len(p), self.normal.shape[1], 2, 2), np.nan)
         distance = np.add.reduce(self.offset * self.normal, axis=1)
@@ -186,7 +190,7 @@ class OpenSides:
 
 @dataclass(frozen=True)
 class PieceContents:
-    """Contributions of pieces to their owned cells; arrays over m pieces."""
+    """Contributions of pieces to their owned cells.  Arrays have an entry for each of m pieces."""
 
     cells: NDArray[np.int32]  # owned cell (m,)
     weight: NDArray[np.float64]  # volume (m,), m^d
@@ -266,11 +270,15 @@ class CellContents(Keyed):
         return self.total(self.weight * values) / self.volume
 
     def nodal(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return an array (n, d, 2^d) with the values of u (nodes, d) at the nodes of each filled cell."""
+        """Return the values (n, d, 2^d) of u (nodes, d) at the nodes of each filled cell."""
         return u[self._nodes].transpose(0, 2, 1)
 
     def motion(self, nodal: NDArray[np.float64], rests: NDArray[np.int64] | None = None) -> CellMotion:
-        """Return the motion of filled cells at centroids from displacements `nodal` (m).  Cells `rests` do not move."""
+        """Return the motion of filled cells at centroids.
+
+        `nodal`: displacements, in m.
+        `rests`: cells that do not move.
+        """
         hoop, d = None, self.grid.dim
         at_centroids = nodal @ self._shapes
         F, moved = self._unit + at_centroids[:, :, :d], at_centroids[:, :, d].copy()
@@ -295,24 +303,12 @@ class CellContents(Keyed):
 class FluxForms:
     """Compiled forms over the faces between active cells, and their coefficients.
 
-    Parameters
-    ----------
-    grid
-        Background grid.
-    active
-        Active part of the grid.
-    weight : (d,), N/m^3
-        Unit weight rho_w g of the pore fluid, as UFL, or None without gravity.
-    flows
-        Whether any material is permeable.  Otherwise there are no fluxes.
-    pressure
-        Pore pressure of the cells (DG0), Pa.
-    bulk
-        Bulk modulus of the fluid, Pa.
-    inertial : (d,), N/m^3
-        Inertia force on the pore fluid, as UFL, or None without inertia.
-    relative
-        Relative conductivities in unsaturated soil, see `unsaturated`, or None.
+    `weight` (d,), N/m^3: unit weight rho_w g of the pore fluid, as UFL, or None without gravity.
+    `flows`: whether any material is permeable.  Otherwise there are no fluxes.
+    `pressure`: pore pressure of the cells (DG0), Pa.
+    `bulk`: bulk modulus of the fluid, Pa.
+    `inertial` (d,), N/m^3: inertia force on the pore fluid, as UFL, or None without inertia.
+    `relative`: relative conductivities in unsaturated soil, see `unsaturated`, or None.
     """
 
     def __init__(

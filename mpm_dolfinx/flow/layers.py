@@ -4,17 +4,17 @@
 Soils along a line are in series, and lines are in parallel.  The mobility of a line is the harmonic mean of the
 mobilities along it.  The mobility of a cell along an axis is the arithmetic mean over the lines along this axis
 (Cardwell and Parsons 1945).  This mobility is exact for flow along and across any number of layers parallel to the
-grid.  Inclined layers must be at least a cell thick.  Only then does a seam of low conductivity block all lines of some
-cell, and only then does a drain contain complete lines.
+grid.  Inclined layers must be at least a cell thick.  Otherwise a seam of low conductivity leaves gaps, and no line
+lies completely in a drain.
 
-The pressure of a cell refers to one position in the cell, the pressure position.  Steady flow along a line has the mean
-pressure of the line at this position.  Let R be the resistance of the line, and let s increase from 0 to 1 along the
-line.  The resistance from the pressure position to the lower end is `int (1 - s) dR`, and to the upper end `int s dR`.
-For a line through several cells, the sum of these resistances is exact.  If layers are inclined by more than
-`INCLINED`, the pressure position moves to the more conductive end.  Without this shift a drain would be interrupted
-between rows of cells.  The shape of a piece is approximated by the bounding box of its domain in the cell.
+The pressure of a cell refers to one position in the cell, the pressure position.  In steady flow along a line, the
+pressure at this position equals the mean pressure of the line.  Let R be the resistance of the line, and let s increase
+from 0 to 1 along the line.  The resistance from the pressure position to the lower end is `int (1 - s) dR`, and to the
+upper end `int s dR`.  The sum of these resistances is exact for a line through several cells.
 
-A conductivity that depends on deformation varies even in cells without layers, see `graded`.
+If layers are inclined by more than `INCLINED`, the pressure position moves to the more conductive end of the cell.
+Without this shift a drain would be interrupted between rows of cells.  The shape of a piece is approximated by the
+bounding box of its domain in the cell.  `graded` treats conductivities that vary gradually with deformation.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ from mpm_dolfinx.parallel.exchange import over_all
 
 INCLINED = 0.01
 """If the slope of layers relative to the grid is larger than this value, the pressure position of a cell moves to the
-more conductive end.  Halving this value changes the result of scene "slope" in tests/plateaus.py by 4.1e-04 (relative),
-doubling it by 5.0e-05, and finer cells by 3.4e-03.
+more conductive end.  The result of scene "slope" in tests/plateaus.py changes by the fraction 4.1e-04 with half this
+value, by 5.0e-05 with twice this value, and by 3.4e-03 with finer cells.
 """
 PAIRS = 2**16
 """Number of pairs of pieces that are processed together."""
@@ -43,7 +43,7 @@ PAIRS = 2**16
 
 @dataclass(frozen=True)
 class Lines:
-    """Lines along an axis through centroids of pieces.  Arrays are over pairs of a line and a crossed piece."""
+    """Lines through the centroids of pieces, parallel to an axis of the grid."""
 
     line: NDArray[np.int64]  # index, among pieces of mixed cells, of the piece through whose centroid the line runs
     piece: NDArray[np.int64]  # index of the crossed piece
@@ -55,22 +55,12 @@ class Lines:
 class MixedCells:
     """Owned cells with several conductivities (mixed cells), and lines through them.
 
-    Parameters
-    ----------
-    rows
-        Indices (m,) of the pieces in mixed cells, ordered by cell.
-    cells
-        Cells (m,) of the pieces.
-    low, high
-        Corners (m, d) of the bounding boxes of pieces, in cell coordinates from 0 to 1.
-    x
-        Centroids (m, d) of the pieces, in cell coordinates.
-    volume
-        Volumes (m,) of the pieces, m^d.
-    contents
-        Material in the cells.
-    soils
-        Numbers (m, k) that identify the soils.  Pieces with equal rows have equal conductivities.
+    `rows`: indices (m,) of the pieces in mixed cells, ordered by cell.
+    `cells`: cells (m,) of the pieces.
+    `low`, `high`: corners (m, d) of the bounding boxes of pieces, in cell coordinates from 0 to 1.
+    `x`: centroids (m, d) of the pieces, in cell coordinates.
+    `volume`: volumes (m,) of the pieces, m^d.
+    `soils`: numbers (m, k) that identify the soils.  Pieces with equal rows have equal conductivities.
     """
 
     def __init__(self, rows, cells, low, high, x, volume, contents: CellContents, soils):
@@ -98,11 +88,10 @@ class MixedCells:
             self._lines.append(Lines(line, piece, length, before, total))
 
     def _crossed(self, rows: slice, first, count, low, high) -> list[tuple[NDArray, NDArray, NDArray]]:
-        """Return for each axis three arrays over pairs of a line and a crossed piece: line, piece, and weight.
+        """Return pairs of a line and a crossed piece for each axis, with weights.
 
-        The lines run through the centroids of the pieces `rows`.  Weights are < 1 if the line runs along the border of
-        the piece.
-        `first`, `count` (m,): first piece and number of pieces in the cell of each piece.
+        The lines run through the centroids of the pieces `rows`.  A weight is below one if the line runs along the
+        border of the piece.
         """
         line, piece = ranges(first[rows], count[rows])
         line += rows.start
@@ -134,10 +123,11 @@ class MixedCells:
     ) -> Mobility:
         """Return the mobility of filled cells.
 
-        With `now`, only inclined layers shift the pressure position of a cell away from the centroid.
-        `kappa`, m^2/(Pa s): mobilities of all pieces.  `mean` (n,), m^2/(Pa s): means of `kappa` in the filled cells.
-        `share` (n, d): mobility along each axis divided by `mean`; values of mixed cells are set in place.
-        `now`, m^2/(Pa s): in unsaturated soil, mobilities of all pieces at their pressures.
+        `kappa`, m^2/(Pa s): mobilities of all pieces.
+        `mean` (n,), m^2/(Pa s): means of `kappa` in the filled cells.
+        `share` (n, d): mobility along each axis divided by `mean`.  The values of mixed cells are set in place.
+        `now`, m^2/(Pa s): mobilities of all pieces at their pressures, in unsaturated soil.  With `now`, only inclined
+        layers shift the pressure position of a cell away from the centroid.
         """
         along, off = self._along(kappa[self._rows])
         if now is not None:
@@ -149,11 +139,9 @@ class MixedCells:
         return Mobility(mean, share, shift)
 
     def _along(self, kappa: NDArray[np.float64], mean: float = 1.0) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return two arrays (n, d) for mixed cells: mobilities along the axes, and shifts of the pressure position.
+        """Return the mobilities along the axes, and the shifts of the pressure position divided by the cell size.
 
-        The shifts are divided by the cell sizes.
-        `kappa`: mobilities of the pieces.
-        `mean`: 1 for shifts to the position of mean pressure, 0 for shifts due to inclined layers only.
+        With `mean` 0 only inclined layers cause shifts.  With 1 the shifts lead to the position of mean pressure.
         """
         n, d = len(self._filled), self._x.shape[1]
         mobility = np.zeros((n, d))
@@ -177,12 +165,11 @@ class MixedCells:
     def paths(
         self, kappa: NDArray[np.float64], law: NDArray[np.int64], laws: int, shift: NDArray[np.float64] | None
     ) -> Paths:
-        """Return the flow paths (n, d, 2, ...) of the mixed cells, see `Paths`.
+        """Return the flow paths of the mixed cells, see `Paths`.
 
         `kappa` (m,), m^2/(Pa s): mobilities of all pieces at saturation.
         `law` (m,): index of the retention curve of each piece, < `laws`.
-        `shift` (n, d), m: vectors from the centroids of filled cells to their pressure positions, or None if all are
-        zero.
+        `shift` (n, d), m: vectors from the centroids of filled cells to their pressure positions, or None for zeros.
         """
         kappa, law = kappa[self._rows], law[self._rows]
         place = 0.5 + self._middle + (0.0 if shift is None else shift[self._filled] / self._h)
@@ -192,7 +179,7 @@ class MixedCells:
         return Paths(*(np.stack(parts, axis=1).reshape(*shape, parts[0].shape[1]) for parts in padded))
 
     def _path(self, axis: int, end: int, kappa, law, laws: int, place: NDArray[np.float64]) -> Paths:
-        """Return the paths (n, ...) along an axis from the position `place` (n,) in each cell to one of its ends."""
+        """Return the flow paths along an axis from the pressure positions to one end of the cells."""
         n, lines = len(place), self._lines[axis]
         middle = (2 * end - 1) * (self._x[lines.piece, axis] - place[self._at[lines.line]])
         length = np.clip(middle + lines.length / 2, 0.0, lines.length)  # of the part between position and end
@@ -233,7 +220,7 @@ class MixedCells:
         return out._replace(parallel=parallel)
 
     def _sharper(self, kappa: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the contribution (n,) of inclined layers to the factor that multiplies the shift in each cell."""
+        """Return the contribution of inclined layers to the factor of the shift in each cell."""
         n = len(self._filled)
 
         def total(values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -252,14 +239,15 @@ class MixedCells:
 def graded(
     contents: CellContents, offset: NDArray[np.float64], kappa: NDArray[np.float64], mean: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the mobilities (n, d) along the axes, divided by `mean`, of cells in which the mobility varies gradually.
+    """Return the mobilities (n, d) along the axes, divided by `mean`, in cells whose mobility varies gradually.
 
-    Pieces conduct in series along the gradient of the mobility, and in parallel across this gradient.  If the gradient
-    is not along an axis, the difference between arithmetic and harmonic mean is distributed over the axes.  The share
-    of an axis is proportional to the variance that a linear variation along this axis explains.
+    Pieces conduct in series along the gradient of the mobility, and in parallel across this gradient.  For a gradient
+    in any direction, the difference between arithmetic and harmonic mean is distributed over the axes.  The share of an
+    axis is proportional to the variance that a linear variation along this axis explains.
 
     `offset` (m, d), m: positions of the pieces relative to the midpoints of cells.
-    `kappa` (m,), m^2/(Pa s): mobilities of the pieces.  `mean` (n,), m^2/(Pa s): mean mobilities of the filled cells.
+    `kappa` (m,), m^2/(Pa s): mobilities of the pieces.
+    `mean` (n,), m^2/(Pa s): mean mobilities of the filled cells.
     """
     with np.errstate(divide="ignore"):
         series = 1 / contents.mean(1 / kappa)
@@ -277,7 +265,7 @@ def graded(
 
 
 def mixed_cells(cut: CutDomains, soils: NDArray[np.float64], contents: CellContents) -> MixedCells | None:
-    """Return the owned cells with pieces of different conductivity, or None if no process has such cells.
+    """Return the owned cells with pieces of different conductivity, or None if no process has a mixed cell.
 
     `soils` (m, k): numbers that identify the soil of each piece.  Pieces with equal rows have equal conductivities.
     """

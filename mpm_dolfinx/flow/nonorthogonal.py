@@ -3,16 +3,18 @@
 
 The two-point flux takes the difference of two cell pressures as the pressure difference across the face.  In bodies
 inclined to the grid, however, the two centroids are also offset along the face, by a vector t of up to half a cell
-size.  The offset causes an error that does not decrease with the cell size.  Let G be the pressure gradient in a cell
+size.  This offset causes an error that does not decrease with the cell size.  Let G be the pressure gradient in a cell
 minus the unit weight of the fluid.  The corrected flux is (see `storage` for other symbols)
 
     Q = T [p+ - p- + rho_w g . (x- - x+) - (G+ + G-)/2 . t].
 
 At an open side, `p - p_out` is replaced by `p - p_out + G . t`.  Here t is the vector along the side, from the foot of
-the perpendicular through the centroid to the centre of the face.  The gradients are fitted by least squares to the
-pressures of neighbouring cells and drained sides, and to zero flow across no-flow sides.  The area vector of a no-flow
-side is the one that closes the surface of the material in the cell.  The fit is exact for linear pressures.  Gradients
-are limited so that the corrected pressures at faces stay between the pressures of the neighbours.
+the perpendicular through the centroid to the centre of the face.
+
+The gradients are fitted by least squares to the pressures of neighbouring cells and drained sides, and to zero flow
+across no-flow sides.  The area vector of a no-flow side closes the surface of the material in the cell.  The fit is
+exact for linear pressures.  Gradients are limited so that the corrected pressures at faces stay between the pressures
+of the neighbours.
 """
 
 from __future__ import annotations
@@ -29,15 +31,15 @@ from mpm_dolfinx.forms.point_forms import FacetSum
 from mpm_dolfinx.grid.grid import Grid, sum_by
 
 ALONG = 1e-4
-"""Fluxes need no correction if two centroids are offset along a face by at most this value times the cell size."""
+"""Largest offset of two centroids along a face, divided by the cell size, for which fluxes need no correction."""
 NEAREST = 0.1
-"""Lower bound of distances in the weights of the least-squares fit, divided by the cell size.  Halving this value
-changes the result of scene "slope" in tests/plateaus.py by 3.0e-08 (relative), doubling it by 1.2e-06, and
-finer cells by 3.4e-03."""
+"""Lower bound of distances in the weights of the least-squares fit, divided by the cell size.  The result of scene
+"slope" in tests/plateaus.py changes by the fraction 3.0e-08 with half this value, by 1.2e-06 with twice this value, and
+by 3.4e-03 with finer cells."""
 SIDES = 2.0
-"""Total weight of the open sides of a cell in the least-squares fit, divided by the weight of one neighbour.  Halving
-this value changes the result of scene "slope" in tests/plateaus.py by 4.8e-06 (relative), doubling it by 2.8e-06, and
-finer cells by 3.4e-03.
+"""Total weight of the open sides of a cell in the least-squares fit, divided by the weight of one neighbour.  The
+result of scene "slope" in tests/plateaus.py changes by the fraction 4.8e-06 with half this value, by 2.8e-06 with twice
+this value, and by 3.4e-03 with finer cells.
 """
 
 
@@ -52,11 +54,12 @@ def nonorthogonal_facets(contents: CellContents, facets: NDArray[np.int32]) -> N
 
 
 class Gradients:
-    """Pressure gradients minus unit weight of the fluid, in cells whose centroid is offset along a face or an open
-    side.
+    """Pressure gradients minus the unit weight of the fluid, in all cells that need the non-orthogonal correction.
 
     The object is valid for one cut of the domains.
-    `contents`: material in the cells.  `sides`: open sides of the bodies.
+
+    `contents`: material in the cells.
+    `sides`: open sides of the bodies.
     """
 
     def __init__(self, contents: CellContents, sides: OpenSides):
@@ -96,7 +99,7 @@ class Gradients:
         self._contents, self._sides = contents, sides
 
     def _sealed(self, contents: CellContents, sides: OpenSides) -> NDArray[np.float64]:
-        """Return the area vectors (n, d) of no-flow sides in the filled cells, divided by the areas of cell faces."""
+        """Return the area vectors of no-flow sides in the filled cells, divided by the areas of cell faces."""
         grid, share = contents.grid, contents.open[contents.filled]
         out = -(share[:, :, 1] - share[:, :, 0])
         for axis in range(grid.dim):
@@ -106,7 +109,7 @@ class Gradients:
 
     @cached_property
     def _units(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Gradients (1/m) for a unit pressure difference: to one neighbour (n, 2 d, d), and to one side (m, d)."""
+        """Return the gradients for a unit pressure difference to a neighbour, and to an open side."""
         known, d = self._known, self._separation.shape[2]
         at, sealed = self._at[known], self._sealed(self._contents, self._sides)[self.rows]
         size = np.linalg.norm(self._sides.area, axis=1)[self._faces[known]]
@@ -130,7 +133,8 @@ class Gradients:
     ) -> NDArray[np.float64]:
         """Return the pressure gradients minus the unit weight of the fluid (rows, d), in Pa/m.
 
-        `p` (c,), Pa: pressures of all local cells.  `outer` (m,), Pa: pressures outside the open sides.
+        `p` (c,), Pa: pressures of all local cells.
+        `outer` (m,), Pa: pressures outside the open sides.
         `weight` (d,), N/m^3: unit weight of the fluid, or None without gravity.
         """
         of_cells, of_sides = self._units
@@ -172,10 +176,11 @@ class NonorthogonalFlow(NamedTuple):
     weight: NDArray[np.float64] | None  # unit weight of the fluid (d,), N/m^3; None without gravity
 
     def __call__(self, p: NDArray[np.float64], bulk: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return two arrays: added outflows (n,) from filled cells to other cells, and corrections (m,) of pressures.
+        """Return the additional outflows (n,) from filled cells, and the corrections (m,) of pressures at open sides.
 
-        The outflows are in m^d/s.  The corrections (Pa) apply to the cell pressures at open sides.
-        `p` (c,), Pa: pressures of the local cells.  `bulk`, Pa: bulk modulus of the fluid.
+        The outflows are in m^d/s.  The corrections, in Pa, apply to the pressures of the cells.
+        `p` (c,), Pa: pressures of the local cells.
+        `bulk`, Pa: bulk modulus of the fluid.
         """
         slope = self.gradients(p, self.sides.pressure, self.weight)
         through = self.gradients.through_sides(slope, len(self.sides.cells))
@@ -188,7 +193,10 @@ class NonorthogonalFlow(NamedTuple):
 
 
 def off_middle(sides: OpenSides, grid: Grid) -> NDArray[np.bool_]:
-    """Return for each face (m,) whether the faces of its condition in its cell have a mean offset along the side."""
+    """Return a mask (m,) of faces that are offset along the side.
+
+    Offsets are averaged over the faces of one condition in one cell.
+    """
     faces, at = np.unique(sides.number * grid.num_local + sides.cells, return_inverse=True)
     size, off = np.sqrt(np.add.reduce(sides.area**2, axis=1)), _along(sides) / grid.sizes(sides.cells)
     mean = sum_by(at, (size[:, None] * off).T, len(faces)) / sum_by(at, size, len(faces))
@@ -196,5 +204,5 @@ def off_middle(sides: OpenSides, grid: Grid) -> NDArray[np.bool_]:
 
 
 def _along(sides: OpenSides) -> NDArray[np.float64]:
-    """Return vectors (m, d) along faces, from the foot of the perpendicular through the centroid to the centre."""
+    """Return the vectors along faces from the foot of the perpendicular through the centroid to the centre."""
     return sides.offset - np.add.reduce(sides.offset * sides.normal, axis=1, keepdims=True) * sides.normal

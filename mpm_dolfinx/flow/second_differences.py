@@ -1,13 +1,17 @@
 # SPDX-License-Identifier: MIT
 """Damping of second differences of the pressure along the axes.
 
-    (H p, q) = sum over cells and axes of w D p D q,   D p = h ((p_+ - p) / d_+ - (p - p_-) / d_-),
+The damping matrix H is defined by sums over cells and axes for all pressures p and test functions q,
 
-with the weight w of a cell and axis, and the edge length h of the cell along the axis.  p_+- are the pressures of the
-neighbours, and d_+- the distances between centroids of the material.  A cell has a term along an axis if both faces
-across this axis are open.  For a pressure that alternates from cell to cell, the damping coefficient is 16 w.  Damping
-of pressure jumps with the weight w would give 4 w.  A uniform gradient is not damped, even at the sides of the body, so
-steep pressures are not smeared.  The sum of H p over the cells is zero, so damping conserves fluid.
+    (H p, q) = sum of w D p D q,   D p = h ((p_+ - p) / d_+ - (p - p_-) / d_-).
+
+Here w is the weight of a cell and axis, and h is the edge length of the cell along the axis.  The neighbours along the
+axis have the pressures p_+ and p_-.  The distances from their centroids to the cell's centroid are d_+ and d_-.  A cell
+has a term along an axis if both faces across this axis are open.
+
+A uniform gradient is not damped, even at the sides of the body, so steep pressures are not smeared.  The sum of H p
+over the cells is zero, so damping conserves fluid.  For a pressure that alternates from cell to cell, the damping
+coefficient is 16 w.  Damping of pressure jumps with the weight w would give 4 w.
 """
 
 from __future__ import annotations
@@ -28,14 +32,14 @@ def second_differences(
     centroid: NDArray[np.float64],
     opening: NDArray[np.float64],
 ) -> PETSc.Mat:
-    """Return the matrix H.  The pattern depends on the active cells only.
+    """Return the matrix H.  The pattern of H depends on the active cells only.
 
-    `unknowns`: pressure unknowns of the active cells.  `grid`: background grid.
-    `strength` (n, d), m^d/Pa: coefficient, >= 0, of each owned active cell and axis.  A damping of jumps with this
-    coefficient has the same effect on alternating pressures.
+    `unknowns`: pressure unknowns of the active cells.
+    `strength` (n, d), m^d/Pa: coefficient, >= 0, of each owned active cell and axis.  Alternating pressures are damped
+    as by a damping of pressure jumps with the same coefficient.
     `centroid` (c, d), m: centroids of the material in the local cells, relative to the midpoints of the cells.
-    `opening` (c, d, 2): open fractions of the lower and upper faces of the local cells, in axisymmetry times
-    `Grid.around`.
+    `opening` (c, d, 2): open fractions of the lower and upper faces of the local cells.  In axisymmetry they are
+    multiplied by `Grid.around`.
     """
     own = unknowns.owned
     number = unknowns.map.indices

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: MIT
 """Fluxes between two cells through unsaturated soils in series.
 
-The pressure of a cell refers to one position in the cell, the pressure position (see `layers`).  The soils between the
-pressure positions of two cells lie in series.  The pressures at the interfaces of soils are local unknowns of each
-face.  Newton's method finds these pressures from the continuity of the flux, and condensation eliminates them.  Each
-soil conducts like a pair of cells that contain only this soil (`fitted`).  Steady flow through layers with exponential
-k_r is therefore exact for any position of the layers.
+The pressure of a cell refers to one position in the cell, the pressure position (see `layers`).  Several soils may lie
+between the pressure positions of two cells.  The pressures at the interfaces of these soils are local unknowns of each
+face.  Newton's method finds these pressures from the continuity of the flux, and condensation eliminates them.  The
+flux law within a soil is the law between two cells of this soil (`fitted`).  Steady flow through layers with
+exponential relative conductivity is therefore exact for any position of the layers.
 
 Lines through a cell (see `layers`) conduct in parallel if they cross a single soil up to the face.  All lines that
 cross several soils are replaced by one line.  This line crosses the same soils in the same sequence.  Its length in
@@ -31,9 +31,9 @@ MOST = 2200  # largest number of iterations.  Source: exact bound, twice the hal
 class Paths(NamedTuple):
     """Flow paths from the pressure positions of n cells to their faces.
 
-    The arrays (n, d, 2, ...) have the indices cell, axis and end of the cell.  Lines that cross a single soil conduct
-    in parallel.  `parallel` has one entry for each of l retention curves; entry 0 is for soil without a curve.  The
-    other lines are replaced by one line with s soils in series.
+    The arrays (n, d, 2, ...) have the indices cell, axis and end of the cell.  `parallel` contains the lines that cross
+    a single soil.  Its entry 0 is for soil without a retention curve, and each curve has one further entry.  All other
+    lines are replaced by one line with s soils in series.
     """
 
     parallel: NDArray[np.float64]  # mobility of single-soil lines, times their fraction of all lines (l,), m^2/(Pa s)
@@ -42,16 +42,16 @@ class Paths(NamedTuple):
     resistance: NDArray[np.float64]  # length divided by mobility and by the fraction of lines (s,), Pa s/m^2
 
     def at(self, *index) -> Paths:
-        """Return the paths at an index of all arrays."""
+        """Return the paths at an index of the arrays."""
         return Paths(*(values[index] for values in self))
 
     def everywhere(self, dim: int) -> Paths:
-        """Repeat the paths (n, ...) for both ends of all axes, and return the result (n, d, 2, ...)."""
+        """Repeat the paths (n, ...) for both ends of all axes."""
         parts = ((np.repeat(values, 2 * dim, axis=0), values.shape) for values in self)
         return Paths(*(many.reshape(shape[0], dim, 2, shape[1]) for many, shape in parts))
 
     def with_slots(self, count: int) -> Paths:
-        """Return the paths padded with unused entries to `count` soils in series."""
+        """Return the paths with room for `count` soils in series."""
         more = [(0, 0)] * (self.law.ndim - 1) + [(0, count - self.law.shape[-1])]
         law, length, resistance = (
             np.pad(values, more, constant_values=v) for values, v in zip(self[1:], (-1, 0, 0), strict=True)
@@ -59,7 +59,7 @@ class Paths(NamedTuple):
         return Paths(self.parallel, law, length, resistance)
 
     def eased(self, factor: NDArray[np.float64]) -> Paths:
-        """Return the paths (n, d, 2, ...) with mobilities multiplied by a factor (n, d) along each axis."""
+        """Multiply the mobilities of the paths by a factor (n, d) along each axis."""
         factor = factor[:, :, None, None]
         return self._replace(parallel=self.parallel * factor, resistance=self.resistance / factor)
 
@@ -79,10 +79,7 @@ def none(count: int, laws: int, slots: int) -> Paths:
 
 
 class _Links(NamedTuple):
-    """Segments of soil along the flow path through a face.
-
-    Each segment connects two nodes (positions with a pressure).
-    """
+    """Segments of soil along the flow path through a face."""
 
     face: NDArray[np.int64]  # index of the face
     low: NDArray[np.int64]  # first node
@@ -111,10 +108,11 @@ def through(
 ) -> Through:
     """Return the conductances of m faces for the pressures on both sides.
 
-    `laws`: relative conductivities as functions of pressure.  `p` (m,), Pa: pressures on both sides, as two arrays.
+    `laws`: relative conductivities as functions of pressure.
+    `p` (m,), Pa: pressures on both sides, as two arrays.
     `paths` (m, ...): paths of one or two cells, from their pressure positions to the face.
     `lengths` (m,), m: lengths of the paths.
-    `drops` (m,), Pa: pressure drops caused by the fluid's weight along each path, from the first to the second side.
+    `drops` (m,), Pa: pressure drops along each path due to the fluid's weight, from the first to the second side.
     """
     counts = [np.maximum((path.law >= 0).sum(axis=1), 1) for path in paths]
     kinds, kind = np.unique(np.stack(counts, axis=1), axis=0, return_inverse=True)
@@ -127,7 +125,7 @@ def through(
 
 
 class _Chain:
-    """Faces with equal numbers of soils in series.  Each interface between soils is a node with a pressure."""
+    """Faces with equal numbers of soils in series.  Each interface between soils has a pressure."""
 
     def __init__(self, laws: Laws, paths: Sequence[Paths], count: Sequence[int], p, lengths, drops):
         self._laws, self._p = laws, p
@@ -155,7 +153,7 @@ class _Chain:
         self._difference = self._hydrostatic[:, -1] - p[1]
 
     def solved(self) -> NDArray[np.float64]:
-        """Return an array (3, m): the conductance between both ends of the path, and the two slopes of `Through`."""
+        """Return the conductance between both ends of the path, and the two slopes of `Through`."""
         links, difference = self._links, self._difference[:, None]
         inner = slice(1, -1)
         scale = np.full(self._hydrostatic.shape, np.inf)
@@ -188,7 +186,7 @@ class _Chain:
         raise NotConverged("soils in series: no solution for the pressure at their interface")
 
     def _flows(self, p: NDArray[np.float64]) -> _Flows:
-        """Return the flows at the node pressures p (m, nodes), in Pa."""
+        """Return the flows at the pressures (Pa) of the interfaces."""
         links = self._links
         ends = p[links.face, links.low], p[links.face, links.high]
         k, slopes = self._laws.between(links.law, ends, links.drop)
@@ -198,13 +196,13 @@ class _Chain:
         return _Flows(c * k, c * own, c * other, c * k * difference, rounding)
 
     def _chain(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Select the values (m, nodes - 1) of the segments in series from the values of all segments."""
+        """Select the values of the segments in series."""
         starts = np.cumsum([0, *(count + 1 for count in self._counts)])
         number = [i for first, count in zip(starts, self._counts, strict=False) for i in range(first, first + count)]
         return np.stack([values[self._parts[i] : self._parts[i + 1]] for i in number], axis=1)
 
     def _step(self, flows: _Flows) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Return two arrays (m, nodes - 2): Newton steps (Pa), and whether the flux is continuous within rounding."""
+        """Return the Newton steps (Pa), and whether the flux is continuous within rounding."""
         links, shape = self._links, self._hydrostatic.shape
 
         def at(node: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -224,7 +222,7 @@ class _Chain:
         return x, balanced
 
     def _condensed(self, flows: _Flows) -> NDArray[np.float64]:
-        """Return the result (3, m) of `solved` from the flows through all segments of the faces."""
+        """Return the result of `solved` from the flows through the segments."""
         out, part = None, 0
         rows = np.stack(flows[:3])
         for count in self._counts:
@@ -239,7 +237,7 @@ class _Chain:
 
 
 def _series(first: NDArray[np.float64] | None, second: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the conductance and slopes (3, m) of two segments in series, or of `second` if `first` is None."""
+    """Return the conductance and slopes of two segments in series."""
     if first is None:
         return second
     (k, own, other), (after, owns, others) = first, second

@@ -20,16 +20,10 @@ from mpm_dolfinx.materials.user_functions import compiling, form
 class Sources(Feeding):
     """All sources of a scene, for all stages.
 
-    Parameters
-    ----------
-    sources
-        User functions that return UFL terms.
-    pieces
-        Quadrature points of all pieces, with the volumes of the material points.
-    p
-        Pore pressure of the cells (DG0), Pa.
-    t : s
-        Time at the end of the substep, a UFL constant.
+    `sources`: user functions that return UFL terms.
+    `pieces`: quadrature points of all pieces, with the volumes of the material points.
+    `p`: pore pressure of the cells (DG0), Pa.
+    `t`, s: time at the end of the substep, a UFL constant.
     """
 
     title = "sources"
@@ -52,7 +46,7 @@ class Sources(Feeding):
         self.linear = not self._slopes
 
     def gain(self, pieces: PointData) -> NDArray[np.float64]:
-        """Return the inflow (m^d/s) into each filled cell at p, as an array over local cells."""
+        """Return the inflow (m^d/s) into each filled cell, as an array over local cells."""
         return self._sum(self._forms, pieces)
 
     def slope(self, pieces: PointData) -> NDArray[np.float64]:
@@ -71,7 +65,7 @@ class Sources(Feeding):
         return SourceFeeds(self, wet)
 
     def fed(self, cut: CutDomains, pieces: PointData) -> NDArray[np.int64]:
-        """Return the indices of points with pieces in cells that contain a source; indices may be repeated."""
+        """Return the indices of points with pieces in cells that contain a source. Indices may be repeated."""
         return cut.pieces.point[cut.to_pieces(self.gain(pieces)[cut.cells] != 0)]
 
 
@@ -84,7 +78,7 @@ class SourceFeeds(Feeds):
         self.linear = sources.linear
 
     def leaving(self, at: None, fluid: Fluid) -> Leaving:
-        """Return minus the inflow into the cells."""
+        """Return the inflow into the cells as a negative outflow."""
         gain = self._sources.gain(self._pieces)[self._cells]
         return Leaving(-gain, gain=np.abs(gain))
 

@@ -1,22 +1,23 @@
 # SPDX-License-Identifier: MIT
 """Storage of the pore fluid: a finite volume method with constant pressures (DG0) in the cells.
 
-`drained_sides` treats open sides.  The fluid balance of an active cell, with J_Delta = det(I + grad u), is
+The fluid balance of an active cell, with J_Delta = det(I + grad u), is
 
     int r [zeta(J_Delta, p) - zeta_n] dV_n  +  int sum_faces Q dt  =  0,      d zeta = alpha dJ + S J dp,
     Q = T r [p+ - p- + rho_w g . (x- - x+)],   T = A / (d+ / kappa+ + d- / kappa-),   kappa = k / (rho_w g).
 
-With div u instead of J_Delta, rotations would cause volume changes.  The factor `r = exp(p / K_w)` is the fluid density
-divided by the density rho_w at zero pressure.  In the storage term, r is taken at the pressure `(p_n + p) / 2`.  On a
-face, r is the logarithmic mean over both cells.  With this mean, `r [p+ - p-]` is the jump of the mass potential
-(`fluid_content`), and the mass that leaves a cell enters the neighbour.  The residual is the left side of the balance,
-divided by the r of the storage term.  The tangent neglects the difference between the r of a face and the r of the
-storage term.  A is the exact area of the body on the face, and k is the conductivity.  The points x+- are the centroids
-of the material in both cells, and d+- are their distances from the face.  `layers` defines kappa and d of mixed cells.
-Distances from centroids are exact for partly filled cells.  Half of the cell size would be too long there.
-`nonorthogonal` corrects fluxes if the two centroids are offset along the face.  The sum
-of the balances of all cells is the fluid balance of the bodies.  `fluid_content` defines the change of the content, and
-`time_integration` the integral over a substep.
+With div u instead of J_Delta, rotations would cause volume changes.  `fluid_content` defines the change of the fluid
+content zeta, and `time_integration` the integral over a substep.  A is the exact area of the body on the face, and k is
+the conductivity.  The points x+ and x- are the centroids of the material in both cells, and d+ and d- are their
+distances from the face.  Distances from centroids are exact for partly filled cells.  `layers` defines kappa and d of
+mixed cells.  `nonorthogonal` corrects the fluxes if the two centroids are offset along the face.  `drained_sides`
+treats open sides.
+
+The factor `r = exp(p / K_w)` is the fluid density divided by the density rho_w at zero pressure.  In the storage term,
+r is taken at the pressure `(p_n + p) / 2`.  On a face, r is the logarithmic mean over both cells.  With this mean,
+`r [p+ - p-]` is the jump of the mass potential (`fluid_content`), and the mass that leaves a cell enters the neighbour.
+The residual is the left side of the balance, divided by the r of the storage term.  The tangent neglects the difference
+between the r of a face and the r of the storage term.
 
 The volumes of domains drift from their fluid content, for three reasons: corners do not follow u alone, points move to
 other cells, and pressure jumps are damped (see below).  Each point stores the difference as a volume defect (`owed`).
@@ -24,12 +25,14 @@ The next steps correct fractions of this defect (`defect`), at a constant rate o
 
 If no fluid flows within a step, Q1 displacements with DG0 pressures violate the inf-sup condition: pressures that
 alternate from cell to cell have no effect.  Therefore jumps of the pressure increment of the step are stabilised by the
-term `max(0, tau d - dt kappa / d) A [p - p_n]`.  Here tau (1/Pa) is the strength of the stabilisation, and `d = d+ +
-d-`.  In this term, dt (s) is the length of the step times the coefficient of Q(u, p) in `time_integration`, which is 1
-or gamma.  The term raises the coefficient `dt kappa A / d` of a face to `tau d A` if `tau d A` is larger.  The term
-conserves fluid, and it is zero in steady states.  For elastic soil, tau is a quarter of Silvester and Kechkar's patch
-value (Camargo, White and Borja 2021).  Soil in plastic flow needs a tau up to a hundred times larger.  The increase of
-tau acts on second differences only (`second_differences`), because damping of jumps would smear steep pressures.
+term `max(0, tau d - dt kappa / d) A [p - p_n]`.  Here tau (1/Pa) is the strength of the stabilisation, and
+`d = d+ + d-`.  In this term, dt is the length of the step times the coefficient of Q(u, p) in `time_integration`.  The
+term raises the coefficient `dt kappa A / d` of a face to at least `tau d A`.  The term conserves fluid, and it is zero
+in steady states.
+
+For elastic soil, tau is a quarter of Silvester and Kechkar's patch value (Camargo, White and Borja 2021).  Soil in
+plastic flow needs a tau up to a hundred times larger.  The increase of tau acts on second differences only
+(`second_differences`), because damping of jumps would smear steep pressures.
 """
 
 from __future__ import annotations
@@ -65,8 +68,8 @@ from mpm_dolfinx.pores.retention import logarithm, restrained
 
 FILTER = 0.75
 """Fraction, in [0, 1], of `beta V` that the filtered fixed-stress operator omits for checkerboard modes.  Here beta is
-the fixed-stress coefficient, and V is the volume.  Halving this value changes the result of scene "beam" in
-tests/plateaus.py by 5.2e-11 (relative), doubling it by 1.3e-10, and finer cells by 1.5e-02.
+the fixed-stress coefficient, and V is the volume.  The result of scene "beam" in tests/plateaus.py changes by the
+fraction 5.2e-11 with half this value, by 1.3e-10 with twice this value, and by 1.5e-02 with finer cells.
 """
 
 
@@ -85,30 +88,19 @@ class CellPressure(NamedTuple):
 class StorageForms:
     """Compiled forms of the fluid balance of a scene.
 
-    Parameters
-    ----------
-    pieces
-        Quadrature points with the fields `biot`, `storage` (1/Pa) and `storage_at_one` (1/Pa), see `change_of_content`.
-        With a specific yield they also have the field `drainage`: specific yield and suction (Pa), see
-        `skeleton.unsaturated`.
-    displacement
-        Increment of the displacement since the start of the step.
-    pressure
-        Pore pressure of the cells, positive in compression.
-    active
-        Active part of the grid.
-    materials
-        Materials and fluid of the scene.  With retention curves, pieces have the fields `retention`, `lever`, `pores`.
-    weight : (d,), N/m^3
-        Unit weight rho_w g of the pore fluid, as UFL, or None without gravity.
-    symmetric
-        Whether to use alpha as the derivative of the content with respect to J_Delta.  If True, the Jacobian is
-        symmetric.  The neglected term is of the order of `(p - p_n) / K_w`.  Newton's method converges as fast without
-        this term.
-    feeding
-        Sources and open sides of all stages.
-    inertial : (d,), N/m^3
-        Inertia force `-rho_w a` on the pore fluid, as UFL, or None without inertia.
+    `pieces`: quadrature points with the fields `biot`, `storage` (1/Pa) and `storage_at_one` (1/Pa), see
+    `change_of_content`.  With a specific yield they also have the field `drainage`: specific yield and suction (Pa),
+    see `skeleton.unsaturated`.
+    `displacement`: increment of the displacement since the start of the step.
+    `pressure`: pore pressure of the cells, positive in compression.
+    `materials`: materials and fluid of the scene.  With retention curves, pieces have the fields `retention`, `lever`,
+    `pores`.
+    `weight` (d,), N/m^3: unit weight rho_w g of the pore fluid, as UFL, or None without gravity.
+    `symmetric`: whether to use alpha as the derivative of the content with respect to J_Delta.  If True, the Jacobian
+    is symmetric.  The neglected term is of the order of `(p - p_n) / K_w`.  Newton's method converges as fast without
+    this term.
+    `feeding`: sources and open sides of all stages.
+    `inertial` (d,), N/m^3: inertia force `-rho_w a` on the pore fluid, as UFL, or None without inertia.
     """
 
     def __init__(
@@ -165,7 +157,7 @@ class StorageForms:
         """Sources and open sides of all stages."""
 
     def change(self, data: PointData) -> NDArray[np.float64]:
-        """Return an array over local cells: change (m^d) of the fluid volume in filled cells since the step's start."""
+        """Return the changes of the fluid volume in filled cells in the step, in m^d, as an array over local cells."""
         b = self._sums
         b[data.places.filled] = 0.0
         self._change.assemble_vector(b, data)
@@ -174,22 +166,23 @@ class StorageForms:
     def derivatives(self, data: PointData) -> list[NDArray[np.float64]]:
         """Return the derivatives of `change` with respect to p, and with respect to the nodal displacements u.
 
-        The derivative d/dp is an array (filled cells,), in m^d/Pa.  The derivatives d/du are one or two arrays (filled
-        cells, n), in m^(d-1).  The first array is for the momentum balance, and differentiates `alpha dJ_Delta`.  The
-        second array exists unless `symmetric` is set, and differentiates the content.
+        The derivative with respect to p is an array (filled cells,), in m^d/Pa.  The derivatives with respect to u are
+        one or two arrays (filled cells, n), in m^(d-1).  The first array is for the momentum balance, and
+        differentiates `alpha dJ_Delta`.  The second array differentiates the content.  It exists only if `symmetric` is
+        False.
         """
         sums, count = self._derivatives(data), self.grid.dim * 2**self.grid.dim
         return [sums[:, 0], *[sums[:, start : start + count] for start in range(1, sums.shape[1], count)]]
 
     def drained(self, data: PointData) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return two arrays (n,): storage of cells due to saturation (m^d/Pa), and `int S d(chi p)/dp dV` (m^d)."""
+        """Return the storage of cells due to saturation (m^d/Pa), and the integral `int S d(chi p)/dp dV` (m^d)."""
         capacity, coupled = self._capacity(data).T
         return capacity, coupled
 
     def driven(
         self, assembled: FacetSum, active: NDArray[np.int64], force: NDArray[np.float64] | None
     ) -> NDArray[np.float64]:
-        """Return the outflow (c,) of active cells to other cells, in m^d/s, caused by p and by the fluid's weight.
+        """Return the outflow of active cells to other cells due to the pressures and the fluid's weight, in m^d/s.
 
         `force` (c, d), N/m^3: inertia force on the fluid in the local cells, or None.
         """
@@ -230,16 +223,10 @@ class Rates:
 class StorageSystem:
     """Vectors and matrices of the pressure unknowns, for one set of active cells.
 
-    Parameters
-    ----------
-    forms
-        Compiled forms, with the material in the cells.
-    cells, facets
-        Active local cells including ghosts, and the faces between two of these cells.
-    momentum
-        Unknowns of the displacement.
-    parts
-        Connected parts of the bodies.
+    `forms`: compiled forms, with the material in the cells.
+    `cells`, `facets`: active local cells including ghosts, and the faces between two of these cells.
+    `momentum`: unknowns of the displacement.
+    `parts`: connected parts of the bodies.
     """
 
     def __init__(
@@ -275,24 +262,24 @@ class StorageSystem:
         return (self._uniform or self._over_uniform())[1]
 
     def _over_uniform(self) -> tuple[FacetSum | None, FacetSum | None]:
-        """Return two forms over the faces between cells of one soil: the form of the flux matrix, and `gravity`."""
+        """Return the forms of the flux matrix and of `gravity`, over the faces between cells of one soil."""
         fluxes, facets = self._forms.fluxes, self._facets
         facets = facets if fluxes.relative is None else fluxes.relative.uniform(facets)
         return tuple(form and form.on(facets) for form in (fluxes.flux, fluxes.gravity))
 
     def places(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the grid positions of this process's unknowns, and an empty array, because no pressure is fixed."""
+        """Return the grid positions of this process's unknowns, and an empty array for prescribed pressures."""
         places = self._forms.grid.cell_places(self.unknowns.owned)
         return places, places[:0]
 
     def change_by(self, u: PETSc.Vec, out: PETSc.Vec, *slopes: FluxSlope) -> None:
-        """Set `out` to the change (m^d) of the residual due to u: by content and, with `slopes`, by fluxes."""
+        """Set `out` to the change (m^d) of the residual due to u.  With `slopes`, the change includes the fluxes."""
         self.B.mult(u, out)
         for slope in slopes:
             out.array_w[:] += slope(u)
 
     def between(self, pi: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the outflow to other cells, in m^d/s, caused by differences of the mass potentials pi (n,), in Pa."""
+        """Return the outflow to other cells due to the mass potentials pi, in m^d/s."""
         self._potentials.array_w[:] = pi
         return (self.T * self._potentials).array_r
 
@@ -309,7 +296,10 @@ class StorageSystem:
         flow: Conduction,
         off: tuple[FacetSum, Gradients, OpenSides] | None,
     ) -> Outflow:
-        """Assemble the fluxes through inner faces.  `off` are arguments of `NonorthogonalFlow`, or None."""
+        """Assemble the fluxes through inner faces.
+
+        `off`: arguments of `NonorthogonalFlow`, or None.
+        """
         fluxes = self._forms.fluxes
         mobility = fluxes.set_conduction(contents, flow)
         if (relative := self._forms.fluxes.relative) is not None:
@@ -325,7 +315,10 @@ class StorageSystem:
         return Outflow([one.conducting(flow) for one in feeds], total, mobility, nonorthogonal)
 
     def assemble_fluxes(self, force: NDArray[np.float64] | None = None) -> None:
-        """Assemble the matrix of fluxes (in unsaturated soil at p).  `force`: see `StorageForms.driven`."""
+        """Assemble the matrix of fluxes, in unsaturated soil at the current pressures.
+
+        `force`: see `StorageForms.driven`.
+        """
         zero(self.T)
         relative, borders = self._forms.fluxes.relative, None
         if relative is not None:
@@ -352,32 +345,15 @@ class StorageResidual:
 class StorageProblem:
     """The fluid balance in one substep.  The pressure at the start of the step is `forms.p_n`.
 
-    Parameters
-    ----------
-    forms
-        Compiled forms.
-    system
-        Vectors and matrices, with the assembled fluxes.
-    data
-        Quadrature points of the pieces.
-    contents
-        Material in the cells.
-    feeds
-        Sources and open sides.
-    flow
-        Function that assembles the outflow at (u, p).  Its argument states whether a substep starts.
-    dt
-        Time weight, s, of the rate at (u, p).
-    before
-        Outflow volumes from the rate of the previous substep.
-    softness : (m,)
-        Softness of the pieces, see `SoftnessAtPoints`.  It is 1 if no law can yield.
-    defect : (n,), m^d
-        Part of the volume defect in the active owned cells that is corrected by the end of the substep.
-    inertial
-        Function that returns the inertia forces (n, d), in N/m^3, on the fluid in the active owned cells, or None.
-    scale
-        Suctions (n,), Pa, at which the pores of the active owned cells drain, or None in saturated scenes.
+    `system`: vectors and matrices, with the assembled fluxes.
+    `flow`: function that assembles the outflow at (u, p).  Its argument states whether a substep starts.
+    `dt`: time weight, s, of the rate at (u, p).
+    `before`: outflow volumes from the rate of the previous substep.
+    `softness` (m,): softness of the pieces, see `SoftnessAtPoints`.  It is 1 if no law can yield.
+    `defect` (n,), m^d: part of the volume defect in the active owned cells that is corrected by the end of the substep.
+    `inertial`: function that returns the inertia forces (n, d), in N/m^3, on the fluid in the active owned cells, or
+    None.
+    `scale`: suctions (n,), Pa, at which the pores of the active owned cells drain, or None in saturated scenes.
     """
 
     def __init__(
@@ -431,7 +407,7 @@ class StorageProblem:
     def _damping_of_soft_soil(
         self, tau: NDArray[np.float64], softest: NDArray[np.float64], mobility: NDArray[np.float64]
     ) -> PETSc.Mat:
-        """Return the matrix of additional damping in soft cells.  `tau` (n,), 1/Pa: strength for elastic soil."""
+        """Return the matrix of additional damping in soft cells."""
         contents, grid = self._contents, self.forms.grid
         flow = self.dt * mobility / grid.sizes(contents.filled) ** 2
         more = np.maximum((softest * tau)[:, None] - flow, 0) - np.maximum(tau[:, None] - flow, 0)
@@ -446,7 +422,7 @@ class StorageProblem:
 
     @property
     def _density(self) -> NDArray[np.float64]:
-        """Density of the fluid in the active owned cells at mid-step, divided by the density at zero pressure."""
+        """Relative density of the fluid in the active owned cells at mid-step."""
         (p, p_n), owned = self._p, self.system.unknowns.owned
         return np.exp((p[owned] + p_n[owned]) / (2 * self.forms.bulk))
 
@@ -481,15 +457,17 @@ class StorageProblem:
 
     @property
     def fill(self) -> NDArray[np.float64]:
-        """Volume fraction of material in each cell, the weight of errors and changes of the cell's pressure."""
+        """Volume fraction of material in each cell.  It is the weight of the cell's pressure error."""
         return self._contents.fill
 
     def sealed(self, volumes: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the pressure rises (Pa) of cells at fixed stress that keep their lost fluid `volumes` (m^d)."""
+        """Return the pressure rises (Pa) of cells at fixed stress, if the outflows `volumes` (m^d) do not leave the
+        cells.
+        """
         return volumes / (self.forms.derivatives(self.data)[0] + self._contents.fixed_stress)
 
     def filling(self, error: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return errors (n,) of the water content by pressure errors (Pa), and changes (n,) of this content."""
+        """Return the errors of the water content for pressure errors (Pa), and the changes of the water content."""
         capacity, _ = self.forms.drained(self.data)
         change = self.forms.change(self.data)[self.system.unknowns.owned]
         share = self.fill / self._contents.volume
@@ -502,7 +480,7 @@ class StorageProblem:
         return float(whole / area)
 
     def _begin(self, outflow: Outflow) -> NDArray[np.float64] | float:
-        """Start the substep.  Return the non-orthogonal correction (m^d/s) of fluxes between cells."""
+        """Start the substep, and return the non-orthogonal correction (m^d/s) of fluxes between cells."""
         p, fluid = self._p[0], self._fluid
         sides = [0 if one.sides is None else len(one.sides.cells) for one in self._feeds]
         between, difference = 0.0, np.zeros(sum(sides))
@@ -516,27 +494,23 @@ class StorageProblem:
 
     @property
     def accuracy(self) -> float:
-        """Largest relative tolerance of linear solves.  Dry cells store little fluid, so their errors must be small."""
+        """Largest relative tolerance of linear solvers.  Dry cells need small errors: they store little fluid."""
         return SAME if self.forms.retains else 1.0
 
     def restrained(
         self, dp: NDArray[np.float64], previous: NDArray[np.float64] | float
     ) -> tuple[NDArray[np.float64], NDArray[np.float64] | float]:
-        """Return two arrays (n,): limited pressure decreases (Pa), and the resulting changes of the suction's
-        logarithm.
+        """Return the limited pressure decreases (Pa), and the resulting changes of the logarithm of the suction.
 
         `dp` (n,), Pa: pressure decreases in the Newton step.
-        `previous` (n,): change of the suction's logarithm in the previous iteration.
+        `previous` (n,): change of the logarithm of the suction in the previous iteration.
         """
         p = self._p[0][self.system.unknowns.owned]
         dp = restrained(p, dp, self._scale, previous)
         return dp, logarithm(p - dp, self._scale) - logarithm(p, self._scale)
 
     def settle(self) -> bool:
-        """Update the active sets for the flow at (u, p), and return whether any set has changed.
-
-        Newton's method solves for (u, p) with fixed active sets, and then updates the sets.
-        """
+        """Update the active sets for the flow at (u, p), and return whether any set has changed."""
         if not self._settles:
             return False
         fluid, both = self._fluid, zip(self._feeds, self._flow(False).at, strict=True)
@@ -551,6 +525,7 @@ class StorageProblem:
 
         The function computes a matrix-free finite difference (Knoll and Keyes 2004) of the conductivity laws and of the
         geometry of the fluxes.  Its caller must then reset the fluxes with `set_fluxes`.
+
         `dofs`: active dofs of u.
         """
         h = self.forms.grid.least
@@ -615,16 +590,15 @@ class StorageProblem:
         return Rates(cells + net, net, turnover, gain)
 
     def _local(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return values (n, d) of the active owned cells as an array (c, d) over local cells."""
+        """Return values of the active owned cells as an array over local cells."""
         out = np.zeros((self.forms.grid.num_local, values.shape[1]))
         out[self.system.unknowns.owned] = values
         return out
 
     def net_inflow(self, rates: Rates) -> NDArray[np.float64]:
-        """Return the net inflow (n,) into each filled owned cell in the step by fluxes and sources, in m^d.
+        """Return the net inflow by fluxes and sources into each filled owned cell in the step, in m^d.
 
-        Volumes refer to the density at mid-step, as in `change`.
-        `rates`: rates at the end of the substep.
+        Volumes refer to the density at mid-step.  `rates`: rates at the end of the substep.
         """
         return (-self.dt * rates.cells - self._before.cells) / self._density
 
@@ -634,8 +608,8 @@ class StorageProblem:
         """Assemble the derivatives `C = d/dp` and `B = d/du` of the residual at (u, p).
 
         `data`: quadrature points of the pieces, by default the points of the problem.
-        `of_suction`: for laws that depend on suction, cells (c,) and derivatives (c, n), m^(d-1), of their nodal forces
-        with respect to p.
+        `of_suction`: cells (c,), and derivatives (c, n), m^(d-1), of the nodal forces of these cells with respect to p.
+        Only laws that depend on suction have these derivatives.
         """
         forms = self.forms
         system = self.system

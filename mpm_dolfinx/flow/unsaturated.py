@@ -2,8 +2,8 @@
 """Fluxes in unsaturated soil: conductivities of faces from the pressures on both sides.
 
 The relative conductivity k_r of a face is the mean of k_r over all pressures between the pressures on both sides
-(`retention.Conductance`).  With the value of the wetter side, a wetting front would move too fast.  With gravity the
-mean is modified (`fitted`), so that steady flow with exponential k_r is exact.  See `series` for mixed cells.
+(`retention.Conductance`).  The k_r of the wetter side would move a wetting front too fast.  With gravity the mean is
+modified (`fitted`), so that steady flow with exponential k_r is exact.  See `series` for mixed cells.
 """
 
 from __future__ import annotations
@@ -48,24 +48,18 @@ class Between(NamedTuple):
 def fitted(p: Sequence, tables: Sequence[Sequence], drop, scale, of: Functions) -> Between:
     """Return the relative conductivity k_r between the two sides of a face, with derivatives.
 
-    k is the mean of k_r over the pressures between both sides.  x is the jump of k_r divided by k.  y is x times
-    `drop`, divided by the pressure jump.  With `s(z) = sinh(z / 2) / (z / 2)`, the result is `k s(x + y) / (s(x)
+    Let k be the mean of k_r over the pressures between both sides.  Let x be the jump of k_r divided by k.  Let y be x
+    times `drop`, divided by the pressure jump.  With `s(z) = sinh(z / 2) / (z / 2)`, the result is `k s(x + y) / (s(x)
     s(y))`.  The result is exact for steady flow with an exponential k_r (Baker 1995), and never exceeds the k_r of the
     wetter side.  Without gravity the result is k (Kirchhoff 1894).  For nearly equal pressures, k is the mean of the
     values on both sides.
 
-    Parameters
-    ----------
-    p
-        Pressures on both sides, Pa.
-    tables
-        Three values on each side: integral of k_r (Pa), k_r, derivative of k_r (1/Pa), see `retention.Conductance`.
-    drop
-        Pressure drop caused by the weight of the fluid from the first side to the second, Pa.
-    scale
-        Characteristic suction of k_r, Pa.
-    of
-        Functions for the type of the arguments: arrays or UFL expressions.
+    `p`: pressures on both sides, Pa.
+    `tables`: three values on each side: integral of k_r (Pa), k_r, derivative of k_r (1/Pa), see
+    `retention.Conductance`.
+    `drop`: pressure drop from the first side to the second due to the weight of the fluid, Pa.
+    `scale`: characteristic suction of k_r, Pa.
+    `of`: functions for the type of the arguments: arrays or UFL expressions.
     """
     (phi0, k0, d0), (phi1, k1, d1) = tables
     jump = p[0] - p[1]
@@ -88,7 +82,7 @@ def fitted(p: Sequence, tables: Sequence[Sequence], drop, scale, of: Functions) 
 
 
 def _log_sinhc(z, of: Functions) -> tuple[Any, Any]:
-    """Return `ln(sinh(z / 2) / (z / 2))` and the derivative of this function with respect to z."""
+    """Return `ln(sinh(z / 2) / (z / 2))` and its derivative with respect to z."""
     small = of.less(abs(z), SECOND)
     half = of.where(small, 1.0, z / 2)
     size = abs(half)
@@ -107,7 +101,11 @@ class Laws:
     def between(
         self, law: NDArray[np.int64], p: Sequence[NDArray[np.float64]], drop: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return k_r (m,) of curves `law` (m,) between pressures p (Pa), and its derivatives (2, m), see `fitted`."""
+        """Return k_r (m,) between two pressures, and its derivatives (2, m), see `fitted`.
+
+        `law` (m,): index of the retention curve of each face.
+        `p`, Pa: pressures on both sides.
+        """
         k, slopes = np.ones(len(law)), np.zeros((2, len(law)))
         for number, one in enumerate(self.conductances, 1):
             rows = np.flatnonzero(law == number)
@@ -121,17 +119,10 @@ class Laws:
 class Relative:
     """Relative conductivities of cells as functions of the cell pressures.
 
-    Parameters
-    ----------
-    grid
-        Background grid.
-    retentions
-        Retention curves of the scene.
-
     Attributes
     ----------
     shares
-        Fractions (DG0) of a cell's mobility at k_r = 1: due to soil without a retention curve, and due to soil of each
+        Fractions (DG0) of a cell's mobility at k_r = 1: of soil without a retention curve, and of the soil of each
         curve.
     """
 
@@ -155,14 +146,19 @@ class Relative:
         return out
 
     def conducts(self, side: str, means: Sequence):
-        """Return k_r of the cell on one side of a face, as UFL, from the k_r of each retention curve."""
+        """Return k_r of the cell on one side of a face, as UFL.
+
+        `means`: k_r of each retention curve.
+        """
         return self.shares(side)[0] + sum(self.shares(side)[1 + i] * k for i, k in enumerate(means))
 
     def set_pressures(self, p: NDArray[np.float64], force: NDArray[np.float64] | None = None) -> Any:
         """Set the coefficients of forms for the pressures of the local cells.
 
         Return the fluxes through faces between cells of different soil (see `borders`), or None without such faces.
-        `p` (c,), Pa: pressures of the local cells.  `force` (c, d), N/m^3: inertia force on the fluid.
+
+        `p` (c,), Pa: pressures of the local cells.
+        `force` (c, d), N/m^3: inertia force on the fluid.
         """
         self._tables.x.array[:] = np.concatenate([law(p) for law in self._laws.conductances], axis=1).ravel()
         if (faces := self._borders.value) is None:
@@ -171,7 +167,7 @@ class Relative:
         return self._flows((faces, pair, force), lambda: faces.flows(pair, force), self._grid.comm)
 
     def uniform(self, facets: NDArray[np.int32]) -> NDArray[np.int32]:
-        """Return the facets with the same soil on both sides, among the `facets` between active cells."""
+        """Return the `facets` between active cells that have the same soil on both sides."""
         faces = self._borders.value
         return facets if faces is None else faces.borders.uniform
 
@@ -188,11 +184,13 @@ class Relative:
         outer: NDArray[np.float64],
         drop: NDArray[np.float64],
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return two arrays (m,): k_r between cells and sides, and `d[k_r (p - outer + drop)]/dp`.
+        """Return k_r (m,) between cells and sides, and `d[k_r (p - outer + drop)]/dp` (m,).
 
-        `cells` (m,): owned cells.  `normal` (m, d): normals of the sides.
-        `p` (m,), Pa: pressures in the cells.  `outer` (m,), Pa: pressures outside.
-        `drop` (m,), Pa: pressure drop from the centroid to the face caused by the weight of the fluid.
+        `cells` (m,): owned cells.
+        `normal` (m, d): normals of the sides.
+        `p` (m,), Pa: pressures in the cells.
+        `outer` (m,), Pa: pressures outside.
+        `drop` (m,), Pa: pressure drop from the centroid to the face due to the weight of the fluid.
         """
         shares = self.shares.x.array.reshape(-1, self.count)[cells]
         k, derivative = shares[:, 0].copy(), shares[:, 0].copy()

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""UFL forms at material points and in cells: compilation, packing of coefficients, sums over cells."""
+"""UFL forms at material points and in cells: compilation, coefficients, and sums over cells."""

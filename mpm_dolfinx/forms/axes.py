@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Second-order tensors whose third axis is principal: the out-of-plane or circumferential direction."""
+"""Second-order tensors whose third axis, out of plane or circumferential, is principal."""
 
 from __future__ import annotations
 
@@ -7,12 +7,15 @@ import ufl
 
 
 def block(T):
-    """Return a UFL tensor (3, 3) with explicit zeros as out-of-plane shear components, for which `planar` looks."""
+    """Return a UFL tensor (3, 3) whose out-of-plane shear components are explicit zeros."""
     return ufl.as_matrix([[T[0, 0], T[0, 1], 0], [T[1, 0], T[1, 1], 0], [0, 0, T[2, 2]]])
 
 
 def planar(F) -> bool:
-    """Return whether the third axis of a UFL deformation gradient F is principal: F is (2, 2), or a `block`."""
+    """Return whether the third axis of a UFL deformation gradient is principal.
+
+    This is so for a tensor (2, 2), and for a result of `block`.
+    """
     if isinstance(F, ufl.classes.Variable):
         F = F.ufl_operands[0]
     if F.ufl_shape == (2, 2):
@@ -24,7 +27,10 @@ def planar(F) -> bool:
 
 
 def embedded(F, across=1):
-    """Return a deformation gradient as a UFL tensor (3, 3).  In plane strain `across` is the out-of-plane stretch."""
+    """Return a deformation gradient as a UFL tensor (3, 3).
+
+    across: in plane strain, the out-of-plane stretch.
+    """
     if F.ufl_shape == (3, 3):
         return F
     return ufl.as_matrix([[F[0, 0], F[0, 1], 0], [F[1, 0], F[1, 1], 0], [0, 0, across]])

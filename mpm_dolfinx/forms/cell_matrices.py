@@ -14,12 +14,12 @@ import ufl
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.caching import Latest
-from mpm_dolfinx.forms.point_forms import BATCH, CellSums, FormPoints, Places, PointData, PointExpression
+from mpm_dolfinx.forms.point_forms import BATCH, NONE, CellSums, FormPoints, Given, Places, PointData, PointExpression
 from mpm_dolfinx.grid.grid import Grid, sum_by
 
 
 def shape_gradients(points: FormPoints) -> list:
-    """Return the gradients of the Q1 shape functions at the points, as UFL; in 3D, their means over each piece."""
+    """Return the gradients of the Q1 shape functions at the points as UFL; in 3D, their means over each piece."""
     grid, xi = points.grid, points.offset
     h = grid.edge_in_forms()
     out = []
@@ -37,7 +37,7 @@ def shape_gradients(points: FormPoints) -> list:
 
 
 def shape_hoops(points: FormPoints) -> list:
-    """Return the means of N / r for the Q1 shape functions N, as UFL, in axisymmetry; see `FormPoints.hoop`."""
+    """Return the means of N / r over each piece as UFL, for the shape functions N."""
     grid, hoop = points.grid, points.functions["hoop"]
     h, out = grid.edge_in_forms(), []
     for s in grid.signs.tolist():
@@ -47,7 +47,7 @@ def shape_hoops(points: FormPoints) -> list:
 
 
 def along_shapes(T, points: FormPoints) -> list:
-    """Return T : grad v at the points, as UFL, with v the shape function of each node along each axis."""
+    """Return T : grad v as UFL for each shape function v along each axis."""
     gradients, d = shape_gradients(points), points.grid.dim
     if not points.grid.axisymmetric:
         return [ufl.dot(T, g)[i] for g in gradients for i in range(d)]
@@ -59,7 +59,7 @@ def along_shapes(T, points: FormPoints) -> list:
 
 
 def element_dofs(grid: Grid, cells: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Return the local dofs (cells, n) of Q1 vectors in these cells, with one dof for each component."""
+    """Return the local dofs (cells, n) of Q1 vectors in cells, with one dof for each component."""
     dofs = grid.cell_nodes[cells][:, :, None] * grid.dim + np.arange(grid.dim, dtype=grid.cell_nodes.dtype)
     return dofs.reshape(len(cells), dofs.shape[1] * grid.dim)
 
@@ -72,14 +72,14 @@ def insert(A: PETSc.Mat, grid: Grid, cells: NDArray[np.int32], matrices: NDArray
 
 
 def insert_rows(A: PETSc.Mat, grid: Grid, cells: NDArray[np.int32], rows: NDArray[np.float64]) -> None:
-    """Add `rows` (cells, n) to `A`, without final assembly.  `A` has a row for each cell, a column for each dof."""
+    """Add rows (cells, n) to `A` without final assembly.  `A` has a row for each cell and a column for each dof."""
     if len(cells):
         dofs = element_dofs(grid, cells).astype(PETSc.IntType)
         A.setValuesLocalRCV(cells[:, None].astype(PETSc.IntType), dofs, rows[:, None], addv=True)
 
 
 def _entries(count: int, symmetric: bool) -> tuple[NDArray, NDArray, NDArray]:
-    """Return row and column of each stored entry of a matrix, and for each entry the index of its stored value."""
+    """Return row, column and storage index of each entry of a matrix."""
     rows, columns = np.triu_indices(count) if symmetric else np.divmod(np.arange(count**2), count)
     place = np.empty((count, count), dtype=np.int64)
     if symmetric:
@@ -89,24 +89,24 @@ def _entries(count: int, symmetric: bool) -> tuple[NDArray, NDArray, NDArray]:
 
 
 class ElementForces:
-    """The linear form T : grad v of Q1 vectors, integrated over points by summation in each cell.
+    """The linear form T : grad v of Q1 vectors, integrated over the points.
 
-    stress (d, d): UFL tensor T[i, k] at the points; points: points of the forms.
+    stress: UFL tensor T (d, d) at the points.
     """
 
     def __init__(self, stress: ufl.core.expr.Expr, points: FormPoints):
         self._sums = CellSums(along_shapes(stress, points), points)
 
-    def assemble_vector(self, b: NDArray[np.float64], data: PointData) -> None:
-        """Add the vector to the local array `b`.  Contributions to ghosts remain in the ghost entries."""
+    def assemble_vector(self, b: NDArray[np.float64], data: PointData, given: Given = NONE) -> None:
+        """Add the vector to the local array `b`, with contributions to ghosts in the ghost entries."""
         dofs, at = data.places.dofs
-        b[dofs] += sum_by(at, self._sums(data).ravel(), len(dofs))
+        b[dofs] += sum_by(at, self._sums(data, given).ravel(), len(dofs))
 
 
 class Beside(NamedTuple):
-    """Further integrals over each cell.  One kernel computes them and an element matrix, which have common terms."""
+    """Further integrals over each cell, which share terms with an element matrix and are computed with it."""
 
-    # UFL tensors T[i, k] (d, d), contracted like the tangent A: with grad v, or grad v F, for each dof of v
+    # UFL tensors T[i, k] (d, d), multiplied by grad v (or by grad v F) for each dof of v
     along: Sequence[ufl.core.expr.Expr] = ()
     scalars: Sequence[ufl.core.expr.Expr] = ()  # UFL scalars
 
@@ -115,11 +115,11 @@ NOTHING = Beside()
 
 
 class ElementMatrices:
-    """The bilinear form grad v : A : grad u of Q1 vectors, summed over the points of each cell before insertion.
+    """The bilinear form grad v : A : grad u of Q1 vectors, summed in each cell before insertion.
 
-    Insertion of a matrix for every point costs twice as much as its computation.  The entries of the element matrix are
-    A, contracted with the gradients of the shape functions at the point.  Through DG0 test functions, the assembler
-    sums these entries over the points of a cell.  Each element matrix is then inserted once.
+    The assembler sums the entries of an element matrix over the points of its cell, through DG0 test functions.  Each
+    element matrix is then inserted once.  Insertion of a matrix for each point would cost twice as much as the
+    computation of this matrix.
 
     Parameters
     ----------
@@ -150,9 +150,9 @@ class ElementMatrices:
         along = [part for T in beside.along for part in along_shapes(T, points)]
         self._sums = CellSums([*entries, *along, *beside.scalars], points)
 
-    def assemble_matrix(self, A: PETSc.Mat, data: PointData) -> NDArray[np.float64]:
-        """Add the matrix to `A`, without final assembly; return the further integrals (cells, quantities)."""
-        sums = self._sums(data)
+    def assemble_matrix(self, A: PETSc.Mat, data: PointData, given: Given = NONE) -> NDArray[np.float64]:
+        """Add the matrix to `A`, without final assembly, and return the further integrals (cells, quantities)."""
+        sums = self._sums(data, given)
         insert(A, self._grid, data.places.filled, sums[:, self._entry])
         return sums[:, self._count :]
 
@@ -160,7 +160,7 @@ class ElementMatrices:
 def _of_hoops(tangent, gradients: list, hoops: list, row: tuple[int, int], column: tuple[int, int]):
     """Return the contribution of circumferential strains to one entry of an element matrix, as UFL.
 
-    `tangent` (3, 3, 3, 3): see `ElementMatrices`.  `row` is node and axis of v, `column` is node and axis of u.
+    row, column: node and axis of v, and node and axis of u.
     """
     (v, i) = row
     (u, j) = column
@@ -175,17 +175,14 @@ def _of_hoops(tangent, gradients: list, hoops: list, row: tuple[int, int], colum
 
 
 class StackedElementMatrices:
-    """The bilinear form (grad v F) : A : (grad u F) of Q1 vectors: kernels evaluate A, BLAS contracts it.
+    """The bilinear form (grad v F) : A : (grad u F) of Q1 vectors, with products by BLAS.
 
-    In 3D, cells contain many points, so that contraction by BLAS is faster than in the kernel.  The gradients of the
-    shape functions, multiplied by F, are stacked for the n points of a cell.  The element matrix is then the product of
-    an 8 x 3n and a 3n x 72 matrix.  Each batch consists of cells with about the same number of points.
+    In 3D, cells contain many points, so that products by BLAS are faster than products in the kernel.  The gradients of
+    the shape functions, multiplied by F, are stacked for the n points of a cell.  The element matrix is then the
+    product of an 8 x 3n and a 3n x 72 matrix.  Each batch consists of cells with about the same number of points.
 
-    The run time per point is 4.2 us for Hencky's law and 20 points per cell: 2.3 us for the kernel, 1.4 us for the
-    products, and 0.4 us for the insertion.  If 24 x 24 entries were inserted for each point, the time would be 13.8 us.
-    With the 300 sums of `ElementMatrices` the time would be 4.8 us, and the kernel would compile in 13 s.  The kernel
-    of this class compiles in 7 s.  If the points in each octant of a cell are merged (8 points), Newton's method does
-    not converge for a bending beam.
+    The run time per point is 4.2 us for Hencky's law and 20 points per cell, and the kernel compiles in 7 s.  With
+    `ElementMatrices` the run time would be 4.8 us, and the kernel would compile in 13 s.
 
     Parameters: see `ElementMatrices`.  The points must have the field F (d, d).
     """
@@ -204,9 +201,9 @@ class StackedElementMatrices:
         self._values = PointExpression(ufl.as_vector(parts), points)
         self._sorted: Latest[list] = Latest()
 
-    def assemble_matrix(self, A: PETSc.Mat, data: PointData) -> NDArray[np.float64]:
-        """Add the matrix to `A`, without final assembly; return the further integrals (cells, quantities)."""
-        live, filled = self._values.live(data), data.places.filled
+    def assemble_matrix(self, A: PETSc.Mat, data: PointData, given: Given = NONE) -> NDArray[np.float64]:
+        """Add the matrix to `A`, without final assembly, and return the further integrals (cells, quantities)."""
+        live, filled = self._values.live(data, given), data.places.filled
         sums = np.empty((len(filled), self._along * 2**self._d * self._d + self._scalars))
         for cells, points, missing in self._sorted(data.places.key, lambda: batches(data.places)):
             matrices, sums[cells] = self._of_batch(data, live, points.ravel(), missing)
@@ -214,7 +211,7 @@ class StackedElementMatrices:
         return sums
 
     def _of_batch(self, data: PointData, live, chosen: NDArray[np.int64], missing: NDArray) -> tuple[NDArray, NDArray]:
-        """Return the element matrices (cells, n, n) of a batch of cells, and further integrals (cells, quantities)."""
+        """Return the element matrices and the further integrals of a batch of cells."""
         d, (cells, most) = self._d, missing.shape
         g = data.places.shape_gradients(chosen)
         g = g @ data["F"][chosen].reshape(-1, d, d)
@@ -236,9 +233,13 @@ class StackedElementMatrices:
 
 
 def batches(places: Places) -> list[tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]]:
-    """Return batches of cells with similar numbers of points: cells (c,), points (c, most), padding (c, most).
+    """Return batches of cells with similar numbers of points.
 
-    Cells are indices in `Places.filled`, points in `Places.cells`.  Padding is True after a cell's last point.
+    Returns for each batch
+    ----------------------
+    cells (c,): indices in `Places.filled`.
+    points (c, most): indices in `Places.cells` of the points in each cell.
+    padding (c, most): True after the last point of a cell.
     """
     cells = places.cells
     filled = places.filled

@@ -2,8 +2,8 @@
 """The unknowns of a step: their numbering, vectors and matrices.
 
 Functions are defined on the whole grid.  Vectors, matrices and factorisations contain only the free degrees of freedom
-of active nodes or cells.  In the local-to-global map all other degrees of freedom have the index -1, which PETSc
-ignores.  dolfinx can therefore assemble directly into these vectors and matrices.
+of active nodes or cells.  All other degrees of freedom have the index -1 in the local-to-global map, which PETSc
+ignores, so that dolfinx can assemble directly into the vectors and matrices.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ class Unknowns:
 
     function: any function of the space, with ghosts.
     dofs: unrolled local degrees of freedom that are unknowns, ghosts included.
-    at: positions (entities, d), m, of the nodes or cells of this process, and whether their rows of matrices may have
-    entries in columns of other processes.  If `at` is None, the space computes all positions at each request, and all
-    rows may have entries in columns of other processes.
+    at: positions (entities, d), in m, of the nodes or cells of this process, and whether their rows of matrices may
+    have entries in columns of other processes.  Without `at`, the space computes the positions at each request, and all
+    rows may have such entries.
     """
 
     def __init__(self, function: fem.Function, dofs: NDArray[np.int64], at: tuple[NDArray, NDArray] | None = None):
@@ -58,17 +58,17 @@ class Unknowns:
 
     @property
     def nodes(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Node and component of each entry of a vector of unknowns."""
+        """Node and component of each entry of a vector."""
         return np.divmod(self.owned, self.dim)
 
     @property
     def positions(self) -> NDArray[np.float64]:
-        """Positions (n, d), in m, of the nodes or cells of the entries of a vector."""
+        """Positions (n, d), in m, of the entries of a vector."""
         x = self._space.tabulate_dof_coordinates() if self._x is None else self._x
         return x[self.owned // self.dim, : self._space.mesh.geometry.dim]
 
     def gather_owned(self, values: NDArray[np.float64]) -> PETSc.Vec:
-        """Return a new vector that has these values on this process."""
+        """Return a new vector with these values on this process."""
         v = self.vector()
         v.array_w[:] = values
         return v
@@ -83,19 +83,19 @@ class Unknowns:
         return v
 
     def gather(self, values: NDArray[np.float64], out: PETSc.Vec) -> PETSc.Vec:
-        """Copy the values of the unknowns from a local array over the whole grid into a vector; return the vector."""
+        """Copy the values of the unknowns from a local array into `out`, and return `out`."""
         out.array_w[:] = values[self.owned]
         return out
 
     def add(self, function: fem.Function, scale: NDArray[np.float64] | float, v: PETSc.Vec) -> None:
-        """Add scale * v to a function, and update its ghosts.  `scale` is one number, or one for each entry."""
+        """Add scale * v to a function, and update its ghosts."""
         values = function.x
         values.array[self.owned] += scale * v.array_r
         values.scatter_forward()
 
 
 def matrix(rows: Unknowns, columns: Unknowns, row_length: int | NDArray[np.int64]) -> PETSc.Mat:
-    """Return an empty sparse matrix for assembly, with memory for `row_length` entries in each row."""
+    """Return an empty sparse matrix with memory for `row_length` entries in each row."""
     A = PETSc.Mat().create(rows.comm)
     A.setSizes(((rows.size, None), (columns.size, None)))
     A.setType(PETSc.Mat.Type.AIJ)
@@ -114,25 +114,27 @@ def zero(A: PETSc.Mat) -> None:
 
 
 def collect_garbage(comm: MPI.Intracomm) -> None:
-    """Free the PETSc objects that Python has released on all processes; all processes must call this function.
+    """Free the PETSc objects that Python has released on all processes.  All processes must call this function.
 
-    On several processes PETSc keeps released objects, because the order of release may differ between processes.
-    Versions of PETSc before 3.20 or so also keep the objects of a single process.  Without calls of this function, a
-    run keeps the matrices of all its steps.
+    PETSc keeps released objects, because the order of release may differ between processes.  Versions of PETSc before
+    about 3.20 also keep them on a single process.  Without this function, a run keeps the matrices of all its steps.
     """
     PETSc.garbage_cleanup(comm)
     PETSc.garbage_cleanup(PETSc.COMM_SELF)
 
 
 def sum_ghosts(function: fem.Function) -> NDArray[np.float64]:
-    """Add the ghost entries of other processes to the owned entries; return the local array of the function."""
+    """Add the ghost entries to the owned entries, and return the local array."""
     if function.function_space.mesh.comm.size > 1:
         _compat.scatter_reverse_add(function)
     return function.x.array
 
 
 def with_ghosts(space, rows: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return rows (n, k) of the n local dofs of a scalar space, after an update of ghosts from their owners."""
+    """Return values at local dofs after an update of the ghosts from their owners.
+
+    rows (n, k): values at the n local dofs.
+    """
     if space.mesh.comm.size == 1:
         return rows
     carrier, out = fem.Function(space), np.empty_like(rows)

@@ -10,22 +10,22 @@ from numpy.typing import NDArray
 
 
 class Velocity:
-    """Velocity `(u - past) / own` at the end of a substep.  For backward Euler past = 0, and own is the step length.
+    """Velocity `(u - past) / own` at the end of a substep.
 
-    u, m: displacement increment of the step.
-    own, s: time weight of the rate in the substep.
-    past, m: part of u that is due to the rate of the previous substep.
+    u, in m: displacement increment of the step.
+    own, in s: time weight of the rate in the substep; in backward Euler, the length of the step.
+    past, in m: part of u that is due to the rate of the previous substep; in backward Euler, zero.
     """
 
     def __init__(self, u: fem.Function):
         self._u, self._past = u, fem.Function(u.function_space)
         self._own = fem.Constant(u.function_space.mesh, 1.0)
         self.value = (u - self._past) / self._own
-        """UFL expression, m/s."""
+        """Velocity as a UFL expression, in m/s."""
 
     @property
     def nodal(self) -> NDArray[np.float64]:
-        """Nodal velocities (unknowns,), in m/s, as a local array."""
+        """Nodal velocities, in m/s, as a local array."""
         return (self._u.x.array - self._past.x.array) / float(self._own.value)
 
     def among(self, form: ufl.Form) -> bool:
@@ -33,6 +33,6 @@ class Velocity:
         return self._past in form.coefficients()
 
     def set(self, own: float, past: float, dofs: NDArray[np.int64]) -> None:
-        """Set `own`, s, and set the field `past` at the active dofs to the argument `past` times the current u."""
+        """Set `own`, in s, and set the field `past` to a multiple of the present u."""
         self._own.value = own
         self._past.x.array[dofs] = past * self._u.x.array[dofs]

@@ -38,11 +38,10 @@ def check_follow(follow: Any, lines: Sequence[ArrayLike] | None) -> None:
 def lines_at(
     follow: Any, given: Sequence[NDArray[np.float64]], t: float, x: NDArray[np.float64] | None
 ) -> list[NDArray[np.float64]]:
-    """Return the lines (n,), in m, along each axis, from a function `follow` of time t (s) and positions x (n, d), in
-    m.
+    """Return the lines (m) along each axis from a function `follow` of time t (s) and positions x (n, d), in m.
 
-    `given` are the lines with which the grid was created.  Along each axis, the number of lines must not change.  The
-    first and the last coordinate must not change either.
+    `given` are the lines with which the grid was created.  The number of lines along each axis, the first coordinate
+    and the last coordinate must not change.
     """
     what, count = f"grid: follow at t = {t:g} s", [len(of) for of in given]
     allowed = f"{' and '.join(map(str, count))} coordinates along the axes"
@@ -59,17 +58,16 @@ def lines_at(
 
 
 def carried(lines: Sequence[NDArray[np.float64]], shift: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """Return the lines (n,), in m, along each axis, after a displacement `shift` (d,), in m, of the smallest cells.
+    """Return the lines (m) along each axis after the smallest cells have moved by `shift` (d,), in m.
 
-    The smallest cells move by whole cells, rounded towards zero.  A tool therefore crosses them like fixed cells.  From
-    them to each side, the edge of the k-th cell (k = 1, 2, ...) is multiplied by the k-th power of a common factor.
-    Cells still grow towards the sides, but faster or slower.
+    The smallest cells move by a whole number of cells, rounded towards zero.  A tool therefore moves through them as
+    through fixed cells.  On each side of the smallest cells, the edge of the k-th cell (k = 1, 2, ...) is multiplied by
+    the k-th power of a common factor.  Cells still grow towards the sides, but faster or slower.
 
     Raises
     ------
     ValueError
-        The smallest cells touch a side and move along its normal, or other cells would become smaller than the
-        smallest.
+        The smallest cells touch a side and move along its normal, or another cell would become smaller than them.
     """
     out = []
     for letter, x, step in zip("xyz", lines, shift.tolist(), strict=False):
@@ -90,10 +88,10 @@ def carried(lines: Sequence[NDArray[np.float64]], shift: NDArray[np.float64]) ->
 
 
 def _filled(width: NDArray[np.float64], length: float, more: float, least: float, letter: str) -> NDArray[np.float64]:
-    """Return the new edge lengths (n,), in m, of the cells between the smallest cells and a side.
+    """Return the new edge lengths of the cells between the smallest cells and a side.
 
-    `width` (n,), in m, are the edge lengths before.  The distance between the smallest cells and the side has grown by
-    `more` from `length`, in m.  `least` is the smallest edge length, in m.
+    `width` (n,), m: old edge lengths.
+    `length`, m: old distance between the smallest cells and the side.  It grows by `more`.
     """
     what = f"grid: follow: the tool has moved by {abs(more):.3g} m along {letter}"
     if not len(width):

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Background grid: a box of quadrilaterals or hexahedra between lines along the axes.
 
-Grids of equal cells locate points by arithmetic.  Other grids search along each axis.  Methods such as `sizes` and
+Grids of equal cells locate points by arithmetic.  All other grids search along each axis.  Methods such as `sizes` and
 `volumes` return a value for each cell.  In grids of equal cells they return a single row (`h`) or a single number.
 
 The mesh is created at its first use.  Before that, a simulation distributes the cells to processes by numbers of
@@ -33,15 +33,15 @@ SIDES = {
     2: {"left": (0, 0), "right": (0, 1), "bottom": (1, 0), "top": (1, 1)},
     3: {"left": (0, 0), "right": (0, 1), "front": (1, 0), "back": (1, 1), "bottom": (2, 0), "top": (2, 1)},
 }
-"""Axis and end of each side of a box.  The end is 0 at the lower and 1 at the upper coordinate."""
+"""Axis and end of each side of a box.  The end is 0 at the lower coordinate, and 1 at the upper."""
 REACH = 1e-4  # distance, in cell sizes, by which bodies may lie outside the grid: walls act by penalties, inexactly
 
 TURN = 2 * np.pi
 """Angle of a whole revolution.  Axisymmetric volumes, forces and outflows refer to this angle.  Source: definition."""
 CHUNK = 2**14
-"""Number of rows of an array that are processed together.  This number limits the size of temporary arrays."""
+"""Number of rows of an array that are processed together.  It limits the size of temporary arrays."""
 SNAP = 1e-10
-"""Vertices nearer to a grid plane than this distance, in cell sizes, count as on it.  `Grid.snap` adds rounding."""
+"""Distance, in cell sizes, below which vertices count as on a grid plane.  `Grid.snap` adds rounding."""
 ORDER = "the order is Grid(lower, upper, cells)"
 MANY = "grid: h is undefined for unequal cells, must be replaced by sizes"
 
@@ -52,12 +52,12 @@ def cross_in_plane(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np
 
 
 def corner_bits(dim: int) -> NDArray[np.int64]:
-    """Return the ends (2^d, d) at which the corners of a box lie along each axis: 0 lower, 1 upper."""
+    """Return the ends (2^d, d), 0 or 1, at which the corners of a box lie along each axis."""
     return (np.arange(2**dim)[:, None] >> np.arange(dim)) & 1
 
 
 def _faces(dim: int) -> NDArray[np.int64]:
-    """Return the corner indices (2d, 2^(d-1)) of a box's faces.  Face `2 a + e` is at end `e` of axis `a`."""
+    """Return the corner indices of a box's faces.  Face `2 a + e` is at end `e` of axis `a`."""
     bits = corner_bits(dim)
     return np.stack([(bits[:, axis] == end).nonzero()[0] for axis in range(dim) for end in (0, 1)])
 
@@ -65,7 +65,9 @@ def _faces(dim: int) -> NDArray[np.int64]:
 FACES = {d: _faces(d) for d in (2, 3)}
 """Corner indices (2d, 2^(d-1)) of the faces of a box.  The box is a cell or a particle domain."""
 FACE_SIGNS = (-1, 1, 1, -1, -1, 1)
-"""Orientation (6,) of faces with corners in the order of `FACES`: 1 outward, -1 inward.  In 2D the first four apply."""
+"""Orientation (6,) of faces with corners in the order of `FACES`: 1 outward, -1 inward.  In 2D only the first four
+apply.
+"""
 ABOUT_MIDDLE = ((0, 1, 4), (1, 3, 4), (3, 2, 4), (2, 0, 4))
 """Triangles of a face in 3D.  Each has two corners and the middle of the face, so no diagonal is preferred."""
 
@@ -83,7 +85,7 @@ def in_chunks(count: int) -> list[slice]:
 
 
 def sum_by(index: NDArray, values: NDArray[np.float64], size: int) -> NDArray[np.float64]:
-    """Return the sums (..., size) of values (..., n) with equal index (n,).  Sums are floats even without values."""
+    """Return the sums (..., size) of values (..., n) with equal index (n,).  Sums are floats."""
     shape = values.shape[:-1]
     if shape and len(index) > CHUNK:  # the index of all rows together would take as much memory as the values
         return np.array([sum_by(index, row, size) for row in values])
@@ -96,10 +98,12 @@ def sum_by(index: NDArray, values: NDArray[np.float64], size: int) -> NDArray[np
 def polynomial(
     coefficients: NDArray[np.float64], y: NDArray[np.float64], slot: NDArray[np.intp], without: int | None = None
 ) -> NDArray[np.float64]:
-    """Return the values (d, n) of a multilinear vector field at offsets y (d, n), in m, from the midpoints of cells.
+    """Return the values (d, n) of a multilinear vector field in cells.
 
-    `coefficients` (d, k, cells) are factors of the monomials, in the order of `Grid.monomials`.  `slot` (n,) is the
-    index of each value's cell.  If an axis `without` is given, the field is constant along this axis.
+    `coefficients` (d, k, cells): factors of the monomials, in the order of `Grid.monomials`.
+    `y` (d, n), m: offsets from the midpoints of the cells.
+    `slot` (n,): index of each value's cell.
+    `without`: an axis along which the field is constant, or None.
     """
     rows = [row for row in range(2 ** len(y)) if without is None or not row >> without & 1]
     total = np.zeros(y.shape)
@@ -113,7 +117,7 @@ def polynomial(
 
 
 def ranges(first: NDArray[np.int64], count: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return, for each integer in these ranges, the index (n,) of its range and the integer (n,) itself."""
+    """Return the index (n,) of the range of each integer in these ranges, and the integers (n,)."""
     of = np.arange(len(count)).repeat(count)
     return of, np.arange(len(of)) + np.repeat(first - (np.cumsum(count) - count), count)
 
@@ -128,14 +132,17 @@ def among(numbers: NDArray[np.integer], chosen: NDArray[np.integer]) -> NDArray[
 def values_at(
     chosen: NDArray[np.int64], numbers: NDArray[np.int64], values: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the values (n, k) of the numbers `chosen` (n,), given values of sorted `numbers` (m,), else 0."""
+    """Return the values (n, k) of the numbers `chosen` (n,), or 0 for numbers without values.
+
+    `numbers` (m,): sorted numbers that have the `values` (m, k).
+    """
     at = numbers.searchsorted(chosen)
     found = np.append(numbers, -1)[at] == chosen
     return np.concatenate([values, np.zeros((1, values.shape[1]))])[np.where(found, at, len(numbers))]
 
 
 def across_faces(grid: Grid, n: Any) -> tuple[Any, Any, Any]:
-    """Return three UFL lengths along the normal n of a face: of the "+" cell, of the "-" cell, and the mean length."""
+    """Return three UFL lengths along the normal n of a face: of the "+" cell, of the "-" cell, and their mean."""
     h = grid.edge_in_forms()
     if grid.even:
         return (sum(abs(n[a]) * h[a] for a in range(grid.dim)),) * 3
@@ -165,7 +172,7 @@ class Spacing(NamedTuple):
 class LocalCells:
     """The local index of each cell by its lexicographic index: `[number]`.  Cells of other processes have -1.
 
-    number (cells,): lexicographic indices of the local cells.  The table covers the box around these cells only.
+    `number` (cells,): lexicographic indices of the local cells.  The table covers the box around these cells only.
     """
 
     def __init__(self, grid: Grid, number: NDArray[np.int64]):
@@ -252,7 +259,7 @@ class Cells:
 
     @cached_property
     def near_others(self) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Masks: local nodes at most two cells from nodes of several processes, and local cells with shared nodes."""
+        """Masks of local nodes at most two cells from shared nodes, and of local cells with shared nodes."""
         holders = fem.Function(self._nodes)
         holders.x.array[:] = 1.0
         _compat.scatter_reverse_add(holders)
@@ -271,7 +278,7 @@ class Cells:
         return out
 
     def move(self, grid: Grid) -> None:
-        """Move mesh, nodes and cells to the current lines of the grid.  Positions depend only on these lines."""
+        """Move mesh, nodes and cells to the current lines of the grid."""
         if grid.follow is None:
             return
         node_x, x = map(grid.places, self._index)
@@ -287,7 +294,7 @@ def of_cells(name: str) -> cached_property:
 
 
 def of_places(name: str) -> property:
-    """Return a property of a grid: current positions of nodes or of midpoints, an attribute of `at` of its `Cells`."""
+    """Return a property of a grid that is an attribute of `at` of its `Cells`."""
     return property(lambda grid: getattr((grid._cells or grid._of_process).at, name))
 
 
@@ -418,7 +425,7 @@ class Grid:
         return tuple(x - start for x, start in zip(lines, self.base, strict=True))
 
     def _spaced(self, lines: tuple[NDArray[np.float64], ...] | None) -> Spacing:
-        """Return the spacing of the grid.  `lines` are positions relative to the base, or None for equal cells."""
+        """Return the spacing of the grid, with lines relative to the base, or with equal cells."""
         finest, most = self._h, self._h
         if lines is None:
             lines = tuple(low + np.arange(n + 1) * h for low, n, h in zip(self.low, self.shape, self._h, strict=True))
@@ -429,7 +436,7 @@ class Grid:
         return Spacing(lines, widths, finest, float(finest.min()), float(most.max()), snap)
 
     def move(self, lines: Mapping[str, NDArray[np.float64]] | None) -> None:
-        """Move the lines of a grid with `follow` to coordinates (n,), in m and from the base, by axis "x", "y", "z".
+        """Move the lines of a grid with `follow` to coordinates (n,) by axis "x", "y", "z", in m from the base.
 
         With None, the lines return to their initial coordinates.  Afterwards all coordinates of nodes, cells and mesh
         are exactly as in a new grid with these lines.
@@ -456,41 +463,39 @@ class Grid:
         return float(np.prod(self.h))
 
     def sizes(self, cells: Any) -> NDArray[np.float64]:
-        """Return the edge lengths (n, d), in m, of local cells.  Equal cells give one row (d,)."""
+        """Return the edge lengths (n, d) of local cells, in m.  Equal cells give one row (d,)."""
         return self._h if self.even else self._of_process.at.sizes[cells]
 
     def along(self, cells: Any, axis: Any) -> NDArray[np.float64]:
-        """Return the edge lengths (n,), in m, of local cells (n,) along an axis.  Each cell may have another axis."""
+        """Return the edge lengths (n,) of local cells along an axis, in m.  Each cell may have another axis."""
         return self.h[axis] if self.even else self._of_process.at.sizes[cells, axis]
 
     def between(self, cells: Any, others: Any, axis: Any) -> NDArray[np.float64]:
-        """Return the distances (n,), in m, between midpoints of local cells (n,) and of neighbours along an axis."""
+        """Return the distances (n,) from midpoints of local cells to their neighbours along an axis, in m."""
         return self.h[axis] if self.even else (self.along(cells, axis) + self.along(others, axis)) / 2
 
     def volumes(self, cells: Any) -> NDArray[np.float64] | float:
-        """Return the volumes (n,), m^d, of local cells; in axisymmetry areas.  Equal cells give one number."""
+        """Return the volumes (n,) of local cells in m^d, or their areas in axisymmetry.  Equal cells give a number."""
         return self.cell_volume if self.even else self._of_process.at.sizes[cells].prod(axis=-1)
 
     def smallest_faces(self, cells: Any) -> NDArray[np.float64] | float:
-        """Return the areas (n,), m^(d-1), of the smallest faces of local cells.  Equal cells give one number."""
+        """Return the areas (n,) of the smallest faces of local cells, in m^(d-1).  Equal cells give one number."""
         return self.volumes(cells) / self.sizes(cells).max(axis=-1)
 
     def sizes_of(self, number: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the edge lengths (n, d), in m, of cells by lexicographic indices (n,).  Equal cells give one row."""
+        """Return the edge lengths (n, d) of cells by lexicographic indices, in m.  Equal cells give one row."""
         if self.even:
             return self._h
         return self.widths_of(np.stack(np.unravel_index(number % self.cells, tuple(self.shape)), axis=-1))
 
     def sizes_at(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the edge lengths (..., d), in m, of cells at x (..., d), in m, from the base.  Equal cells give one
-        row.
-        """
+        """Return the edge lengths (..., d) of cells at positions x, in m from the base.  Equal cells give one row."""
         if self.even:
             return self._h
         return self.widths_of(self.index_from_base(x.reshape(-1, self.dim))).reshape(x.shape)
 
     def in_cells(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Convert positions x (..., d), in m, from the base to cell index plus fraction of the cell along each axis."""
+        """Convert positions x (..., d), in m from the base, to cell index plus fraction of the cell along each axis."""
         if self.even:
             return (x - self.low) / self._h
         out = np.empty(x.shape)
@@ -500,15 +505,15 @@ class Grid:
         return out
 
     def cells_between(self, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the distances (..., d), in cells, between x and y along the axes.  `in_cells` defines fractions."""
+        """Return the distances (..., d) between x and y along the axes, in cells, see `in_cells`."""
         if self.even:
             return np.abs((y - x) / self._h)
         return np.abs(self.in_cells(y) - self.in_cells(x))
 
     def places(self, index: NDArray[np.integer], share: NDArray[np.float64] | float = 0.0) -> NDArray[np.float64]:
-        """Return positions (n, d), in m, from the base: lower corners of cells plus a fraction `share` of their edges.
+        """Return positions (n, d) in m from the base: lower corners of cells plus a fraction `share` of their edges.
 
-        `index` (n, d) are cell indices along the axes.  Cells beyond a side have the size of the outermost cell.
+        `index` (n, d): indices of cells along the axes.  Cells beyond a side have the size of the outermost cell.
         """
         if self.even:
             return self.low + (index + share) * self._h
@@ -520,29 +525,25 @@ class Grid:
         return out
 
     def edge_in_forms(self) -> Any:
-        """Return the edge lengths (d,), in m, of a cell as a UFL coefficient, or as a constant if cells are equal."""
+        """Edge lengths (d,) of a cell as a UFL coefficient, in m, or as a constant if cells are equal."""
         return fem.Constant(self.mesh, self._h) if self.even else self._of_process.edges
 
     def nodes_along(self, x: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the indices (..., d) along the axes of nodes at positions x (..., d), in m and from the base."""
+        """Return the indices (..., d) along the axes of nodes at positions x, in m from the base."""
         return np.rint(self.in_cells(x)).astype(np.int64)
 
     def widths_of(self, index: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the edge lengths (n, d), in m, of cells with indices (n, d) along the axes, or one row for equal
-        cells.
-        """
+        """Return the edge lengths (n, d) of cells with indices (n, d), in m.  Equal cells give one row."""
         if self.even:
             return self._h
         return np.stack([w[i] for w, i in zip(self.widths, index.T, strict=True)], axis=-1)
 
     def next_plane(self, axis: int, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the next line (n,), in m, above coordinates x (n,) along an axis of unequal cells, or inf above the
-        last.
-        """
+        """Return the next line (n,) above coordinates x (n,) along an axis of unequal cells, in m, or inf."""
         return np.append(self.lines[axis], np.inf)[self.lines[axis].searchsorted(x, side="right")]
 
     def cells_along(self, axis: int, x: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the indices of cells in the grid nearest to coordinates x, in m, along an axis of unequal cells."""
+        """Return the indices of cells in the grid nearest to coordinates x (m) along an axis of unequal cells."""
         return np.minimum(np.maximum(self.lines[axis].searchsorted(x, side="right") - 1, 0), self.shape[axis] - 1)
 
     mesh = of_cells("mesh")
@@ -561,21 +562,21 @@ class Grid:
 
     @property
     def _of_process(self) -> Cells:
-        """The cells of this process.  If no scene has distributed the cells, each process gets an equal number."""
+        """The cells of this process.  By default each process gets an equal number of cells."""
         if self._cells is None:
             self.share(np.zeros(int(np.prod(self.shape))))
         return self._cells
 
     def share(self, load: NDArray[np.float64]) -> None:
-        """Create the mesh, unless it exists.  The cells are distributed among processes by their loads (cells,)."""
+        """Create the mesh, unless it exists, with cells distributed among processes by their loads (cells,)."""
         if self._cells is None:
             self._cells = self._made(boxes(load.reshape(self.shape), self.comm.size))
 
     def shared(self, load: NDArray[np.float64], keep: bool) -> Grid:
         """Return a grid whose cells are distributed by their loads: this grid, or an equal grid with another mesh.
 
-        load (cells,): load >= 0 of each cell, such as its number of points
-        keep: whether to return this grid in any case, because other objects were created on its mesh
+        `load` (cells,): load >= 0 of each cell, such as its number of points
+        `keep`: whether to return this grid in any case, because other objects were created on its mesh
         """
         new = boxes(load.reshape(self.shape), self.comm.size)
         if self._cells is None:
@@ -585,11 +586,10 @@ class Grid:
         return self
 
     def better(self, x: NDArray[np.float64]) -> NDArray[np.int64] | None:
-        """Return boxes (ranks, 2, d) that distribute points at x (n, d), in m, more evenly than the present ones, or
-        None.
+        """Return boxes (ranks, 2, d) that distribute points at x more evenly than the present boxes, or None.
 
-        The points of all processes are counted.  The present boxes remain (None) if their imbalance is at most
-        `UNEVEN`.
+        The points of all processes are counted.  If the imbalance of the present boxes is at most `UNEVEN`, the result
+        is None.
         """
         number = self.number(self.index_from_base(x))
         counts = over_all(self.comm, np.bincount(self.owner(number), minlength=self.comm.size))
@@ -613,7 +613,7 @@ class Grid:
         return Grid(**self.given, comm=self.comm, axisymmetric=self.axisymmetric)
 
     def _made(self, boxes: NDArray[np.int64]) -> Cells:
-        """Create the mesh, and return its cells.  `boxes` (ranks, 2, d): see `Partition`."""
+        """Create the mesh, and return its cells."""
         partition = Partition(boxes, tuple(self.shape))
         own = partition.cells(self.comm.rank)
         nodes = np.concatenate([self.corners(own) + copy * self.nodes for copy in range(self.copies)])
@@ -630,7 +630,7 @@ class Grid:
         return np.ravel_multi_index(tuple(index.transpose(2, 0, 1)), tuple(self.shape + 1))
 
     def _nodes(self) -> NDArray[np.float64]:
-        """Return the positions (n, d), in m, of the nodes that this process contributes, in lexicographic order."""
+        """Return the positions of the nodes that this process contributes, in lexicographic order."""
         count = self.copies * self.nodes
         start, stop = (count * (self.comm.rank + end) // self.comm.size for end in (0, 1))
         index = np.stack(np.unravel_index(np.arange(start, stop) % self.nodes, self.shape + 1), axis=-1)
@@ -638,7 +638,7 @@ class Grid:
 
     @property
     def copies(self) -> int:
-        """Number of copies of the box in the mesh.  It is one; `GridOfGroups` has one copy for each contact group."""
+        """Number of copies of the box in the mesh: one, or in `GridOfGroups` the number of contact groups."""
         return 1
 
     @property
@@ -686,7 +686,7 @@ class Grid:
         return self.axisymmetric and bool(self.lower[0] <= SAME * self.finest[0])
 
     def around(self, x: NDArray[np.float64]) -> NDArray[np.float64] | float:
-        """Return the factor from plane to volume integrals at x (n, d): 1, or in axisymmetry `2 pi r` (n,), in m."""
+        """Return the factor from plane to volume integrals at x (n, d): 1, or in axisymmetry `2 pi r` (n,) in m."""
         return TURN * x[:, 0] if self.axisymmetric else 1.0
 
     def number(self, index: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -694,11 +694,11 @@ class Grid:
         return np.ravel_multi_index(tuple(index.T), tuple(self.shape))
 
     def index(self, x: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the indices (n, d) of the nearest cells in the grid to true positions x (n, d), in m."""
+        """Return the indices (n, d) of the cells nearest to true positions x, in m."""
         return self.index_from_base(x - self.base)
 
     def index_from_base(self, x: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the indices (n, d) of the nearest cells in the grid to positions x (n, d), in m, from the base."""
+        """Return the indices (n, d) of the cells nearest to positions x, in m from the base."""
         if not self.even:
             return np.stack([self.cells_along(a, x[:, a]) for a in range(self.dim)], axis=1)
         i = np.floor((x - self.low) / self.h).astype(np.int64)
@@ -711,7 +711,7 @@ class Grid:
         return self.partition.owner(np.array(np.unravel_index(number % self.cells, tuple(self.shape))))
 
     def gathered(self, rows: Sequence[tuple], width: int) -> tuple[NDArray, NDArray, NDArray]:
-        """Send rows (cells, positions, values) to the owners of the cells.  Return received rows with local cells."""
+        """Send rows (cells, positions, values) to the owners of the cells, and return the received rows."""
         empty = (np.empty(0, dtype=np.int64), np.empty((0, self.dim)), np.empty((0, width)))
         parts = [np.concatenate(column) for column in zip(empty, *rows, strict=True)]
         travel = Exchange(self.comm, self.owner(parts[0]))
@@ -731,16 +731,15 @@ class Grid:
         return np.ravel_multi_index(tuple(index), tuple(self.shape + 1)) + copy * self.nodes
 
     def from_other(self, other: Grid, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Convert nodal values (unknowns,) from `other`, an equal grid with another partition, to this grid."""
+        """Convert nodal values (unknowns,) from an equal grid with another partition to this grid."""
         rows = nodal.reshape(-1, self.dim)
         some = rows.any(axis=1)
         return self.from_rows(other.node_numbers()[some], rows[some])
 
     def from_rows(self, nodes: NDArray[np.int64], rows: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return nodal values (unknowns,) from rows (n, d) of nodes (n,), which may be on any process.
+        """Return nodal values (unknowns,) from rows (n, d) of nodes, which may be on any process.
 
-        The values of all other nodes are zero.  `nodes`: lexicographic indices.  Rank `i % P` of P forwards the row of
-        node i.
+        `nodes` (n,): lexicographic indices.  The values of all other nodes are zero.
         """
         new = self.node_numbers()
         store, fetch = (Exchange(self.comm, (node % self.comm.size).astype(np.int32)) for node in (nodes, new))
@@ -765,7 +764,7 @@ class Grid:
         return out
 
     def outside(self, x: NDArray[np.float64], tolerance: float = SAME) -> NDArray[np.bool_]:
-        """Return which positions x, from the base, are outside the grid by more than `tolerance` cells and rounding."""
+        """Return whether positions x, from the base, are outside the grid by more than `tolerance` cells."""
         least = self.h if self.even else np.array([w[[0, -1]].min() for w in self.widths])  # at the sides
         tolerance = tolerance + rounding(np.array([self.lower, self.upper])) / least
         inside, cells = np.ones(len(x), dtype=bool), None if self.even else self.in_cells(x)
@@ -777,10 +776,10 @@ class Grid:
     def shape_gradients(
         self, cells: NDArray[np.int32], x: NDArray[np.float64], mixed: NDArray[np.float64] | None = None
     ) -> NDArray[np.float64]:
-        """Return the gradients (n, 2^d, d), 1/m, of the Q1 shape functions of local cells at points x.
+        """Return the gradients (n, 2^d, d) of the Q1 shape functions of local cells at points x, in 1/m.
 
         With `mixed`, used in 3D, gradients are means over subdomains about the points.  `mixed` (n, 3), m^2, are the
-        means, over each subdomain, of the products of two offsets from the point.
+        means of the products of two offsets from the point, over each subdomain.
         """
         hats, h = self._hats(cells, x), self.sizes(cells).T[..., None] if not self.even else self.h
         dN = np.empty((*hats[0].shape, self.dim))
@@ -795,7 +794,7 @@ class Grid:
 
     @cached_property
     def monomials(self) -> NDArray[np.float64]:
-        """Coefficients (2^d, 2^d) of the Q1 shape functions about the midpoint of a cell; columns are functions.
+        """Coefficients (2^d, 2^d) of the Q1 shape functions about the midpoint of a cell.  Columns are functions.
 
         Row s has the factors of the monomial s, the product of the offsets along all axes whose bit is set in s.  For
         unequal cells, the offsets are divided by the edge lengths, see `over_edges`.
@@ -815,7 +814,7 @@ class Grid:
         return reduce(np.multiply, self._hats(cells, x))
 
     def at(self, cells: NDArray[np.int32], x: NDArray[np.float64], u: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the values of a Q1 field u (nodes, k) at points x (n, d), m, in local cells (n,)."""
+        """Return the values of a Q1 field u (nodes, k) at points x in local cells."""
         out = np.empty((len(x), u.shape[1]))
         for part in in_chunks(len(x)):
             N, at_nodes = self.shape_values(cells[part], x[part]), u[self.cell_nodes[cells[part]]]
@@ -823,12 +822,15 @@ class Grid:
         return out
 
     def _hats(self, cells: NDArray[np.int32], x: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-        """Return for each axis a factor (n, 2^d) of the shape functions.  This factor is linear along the axis."""
+        """Return for each axis a factor of the shape functions, which is linear along the axis."""
         y = (x - self.midpoints[cells]) / self.sizes(cells)
         return [0.5 + y[:, a, None] * self.signs[:, a] for a in range(self.dim)]
 
     def interior_facets(self, active: NDArray[np.bool_], cells: NDArray[np.int32]) -> NDArray[np.int32]:
-        """Return the owned facets between two active cells.  `cells` are the indices of the mask `active`."""
+        """Return the owned facets between two active cells.
+
+        `cells`: indices of the mask `active`.
+        """
         facets = np.unique(self.cell_facets[cells])
         facets = facets[facets < self.facets_owned]
         both = self.facet_cells[facets]
@@ -842,7 +844,9 @@ class Grid:
 
 
 def begin_with(name: str, grid: Any) -> None:
-    """Move lines that follow to their initial coordinates, for new bodies and scenes.  Raise ValueError for no grid."""
+    """Move lines that follow to their initial coordinates, for new bodies and scenes.  Raise ValueError for other
+    objects.
+    """
     instance(name, grid, Grid)
     grid.move(None)
 
@@ -852,9 +856,9 @@ class GridOfGroups(Grid):
 
     The copies coincide in space.  Cells at the same place in all copies belong to the same process.
 
-    grid: grid of the bodies
-    group (bodies,): index, from 0, of the group of each body
-    starts (bodies,): id of the first material point of each body
+    `grid`: grid of the bodies
+    `group` (bodies,): index, from 0, of the group of each body
+    `starts` (bodies,): id of the first material point of each body
     """
 
     def __init__(self, grid: Grid, group: NDArray[np.int64], starts: NDArray[np.int64]):

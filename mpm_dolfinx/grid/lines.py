@@ -60,8 +60,8 @@ def graded(
     lower, upper : (d,), m
         Lower and upper corner of the grid; d = 2 or 3.
     fine : (boxes, 2, d), m
-        Lower and upper corners of at least one fine box.  Boxes must be inside the grid.  Small cells also fill gaps,
-        along an axis, narrower than a cell.  Such gaps lie between two boxes, or between a box and a side.
+        Lower and upper corners of at least one fine box.  Boxes must be inside the grid.  Small cells also fill gaps
+        that are narrower than a cell along an axis.  Such gaps lie between two boxes, or between a box and a side.
     size : number or (d,), m
         Largest edge lengths > 0 of the small cells.  Cells may be smaller, because each box contains a whole number of
         cells.
@@ -70,7 +70,9 @@ def graded(
     largest : m
         Largest edge length of a cell, >= size.
 
-    Returns ------- Lines (n,), in m, along each axis, for `Grid(lines=...)`.
+    Returns
+    -------
+    Lines (n,), in m, along each axis, for `Grid(lines=...)`.
 
     Raises
     ------
@@ -100,9 +102,7 @@ def graded(
 def _along(
     low: float, high: float, fine: NDArray[np.float64], size: float, ratio: float, largest: float
 ) -> NDArray[np.float64]:
-    """Return the lines (n,), in m, from low to high along an axis.  `fine` (k, 2), in m, are the intervals of small
-    cells.
-    """
+    """Return the lines from low to high along an axis, with small cells in the intervals `fine`."""
     joined: list[list[float]] = []
     for start, stop in sorted(fine.tolist()):
         if joined and start - joined[-1][1] <= size * (1 + SAME):
@@ -129,7 +129,7 @@ def _along(
 
 
 def _growing(gap: float, size: float, ratio: float, largest: float) -> NDArray[np.float64]:
-    """Return edge lengths (n,), in m, that fill a gap, in m.  They grow from `size` by a common factor.
+    """Return edge lengths that fill a gap, and grow from `size` by a common factor.
 
     The factor is at most `ratio` if possible.  Two numbers of edges are tried, and the number with a factor nearer to 1
     is used.

@@ -12,8 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 UNEVEN = 1.2
-"""Imbalance: largest number of points of a process, divided by the mean.  Above this limit, cells are distributed anew.
-The results of a scene do not depend on the limit.  Source: definition, the documented limit of the imbalance.
+"""Largest allowed imbalance: largest number of points of a process, divided by the mean.
+
+With a larger imbalance, cells are distributed anew.  The results of a scene do not depend on this limit.  Source:
+definition, the documented limit of the imbalance.
 """
 EMPTY = 1e-2
 """Weight of an empty cell divided by the mean weight of a filled cell.  Empty cells need memory and time."""
@@ -22,12 +24,8 @@ EMPTY = 1e-2
 class Partition:
     """Boxes of cells, one for each process.
 
-    Parameters
-    ----------
-    boxes : (ranks, 2, d)
-        The box of each process.  The two rows are the first cell index along each axis, and the last index plus one.
-    shape : (d,)
-        Number of cells of the grid along each axis.
+    `boxes` (ranks, 2, d): first index of cells along each axis in each box, and last index plus one.
+    `shape` (d,): number of cells of the grid along each axis.
 
     Raises
     ------
@@ -65,7 +63,7 @@ class Partition:
         return self.numbered(np.full(self.count[rank].prod(), rank), np.arange(self.count[rank].prod()))
 
     def numbered(self, rank: NDArray[np.int64], k: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the lexicographic indices (n,) of cells: the k-th cell (n,), from 0, of process `rank` (n,)."""
+        """Return the lexicographic indices (n,) of the `k`-th cells (n,), from 0, of processes `rank` (n,)."""
         out, stride = np.zeros_like(k), 1
         for axis in reversed(range(len(self.shape))):
             k, place = np.divmod(k, self.count[rank, axis])
@@ -77,8 +75,8 @@ class Partition:
 def boxes(load: NDArray[np.float64], processes: int) -> NDArray[np.int64]:
     """Return the boxes of cells (ranks, 2, d) of all ranks, see `Partition`.
 
-    load (cells along each axis): load >= 0 of each cell, such as its number of points
-    processes: number of ranks, >= 1
+    `load` (cells along each axis): load >= 0 of each cell, such as its number of points
+    `processes`: number of ranks, >= 1
     """
     filled = load > 0
     weight = load + (EMPTY * load[filled].mean() if filled.any() else 1.0)
@@ -88,24 +86,23 @@ def boxes(load: NDArray[np.float64], processes: int) -> NDArray[np.int64]:
 
 
 def better(load: NDArray[np.float64], of: NDArray[np.int64]) -> NDArray[np.int64] | None:
-    """Return the boxes (ranks, 2, d) of a new bisection, or None if they are hardly more even than the boxes `of`.
+    """Return the boxes (ranks, 2, d) of a new bisection, or None if they are hardly better than the boxes `of`.
 
-    If the imbalance of the new boxes is above `UNEVEN`, they must reduce the imbalance by the factor `UNEVEN`.  Without
-    this rule, each reset of the grid might distribute a few cells anew.
+    New boxes are returned if their imbalance is below `UNEVEN`, or below the imbalance of the boxes `of` divided by
+    `UNEVEN`.  Otherwise each reset of the grid might distribute a few cells anew.
     """
     new = boxes(load, len(of))
     return new if imbalance(load, new) < max(UNEVEN, imbalance(load, of) / UNEVEN) else None
 
 
 def imbalance(load: NDArray[np.float64], of: NDArray[np.int64]) -> float:
-    """Return the largest load of the boxes `of` (ranks, 2, d), divided by the mean load, or 1 without loads."""
+    """Return the largest load of the boxes `of`, divided by the mean load.  It is 1 without loads."""
     each = np.array([load[tuple(map(slice, *box))].sum() for box in of])
     return float(each.max() / each.mean()) if each.any() else 1.0
 
 
 def _bisect(weight: NDArray[np.float64], filled: NDArray[np.bool_], low: NDArray[np.int64], out: NDArray[np.int64]):
-    """Distribute a box of cells, with first cell `low` (d,), among ranks.  Set the boxes `out` (ranks, 2, d) of the
-    ranks.
+    """Distribute a box of cells among ranks, and set the boxes `out` of the ranks.
 
     If there are enough cells, each rank gets at least one cell.  This rule has priority over equal loads.
     """
@@ -137,9 +134,9 @@ def _extent(filled: NDArray[np.bool_], axis: int) -> int:
 
 
 def destinations(partition: Partition, cells: NDArray[np.int64]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Return two arrays: the ranks that hold each cell, the owner first, in one list, and the start of each cell in it.
+    """Return the ranks that hold each cell, the owner first, in one list, and the start of each cell in this list.
 
-    `cells` (n,) are lexicographic indices.  Processes that own a neighbour across a face hold the cell as a ghost.
+    `cells` (n,): lexicographic indices.  Processes that own a neighbour across a face hold the cell as a ghost.
     """
     index, shape = np.array(np.unravel_index(cells, partition.shape)), np.array(partition.shape)[:, None]
     ranks = [partition.owner(index)]

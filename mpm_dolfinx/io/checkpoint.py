@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Checkpoints: files from which an interrupted run is resumed, on any number of processes.
 
-A checkpoint is a numpy archive of the state between two steps (`State`), with a description that identifies the scene.
-The points are in the order of their ids, for any number of processes.  Each process writes and reads an equal share of
-the points.
+A checkpoint is a numpy archive with the state between two steps (`State`) and a description of the scene.  The points
+are in the order of their ids.  Each process writes and reads an equal share of the points.
 """
 
 from __future__ import annotations
@@ -54,13 +53,15 @@ NOTE = {"t": float, "resets": int, "begins": bool, "scene": dict, "result": dict
 
 @dataclass
 class Checkpoint:
-    """Saves the state of a run at intervals and at its end, if passed as `checkpoint` to `Simulation.run`.
+    """Saves the state of a run at intervals and at the end of the run.
+
+    Pass the object as `checkpoint` to `Simulation.run`.
 
     Parameters
     ----------
     file
-        Path of the checkpoint, in a folder to which all processes have access.  A new checkpoint replaces the old one
-        when the new one is complete.
+        Path of the checkpoint, in a folder to which all processes have access.  A complete new checkpoint replaces the
+        old checkpoint.
     every
         Number of output intervals between two checkpoints, >= 1.
     seconds
@@ -116,23 +117,21 @@ def save(simulation: Simulation, file: Path) -> None:
 
 
 def resume(simulation: Simulation, file: str | os.PathLike) -> Result:
-    """Restore a simulation from a checkpoint, and return its result, from which `run(after=...)` continues.
+    """Restore a simulation from a checkpoint, and return the histories for `run(after=...)`.
 
     Parameters
     ----------
     simulation
-        The scene of the checkpoint, on any number of processes.  If the run has several stages, first call `stage` to
-        bring the scene to the stage of the checkpoint.  Grid, bodies, fluid, and materials with their fields and laws
-        must be as in the file.  Loads, boundary conditions, terms and sources may differ.  The file does not contain
-        data that observers have collected.
+        The scene of the checkpoint.  Grid, bodies, fluid and materials must be those of the checkpoint.  Loads,
+        conditions, terms, sources and the number of processes may differ.  If the run had several stages, first call
+        `stage` to bring the scene to the stage of the checkpoint.  A checkpoint contains no data of observers.
     file
         Path of the checkpoint.
 
     Raises
     ------
     ValueError
-        The file is not a complete checkpoint, or belongs to another scene; the message gives the reason.  The
-        simulation is not changed.
+        The file is not a complete checkpoint, or belongs to another scene.  The simulation does not change.
     OSError
         The file does not exist (FileNotFoundError), or cannot be read.
     """
@@ -165,7 +164,7 @@ def _scalars(result: Result) -> dict[str, Any]:
 
 
 def _arrays(state: State) -> dict[str, NDArray]:
-    """Return all arrays of a state by name.  Slashes in a name separate the keys of nested dictionaries."""
+    """Return all arrays of a state by name."""
     named = {"points": vars(state.points), "outcome": state.outcome}
     named["result"] = {name: state.result.rows.column(name) for name in COLUMNS}
     for i, outcome in enumerate(state.result.rows.outcomes):
@@ -187,9 +186,9 @@ def _arrays(state: State) -> dict[str, NDArray]:
 
 
 def _state(file: Path, arrays: dict[str, NDArray], note: dict[str, Any], simulation: Simulation, count: int) -> State:
-    """Return a state that contains this process's share of the `count` points in a file.
+    """Return the state in a file with `count` points; raise ValueError if the file does not fit the simulation.
 
-    Nodal fields of the state are pairs of nodes and values.  Raise ValueError if the file does not fit the simulation.
+    Nodal fields are pairs of node numbers and values.
     """
     now, dim = simulation.state, simulation.grid.dim
     wet = simulation.scene.fluid is not None
@@ -256,9 +255,9 @@ def _outcomes(arrays: dict[str, NDArray], count: int) -> list[dict[str, dict[str
 
 
 def _like(outcome: dict[str, dict[str, NDArray]], now: Outcome) -> dict[str, dict[str, NDArray]]:
-    """Return the stored results of the current conditions; other conditions keep their present results.
+    """Return the stored results of the present conditions; raise ValueError if a result is invalid.
 
-    Raise ValueError if shapes differ, or if the motion of a tool is not finite.
+    Conditions without a stored result keep their present result.
     """
     found = {q: {name: outcome.get(q, {}).get(name, value) for name, value in of.items()} for q, of in now.items()}
     if "energy" in outcome:
@@ -277,7 +276,7 @@ def _like(outcome: dict[str, dict[str, NDArray]], now: Outcome) -> dict[str, dic
 
 
 def _nested(arrays: dict[str, NDArray]) -> dict[str, Any]:
-    """Return nested dictionaries of the arrays.  Slashes in the name of an array separate the keys."""
+    """Return nested dictionaries of arrays.  Slashes in the name of an array separate the keys."""
     out: dict[str, Any] = {}
     for name, value in arrays.items():
         *folders, last = name.split("/")
@@ -289,7 +288,7 @@ def _nested(arrays: dict[str, NDArray]) -> dict[str, Any]:
 
 
 def _points(arrays: dict[str, NDArray], like: MaterialPoints) -> MaterialPoints:
-    """Return material points from the stored arrays; raise ValueError if names or shapes do not match `like`."""
+    """Return material points from stored arrays; raise ValueError if the arrays differ in kind from those of `like`."""
     data = _part(arrays, "data/")
     like = with_faces(like) if PARENT in data else like
     like = with_parts(like) if ROOT in data else like
@@ -300,18 +299,12 @@ def _points(arrays: dict[str, NDArray], like: MaterialPoints) -> MaterialPoints:
         if rows.dtype != kind.dtype or rows.shape != (len(points), *kind.shape[1:]) or not np.isfinite(rows).all():
             raise ValueError(f"points/{name}: wrong type or shape ({rows.dtype}, {rows.shape}), or not finite")
     if set(data) != set(like.data):
-        raise ValueError(f"points/data: {', '.join(data)}, must be the data of the points")
+        raise ValueError(f"points/data: {', '.join(data)}, must be the names in `points.data` of the simulation")
     return points
 
 
 def _check_ids(points: MaterialPoints, simulation: Simulation, count: int) -> None:
-    """Raise ValueError if the points of a file do not belong to the present bodies.
-
-    count: number of points in the file, on all processes.
-
-    New points after renewal or division replace seeded points.  The ids of new points are at least the number of seeded
-    points.
-    """
+    """Raise ValueError if the points of a file with `count` points do not belong to the present bodies."""
     lengths, present = np.array([len(body) for body in simulation.bodies]), np.asarray(simulation.state.stage.present)
     starts = np.concatenate([[0], lengths.cumsum()])
     whole = count == lengths[present].sum() and (points.id < starts[-1]).all()
@@ -321,7 +314,7 @@ def _check_ids(points: MaterialPoints, simulation: Simulation, count: int) -> No
 
 
 def _partition(file: Path, given: list, grid: Grid) -> NDArray[np.int64]:
-    """Return the boxes (ranks, 2, d) of the processes that have written a file; raise ValueError for invalid boxes."""
+    """Return the boxes of cells of the processes that wrote a file; raise ValueError for invalid boxes."""
     with _complete(file):
         boxes = np.array(given, dtype=np.int64).reshape(-1, 2, grid.dim)
         grid.check_boxes(boxes)
@@ -329,7 +322,7 @@ def _partition(file: Path, given: list, grid: Grid) -> NDArray[np.int64]:
 
 
 def _nodal_rows(simulation: Simulation, name: str, nodal: NDArray[np.float64] | None) -> dict[str, NDArray]:
-    """Return this process's share of the nodes with non-zero values, and these values; nothing if `nodal` is None."""
+    """Return the nodes with non-zero values that this process writes, and the values at these nodes."""
     if nodal is None:
         return {}
     grid, owned = simulation.grid, simulation.scene.momentum.u.function_space.dofmap.index_map.size_local
@@ -343,7 +336,7 @@ def _nodal_rows(simulation: Simulation, name: str, nodal: NDArray[np.float64] | 
 
 
 def _check_lines(arrays: dict[str, NDArray], grid: Grid) -> None:
-    """Raise ValueError if the arrays are not lines of this grid, or if its lines do not follow anything."""
+    """Raise ValueError if the arrays are not lines of this grid, or if the grid has fixed lines."""
     shapes = {letter: x.shape for letter, x in zip("xyz", grid.lines, strict=False)}
     if grid.follow is None or {name: x.shape for name, x in arrays.items()} != shapes:
         raise ValueError("lines: these are not lines of the grid")
@@ -354,7 +347,7 @@ def _check_lines(arrays: dict[str, NDArray], grid: Grid) -> None:
 
 
 def _nodal(name: str, arrays: dict[str, NDArray], grid: Grid) -> tuple[NDArray, NDArray] | None:
-    """Return nodes and their values from stored arrays, or None without arrays; raise ValueError for invalid arrays."""
+    """Return the nodes and the values of a stored nodal field, or None if the field is not stored."""
     if not arrays:
         return None
     node, values = arrays.pop("node"), arrays.pop("values")
@@ -367,7 +360,7 @@ def _nodal(name: str, arrays: dict[str, NDArray], grid: Grid) -> tuple[NDArray, 
 
 
 def _check_trend(trend: Trend, points: MaterialPoints, wet: bool) -> None:
-    """Raise ValueError if a `Trend` (the motion in the last steps) does not belong to the points."""
+    """Raise ValueError if the stored motion in the last steps does not belong to the points."""
     (n, d), k = points.x.shape, len(trend.lengths)
     right = k in (1, 2, 3) and trend.lengths.shape == (k,) and trend.rates.shape == (n, k, d * (1 + d) + wet)
     numbers_only = all(v.dtype == np.float64 and np.isfinite(v).all() for v in vars(trend).values())
@@ -376,7 +369,7 @@ def _check_trend(trend: Trend, points: MaterialPoints, wet: bool) -> None:
 
 
 def _check_pieces(arrays: dict[str, NDArray], ids: NDArray[np.int64], dim: int) -> None:
-    """Raise ValueError if the arrays do not describe the pieces of the points with these ids."""
+    """Raise ValueError if the arrays are not the pieces of the points with these ids."""
     shapes, count = {"x": (dim,), "slope": (dim,), "bounds": (2,)}, len(arrays["id"])
     for name, rows in arrays.items():
         kind = np.int64 if name in ("id", "cell") else np.float64
@@ -387,7 +380,7 @@ def _check_pieces(arrays: dict[str, NDArray], ids: NDArray[np.int64], dim: int) 
 
 
 def _named(prefix: str, values: dict) -> dict[str, NDArray]:
-    """Return the arrays of nested dictionaries.  The name of an array has slashes between the keys."""
+    """Return the arrays in nested dictionaries.  Slashes join the keys to the name of an array."""
     out = {}
     for name, value in values.items():
         out |= _named(f"{prefix}{name}/", value) if isinstance(value, Mapping) else {prefix + name: value}
@@ -395,13 +388,13 @@ def _named(prefix: str, values: dict) -> dict[str, NDArray]:
 
 
 def _part(arrays: dict[str, NDArray], prefix: str) -> dict[str, NDArray]:
-    """Remove the arrays whose names begin with a prefix, and return them under names without the prefix."""
+    """Remove all arrays whose names begin with a prefix, and return these arrays without the prefix."""
     return {name.removeprefix(prefix): arrays.pop(name) for name in list(arrays) if name.startswith(prefix)}
 
 
 @contextmanager
 def _complete(file: Path) -> Iterator[None]:
-    """Context manager that replaces errors in reading by a ValueError, which says that the checkpoint is damaged."""
+    """Replace an error in reading by a ValueError that reports a damaged checkpoint."""
     try:
         yield
     except (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError, BadZipFile) as error:
@@ -409,18 +402,12 @@ def _complete(file: Path) -> Iterator[None]:
 
 
 def _numbered(name: str) -> str | None:
-    """Return the name of the array that numbers the rows of an array, or None if the array is not stored by rows."""
+    """Return the name of the array that numbers the rows of an array, or None without such an array."""
     return next((numbers for start, numbers in NUMBERED.items() if name.startswith(start)), None)
 
 
 def _ranges(comm: MPI.Intracomm, file: Path, of: dict[str, Member]) -> dict[str, tuple[int, int]]:
-    """Return the first row, and the last row plus one, that this process reads of each array that is stored by rows.
-
-    A process reads the pieces of its points.
-
-    Raise ValueError if the length of an array differs from that of the array that numbers its rows.  Raise
-    ValueError if these numbers do not ascend.
-    """
+    """Return the range of rows that this process reads from each array; raise ValueError for invalid row numbers."""
     out = {}
     for name in dict.fromkeys(map(_numbered, of)):
         first, last = (of[name].shape[0] * (comm.rank + k) // comm.size for k in (0, 1))
@@ -437,7 +424,7 @@ def _ranges(comm: MPI.Intracomm, file: Path, of: dict[str, Member]) -> dict[str,
 
 
 def _before(file: Path, of: dict[str, Member], row: int) -> int:
-    """Return the number of pieces that belong to points before row `row`."""
+    """Return the number of pieces of the points in all rows before `row`."""
     points, pieces = of[POINTS], of[PIECES]
     if row == points.shape[0]:
         return pieces.shape[0]
@@ -446,7 +433,7 @@ def _before(file: Path, of: dict[str, Member], row: int) -> int:
 
 
 def _read(file: Path) -> tuple[dict[str, NDArray], dict[str, Member], dict[str, Any]]:
-    """Return the arrays of a checkpoint that are not stored by rows, the other arrays as members, and the metadata."""
+    """Return the short arrays of a checkpoint, the places of its long arrays in the file, and its metadata."""
     with open(file, "rb") as f:
         begin = f.read(4)
     what = "is cut short or damaged, must be a whole checkpoint" if begin == ZIP else FOREIGN
@@ -472,7 +459,7 @@ def _read(file: Path) -> tuple[dict[str, NDArray], dict[str, Member], dict[str, 
 
 
 def describe(simulation: Simulation) -> dict[str, Any]:
-    """Return the constants that identify the scene in a checkpoint, by name."""
+    """Return the constants that identify a scene, by name."""
     kept = sorted(simulation.state.stage.kept(0))
     more = {"bodies present": list(simulation.present), "data that points keep of conditions": kept}
     return {**simulation.scene.description, **more}

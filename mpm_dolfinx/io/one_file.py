@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Material points at all output times of a run, in one XDMF file for ParaView with data in HDF5."""
+"""Material points at all output times of a run, in one XDMF file for ParaView."""
 
 from __future__ import annotations
 
@@ -23,13 +23,12 @@ if TYPE_CHECKING:  # meshio takes long to import, so functions import it
 
 
 def one_file(folder: str | os.PathLike) -> Path:
-    """Write the points in the folder of a `Writer` as one time series: `points.xdmf` and `points.h5`.
+    """Join the point files of a `Writer` in one time series: `points.xdmf` and `points.h5`.
 
     ParaView, VTK and meshio (xdmf.TimeSeriesReader) read these files.  dolfinx reads the particle domains of one
     output time as a mesh.  For example, `XDMFFile.read_mesh(name="2", xpath="/Xdmf/Domain/Grid")` reads the third time.
-    Each output time has separate domains, so bodies may be added or removed between two times.  The
-    elements `<Information>` in points.xdmf describe the fields and their units.  The files of the `Writer` remain.  A
-    call during a run writes the output times so far; call the function again at the end of the run.
+    The elements `<Information>` in points.xdmf describe the fields and their units.  The files of the `Writer` remain.
+    A call during a run joins the files written so far.
 
     Parameters
     ----------
@@ -74,7 +73,7 @@ def one_file(folder: str | os.PathLike) -> Path:
 
 
 def joined(pieces: Sequence[meshio.Mesh]) -> meshio.Mesh:
-    """Return the domains in the files of all processes as one mesh of unconnected cells, ordered by id."""
+    """Return the particle domains of all processes as one mesh, ordered by id."""
     import meshio
 
     if len(pieces) == 1:
@@ -88,7 +87,7 @@ def joined(pieces: Sequence[meshio.Mesh]) -> meshio.Mesh:
 
 
 def _add(writer: meshio.xdmf.TimeSeriesWriter, number: int, t: float, mesh: meshio.Mesh) -> None:
-    """Add a mesh and its fields at time t.  meshio's `write_data` allows only one mesh for all times."""
+    """Add the mesh and the fields of one output time."""
     grid = SubElement(writer.collection, "Grid", Name=str(number), GridType="Uniform")
     SubElement(grid, "Time", Value=repr(t))
     writer.points(grid, mesh.points)

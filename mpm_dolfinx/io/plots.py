@@ -17,24 +17,24 @@ from mpm_dolfinx.simulation.simulation import Simulation
 
 
 def plot(simulation: Simulation, field: str = "pressure", ax=None, *, bar: bool = True, label: str = "", **style):
-    """Draw the particle domains, coloured by a field; return the axes of matplotlib.
+    """Draw the particle domains, coloured by a field, and return the axes of matplotlib.
 
-    All processes must call this function.  The first process draws the picture; the other processes return None.
+    All processes must call this function.  The first process draws the picture.  All other processes return None.
 
     Parameters
     ----------
     simulation
         A scene in plane strain or axisymmetry.
     field
-        "pressure", "displacement" (the magnitude), "displacement_x", "stress_xx", "effective_stress_xy",
-        "mean_effective_stress", "deviatoric_stress", "porosity", "J", in unsaturated soil "saturation" and "suction",
-        or any other scalar in `points.pvd` and `points.data`.
+        Name of the field, for example "pressure", "displacement" (the magnitude), "displacement_x", "stress_xx",
+        "effective_stress_xy", "mean_effective_stress", "deviatoric_stress", "porosity" or "J".  In unsaturated soil
+        "saturation" and "suction" are fields too.  Any scalar in `points.pvd` or `points.data` is a field.
     ax
         Axes for the picture; by default new axes.
     bar
-        Whether to draw a colour bar with the unit.
+        Whether to draw a colour bar.
     label
-        Label of the colour bar; by default the name of the field and its unit.
+        Label of the colour bar; by default the name and the unit of the field.
     **style
         Arguments of matplotlib's PolyCollection, such as cmap and clim.
 

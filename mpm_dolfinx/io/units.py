@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Names, units and meaning of the fields in the output files, as a text for the output folder."""
+"""Units and meaning of the fields in the output files."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def text() -> str:
 
 
 def unit(name: str) -> str:
-    """Return the unit of a field of points, or of a component of the field; an empty string if unknown."""
+    """Return the unit of a field of the points, or an empty string if the field is unknown."""
     for names, meaning in FIELDS["points.pvd: the domains of the material points"].items():
         for each in names.split(", "):
             if each not in ("id", "material", "others") and (name == each or name.startswith(f"{each}_")):

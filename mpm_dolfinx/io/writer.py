@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Files of a run: material points and grid for ParaView, histories as a table.
 
-Every output time has separate files.  A new index of these files replaces the old index only when the new index is
-complete.  All output of a run can therefore be read, even if the run fails.
+Every output time has its own files, and an index lists these files.  If a run fails, all output so far can be read.
 """
 
 from __future__ import annotations
@@ -39,32 +38,28 @@ if TYPE_CHECKING:  # meshio takes long to import, so functions import it
     import meshio
 
 VTK_CELLS = {2: ("quad", [0, 1, 3, 2]), 3: ("hexahedron", [0, 1, 3, 2, 4, 5, 7, 6])}
-"""VTK's cell type of a particle domain, and the order of the domain's corners in VTK."""
+"""Cell type of a particle domain in VTK, and order of its corners in VTK, by dimension."""
 WRITABLE = "in a writable folder with free space; `after=simulation.result` continues the run"
 COUNTS = ("steps", "newton", "coupling", "cuts", "rederived", "balance", "residual", "wall")
 
 
 class Writer:
-    """Writes points, histories and grid of a run, as an observer of `Simulation.run`.
+    """Writes points, histories and grid of a run to a folder, as an observer of `Simulation.run`.
 
-    The folder receives
+    The folder contains these files:
 
-    * `points.pvd`: the particle domains as solid cells, in one file for each process that has points.  Fields are
-      displacement, pore pressure, F, J, all data of the points, and the results of `Simulation.point_fields`: stresses,
-      p', q, porosity;
+    * `points.pvd`: the particle domains with displacement, pore pressure, F, J, all data of the points, stresses and
+      porosity;
     * `history.csv`: one row for each output time, with counts and errors of `Result`, smallest and largest pressure,
-      quantities at probes, forces of prescribed displacements and tools, and outflows.  Forces and outflows are nan
-      before the first step of a stage;
+      quantities at probes, forces of prescribed displacements and tools, and outflows;
     * `fields.txt`: meaning and unit of each field in these files;
-    * with tools, `tools.pvd`: the parts of the grid cells inside the tools, with the forces of the tools;
-    * with `grid=True`, `grid.pvd`: the fields of the cells (`Simulation.cells`) by components, zero in empty cells.
+    * `tools.pvd`, in scenes with tools: the parts of the grid cells inside the tools, with the forces of the tools;
+    * `grid.pvd`, with `grid=True`: the fields of the cells (`Simulation.cells`), zero in empty cells.
 
     ParaView and VTK read all files; meshio reads the points.
 
-    If the folder has output from before the current time, the new run continues this output.  After `resume`, the
-    files of a new writer are therefore equal to the files of an uninterrupted run.
-
-    Until `close`, the end of its context, or its deletion, a writer locks its folder against other processes.
+    If the folder has output of earlier times, the new run continues this output.  After `resume`, the files are
+    therefore equal to the files of an uninterrupted run.  A writer locks its folder until the writer is closed.
 
     Parameters
     ----------
@@ -75,16 +70,15 @@ class Writer:
     every
         Number of output intervals between two files of points and grid, >= 1.  Start and end are always written.
     grid
-        Whether to write the fields of the grid cells too.
+        Whether to write `grid.pvd`.
 
     Raises
     ------
     ValueError
         An argument has the wrong type.  Files in the folder were not written by a writer, or have other columns.  The
-        run belongs to a simulation other than `simulation`, or starts at a time other than that of the writer.  The
-        writer is closed.
+        writer is closed, or was made for another simulation or for another time.
     OSError
-        The folder is not writable, or the disk is full.  `simulation.run(..., after=simulation.result)` then continues.
+        The folder is not writable, or the disk is full.  `run(..., after=simulation.result)` continues such a run.
     """
 
     def __init__(self, simulation: Simulation, folder: str | os.PathLike, *, every: int = 1, grid: bool = False):
@@ -144,7 +138,7 @@ class Writer:
         self._write_indices()
 
     def _start(self, result: Result) -> None:
-        """Remove the output of later times from the index and the table, because a new run continues from here."""
+        """Remove the output of later times from the index and the table."""
         if (start := result.rows[-2][0]) != self._t:
             what = f"writer: made at t = {self._t:g} s, but the run starts at t = {start:g} s"
             raise ValueError(f"{what}; must be made just before the run")
@@ -188,7 +182,7 @@ class Writer:
 
 
 def fields_of_points(simulation: Simulation) -> dict[str, NDArray[np.float64]]:
-    """Return fields (n,) of this process's points by name: porosity, saturation, stress components and invariants."""
+    """Return porosity, saturation, stress components and stress invariants of the points, by name."""
     fields, wet = simulation.point_fields(), simulation.scene.fluid is not None
     drains = simulation.scene.materials.retentions is not None
     out = {name: getattr(fields, name) for name in ("porosity", "saturation")[: 1 + drains]}
@@ -199,7 +193,7 @@ def fields_of_points(simulation: Simulation) -> dict[str, NDArray[np.float64]]:
 
 
 def _write_tools(simulation: Simulation, file: Path) -> None:
-    """Write the parts of the grid cells inside the tools, with index and force of each tool."""
+    """Write the parts of the grid cells inside the tools, with indices and forces of the tools."""
     grid, tools = simulation.grid, simulation.state.stage.of(Tool)
     corners = [
         tool.drawn(grid, simulation.t, motion_by_forces(simulation.state.outcome, name)) for name, tool in tools.items()
@@ -226,7 +220,7 @@ class Lock:
 
     @classmethod
     def of(cls, folder: Path) -> Lock:
-        """Return the lock of a folder, which is created if necessary; raise ValueError if another process locks it."""
+        """Return the lock of a folder; raise ValueError if another run has locked the folder."""
         folder.mkdir(parents=True, exist_ok=True)
         folder = folder.resolve()
         lock = cls._held.get(folder)
@@ -236,19 +230,14 @@ class Lock:
 
 
 def _row(result: Result) -> dict[str, float]:
-    """Return the histories and the results of the conditions at the last output time."""
+    """Return the row of the table for the last output time."""
     row = result.rows[-1]
     out = {"t": row.t, **{name: getattr(result, name) for name in COUNTS}}
     return out | {name: float(value) for name, (value, _) in columns(row, row.outcome).items()}
 
 
 def solid(points: MaterialPoints, displacement: NDArray[np.float64], wet: bool) -> meshio.Mesh:
-    """Return the particle domains as unconnected cells, with all fields of the material points.
-
-    points: all material points
-    displacement (n, d), m: displacements of the points
-    wet: whether the points have a pore pressure
-    """
+    """Return the particle domains as a mesh of unconnected cells, with all fields of the points."""
     fields = {"id": points.id, "material": points.material, "displacement": displacement, "J": points.J, "F": points.F}
     if wet:
         fields["pressure"] = points.pressure
@@ -256,7 +245,7 @@ def solid(points: MaterialPoints, displacement: NDArray[np.float64], wet: bool) 
 
 
 def _cells(corners: NDArray[np.float64], fields: dict[str, NDArray]) -> meshio.Mesh:
-    """Return a mesh of n unconnected cells with corners (n, 2^d, d), in m, and with fields (n, ...)."""
+    """Return a mesh of unconnected cells with these corners and fields."""
     import meshio
 
     kind, order = VTK_CELLS[corners.shape[2]]
@@ -271,7 +260,7 @@ def _padded(vectors: NDArray) -> NDArray:
 
 
 def _columns(name: str, rows: NDArray) -> Iterator[tuple[str, NDArray]]:
-    """Yield names and values of the VTK fields that represent a field (n, ...) of scalars, vectors or tensors."""
+    """Yield the name and the values of each VTK field that represents a field of the points."""
     if rows.shape[1:] == (2, 2):  # not padded to 3 x 3, because the out-of-plane components are unknown
         for i, j in np.ndindex(2, 2):
             yield f"{name}_{'xy'[i]}{'xy'[j]}", rows[:, i, j]
@@ -282,7 +271,7 @@ def _columns(name: str, rows: NDArray) -> Iterator[tuple[str, NDArray]]:
 
 
 def _grid_fields(simulation: Simulation) -> list[fem.Function]:
-    """Return the fields of the cells as functions with names."""
+    """Return the fields of the cells as named functions."""
     scene, d = simulation.scene, simulation.grid.dim
     cells = simulation.cells()
     fields = {"fill": scene.momentum.ghost.fill.x.array[cells.cell]}
@@ -304,7 +293,7 @@ def _grid_fields(simulation: Simulation) -> list[fem.Function]:
 
 @contextmanager
 def _true_places(grid: Grid) -> Iterator[None]:
-    """Context manager that shifts the mesh of a grid to the true positions of its nodes."""
+    """Shift the mesh of a grid to its true position while the context lasts."""
     x = grid.mesh.geometry.x
     own = x.copy()
     x[:, : grid.dim] += grid.base
@@ -325,7 +314,7 @@ def _ends(file: Path) -> bool:
 
 @contextmanager
 def replacing(file: Path) -> Iterator[Path]:
-    """Context manager for a new file at a temporary path.  When this file is on the disk, it replaces `file`."""
+    """Give a temporary path for a new file, which replaces `file` at the end of the context."""
     part = file.with_name(file.name + ".part")
     yield part
     with open(part, "rb") as f:
@@ -335,7 +324,7 @@ def replacing(file: Path) -> Iterator[Path]:
 
 @contextmanager
 def _ours(file: Path) -> Iterator[None]:
-    """Context manager that replaces errors in reading by a ValueError, which says that no `Writer` wrote the file."""
+    """Replace an error in reading by a ValueError that reports a foreign file."""
     try:
         yield
     except (ElementTree.ParseError, KeyError, TypeError, ValueError) as error:
@@ -343,7 +332,7 @@ def _ours(file: Path) -> Iterator[None]:
 
 
 def kept(entries: Sequence[tuple[float, Any]], t: float) -> list[tuple[float, Any]]:
-    """Return the entries (time, ...) up to time t, which a run from t continues; none for a new run."""
+    """Return the entries of earlier output up to the time `t`, or no entries for a new run."""
     out = [entry for entry in entries if entry[0] <= t]
     return out if any(entry[0] < t for entry in out) else []
 
@@ -351,8 +340,8 @@ def kept(entries: Sequence[tuple[float, Any]], t: float) -> list[tuple[float, An
 class Series:
     """A time series for ParaView: an index (.pvd), and files in a folder with the same name.
 
-    `entries` are the output times so far with their files, equal on all processes.  `next` is the path of the next
-    file, without suffix.
+    entries: output times so far, with their files.
+    next: path of the next file, without suffix.
     """
 
     def __init__(self, comm: MPI.Intracomm, file: Path, t: float):
@@ -366,7 +355,7 @@ class Series:
         return self.folder / f"{len(self.entries):06d}"
 
     def pieces(self, counts: Sequence[int]) -> dict[int, Path]:
-        """Return the path of the next file for each rank with points; counts: number of points of each rank."""
+        """Return the path of the next file of each process that has points."""
         names = {rank: f"{self.next.name}_p{rank}.vtu" for rank, count in enumerate(counts) if count}
         names = names if len(counts) > 1 else {0: f"{self.next.name}.vtu"}
         return {rank: self.folder / name for rank, name in names.items()}
@@ -419,7 +408,7 @@ class Table:
             return [(float(row["t"]), row) for row in csv.DictReader(whole)]
 
     def start(self, first: dict[str, float]) -> None:
-        """Write the rows of earlier times, or the row `first` without earlier rows."""
+        """Write the rows of earlier times, or the row `first` if there are no earlier rows."""
         rows = [row for _, row in self._rows] or [first]
         self.columns = list(rows[0])
         self._check(first)
@@ -431,7 +420,7 @@ class Table:
         at_root(self.comm, write)
 
     def add(self, row: dict[str, float]) -> None:
-        """Add a row.  If the row has new columns, the file is written again, with nan in these columns of old rows."""
+        """Add a row to the file.  New columns have nan in all old rows."""
         self._check(row)
         new = [name for name in row if name not in self.columns]
         self.columns.extend(new)

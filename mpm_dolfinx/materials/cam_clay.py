@@ -1,18 +1,20 @@
 # SPDX-License-Identifier: MIT
 """Modified Cam Clay at finite strain (Borja and Tamagnini 1998), and the Barcelona Basic Model for suction.
 
-Plasticity is multiplicative, in principal logarithmic strains.  With the Kirchhoff stress tau, the
-elastic volume strain e_v and deviatoric strain e (tension positive), P = -tr(tau)/3 and Q = sqrt(3/2) |dev tau|,
+The law is for clay whose yield surface grows with plastic compaction.  Plasticity is multiplicative, in principal
+logarithmic strains.  tau is the Kirchhoff stress, e_v is the elastic volume strain, and e is the elastic
+deviatoric strain (tension positive).  With P = -tr(tau)/3 and Q = sqrt(3/2) |dev tau|, the law is
 
     P = P_0 exp(-e_v / kappa),   dev tau = 2G e,
     f = Q^2 / M^2 + P (P - P_c) <= 0,   dP_c / P_c = -de_v^p / (lambda - kappa),
 
-and flow is associated.  M is the slope of the critical state line.  P_c is the size of the yield surface.  P_0 is the
-pressure at F = I.  e_v^p is the plastic volume strain.  P and P_c follow the bilogarithmic law: the logarithm of the
-specific volume v is linear in ln P.  The slope is lambda in first loading and kappa in unloading.  The stress at the
-end of a step follows implicitly from the trial stresses P_t and Q_t, and from the size P_c,n at the start of the step.
-The plastic compaction defines a, as compaction / kappa.  The plastic multiplier dgamma defines h:
-6G dgamma / M^2 = exp(h) - 1.  With w = (Q_t / (M P_t))^2,
+with associated flow.  P_0 is the pressure at F = I, G is the shear modulus, M is the slope of the critical state line,
+P_c is the size of the yield surface, and e_v^p is the plastic volume strain.  The logarithm of the specific volume is
+linear in ln P (bilogarithmic law), with the slope lambda in first loading and the slope kappa in unloading.
+
+The stress at the end of a step is computed from the trial stresses P_t and Q_t, and from the size P_c,n of the yield
+surface at the start of the step.  The number a is the plastic compaction divided by kappa.  The number h is defined by
+6G dgamma / M^2 = exp(h) - 1, with the plastic multiplier dgamma.  With w = (Q_t / (M P_t))^2,
 
     P = P_t exp(-a),   Q = Q_t exp(-h),   P_c = P_c,n exp(rho a),   rho = kappa / (lambda - kappa),
     (6G kappa / M^2) a = (exp(h) - 1) (2P - P_c).
@@ -22,7 +24,7 @@ Q / (M P) = sqrt(w) exp(-d/2).  On the yield surface a = (ln(P_t / P_c,n) + ln(1
 equation for d is smooth and monotone, even at isotropic stresses and at the critical state (a = 0).
 
 If M^2 P_c > 6G (lambda - kappa), soil on the dry side of the critical state softens faster than it unloads elastically.
-Then the stress jumps, or the equation for d has no solution.  Without a solution, the time step is reduced.
+The stress then jumps, or the equation for d has no solution.  Without a solution, the time step is reduced.
 """
 
 from __future__ import annotations
@@ -51,21 +53,21 @@ GIVEN = {
 
 
 class _Follows(float):
-    """A bulk modulus that the class has derived from other constants, not one that the user gave."""
+    """A bulk modulus that the class has derived from other constants."""
 
     follows = True
 
 
 @dataclass(frozen=True)
 class _FollowsByPlace:
-    """The bulk modulus P_0 / kappa as a function of position; initial stress and kappa are values or functions."""
+    """The bulk modulus P_0 / kappa as a function of position."""
 
     stress: object
     kappa: object
     follows: ClassVar[bool] = True
 
     def __call__(self, X: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the bulk moduli (n,), Pa, at reference positions X (n, d), m."""
+        """Return the bulk moduli, in Pa, at reference positions X (n, d), in m."""
         at = [f(X) if callable(f) else np.asarray(f) for f in (self.stress, self.kappa)]
         return np.broadcast_to(-np.mean(at[0], axis=-1) / at[1], len(X))
 
@@ -79,8 +81,9 @@ class ModifiedCamClay(Skeleton):
     M
         Slope of the critical state line Q = M P, -, > 0.
     lambda_, kappa
-        Slopes of ln v against ln P, -, 0 < kappa < lambda_.  lambda_ applies to first loading, kappa to unloading.  P
-        is a Kirchhoff stress.  A slope C of v against the logarithm of the Cauchy stress corresponds to C / (v - C).
+        Slopes of ln v against ln P, -, 0 < kappa < lambda_, with the specific volume v.  lambda_ applies to first
+        loading, kappa to unloading.  P is a Kirchhoff stress.  If v has the slope C against the logarithm of the Cauchy
+        stress, the slope of ln v against ln P is C / (v - C).
     initial_stress : (3,), Pa
         Normal effective stresses at F = I, tension positive.  Their mean must be < 0.  The last stress is out of plane
         in 2D, and circumferential in axisymmetry.  These stresses must be in equilibrium with the loads.
@@ -91,9 +94,9 @@ class ModifiedCamClay(Skeleton):
     bulk
         Must not be given: the bulk modulus at the start is P_0 / kappa.
 
-    Other parameters: see `Skeleton`.  All parameters are passed by name.  State variables in `points.data`: `plastic`
-    is the inverse plastic metric C_p^-1 (3, 3), and `consolidated` is ln(P_c / initial P_c).  Source: Borja and
-    Tamagnini (1998).
+    Other parameters: see `Skeleton`.  All parameters are passed by name.  The state variable `plastic` in `points.data`
+    is the inverse plastic metric C_p^-1 (3, 3).  The state variable `consolidated` is ln(P_c / initial P_c).  Source:
+    Borja and Tamagnini (1998).
 
     Raises
     ------
@@ -162,14 +165,14 @@ class ModifiedCamClay(Skeleton):
 
     @staticmethod
     def trial(F, prestretch, plastic):
-        """Return the trial strain, its volume strain e_v, and its squared deviatoric strain e_s^2 = 2/3 e : e."""
+        """Return the trial strain, its volume strain e_v, and its squared deviatoric strain 2/3 e : e."""
         strain = Trial(F, plastic, prestretch)
         e = strain.deviatoric
         return {"volume": strain.volumetric, "distortion": 2 / 3 * ufl.inner(e, e), "strain": strain}
 
     @staticmethod
     def residual(trial, shear, M, lambda_, kappa, pressure, yield_pressure, consolidated, steeper):
-        """Return the residual of the flow rule on the yield surface, which is the equation for d."""
+        """Return the residual of the equation for d."""
         to = _Return(trial, shear, M, lambda_, kappa, pressure, yield_pressure, consolidated, steeper)
         c, P = 6 * shear * kappa / M**2, to.trial_pressure * ufl.exp(-to.compaction)
         rule = (c * to.compaction - (ufl.exp(to.flow) - 1) * (1 - to.steepness) * P) / (c + P)
@@ -180,7 +183,7 @@ class ModifiedCamClay(Skeleton):
 
     @staticmethod
     def kirchhoff(trial, shear, M, lambda_, kappa, pressure, yield_pressure, consolidated, steeper):
-        """Return the Kirchhoff stress (3, 3), Pa, as UFL."""
+        """Return the Kirchhoff stress (3, 3), in Pa, as UFL."""
         to = _Return(trial, shear, M, lambda_, kappa, pressure, yield_pressure, consolidated, steeper)
         a, h = (ufl.conditional(to.yields, value, 0.0) for value in (to.compaction, to.flow))
         deviator = 2 * shear * ufl.exp(-h) * trial["strain"].deviatoric
@@ -188,7 +191,7 @@ class ModifiedCamClay(Skeleton):
 
     @staticmethod
     def update(trial, shear, M, lambda_, kappa, pressure, yield_pressure, plastic, consolidated, steeper):
-        """Return the state at the end of the step: UFL by name."""
+        """Return the state at the end of the step as UFL, by name."""
         to = _Return(trial, shear, M, lambda_, kappa, pressure, yield_pressure, consolidated, steeper)
         strain = trial["strain"]
         a = to.compaction
@@ -207,7 +210,7 @@ LC = {"r": "> kappa / lambda_, <= 1", "beta": ">= 0 1/Pa and finite", "reference
 
 
 def _dried(function: Callable) -> Callable:
-    """Return a function of Modified Cam Clay that is evaluated with lambda(s) and P_c(s) at the suction s."""
+    """Return a function of Modified Cam Clay with lambda(s) and P_c(s) at the suction s."""
     arguments = Skeleton.arguments_of(function)
 
     def of(**given):
@@ -238,15 +241,15 @@ def _dried(function: Callable) -> Callable:
 class BarcelonaBasic(ModifiedCamClay):
     """Modified Cam Clay with a yield surface that grows with suction, for soil that collapses on wetting.
 
-    At a suction s = max(-p, 0) the yield surface in Bishop's stress has the size P_c:
+    P_c is the size of the yield surface in Bishop's stress at the suction s = max(-p, 0), with the pore pressure p.
+    P_c0 is the size of the yield surface in saturated soil.  The loading-collapse curve of the Barcelona Basic Model is
 
         P_c / P_r = (P_c0 / P_r)^((lambda(0) - kappa) / (lambda(s) - kappa)),
         lambda(s) = lambda(0) [(1 - r) exp(-beta s) + r],   dP_c0 / P_c0 = -de_v^p / (lambda(0) - kappa),
 
-    This is the loading-collapse curve of the Barcelona Basic Model.  P_c0 is the size of the yield surface in saturated
-    soil.  At constant suction the law is Modified Cam Clay with lambda(s), and in saturated soil with lambda(0).
-    Bishop's stress alone determines the strength due to suction and the swelling on wetting.  The suction is evaluated
-    at the end of a substep.  Suction has no effect on the yield surface if P_c0 is below P_r.
+    with the constants P_r, r and beta below.  At constant suction the law is Modified Cam Clay with lambda(s).  Suction
+    has no effect on the yield surface if P_c0 is below P_r.  Bishop's stress alone determines the strength due
+    to suction, and the swelling on wetting.  The suction is evaluated at the end of a substep.
 
     Parameters
     ----------
@@ -261,11 +264,11 @@ class BarcelonaBasic(ModifiedCamClay):
     beta
         Rate of decrease of lambda with suction, 1/Pa, >= 0.
     reference
-        Stress P_r, Pa, > 0, usually 0.01 to 0.5 times the initial P_c0.  If P_c0 < P_r, P_c does not depend on suction.
+        Stress P_r, Pa, > 0, usually 0.01 to 0.5 times the initial P_c0.
 
-    Other parameters: see `ModifiedCamClay`.  A scene with fluid requires `retention`.  State variables: `plastic`,
-    `consolidated` = ln(P_c0 / initial P_c0), `suction` and `suction_at_start`, Pa.  Source: Alonso, Gens and Josa
-    (1990); in Bishop's stress Bolzon, Schrefler and Zienkiewicz (1996).
+    Other parameters: see `ModifiedCamClay`.  A scene with fluid requires `retention`.  State variables are `plastic`,
+    `consolidated` = ln(P_c0 / initial P_c0), and `suction` and `suction_at_start`, in Pa.  Source: Alonso, Gens and
+    Josa (1990); for Bishop's stress Bolzon, Schrefler and Zienkiewicz (1996).
 
     Raises
     ------
@@ -304,12 +307,12 @@ class BarcelonaBasic(ModifiedCamClay):
 
 
 class _Return:
-    """Return to the yield surface for a given d, see the module's docstring.
+    """Return to the yield surface for a value of the unknown d.
 
     compaction: a.
     flow: h.
     steepness: w exp(-d), the square of Q / (M P) at the end of the step.
-    trial_pressure: P_t, Pa.
+    trial_pressure: P_t, in Pa.
     rho: ln(P_c / P_c,n) / a.
     yields: whether the trial stress is outside the yield surface.
     """

@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: MIT
 """Drucker and Prager's elastoplasticity at finite strain.
 
-Plasticity is multiplicative, in principal logarithmic strains.  The state is the inverse plastic metric C_p^-1, and the
-trial elastic strain is eps = ln(b)/2 with b = F C_p^-1 F^T.  Elasticity is Hencky's, tau = K tr(eps) I + 2G dev eps.
-The return to the yield surface
+Plasticity is multiplicative, in principal logarithmic strains.  The state is the inverse plastic metric C_p^-1.  With
+b = F C_p^-1 F^T, the trial elastic strain is eps = ln(b)/2.  Elasticity is Hencky's: the Kirchhoff stress is
+tau = K tr(eps) I + 2G dev eps.  The stress returns to the yield surface
 
     f = sqrt(J_2) + eta p - xi c <= 0,   p = tr(tau)/3 (tension positive),  c = c_0 + H kappa,
 
-has the closed form of small-strain plasticity, both on the cone and at its apex (de Souza Neto, Peric and Owen 2008,
-8.3 and 14.6).  `MATCHES` gives eta and xi; kappa is the accumulated plastic strain.  The consistent tangent is UFL's
-derivative of the stress.
+with J_2 = dev tau : dev tau / 2, the cohesion c, the accumulated plastic strain kappa, and eta and xi from `MATCHES`.
+The return has the closed form of small-strain plasticity, on the cone and at its apex (de Souza Neto, Peric and Owen
+2008, 8.3 and 14.6).  The consistent tangent is UFL's derivative of the stress.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ MATCHES = {
     "compression": lambda t, s, c: (6 * s / np.sqrt(3) / (3 - s), 6 * c / np.sqrt(3) / (3 - s)),
     "extension": lambda t, s, c: (6 * s / np.sqrt(3) / (3 + s), 6 * c / np.sqrt(3) / (3 + s)),
 }
-"""Parameters (eta, xi) of the cone as functions of tan phi, sin phi and cos phi, for each match to Mohr and Coulomb."""
+"""Parameters (eta, xi) of the cone, from tan phi, sin phi and cos phi, for each match to Mohr and Coulomb's law."""
 LEAST = 1e-20
-"""Constant added to the squared deviatoric strain under the square root, so that its derivative is finite at zero.
-Halving this value changes the result of scene "soil" in tests/plateaus.py by 2.3e-11 (relative), doubling it by
-1.0e-11, and finer cells by 3.0e-02.
+"""Constant added to the squared deviatoric strain under the square root, so that its derivative is finite at zero. The
+result of scene "soil" in tests/plateaus.py changes by the fraction 2.3e-11 with half this value, by 1.0e-11 with twice
+this value, and by 3.0e-02 with finer cells.
 """
 
 
@@ -53,22 +53,22 @@ class DruckerPrager(Frictional):
     cohesion
         Cohesion c_0, Pa, >= 0.  If it is zero, points without mean pressure have no stiffness.
     hardening
-        Linear hardening modulus H, Pa, >= 0: c = c_0 + H kappa.  kappa is the accumulated plastic strain (work
-        conjugate to c, if flow is associated).
+        Linear hardening modulus H, Pa, >= 0: c = c_0 + H kappa, with the accumulated plastic strain kappa.  In
+        associated flow, kappa is work conjugate to c.
     match
-        Stress states in which the cone coincides with Mohr and Coulomb's yield surface: "plane strain" (equal collapse
-        load, exact for associated flow), triaxial "compression" (outer cone) or triaxial "extension" (inner cone).  In
-        axisymmetry no cone coincides in all stress states.  A circular footing therefore bears 10 % less on von Mises's
-        soil than on Tresca's.
+        Stress states in which the cone coincides with Mohr and Coulomb's yield surface.  "plane strain" gives the same
+        collapse load in plane strain, exactly for associated flow.  "compression" is the outer cone of triaxial
+        compression, and "extension" is the inner cone of triaxial extension.  In axisymmetry no cone coincides in all
+        stress states: a circular footing bears 10 % less on von Mises's soil than on Tresca's.
 
-    Other parameters: see `Skeleton`.  All parameters are passed by name.  State variables in `points.data`: `plastic`
+    Other parameters: see `Skeleton`.  All parameters are passed by name.  The state variable `plastic` in `points.data`
     is the inverse plastic metric C_p^-1 (3, 3), and `hardened` is kappa.  Source: de Souza Neto, Peric and Owen (2008),
     8.3 and 14.6.
 
     Raises
     ------
     ValueError
-        A constant is out of its range or missing: friction, dilation and cohesion have no safe defaults.
+        A constant is out of its range or missing.  Friction, dilation and cohesion have no default values.
     """
 
     hardening: Field = 0.0
@@ -104,21 +104,21 @@ class DruckerPrager(Frictional):
 
     @staticmethod
     def kirchhoff(F, bulk, shear, eta, xi, eta_flow, cohesion, hardening, plastic, hardened):
-        """Return the Kirchhoff stress (3, 3), Pa, as UFL."""
+        """Return the Kirchhoff stress (3, 3), in Pa, as UFL."""
         trial = Trial(F, plastic)
         to = returned(trial, bulk, shear, eta, xi, eta_flow, cohesion, hardening, hardened)
         return stress(trial, to, shear)
 
     @staticmethod
     def update(F, bulk, shear, eta, xi, eta_flow, cohesion, hardening, plastic, hardened):
-        """Return the state at the end of the step: UFL by name."""
+        """Return the state at the end of the step as UFL, by name."""
         trial = Trial(F, plastic)
         to = returned(trial, bulk, shear, eta, xi, eta_flow, cohesion, hardening, hardened)
         return {"plastic": metric(trial, to, bulk, plastic), "hardened": hardened + to["hardened"]}
 
 
 def stress(trial: Trial, to: dict, shear):
-    """Return the Kirchhoff stress (3, 3), Pa, from the result of `returned`."""
+    """Return the Kirchhoff stress (3, 3), in Pa, from the result of `returned`."""
     return to["p"] * ufl.Identity(3) + 2 * shear * to["ratio"] * trial.deviatoric
 
 
@@ -132,15 +132,17 @@ def metric(trial: Trial, to: dict, bulk, plastic):
 
 
 def returned(trial: Trial, bulk, shear, eta, xi, eta_flow, cohesion, hardening, hardened, drag=0.0) -> dict:
-    """Return the stress and the hardening after the return to the yield surface; drag: viscosity / time step, Pa.
+    """Return the stress and the hardening after the return to the yield surface.
+
+    drag: viscosity divided by the time step, in Pa.
 
     Returns
     -------
-    p: mean stress, Pa, > 0 in tension.
-    ratio: final deviatoric stress divided by the trial one.
+    p: mean stress, in Pa, tension positive.
+    ratio: final deviatoric stress divided by the trial deviatoric stress.
     hardened: increment of the accumulated plastic strain.
     yields: whether the trial stress is outside the yield surface.
-    apex: 1 if the stress returns to the apex, else 0.
+    apex: 1 if the stress returns to the apex, and 0 otherwise.
     """
     p = bulk * trial.volumetric
     q = shear * ufl.sqrt(2 * ufl.inner(trial.deviatoric, trial.deviatoric) + LEAST)  # sqrt(J_2)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Evaluation of laws: stresses and new state at material points, and conductivities in pieces of particle domains."""
+"""Stresses and new state at material points, and conductivities in pieces of particle domains."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from ufl.algorithms.apply_derivatives import apply_derivatives
 from mpm_dolfinx.base.errors import NotConverged
 from mpm_dolfinx.base.tolerances import NEAR
 from mpm_dolfinx.forms.axes import block
-from mpm_dolfinx.forms.point_forms import FormPoints, PointData, PointExpression
+from mpm_dolfinx.forms.point_forms import NONE, FormPoints, PointData, PointExpression
 from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.materials.local_unknowns import LocalUnknowns
 from mpm_dolfinx.materials.skeleton import BY_SCENE, Skeleton
@@ -29,7 +29,7 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 
 
 class LawAtPoints:
-    """Evaluation of a law at its material points.
+    """A law at its material points.
 
     Parameters
     ----------
@@ -40,7 +40,7 @@ class LawAtPoints:
     shapes
         Shape of each parameter and state variable of the law.
     stretches
-        Number of rows of the law's deformation gradients, 2 or 3; by default `grid.stretches`.
+        Number of rows, 2 or 3, of the deformation gradients that the law receives; by default `grid.stretches`.
     cell_size
         Cell size passed to the law, m; by default the mean edge length of the cell that contains the point.
     """
@@ -85,16 +85,19 @@ class LawAtPoints:
         own = self._local.known if self._local is not None else {}
         return {**self._given, **own}
 
-    def _solve(self, data: PointData, dt: float) -> None:
-        """Set the time since the start of the step, s, and solve for the local unknowns."""
+    def _evaluate(self, expression: PointExpression, data: PointData, dt: float = 0.0) -> NDArray[np.float64]:
+        """Return the values of an expression at the points, after a solve for local unknowns."""
         self._by_scene["dt"].value = dt
-        if self._local is not None:
-            self._local.update(data, derive=False)
+        given = NONE if self._local is None else self._local.solve(data, derive=False)
+        return expression.evaluate(data, live=expression.live(data, given))
 
     def data(
         self, points: MaterialPoints, rows: NDArray[np.int64], values: dict[str, NDArray[np.float64]]
     ) -> PointData:
-        """Return form data at the points `rows`; values: F, parameters and state (n, ...) of all points, by name."""
+        """Return form data at the points `rows`.
+
+        values: F, parameters and state (n, ...) of all points, by name.
+        """
         x = points.x[rows]
         cells = self.grid.locals[self.grid.number(self.grid.index_from_base(x))]
         inputs = {name: values[name][rows] for name in ("F", *self._shapes)}
@@ -107,20 +110,19 @@ class LawAtPoints:
         return PointExpression(self.law.first_piola(F, self._values) * F.T / ufl.det(F), self.points)
 
     def stress(self, data: PointData, dt: float = 0.0) -> NDArray[np.float64]:
-        """Return the effective Cauchy stress (n, d, d), Pa; dt: time since the last update of the state, s."""
-        stress = self._stress
-        self._solve(data, dt)
-        return stress.evaluate(data)
+        """Return the effective Cauchy stress (n, d, d), in Pa.
+
+        dt: time since the last update of the state, in s.
+        """
+        return self._evaluate(self._stress, data, dt)
 
     @cached_property
     def _energy(self) -> PointExpression:
         return PointExpression(expression(self.law.energy, [()], "F", F=self._F, **self._values), self.points)
 
     def energy(self, data: PointData) -> NDArray[np.float64]:
-        """Return the stored energy (n,) per reference volume, Pa, of a law with an energy."""
-        energy = self._energy
-        self._solve(data, 0.0)
-        return energy.evaluate(data)
+        """Return the stored energy (n,) per reference volume, in Pa, of a law with an energy."""
+        return self._evaluate(self._energy, data)
 
     @cached_property
     def _out_of_plane(self) -> PointExpression | None:
@@ -128,17 +130,17 @@ class LawAtPoints:
         return None if across is None else PointExpression(across, self.points)
 
     def stress_3d(self, data: PointData) -> NDArray[np.float64]:
-        """Return the effective Cauchy stress (n, 3, 3), Pa.  It is nan out of plane if the law does not define it."""
+        """Return the effective Cauchy stress (n, 3, 3), in Pa, with nan for undefined out-of-plane stresses."""
         if self._stretches == 3:
             return self.stress(data)
         out = np.zeros((len(data.cells), 3, 3))
         out[:, :2, :2], across = self.stress(data), self._out_of_plane
-        out[:, 2, 2] = np.nan if across is None else across.evaluate(data)
+        out[:, 2, 2] = np.nan if across is None else self._evaluate(across, data)
         return out
 
     @cached_property
     def _update(self) -> tuple[PointExpression, dict[str, tuple[int, ...]]]:
-        """Expression of all components of the new state as one vector, and the shapes of the state variables."""
+        """Expression of the new state as one vector, and the shapes of the state variables."""
         what, shapes = f"{self.law.__name__}.update", {name: np.shape(value) for name, value in self.law.state.items()}
         new = named(what, call(self.law.update, F=self._F, **self._values), shapes, some=True)
         parts = [f[i] if i else f for f in new.values() for i in np.ndindex(f.ufl_shape)]
@@ -146,12 +148,11 @@ class LawAtPoints:
             return PointExpression(ufl.as_vector(parts), self.points), {name: shapes[name] for name in new}
 
     def new_state(self, data: PointData, dt: float) -> list[tuple[str, NDArray[np.float64]]]:
-        """Return name and values (n, ...) of each updated state variable.  data contain F after a step of dt, s."""
+        """Return names and values of the updated state variables after a step of length dt, in s."""
         if self.law.update is None:
             return []
         expression, shapes = self._update
-        self._solve(data, dt)
-        values = expression.evaluate(data)
+        values = self._evaluate(expression, data, dt)
         out = []
         start = 0
         for name, shape in shapes.items():
@@ -162,9 +163,11 @@ class LawAtPoints:
 
 
 def knows_space(grid: Grid, m: Skeleton) -> bool:
-    """Return whether a material's law accepts F (3, 3) in plane strain; some user-defined laws accept F (2, 2) only.
+    """Return whether a material's law accepts F (3, 3) in plane strain.
 
-    m: material with constants as arrays for one point.  The result is True for laws with local unknowns.
+    Some user-defined laws accept F (2, 2) only.  The result is True for laws with local unknowns.
+
+    m: material with constants as arrays for one point.
     """
     law = type(m)
     function, shape = (law.energy, ()) if law.kirchhoff is None else (law.kirchhoff, (3, 3))
@@ -189,9 +192,9 @@ def knows_space(grid: Grid, m: Skeleton) -> bool:
 def by_scene(
     grid: Grid, cell_size: float | None = None, law: type[Skeleton] | None = None, points: FormPoints | None = None
 ) -> dict[str, Any]:
-    """Return the arguments `BY_SCENE` of laws as UFL: the time, which the caller sets, and the cell size.
+    """Return the time and the cell size as UFL, the arguments `BY_SCENE` of laws.
 
-    points: integration points of the law.  On a grid with several cell sizes, each point stores the size of its cell.
+    points: integration points of the law.  If cells have several sizes, each point stores the size of its cell.
     """
     if points is not None and not grid.even and cell_size is None and "cell_size" in law.by_scene:
         sizes = points.follow("cell_size", (), lambda data: grid.volumes(data.cells)[:, None] ** (1 / grid.dim))
@@ -201,31 +204,31 @@ def by_scene(
 
 
 def mean_size(grid: Grid) -> float:
-    """Return the edge length, m, of a square or cube with the volume of the largest cell."""
+    """Return the edge length, in m, of the square or cube as large as the largest cell."""
     h = grid.h if grid.even else [w.max() for w in grid.widths]
     return float(np.prod(h) ** (1 / grid.dim))
 
 
 MOST = 100.0
-"""Upper limit of the softness, because softness is infinite in perfectly plastic flow.  Halving
-this value changes the result of scene "soil" in tests/plateaus.py by 4.0e-03 (relative), doubling it by 5.0e-03, and
-finer cells by 3.0e-02.
+"""Upper limit of the softness, because softness is infinite in perfectly plastic flow.
+
+The result of scene "soil" in tests/plateaus.py changes by the fraction 4.0e-03 with half this value, by 5.0e-03 with
+twice this value, and by 3.0e-02 with finer cells.
 """
 
 
 class SoftnessAtPoints:
-    """Softness of yielding points: ratio of elastic to tangent shear modulus along the strain of the last step.
+    """Softness of yielding points: elastic shear modulus divided by tangent shear modulus.
 
-    Volume strains that alternate from cell to cell grow with the strain.  They cause alternating pressures.  The
-    pressures are these volume strains divided by the damping coefficient tau, 1/Pa.  In plastic flow the strain grows
-    at constant stress.  tau must then grow with the softness, else the alternating pressures reach the soil's strength.
+    In plastic flow, volume strains that alternate from cell to cell grow at constant stress.  They cause alternating
+    pressures, equal to the volume strains divided by the damping coefficient tau.  tau must therefore grow with the
+    softness, or the alternating pressures reach the strength of the soil.
 
-    The strain of a step is e = dev sym dF F^-1.  With the Kirchhoff stress T(s) at F - (1 - s) dF, the tangent shear
-    modulus is G_t = (dT/ds) : e / (2 e : e) at s = 1.  The forms use the softness of the previous step.  The softness
-    of the current iterate would prevent convergence of Newton's method, or make the result depend on the iterates.
-
-    At rest the strain is a rounding error with a random direction.  G_t is therefore a weighted mean.  The modulus of
-    the step has the weight e : e, and the old modulus has the weight `NEAR`^4.  A step at rest thus keeps the softness.
+    The strain of a step is e = dev sym dF F^-1, with the change dF of F.  With the Kirchhoff stress T(s) at
+    F - (1 - s) dF, the tangent shear modulus is G_t = (dT/ds) : e / (2 e : e) at s = 1.  At rest the direction of e is
+    random.  G_t is therefore a weighted mean of the modulus of the step, with the weight e : e, and of the old modulus,
+    with the weight `NEAR`^4.  The forms use the softness of the previous step, because Newton's method may not converge
+    with the softness of the current iterate.
 
     grid, law, shapes, stretches: see `LawAtPoints`.
     """
@@ -250,19 +253,19 @@ class SoftnessAtPoints:
         self._along = PointExpression(ufl.as_vector([ufl.inner(e, e), ufl.inner(ufl.diff(tau, s), e)]), points)
 
     def __call__(self, at: PointData, dF: NDArray, shear: NDArray, dt: float, before: NDArray) -> NDArray[np.float64]:
-        """Return the softness (n,), in [1, `MOST`], of points whose data `at` contain F, parameters and state.
+        """Return the softness of points, in [1, `MOST`].
 
-        dF (n, d, d): change of F in a step of dt, s.
-        shear (n,), Pa: elastic shear modulus.
+        at: data with F, parameters and state of n points.
+        dF (n, d, d): change of F in a step of dt, in s.
+        shear (n,), in Pa: elastic shear modulus.
         before (n,): softness before the step.
         """
         self._by_scene["dt"].value = dt
         fields = {name: at[name] for name in ("F", *self._shapes)}
         dF = dF[:, : self._stretches, : self._stretches]
         data = PointData(self._points, at.places, at.volume, {"dF": dF, **fields})
-        if self._local is not None:
-            self._local.update(data)
-        weight, work = self._along.evaluate(data).T
+        given = NONE if self._local is None else self._local.solve(data)
+        weight, work = self._along.evaluate(data, live=self._along.live(data, given)).T
         elastic = 2 * shear * (weight + NEAR**4)
         return np.clip(elastic / np.maximum(work + 2 * shear * NEAR**4 / before, elastic / MOST), 1.0, MOST)
 
@@ -316,12 +319,16 @@ class ConductivityAtPieces:
         )
 
     def evaluate(self, data: PointData, material: NDArray[np.int32], begins: bool) -> NDArray[np.float64]:
-        """Return the conductivities (n,), m/s, of pieces at the present displacement; material (n,): their materials.
+        """Return the conductivities of pieces, in m/s, at the present displacement.
+
+        material (n,): index of the material of each piece.
 
         Raises
         ------
-        ValueError, NotConverged
-            A conductivity is negative or not finite.  This is a ValueError at the start of a step, else NotConverged.
+        ValueError
+            At the start of a step, a conductivity is negative or not finite.
+        NotConverged
+            Later in a step, a conductivity is negative or not finite.
         """
         out = data["conductivity"][:, 0].copy()
         for law, k in self._laws.items():
@@ -337,7 +344,7 @@ class ConductivityAtPieces:
 
 
 def sampled(law: Callable) -> list[float | None]:
-    """Return the conductivities of a law in three deformation states, as a fingerprint of the law."""
+    """Return numbers that identify a law: its conductivities in three states of deformation."""
     out = []
     for J in (0.75, 1.0, 1.25):
         F = ufl.as_matrix([[J, J / 8], [0.0, 1.0]])

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Materials of a scene at its material points.  Parameters may depend on position, and materials may differ in law."""
+"""Materials of a scene at its material points.
+
+Parameters may depend on position, and materials may have different laws.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +29,7 @@ from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.materials.evaluate import LawAtPoints, SoftnessAtPoints, knows_space, mean_size, sampled
 from mpm_dolfinx.materials.prestressed import AT_REST, stressed
 from mpm_dolfinx.materials.skeleton import BY_SCENE, DRIED, Fluid, Skeleton, constants_of
-from mpm_dolfinx.parallel.exchange import Exchange, everywhere, first, over_all
+from mpm_dolfinx.parallel.exchange import Exchange, first, over_all, together
 from mpm_dolfinx.points.material_points import ACROSS, MaterialPoints
 from mpm_dolfinx.pores.retention import Retentions, SaturationAt, scale_of
 from mpm_dolfinx.pores.retention import sampled as drained
@@ -35,22 +38,22 @@ RESERVED = frozenset(
     "F dF softness owed due storage storage_at_one density position displacement porosity0 gradient drainage retention "
     "pores".split()
 )
-"""Reserved names of quadrature point data, not available for parameters and state."""
+"""Names of data at quadrature points that parameters and state variables cannot have."""
 WHAT_IS_NAMED = "parameters, state and unknowns"
 EVOLVED = 1e-3
-"""Soil has yielded if a state variable differs from its initial value by more than this number.  Halving this value
-changes the result of scene "soil" in tests/plateaus.py by 6.6e-05 (relative), doubling it by 1.4e-04, and finer cells
-by 3.0e-02.
+"""Soil has yielded if a state variable differs from its initial value by more than this number.  The result of scene
+"soil" in tests/plateaus.py changes by the fraction 6.6e-05 with half this value, by 1.4e-04 with twice this value, and
+by 3.0e-02 with finer cells.
 """
 STIFFEST = 100.0
 """Upper limit of (alpha^2 / S) / (lambda + 2G), the ratio of the pore fluid's stiffness to the skeleton's stiffness.  S
-is the storage coefficient.  The limit keeps rounding errors small.  Halving this value changes the result of scene
-"soil" in tests/plateaus.py by 1.2e-07 (relative), doubling it by 1.0e-07, and finer cells by 3.0e-02.
+is the storage coefficient.  The limit keeps rounding errors small.  The result of scene "soil" in tests/plateaus.py
+changes by the fraction 1.2e-07 with half this value, by 1.0e-07 with twice this value, and by 3.0e-02 with finer cells.
 """
 
 
 class SceneMaterials:
-    """Materials of a scene; values that vary from point to point are stored in `points.data`.
+    """Materials of a scene.  Values that vary from point to point are stored in `points.data`.
 
     Parameters
     ----------
@@ -61,8 +64,7 @@ class SceneMaterials:
     bodies
         All bodies.
     points
-        Material points of this process, as seeded.  Each process evaluates fields at the reference positions of its
-        points.
+        Material points of this process, as seeded.  Fields are evaluated at their reference positions.
     fluid
         Pore fluid, if there is one.
     prestressed
@@ -86,7 +88,7 @@ class SceneMaterials:
         places = {i: _places(bodies, i, points.id[own]) for i, own in rows.items()}
 
         def at_points() -> list[tuple[Skeleton, Skeleton]]:
-            """Return each material at its points of this process, and at its first point of all processes."""
+            """Return each material at its points on this process, and at its first point on all processes."""
             return [_evaluated(grid, materials[i], places[i], points.id[rows[i]]) for i in self._used]
 
         evaluated, at_first = zip(*at_points(), strict=True)
@@ -130,17 +132,17 @@ class SceneMaterials:
             for i, m in zip(self._used, used, strict=True)
             if m.conductivity_law
         }
-        """Checksums of fields, and sampled values of laws of flow.  They show whether a checkpoint fits the scene."""
+        """Checksums of fields, and sampled values of laws of flow, which show whether a checkpoint fits the scene."""
         for i, m in zip(self._used, used, strict=True):
             if m.retention is not None:
                 self.checksums[f"retention of material {i}"] = drained(m.retention)
         self.check_cells()
         self.shapes: dict[str, tuple[int, ...]] = {}
-        """Shape of each parameter and of each state variable."""
+        """Shape of each parameter and each state variable."""
         for i, m in zip(self._used, evaluated, strict=True):
             values = {name: getattr(m, name) for name in self._fields[i]}
             count, own = max(1, len(rows[i])), rows[i]
-            everywhere(grid.comm, partial(self._add_shapes, _expanded(m, values, count), seeded, len(points)))
+            together(grid.comm, partial(self._add_shapes, _expanded(m, values, count), seeded, len(points)))
             for name, value in values.items():
                 filled = np.zeros((len(points), *value.shape[1:]))
                 filled[own] = value[: len(own)]
@@ -160,32 +162,32 @@ class SceneMaterials:
                     shapes = {name: self.shapes[name] for name in _takes(law)}
                     self._softness[number] = SoftnessAtPoints(grid, law, shapes, self._stretches_of(law))
         self.seeded = replace(points, data=seeded)
-        """The material points with their initial data: the state, and parameters that are functions of position."""
+        """The material points with their initial data: state, and parameters that are functions of position."""
         self._at_points = [
             LawAtPoints(grid, law, {name: self.shapes[name] for name in _takes(law)}, self._stretches_of(law))
             for law in self.laws
         ]
 
     def seeds_no_more(self) -> None:
-        """Delete the seeded points when all bodies are in the scene.  Names and shapes of the points' data remain."""
+        """Delete the seeded points when all bodies are in the scene."""
         self.seeded = self.seeded.of(np.empty(0, dtype=np.int64))
 
     def check_cells(self) -> None:
-        """Raise ValueError if cells are too large for a softening law.  Called after the cells are created or moved."""
+        """Raise ValueError if cells are too large for a softening law."""
         size = mean_size(self.grid)
-        everywhere(self.grid.comm, lambda: [m.check_cells(size) for m in self._evaluated])
+        together(self.grid.comm, lambda: [m.check_cells(size) for m in self._evaluated])
 
     @property
     def across(self) -> bool:
-        """Whether laws in plane strain use an out-of-plane stretch, which F-bar determines."""
+        """Whether laws in plane strain use an out-of-plane stretch from F-bar."""
         return self.stretches > self.grid.stretches
 
     def _stretches_of(self, law: type[Skeleton]) -> int:
-        """Return the number of rows of the deformation gradients that a law receives, 2 or 3."""
+        """Return the number of rows of the deformation gradients that a law receives."""
         return self.stretches if (law, True, True) in self._parts else self.grid.stretches
 
     def _add_shapes(self, m: Skeleton, seeded: dict[str, NDArray[np.float64]], count: int) -> None:
-        """Add the shapes of a law's parameters and state, and initialise the state of `count` points."""
+        """Add the shapes of a law's parameters and state, and initialise the state."""
         law = type(m)
         if (law.energy is None) == (law.kirchhoff is None):
             which = "neither" if law.energy is None else "both"
@@ -225,7 +227,7 @@ class SceneMaterials:
             raise ValueError(f"{law.__name__}: {name} has shape {shape}, in another law {other}; must be equal")
 
     def parts(self, pieces: FormPoints, common: Sequence[str]) -> list[tuple[type[Skeleton], FormPoints, bool]]:
-        """Return (law, integration points, whether Q1 cells would lock) for each part of the scene's points.
+        """Return the parts of the points: law, integration points, and whether Q1 cells would lock.
 
         A part contains the points of one law.  If only some materials of a law are nearly incompressible, the law has
         two parts.  A single part uses `pieces`.  Several parts have their own integration points, with the fields
@@ -242,30 +244,30 @@ class SceneMaterials:
         return [(law, own, locks) for (law, locks, _), own in zip(self._parts, points, strict=True)]
 
     def part_of(self, points: MaterialPoints) -> NDArray[np.int64]:
-        """Return the index (n,) of the part that contains each point, see `parts`."""
+        """Return the index of the part that contains each point, see `parts`."""
         return self._part[points.material]
 
     def law_of(self, points: MaterialPoints) -> NDArray[np.int64]:
-        """Return the index (n,) in `laws` of the law of each point."""
+        """Return the index of the law of each point."""
         return np.array([self.laws.index(law) for law, *_ in self._parts])[self.part_of(points)]
 
     def locking(self, points: MaterialPoints) -> NDArray[np.bool_]:
-        """Return for each point (n,) whether Q1 cells with its material would lock."""
+        """Return for each point whether Q1 cells with its material would lock."""
         return np.array([locks for _, locks, _ in self._parts])[self.part_of(points)]
 
     def stretched(self, points: MaterialPoints) -> NDArray[np.bool_]:
-        """Return for each point (n,) whether its law uses the out-of-plane stretch of F-bar."""
+        """Return for each point whether its law uses the out-of-plane stretch of F-bar."""
         return self.across & self.locking(points) & self.knows_across(points)
 
     def knows_across(self, points: MaterialPoints) -> NDArray[np.bool_]:
-        """Return for each point (n,) whether its law accepts an out-of-plane stretch."""
+        """Return for each point whether its law accepts an out-of-plane stretch."""
         return np.array([known for *_, known in self._parts])[self.part_of(points)]
 
     def conducting(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return two numbers (n, 2) for each point: its conductivity, m/s, and the index of its conductivity law.
+        """Return the conductivity, in m/s, and a number for the law of conductivity at each point.
 
-        Points with equal pairs of numbers have equal conductivities.  If the law depends on position, each point has
-        its own index.  The fractional part of the index denotes the retention curve.
+        The result has the shape (n, 2).  Points with equal rows conduct equally.  If the conductivity law depends on
+        position, each point has its own number.
         """
         laws, known = [m.conductivity_law for m in self.materials], self.conductivity_laws
         law = np.array([known.index(law) if law in known else -1 for law in laws])[points.material]
@@ -277,13 +279,13 @@ class SceneMaterials:
         return np.stack([conductivity, number], axis=1)
 
     def retention_of(self, points: MaterialPoints) -> NDArray[np.int64]:
-        """Return the index (n,), from 1, of the retention curve of each point; 0 if the pores stay saturated."""
+        """Return the number of the retention curve of each point, or 0 if its pores stay saturated."""
         return np.array([self.retentions.number(m.retention) for m in self.materials])[points.material]
 
     def saturation(
         self, points: MaterialPoints, p: NDArray[np.float64], of: NDArray[np.int64] | slice = slice(None)
     ) -> tuple[NDArray[np.float64], ...]:
-        """Return saturation, dS/dp (1/Pa), chi and relative permeability, each (k,), at p (k,), Pa, of points `of`."""
+        """Return saturation, dS/dp, chi and relative permeability at pressures p, in Pa, of the points `of`."""
         return self.saturations(self.retention_rows(points)[of], p)
 
     @cached_property
@@ -298,28 +300,30 @@ class SceneMaterials:
         return SaturationAt(self.grid, self.retentions)
 
     def saturations(self, rows: NDArray[np.float64], p: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
-        """Return the results of `saturation` at pressures p (k,), Pa.  rows (k, width): the field `retention`."""
+        """Return the results of `saturation` at pressures p, in Pa, for rows of the field `retention`."""
         return self._saturation(rows, p)
 
     def retention_scale(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the suction (n,), Pa, at which the pores of each point drain; infinite if they stay saturated."""
+        """Return the suction, in Pa, at which the pores of each point drain."""
         scales = [np.inf if m.retention is None else scale_of(m.retention) for m in self.materials]
         return np.array(scales)[points.material]
 
     def pore_stress(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return alpha chi p (n,), Pa, at the points: the effective stress minus the total stress."""
+        """Return alpha chi p at the points, in Pa: the effective stress minus the total stress."""
         pressure = self.table(points, lambda m: m.biot) * points.pressure
         return pressure if self.retentions is None else pressure * self.saturation(points, points.pressure)[2]
 
     def retention_rows(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the field `retention` (n, width) of the points, see `Retentions`."""
+        """Return the field `retention` of the points, see `Retentions`."""
         return np.stack([self.retentions.row(m.retention) for m in self.materials])[points.material]
 
     def table(self, points: MaterialPoints, value: Callable[..., float], *columns: NDArray) -> NDArray[np.float64]:
-        """Evaluate the function `value(material, *columns)` at the points and return the results (n, ...).
+        """Return the values (n, ...) of a function of the material at the points.
 
-        `columns` are further point data (n,), passed to the function.  The function returns values (n, ...) or one
-        number.  Without `columns`, for a uniform material, it may also return one value (...) for all points.
+        The function is called as `value(material, *columns)` and returns values (n, ...) or one number.  Without
+        `columns`, for a uniform material, it may also return one value (...) for all points.
+
+        columns (n,): further point data.
         """
         each, shapes = [], set()
         for i in self._used:
@@ -334,7 +338,7 @@ class SceneMaterials:
         return out
 
     def changed(self, what: str, points: MaterialPoints, named: Collection[str]) -> MaterialPoints:
-        """Return the points after a change of the fields `named`.  Fields that depend on these fields are updated.
+        """Return the points after a change of named fields and of all fields that depend on them.
 
         Raises
         ------
@@ -356,14 +360,14 @@ class SceneMaterials:
         return replace(points, data=data)
 
     def _at(self, points: MaterialPoints, i: int, rows: NDArray[np.int64]) -> Skeleton:
-        """Return a material with its constants as arrays over points `rows`.  Uniform materials do not change."""
+        """Return a material with its constants as arrays over the points `rows`."""
         if not self._fields[i]:
             return self.materials[i]
         values = {name: points.data[name][rows] for name in self._fields[i]}
         return _expanded(self.materials[i], values, len(rows))
 
     def parameters(self, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
-        """Return each parameter (n, ...) at the points.  A parameter is zero at points whose law does not have it."""
+        """Return each parameter at the points, with zeros at points whose law does not have the parameter."""
         out = {name: np.zeros((len(points), *s)) for name, s in self.shapes.items() if name not in self.state_names}
         for i in self._used:
             rows = (points.material == i).nonzero()[0]
@@ -393,15 +397,15 @@ class SceneMaterials:
         return list(dict.fromkeys(name for law in self.laws for name in law.state))
 
     def porosity(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the porosity n = 1 - (1 - n_0) / J at the points (n,)."""
+        """Return the porosity n = 1 - (1 - n_0) / J of the points."""
         return 1 - (1 - self.table(points, lambda m: m.porosity)) / points.J
 
     def storage(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the storage coefficient at the points (n,), 1/Pa, of a scene with fluid."""
+        """Return the storage coefficient of the points, in 1/Pa, in a scene with fluid."""
         return self.table(points, lambda m, n: m.storage(self.fluid.bulk, n), self.porosity(points))
 
     def storage_at_one(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the storage coefficient (n,), 1/Pa, for a porosity of 1."""
+        """Return the storage coefficient of the points, in 1/Pa, for a porosity of 1."""
         return self.table(points, lambda m: m.storage(self.fluid.bulk, 1.0))
 
     @property
@@ -410,7 +414,7 @@ class SceneMaterials:
         return any(getattr(law, "specific_yield", 0.0) > 0 for law in self.conductivity_laws)
 
     def drainage(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return an array (n, 2): specific yield of the points, and suction, Pa, at which drainable pores are empty."""
+        """Return the specific yield, and the suction, in Pa, at which drainable pores are empty."""
         names = {"specific_yield": 0.0, "suction": 1.0}
         return np.stack(
             [self.table(points, lambda m, k=k, v=v: getattr(m.conductivity_law, k, v)) for k, v in names.items()],
@@ -418,12 +422,12 @@ class SceneMaterials:
         )
 
     def density(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the density (n,), kg/m^3, of the points' soil with saturated pores."""
+        """Return the density of the points' soil with saturated pores, in kg/m^3."""
         n, wet = self.porosity(points), self.fluid.density if self.fluid else 0.0
         return (1 - n) * self.table(points, lambda m: m.grain_density) + n * wet
 
     def present_density(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the density (n,), kg/m^3, of the points' soil with its present pore water."""
+        """Return the density of the points' soil with its present pore water, in kg/m^3."""
         density = self.density(points)
         if self.retentions is None:
             return density
@@ -431,7 +435,7 @@ class SceneMaterials:
         return density - empty * self.porosity(points) * self.fluid.density
 
     def confined_modulus(self, points: MaterialPoints, most: float = STIFFEST) -> NDArray[np.float64]:
-        """Return the undrained confined modulus (n,), Pa: lambda + 2G + alpha^2 / S.
+        """Return the undrained confined modulus lambda + 2G + alpha^2 / S of the points, in Pa.
 
         alpha^2 / S is limited to `most` times (lambda + 2G).
         """
@@ -442,11 +446,11 @@ class SceneMaterials:
         return modulus + np.minimum(fluid, most * modulus)
 
     def state(self, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
-        """Return each state variable at the points (n, ...)."""
+        """Return the values of each state variable at the points."""
         return {name: points.data[name] for name in self.state_names}
 
     def evolved(self, points: MaterialPoints) -> NDArray[np.bool_]:
-        """Return for each point (n,) whether a state variable, except suction, has changed by more than `EVOLVED`."""
+        """Return for each point whether a state variable, except suction, has changed by more than `EVOLVED`."""
         out, law_of = np.zeros(len(points), dtype=bool), self.law_of(points)
         for number, law in enumerate(self.laws):
             rows = (law_of == number).nonzero()[0]
@@ -460,15 +464,15 @@ class SceneMaterials:
 
     @property
     def some_elastic(self) -> bool:
-        """Whether any law has no state variables, and is therefore elastic."""
+        """Whether any law is elastic, which means that it has no state variables."""
         return any(not law.state for law in self.laws)
 
     def elastic(self, points: MaterialPoints) -> NDArray[np.bool_]:
-        """Return for each point (n,) whether its law has no state variables, and is therefore elastic."""
+        """Return for each point whether its law is elastic, which means that it has no state variables."""
         return np.array([not m.state for m in self.materials])[points.material]
 
     def soil_rows(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return constants (n, c) that are equal at points of one soil, even if their initial stresses differ."""
+        """Return the index and the varying constants of the material of each point, without the initial stress."""
         fields = [points.data[name] for name in self.field_names if name != "seeded_stretch"]
         fields = [rows.reshape(len(rows), int(np.prod(rows.shape[1:]))) for rows in fields]
         return np.column_stack([points.material, *fields])
@@ -480,13 +484,13 @@ class SceneMaterials:
         return any(m.dilates and (callable(m.dilation) or np.any(m.dilation)) for m in used)
 
     def dilating(self, points: MaterialPoints) -> NDArray[np.bool_]:
-        """Return for each point (n,) whether its soil has yielded with dilatant flow."""
+        """Return for each point whether its soil has yielded with dilatant flow."""
         return self.evolved(points) & (self.table(points, lambda m: m.dilation if m.dilates else 0.0) > 0)
 
     def effective_stress(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the effective Cauchy stress (n, d, d), Pa, at the points; in axisymmetry (n, 3, 3).
+        """Return the effective Cauchy stress (n, d, d), in Pa, at the points; in axisymmetry (n, 3, 3).
 
-        All processes must call it.
+        All processes must call this method.
         """
         out, d = np.zeros_like(points.F), self.grid.stretches
         for law, rows, data in self._placed(points):
@@ -494,17 +498,17 @@ class SceneMaterials:
         return out
 
     def effective_stress_3d(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the effective Cauchy stress (n, 3, 3), Pa, at the points; all processes must call it."""
+        """Return the effective Cauchy stress (n, 3, 3), in Pa, at the points.  All processes must call this method."""
         out = np.zeros((len(points), 3, 3))
         for law, rows, data in self._placed(points):
             out[rows] = law.stress_3d(data)
         return out
 
     def stored(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the elastic energy of the skeleton (n,) per reference volume, Pa; all processes must call it.
+        """Return the elastic energy of the skeleton per reference volume, in Pa, at the points.
 
-        Laws with `elastic_hencky` but without an energy have Hencky's energy with constant moduli.  Other laws without
-        an energy have zero.
+        All processes must call this method.  Laws with `elastic_hencky` but without an energy have Hencky's energy with
+        constant moduli.  For other laws without an energy the result is zero.
         """
         out = np.zeros(len(points))
         bulk, shear = (self.table(points, lambda m, name=name: getattr(m, name)) for name in ("bulk", "shear"))
@@ -519,13 +523,16 @@ class SceneMaterials:
         return out
 
     def total_stress(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the total Cauchy stress, Pa, in the shape of `effective_stress`; all processes must call it."""
+        """Return the total Cauchy stress, in Pa, in the shape of `effective_stress`.  All processes must call it."""
         return self.effective_stress(points) - self.pore_stress(points)[:, None, None] * np.eye(self.grid.stretches)
 
     def updated_state(
         self, points: MaterialPoints, before: MaterialPoints, dt: float
     ) -> dict[str, NDArray[np.float64]]:
-        """Return the point data after a step of dt, s; points have the new F and the old state, before have the old F.
+        """Return the point data after a step of length dt, in s.
+
+        points: points with the new F and the old state.
+        before: points with the old F.
 
         Raises
         ------
@@ -557,7 +564,7 @@ class SceneMaterials:
         return out
 
     def _placed(self, points: MaterialPoints) -> list[tuple[LawAtPoints, NDArray[np.int64], PointData]]:
-        """Return for every law: the law, the indices of its points, and the form data of these points."""
+        """Return each law with the indices and the form data of its points."""
         number, values = self.law_of(points), {**self.parameters(points), **self.state(points)}
         values["F"] = points.F_of_laws
         rows = [(number == k).nonzero()[0] for k in range(len(self.laws))]
@@ -565,7 +572,7 @@ class SceneMaterials:
 
 
 def _known(name: str, value) -> NDArray[np.float64]:
-    """Return a parameter or state variable of a law as an array.  Infinity is allowed; NaN raises ValueError."""
+    """Return a parameter or state variable as an array, or raise ValueError for NaN."""
     out = numbers(name, value, None, allowed="numbers", test=np.isreal)
     if np.isnan(out).any():
         raise ValueError(f"{name} = nan, must be numbers")
@@ -582,7 +589,7 @@ def _takes(law: type[Skeleton]) -> list[str]:
 
 
 def _used(bodies: Sequence[Body], count: int) -> list[int]:
-    """Return the indices of the materials that bodies have, ascending; count: number of materials."""
+    """Return the indices of the materials that bodies have, in ascending order."""
     for body in bodies:
         if not 0 <= body.material < count:
             raise ValueError(f"body: material = {body.material!r}, must be an index of the {count} materials")
@@ -595,14 +602,10 @@ def _by_place(m: Skeleton) -> list[str]:
 
 
 def _evaluated(grid: Grid, m: Skeleton, X: NDArray[np.float64], ids: NDArray[np.int64]) -> tuple[Skeleton, Skeleton]:
-    """Return a material twice, with arrays of its constants: at this process's points, and at the first point of all.
+    """Return a material twice: at this process's points, and at the point with the lowest id on all processes.
 
-    The first point has the lowest id on all processes.  A process without points of the material uses the constants at
-    the first point in both.
-
-    X (n, d), m: reference positions of this process's points with the material.
+    X (n, d), in m: reference positions of this process's points with the material.
     ids (n,): ids of these points.
-
     """
     names = _by_place(m)
 
@@ -612,7 +615,7 @@ def _evaluated(grid: Grid, m: Skeleton, X: NDArray[np.float64], ids: NDArray[np.
             _check_local(made, m.at(X[::2]), names)
         return made
 
-    out = everywhere(grid.comm, at_points)
+    out = together(grid.comm, at_points)
     row = [(int(ids[0]), {name: getattr(out, name)[:1] for name in names})] if len(X) else []
     found = over_all(grid.comm, row) if names else []
     values = min(found, key=itemgetter(0))[1] if found else {}
@@ -621,7 +624,7 @@ def _evaluated(grid: Grid, m: Skeleton, X: NDArray[np.float64], ids: NDArray[np.
 
 
 def _check_local(all_points: Skeleton, half: Skeleton, names: Sequence[str]) -> None:
-    """Raise ValueError if the fields at every other point change when they are evaluated without the points between."""
+    """Raise ValueError if fields at points depend on other points."""
     for name in names:
         value, alone = getattr(all_points, name)[::2], getattr(half, name)
         if np.abs(value - alone).max() > SAME * np.abs(value).max():
@@ -630,7 +633,7 @@ def _check_local(all_points: Skeleton, half: Skeleton, names: Sequence[str]) -> 
 
 
 def _places(bodies: Sequence[Body], material: int, ids: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return the reference positions (n, d), in m, of the points with a material.  ids (n,): their ids, ascending."""
+    """Return the reference positions, in m, of the points with a material."""
     starts = np.cumsum([0, *map(len, bodies)])
     at = ids.searchsorted(starts)
     each = zip(bodies, starts[:-1], pairwise(at), strict=True)
@@ -639,14 +642,14 @@ def _places(bodies: Sequence[Body], material: int, ids: NDArray[np.int64]) -> ND
 
 
 def _ends(grid: Grid, values: Sequence) -> tuple[float, float]:
-    """Return the least and the largest number in some numbers and arrays, over all processes."""
+    """Return the least and the largest of some numbers and arrays, over all processes."""
     flat = np.concatenate([np.ravel(one) for one in values])
     least, most = over_all(grid.comm, np.array([flat.min(), -flat.max()]), MPI.MIN)
     return float(least), -float(most)
 
 
 def _checksum(grid: Grid, ids: NDArray[np.int64], rows: NDArray[np.float64], total: int) -> int:
-    """Return the checksum of all processes' rows (n, ...), in the order of ids (n,); total: number above all ids."""
+    """Return a checksum of the rows of all processes, in the order of their ids."""
     exchange, checksum = Exchange(grid.comm, (ids * grid.comm.size // total).astype(np.int32)), 0
     content = exchange.send(rows)[exchange.send(ids).argsort()].tobytes()
     for rank in range(grid.comm.size):
@@ -655,7 +658,7 @@ def _checksum(grid: Grid, ids: NDArray[np.int64], rows: NDArray[np.float64], tot
 
 
 def _expanded(m: Skeleton, values: dict[str, NDArray[np.float64]], n: int) -> Skeleton:
-    """Return a copy of a material.  Some fields have the values (n, ...); other constants are repeated n times."""
+    """Return a copy of a material with an array of n values for each constant."""
     out = copy(m)
     for name in constants_of(m):
         value = getattr(m, name)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Initial effective stresses, prescribed or computed from the overburden, and the corresponding elastic strains."""
+"""Initial effective stresses, prescribed or computed from the overburden, and the elastic strains that cause them."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from mpm_dolfinx.materials.fields import SceneMaterials
 from mpm_dolfinx.materials.prestressed import AT_REST
 from mpm_dolfinx.materials.skeleton import STANDARD_GRAVITY, Field
 from mpm_dolfinx.materials.trial import PLANE, SPACE
-from mpm_dolfinx.parallel.exchange import Exchange, everywhere, first, over_all
+from mpm_dolfinx.parallel.exchange import Exchange, first, over_all, together
 from mpm_dolfinx.points.material_points import MaterialPoints, unstretched
 
-EXACT, CLOSE = 1e-13, SAME  # errors relative to the largest initial stress: one ends Newton's method, one is accepted
+EXACT, CLOSE = 1e-13, SAME  # errors relative to the largest initial stress: the first ends Newton's method
 MOST = 30  # largest number of Newton iterations
 LARGEST = 0.2  # limit to the change of a strain component in one iteration
 
@@ -33,12 +33,12 @@ LARGEST = 0.2  # limit to the change of a strain component in one iteration
 class K0:
     """Initial effective stress of soil under its own weight, with the coefficient K0 of earth pressure at rest.
 
-    The vertical effective stress is the overburden of soil and fluid plus the surcharge, minus the pore stress alpha
-    chi p (Biot coefficient alpha, Bishop's chi, pore pressure p).  In saturated soil chi is 1.  The horizontal
-    effective stresses are K0 times the vertical one.  In axisymmetry these are the radial and the circumferential
-    stress.  The stresses are exact for level ground with level layers.  In other ground they are balanced, without
-    motion of the points.  If balancing changes a stress by more than 5 % of the largest initial stress, as on slopes, a
-    warning is given.
+    The vertical effective stress is the overburden of soil and fluid plus the surcharge, minus the pore stress
+    alpha chi p.  alpha is Biot's coefficient, chi is Bishop's coefficient, and p is the pore pressure.  The horizontal
+    effective stresses are K0 times the vertical effective stress.  In axisymmetry they are the radial and the
+    circumferential stress.  The stresses are exact for level ground with level layers.  In other ground the stresses
+    are balanced, without motion of the points.  A warning is given if balancing changes a stress by more than 5 % of
+    the largest initial stress, as on slopes.
 
     Parameters
     ----------
@@ -61,7 +61,7 @@ class K0:
         return numbers(f"K0: {name}", value, (), *shapes, **test)
 
     def values(self, name: str, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the ratio or surcharge at positions x (n, d), m: one value, or an array (n,)."""
+        """Return the ratio or the surcharge at positions x (n, d), in m."""
         value = getattr(self, name)
         given = at_places(f"K0: {name}", "one value per position", value, "x", x) if callable(value) else value
         return self._checked(name, given, (len(x),))
@@ -73,7 +73,7 @@ InitialStress = K0 | Callable[[NDArray[np.float64]], ArrayLike]
 def hydrostatic(level: float, unit_weight: float | None = None) -> Callable[[NDArray], NDArray]:
     """Return the hydrostatic pressure below a phreatic level as a function of positions x (n, d).
 
-    Use it as `pressure` of a `Simulation`.  Above the level the pressure is negative (suction).
+    The result can be the `pressure` of a `Simulation`.  Above the level the pressure is negative (suction).
 
     Parameters
     ----------
@@ -81,7 +81,7 @@ def hydrostatic(level: float, unit_weight: float | None = None) -> Callable[[NDA
         Height, m, along the last axis.
     unit_weight
         Unit weight of the fluid, N/m^3, > 0; by default that of the scene's fluid, or 9810 outside a scene.  A warning
-        is given if the value differs from that of the scene's fluid.
+        is given if the value differs from the unit weight of the scene's fluid.
     """
     numbers("hydrostatic: level", level)
     if unit_weight is not None:
@@ -92,11 +92,11 @@ def hydrostatic(level: float, unit_weight: float | None = None) -> Callable[[NDA
 
 @dataclass(frozen=True)
 class OfWater:
-    """A water pressure with a unit weight, N/m^3: by default the fluid's unit weight, or 9810 outside a scene."""
+    """A water pressure with a unit weight."""
 
     @property
     def unit_weight(self) -> float:
-        """Unit weight, N/m^3."""
+        """Unit weight, in N/m^3."""
         return 1000 * STANDARD_GRAVITY if self.given is None else self.given
 
 
@@ -108,12 +108,12 @@ class Hydrostatic(OfWater):
     given: float | None = None
 
     def __call__(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the pressures (n,), Pa, at positions x (n, d), m."""
+        """Return the pressures, in Pa, at positions x (n, d), in m."""
         return self.unit_weight * (self.level - x[:, -1])
 
 
 def by_body(given, bodies: Sequence[Body], later: Sequence[int]) -> dict[int, InitialStress]:
-    """Return the initial stress of each body.  A single initial stress applies to all bodies present at the start."""
+    """Return the initial stress of each body.  One initial stress applies to all bodies present at the start."""
     allowed = "a K0, a function of x, or a dict of these, {index of a body: ...}"
     if given is None:
         return {}
@@ -128,9 +128,8 @@ def by_body(given, bodies: Sequence[Body], later: Sequence[int]) -> dict[int, In
 class InitialStresses:
     """Initial stresses of the bodies of a scene.
 
-    bodies: all bodies.
     given: result of `by_body`.
-    pressure: initial pore pressure, Pa, a number or a function of x.
+    pressure: initial pore pressure, in Pa, as a number or a function of x.
     """
 
     def __init__(self, bodies: Sequence[Body], given: Mapping[int, InitialStress], pressure: float | Callable):
@@ -140,14 +139,10 @@ class InitialStresses:
         self._start = np.cumsum([0, *(len(body) for body in bodies)])
 
     def of(self, materials: SceneMaterials, points: MaterialPoints, present: Sequence[bool], gravity) -> MaterialPoints:
-        """Return the points with the elastic strains of their initial stress; all processes must call it.
+        """Return the points with the elastic strains of their initial stress.  All processes must call this method.
 
-        Parameters
-        ----------
-        present
-            Whether each body is present.  The overburden contains present bodies only.
-        gravity : (d,), m/s^2
-            Acceleration of gravity, or None.
+        present: whether each body is present, so that its weight acts on the soil below.
+        gravity (d,), in m/s^2: acceleration of gravity, or None.
         """
         if not self.given:
             return points
@@ -163,11 +158,11 @@ class InitialStresses:
                     target[own] = self._at(stress, body, placed.map(lambda v, own=own: v[own]), [a[own] for a in above])
                 rows[own] = True
 
-        everywhere(materials.grid.comm, fill)
+        together(materials.grid.comm, fill)
         return stressed(materials, points, rows, target)
 
     def _at(self, stress: InitialStress, body: int, points: MaterialPoints, above: list[NDArray]) -> NDArray:
-        """Return the effective stress (n, 3, 3), Pa, of points of a body.  above: results of `_above` for them."""
+        """Return the effective stress, in Pa, of points of a body."""
         n, d = points.x.shape
         if not isinstance(stress, K0):
             name = f"initial_stress of body {body}: {line(stress)}"
@@ -190,7 +185,7 @@ class InitialStresses:
         return normal[:, :, None] * np.eye(3)
 
     def _above(self, materials: SceneMaterials, points: MaterialPoints, present, gravity) -> list[NDArray]:
-        """Return three arrays (n,) for K0: overburden, Pa; surface height, m; and pore stress alpha chi p, Pa."""
+        """Return the overburden, the height of the surface, and alpha chi p at each point."""
         if not any(isinstance(stress, K0) for stress in self.given.values()):
             return [points.pressure] * 3
         if gravity is None or np.any(gravity[:-1]) or not gravity[-1] <= 0:
@@ -213,10 +208,10 @@ def _in_columns(
     unit_weight: NDArray[np.float64],
     above: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return corners and unit weights of all domains above and below domains of this process, in the order of ids.
+    """Return corners and unit weights of all domains above and below this process's domains.
 
-    ids (n,), corners (n, 2^d, d), m, unit_weight (n,), N/m^3: values of this process's domains in the scene.
-    above (k, 2^d, d), m: corners of the domains whose columns this process needs.
+    ids (n,), corners (n, 2^d, d), in m, unit_weight (n,), in N/m^3: this process's domains in the scene.
+    above (k, 2^d, d), in m: corners of the domains whose columns are needed.
     """
     ends = [above[..., :-1].min(axis=(0, 1), initial=np.inf), above[..., :-1].max(axis=(0, 1), initial=-np.inf)]
     low, high = corners[..., :-1].min(axis=1), corners[..., :-1].max(axis=1)
@@ -230,15 +225,10 @@ def _in_columns(
 def stressed(
     materials: SceneMaterials, points: MaterialPoints, chosen: NDArray[np.bool_], target: NDArray[np.float64]
 ) -> MaterialPoints:
-    """Return the points with target stresses (n, 3, 3), Pa, at the chosen points (n,); all processes must call it.
+    """Return the points with target stresses (n, 3, 3), in Pa, at the chosen points.  All processes must call it.
 
-    In Modified Cam Clay the initial stress is a parameter.  In other laws elastic strains cause the initial stress, see
-    `_ElasticStrains`.
-
-    Raises
-    ------
-    ValueError
-        A stress is outside the yield surface.  The message states the first position with such a stress.
+    In Modified Cam Clay the initial stress is a parameter.  In other laws it is due to elastic strains.  ValueError is
+    raised if a target stress is outside the yield surface.
     """
     comm = materials.grid.comm
     rows = np.flatnonzero(chosen)
@@ -265,7 +255,7 @@ def stressed(
 
 @dataclass(frozen=True, eq=False)
 class _ElasticStrains:
-    """Elastic strains for target stresses, by Newton's method.  A strain is ln `seeded_stretch` or ln(C_p^-1) / 2."""
+    """Elastic strains for target stresses, as logarithms of stretches, by Newton's method."""
 
     materials: SceneMaterials
     points: MaterialPoints  # n points
@@ -275,28 +265,28 @@ class _ElasticStrains:
 
     @property
     def components(self) -> tuple[tuple[int, int], ...]:
-        """Indices of the k components of a symmetric tensor."""
+        """Indices of the components of a symmetric tensor."""
         return PLANE if self.points.x.shape[1] == 2 else SPACE
 
     @property
     def free(self) -> NDArray[np.bool_]:
-        """Whether each strain component (n, k) is unknown."""
+        """Whether each strain component is unknown."""
         out = np.repeat(~self.given[:, None], len(self.components), axis=1)
         out[:, 2] &= self.materials.knows_across(self.points)
         return out
 
     def of(self, tensor: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the unknown components (n, k) of tensors (n, 3, 3); other components are zero."""
+        """Return the components of tensors (n, 3, 3), with zeros where the strain component is not unknown."""
         i, j = np.array(self.components).T
         return np.where(self.free, tensor[:, i, j], 0.0)
 
     def moduli(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return bulk and shear moduli (n,), Pa."""
+        """Return bulk and shear moduli (n,), in Pa."""
         bulk, shear = (lambda m, name=name: getattr(m, name) for name in ("bulk", "shear"))
         return self.materials.table(self.points, bulk), self.materials.table(self.points, shear)
 
     def linear(self) -> NDArray[np.float64]:
-        """Return the elastic strains (n, k) of the target stresses in linear elasticity."""
+        """Return the elastic strains that the target stresses cause in linear elasticity."""
         (bulk, shear) = self.moduli()
         target = self.target
         identity = np.eye(3)
@@ -306,7 +296,7 @@ class _ElasticStrains:
         return self.of(elastic)
 
     def residual(self, strain: NDArray[np.float64]) -> tuple[MaterialPoints, NDArray[np.float64]]:
-        """Return the points with elastic strains (n, k), and their excess (n, k), Pa, over the target stresses."""
+        """Return the points with these elastic strains, and their stresses minus the target stresses, in Pa."""
         tensor = np.zeros((len(strain), 3, 3))
         for value, (i, j) in zip(strain.T, self.components, strict=True):
             tensor[:, i, j] = tensor[:, j, i] = value
@@ -319,7 +309,7 @@ class _ElasticStrains:
         return now, self.of(stress - self.target)
 
     def step(self, strain: NDArray[np.float64], missing: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the strains (n, k) after a Newton step with finite differences; missing (n, k): residual, Pa."""
+        """Return the strains after a Newton step with finite differences, from strains and residual stresses."""
         count = strain.shape[1]
         free = self.free
         (_, shear) = self.moduli()
@@ -334,7 +324,7 @@ class _ElasticStrains:
         return np.clip(strain - change, -1, 1)
 
     def solved(self) -> tuple[MaterialPoints, NDArray[np.bool_]]:
-        """Return the points with elastic strains, and for each point (n,) whether it misses its target stress."""
+        """Return the points with elastic strains, and for each point whether it misses its target stress."""
         comm, strain = self.materials.grid.comm, self.linear()
         largest = over_all(comm, float(np.abs(self.target).max(initial=0.0)), MPI.MAX)
         close = CLOSE * largest + ROUND_OFF * np.maximum(*self.moduli())  # the second term is for very small strains
@@ -354,7 +344,7 @@ class _ElasticStrains:
 
 
 def strained(materials: SceneMaterials, points: MaterialPoints, moved: MaterialPoints) -> MaterialPoints:
-    """Return the points, at their positions, with the elastic strains of `moved`, the points after deformation."""
+    """Return points with the elastic strains that they have in `moved`, after deformation."""
     law = materials.law_of(points)
     own = {name: points.data[name] for name in MaterialPoints.INTERNAL if name in points.data}
     data = {**moved.data, **own}
@@ -372,7 +362,7 @@ def strained(materials: SceneMaterials, points: MaterialPoints, moved: MaterialP
 
 
 def _with(points: MaterialPoints, chosen: NDArray[np.bool_], **values: NDArray) -> MaterialPoints:
-    """Return the points with new values (n, ...) at the chosen points (n,); names that the points lack are ignored."""
+    """Return the points with new values at the chosen points."""
     data = dict(points.data)
     for name, new in values.items():
         if name in data and chosen.any():
@@ -386,7 +376,7 @@ def _kappa(m) -> NDArray[np.float64]:
 
 
 def _friction(m) -> NDArray[np.float64]:
-    """Return the friction angle, degrees; nan for laws without friction."""
+    """Return the friction angle of a material, in degrees, or nan without friction."""
     return getattr(m, "friction", np.full(np.shape(m.bulk), np.nan))
 
 
@@ -395,7 +385,7 @@ def _prestretch(m) -> NDArray[np.float64]:
 
 
 def _no_constants(points: MaterialPoints, target: NDArray[np.float64], given: NDArray[np.bool_]) -> str:
-    """Return an error message if Modified Cam Clay does not allow a stress (n, 3, 3), Pa, else an empty string."""
+    """Return the reason why Modified Cam Clay does not allow a target stress, or an empty string."""
     shear = np.abs(target - np.diagonal(target, axis1=1, axis2=2)[:, :, None] * np.eye(3)).max(axis=(1, 2), initial=0.0)
     invalid = given & ((shear > 0) | ~(np.trace(target, axis1=1, axis2=2) < 0))
     what = "must have no shear and a compressive mean for ModifiedCamClay"

@@ -1,16 +1,17 @@
 # SPDX-License-Identifier: MIT
 """Local unknowns of laws, determined by equations at each point.
 
-A law has unknowns y, trial values z(F) and residuals f(y, z).  Newton's method solves f = 0 at all points together, up
-to round-off.  The forms contain
+Some stresses have no closed formula.  A law then has unknowns y, trial values z(F) and residuals f(y, z) at each point.
+Newton's method solves f = 0 at all points together, up to round-off.  With the solution (y*, z*), the forms contain
 
-    y = y* + Y (z(F) - z*),     Y = -(df/dy)^-1 df/dz  at the solution (y*, z*),
+    y = y* + Y (z(F) - z*),     Y = -(df/dy)^-1 df/dz  at (y*, z*).
 
-At the solution, this y has the right value and the right derivative with respect to F.  UFL's derivative of a stress
-with respect to F includes the dependence through y.  It is therefore the consistent tangent, although the forms contain
-no iterations.  y*, z* and Y are coefficients at the points.  If the stress is not differentiated, y* is used in place
-of y.  If the law has an energy, the tangent is the second derivative of the energy.  The expression for y then has a
-second-order term, whose coefficients also follow from f = 0.  A law in numpy returns y(z) and dy/dz.
+At the solution, this y has the right value and the right derivative with respect to F.  UFL's derivative of a stress is
+therefore the consistent tangent, although the forms contain no iterations.  y*, z* and Y are coefficients at the
+points.  Expressions that are not differentiated use y* in place of y.
+
+If the law has an energy, the tangent is the second derivative of the energy, and the expression for y has a
+second-order term.  A law in numpy returns y(z) and dy/dz.
 """
 
 from __future__ import annotations
@@ -28,18 +29,17 @@ from mpm_dolfinx.base.caching import Latest
 from mpm_dolfinx.base.errors import NotConverged
 from mpm_dolfinx.base.tolerances import EPSILON, SAME
 from mpm_dolfinx.base.validation import asked, instance, line
-from mpm_dolfinx.forms.point_forms import FormPoints, PointData, PointExpression
+from mpm_dolfinx.forms.point_forms import FormPoints, Given, PointData, PointExpression
 from mpm_dolfinx.materials.skeleton import BY_SCENE, Skeleton
 from mpm_dolfinx.materials.user_functions import call, named
-from mpm_dolfinx.parallel.exchange import everywhere, first
+from mpm_dolfinx.parallel.exchange import first, together
 
-MOST, HALVINGS = 60, 25  # largest numbers of Newton iterations, and of step halvings in all iterations together
+MOST, HALVINGS = 60, 25  # largest numbers of Newton iterations, and of halvings of steps in all iterations together
 
 
 class Solved(NamedTuple):
     """Solution of the local equations at n points."""
 
-    key: object  # identifies the points' data for which the equations were solved
     unknowns: NDArray[np.float64]  # (n, m)
     trial: NDArray[np.float64]  # trial values (n, k)
     derive: Callable[[], Derived]  # function that returns the derivatives
@@ -55,16 +55,9 @@ class Derived(NamedTuple):
 class LocalUnknowns:
     """The local unknowns of a law at some points, as coefficients of forms.
 
-    Parameters
-    ----------
-    law
-        Class of the law.
-    points
-        The points, with the law's parameters and state.
-    F
-        Deformation gradient (d, d) of the law, as UFL.
-    values
-        UFL values of the law's parameters and state, and of the scene's constants `BY_SCENE`.
+    law: class of the law.
+    points: the points, with the law's parameters and state.
+    F: deformation gradient (d, d) of the law, as UFL.
 
     Attributes
     ----------
@@ -72,7 +65,7 @@ class LocalUnknowns:
         The unknowns by name, as UFL that depends on F, and `trial`.
     known
         Like `values`, but independent of F, for expressions that are not differentiated with respect to F.  The kernels
-        of such expressions need not compute trial values.  For laws with an energy, `known` equals `values`.
+        of such expressions need no trial values.  For laws with an energy, `known` equals `values`.
     """
 
     def __init__(self, law: type[Skeleton], points: FormPoints, F, values: Mapping[str, object]):
@@ -86,16 +79,13 @@ class LocalUnknowns:
         z = _parts(trial.values())
         self._trial, self._dt = PointExpression(ufl.as_vector(z), points), values["dt"]
         self._solved: Latest[Solved] = Latest()
-        self._derived: Latest[tuple[Solved, Derived]] = Latest()
+        self._derived: Latest[Derived] = Latest()
         self._of_energy = law.kirchhoff is None
         bends = self._of_energy and law.residual is not None
         self._equations = _Equations(law, points, trial, {name: values[name] for name in BY_SCENE}, bends)
         m, k = self._equations.count, len(z)
         shapes = {"unknowns": (m,), "trial": (k,), "slopes": (m, k)} | ({"bends": (m, k * k)} if bends else {})
-        at = {
-            what: points.follow(f"local {what}", s, lambda data, w=what: self._now(data, w))
-            for what, s in shapes.items()
-        }
+        at = {what: points.follow(f"local {what}", s) for what, s in shapes.items()}
         # component by component: in 3D products of tensors take ten times as long to compile
         off = [z[j] - at["trial"][j] for j in range(k)]
         y = [at["unknowns"][i] + sum(at["slopes"][i, j] * off[j] for j in range(k)) for i in range(m)]
@@ -106,44 +96,25 @@ class LocalUnknowns:
         self.values = given | _named(shapes, y)
         self.known = self.values if self._of_energy else given | _named(shapes, at["unknowns"])
 
-    def update(self, data: PointData, derive: bool = True) -> None:
-        """Solve for the local unknowns of the points at their present F; all processes must call it.
+    def solve(self, data: PointData, derive: bool = True, motion: tuple = ()) -> Given:
+        """Solve for the local unknowns at the present F, and return values for the forms.  All processes must call it.
 
-        derive: whether to differentiate by the trial values too.  `values` needs these derivatives; `known` does not.
+        derive: whether to differentiate with respect to the trial values, which `values` needs.
+        motion: key for `Latest`, which changes whenever trial values of the same `data` change, except with time.
 
-        Raises
-        ------
-        NotConverged
-            The equations of a point have no solution.  The message states the first point without a solution.
+        derive: whether to differentiate with respect to the trial values, which `values` needs.
         """
-        trial = self._trial.evaluate(data)
-        self._solved((data.key, trial, float(self._dt.value)), lambda: self._equations.solve(data, trial), self._comm)
+        key = data.key, motion, float(self._dt.value)
+        solved = self._solved(key, lambda: self._equations.solve(data, self._trial.evaluate(data)), self._comm)
+        out = {"local unknowns": solved.unknowns, "local trial": solved.trial}
         if derive or self._of_energy:
-            self.derive(data)
-
-    def derive(self, data: PointData) -> None:
-        """Differentiate the last solution with respect to the trial values; all processes must call it."""
-        solved = self._at(data)
-        self._derived(solved.derive, lambda: (solved, solved.derive()), self._comm)
-
-    def _at(self, data: PointData) -> Solved:
-        solved = self._solved.value
-        if solved is None or solved.key is not data.key:
-            raise RuntimeError(f"{self._law.__name__}: local unknowns are used before they are solved")
-        return solved
-
-    def _now(self, data: PointData, what: str) -> NDArray[np.float64]:
-        solved = self._at(data)
-        if what not in Derived._fields:
-            return getattr(solved, what)
-        of, derived = self._derived.value or (None, None)
-        if of is not solved:
-            raise RuntimeError(f"{self._law.__name__}: derivatives of local unknowns are used before they are computed")
-        return getattr(derived, what)
+            derived = self._derived(solved.derive, solved.derive, self._comm)
+            out |= {"local slopes": derived.slopes, "local bends": derived.bends}
+        return out
 
 
 class _Equations:
-    """The equations f(y, z) = 0 of a law, as functions of data at the points."""
+    """The equations f(y, z) = 0 of a law at points."""
 
     def __init__(
         self,
@@ -167,7 +138,7 @@ class _Equations:
         if law.residual is None:
             return
         k = sum(_size(s) for s in self._trial.values())
-        y, z = (ufl.variable(own.follow(name, (size,), _given)) for name, size in (("unknowns", m), ("trial", k)))
+        y, z = (ufl.variable(own.follow(name, (size,))) for name, size in (("unknowns", m), ("trial", k)))
         given = {name: getattr(own, name) for name in self._names} | _named(self._unknowns, y) | self._by_scene
         residual = call(law.residual, **self._with_trial(_named(self._trial, z)), **given)
         found = named(f"{law.__name__}.residual", residual, self._unknowns)
@@ -178,18 +149,18 @@ class _Equations:
         self._slopes = PointExpression(ufl.as_vector([*steps, *(by_z[i, j] for i in range(m) for j in range(k))]), own)
         self._bends = None
         if bends:  # the second derivative of f along y = y* + Y (z - z*)
-            Y = own.follow("slopes", (m, k), _given)
+            Y = own.follow("slopes", (m, k))
             along = ufl.as_matrix([[_along(by_y, by_z, Y, m, (i,), j) for j in range(k)] for i in range(m)])
             by_y, by_z = ufl.diff(along, y), ufl.diff(along, z)
             each = product(range(m), range(k), range(k))
             self._bends = PointExpression(ufl.as_vector([_along(by_y, by_z, Y, m, (i, j), l) for i, j, l in each]), own)
 
     def _with_trial(self, values: dict) -> dict:
-        """Return the trial values by the argument names of the law's equations."""
+        """Return the trial values by the names of the arguments of the law's equations."""
         return {"trial": values} if self._law.trial is not None else values
 
     def solve(self, data: PointData, trial: NDArray[np.float64]) -> Solved:
-        """Return the solution at points with trial values (n, k); all processes must call it."""
+        """Return the solution at points with trial values (n, k).  All processes must call this method."""
         if self._law.residual is None:
             return self._in_numpy(data, trial)
         m, n = self.count, len(trial)
@@ -218,10 +189,10 @@ class _Equations:
             bends = -_solve(by_y, second.reshape(n, m, k * k))
             return Derived(slopes.reshape(n, m * k), bends.reshape(n, m * k * k))
 
-        return Solved(data.key, y, trial, derive)
+        return Solved(y, trial, derive)
 
     def _refuse(self, data: PointData, failed: NDArray[np.int64], why: str) -> None:
-        """Raise NotConverged on all processes if any point has failed.  The message states the first failed point."""
+        """Raise NotConverged on all processes if any point has failed."""
         messages = [f"{self._law.__name__}{why} at {data.x[i] + data.points.grid.base}" for i in failed[:1]]
         if message := first(self._grid.comm, "".join(messages)):
             raise NotConverged(message)
@@ -241,28 +212,21 @@ class _Equations:
             return [found[of][0].reshape(n, _size(shape)) for of, shape in self._unknowns.items()]
 
         def derive() -> Derived:
-            each = everywhere(self._grid.comm, lambda: [self._slopes_of(of, found[of][1], n) for of in self._unknowns])
+            each = together(self._grid.comm, lambda: [self._slopes_of(of, found[of][1], n) for of in self._unknowns])
             slopes = np.concatenate(each, axis=1)
             self._refuse(data, np.flatnonzero(~np.isfinite(slopes).all(axis=(1, 2))), ".solution: is not finite")
             return Derived(slopes.reshape(n, self.count * k))
 
-        y = np.concatenate(everywhere(self._grid.comm, solution), axis=1)
+        y = np.concatenate(together(self._grid.comm, solution), axis=1)
         self._refuse(data, np.flatnonzero(~np.isfinite(y).all(axis=1)), ".solution: is not finite")
-        return Solved(data.key, y, trial, derive)
+        return Solved(y, trial, derive)
 
     @property
     def _title(self) -> str:
         return f"{self._law.__name__}.solution"
 
     def _checked(self, found, n: int) -> dict:
-        """Return the checked result of `solution` at n points: unknowns and their derivatives as real arrays.
-
-        Raises
-        ------
-        ValueError
-            The result is not a dict of pairs with the unknowns' names and shapes, or a derivative is with respect to a
-            name that is not in `trial`.
-        """
+        """Return the unknowns and their derivatives in the result of `solution`, or raise ValueError."""
         instance(f"{self._title}: its result", found, dict)
         for of, pair in found.items():
             if not (isinstance(pair, (tuple, list)) and len(pair) == 2 and isinstance(pair[1], dict)):
@@ -283,15 +247,15 @@ class _Equations:
         return out
 
     def _slope(self, of: str, by: str, given, n: int) -> NDArray[np.float64]:
-        """Return the derivative (n, ..., ...) of an unknown by a trial value; given: array or callable."""
+        """Return the derivative (n, ..., ...) of an unknown with respect to a trial value."""
         what = f"{self._title}: derivative of {of} with respect to {by}"
         value = asked(what, "a function without arguments that gives it", given) if callable(given) else given
         return _real(what, value, (n, *self._unknowns[of], *self._trial[by]))
 
     def _slopes_of(self, of: str, given: Mapping[str, object], n: int) -> NDArray[np.float64]:
-        """Return the derivatives (n, m, k) of one unknown with m components with respect to all k trial components.
+        """Return the derivatives (n, m, k) of one unknown with respect to all trial values.
 
-        given: derivatives by name of the trial value; missing derivatives are zero.
+        given: derivatives by name of the trial value.  Missing derivatives are zero.
         """
         m, parts = _size(self._unknowns[of]), []
         for by, shape in self._trial.items():
@@ -301,12 +265,12 @@ class _Equations:
 
 
 def _along(by_y, by_z, Y, m: int, i: tuple[int, ...], j: int):
-    """Return the derivative of component i with respect to component j of z, along y = y* + Y (z - z*), as UFL."""
+    """Return the derivative of component i with respect to component j of z as UFL."""
     return by_z[(*i, j)] + sum(by_y[(*i, a)] * Y[a, j] for a in range(m))
 
 
 def _real(name: str, value, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    """Return a value as an array of real numbers; raise ValueError for a wrong shape or type."""
+    """Return a value as an array of real numbers with this shape."""
     try:
         value = np.asarray(value)
     except ValueError as error:  # rows of different lengths
@@ -319,9 +283,9 @@ def _real(name: str, value, shape: tuple[int, ...]) -> NDArray[np.float64]:
 
 
 def _newton(system, y: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Solve f(y) = 0 at all points, in place, by Newton's method with a line search; return indices of failed points.
+    """Solve f(y) = 0 in place, and return the indices of points without a solution.
 
-    system: function of r point indices and of the y (r, m) of these points.  It stores y, and returns f, df/dy and
+    system: function of r point indices and of the y (r, m) of these points.  It stores y, and returns f, df/dy and the
     norms of f.
     """
     rows, failed = np.arange(len(y)), np.zeros(len(y), dtype=bool)
@@ -333,7 +297,7 @@ def _newton(system, y: NDArray[np.float64]) -> NDArray[np.int64]:
         step[solved & failed[rows]] = 0.0  # a solution, which may not be unique
         failed[rows] &= ~solved
         close = (np.abs(step) <= SAME * np.maximum(1.0, np.abs(old))).all(axis=1) | solved
-        y[rows] = old - step  # for close points this is the solution
+        y[rows] = old - step  # the solution at points that are close
         on = ~(close | failed[rows])
         rows, step, old, norm = (values[on] for values in (rows, step, old, norm))
         length = np.ones(int(on.sum()))
@@ -353,7 +317,7 @@ def _newton(system, y: NDArray[np.float64]) -> NDArray[np.int64]:
 
 
 def _solve(A: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return A^-1 b (n, m, k) for matrices A (n, m, m); the result is not finite for a singular matrix."""
+    """Return A^-1 b for matrices A, not finite if A is singular."""
     with np.errstate(all="ignore"):
         if A.shape[1] == 1:
             return b / A
@@ -378,7 +342,7 @@ def _size(shape: tuple[int, ...]) -> int:
 
 
 def _named(shapes: Mapping[str, tuple[int, ...]], vector) -> dict:
-    """Return tensors of the given shapes, by name.  The components of a tensor are consecutive in a UFL vector."""
+    """Return tensors by name from the components of a UFL vector."""
     out, start = {}, 0
     for name, shape in shapes.items():
         index = np.arange(start, start + _size(shape)).reshape(shape)
@@ -389,7 +353,3 @@ def _named(shapes: Mapping[str, tuple[int, ...]], vector) -> dict:
 
 def _nested(vector, index: NDArray[np.int64]):
     return [_nested(vector, row) for row in index] if index.ndim else vector[int(index)]
-
-
-def _given(data: PointData) -> NDArray[np.float64]:
-    raise RuntimeError("trial values and unknowns must be passed to each evaluation")

@@ -1,18 +1,20 @@
 # SPDX-License-Identifier: MIT
 """Mohr and Coulomb's elastoplasticity at finite strain, with edges, apex and a tension cut-off.
 
-Plasticity is multiplicative, in principal logarithmic strains, with Hencky's elasticity.  For principal Kirchhoff
-stresses t_1 >= t_2 >= t_3, tension positive,
+Plasticity is multiplicative, in principal logarithmic strains, with Hencky's elasticity.  The principal Kirchhoff
+stresses are t_1 >= t_2 >= t_3, tension positive.  They satisfy
 
-    f_ij = (1 + sin phi) t_i - (1 - sin phi) t_j - 2 c cos phi <= 0  for all i, j,    t_i <= T.
+    f_ij = (1 + sin phi) t_i - (1 - sin phi) t_j - 2 c cos phi <= 0  for all i, j,    t_i <= T,
 
-The direction of flow is (1 + sin psi) e_i - (1 - sin psi) e_j on a face f_ij, and e_i at the cut-off T.  e_i are
-principal directions; phi, psi, c and T are constants of `MohrCoulomb`.  The return mapping keeps the order of the
-principal stresses.  Its result therefore lies on one of ten faces, edges and vertices, see `_Return`.  On each face,
-edge or vertex the final stress is linear in the trial stress (de Souza Neto, Peric and Owen 2008, 8.2, without the
-cut-off).  A final stress is valid if it is admissible, the order is kept, and all plastic multipliers are >= 0.  The
-return mapping uses the one of the ten final stresses with the smallest violation, which is a rounding error.
-Derivatives are computed in numpy, and are exact even for equal eigenvalues.
+with the friction angle phi, the cohesion c and the tensile strength T.  The direction of flow is
+(1 + sin psi) e_i - (1 - sin psi) e_j on a face f_ij, and e_i at the cut-off T, with the dilation angle psi and the
+principal directions e_i.
+
+The return mapping keeps the order of the principal stresses.  The final stress lies on one of ten faces, edges and
+vertices.  On each of these the final stress is linear in the trial stress (de Souza Neto, Peric and Owen 2008, 8.2,
+without the cut-off).  A final stress is valid if it is admissible, the order is kept, and all plastic multipliers are
+>= 0.  Of the ten possible final stresses, the return mapping uses the stress with the smallest violation, which is a
+rounding error.  Derivatives are computed in numpy, and are exact even for equal eigenvalues.
 """
 
 from __future__ import annotations
@@ -31,7 +33,7 @@ from mpm_dolfinx.materials.frictional import Frictional
 from mpm_dolfinx.materials.skeleton import Field, _check
 from mpm_dolfinx.materials.trial import PLANE, Coaxial, Isotropic, components, eigen, symmetric
 
-FACE, EDGES, ALL = slice(0, 1), slice(1, 3), slice(None)  # candidates for the final stress in the list of `end`
+FACE, EDGES, ALL = slice(0, 1), slice(1, 3), slice(None)  # possible places of the final stress in the list of `end`
 NEVER = 1e6  # largest tensile strength, divided by the bulk modulus
 
 
@@ -42,7 +44,7 @@ class MohrCoulomb(Frictional):
     Parameters
     ----------
     friction
-        Friction angle phi, degrees, in [0, 90); 0 is Tresca's law, with the undrained strength `cohesion`.
+        Friction angle phi, degrees, in [0, 90).  At 0 the law is Tresca's law with the undrained strength `cohesion`.
     dilation
         Dilation angle psi, degrees, in [0, friction].  If it equals `friction`, flow is associated and the tangent is
         symmetric.  Soil in tension at the apex dilates for any psi.
@@ -57,7 +59,7 @@ class MohrCoulomb(Frictional):
     Raises
     ------
     ValueError
-        A constant is out of its range or missing: friction, dilation and cohesion have no safe defaults.
+        A constant is out of its range or missing.  Friction, dilation and cohesion have no default values.
     """
 
     tension: Field = np.inf
@@ -99,7 +101,7 @@ class MohrCoulomb(Frictional):
 
     @staticmethod
     def solution(trial, bulk, shear, sine, sine_flow, strength, cutoff):
-        """Return the final stress components, Pa, their derivatives, and a flag: 1 in plastic flow, else 0."""
+        """Return the final stress, in Pa, its derivatives, and whether the flow is plastic (1 or 0)."""
         x, axes = eigen(trial["b"])
         with np.errstate(invalid="ignore", divide="ignore"):  # in a diverging iterate, which is rejected later
             e = np.log(x) / 2
@@ -114,12 +116,12 @@ class MohrCoulomb(Frictional):
 
     @staticmethod
     def kirchhoff(stress):
-        """Return the Kirchhoff stress (3, 3), Pa, as UFL."""
+        """Return the Kirchhoff stress (3, 3), in Pa, as UFL."""
         return symmetric(stress)
 
     @staticmethod
     def update(trial, bulk, shear, plastic, stress, flows):
-        """Return the state at the end of the step: UFL by name."""
+        """Return the state at the end of the step as UFL, by name."""
         (F, plane) = trial["F"]
         tau = symmetric(stress)
         I = ufl.Identity(3)
@@ -130,9 +132,9 @@ class MohrCoulomb(Frictional):
 
 
 def _returned(e: NDArray, bulk: NDArray, shear: NDArray, sine: NDArray, sine_flow: NDArray, *limits: NDArray) -> tuple:
-    """Return principal Kirchhoff stresses (n, 3), Pa, their derivatives (n, 3, 3) by e, and flags (n,) of plastic flow.
+    """Return principal stresses, their derivatives with respect to e, and flags of plastic flow.
 
-    e (n, 3): principal trial strains, in descending order.  The other arguments are parameters (n,) of the law.
+    e (n, 3): principal trial strains, in descending order.
     """
     elastic = (bulk - 2 * shear / 3)[:, None, None] * np.ones((3, 3)) + 2 * shear[:, None, None] * np.eye(3)
     t, slopes = np.einsum("nij,nj->ni", elastic, e), elastic
@@ -153,7 +155,7 @@ def _returned(e: NDArray, bulk: NDArray, shear: NDArray, sine: NDArray, sine_flo
 
 
 class _Surface:
-    """Yield surface for ordered principal stresses, with p = 1 + sin phi, q = 1 - sin phi, k = 2 c cos phi, and T."""
+    """Yield surface of ordered principal stresses."""
 
     def __init__(self, sine: NDArray, strength: NDArray, cutoff: NDArray):
         self.p = 1 + sine
@@ -162,12 +164,12 @@ class _Surface:
         self.T = cutoff
 
     def outside(self, t: NDArray) -> NDArray:
-        """Return the largest yield function (n,), Pa, at stresses t (n, 3).  It is > 0 outside the yield surface."""
+        """Return the largest yield function at stresses t, > 0 outside the yield surface."""
         return np.maximum(self.p * t[:, 0] - self.q * t[:, 2] - self.k, t[:, 0] - self.T)
 
 
 class _Return:
-    """Return mapping of principal trial stresses t (n, 3), Pa, in descending order, outside the yield surface."""
+    """Return mapping of ordered principal trial stresses outside the yield surface."""
 
     def __init__(self, t, elastic, bulk, shear, sine, sine_flow, strength, cutoff):
         self._trial = t
@@ -192,9 +194,9 @@ class _Return:
         )
 
     def end(self, few: slice) -> tuple[NDArray, NDArray, NDArray]:
-        """Return final stresses (n, 3), Pa, their derivatives (n, 3, 3) by t, and their `_violation` (n,), Pa.
+        """Return the final stresses, their derivatives with respect to the trial stresses, and their violation.
 
-        few: slice of `_faces` with the possible faces and edges of the final stress; `ALL` includes the vertices too.
+        few: slice of `_faces` with possible faces and edges of the final stress.  `ALL` also includes the vertices.
         """
         with np.errstate(all="ignore"):  # vertices at infinity
             ends = [self._on(faces) for faces in self._faces[few]]
@@ -208,15 +210,12 @@ class _Return:
         return stresses, slopes, violation[best, n]
 
     def _violation(self, t: NDArray, multipliers: Sequence[NDArray]) -> NDArray:
-        """Return the largest violation (n,), Pa, of three conditions.
-
-        The conditions are: yield functions <= 0, principal stresses t in descending order, 2G times multipliers >= 0.
-        """
+        """Return the largest violation, in Pa, of the conditions for a final stress."""
         multipliers = [-2 * self._G * m for m in multipliers]
         return np.max([self._surface.outside(t), t[:, 1] - t[:, 0], t[:, 2] - t[:, 1], *multipliers], axis=0)
 
     def _on(self, faces: Sequence) -> tuple[NDArray, NDArray, NDArray]:
-        """Return stresses on a face, or on the edge of two faces, their derivatives and their violation: see `end`."""
+        """Return the results of `end` on a face, or on the edge of two faces."""
         normals, limits, flows = (np.stack(part, axis=1) for part in zip(*faces, strict=True))
         drops = np.einsum("nij,nfj->nif", self._elastic, flows)
         gram = normals @ drops
@@ -228,28 +227,28 @@ class _Return:
         return t, slopes, self._violation(t, multipliers.T)
 
     def _at(self, t: NDArray, conditions: Callable) -> tuple[NDArray, NDArray, NDArray]:
-        """Return stresses t at a vertex, zero derivatives and the violation.  conditions: function like `_in_apex`."""
+        """Return the results of `end` for a vertex with the stresses t."""
         drop = self._trial - t
         mean = drop.mean(axis=1)
         plastic = drop / (2 * self._G)[:, None] + (mean / (3 * self._K) - mean / (2 * self._G))[:, None]
         return t, np.zeros((len(t), 3, 3)), self._violation(t, conditions(plastic))
 
     def _in_apex(self, x: NDArray) -> list[NDArray]:
-        """Return quantities that are >= 0 if an ordered plastic strain x is in the cone of all six flow directions."""
+        """Return quantities that are >= 0 if the apex is the final stress."""
         total, difference = x.sum(axis=1), self._p - self._q
         return [total, self._q * total + difference * x[:, 2], self._q * total + difference * (x[:, 1] + x[:, 2])]
 
     def _in_triaxial(self, x: NDArray) -> list[NDArray]:
-        """Like `_in_apex`, for the vertex of two faces with t_2 = t_3 and the cut-off of t_1."""
+        """Like `_in_apex`, for the vertex with t_2 = t_3 at the cut-off of t_1."""
         return [-x[:, 1], -x[:, 2], x[:, 0] + self._p / self._q * (x[:, 1] + x[:, 2])]
 
     def _in_extension(self, x: NDArray) -> list[NDArray]:
-        """Like `_in_apex`, for the vertex of two faces with t_1 = t_2 and the cut-offs of t_1 and t_2."""
+        """Like `_in_apex`, for the vertex with t_1 = t_2 at their cut-offs."""
         return [x[:, 0], x[:, 1], -x[:, 2], x[:, 0] + x[:, 1] + self._p / self._q * x[:, 2]]
 
 
 def _inverse(A: NDArray) -> NDArray:
-    """Return the inverses of matrices (n, 2, 2); LAPACK takes ten times as long."""
+    """Return the inverses of matrices (n, 2, 2), ten times faster than LAPACK."""
     adjugate = A[:, ::-1, ::-1].transpose(0, 2, 1) * [[1, -1], [-1, 1]]
     return adjugate / (A[:, 0, 0] * A[:, 1, 1] - A[:, 0, 1] * A[:, 1, 0])[:, None, None]
 

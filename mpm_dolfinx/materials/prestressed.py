@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Laws of soil with an initial stress.
 
-A law is evaluated at F F_i.  F is relative to the seeded state, and F_i is an initial stretch at each point.  The soil
-responds as if loading had caused its initial stress.  Volumes, porosities and conductivities refer to the seeded state.
-F_i is (3, 3), also in plane strain.  Laws with the state variable `plastic` use C_p^-1 in place of F_i.
+A soil with an initial stress responds as if loading had caused this stress.  The law is therefore evaluated at F F_i.
+F is the deformation gradient relative to the seeded state, and F_i is an initial stretch (3, 3) at each point.
+Volumes, porosities and conductivities refer to the seeded state.  In laws with the state variable `plastic`, the
+inverse plastic metric C_p^-1 replaces F_i.
 """
 
 from __future__ import annotations
@@ -20,13 +21,13 @@ from mpm_dolfinx.forms.axes import block, embedded, planar
 from mpm_dolfinx.materials.skeleton import Field, Skeleton
 
 AT_REST = " at rest"
-"""Suffix of the names of state variables at seeding.  A point has yielded if its state differs from that at seeding."""
+"""Suffix of the names of state variables at seeding, which show whether a point has yielded."""
 
 
 def stressed(m: Skeleton, knows_space: bool) -> Skeleton:
-    """Return a material with a point field, set later, for its initial stress or for the strain that causes it.
+    """Return a material with a point field for its initial stress or initial strain.
 
-    knows_space: whether the material's law accepts F (3, 3)
+    knows_space: whether the material's law accepts F (3, 3).
     """
     if "initial_stress" in (names := [f.name for f in fields(m)]):
         own = m.initial_stress if callable(m.initial_stress) else _everywhere(m.initial_stress)
@@ -43,7 +44,7 @@ def _everywhere(value) -> Callable:
 
 @cache
 def prestressed(law: type[Skeleton], knows_space: bool) -> type[Skeleton]:
-    """Return a law with the additional field `seeded_stretch`, F_i (3, 3)."""
+    """Return a law with F_i as the additional field `seeded_stretch`."""
     names = ("energy", "kirchhoff", "update", "trial")
     used = {name: f for name in names if (f := getattr(law, name)) is not None}
     given = {name: staticmethod(_from_seeded(f, name, knows_space)) for name, f in used.items()}
@@ -53,7 +54,7 @@ def prestressed(law: type[Skeleton], knows_space: bool) -> type[Skeleton]:
 
 
 def _from_seeded(function: Callable, name: str, knows_space: bool) -> Callable:
-    """Return a function of a law, evaluated at F F_i; stresses and energies are per volume of the seeded state."""
+    """Return a function of a law that is evaluated at F F_i."""
     names = Skeleton.arguments_of(function)
 
     def of(**given):

@@ -23,29 +23,32 @@ from mpm_dolfinx.materials.user_functions import expression
 from mpm_dolfinx.pores.retention import check_retention
 
 Field = float | Sequence[float] | Callable[[NDArray[np.float64]], ArrayLike]
-"""A constant (number or vector), or a function of the reference positions X (n, d), m, that returns (n, ...).
+"""A constant (number or vector), or a function of the reference positions X (n, d), in m, that returns values (n, ...).
 
-X are the points of one process.  On several processes, values that depend on other positions, like a mean, raise
-ValueError.
+X are the points of one process.  On several processes, a function whose values depend on other points, like a mean,
+raises ValueError.
 """
 
 BY_SCENE = ("dt", "cell_size")
 """Arguments that laws receive from the scene: time since the start of the step, s; mean edge length of a cell, m."""
 
 DRIED = ("suction", "suction_at_start")
-"""State variables that the scene sets: the suction max(-p, 0), Pa, at the end of a substep and at seeding."""
+"""State variables that the scene sets: suction max(-p, 0), in Pa, at the end of a substep, and suction at seeding."""
 
 LOCKING = 0.43
-"""Poisson's ratio nu above which cells use F-bar.  F-bar doubles the run time of a step.
+"""Poisson's ratio nu above which cells use F-bar, which doubles the run time of a step.
 
-Errors of the drained beam's tip deflection with h = 0.015 m, without F-bar: -0.02 % at nu = 0.3, -0.44 % at nu = 0.45,
--2.0 % at nu = 0.49, -10.3 % at nu = 0.499.  Errors with F-bar: +0.22 % at nu = 0.3, +0.21 % at nu = 0.45 and 0.49,
--0.02 % at nu = 0.499.  With h = 0.06 m and nu = 0.499: -56 % without F-bar, -0.4 % with F-bar.
+The tip deflection of the drained beam with h = 0.015 m has these errors:
+nu = 0.3: -0.02 % without F-bar, +0.22 % with F-bar.
+nu = 0.45: -0.44 % without F-bar, +0.21 % with F-bar.
+nu = 0.49: -2.0 % without F-bar, +0.21 % with F-bar.
+nu = 0.499: -10.3 % without F-bar, -0.02 % with F-bar.
 """
 
 SEPARATION = 1e-4
-"""Relative difference added to equal eigenvalues, for finite derivatives.  Halving this value changes the result of
-scene "beam" in tests/plateaus.py by 1.8e-09 (relative), doubling it by 7.2e-09, and finer cells by 1.5e-02.
+"""Relative difference added to equal eigenvalues, for finite derivatives.  The result of scene "beam" in
+tests/plateaus.py changes by the fraction 1.8e-09 with half this value, by 7.2e-09 with twice this value, and by 1.5e-02
+with finer cells.
 """
 
 
@@ -56,7 +59,7 @@ class Skeleton:
     Parameters
     ----------
     bulk
-        Drained bulk modulus K, Pa, > 0 (3D modulus, even in plane strain).
+        Drained bulk modulus K in three dimensions, Pa, > 0, even in plane strain.
     shear
         Shear modulus G, Pa, > 0.
     porosity
@@ -70,18 +73,18 @@ class Skeleton:
     grain_density
         Density of the grains, kg/m^3, >= 0; used only with gravity.
     conductivity_law
-        Function that returns the conductivity k, m/s, as UFL, for the present deformation.  Arguments may be
-        conductivity (the field above), F, J = det F, porosity, porosity0, x (present position), and p (pore pressure of
-        the cell at the start of the substep, Pa).
+        Function that returns the present conductivity k, m/s, as UFL.  Its arguments may be conductivity (the field
+        above), F, J = det F, porosity, porosity0, x (present position), and p (pore pressure of the cell at the start
+        of the substep, Pa).
     retention
         Retention curve and relative permeability: `VanGenuchten`, `Gardner`, `BrooksCorey` or a user-defined object,
         see `retention`.  It is passed by name.  With None the pores stay saturated.
 
     A law adds its parameters as fields of the dataclass and defines one of the static methods below.  Arguments of a
-    method may be F, and the law's fields, properties and state variables.  F is (d, d).  In axisymmetry F is (3, 3),
-    with the circumferential stretch last, see `axes`.  In plane strain F is (3, 3), with the out-of-plane stretch last,
-    in two cases: if Q1 cells would lock, and for soil with an initial stress.  If the law does not accept this, F is
-    (2, 2).
+    method may be F, and the law's fields, properties and state variables.  F is (d, d) in general.  In axisymmetry F is
+    (3, 3), with the circumferential stretch last, see `axes`.  In plane strain F is (3, 3), with the out-of-plane
+    stretch last, if Q1 cells would lock or if the soil has an initial stress.  For a law that does not accept F (3, 3)
+    in plane strain, F is (2, 2).
 
     energy
         Stored energy psi per reference volume, Pa.  Stress and tangent are UFL's derivatives.
@@ -93,27 +96,26 @@ class Skeleton:
     reduced.
 
     A law whose stress has no closed formula has local unknowns.  `unknowns` contains the initial values of the unknowns
-    in their iteration, by name.  Unknowns are arguments of `kirchhoff` and `update`.  Scale unknowns and residuals to
-    values of about one:
+    in their iteration, by name.  Unknowns are arguments of `kirchhoff` and `update`.  Unknowns and residuals should be
+    scaled to values of about one.
 
     residual
-        Function of the law's fields, state, unknowns and `trial`.  It returns a dict: UFL of the unknown's shape for
-        each unknown.  Newton's method solves residual = 0 at each point.
+        Function of the law's fields, state, unknowns and `trial`.  It returns a dict with UFL of the shape of the
+        unknown for each unknown.  Newton's method solves residual = 0 at each point.
     solution
-        Alternative to residual, in numpy: function of arrays (n, ...) of the law's fields, state and `trial`.  It
-        returns a dict.  Each unknown has a pair: its values (n, ...), and a dict of its derivatives (n, ..., ...) by
-        name of the trial value.  `solution` suits return mappings with many cases, and existing codes.  The unknowns
-        are then usually the stress and the new state.  A derivative may be a function without arguments, called when a
-        tangent is assembled.  A missing derivative is zero.  If there is no solution, return NaN or infinity; the time
-        step is then reduced.  If `energy` is not stationary in the unknowns, Newton's method is slow, because second
-        derivatives are missing.
+        Alternative to `residual` in numpy, for return mappings with many cases, and for existing codes.  It is a
+        function of arrays (n, ...) of the law's fields, state and `trial`.  It returns a dict with a pair for each
+        unknown: the values (n, ...), and a dict of derivatives (n, ..., ...) by name of the trial value.  A derivative
+        may be a function without arguments, called when a tangent is assembled.  A missing derivative is zero.  Without
+        a solution, return NaN or infinity; the time step is then reduced.  Newton's method is slow if `energy` is not
+        stationary in the unknowns.
     trial
         Function (F, ...) -> {name: UFL}.  Residuals depend on F through these trial values only.  In a law without
         `trial`, residuals have F itself as argument.  `kirchhoff` and `update` also receive values other than UFL.
 
     All these functions may have the argument `dt`, the time since the start of the step, s, for rate-dependent laws.
-    With the new state and dt = 0, a law must return the stress at the end of the step.  The argument `cell_size` is the
-    mean edge length of a cell, m.  It can make softening independent of the grid.
+    With the new state and dt = 0, a law must return the stress at the end of the step.  The argument `cell_size`, the
+    mean edge length of a cell, m, can make softening independent of the grid.
 
     A law that depends on suction has the state variable `suction`, and optionally `suction_at_start`, both initially
     0.0.  The scene sets `suction` to max(-p, 0), Pa, at the end of each substep, and `suction_at_start` to this value
@@ -124,8 +126,7 @@ class Skeleton:
     Raises
     ------
     ValueError
-        A constant is out of its range.  The scene raises ValueError for fields out of range, for conflicting names or
-        shapes, and for functions that raise errors or do not return UFL of the required shape.
+        A constant is out of its range.  The scene raises ValueError for invalid fields, names, shapes and functions.
 
     Examples
     --------
@@ -160,9 +161,9 @@ class Skeleton:
     dilates: ClassVar[bool] = False
     """Whether the law has an angle of `dilation`."""
     elastic_hencky: ClassVar[bool] = False
-    """Whether stresses follow from elastic strains by Hencky's law.  The stresses then determine the elastic energy."""
+    """Whether elastic strains determine the stresses by Hencky's law, so that stresses determine the elastic energy."""
     linear: ClassVar[bool] = False
-    """Whether the stress is linear in F; a factorisation is then reused until active cells or step size change."""
+    """Whether the stress is linear in F, so that a factorisation is reused until active cells or step size change."""
     state: ClassVar[Mapping[str, ArrayLike]] = {}
     by_scene: ClassVar[tuple[str, ...]] = ()
     """Names in `BY_SCENE` that are arguments of the law's functions."""
@@ -179,7 +180,7 @@ class Skeleton:
         own = {"F", *BY_SCENE, *cls.state, *cls.unknowns, *(["trial"] if cls.unknowns else [])}
         cls.parameters = tuple(name for name in names if name not in own)
         if "energy" in vars(cls) and "linear" not in vars(cls):
-            cls.linear = False  # a new energy does not inherit the linearity of the base class
+            cls.linear = False  # a new energy may be nonlinear
 
     @staticmethod
     def arguments_of(function: Callable | None) -> list[str]:
@@ -212,7 +213,7 @@ class Skeleton:
             _check(self, "biot", lambda v: (self.porosity <= v) & (v <= 1), f"in [porosity{n}, 1]")
 
     def at(self, X: NDArray[np.float64]) -> Skeleton:
-        """Return this material with its fields evaluated at reference positions X (n, d), m, as arrays (n, ...)."""
+        """Return this material with its fields evaluated at reference positions X (n, d), in m."""
         values, scalars = {}, [f.name for f in fields(Skeleton)]
         for name in constants_of(self):
             value, what = getattr(self, name), f"{type(self).__name__}: {name}"
@@ -233,13 +234,14 @@ class Skeleton:
         return self.kirchhoff is None
 
     def check_cells(self, cell_size: float) -> None:
-        """Raise ValueError if cells are too large for a softening law; cell_size: edge length of a cell, m."""
+        """Raise ValueError if cells of this edge length, in m, are too large for a softening law."""
 
     @classmethod
     def first_piola(cls, F, values: Mapping[str, object]):
-        """Return the first Piola-Kirchhoff effective stress (d, d), Pa, as UFL.
+        """Return the first Piola-Kirchhoff effective stress (d, d), in Pa, as UFL.
 
-        F: deformation gradient (d, d), a UFL variable; values: UFL values of the parameters and of the state.
+        F: deformation gradient (d, d), a UFL variable.
+        values: UFL values of the parameters and of the state.
         """
         if cls.kirchhoff is None:
             return ufl.diff(expression(cls.energy, [()], "F", F=F, **values), F)
@@ -247,21 +249,22 @@ class Skeleton:
 
     @classmethod
     def kirchhoff_in_plane(cls, F, values: Mapping[str, object]):
-        """Return the Kirchhoff stress, Pa, of a law without an energy, as UFL in the shape of F."""
+        """Return the Kirchhoff stress, in Pa, as UFL in the shape of F."""
         d = F.ufl_shape[0]
         tau = cls._kirchhoff(F, values, (d, d))
         return ufl.as_matrix([[tau[a, b] for b in range(d)] for a in range(d)])
 
     @classmethod
     def _kirchhoff(cls, F, values: Mapping[str, object], shape: tuple[int, int]):
-        """Return the Kirchhoff stress, Pa, as UFL of shape `shape` or (3, 3); it depends on F, or on local unknowns."""
+        """Return the Kirchhoff stress, in Pa, as UFL of the right shape."""
         return expression(cls.kirchhoff, [shape, (3, 3)], "" if cls.unknowns else "F", F=F, **values)
 
     @classmethod
     def out_of_plane(cls, F, values: Mapping[str, object]):
-        """Return the out-of-plane effective Cauchy stress, Pa, in plane strain as UFL, or None if it is not defined.
+        """Return the out-of-plane effective Cauchy stress in plane strain, in Pa, as UFL, or None if undefined.
 
-        F: deformation gradient (2, 2), a UFL variable; values: UFL values of the parameters and of the state.
+        F: deformation gradient (2, 2), a UFL variable.
+        values: UFL values of the parameters and of the state.
         """
         if cls.kirchhoff is not None:
             tau = cls._kirchhoff(F, values, (2, 2))
@@ -276,7 +279,7 @@ class Skeleton:
         return ufl.diff(energy, whole)[2, 2] / ufl.det(F)
 
     def drained_modulus(self, dim: int) -> float:
-        """Return the drained bulk modulus K_dr, Pa, for F (dim, dim): K for dim = 3, lambda + G in plane strain."""
+        """Return the drained bulk modulus, in Pa: K in 3D, lambda + G in plane strain."""
         return self.bulk if dim == 3 else self.bulk + self.shear / 3
 
     @property
@@ -291,40 +294,39 @@ class Skeleton:
 
     @property
     def oedometric(self) -> float:
-        """Oedometric (P-wave) modulus lambda + 2G, Pa."""
+        """Oedometric (P-wave) modulus lambda + 2G, in Pa."""
         return self.bulk + 4 / 3 * self.shear
 
     def pressure_damping(self) -> float:
-        """Return the damping coefficient tau, 1/Pa: a fraction of the value for macroelements.
+        """Return the damping coefficient tau, in 1/Pa, which damps increments of alternating pressures.
 
-        The fraction is 1/4, or 1/2 for laws with a state.  For macroelements of 2 x 2 cells the value is 3 alpha^2 / (8
-        (lambda + 3G)).  A quarter of this value gives better conditioning and smears less (Silvester and Kechkar 1990;
-        Camargo, White and Borja 2021).  The value for 2 x 2 x 2 cells is up to 56 % smaller.  The smaller value would
-        not damp pressures that alternate along two axes only, like checkerboards in plane strain.  tau damps pressure
-        increments only; oscillations due to first yield remain.
+        The value for macroelements of 2 x 2 cells is 3 alpha^2 / (8 (lambda + 3G)) (Silvester and Kechkar 1990;
+        Camargo, White and Borja 2021).  tau is half of this value for laws with a state, and a quarter for other laws.
+        A quarter gives better conditioning and less smearing.  The value for 2 x 2 x 2 cells is too small to damp
+        pressures that alternate along two axes only.  Oscillations due to first yield remain.
         """
         lam = self.bulk - 2 * self.shear / 3
         return (0.5 if self.state else 0.25) * self.biot**2 * 3 / (8 * (lam + 3 * self.shear))
 
     def storage(self, fluid_bulk: float, porosity):
-        """Return the storage coefficient S = n/K_w + (alpha - n)/K_s, 1/Pa, at a porosity."""
+        """Return the storage coefficient S = n/K_w + (alpha - n)/K_s, in 1/Pa, at a porosity n."""
         return porosity / fluid_bulk + (self.biot - porosity) / self.grain_bulk
 
 
 def constants_of(material: Skeleton) -> list[str]:
-    """Return the names of a material's constants.  The constants may vary with position."""
+    """Return the names of the constants of a material, which may vary with position."""
     return [f.name for f in fields(material) if f.name not in ("conductivity_law", "retention")]
 
 
 def check_given(obj, allowed: Mapping[str, str]) -> None:
-    """Raise ValueError if a constant without a safe default is missing; allowed: range of each such constant."""
+    """Raise ValueError if a constant without a default is missing."""
     for name, what in allowed.items():
         if getattr(obj, name) is None:
             raise ValueError(f"{type(obj).__name__}: {name} is not given, must be {what}")
 
 
 def _check(obj, name: str, test: Callable, allowed: str) -> None:
-    """Raise ValueError if a constant, or a value of an array, fails a test.  Functions are not tested."""
+    """Raise ValueError if a constant is out of its range."""
     value = getattr(obj, name)
     if callable(value):
         return
@@ -341,14 +343,14 @@ def _check(obj, name: str, test: Callable, allowed: str) -> None:
 class Hencky(Skeleton):
     """Hencky's law: psi = lambda/2 (ln J)^2 + G sum_i (ln lambda_i)^2, with the principal stretches lambda_i.
 
-    2D means plane strain.  Source: Hencky (1928).  A small constant under a square root keeps the derivatives of equal
-    eigenvalues of C = F^T F finite.  Only the deviatoric part of psi contains this constant.  The derivative of this
-    part is zero at F = I, so that the stress at F = I is exactly zero.  Parameters as for `Skeleton`.
+    2D means plane strain.  Source: Hencky (1928).  The deviatoric part contains a small constant under a square root,
+    which keeps the derivatives finite at equal eigenvalues.  The stress at F = I is exactly zero.  Parameters as for
+    `Skeleton`.
     """
 
     @staticmethod
     def energy(F, bulk, shear):
-        """Return psi, Pa, as UFL of F (d, d)."""
+        """Return the stored energy, in Pa, as UFL."""
         d, ln_J = F.ufl_shape[0], ufl.ln(ufl.det(F))
         if d == 3 and planar(F):
             return bulk / 2 * ln_J**2 + shear * _deviatoric(F)
@@ -362,7 +364,7 @@ class Hencky(Skeleton):
 
 
 def _deviatoric(F):
-    """Return `sum l_i^2 - (sum l_i)^2 / 3` as UFL, with the logarithmic stretches l_i of F.  Axis 3 is principal."""
+    """Return `sum l_i^2 - (sum l_i)^2 / 3` as UFL for the logarithmic stretches l_i."""
     whole = F.T * F
     C = ufl.as_matrix([[whole[i, j] for j in (0, 1)] for i in (0, 1)])
     return _stretch_difference(C) ** 2 / 2 + (ufl.ln(ufl.det(C)) / 2 - ufl.ln(whole[2, 2])) ** 2 / 6
@@ -371,8 +373,7 @@ def _deviatoric(F):
 def _stretch_difference(C):
     """Return the difference of the logarithmic principal stretches of a symmetric 2x2 tensor, as UFL.
 
-    The eigenvalues divided by their mean are 1 + radius and 1 - radius.  The formula has one quotient, `ratio`.  If C
-    were divided by its mean first, the second derivatives would contain twice as many quotients.
+    With a single quotient, `ratio`, the second derivatives are half as long as with two.
     """
     ratio = ((C[0, 0] - C[1, 1]) ** 2 + 4 * C[0, 1] ** 2) / (C[0, 0] + C[1, 1]) ** 2
     radius = ufl.sqrt(ratio + SEPARATION**2 / 4)
@@ -380,7 +381,7 @@ def _stretch_difference(C):
 
 
 def _eigenvalues(C, separation: float = SEPARATION):
-    """Return the eigenvalues of a symmetric 2x2 or 3x3 tensor as UFL.  separation: least distance of two of them."""
+    """Return separated eigenvalues of a symmetric 2x2 or 3x3 tensor as UFL."""
     if C.ufl_shape[0] == 2:
         mean = (C[0, 0] + C[1, 1]) / 2
         radius = ufl.sqrt((C[0, 0] - C[1, 1]) ** 2 + 4 * C[0, 1] ** 2 + separation**2) / 2
@@ -401,7 +402,7 @@ class NeoHookean(Skeleton):
 
     @staticmethod
     def energy(F, bulk, shear):
-        """Return psi, Pa, as UFL of F (d, d)."""
+        """Return the stored energy, in Pa, as UFL."""
         ln_J = ufl.ln(ufl.det(F))
         lam = bulk - 2 * shear / 3
         return shear / 2 * (ufl.inner(F, F) - F.ufl_shape[0] - 2 * ln_J) + lam / 2 * ln_J**2
@@ -411,14 +412,14 @@ class NeoHookean(Skeleton):
 class LinearElastic(Skeleton):
     """Linear elasticity of small strain: psi = lambda/2 (tr eps)^2 + G eps:eps with eps = sym F - I.
 
-    The law is not objective; use it for small rotations only.  Parameters as for `Skeleton`.
+    The law is not objective, so rotations must be small.  Parameters as for `Skeleton`.
     """
 
     linear: ClassVar[bool] = True
 
     @staticmethod
     def energy(F, bulk, shear):
-        """Return psi, Pa, as UFL of F (d, d)."""
+        """Return the stored energy, in Pa, as UFL."""
         eps = ufl.sym(F) - ufl.Identity(F.ufl_shape[0])
         return (bulk - 2 * shear / 3) / 2 * ufl.tr(eps) ** 2 + shear * ufl.inner(eps, eps)
 
@@ -426,7 +427,7 @@ class LinearElastic(Skeleton):
 def kozeny_carman(conductivity, porosity, porosity0):
     """Return k = k0 n^3 / (1 - n)^2 / (n0^3 / (1 - n0)^2), m/s, the law of Kozeny (1927) and Carman (1937).
 
-    Use it as `conductivity_law` of a material.
+    The function can be the `conductivity_law` of a material.
 
     Parameters
     ----------
@@ -439,30 +440,29 @@ def kozeny_carman(conductivity, porosity, porosity0):
 
 
 def filled(p, suction):
-    """Return the saturation of drainable pores at a pressure p, Pa: a cubic from 0 at -`suction` to 1 at `suction`."""
+    """Return the saturation of drainable pores, a cubic from 0 at -`suction` to 1 at `suction`."""
     x = ufl.max_value(0.0, ufl.min_value(1.0, (1 + p / suction) / 2))
     return x**2 * (3 - 2 * x)
 
 
 @dataclass(frozen=True, eq=False)
 class unsaturated:
-    """Conductivity law for flow below a free surface; use it as `conductivity_law` of a material.
+    """Conductivity law for flow below a free surface, as `conductivity_law` of a material.
 
     The conductivity falls from k at p = `suction` to `least` * k at p = -`suction`, by a smooth cubic (Bathe and
     Khoshgoftaar 1979).  The drainable porosity empties along the same cubic; other pores stay full.  The soil's weight
     is computed with full pores.  The law uses the pressure at the start of each substep.  Steady flow therefore needs
-    steps of about h^2 / c_v, with the cell size h and the coefficient of consolidation c_v.  In such a step a free
-    surface moves by less than a cell.
+    steps of about h^2 / c_v, with the cell size h and the coefficient of consolidation c_v.
 
     Parameters
     ----------
     suction
         Half width of the transition, Pa, > 0.  Recommended: 0.5 to 1 times unit weight of water times cell height.
     least
-        Conductivity of drained soil, divided by that of saturated soil, in (0, 1).
+        Conductivity of drained soil, divided by the conductivity of saturated soil, in (0, 1).
     specific_yield
-        Drainable porosity, in [0, 1), at most the porosity.  Use 0 for steady flow only: with 0, a free surface falls
-        at once.
+        Drainable porosity, in [0, 1), at most the porosity.  With 0, a free surface falls at once, so that only steady
+        flow is meaningful.
     """
 
     suction: float
@@ -476,7 +476,7 @@ class unsaturated:
         numbers("unsaturated: specific_yield", drains, test=lambda v: (0 <= v) & (v < 1), allowed=allowed)
 
     def __call__(self, conductivity, p):
-        """Return the conductivity, m/s, as UFL."""
+        """Return the conductivity, in m/s, as UFL."""
         return conductivity * (self.least + (1 - self.least) * filled(p, self.suction))
 
 
@@ -493,7 +493,7 @@ class Fluid:
         rho_w exp(p / K_w).
     gravity
         Acceleration g that defines hydraulic conductivities, m/s^2, > 0.  By default it is the scene's gravity if this
-        is a constant vector other than zero, else 9.81.  With units other than m and s, this argument is required in
+        is a constant vector other than zero, and 9.81 otherwise.  With units other than m and s, it is required in
         scenes without gravity, or with gravity as a function of time.
 
     Raises
@@ -515,7 +515,7 @@ class Fluid:
 
     @property
     def unit_weight(self) -> float:
-        """Unit weight rho_w g, N/m^3, that turns a hydraulic conductivity into a mobility k/(rho_w g)."""
+        """Unit weight rho_w g, in N/m^3, that turns a hydraulic conductivity into a mobility k/(rho_w g)."""
         return self.density * (self.gravity or STANDARD_GRAVITY)
 
 

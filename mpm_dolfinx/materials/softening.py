@@ -2,13 +2,14 @@
 """Drucker and Prager's law with a viscosity, and with a cohesion that decreases with slip.
 
 Softening localises in shear bands one cell wide.  If the cohesion depended on strain, the dissipated work would
-decrease with the cell size.  The cohesion therefore depends on the slip gamma h of a band.  gamma is the plastic shear
-strain, h is the cell size (crack band: Bazant and Oh 1983; Pietruszczak and Mroz 1981),
+decrease with the cell size.  The cohesion c therefore depends on the slip gamma h of a band, with the plastic shear
+strain gamma and the cell size h (crack band: Bazant and Oh 1983; Pietruszczak and Mroz 1981),
 
-    c = c_0 - (c_0 - c_r) min(1, gamma h / s),
+    c = c_0 - (c_0 - c_r) min(1, gamma h / s).
 
-so that softening along a band dissipates the work (c_0 - c_r) s / 2 per area, on any grid.  Perzyna's viscosity is
-f = eta dgamma/dt, with the yield function f.  It is linear, integrated implicitly, and without effect in slow loading.
+c_0 is the initial cohesion, c_r is the residual cohesion, and s is the slip at which c = c_r.  Softening along a band
+dissipates the work (c_0 - c_r) s / 2 per area, on any grid.  Perzyna's viscosity is f = eta dgamma/dt, with the yield
+function f and the viscosity eta.  It is integrated implicitly, and has no effect in slow loading.
 """
 
 from __future__ import annotations
@@ -42,9 +43,9 @@ class SofteningDruckerPrager(DruckerPrager):
     viscosity
         Viscosity eta of Perzyna's law f = eta dgamma/dt, Pa s, >= 0, with the yield function f of `DruckerPrager`.
 
-    Other parameters: see `DruckerPrager`, without hardening.  State variables: `plastic` is the inverse plastic metric
-    C_p^-1 (3, 3), and `hardened` is xi gamma.  xi is the coefficient of the cohesion in the yield function, gamma is
-    the plastic shear strain.  Soil in tension at the apex of the cone has the residual cohesion.
+    Other parameters: see `DruckerPrager`, without hardening.  The state variable `plastic` is the inverse plastic
+    metric C_p^-1 (3, 3).  The state variable `hardened` is xi gamma, with the coefficient xi of the cohesion in the
+    yield function and the plastic shear strain gamma.  Soil in tension at the apex of the cone has the cohesion c_r.
 
     Raises
     ------
@@ -67,6 +68,11 @@ class SofteningDruckerPrager(DruckerPrager):
         if not callable(self.cohesion):
             _check(self, "residual", lambda v: (0 <= v) & (v <= self.cohesion), "in [0, cohesion]")
 
+    @property
+    def cone(self):
+        """Coefficients (..., 3): eta and xi of the yield function, and eta of the plastic potential."""
+        return np.stack(np.broadcast_arrays(self.eta, self.xi, self.eta_flow), axis=-1)
+
     def check_cells(self, cell_size: float) -> None:
         stiff = self.shear + self.bulk * self.eta * self.eta_flow
         least = self.xi * (self.cohesion - self.residual) * cell_size / stiff
@@ -77,29 +83,25 @@ class SofteningDruckerPrager(DruckerPrager):
             raise ValueError(f"{what} {cell_size:g} m, else the soil softens faster than it unloads")
 
     @staticmethod
-    def kirchhoff(
-        F, bulk, shear, eta, xi, eta_flow, cohesion, residual, slip, viscosity, plastic, hardened, dt, cell_size
-    ):
-        """Return the Kirchhoff stress (3, 3), Pa, as UFL."""
+    def kirchhoff(F, bulk, shear, cone, cohesion, residual, slip, viscosity, plastic, hardened, dt, cell_size):
+        """Return the Kirchhoff stress (3, 3), in Pa, as UFL."""
         trial = Trial(F, plastic)
         strength = cohesion, residual, slip / cell_size, viscosity / (dt + TINY)
-        return stress(trial, _softened(trial, bulk, shear, eta, xi, eta_flow, hardened, *strength), shear)
+        return stress(trial, _softened(trial, bulk, shear, cone, hardened, *strength), shear)
 
     @staticmethod
-    def update(
-        F, bulk, shear, eta, xi, eta_flow, cohesion, residual, slip, viscosity, plastic, hardened, dt, cell_size
-    ):
-        """Return the state at the end of the step: UFL by name."""
+    def update(F, bulk, shear, cone, cohesion, residual, slip, viscosity, plastic, hardened, dt, cell_size):
+        """Return the state at the end of the step as UFL, by name."""
         trial = Trial(F, plastic)
         strength = cohesion, residual, slip / cell_size, viscosity / (dt + TINY)
-        to = _softened(trial, bulk, shear, eta, xi, eta_flow, hardened, *strength)
+        to = _softened(trial, bulk, shear, cone, hardened, *strength)
         return {"plastic": metric(trial, to, bulk, plastic), "hardened": hardened + to["hardened"]}
 
 
-def _softened(trial: Trial, bulk, shear, eta, xi, eta_flow, hardened, cohesion, residual, strain, drag) -> dict:
-    """Like `drucker_prager.returned`, with softening; strain: plastic shear strain at which the cohesion is c_r."""
-    end = xi * strain  # in terms of `hardened`
-    moduli = trial, bulk, shear, eta, xi, eta_flow
+def _softened(trial: Trial, bulk, shear, cone, hardened, cohesion, residual, strain, drag) -> dict:
+    """Like `drucker_prager.returned`, with a cohesion that falls to c_r at the plastic shear strain `strain`."""
+    end = cone[1] * strain  # in terms of `hardened`
+    moduli = trial, bulk, shear, *cone
     falling = returned(*moduli, cohesion, (residual - cohesion) / end, hardened, drag)
     left = returned(*moduli, residual, 0.0, hardened, drag)
     # soil in tension at the apex has the residual cohesion

@@ -3,7 +3,7 @@
 
 In UFL, isotropic functions of a tensor are Newton's interpolation polynomials at its eigenvalues.  The polynomials are
 exact for smooth functions of each eigenvalue.  They remain smooth at equal eigenvalues, because `_eigenvalues`
-separates equal eigenvalues.  If the principal values have kinks and depend on all three eigenvalues, `Coaxial` gives
+separates equal eigenvalues.  For principal values that have kinks and depend on all three eigenvalues, `Coaxial` gives
 exact derivatives in numpy.
 """
 
@@ -24,7 +24,7 @@ PLANE, SPACE = ((0, 0), (1, 1), (2, 2), (0, 1)), ((0, 0), (1, 1), (2, 2), (0, 1)
 
 
 class Isotropic:
-    """Isotropic functions of a symmetric UFL tensor b (3, 3); plane: whether the third axis of b is principal."""
+    """Isotropic functions of a symmetric UFL tensor (3, 3)."""
 
     def __init__(self, b, plane: bool):
         self._b, self._plane = b, plane
@@ -66,12 +66,12 @@ class Trial:
 
 
 def components(b, plane: bool):
-    """Return the components of a symmetric UFL tensor (3, 3) as a vector: six, or the four in `PLANE`."""
+    """Return the components of a symmetric UFL tensor (3, 3), six or the four in `PLANE`."""
     return ufl.as_vector([b[i] for i in (PLANE if plane else SPACE)])
 
 
 def symmetric(values):
-    """Return the symmetric UFL tensor (3, 3) with the six components `values`, in the order of `SPACE`."""
+    """Return the symmetric UFL tensor (3, 3) with six components in the order of `SPACE`."""
     place = {}
     for k, (i, j) in enumerate(SPACE):
         place[i, j] = place[j, i] = values[k]
@@ -79,7 +79,7 @@ def symmetric(values):
 
 
 def eigen(b: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return eigenvalues (n, 3) and axes (n, 3, 3) of tensors with components b (n, 4) or (n, 6).  Axes are columns."""
+    """Return eigenvalues (n, 3), and axes (n, 3, 3) as columns, of tensors with components b."""
     n = len(b)
     if b.shape[1] == len(SPACE):
         full = np.empty((n, 3, 3))
@@ -101,11 +101,11 @@ def eigen(b: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float
 
 
 class Coaxial:
-    """Tensors coaxial with given tensors.
+    """Tensors that are coaxial with n other tensors.
 
-    x (n, 3), axes (n, 3, 3): eigenvalues and axes of the given tensors, see `eigen`.
+    x (n, 3), axes (n, 3, 3): eigenvalues and axes of the other tensors, see `eigen`.
     y (n, 3): principal values of the coaxial tensors.
-    plane: whether the given tensors have the components in `PLANE`, as in plane strain and axisymmetry.
+    plane: whether the other tensors have the components in `PLANE`.
     """
 
     def __init__(self, x: NDArray[np.float64], axes: NDArray[np.float64], y: NDArray[np.float64], plane: bool):
@@ -128,10 +128,12 @@ class Coaxial:
         return out
 
     def tangent(self, slopes: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return derivatives (n, 6, 4 or 6) of `values` by the given tensors' components.  slopes (n, 3, 3): dy/dx.
+        """Return the derivatives of `values` with respect to the components of the other tensors.
 
-        In principal axes, off-diagonal derivatives follow from dy_ij = (y_i - y_j) / (x_i - x_j) dx_ij.  For x_i = x_j
-        the limit is (dy_i/dx_i - dy_i/dx_j) dx_ij, because an isotropic function has y_i = y_j there.
+        In principal axes, dy_ij = (y_i - y_j) / (x_i - x_j) dx_ij for i != j.  The limit for x_i = x_j is
+        (dy_i/dx_i - dy_i/dx_j) dx_ij, because an isotropic function has y_i = y_j there.
+
+        slopes (n, 3, 3): dy/dx.
         """
         x = self._x
         y = self._y

@@ -1,18 +1,19 @@
 # SPDX-License-Identifier: MIT
 """User-defined functions that return UFL.
 
-The name of an argument determines its value.  Laws and conductivities belong to materials: see `skeleton.Skeleton`.
-`Simulation` takes terms of the balances, integrated over the configuration at the start of the step.  Their arguments:
+The package passes each argument by its name; the names are listed below.  Laws and conductivities belong to materials:
+see `skeleton.Skeleton`.  `Simulation` takes terms of the balances, integrated over the configuration at the start of
+the step.  Their arguments are:
 
 points
     Quadrature points.  `points.dx` is their measure, which adds up to the volumes of the material points.
-    `points.value(f)` and `points.grad(f)` are the value and gradient of f = u or v; the gradient is (3, 3) in
-    axisymmetry, with f_r / r.  `points.F` is the deformation gradient at the start of the step, in the shape of grad u,
-    with the volume ratio as determinant.  `points.position` and `points.displacement` are values at the start of the
-    step; displacements count from the start of the run, or from a stage that set them to zero.  Other attributes are
-    parameters that are functions of position, and the laws' state variables.
+    `points.value(f)` and `points.grad(f)` are the value and gradient of f = u or v.  In axisymmetry the gradient is
+    (3, 3), with f_r / r.  `points.F` is the deformation gradient at the start of the step, in the shape of grad u, with
+    the volume ratio as determinant.  `points.position` is the position at the start of the step.
+    `points.displacement` is the displacement since the start of the run, or since a stage that set it to zero.  Other
+    attributes are parameters that are functions of position, and the laws' state variables.
 t
-    Time at which the balances hold, s, as a UFL constant.  It is the end of the step or of its first substep.
+    Time at which the balances hold, s, as a UFL constant: the end of the step or of its first substep.
 
 A function in `terms` is added to the balance of momentum, `int P : grad v dV - loads + term = 0`.  It may also have
 these arguments:
@@ -55,12 +56,11 @@ from mpm_dolfinx.base.validation import asked, instance, line, line_of
 
 
 def call(function: Callable, kind: str = "UFL", /, **available):
-    """Call a user-defined function with the arguments in its signature; kind: type of the result, for messages.
+    """Call a user-defined function with the arguments in its signature.
 
-    Raises
-    ------
-    ValueError
-        The function has an unknown argument, or raises an error.
+    ValueError is raised if the function has an unknown argument or fails.
+
+    kind: type of the result, for messages.
     """
     names = list(signature(function).parameters)
     for name in names:
@@ -73,11 +73,8 @@ def call(function: Callable, kind: str = "UFL", /, **available):
 def expression(function: Callable, shapes: Sequence[tuple[int, ...]], of: str = "", **available):
     """Return the result of a user-defined function as a UFL expression with one of the given shapes.
 
-    Raises
-    ------
-    ValueError
-        The function raises an error as in `call`, or its result is not UFL, has a wrong shape, or does not depend on
-        the argument `of`.
+    ValueError is raised if the function fails, or if its result is not UFL, has a wrong shape, or does not depend on
+    the argument `of`.
     """
     value = call(function, **available)
     allowed = f"UFL of shape {' or '.join(map(str, shapes))}{f' that depends on {of}' if of else ''}"
@@ -96,7 +93,7 @@ def expression(function: Callable, shapes: Sequence[tuple[int, ...]], of: str = 
 
 
 def _check_parts(what: str, out: ufl.core.expr.Expr) -> None:
-    """Raise ValueError for infinite numbers and NaN, and for sums over an index of two sizes, which UFL may accept."""
+    """Raise ValueError for infinite numbers, NaN, and sums over an index of two sizes."""
     for part in unique_pre_traversal(out):
         if isinstance(part, ufl.constantvalue.RealValue) and not np.isfinite(float(part)):
             raise ValueError(f"{what}: contains {float(part)}, must be finite")
@@ -109,12 +106,9 @@ def _check_parts(what: str, out: ufl.core.expr.Expr) -> None:
 
 
 def named(what: str, given, shapes: Mapping[str, tuple[int, ...]], some: bool = False) -> dict:
-    """Return the dict from a user-defined function as UFL with the given shapes.  some: whether names may be missing.
+    """Return the dict from a user-defined function as UFL with the given shapes, or raise ValueError.
 
-    Raises
-    ------
-    ValueError
-        The result is not a dict of UFL with these names and shapes, or all values are constant.
+    some: whether names may be missing.
     """
     instance(f"{what}: its result", given, dict)
     allowed, out = f"{'some of ' if some else ''}the names and shapes {dict(shapes)}", {}
@@ -135,10 +129,7 @@ def named(what: str, given, shapes: Mapping[str, tuple[int, ...]], some: bool = 
 def form(kind: str, function: Callable, **available) -> ufl.Form:
     """Return the form of a user-defined function, integrated over the points.
 
-    Raises
-    ------
-    ValueError
-        The function raises an error as in `call`, or its result is not a form, or has integrals over the grid.
+    ValueError is raised if the function fails, or if its result is not a form or has integrals over the grid.
     """
     out, dx = call(function, **available), available["points"].dx
     allowed = "a form with points.dx"
@@ -152,12 +143,9 @@ def form(kind: str, function: Callable, **available) -> ufl.Form:
 
 
 def term_of(term: Callable, unknown: ufl.Coefficient, test: ufl.Argument, **available) -> tuple[ufl.Form, bool]:
-    """Return a user-defined term as a linear form in the test function, and whether it derives from an energy.
+    """Return a user-defined term as a linear form, and whether it derives from an energy.
 
-    Raises
-    ------
-    ValueError
-        The term raises an error as in `form`, or depends on neither the unknown nor v.
+    ValueError is raised if the term fails or depends on neither the unknown nor v.
     """
     out = form("terms", term, **available)
     if out.arguments():
@@ -169,7 +157,7 @@ def term_of(term: Callable, unknown: ufl.Coefficient, test: ufl.Argument, **avai
 
 @contextmanager
 def compiling(what: str, allowed: str) -> Iterator[None]:
-    """Turn errors of UFL and its compiler into a ValueError that names the object and the allowed values."""
+    """Turn errors of UFL and its compiler into a ValueError that names the object."""
     try:
         yield
     except (Exception, ArityMismatch) as error:  # UFL and FFCx raise many kinds; one is no Exception
@@ -180,7 +168,7 @@ def compiling(what: str, allowed: str) -> Iterator[None]:
 
 
 def _is_ours(error: Exception) -> bool:
-    """Return whether this package raised an error.  The error's message then names the object."""
+    """Return whether this package raised an error."""
     frames = error.__traceback__
     while frames.tb_next is not None:
         frames = frames.tb_next

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Derivatives of nodal forces with respect to the cells' pressures, through laws that depend on suction.
+"""Derivatives of nodal forces with respect to the pressures of cells, for laws that depend on suction.
 
-The stress of a law that depends on suction depends on the pressure twice: through the law, and through the term chi p
-of Bishop's stress. In cells with F-bar, the mean stress pi depends on the pressure too.
+The stress of such a law depends on the pressure through the law, and through the term chi p of Bishop's stress.  In
+cells with F-bar, the mean stress pi also depends on the pressure.
 """
 
 from __future__ import annotations
@@ -14,18 +14,17 @@ import ufl
 from numpy.typing import NDArray
 
 from mpm_dolfinx.forms.cell_matrices import along_shapes
-from mpm_dolfinx.forms.point_forms import CellSums, FormPoints
+from mpm_dolfinx.forms.point_forms import CellSums, FormPoints, Given
 from mpm_dolfinx.mechanics.mean_dilatation import MeanDilatation
 from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
 
 
 def suction_sums(points: FormPoints, F, slopes: Sequence, locks: bool) -> CellSums | None:
-    """Return the sums over one part's pieces in each cell that `OfSuction` needs, or None if it needs no sums.
+    """Return the sums over pieces in each cell that `OfSuction` needs, or None.
 
-    points: integration points of the pieces.
     F: deformation gradient (d, d), a UFL variable.
-    slopes: UFL derivatives of two stresses with respect to the pressure, empty for laws without suction.  The stresses
-    are the first Piola-Kirchhoff stress (d, d) and, with F-bar, the mean stress pi conjugate to theta.
+    slopes: UFL derivatives with respect to the pressure, empty for laws without suction.  The first derivative is that
+    of the first Piola-Kirchhoff stress (d, d).  With F-bar, the second is that of the mean stress pi.
     locks: whether the law of the pieces uses F-bar.
     """
     share = 1 / ufl.det(points.F)
@@ -36,11 +35,10 @@ def suction_sums(points: FormPoints, F, slopes: Sequence, locks: bool) -> CellSu
 
 
 class OfSuction:
-    """Derivatives of the nodal forces with respect to the cells' pressures, for laws that depend on suction.
+    """Derivatives of nodal forces with respect to the pressures of cells, for laws that depend on suction.
 
-    dim: number of axes.
     dilatation: volume ratios of cells for F-bar, or None if no cell would lock.
-    sums: results of `suction_sums`, one for each part of the points (`SceneMaterials.parts`).
+    sums: results of `suction_sums` for each part of the points.
     """
 
     def __init__(self, dim: int, dilatation: MeanDilatation | None, sums: Sequence[CellSums | None]):
@@ -49,12 +47,16 @@ class OfSuction:
         found = {number: of for number, of in enumerate(sums) if of is not None}
         self._free = {number: of for number, of in found.items() if number not in self._locked}
 
-    def rows(self, data: QuadratureData) -> list[tuple[NDArray[np.int32], NDArray[np.float64]]]:
-        """Return pairs of cells (c,) and derivatives (c, n), m^(d-1), of their nodal forces by their pressures."""
-        out = [(data.parts[number].places.filled, sums(data.parts[number])) for number, sums in self._free.items()]
+    def rows(self, data: QuadratureData, given: Sequence[Given]) -> list[tuple[NDArray[np.int32], NDArray[np.float64]]]:
+        """Return cells, and the derivatives of their nodal forces with respect to their pressures.
+
+        given: values that are passed to the forms of each part.
+        """
+        parts = data.parts
+        out = [(parts[k].places.filled, of(parts[k], given[k])) for k, of in self._free.items()]
         if self._locked:
             width = 2 * self._width + 1
-            sums = [of(data.parts[number]) for number, of in self._locked.items()]
+            sums = [of(parts[k], given[k]) for k, of in self._locked.items()]
             cells, total, volume = self._dilatation.total(data, [_padded(values, width) for values in sums])
             by_volume, by_stress, slope = np.split(total, (self._width, 2 * self._width), axis=1)
             out.append((cells, by_stress + slope / volume * by_volume))
@@ -62,5 +64,5 @@ class OfSuction:
 
 
 def _padded(values: NDArray[np.float64], width: int) -> NDArray[np.float64]:
-    """Return values (k, n) padded with zeros, in rows of the given width."""
+    """Return values (k, n) with rows padded by zeros to a width."""
     return np.pad(values, ((0, 0), (0, width - values.shape[1])))

@@ -1,21 +1,20 @@
 # SPDX-License-Identifier: MIT
 """Ghost penalty: nearly empty cells follow the deformation of fuller neighbours (Burman 2010, Coombs 2023).
 
-The term `gamma s 2G h/3 int [d_n u].[d_n v] dS` acts on the displacement increment u of the step.  gamma is `GHOST`,
-and s is the strength of a face (see below).  G is the shear modulus, h is the cell size, and [d_n u] is the jump of the
-normal derivative.  Nearly empty cells then hardly affect conditioning and accuracy.  The penalty resists each step's
-increment like a viscosity, so it must not act on load-bearing cells:
+Nearly empty cells would spoil the conditioning and the accuracy of a step.  The ghost penalty adds the term
+`gamma s 2G h/3 int [d_n u].[d_n v] dS` over faces, with the displacement increment u of the step and the test function
+v.  gamma is `GHOST`, s is the strength of the face, G is the shear modulus, h is the cell size, and [d_n u] is the jump
+of the normal derivative.  The penalty resists motion like a viscosity, so it must not act on load-bearing cells:
 
-* The strength s of a face has two factors.  The first factor falls from 1 to 0 while the emptier cell's filling rises
-  from 0 to `RATIO` times the fuller cell's filling.  The second factor is the squared ratio of the fuller cell's
-  filling to the largest filling of the emptier cell's neighbours.  A penalty between equally filled cells would resist
-  kinks of a body.
+* The strength s has two factors.  The first factor falls from 1 to 0 while the filling of the emptier cell rises from 0
+  to `RATIO` times the filling of the fuller cell.  The second factor is the squared ratio of the filling of the fuller
+  cell to the largest filling of the emptier cell's neighbours.  The penalty does not resist kinks of a body between
+  equally filled cells.
 * The factor 2G contains the shear modulus only.  With lambda + 2G, nearly empty cells of nearly incompressible bodies
-  would copy the stretch of the full neighbour, against their own volume constraint.  In flowing soil the factor is less
-  than 2G.
+  would copy the stretch of the full neighbour, against their own volume constraint.
 
 With integration at the material points, any cell may hold too few points for its nodes.  All faces of cells that are
-not full therefore have a penalty of strength 0.2.
+not full then have a penalty of strength 0.2.
 """
 
 from __future__ import annotations
@@ -34,32 +33,33 @@ from mpm_dolfinx.grid.grid import TURN, Grid, across_faces
 from mpm_dolfinx.materials.skeleton import Skeleton
 
 GHOST = 0.05
-"""Strength of the ghost penalty.  Halving this value changes the result of scene "beam" in tests/plateaus.py by 9.9e-06
-(relative), doubling it by 1.9e-05, and finer cells by 1.5e-02.
+"""Strength of the ghost penalty.  The result of scene "beam" in tests/plateaus.py changes by the fraction 9.9e-06 with
+half this value, by 1.9e-05 with twice this value, and by 1.5e-02 with finer cells.
 """
 YIELDING = 0.02
 """Smallest reduction factor of the penalty for nearly incompressible laws with a state."""
 RATIO = 0.3
-"""Ratio of the emptier to the fuller cell's filling below which a face has the penalty.  Halving this value changes the
-result of scene "soil" in tests/plateaus.py by 1.3e-03 (relative), doubling it by 5.9e-04, and finer cells by 3.0e-02.
+"""A face has the penalty if the filling of the emptier cell, divided by that of the fuller cell, is below this value.
+
+The result of scene "soil" in tests/plateaus.py changes by the fraction 1.3e-03 with half this value, by 5.9e-04 with
+twice this value, and by 3.0e-02 with finer cells.
 """
 SPARSE, FULL = 0.2, 0.9
-"""Strength of the penalty with integration at points, and volume fraction of the fullest cells with this penalty."""
+"""Two numbers for integration at points: strength of the penalty, and largest volume fraction of a cell with it."""
 
 
 def stiffness(material: Skeleton) -> NDArray[np.float64]:
-    """Return the modulus that scales the penalty, Pa: 2G, reduced for nearly incompressible laws with a state.
+    """Return the modulus of the penalty, in Pa: 2G, reduced for nearly incompressible laws with a state.
 
-    In nearly empty cells of flowing soil the volume constraint opposes the penalty. With the modulus 2G, a penalty ten
-    times as large raises a footing's limit load by 0.004 % at nu = 0.3, by 0.3 % at nu = 0.49, and by 0.75 % at nu =
-    0.499.  At low nu the penalty is not reduced, else Newton's method fails in frictional soil at deep penetration.
+    In nearly empty cells of flowing soil, the volume constraint opposes the penalty.  At low Poisson's ratio the
+    penalty is not reduced, because Newton's method would fail in frictional soil at deep penetration.
     """
     share = np.minimum(1.0, 4 * material.shear / material.oedometric) ** 2 if material.state else 1.0
     return 2 * np.maximum(YIELDING, share) * material.shear
 
 
 def kinks(grid: Grid, V: fem.FunctionSpace, strength: ufl.core.expr.Expr, power: int) -> FacetForm:
-    """Return the form `int strength h^power [d_n u].[d_n v] dS` over faces; h, m: mean cell size normal to the face."""
+    """Return the form `int strength h^power [d_n u].[d_n v] dS` over faces, with the cell size h."""
     n = ufl.FacetNormal(grid.mesh)("+")
     *_, across = across_faces(grid, n)
     dS = ufl.Measure("dS", domain=grid.mesh, subdomain_id=_compat.SUBDOMAIN, metadata={"quadrature_degree": 2})
@@ -70,19 +70,15 @@ def kinks(grid: Grid, V: fem.FunctionSpace, strength: ufl.core.expr.Expr, power:
 class GhostPenalty:
     """Form of the ghost penalty, with modulus and volume fraction of the cells as coefficients.
 
-    Parameters
-    ----------
-    grid, V
-        Background grid, and space of the displacement.
-    at_points
-        Whether bodies are integrated at their material points.
+    V: space of the displacement.
+    at_points: whether bodies are integrated at their material points.
 
     Attributes
     ----------
     modulus
-        Modulus of the penalty, Pa: mean over the material in the cell, see `stiffness`.
+        Mean modulus of the penalty in each cell, Pa, see `stiffness`.
     shear
-        Shear modulus, Pa, of laws with a state: mean over the material in the cell; zero for other laws.
+        Mean shear modulus in each cell, Pa, with zero for laws without a state.
     firmness
         Form that regularises tangents: elastic shear stiffness of the cells times their volume fraction.
     fill, beside
@@ -103,7 +99,7 @@ class GhostPenalty:
         self.firmness = FacetForm(2 * self.fill * self.shear * around * ufl.inner(*strains) * dx, grid.comm)
 
     def _scale(self):
-        """Return the strength of a face times the harmonic mean of both cells' moduli, Pa, as UFL."""
+        """Return the strength of a face times the mean modulus of both cells, as UFL."""
         fills, moduli, beside = ([f("+"), f("-")] for f in (self.fill, self.modulus, self.beside))
         full, little = ufl.max_value(*fills), ufl.min_value(*fills)
         fullest = ufl.conditional(ufl.lt(*fills), *beside)  # largest filling next to the emptier cell
@@ -115,11 +111,12 @@ class GhostPenalty:
     def set_contents(
         self, own: NDArray[np.int64], volume: NDArray[np.float64], *moduli: NDArray[np.float64]
     ) -> NDArray[np.int64]:
-        """Set the volume fractions and moduli of the cells `own` (n,), owned cells that contain material.
+        """Set the volume fractions and moduli of owned cells with material, and return all active local cells.
 
-        Return all active local cells, ascending.  `fill` must be zero before the call.
+        `fill` must be zero before the call.
 
-        volume (n,), m^d: volume of the material in each cell.
+        own (n,): owned cells that contain material.
+        volume (n,), in m^d: volume of the material in each cell.
         moduli: two arrays (n,), `modulus` times volume and `shear` times volume.
         """
         grid, fill = self.grid, self.fill.x.array
@@ -135,7 +132,7 @@ class GhostPenalty:
         return np.concatenate([own, ghosts])
 
     def on(self, facets: NDArray[np.int32], at_walls: NDArray[np.int32]) -> Loads:
-        """Return the penalty on faces of this process.  at_walls: faces of cells with nodes that walls fix."""
+        """Return the penalty on faces.  The faces `at_walls` belong to cells with nodes that walls fix."""
         return GhostLoads(self.form.on(facets), self.form.on(at_walls))
 
     def facets(self, facets: NDArray[np.int32]) -> NDArray[np.int32]:
@@ -145,7 +142,7 @@ class GhostPenalty:
 
 
 class GhostLoads(Loads):
-    """Ghost penalty on all inner faces of partly filled cells, with a separate sum over the faces at walls."""
+    """Ghost penalty on inner faces of partly filled cells."""
 
     def __init__(self, everywhere: FacetSum, at_walls: FacetSum):
         self._everywhere, self._at_walls = everywhere, at_walls

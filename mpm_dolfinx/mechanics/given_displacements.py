@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Prescribed displacements of sides, by penalties on cell means and weaker penalties at points; see `held_cells`.
 
-If a side lags behind its prescribed displacement, each component in each cell gets a multiplier, by the method of
-multipliers (Hestenes 1969).  The multipliers make the cell means reach the prescribed displacements, unless the cells
+A side may lag behind its prescribed displacement.  Each component in each cell then gets a multiplier, by the method of
+multipliers (Hestenes 1969).  With the multipliers, the cell means reach the prescribed displacements, unless the cells
 cannot follow the side.
 """
 
@@ -31,7 +31,7 @@ from mpm_dolfinx.forms.point_forms import FormPoints, PointData, PointForm
 from mpm_dolfinx.grid.grid import Grid, sum_by
 from mpm_dolfinx.mechanics.held_cells import HeldCells, HeldPoints, inner_cells
 from mpm_dolfinx.mechanics.rigid_motion import rigid_motion, turned
-from mpm_dolfinx.parallel.exchange import everywhere, first, over_all
+from mpm_dolfinx.parallel.exchange import first, over_all, together
 from mpm_dolfinx.parallel.messages import ConditionWarning, warn
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.points.parts import Parts
@@ -40,7 +40,7 @@ ARTEFACT = "%s: not at its prescribed position at %s, so %s"
 
 
 class HoldForms:
-    """Forms of penalties, at points or on means over points: stiffness, and force towards the prescribed position."""
+    """Forms of penalties at points or on means: stiffness, and force towards the prescribed position."""
 
     def __init__(self, grid: Grid, u: fem.Function):
         d = grid.dim
@@ -49,7 +49,7 @@ class HoldForms:
         v, du = ufl.TestFunction(u.function_space), ufl.TrialFunction(u.function_space)
 
         def along(w):
-            """Return the component of a Q1 field along `direction`, averaged over points with the given moments."""
+            """Return the component of a Q1 field along `direction`, averaged over points with these moments."""
             second = ufl.grad(ufl.grad(w))
             i, j, k = ufl.indices(3)
             mean = w + ufl.dot(ufl.grad(w), h.offset) + ufl.as_vector(second[i, j, k] * h.squares[j, k], i) / 2
@@ -62,17 +62,9 @@ class HoldForms:
 
 
 class GivenDisplacements(Acting):
-    """The prescribed displacements of a stage.
+    """The prescribed displacements of a stage, by name.
 
-    Parameters
-    ----------
-    setting, displacements
-        The stage, and its conditions of this kind by name.
-
-    Raises
-    ------
-    ValueError
-        Two conditions prescribe the same component on the same part of a face.
+    ValueError is raised if two conditions prescribe the same component on the same part of a face.
     """
 
     conditions, title = (Displacement,), "given displacements"
@@ -83,7 +75,7 @@ class GivenDisplacements(Acting):
         self._materials = setting.materials
         self._free, self._names = setting.free, list(displacements)
         self._meeting: list[tuple[Displacement, Displacement, list[int], NDArray[np.float64]]] = []
-        self._warned: set[tuple[int, str]] = set()  # indices of the conditions with a warning in the log, and its text
+        self._warned: set[tuple[int, str]] = set()  # index of the condition, and text, of each warning in the log
         sides, d = setting.sides, self._grid.dim
         whole = [(hold, sides.of(hold), hold.axes(d)) for hold in displacements.values()]
         for (one, faces, axes), (other, others, more) in combinations(whole, 2):
@@ -101,9 +93,9 @@ class GivenDisplacements(Acting):
         return [faces for _, faces, _ in self._holds]
 
     def check_start(self, place: Place) -> None:
-        """Warn, once for each condition, if its side must jump at the start of a stage with inertia.
+        """Warn once for each condition whose side must jump at the start of a stage with inertia.
 
-        A gap is a jump if the strain that it causes in the cell exceeds the cell's stress divided by the modulus.
+        A gap is a jump if it strains the cell by more than the stress of the cell divided by its modulus.
         """
         if not (place.inertia and place.dt):
             return
@@ -121,7 +113,7 @@ class GivenDisplacements(Acting):
                 self._warn(number, what, jump, place.start, why)
 
     def placed(self, place: Place) -> Loads:
-        """Return the penalties in a substep: one for each component and each cell or point."""
+        """Return the penalties in a substep."""
         d, comm = self._grid.dim, self._grid.comm
         self._check_meeting(place.t)
         ends = (place.start, place.start + place.dt) if place.dt > 0 else ()  # empty if the displacement is zero
@@ -145,9 +137,9 @@ class GivenDisplacements(Acting):
         return HoldLoads(self, forms, data, held, row, own, place)
 
     def _held_points(self, place: Place, ends: Sequence[float]) -> HeldPoints:
-        """Return the integration points on sides.  A point is on the process of its constraint, see `inner_cells`.
+        """Return the integration points on sides, on the processes of their constraints, see `inner_cells`.
 
-        ends: start and end of the step, s; empty if the displacement is zero.
+        ends: start and end of the step, in s; empty if the displacement is zero.
         """
         cut, points = place.cut, place.points
         d, t = self._grid.dim, place.t
@@ -185,7 +177,7 @@ class GivenDisplacements(Acting):
         return HeldPoints(number.astype(np.int64), cell, *own, x, *np.split(values[:, 7:], [d, 3 * d, 4 * d], axis=1))
 
     def _check_meeting(self, t: float) -> None:
-        """Raise ValueError if displacements differ where two sides meet, because the stress there would be infinite."""
+        """Raise ValueError if displacements differ where two sides meet, because the stress would be infinite."""
         for one, other, axes, X in self._meeting:
             jump = np.abs(self._given(one, t, X) - self._given(other, t, X))[:, axes].max(axis=1)
             if jump.max(initial=0.0) > NEAR * self._grid.least:
@@ -193,15 +185,15 @@ class GivenDisplacements(Acting):
                 raise ValueError(f"{what}, at {X[jump.argmax()]}; must be equal there, or the sides two cells apart")
 
     def _given(self, hold: Displacement, t: float, X: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the prescribed displacements (n, d), m, at reference positions X (n, d) of this process."""
-        return everywhere(self._grid.comm, lambda: hold.at(t, X))
+        """Return the prescribed displacements, in m, at reference positions X (n, d)."""
+        return together(self._grid.comm, lambda: hold.at(t, X))
 
     def unknown(self, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:
         """Return reactions, by quantity and name of the condition, with every component equal to `value`."""
         return {"reactions": {name: np.full(self._grid.dim, value) for name in self._names}}
 
     def reactions(self, loads: HoldLoads, at: At) -> dict[str, NDArray[np.float64]]:
-        """Return the force (d,), N, of each condition on the bodies at u."""
+        """Return the force of each condition on the bodies at u, in N."""
         held = loads.held
         data = loads.data
         force = loads.pull(at.nodal)
@@ -215,7 +207,7 @@ class GivenDisplacements(Acting):
         return dict(zip(self._names, self._grid.comm.allreduce(sums), strict=True))
 
     def _warn(self, number: int, what: str, *values) -> None:
-        """Warn of a fault `what` of the condition with index `number`, once for each condition and fault."""
+        """Warn of a fault of a condition, once for each condition and fault."""
         if (number, what) not in self._warned:
             warn(self._grid.comm, ConditionWarning, what, line(self._holds[number][0]), *values)
             self._warned.add((number, what))
@@ -241,12 +233,11 @@ class GivenDisplacements(Acting):
     def under_held(
         self, ids: NDArray[np.int64], tracked: NDArray[np.float64], volume: NDArray[np.float64], corners: NDArray
     ) -> NDArray[np.float64]:
-        """Return corners (n, 2^d, d), m, of the particle domains `ids`; domains at a held side are replaced by prisms.
+        """Return corners of particle domains, in m, with prisms in place of domains at a held side.
 
-        A prism has the volume of its domain.  It keeps the tracked corners on the held face, because the penalty would
-        pull a moved face back.
+        A prism has the volume of its domain, and keeps the tracked corners on the held face.
 
-        tracked, m: tracked corners.
+        tracked, corners (n, 2^d, d), in m: tracked corners, and corners, of the domains `ids`.
         volume (n,): volumes of the domains, in axisymmetry areas of their sections.
         """
         index = np.arange(2**self._grid.dim)
@@ -263,11 +254,9 @@ class GivenDisplacements(Acting):
 
 
 class HoldLoads(Loads):
-    """Prescribed displacements in a substep.
+    """Prescribed displacements in a substep, as penalties on k components.
 
-    acting: the prescribed displacements of the stage.
-    forms: forms of the penalties.
-    data: points of the forms, one for each of k prescribed components, with stiffness, direction and gap.
+    data: points of the forms, one for each component, with stiffness, direction and gap.
     held: geometry and stiffness of all penalties.
     row (k,): index in `held` of each component.
     share (k, 2^d): fraction of each component's force on each node, without the fraction that walls of the grid bear.
@@ -300,11 +289,10 @@ class HoldLoads(Loads):
         self._lacked = np.full(1, np.inf)  # for each side of a part: last sum of gaps in `augment`, at first infinite
 
     def augment(self, at: At) -> bool:
-        """Add the penalty forces on cell means to the multipliers of the means, on sides that lag behind.
+        """Add the penalty forces on sides that lag behind to the multipliers.
 
-        A whole body, for example undrained soil, may resist the side's motion more stiffly than a single cell.  The
-        updates end if the side's mean gap no longer falls by half, because the cells then cannot follow the side any
-        further.  The mean gap is computed over the faces of each connected part of the bodies.
+        This is needed if a whole body, such as undrained soil, resists a side more stiffly than one cell.  The updates
+        end when the mean gap of a side over a connected part of the bodies no longer falls by half.
         """
         if not self._place.dt:
             return False
@@ -323,7 +311,7 @@ class HoldLoads(Loads):
         return bool(more.any())
 
     def reached(self, at: At) -> NDArray[np.bool_]:
-        """Return whether each component (k,) lags at u by at most `1 / sqrt(HOLD)` of its prescribed increment."""
+        """Return whether each component lags at u by at most `1 / sqrt(HOLD)` of its prescribed increment."""
         return np.abs(self._asked - self._along(at.nodal)) * np.sqrt(HOLD) <= np.abs(self._asked)
 
     def pulls(self, b: NDArray[np.float64]) -> None:
@@ -331,7 +319,7 @@ class HoldLoads(Loads):
         self._forms.pull.assemble_vector(b, self.data)
 
     def penalty(self, A: PETSc.Mat, walls: bool) -> None:
-        """Add the penalty stiffness; the penalty forces on walls of the grid come from `counted`."""
+        """Add the penalty stiffness."""
         if not walls:
             self._forms.hold.assemble_matrix(A, self.data)
 
@@ -342,16 +330,16 @@ class HoldLoads(Loads):
         return out
 
     def _along(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the displacement (k,), m, along each prescribed component, at nodal displacements u (nodes, d), m."""
+        """Return the displacement along each prescribed component, in m, from nodal displacements."""
         at_nodes = u[self.data.points.grid.cell_nodes[self.data.cells]]
         return np.einsum("mk,mkd,md->m", self.held.shape[self.row], at_nodes, self.data["direction"])
 
     def pull(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the force (k,), N, along each prescribed component, at nodal displacements u (nodes, d), m."""
+        """Return the force along each prescribed component, in N, from nodal displacements."""
         return self.data["stiffness"][:, 0] * (self.data["gap"][:, 0] - self._along(u))
 
     def pulling(self, at: At, v: NDArray[np.float64]) -> float:
-        """Return the power, W, of the penalty forces."""
+        """Return the power of the penalty forces, in W."""
         return float(self.pull(at.nodal) @ self._along(v.reshape(-1, self._d)))
 
     def counted(self, at: At) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
@@ -362,7 +350,7 @@ class HoldLoads(Loads):
         return dofs.ravel(), (self.share * self.pull(at.nodal)[:, None]).ravel()
 
     def guess(self, parts: Parts, nodal: NDArray[np.float64]) -> NDArray[np.float64] | None:
-        """Return an initial guess of u, or None if the conditions rotate no connected part of the bodies.
+        """Return the nodal displacements of an initial guess, or None if no connected part rotates.
 
         Rotated parts get the rigid motion nearest to the prescribed displacements.  Other parts get `nodal`.
         """
@@ -387,7 +375,7 @@ class HoldLoads(Loads):
         return self.data.cells
 
     def rounding(self, of_cells: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the rounding error of nodal forces; the penalty adds its stiffness times the error of coordinates."""
+        """Return the rounding errors of nodal forces, which the penalty increases."""
         grid = self.data.points.grid
         held = np.zeros(grid.num_local)
         np.maximum.at(held, self.data.cells, self.data["stiffness"][:, 0])

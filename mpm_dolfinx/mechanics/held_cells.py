@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Prescribed displacements of sides in cells: a stiff penalty on the mean, a weak penalty on deviations from it.
 
-A Q1 field has too few nodal displacements in a cell to satisfy constraints at many points of a side. A stiff penalty at
-each point would lock sides that are curved or inclined to the grid. The weak penalty controls the modes with zero mean
-in each cell. The present traction of the body, rotated with the side, is applied explicitly. The penalties
-then bear only the traction increment of the step, and the gap between side and prescribed position is small.
+A Q1 field has too few nodal displacements in a cell to satisfy constraints at many points of a side.  A stiff penalty
+at each point would lock sides that are curved or inclined to the grid.  A stiff penalty therefore acts on the mean
+displacement in each cell, and a weak penalty acts on deviations from this mean.  The present traction of the body,
+rotated with the side, is applied explicitly, so that the penalties bear only the traction increment of the step.
 """
 
 from __future__ import annotations
@@ -25,25 +25,25 @@ from mpm_dolfinx.parallel.exchange import over_all
 ALIGNED = 1e-2
 """Largest slope of a side against a grid axis at which cells can follow all points of the side at constant volume."""
 WEAK = 8.0
-"""Pointwise penalty stiffness for deviations from the means, in units of (modulus + 10 stress) / cell size.  Halving
-this value changes the result of scene "soil" in tests/plateaus.py by 5.0e-06 (relative), doubling it by 7.9e-06, and
-finer cells by 3.0e-02.
+"""Pointwise penalty stiffness for deviations from the means, in units of (modulus + 10 stress) / cell size.  The result
+of scene "soil" in tests/plateaus.py changes by the fraction 5.0e-06 with half this value, by 7.9e-06 with twice this
+value, and by 3.0e-02 with finer cells.
 """
 EVERYWHERE = 1e2
-"""Normal penalty stiffness at points of sides with slopes below `ALIGNED`, in units of resistance / cell size.
-Halving this value changes the result of scene "soil" in tests/plateaus.py by 2.2e-05 (relative), doubling it by
-1.7e-05, and finer cells by 3.0e-02.
+"""Normal penalty stiffness at points of sides with slopes below `ALIGNED`, in units of resistance / cell size. The
+result of scene "soil" in tests/plateaus.py changes by the fraction 2.2e-05 with half this value, by 1.7e-05 with twice
+this value, and by 3.0e-02 with finer cells.
 """
 TENSE = 10
-"""Factor on a side's stress in the modulus of the penalty: a side would buckle if its stress exceeded this modulus.
-Halving this value changes the result of scene "soil" in tests/plateaus.py by 2.8e-06 (relative), doubling it by
-4.7e-06, and finer cells by 3.0e-02.
+"""Factor on a side's stress in the modulus of the penalty: a side would buckle if its stress exceeded this modulus. The
+result of scene "soil" in tests/plateaus.py changes by the fraction 2.8e-06 with half this value, by 4.7e-06 with twice
+this value, and by 3.0e-02 with finer cells.
 """
 CARRIED = 0.3  # largest plausible traction increment of a step, divided by (resisting modulus + TENSE * stress)
 
 
 class HeldPoints(NamedTuple):
-    """Integration points on sides with prescribed displacements; arrays for n points in owned cells."""
+    """Integration points on sides with prescribed displacements, as arrays for n points in owned cells."""
 
     number: NDArray[np.int64]  # (n,) index of the condition
     cell: NDArray[np.int32]  # (n,) local cell
@@ -54,7 +54,7 @@ class HeldPoints(NamedTuple):
     firm: NDArray[np.float64]  # (n,) confined modulus times area, N, with a limited contribution of the fluid
     undrained: NDArray[np.float64]  # (n,) undrained confined modulus times area, N
     x: NDArray[np.float64]  # (n, d) position, m
-    gap: NDArray[np.float64]  # (n, d) prescribed minus present position, m
+    gap: NDArray[np.float64]  # (n, d) prescribed position minus present position, m
     given: NDArray[np.float64]  # (n, 2 d) prescribed displacements at start and end of the step, m
     normal: NDArray[np.float64]  # (n, d) area vector at the last reset of the grid, m^(d-1)
     force: NDArray[np.float64]  # (n, d) force of the present stress, rotated with the side, N
@@ -70,13 +70,12 @@ def inner_cells(
 ) -> NDArray[np.int64]:
     """Return for each of n points on sides the local cell (n,) whose constraint contains this point.
 
-    After deformation, a side along a grid line is slightly wavy, so some points of the side lie in nearly empty cells
-    beyond the line.  Constraints in these cells would contradict the constraints of inner cells.  Only a large motion
-    of the nodes beyond the line could satisfy both, and nothing resists this motion.  The constraints of the inner
-    cells therefore contain these points too (aggregation; Badia, Verdugo and Martin 2018).
+    A deformed side along a grid line is wavy, so that some of its points lie in nearly empty cells beyond the line.
+    Constraints in these cells would contradict the constraints of inner cells.  The constraints of the inner cells
+    therefore contain these points too (aggregation; Badia, Verdugo and Martin 2018).
 
     fill (cells,): volume fractions.
-    sides: for each condition, the prescribed components, and the extent (d,), m, of the prescribed positions.
+    sides: for each condition, the prescribed components, and the extent (d,), in m, of the prescribed positions.
     number (n,): index of each point's condition.
     cell (n,): owned cell of each point.
     normal (n, d): outward area vector of each point.
@@ -98,26 +97,18 @@ def inner_cells(
 class HeldCells:
     """Penalties of prescribed displacements: first on means, one for each condition and cell, then at points.
 
-    Parameters
-    ----------
-    grid
-        Background grid.
-    points
-        The integration points.
-
     Attributes
     ----------
     number, cell
         Index of the condition, and cell, of each penalty.
     x, shape, moments
-        For each penalty: position, m, shape functions, and products of offsets from the cell's midpoint, m^2 and m^3.
-        A penalty on a mean has the means of these values over its points.
+        Position, m, shape functions, and products of offsets from the cell's midpoint, of each penalty.  A penalty on a
+        mean has the means of these values over its points.
     stiffness
-        Stiffness of each penalty and component, N/m.  On means, the stiffness normal to a side parallel to the grid
-        follows from the confined modulus.
+        Stiffness of each penalty and component, N/m.
     limit : (2, k, d)
-        Largest plausible force, N, of each of k penalties on means.  limit[0] is for the skeleton.  limit[1] is for
-        undrained soil, and applies if the side is at its prescribed position.  Larger forces are numerical artefacts.
+        Largest plausible force, N, of each of k penalties on means: limit[0] for the skeleton, limit[1] for undrained
+        soil.  limit[1] applies if the side is at its prescribed position.  Larger forces are numerical artefacts.
     way
         Increment (d,) of the prescribed displacement in the step, m, for each penalty.
     """
@@ -175,18 +166,21 @@ class HeldCells:
     def rows(self, axis: int, given: NDArray[np.bool_], free: NDArray[np.bool_]) -> tuple:
         """Return the penalties on one component, with their stiffness, gap and distribution of the force to nodes.
 
-        Where a side ends at a wall, its penalties omit nodes that the wall fixes. Otherwise the free nodes of the cell
-        would compensate for the fixed nodes, with an oscillation along the side.  The prescribed displacement is also
-        extrapolated to the wall.  If the extrapolated value exceeds half of the cell's mean, at the start or the end of
-        the step, the displacement must vary over the cell.  The penalty is then omitted if other penalties of the
-        condition hold a free node of the cell.
+        Where a side ends at a wall, its penalties omit nodes that the wall fixes, because the free nodes of the cell
+        would otherwise oscillate along the side.  The prescribed displacement is also extrapolated to the wall.  A
+        penalty is omitted if the extrapolated value exceeds half of the cell's mean, at the start or the end of the
+        step, and if other penalties of the condition hold a free node of the cell.
 
         given (conditions,): whether each condition prescribes component `axis`.
         free (nodes,): whether no wall fixes the node.
 
-        Return four arrays: indices (k,) of the penalties; their stiffness (k,), N/m; their gaps (k,), m; and fractions
-        (k, 2^d) of the force on each node, without the wall's part.  Also return the index of a penalty that must move
-        but has fixed nodes only, or -1 without such a penalty.
+        Returns
+        -------
+        index (k,): indices of the penalties.
+        stiffness (k,), in N/m: stiffness of these penalties.
+        gap (k,), in m: gaps of these penalties.
+        share (k, 2^d): fractions of the force on each node, without the fraction of the wall.
+        stuck: index of a penalty that must move but has fixed nodes only, or -1.
         """
         grid, chosen = self.grid, np.flatnonzero(given[self.number])
         nodes, x, gap, N = (v[chosen] for v in (grid.cell_nodes[self.cell], self.x, self._gap[:, axis], self.shape))
@@ -212,10 +206,9 @@ class HeldCells:
     def _held_beside(
         self, number: NDArray[np.int64], nodes: NDArray[np.int32], N: NDArray[np.float64], stuck: NDArray[np.bool_]
     ) -> NDArray[np.bool_]:
-        """Return which penalties (k,) at a wall have a free node that their condition also holds away from walls.
+        """Return which penalties at a wall have a node that other penalties of the condition hold.
 
-        number (k,): index of the condition.
-        nodes, N (k, 2^d): nodes, and values of their shape functions.
+        N (k, 2^d): values of the shape functions of the nodes.
         stuck (k, 2^d): whether each node is at a wall.
         """
         grid = self.grid
@@ -233,15 +226,15 @@ class HeldCells:
     def beyond(
         self, row: NDArray, axis: NDArray, force: NDArray, reached: NDArray[np.bool_], told: Collection[int]
     ) -> list[tuple[int, NDArray[np.float64]]]:
-        """Return for each condition with forces beyond their limits its index, and the worst force's position (d,), m.
+        """Return the conditions with too large forces, and the position of the largest force of each.
 
-        A Q1 field cannot always have the prescribed means in two neighbouring cells, as at a side on a grid line. The
-        forces of these penalties then oppose each other.  Only the sum of the penalty forces at a node acts on the body
-        and counts in the reaction. A force thus counts as too large only if the sums at its nodes exceed their limits
-        too.
+        A Q1 field cannot always have the prescribed means in two neighbouring cells, as at a side on a grid line.  The
+        forces of their penalties then oppose each other.  A force therefore counts as too large only if the sums of the
+        forces at its nodes also exceed their limits.
 
         row (k,): index of the penalty of each of k prescribed components.
-        axis (k,), force (k,), N: axis and force of each component.
+        axis (k,): axis of each component.
+        force (k,), in N: force of each component.
         reached (k,): whether each component is at its prescribed position.
         told: indices of conditions that have been reported already; they are excluded.
         """

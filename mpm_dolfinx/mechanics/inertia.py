@@ -1,28 +1,31 @@
 # SPDX-License-Identifier: MIT
 """Inertia: consistent mass, velocities of material points and nodes, and accelerations in the substeps.
 
-In a substep of a step of length dt, the forces balance rho a, with a = (u - u^) / (g dt)^2.  The predictor u^ is
+In a substep of a step of length dt, the forces balance rho a, with the density rho and a = (u - u^) / (g dt)^2.  u is
+the displacement since the start of the step.  The predictor u^ is the displacement that would occur without forces:
 
     u^ = b dt v_1 + g dt (v_n + b dt a_1),      v = v_n + dt (b a_1 + g a).
 
-The weight g multiplies the rate of the substep.  The weight b multiplies the rate of the previous substep
-(`time_integration`).  u^ is the displacement that would occur without forces.  Both u and u^ are measured from the
-start of the step, where the velocity is v_n.  v_1 and a_1 are velocity and acceleration of the previous substep.  Only
-velocities are carried from step to step.  In each step SDIRK2 dissipates the fraction GAMMA^4 (omega dt)^4 = 0.0074
-(omega dt)^4 of the energy of an oscillation of angular frequency omega.  This dissipation damps unresolved modes.
+v_n is the velocity at the start of the step, and v is the velocity at the end of the substep.  v_1 and a_1 are velocity
+and acceleration of the previous substep.  The weight g multiplies the rate of the substep, and the weight b multiplies
+the rate of the previous substep (`time_integration`).  In each step SDIRK2 dissipates the fraction
+GAMMA^4 (omega dt)^4 = 0.0074 (omega dt)^4 of the energy of an oscillation of angular frequency omega.  The dissipation
+damps unresolved modes.
 
 The mass is integrated over the pieces of the particle domains.  Piece k has the mass m_k, the centroid x_k, and the
-second moments S_k about x_k:
+second moments S_k about x_k.  With the shape functions N and the velocity gradient L,
 
-    (M + G) v_n = sum m_k [N(x_k) v(x_k) + grad N . (L S_k)],    M = sum m_k [N N^T + grad N S_k grad N^T],
+    (M + G) v_n = sum m_k [N(x_k) v(x_k) + grad N . (L S_k)],    M = sum m_k [N N^T + grad N S_k grad N^T].
 
-with the shape functions N and the velocity gradient L.  The ghost mass `G = c rho h^3 int [[d_n N]] [[d_n N]] dS` acts
-on faces of cells that are not full.  Here c is `GHOST_MASS`, h is the cell size, and [[d_n N]] is the jump of the
-normal derivative.  For an affine velocity field, G v_n vanishes, and M v_n equals the right side.  The transfer to the
-grid and back therefore conserves linear and angular momentum to rounding.  A material point carries v and F', the rate
-of F.  The velocity in its domain is v + F' F^-1 (x - x_p).  Increments of v and F' come from the grid (Brackbill and
-Ruppel 1986; consistent mass: Burgess, Sulsky and Brackbill 1992). The first substep of SDIRK2 is a midpoint rule;
-`chord` corrects this rule's error for rotations.
+The ghost mass `G = c rho h^3 int [[d_n N]] [[d_n N]] dS` acts on faces of cells that are not full.  Here c is
+`GHOST_MASS`, h is the cell size, and [[d_n N]] is the jump of the normal derivative.  For an affine velocity field,
+G v_n vanishes, and M v_n equals the right side.  The transfer to the grid and back therefore conserves linear and
+angular momentum to rounding.
+
+A material point carries the velocity v and the rate F' of F.  The velocity in its domain is v + F' F^-1 (x - x_p), with
+the position x_p of the point.  Increments of v and F' come from the grid (Brackbill and Ruppel 1986; consistent mass:
+Burgess, Sulsky and Brackbill 1992).  The first substep of SDIRK2 is a midpoint rule.  `chord` corrects the error
+of this rule in rotations.
 """
 
 from __future__ import annotations
@@ -40,59 +43,33 @@ from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.base.caching import Latest
 from mpm_dolfinx.base.tolerances import ROUND_OFF
-from mpm_dolfinx.base.validation import at_places, check_names, flag, line, numbers
+from mpm_dolfinx.base.validation import at_places, numbers
 from mpm_dolfinx.conditions.acting import At, Loads
 from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.forms.point_forms import FormPoints, Places, PointData, PointForm
 from mpm_dolfinx.forms.unknowns import Unknowns, matrix, sum_ghosts
-from mpm_dolfinx.grid.grid import Grid, polynomial, sum_by
+from mpm_dolfinx.grid.grid import polynomial, sum_by
 from mpm_dolfinx.mechanics.ghost_penalty import kinks
 from mpm_dolfinx.points.cutting import spreads
 from mpm_dolfinx.points.material_points import MaterialPoints, middle
 
 GHOST_MASS = 0.02
-"""Strength c of the ghost mass.  A rotating block has equal energies for 0.002 and 0.2 (`tests/test_inertia.py`)."""
+"""Strength c of the ghost mass.  A rotating block has the same energies with 0.002 and 0.2 (tests/test_inertia.py)."""
 RELAXES = 2.0
 """Relaxation rate of point velocities towards grid velocities, for domain corners that move by one cell size.
 
-Relaxation removes velocity modes of the points that the nodes cannot represent. In a test, a vibrating bar of 20 cells
-moves across 50 cells, with 40 steps a period. After 25 periods the velocity error is 1.7 % for a rate of 0, and 1.2 %
-for rates of 0.1, 2 and 10. The energy loss is 1.58 % for a rate of 0, 1.60 % for 0.1 and 2, and 1.67 % for 10.
+Relaxation removes velocity modes of the points that the nodes cannot represent.  In a test, a vibrating bar of 20 cells
+moves across 50 cells, with 40 steps a period.  After 25 periods the velocity error is 1.7 % at the rate 0, and 1.2 % at
+the rates 0.1, 2 and 10.  The energy loss is 1.58 % at the rate 0, 1.60 % at the rates 0.1 and 2, and 1.67 % at 10.
 """
 
 VELOCITY, RATE = "velocity", "F_rate"
-"""Names of point data: velocity (n, d), m/s, at the centroid, and rate of F (n, d, d), 1/s."""
+"""Names of point data: velocity (n, d), in m/s, at the centroid, and rate of F (n, d, d), in 1/s."""
 
 
 def resting(points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
-    """Return velocity and rate of F, both zero, of points without motion."""
+    """Return zero velocities and zero rates of F for points at rest."""
     return moving(points, np.zeros(points.x.shape[1]), 0.0)
-
-
-def checked_velocity(
-    grid: Grid, quadrature: str, inertia: bool | None, velocity: ArrayLike | Callable | None
-) -> ArrayLike | Callable | None:
-    """Return the initial velocity of a scene, zero by default, or None if the scene's argument `inertia` is None.
-
-    Raises
-    ------
-    ValueError
-        A velocity is given without inertia, or the scene does not support inertia.
-    """
-    if inertia is None:
-        if velocity is not None:
-            raise ValueError(f"velocity = {line(velocity)}: bodies have no inertia; a velocity requires inertia=True")
-        return None
-    flag("inertia", inertia)
-    if quadrature != "domain":
-        raise ValueError(f"inertia = {inertia} with quadrature {quadrature!r}, must be None")
-    if velocity is not None and not inertia:
-        raise ValueError(f"velocity = {line(velocity)}: no inertia at first; a velocity requires inertia=True")
-    if callable(velocity):
-        check_names("velocity", velocity, ("x",))
-    elif grid.axisymmetric and velocity is not None and np.ravel(velocity)[:1].any():
-        raise ValueError(f"velocity = {line(velocity)}, must be (0, v): axisymmetric bodies move along the axis")
-    return np.zeros(grid.dim) if velocity is None else velocity
 
 
 def moving(
@@ -103,19 +80,10 @@ def moving(
 ) -> dict[str, NDArray[np.float64]]:
     """Return the point data `VELOCITY` and `RATE` of a velocity field.
 
-    Parameters
-    ----------
-    velocity : (d,) or callable x (n, d) -> (n, d), m/s
-        Velocity, or a function of position.  Each domain stores the affine field nearest to the values at its corners.
-    base : (d,), m
-        Origin of the points' coordinates.
-    rings
-        Whether the domains are rings (axisymmetry): a point then has the velocity at the centroid of its ring.
-
-    Raises
-    ------
-    ValueError
-        The velocity has a wrong shape, or is not finite.
+    velocity: vector (d,), in m/s, or function of positions x (n, d) with values (n, d).  Each domain stores the affine
+    field nearest to the values at its corners.
+    base (d,), in m: origin of the points' coordinates.
+    rings: whether the domains are rings, whose centroids then determine the velocities (axisymmetry).
     """
     n, corners, d = points.corners.shape
     places = (points.corners + base).reshape(-1, d)
@@ -136,7 +104,7 @@ def moving(
 
 
 def inverses(A: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the inverses of matrices (n, d, d); 2 x 2 matrices are inverted in a tenth of numpy's time."""
+    """Return the inverses of matrices (n, d, d), faster than numpy."""
     if A.shape[1] > 2:
         return np.linalg.inv(A)
     (a, b), (c, e) = np.ascontiguousarray(A.transpose(1, 2, 0))
@@ -144,7 +112,7 @@ def inverses(A: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def product(A: NDArray[np.float64], B: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the products of matrices (n, d, d), stored by component; numpy's product takes three times as long."""
+    """Return the products of matrices (n, d, d), faster than numpy."""
     A, B = (np.ascontiguousarray(of.transpose(1, 2, 0)) for of in (A, B))
     return sum(A[:, j, None] * B[None, j] for j in range(len(B))).transpose(2, 0, 1)
 
@@ -153,11 +121,11 @@ def chord(G: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float
     """Return the increment F~ - 1 at which a midpoint rule evaluates laws, and the rotation of the laws' stress.
 
     The rule moves F from F_n to F_n + 2 D, with the midpoint F = F_n + D.  The mean of C = F^T F over both ends of the
-    step is F^T F + D^T D, with the midpoint's F on the right side.  Laws are evaluated at
+    step is F^T F + D^T D, with the midpoint's F on the right side.  Laws are evaluated at F~, and give the stress P:
 
         F~ = F + F^-T D^T D / 2,     F~^T F~ = F^T F + D^T D + O(D^4),     P = F F~^-1 P(F~).
 
-    A rigid rotation then causes no strain in any body. P F^T is symmetric, so moments balance.
+    A rigid rotation then causes no strain in any body.  P F^T is symmetric, so moments balance.
 
     G (n, d, d): gradient of the displacement since the start of the step.
     """
@@ -168,9 +136,9 @@ def chord(G: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float
 
 
 class InertiaForms:
-    """Compiled forms of mass and momentum, and the midpoint rule's coefficients in the forms of stresses and fluxes.
+    """Compiled forms of mass and momentum, with the coefficients of the midpoint rule.
 
-    points: all integration points; of_laws: the integration points of each law; u, m: displacement increment.
+    points, of_laws: all integration points, and the integration points of each law.
     """
 
     def __init__(self, points: FormPoints, of_laws: Sequence[FormPoints], u: fem.Function):
@@ -178,8 +146,9 @@ class InertiaForms:
         grid, d = self.grid, self.grid.dim
         self._u, self._flight, self._rate = u, fem.Function(V), fem.Constant(grid.mesh, 0.0)
         self.acceleration = self._rate * (u - self._flight)
-        """Acceleration at u as UFL, m/s^2."""
-        self._midpoint = fem.Constant(grid.mesh, 0.0)
+        """Acceleration at u as UFL, in m/s^2."""
+        self.midpoint = fem.Constant(grid.mesh, 0.0)
+        """1 in a substep with a midpoint rule, and 0 in other substeps."""
         for seen in dict.fromkeys([points, *of_laws] if not grid.axisymmetric else []):  # axisymmetric bodies: no spin
             chords: Latest[tuple[NDArray, NDArray]] = Latest()
             seen.follow("gradient", (d, d), partial(self._seen, chords, 0))
@@ -192,29 +161,29 @@ class InertiaForms:
         self.moving = p = FormPoints(grid, velocity=(d,), turn=(d, d))
         self._momentum = PointForm((ufl.inner(p.velocity, p.value(v)) + ufl.inner(p.turn, p.plane_grad(v))) * p.dx, p)
         self.density = fem.Function(grid.cellwise())
-        """Density (cells,) of the material in the cells, kg/m^3."""
+        """Density of the material in the cells, in kg/m^3."""
         self.work = fem.Function(V)
         self._ghost = kinks(grid, V, GHOST_MASS * ufl.avg(self.density), 3)
 
     def set_substep(self, inertia: Inertia | None, midpoint: bool) -> None:
-        """Set the forms' acceleration, zero if inertia is None; midpoint: whether the substep uses a midpoint rule."""
-        self._midpoint.value = float(midpoint and inertia is not None)
+        """Set the acceleration in the forms, zero without inertia, and whether the substep uses a midpoint rule."""
+        self.midpoint.value = float(midpoint and inertia is not None)
         self._rate.value = 0.0 if inertia is None else inertia.rate
         if inertia is not None:
             self._flight.x.array[:] = inertia.flight
 
     def at(self, cells: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return accelerations (n, d), m/s^2, at u, at a place in each of n cells; values: shape functions there."""
+        """Return accelerations, in m/s^2, at one place in each cell from the shape functions there."""
         nodal = self._rate.value * (self._u.x.array - self._flight.x.array).reshape(-1, self.grid.dim)
         return np.einsum("nk,nkd->nd", values, nodal[self.grid.cell_nodes[cells]])
 
     def _seen(self, chords: Latest[tuple[NDArray, NDArray]], which: int, data: PointData) -> NDArray[np.float64]:
-        """Return arrays (n, d^2) at the present u: gradients for laws, or rotations of the laws' stress; see `chord`.
+        """Return the gradients for laws, or the rotations of their stresses, see `chord`.
 
-        chords: the last result, shared by all forms at the same u; which: 0 for gradients, 1 for rotations.
+        chords: the last result, shared by all forms at the same u.
         """
         G, d = data.gradients(self._u.x.array), self.grid.dim
-        if self._midpoint.value:
+        if self.midpoint.value:
             return chords(G, lambda: chord(G.reshape(-1, d, d)))[which].reshape(-1, d * d)
         return np.broadcast_to(np.eye(d).ravel(), G.shape) if which else G
 
@@ -229,8 +198,7 @@ class InertiaForms:
     ) -> Mass:
         """Return the mass of the bodies on the grid.
 
-        cut: the cut particle domains.
-        mass (n,), kg: masses of the points.
+        mass (n,), in kg: masses of the points.
         fill (cells,): volume fractions of the local cells.
         facets: faces between two active cells, at least one of them not full.
         unknowns, held: unknown displacements, and displacements that grid boundary conditions fix.
@@ -257,12 +225,9 @@ class InertiaForms:
 class Mass:
     """Mass of the bodies on the grid, constant until the next reset of the grid.
 
-    forms: compiled forms.
-    cut: the cut particle domains.
-    pieces: integration points of their pieces, with masses, kg, as weights.
-    unknowns: unknown displacements.
-    M: mass matrix, kg, with the rows of the unknowns.
-    held: mass matrix, kg, with the rows of displacements that walls of the grid fix.
+    pieces: integration points of the pieces, with masses, in kg, as weights.
+    M: mass matrix, in kg, with the rows of the unknowns.
+    held: mass matrix, in kg, with the rows of displacements that walls of the grid fix.
     """
 
     def __init__(
@@ -276,7 +241,7 @@ class Mass:
         ksp.setTolerances(rtol=ROUND_OFF, atol=0.0)
 
     def velocity(self, points: MaterialPoints) -> PETSc.Vec:
-        """Return the velocities of the unknowns, m/s, projected from the velocities of the points."""
+        """Return the velocities of the unknowns, in m/s, projected from the velocities of the points."""
         cut, forms, pieces, b = self._cut, self._forms, self._pieces, self._forms.work.x.array
         L = velocity_gradients(points)
         v = points.data[VELOCITY][cut.pieces.point] + np.einsum("nij,nj->ni", L[cut.pieces.point], self._off)
@@ -295,8 +260,8 @@ class Mass:
         """Return the point data `VELOCITY` and `RATE` after a step.
 
         points: material points at the start of the step.
-        velocities: velocities, m/s, of the unknowns at the start and at the end of the step.
-        moved (n,): largest displacement of a corner, in cell sizes, in the connected part of the point.  It is 0 if the
+        velocities: velocities of the unknowns, in m/s, at the start and at the end of the step.
+        moved (n,): largest displacement of a corner, in cell sizes, in the connected part of the point, or 0 if the
         point keeps its pieces.
         """
         start, end = velocities
@@ -309,7 +274,7 @@ class Mass:
         return out
 
     def local(self, v: PETSc.Vec) -> NDArray[np.float64]:
-        """Return a vector of the unknowns as a local array with ghosts, and with zeros at fixed displacements."""
+        """Return a vector of the unknowns as a local array with zeros at fixed displacements."""
         work = self._forms.work
         work.x.array[:] = 0.0
         self.unknowns.add(work, 1.0, v)
@@ -317,17 +282,17 @@ class Mass:
 
     @cached_property
     def _off(self) -> NDArray[np.float64]:
-        """Vectors (pieces, d), in m, from the centroids of the particle domains to the centroids of their pieces."""
+        """Vectors, in m, from the centroids of domains to the centroids of their pieces."""
         pieces = self._cut.pieces
         return pieces.x - self._cut.mean(pieces.x)[pieces.point]
 
     @cached_property
     def _focus(self) -> NDArray[np.float64]:
-        """Inverses (n, d, d), 1/m^2, of the second moments of the domains about their centroids."""
+        """Inverses, in 1/m^2, of the second moments of the domains about their centroids."""
         return inverses(self._cut.mean(self._off[:, :, None] * self._off[:, None] + self._cut.pieces.second))
 
     def _at_points(self, points: MaterialPoints, v: PETSc.Vec) -> dict[str, NDArray[np.float64]]:
-        """Return `VELOCITY` and `RATE` of each domain: the affine field nearest to the field of velocities v, m/s."""
+        """Return the affine velocity field in each domain that is nearest to the grid's velocities."""
         cut, grid, places, nodal = self._cut, self._forms.grid, self._pieces.places, self.local(v)
         d, of_cells = grid.dim, grid.over_edges(grid.monomials @ nodal.take(places.nodal), places.filled)
         at, slope = polynomial(of_cells, places.offset.T, places.slots).T, self._pieces.gradients_of(nodal)
@@ -338,7 +303,7 @@ class Mass:
 
 
 def velocity_gradients(points: MaterialPoints) -> NDArray[np.float64]:
-    """Return the velocity gradients (n, d, d), 1/s, of the points.  In axisymmetry these are in-plane components."""
+    """Return the velocity gradients (n, d, d) of the points, in 1/s, in axisymmetry for the plane."""
     d = points.x.shape[1]
     return product(points.data[RATE], inverses(points.F[:, :d, :d]))
 
@@ -346,9 +311,8 @@ def velocity_gradients(points: MaterialPoints) -> NDArray[np.float64]:
 class Inertia(Loads):
     """Inertia forces in a substep.
 
-    mass: mass of the bodies on the grid.
-    flight, m: inertial predictor, the displacement without forces.
-    rate, 1/s^2: acceleration divided by (displacement - flight).
+    flight, in m: inertial predictor, the displacement without forces.
+    rate, in 1/s^2: acceleration divided by (displacement - flight).
     """
 
     holding = True
@@ -358,18 +322,18 @@ class Inertia(Loads):
 
     @cached_property
     def flight(self) -> NDArray[np.float64]:
-        """The inertial predictor, m, as a local array: displacement without forces in this substep."""
+        """Inertial predictor, in m, as a local array."""
         return self._mass.local(self._flight)
 
     def acceleration(self, at: At) -> PETSc.Vec:
-        """Return the accelerations of the unknowns at u, m/s^2."""
+        """Return the accelerations of the unknowns at u, in m/s^2."""
         u = at.unknowns.gather(at.u, at.unknowns.vector())
         u.axpy(-1.0, self._flight)
         u.scale(self.rate)
         return u
 
     def inertia(self, at: At) -> PETSc.Vec:
-        """Return the inertia forces at u, N."""
+        """Return the inertia forces at u, in N."""
         return self._mass.M * self.acceleration(at)
 
     def push(self, at: At, residual: PETSc.Vec, on: Unknowns) -> None:
@@ -402,7 +366,7 @@ class Flight(NamedTuple):
     acceleration: PETSc.Vec | None = None  # acceleration in the last substep, m/s^2
 
     def free(self, own: float, before: float) -> PETSc.Vec:
-        """Return the predictor, m, of the next substep; own, before: weights, s, of its rate and the previous rate."""
+        """Return the predictor of the next substep, in m."""
         flight = self.start * own
         if self.acceleration is not None:
             flight += self.velocity * before + self.acceleration * (own * before)

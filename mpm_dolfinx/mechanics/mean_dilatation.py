@@ -1,23 +1,23 @@
 # SPDX-License-Identifier: MIT
 """F-bar: one volume ratio per cell, against volumetric locking of nearly incompressible skeletons.
 
-Four volume constraints per cell suppress the bending modes of a Q1 quadrilateral, with errors of up to 50 % at nu =
-0.499. F-bar scales the law's deformation gradient so that its volume ratio in the step is theta, a mean over the cell,
+Without F-bar, four volume constraints per cell suppress the bending modes of a Q1 quadrilateral, with errors of up to
+50 % at nu = 0.499.  F-bar scales the deformation gradient F that the law receives.  The scaled gradient Fbar has the
+volume ratio theta in the step, which is a mean over the cell:
 
     Fbar = (theta J_n / det F)^(1/3) F,     theta = sum w det(Delta) / sum w   over the locking pieces of the cell.
 
-Here w is the volume of a piece.  Delta = I + grad u is the deformation gradient of the step, with F = Delta F_n and
-J_n = det F_n.  The scaling acts along all three axes: in plane strain the points store an out-of-plane stretch, as in a
-slice of the body.  The material decides whether cells would lock (`Skeleton.nearly_incompressible`). In a cell of
-several materials, only the materials that would lock use Fbar. With the law's energy psi and Psi = psi(Fbar) / J_n, the
-energy sum w Psi has the derivative
+Here w is the volume of a piece, Delta = I + grad u is the deformation gradient of the step, F = Delta F_n, and
+J_n = det F_n.  The scaling acts along all three axes, so that points in plane strain store an out-of-plane stretch.  In
+a cell of several materials, only the nearly incompressible materials use Fbar (`Skeleton.nearly_incompressible`).  With
+the law's energy psi and Psi = psi(Fbar) / J_n, the energy sum w Psi has the derivative
 
     sum w [dPsi/dF : dF + pi d(det Delta)],   pi = (sum w dPsi/dtheta) / (sum w).
 
 The residual has the additional term with pi.  The tangent of the residual at fixed theta and pi is symmetric.  The
-derivatives with respect to theta and pi add a matrix of rank two in each cell (Simo, Taylor and Pister 1985). Coombs et
-al. (2018) used incremental F-bar in the material point method. For a law without an energy, P(Fbar) : dFbar replaces
-dPsi. The points store Fbar.  The next step starts from a J_n computed from the particle domains in the cell
+derivatives with respect to theta and pi add a matrix of rank two in each cell (Simo, Taylor and Pister 1985).  Coombs
+et al. (2018) used incremental F-bar in the material point method.  For a law without an energy, P(Fbar) : dFbar
+replaces dPsi.  The points store Fbar.  The next step starts from the volume ratios of the particle domains
 (`cell_ratios`).
 """
 
@@ -36,25 +36,27 @@ from numpy.typing import NDArray
 from mpm_dolfinx.base.caching import Latest
 from mpm_dolfinx.forms.axes import block, embedded
 from mpm_dolfinx.forms.cell_matrices import Beside, insert
-from mpm_dolfinx.forms.point_forms import CellSums, FormPoints, PointData, PointExpression
+from mpm_dolfinx.forms.point_forms import CellSums, FormPoints, Given, PointData, PointExpression
 from mpm_dolfinx.grid.grid import Grid, sum_by
 from mpm_dolfinx.materials.skeleton import Skeleton
 from mpm_dolfinx.materials.user_functions import expression
 from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
 from mpm_dolfinx.points.material_points import ACROSS, with_ratio
 
+STRESS = "stress of the law"
+
 
 class SumsOfPart(NamedTuple):
-    """Sums for theta and pi, in each cell, over one part of the scene's integration points: see `MeanDilatation`."""
+    """Sums over one part of the integration points in each cell, for theta and pi, see `MeanDilatation`."""
 
     ratio: CellSums
-    stress: StressAtPoints
+    stress: PointExpression  # components of P for the residual, and the derivative with respect to theta for pi
 
 
 class FBar:
-    """F-bar modification of laws, with the step's volume ratio theta and the conjugate mean stress pi of each cell.
+    """F-bar modification of laws, with theta and pi of each cell as fields.
 
-    grid: background grid; symmetric: whether the tangents of all laws are symmetric.
+    symmetric: whether the tangents of all laws are symmetric.
     """
 
     def __init__(self, grid: Grid, symmetric: bool):
@@ -64,7 +66,7 @@ class FBar:
         self._theta = ufl.variable(self.theta)
 
     def of(self, points: FormPoints, F):
-        """Return Fbar (3, 3) as a UFL variable; (2, 2) for laws that accept only F (2, 2)."""
+        """Return Fbar (3, 3) as a UFL variable, or (2, 2) for laws that accept only F (2, 2)."""
         ratio = self._theta * ufl.det(points.F) / ufl.det(F)
         if self.grid.stretches == 2 and ACROSS not in points.functions:
             return ufl.variable(ufl.sqrt(ratio) * F)
@@ -84,42 +86,34 @@ class FBar:
         values: Mapping[str, object],
         known: Mapping[str, object],
     ) -> tuple:
-        """Return the stress and the cell sums of points with one law, whose Q1 cells would lock without F-bar.
+        """Return the stress and the cell sums of points with a law that uses F-bar.
 
-        Parameters
-        ----------
-        law
-            Class of the part's law.
-        points
-            Integration points of the part, with the field F (d, d): deformation gradient at the start of the step.
-        F
-            Deformation gradient (d, d), a UFL variable.
-        Fbar
-            F-bar modification of F, see `of`.
-        ratio
-            det Delta, with Delta F_n = F.
-        values
-            UFL values of the law's parameters, state and local unknowns.
-        known
-            The same values for expressions that are not differentiated, see `LocalUnknowns`.
+        points: integration points with the law, with the field F at the start of the step.
+        F: deformation gradient (d, d), a UFL variable.
+        Fbar: result of `of`.
+        ratio: det Delta, with Delta F_n = F.
+        values: UFL values of the law's parameters, state and local unknowns.
+        known: the same values for expressions that are not differentiated, see `LocalUnknowns`.
 
         Returns
         -------
-        The first Piola-Kirchhoff stress, Pa, as UFL of F, theta and pi, for the residual.  The derivative (d, d, d, d),
-        Pa, of this stress with respect to F, for the tangent.  Further UFL integrands of the tangent (`Beside`), for
-        sums over each cell.  Kernels that sum theta and pi over each cell, for `MeanDilatation`.
+        The first Piola-Kirchhoff stress, in Pa, as UFL of F, theta and pi, for the residual.
+        The derivative (d, d, d, d) of this stress with respect to F, in Pa, for the tangent.
+        Further integrals over each cell for the tangent (`Beside`).
+        Kernels that sum theta and pi over each cell, for `MeanDilatation`.
         """
         J_n, J = ufl.det(points.F), ufl.det(F)
-        P, slope = self._stress(law, F, Fbar, known)
-        sums = SumsOfPart(CellSums([ratio], points), StressAtPoints(P, slope / J_n, points))
+        P, slope = self.stresses(law, F, Fbar, known)
+        stress = PointExpression(ufl.as_vector([*(P[i] for i in np.ndindex(P.ufl_shape)), slope / J_n]), points)
+        sums, own = SumsOfPart(CellSums([ratio], points), stress), points.follow(STRESS, P.ufl_shape)
         P_F, P_theta, slope_F, slope_theta = self._slopes(law, F, Fbar, values)
         shared, share = self.pi * ufl.diff(J, F), 1 / J_n
         along = [share * T for T in (ufl.diff(J, F), slope_F, *([] if self.symmetric else [P_theta]))]
         beside = Beside(along, [share * slope_theta])
-        return sums.stress.P + shared, P_F + ufl.diff(shared, F), beside, sums
+        return (block(own) if self.grid.axisymmetric else own) + shared, P_F + ufl.diff(shared, F), beside, sums
 
-    def _stress(self, law: type[Skeleton], F, Fbar, values: Mapping[str, object]) -> tuple:
-        """Return the derivatives of psi(Fbar), or of the work of a law without energy, with respect to F and theta."""
+    def stresses(self, law: type[Skeleton], F, Fbar, values: Mapping[str, object]) -> tuple:
+        """Return the derivatives of psi(Fbar) with respect to F and theta."""
         if law.kirchhoff is None:
             energy = expression(law.energy, [()], F=Fbar, **values)
             return ufl.diff(energy, F), ufl.diff(energy, self._theta)
@@ -127,12 +121,8 @@ class FBar:
         mean = ufl.tr(tau) / Fbar.ufl_shape[0]
         return _dev(tau, F) * ufl.inv(F).T, mean / self._theta
 
-    def by_pressure(self, law: type[Skeleton], F, Fbar, values: Mapping[str, object], p) -> list:
-        """Return the derivatives of both results of `_stress` with respect to a pressure p, a UFL variable."""
-        return [ufl.diff(of, p) for of in self._stress(law, F, Fbar, values)]
-
     def _slopes(self, law: type[Skeleton], F, Fbar, values: Mapping[str, object]) -> tuple:
-        """Return the derivatives of both results of `_stress` with respect to F and theta.
+        """Return the derivatives of both results of `stresses` with respect to F and theta.
 
         In 2D a law without an energy is differentiated with respect to Fbar only, which halves the time for tangents.
         With Fbar = s F,
@@ -141,7 +131,7 @@ class FBar:
 
         for F (d, d) and the (d, d) components of s F. In 3D this formula would take two minutes to compile.
         """
-        P, slope = self._stress(law, F, Fbar, values)
+        P, slope = self.stresses(law, F, Fbar, values)
         if law.kirchhoff is None or self.grid.dim == 3:
             return tuple(ufl.diff(of, by) for of in (P, slope) for by in (F, self._theta))
         d, n = range(F.ufl_shape[0]), Fbar.ufl_shape[0]
@@ -155,7 +145,7 @@ class FBar:
         s = sum(Fbar[a, b] * G[a, b] for a in d for b in d) / len(d)
 
         def by_F(part, by_theta):
-            """Return dtau/dF for one component of tau; part(a, b): dtau/dFbar; by_theta: dtau/dtheta."""
+            """Return dtau/dF for one component of tau, from dtau/dFbar and dtau/dtheta."""
             return ufl.as_matrix([[s * part(a, b) - theta * by_theta * G[a, b] for b in d] for a in d])
 
         mean_theta = ufl.tr(tau_theta) / n
@@ -168,42 +158,66 @@ class FBar:
 
 
 class MeanDilatation:
-    """The volume ratio theta of the step in each cell, and its work-conjugate mean stress pi, for F-bar.
+    """The volume ratio theta and the mean stress pi of each cell, for F-bar.
 
-    fbar: the fields theta and pi.
     parts: sums over each part in which cells would lock, by index of the part, see `QuadratureData`.
+    dt: time since the start of the step, s.
     """
 
-    def __init__(self, fbar: FBar, parts: Mapping[int, SumsOfPart]):
+    def __init__(self, fbar: FBar, parts: Mapping[int, SumsOfPart], dt: fem.Constant):
+        self._dt = dt
         self._grid, self._symmetric = fbar.grid, fbar.symmetric
         self.theta, self.pi = fbar.theta, fbar.pi
         self.numbers = list(parts)
         self._sums = list(parts.values())
         self._filled: Latest[Cells] = Latest()
         self._volume: Latest[NDArray[np.float64]] = Latest()
+        self._ratios: Latest[None] = Latest()
+        self._stresses: Latest[list[Given]] = Latest()
 
     def total(
         self, data: QuadratureData, sums: Sequence[NDArray[np.float64]]
     ) -> tuple[NDArray[np.int32], NDArray[np.float64], NDArray[np.float64]]:
-        """Return the cells with F-bar, totals (cells, k) of `sums` over all parts, and the result of `_volume_of`."""
+        """Return the cells with F-bar, the totals of `sums` over all parts, and the result of `_volume_of`."""
         return self._cells(data).filled, self._cells(data).total(sums), self._volume_of(data)
 
-    def update(self, data: QuadratureData, solve: Callable[[], None]) -> None:
-        """Set theta, the stresses and pi at the present displacement; solve: function that solves local unknowns."""
-        self._set_mean(self.theta, [of.ratio for of in self._sums], data)
-        solve()
-        self._set_mean(self.pi, [of.stress for of in self._sums], data)
+    def at(self, data: QuadratureData, motion: tuple, solve: Callable[[], Sequence[Given]]) -> list[Given]:
+        """Set theta and pi, and return values for the forms of each part.  All processes must call this method.
 
-    def _set_mean(self, f: fem.Function, sums: Sequence[CellSums | StressAtPoints], data: QuadratureData) -> None:
-        """Set f in each cell to the volume mean of a quantity over the pieces with F-bar.
-
-        sums: for each part of the scene's points, a function that sums quantity times volume in each cell.
+        motion: key for `Latest`, which changes whenever stresses at the points `data` change, except with time.
+        solve: function that returns these values without stresses, see `LocalUnknowns`.
         """
-        total = self._cells(data).total([of(part) for of, part in zip(sums, self._parts(data), strict=True)])
-        f.x.array[self._cells(data).filled] = total[:, 0] / self._volume_of(data)[:, 0]
+
+        def given_stresses() -> list[Given]:
+            given, sums = [*solve()], []
+            for number, part, of in zip(self.numbers, self._parts(data), self._sums, strict=True):
+                values = of.stress.evaluate(part, live=of.stress.live(part, given[number]))
+                sums.append(sum_by(part.places.slots, part.volume * values[:, -1], len(part.places.filled))[:, None])
+                given[number] = {**given[number], STRESS: values[:, :-1]}
+            self._set_mean(self.pi, sums, data)
+            return given
+
+        self._set_ratios(data, motion)
+        return self._stresses((self._key(data), motion, float(self._dt.value)), given_stresses, self._grid.comm)
+
+    def _set_ratios(self, data: QuadratureData, motion: tuple) -> None:
+        """Set theta, with the key `motion` of the method `at`."""
+
+        def ratios() -> None:
+            sums = [of.ratio(part) for of, part in zip(self._sums, self._parts(data), strict=True)]
+            self._set_mean(self.theta, sums, data)
+
+        self._ratios((self._key(data), motion), ratios)
+
+    def _set_mean(self, f: fem.Function, sums: Sequence[NDArray[np.float64]], data: QuadratureData) -> None:
+        """Set f in each cell to a mean over the pieces with F-bar.
+
+        sums: for each part of the points, the sums (cells, 1) of the quantity times the volume.
+        """
+        f.x.array[self._cells(data).filled] = self._cells(data).total(sums)[:, 0] / self._volume_of(data)[:, 0]
 
     def assemble_matrix(self, A: PETSc.Mat, data: QuadratureData, sums: Sequence[NDArray[np.float64]]) -> None:
-        """Add the contribution of theta and pi at the last update to the tangent; the caller finalises the matrix.
+        """Add the contribution of theta and pi to the tangent, without final assembly.
 
         sums: for each part, the integrals (cells, quantities) of `Beside` from `FBar.forms` over each cell.
         """
@@ -220,8 +234,9 @@ class MeanDilatation:
         matrices = b[:, :, None] * columns[:, None, :] + rows[:, :, None] * b[:, None, :]
         insert(A, self._grid, self._cells(data).filled, matrices)
 
-    def average(self, delta: NDArray[np.float64], data: QuadratureData) -> None:
-        """Scale the gradients Delta (n, d, d) of pieces with F-bar to their cells' volume ratios."""
+    def average(self, delta: NDArray[np.float64], data: QuadratureData, motion: tuple) -> None:
+        """Scale the gradients Delta of pieces with F-bar to the volume ratios of their cells."""
+        self._set_ratios(data, motion)
         for number in self.numbers:
             rows = data.rows[number]
             theta, own = self.theta.x.array[data.parts[number].cells], delta[rows]
@@ -235,9 +250,12 @@ class MeanDilatation:
         places = [part.places for part in self._parts(data)]
         return self._filled(tuple(p.key for p in places), lambda: Cells([p.filled for p in places]))
 
+    def _key(self, data: QuadratureData) -> tuple:
+        return tuple(part.key for part in self._parts(data))
+
     def _volume_of(self, data: QuadratureData) -> NDArray[np.float64]:
-        """Return for each filled cell the total volume (cells, 1), m^d, of its pieces that use F-bar."""
-        key = tuple(part.key for part in self._parts(data))
+        """Return the total volume, in m^d, of the pieces with F-bar in each filled cell."""
+        key = self._key(data)
 
         def volumes() -> NDArray[np.float64]:
             sums = [sum_by(p.places.slots, p.volume, len(p.places.filled))[:, None] for p in self._parts(data)]
@@ -247,46 +265,20 @@ class MeanDilatation:
 
 
 def _dev(tau, F):
-    """Return the components (d, d) of the deviator of a UFL tensor, in the axes of F (d, d)."""
+    """Return the components (d, d) of the deviator of a UFL tensor."""
     d, mean = range(F.ufl_shape[0]), ufl.tr(tau) / tau.ufl_shape[0]
     return ufl.as_matrix([[tau[a, b] - mean if a == b else tau[a, b] for b in d] for a in d])
 
 
-class StressAtPoints:
-    """Stress P of a law and its derivative with respect to theta, evaluated once for both residual and pi.
-
-    P (d, d), slope: the stress and its derivative, as UFL; points: integration points of the part.
-    """
-
-    def __init__(self, P, slope, points: FormPoints):
-        shape, self._last = P.ufl_shape, Latest()
-        self._values = PointExpression(ufl.as_vector([*(P[i] for i in np.ndindex(shape)), slope]), points)
-        stress = points.follow("stress of the law", shape, self._stress)
-        self.P = block(stress) if points.grid.axisymmetric else stress
-        """The stress as UFL, with the values of the last evaluation."""
-
-    def __call__(self, data: PointData) -> NDArray[np.float64]:
-        """Evaluate stress and derivative; return the integrals (cells, 1) of the derivative over the points' cells."""
-        _, values = self._last(object(), lambda: (data.key, self._values.evaluate(data)))
-        return sum_by(data.places.slots, data.volume * values[:, -1], len(data.places.filled))[:, None]
-
-    def _stress(self, data: PointData) -> NDArray[np.float64]:
-        """Return the stresses (n, d^2), Pa, of the last evaluation."""
-        of, values = self._last.value or (None, None)
-        if of is not data.key:
-            raise RuntimeError("stresses at points are used before their evaluation")
-        return values[:, :-1]
-
-
 class Cells:
-    """Cells with pieces of any part.  filled: these cells; where: indices of each part's cells in `filled`."""
+    """The cells with pieces that use F-bar, with indices of the cells of each part."""
 
     def __init__(self, of_parts: Sequence[NDArray[np.int32]]):
         self.filled = np.unique(np.concatenate(of_parts))
         self.where = [np.searchsorted(self.filled, cells) for cells in of_parts]
 
     def total(self, values: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
-        """Return the sums (cells, quantities) over the parts in the cells `filled`; values: one array for each part."""
+        """Return the sums (cells, quantities) over all parts."""
         if len(values) == 1:
             return values[0]
         out = np.zeros((len(self.filled), values[0].shape[1]))

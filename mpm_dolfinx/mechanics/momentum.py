@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: MIT
 """Balance of momentum: Q1 displacements on the grid, integrated over the pieces of particle domains in cells.
 
-u is the displacement increment of the step.  It defines Delta = I + grad u, F = Delta F_n, J_n = det F_n and
+The displacement increment u of the step defines Delta = I + grad u, F = Delta F_n, J_n = det F_n and
 J_Delta = det Delta.  The residual is the derivative of
 
     int [psi(F) / J_n - alpha p J_Delta] dV_n  -  work of the loads,
 
-that is, `int (P' - alpha p J_Delta Delta^-T) : grad v dV_n = int rho g . v dV_n + tractions`.  psi is the energy of the
-skeleton, alpha is Biot's coefficient, and p is the pore pressure. P' is the first Piola-Kirchhoff effective stress
-relative to the start of the step.  A law may define the stress instead of psi.
+with the energy psi of the skeleton, Biot's coefficient alpha and the pore pressure p.  That is
+`int (P' - alpha p J_Delta Delta^-T) : grad v dV_n = int rho g . v dV_n + tractions`, with the density rho, the
+acceleration of gravity g and the test function v.  P' is the first Piola-Kirchhoff effective stress relative to the
+start of the step.  A law may define the stress instead of psi.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from mpm_dolfinx.base import _compat
 from mpm_dolfinx.conditions.acting import At, FormsOf, Loads
 from mpm_dolfinx.conditions.walls import wall_forces
 from mpm_dolfinx.forms.cell_matrices import Beside, ElementForces, ElementMatrices, StackedElementMatrices
-from mpm_dolfinx.forms.point_forms import CellSums, FormPoints
+from mpm_dolfinx.forms.point_forms import NONE, CellSums, FormPoints, Given
 from mpm_dolfinx.forms.unknowns import Unknowns, matrix, sum_ghosts, zero
 from mpm_dolfinx.forms.velocity import Velocity
 from mpm_dolfinx.grid.grid import among, sum_by
@@ -53,34 +54,23 @@ class FormsOfPart(NamedTuple):
     residual: ElementForces
     tangent: ElementMatrices | StackedElementMatrices
     local: LocalUnknowns | None  # None for laws without local unknowns
-    means: SumsOfPart | None  # sums for F-bar, None for laws without it
+    means: SumsOfPart | None  # sums for F-bar, None for laws without F-bar
     dried: CellSums | None  # for laws that depend on suction, see `suction_sums`
 
 
 class MomentumForms:
     """Compiled forms of the balance of momentum of a scene.
 
-    Parameters
-    ----------
-    pieces
-        All integration points.
-    laws
-        Classes of the skeletons' laws, each with its integration points and whether it uses F-bar, see
-        `MeanDilatation`. The points have F, and the law's parameters and state.  With fluid they also have `biot`.
-    pressure
-        DG0 pore pressure, None without fluid.
-    gravity : (d,), m/s^2
-        Acceleration, as a UFL constant, or None.  With gravity the integration points have `density`, kg/m^3.
-    materials
-        Materials of the scene, and its fluid. With retention curves the points also have `retention`, `lever`, `pores`.
-    at_points
-        Whether bodies are integrated at their material points.
-    terms
-        User-defined terms, see `user_functions`.
-    t, dt : s
-        Time at the end of the substep, and time since the start of the step, as UFL constants.
-    inertia
-        Whether bodies may have inertia.
+    pieces: all integration points.  With gravity they have `density`, in kg/m^3.
+    laws: class, integration points, and whether it uses F-bar (`MeanDilatation`), of each law.  The points have F, the
+    law's parameters and state, and with fluid `biot`.  With retention curves they have `retention`, `lever`, `pores`.
+    pressure: DG0 pore pressure, or None without fluid.
+    gravity (d,), in m/s^2: acceleration as a UFL constant, or None.
+    materials: materials of the scene, and its fluid.
+    at_points: whether bodies are integrated at their material points.
+    terms: user-defined terms, see `user_functions`.
+    t, dt, in s: time at the end of the substep, and time since the start of the step, as UFL constants.
+    inertia: whether bodies may have inertia.
     """
 
     def __init__(
@@ -101,17 +91,18 @@ class MomentumForms:
         symmetric = materials.symmetric
         V = _compat.function_space(grid.mesh, "Lagrange", 1, (grid.dim,))
         self.u = fem.Function(V)
-        """Displacement increment since the start of the step, m."""
+        """Displacement increment since the start of the step, in m."""
         rooms = [fem.Function(V) for _ in range(3)]
         self._rooms = [(room, room.x.array) for room in rooms]  # buffers for sums of forces that exist together
         self._fbar = FBar(grid, symmetric) if any(locks for *_, locks in laws) else None
         self.inertia = InertiaForms(pieces, [points for _, points, _ in laws], self.u) if inertia else None
-        """Forms of inertia, None in a scene without inertia."""
+        """Forms of inertia, or None in a scene without inertia."""
         dried = pressure is not None and any("suction" in law.state for law, *_ in laws)
         self.law_forms = [self._forms_of_law(*law, pressure, dried, symmetric, dt) for law in laws]
         """Forms of each part of the points."""
         locked = {number: part.means for number, part in enumerate(self.law_forms) if part.means is not None}
-        self.dilatation = MeanDilatation(self._fbar, locked) if locked else None
+        self.dilatation = MeanDilatation(self._fbar, locked, dt) if locked else None
+        self._suction = pressure if dried else None
         sums = [part.dried for part in self.law_forms]
         self._of_suction = OfSuction(grid.dim, self.dilatation, sums) if dried else None
         self.velocity = Velocity(self.u)
@@ -127,11 +118,11 @@ class MomentumForms:
         self.linear = not locked and all(law.linear for law, *_ in laws)
         """Whether the tangent of the laws depends only on the positions of the points."""
         self.elastic = not any(law.state for law, *_ in laws)
-        """Whether no law has a state.  Only then may the next substep reuse a tangent."""
+        """Whether no law has a state, so that the next substep may reuse a tangent."""
         self.ghost = GhostPenalty(grid, V, at_points)
         kept = [self.ghost.fill.x.array], [f.x.array for f in (self.u, *rooms)]
         self.active = Active(grid, pressure is not None, *kept)
-        """Active cells; u is zero at nodes of other cells."""
+        """Active cells.  u is zero at nodes of other cells."""
 
     def _forms_of_law(
         self,
@@ -143,7 +134,7 @@ class MomentumForms:
         symmetric: bool,
         dt: fem.Constant,
     ) -> FormsOfPart:
-        """Return the compiled forms of a law at its integration points; dried: whether any law depends on suction."""
+        """Return the compiled forms of a law; `dried` tells whether any law depends on suction."""
         F = points.deformation(self.u)
         values = {name: getattr(points, name) for name in (*law.parameters, *law.state)}
         values |= by_scene(self.grid, None, law, points) | {"dt": dt}
@@ -157,7 +148,7 @@ class MomentumForms:
             values, known = values | local.values, values | local.known
         else:
             known = values
-        # derivatives with respect to F, contracted; derivatives with respect to u compile twenty times as long in 3D
+        # derivatives with respect to F; derivatives with respect to u compile twenty times as long in 3D
         beside = Beside()
         if locks:
             ratio = ufl.det(points.increment(self.u))
@@ -166,7 +157,8 @@ class MomentumForms:
             P, A = law.first_piola(F, known), ufl.diff(law.first_piola(F, values), F)
         slopes = []
         if p is not None:
-            slopes = self._fbar.by_pressure(law, F, seen, values, p) if locks else _by_pressure(law, F, values, p)
+            stresses = self._fbar.stresses(law, F, seen, values) if locks else [law.first_piola(F, values)]
+            slopes = [ufl.diff(of, p) for of in stresses]
         sums = suction_sums(points, F, slopes, locks) if dried else None
         if pressure is not None:
             of_pressure = -points.biot * pressure * ufl.diff(ufl.det(F), F)
@@ -186,18 +178,18 @@ class MomentumForms:
         return FormsOfPart(residual, StackedElementMatrices(A, points, symmetric, beside), local, means, sums)
 
     def of_suction(self, data: QuadratureData) -> list[tuple[NDArray[np.int32], NDArray[np.float64]]]:
-        """Return derivatives of nodal forces with respect to cell pressures through suction, see `OfSuction.rows`."""
-        return [] if self._of_suction is None else self._of_suction.rows(data)
+        """Return the derivatives of nodal forces with respect to cell pressures, see `OfSuction.rows`."""
+        return [] if self._of_suction is None else self._of_suction.rows(data, self._given(data, derive=True))
 
     def set_contents(self, own: NDArray[np.int64], *contents: NDArray[np.float64]) -> ActiveSet:
-        """Set contents of the owned cells (n,) with material (`GhostPenalty.set_contents`); return the active set."""
+        """Set the contents of owned cells with material (`GhostPenalty.set_contents`), and return the active set."""
         self.active.clear()
         cells = self.ghost.set_contents(own, *contents)
         self.active.set(cells, lambda: self.active_nodes(cells).nonzero()[0])
         return self.active.now
 
     def summed(self, room: int, adders: Sequence[Callable[[NDArray[np.float64]], None]]) -> NDArray[np.float64]:
-        """Return the nodal forces of `adders`, summed over processes, as a local array.  room: index of a buffer."""
+        """Return the nodal forces of `adders`, summed over processes, in the buffer with the index `room`."""
         carrier, out = self._rooms[room]
         out[self.active.now.dofs] = 0.0
         for add in adders:
@@ -206,39 +198,60 @@ class MomentumForms:
 
     @cached_property
     def nodal(self) -> NDArray[np.float64]:
-        """Displacement increment u as an array (nodes, d), m."""
+        """Displacement increment u as an array (nodes, d), in m."""
         return self.u.x.array.reshape(-1, self.grid.dim)
 
     def internal(self, data: QuadratureData, loads: Sequence[Loads] = ()) -> NDArray[np.float64]:
-        """Return the nodal forces, N, of the stresses at u and of `Loads.takes_up`, as a local array."""
+        """Return the nodal forces of the stresses at u and of `Loads.takes_up`, in N."""
 
-        def solve() -> None:
-            for forms, part in zip(self.law_forms, data.parts, strict=True):
-                if forms.local is not None:
-                    forms.local.update(part, derive=False)
+        given = self._nothing or self._given(data)
 
         def add(b: NDArray[np.float64]) -> None:
-            for forms, part in zip(self.law_forms, data.parts, strict=True):
-                forms.residual.assemble_vector(b, part)
+            for forms, part, values in zip(self.law_forms, data.parts, given, strict=True):
+                forms.residual.assemble_vector(b, part, values)
 
-        if self.dilatation is None:
-            solve()
-        else:
-            self.dilatation.update(data, solve)
         return self.summed(0, [add, *[one.takes_up for one in loads]])
 
     def assemble_tangent(self, K: PETSc.Mat, data: QuadratureData) -> None:
-        """Add the tangent of the stresses at u to K; the caller finalises K."""
-        parts = list(zip(self.law_forms, data.parts, strict=True))
-        for forms, part in parts:
-            if forms.local is not None:
-                forms.local.derive(part)
-        sums = [forms.tangent.assemble_matrix(K, part) for forms, part in parts]
+        """Add the tangent of the stresses at u to K, without final assembly."""
+        parts = zip(self.law_forms, data.parts, self._nothing or self._given(data, derive=True), strict=True)
+        sums = [forms.tangent.assemble_matrix(K, part, given) for forms, part, given in parts]
         if self.dilatation is not None:
             self.dilatation.assemble_matrix(K, data, sums)
 
+    def average(self, delta: NDArray[np.float64], data: QuadratureData) -> None:
+        """Scale the gradients Delta of pieces with F-bar to the volume ratios of their cells."""
+        if self.dilatation is not None:
+            self.dilatation.average(delta, data, self._motion)
+
+    @property
+    def _motion(self) -> tuple:
+        """Key for `Latest`, which changes whenever stresses at the same points change, except with time."""
+        p = None if self._suction is None else self._suction.x.array.copy()
+        return self.u.x.array[self.active.now.dofs], self.inertia and float(self.inertia.midpoint.value), p
+
+    @cached_property
+    def _nothing(self) -> list[Given]:
+        """Result of `_given` if no law has local unknowns or F-bar, and an empty list otherwise."""
+        some = self.dilatation is not None or any(forms.local is not None for forms in self.law_forms)
+        return [] if some else [NONE] * len(self.law_forms)
+
+    def _given(self, data: QuadratureData, derive: bool = False) -> Sequence[Given]:
+        """Set theta and pi, and return values at u for the forms of each part, see `LocalUnknowns`."""
+
+        motion = self._motion
+
+        def solve(derive: bool = False) -> list[Given]:
+            parts = zip(self.law_forms, data.parts, strict=True)
+            return [NONE if forms.local is None else forms.local.solve(part, derive, motion) for forms, part in parts]
+
+        if self.dilatation is None:
+            return solve(derive)
+        given = self.dilatation.at(data, motion, solve)
+        return [{**a, **b} for a, b in zip(given, solve(derive), strict=True)] if derive else given
+
     def at_nodes(self, cells: NDArray[np.int32], values: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
-        """Return nodal sums (k, nodes) of k quantities; values: for each, an array (cells, 2^d), or (cells, 1)."""
+        """Return nodal sums (k, nodes) of k quantities from their values in the cells."""
         (shared, values_at), nodes = self._rooms[0], self.active.now.nodes
         at = nodes.searchsorted(self.grid.cell_nodes[cells])
         of_nodes = np.array([of + np.zeros(at.shape) for of in values])
@@ -251,7 +264,7 @@ class MomentumForms:
         return out
 
     def parts(self, of: NDArray[np.int64], count: int) -> Parts:
-        """Return the connected parts of the bodies; `of` and `count` are the results of `OnGrid.parts_of_cells`."""
+        """Return the connected parts of the bodies from the results of `OnGrid.parts_of_cells`."""
         grid, nodes = self.grid, np.full(len(self.grid.node_x), -1)
         own = self.active.now.cells[self.active.now.cells < grid.num_owned]
         total, count_of = self.at_nodes(own, [of[own, None], np.ones((len(own), 1))])
@@ -259,7 +272,7 @@ class MomentumForms:
         return Parts(count, of - 1, nodes)
 
     def active_nodes(self, cells: NDArray[np.int32]) -> NDArray[np.bool_]:
-        """Return whether each local node belongs to an active cell of any process.  cells: own active cells."""
+        """Return whether each local node belongs to an active cell of any process."""
         nodes = np.zeros(len(self.grid.node_x), dtype=bool)
         nodes[self.grid.cell_nodes[cells]] = True
         if self.grid.comm.size == 1:
@@ -271,28 +284,14 @@ class MomentumForms:
         return values[:: self.grid.dim] > 0
 
 
-def _by_pressure(law: type[Skeleton], F, values: Mapping[str, object], p) -> list:
-    """Return the derivative of a law's first Piola-Kirchhoff stress with respect to a pressure p, a UFL variable."""
-    return [ufl.diff(law.first_piola(F, values), p)]
-
-
 class MomentumSystem:
     """Vectors and matrices of the balance of momentum for one set of active cells.
 
-    Parameters
-    ----------
-    forms
-        The forms.
-    dofs
-        Unrolled local degrees of freedom that are unknowns, ghosts included.
-    cells
-        Active cells of this process.
-    facets
-        Faces of this process with a ghost penalty.
-    stiff
-        Whether plates or prescribed displacements have a penalty.
-    parts
-        Connected parts of the bodies.
+    dofs: unrolled local degrees of freedom that are unknowns, ghosts included.
+    cells: active cells of this process.
+    facets: faces of this process with a ghost penalty.
+    stiff: whether plates or prescribed displacements have a penalty.
+    parts: connected parts of the bodies.
     """
 
     def __init__(
@@ -318,9 +317,9 @@ class MomentumSystem:
         )
         """Connected part of each unknown, and of each degree of freedom in `touched`."""
         self.rounding = self.unknowns.vector()
-        """Rounding error of the residual at each unknown, N."""
+        """Rounding error of the residual at each unknown, in N."""
         self.of_whole = self.unknowns.vector()
-        """For each unknown, the norm, N, of a vector over its connected part that has its rounding error throughout."""
+        """Norm, in N, of a vector with the rounding error of an unknown at all unknowns of the same connected part."""
         self.K = matrix(self.unknowns, self.unknowns, 3**d * d)
         self.residual, self.step = self.unknowns.vector(), self.unknowns.vector()
         held = active[~among(active, dofs)]
@@ -338,15 +337,15 @@ class MomentumSystem:
 
     @property
     def round_off(self) -> NDArray[np.float64]:
-        """Rounding error of the residual in each connected part (parts,), N."""
+        """Rounding error of the residual in each connected part, in N."""
         return self.of_parts.norms(self.rounding.array_r)
 
     def forces_of_parts(self, forces: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
-        """Return the norms (k, parts), N, of k force vectors in each part, over the degrees of freedom `touched`."""
+        """Return the norms (k, parts), in N, of k force vectors in each connected part."""
         return self._touched.norms(np.array(forces))
 
     def set_rounding(self, nodes: NDArray[np.float64]) -> None:
-        """Set the rounding error of the residual at the active local nodes, N."""
+        """Set the rounding errors of the residual at the active local nodes, in N."""
         self.rounding.array_w[:] = nodes[
             self._forms.active.now.nodes.searchsorted(self.unknowns.owned // self.unknowns.dim)
         ]
@@ -359,7 +358,7 @@ class MomentumSystem:
         return None if grid.even else grid.lines
 
     def places(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the grid positions of this process's unknowns and fixed degrees of freedom: see `multigrid_solver`."""
+        """Return the grid positions of the unknowns and of the fixed degrees of freedom, see `multigrid_solver`."""
         held = np.setdiff1d(self.touched, self.unknowns.owned)
         node, axis = np.divmod(np.concatenate([self.unknowns.owned, held]), self.unknowns.dim)
         places = self._forms.grid.node_places(node)
@@ -367,7 +366,7 @@ class MomentumSystem:
         return places[: self.unknowns.size], places[self.unknowns.size :]
 
     def _penalty_matrix(self, rows: Unknowns, facets: NDArray[np.int32], stiff: bool) -> PETSc.Mat:
-        """Return an empty matrix for the penalties; the ghost penalty couples equal components of two cells."""
+        """Return an empty matrix for the penalties."""
         grid = self._forms.grid
         d = grid.dim
         length = 3**d + 2 * d * 3 ** (d - 1)
@@ -379,7 +378,7 @@ class MomentumSystem:
         return A
 
     def set_penalty(self, loads: Sequence[Loads]) -> None:
-        """Assemble the terms linear in the step's increment: ghost penalty, penalties of loads, regularisation."""
+        """Assemble the ghost penalty, the penalties of loads and the regularisation, which are linear in u."""
         for penalty in (self.held_penalty, self.penalty):
             zero(penalty)
             for one in (self._ghost, *loads):
@@ -394,13 +393,10 @@ class MomentumSystem:
 class MomentumProblem:
     """Balance of momentum of one step.
 
-    forms: compiled forms.
-    system: vectors and matrices, with assembled penalties.
     data: integration points.
-    loads: loads on the bodies.
     tolerance: tolerance of the residual, relative to the forces.
-    goes_on (unknowns,), m: local array of displacements extrapolated from the last step, or None.
-    held (unknowns,), N: local array of forces that balance initial stresses where loads do not, or None.
+    goes_on (unknowns,), in m: displacements extrapolated from the last step, or None.
+    held (unknowns,), in N: forces that balance initial stresses where loads do not, or None.
     yielded: whether any soil has yielded before this step.
     """
 
@@ -443,33 +439,33 @@ class MomentumProblem:
         return At(self.system.unknowns, self.forms.u.x.array, self.system.parts)
 
     def settle(self, sticks: bool) -> bool:
-        """Update stick and slip at u, and return whether either changed.  sticks: whether slip may change to stick."""
+        """Update stick and slip at u, and return whether either changed.  `sticks` allows changes to stick."""
         return any([one.settle(self.at, sticks) for one in self.loads])
 
     def augment(self) -> bool:
-        """Update multipliers and contact geometry of converged loads; return whether any force changed."""
+        """Update multipliers and contact geometry of converged loads, and return whether any force changed."""
         return any([one.augment(self.at) for one in self.loads]) or any([one.follow(self.at) for one in self.loads])
 
     def guesses(self) -> list[NDArray[np.float64]]:
-        """Return initial guesses of the displacements (active dofs,), m, for Newton's method.
+        """Return initial guesses of the displacements, in m, for Newton's method.
 
-        Each of the loads may propose a guess, such as a rigid rotation.  A further guess extrapolates the last motion.
+        Each load may propose a guess, such as a rigid rotation.  A further guess extrapolates the last motion.
         """
         found = [one.guess(self.system.parts, self.forms.nodal) for one in self.loads]
         found = [values.ravel() for values in (*found, self._goes_on) if values is not None]
         return [self.freely(values[self.forms.active.now.dofs]) for values in found]
 
     def freely(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return displacements (active dofs,), m, with zeros where walls fix them."""
+        """Return displacements, in m, with zeros where walls fix them."""
         return np.where(self.system.unknowns.map.indices[self.forms.active.now.dofs] >= 0, values, 0.0)
 
     def assemble_residual(self) -> tuple[PETSc.Vec, float]:
-        """Return the out-of-balance nodal forces (N) at u, and the norm (N) of the force scales of all parts."""
+        """Return the out-of-balance nodal forces at u, and the norm of the force scales, in N."""
         r, scales = self.residual_of_parts()
         return r, float(np.linalg.norm(scales))
 
     def residual_of_parts(self) -> tuple[PETSc.Vec, NDArray[np.float64]]:
-        """Return the out-of-balance nodal forces (N) at u, and the force scales (parts,) of connected parts, in N."""
+        """Return the out-of-balance nodal forces at u, and the force scales of the connected parts, in N."""
         forms, system = self.forms, self.system
         b, norms = self._unbalanced()
         system.held.gather(b, system.held_residual)  # without penalties; `wall_forces` adds their part on fixed nodes
@@ -487,11 +483,11 @@ class MomentumProblem:
         return r, np.maximum.reduce(norms)
 
     def unbalanced(self) -> NDArray[np.float64]:
-        """Return the out-of-balance nodal forces, N, at u without penalties, as a local array."""
+        """Return the out-of-balance nodal forces at u without penalties, in N, as a local array."""
         return self._unbalanced()[0].copy()
 
     def _unbalanced(self) -> tuple[NDArray[np.float64], list[NDArray[np.float64]]]:
-        """Return the result of `unbalanced`, and a list of the norms (parts,), N, of its force terms."""
+        """Return the result of `unbalanced`, and the norms of its terms in each part, in N."""
         forms, system = self.forms, self.system
         b = forms.internal(self.data, self.loads)
         forces, external = b[system.touched], self._external
@@ -507,7 +503,7 @@ class MomentumProblem:
         return b, [*system.forces_of_parts([*terms, external])]
 
     def powers(self) -> dict[str, float]:
-        """Return the powers (W) of stresses, viscous resistance, friction and external loads at u on this process."""
+        """Return the powers of stresses, viscous resistance, friction and loads at u, in W, on this process."""
         forms, unknowns = self.forms, self.system.unknowns
         v = np.where(unknowns.map.indices >= 0, forms.velocity.nodal, 0.0)  # fixed nodes have no velocity
         owned = forms.u.function_space.dofmap.index_map.size_local * forms.grid.dim
@@ -533,11 +529,11 @@ class MomentumProblem:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return two relative residuals of each connected part.
 
-        In the first residual, the rounding error at each node is subtracted.  With `first` this error is not
-        subtracted, so that even a load below the error causes a solve.  In the second residual, the force scale at an
-        unknown is at least `of_whole` divided by the tolerance.  A residual within rounding then counts as converged.
+        For the first result, the rounding error at each node is subtracted from the residual.  With `first` it is not
+        subtracted, so that even a load below the error causes a solve.  For the second result, the force scale at an
+        unknown is at least `of_whole` divided by the tolerance, so that a residual within rounding has converged.
 
-        r: residuals, N; scales (parts,), N: force scales.
+        r, scales (parts,), in N: residuals and force scales.
         """
         system, parts = self.system, self.system.of_parts
         both = np.zeros((2, system.unknowns.size))
@@ -550,7 +546,7 @@ class MomentumProblem:
         return relative(counts, scales), full
 
     def wall_forces(self, walls: Mapping[str, str]) -> dict[str, NDArray[np.float64]]:
-        """Return the forces (d,), N, of the walls at u, by name; the residual must have been assembled at this u."""
+        """Return the forces of the walls at u, in N, by name.  The residual must have been assembled at this u."""
         system, forces = self.system, self.system.held_residual.copy()
         system.held_penalty.multAdd(system.step, forces, forces)
         for one in self.loads:
@@ -570,7 +566,7 @@ class MomentumProblem:
         return out
 
     def of_suction(self, data: QuadratureData | None = None) -> list[tuple[NDArray, NDArray]]:
-        """Return derivatives of nodal forces with respect to cell pressures through suction, see `OfSuction.rows`."""
+        """Return the derivatives of nodal forces with respect to cell pressures, see `OfSuction.rows`."""
         return self.forms.of_suction(data or self.data)
 
     def assemble_tangent(
@@ -578,8 +574,8 @@ class MomentumProblem:
     ) -> PETSc.Mat:
         """Return the tangent at u, regularised by a fraction of the elastic shear stiffness.
 
-        data: integration points, by default the problem's.
-        firmness: the fraction, one number or one for each connected part.
+        data: integration points, by default the points of the problem.
+        firmness: this fraction, as one number or as one number for each connected part.
         """
         K = self.system.K
         # the first sum gives K its full sparsity pattern, because PETSc does not always notice a later change

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Rigid plates: a uniform traction, and a penalty on the slope of the side, see `RigidPlate`."""
+"""Rigid plates, which exert a uniform traction and a penalty on the slope of a side, see `RigidPlate`."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ from mpm_dolfinx.parallel.exchange import over_all
 
 
 class PlateForms:
-    """Forms of a penalty on the tilt of a side under a plate: stiffness, and forces from the present tilt."""
+    """Forms of a penalty on the tilt of a side under a plate."""
 
     def __init__(self, grid: Grid, u: fem.Function):
         self.points = p = FormPoints(grid, rigidity=(), normal=(grid.dim,), tilt=(grid.dim,))
         v, du = ufl.TestFunction(u.function_space), ufl.TrialFunction(u.function_space)
 
         def slope(w):
-            """Return the tangential gradient of the normal displacement, grad_t(w_n)."""
+            """Return the tangential gradient of the normal displacement."""
             gradient = ufl.dot(p.normal, p.plane_grad(w))
             return gradient - ufl.dot(gradient, p.normal) * p.normal
 
@@ -44,17 +44,9 @@ class PlateForms:
 
 
 class Plates(Acting):
-    """The rigid plates of a stage.
+    """The rigid plates of a stage, by name.
 
-    Parameters
-    ----------
-    setting, plates
-        The stage, and its plates by name.
-
-    Raises
-    ------
-    ValueError
-        The faces under a plate are not one flat side.
+    ValueError is raised if the faces under a plate are not one flat side.
     """
 
     conditions, title = (RigidPlate,), "rigid plates"
@@ -100,7 +92,7 @@ class Plates(Acting):
 
 
 class PlateLoads(Loads):
-    """Plates in a substep; even: loads of the plates' uniform tractions."""
+    """Plates in a substep.  The loads `even` are their uniform tractions."""
 
     stiff = True
 
@@ -132,7 +124,7 @@ class PlateLoads(Loads):
 
 
 def _check_flat(plate: RigidPlate, faces: Surface) -> None:
-    """Raise ValueError unless the faces are one flat, connected side; separate parts of a plate would move apart."""
+    """Raise ValueError unless the faces under a plate are one flat, connected side."""
     corners, axis = faces.places(), facing(faces)[0]
     tangential = np.arange(corners.shape[2]) != axis
     low = corners.min(axis=1)[:, tangential]

@@ -23,31 +23,30 @@ from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.material_points import ACROSS, MaterialPoints, in_plane, in_space
 
 STIFF_DRY = 50
-"""Weight in dry bodies of a cell's corner-based volume ratio J_n (`cell_ratios`), in units of G / (lambda + 2G).
+"""Weight in dry bodies of the volume ratio from the corners of domains (`cell_ratios`), in units of G / (lambda + 2G).
 
-The weight is at most 1; the incremental volume ratio of the points has the remaining weight. With nu = 0.4999 and a
+The weight is at most 1; the incremental volume ratio of the points has the remaining weight.  With nu = 0.4999 and a
 weight of 1, the stress change at a reset of the grid would exceed the stresses in the bodies.
 """
 STIFF_WET = 8
-"""Value of (lambda + 2G) / G above which the corner-based ratio loses weight in wet bodies.
+"""Value of (lambda + 2G) / G above which the volume ratio from the corners loses weight in wet bodies.
 
-The weight is 1 at nu = 0.43, and 0 at nu = 0.47.  In skeletons above this value, the difference between corner-based
-ratio and Q1 field expels water in every step, however short.  With a weight of 1, the extreme pressures of a beam with
-eight cells across its depth have errors of 43 % at nu = 0.49.  At nu = 0.499 the pressures are six to thirty times too
-large, and adaptive steps never grow.
+The weight is 1 at nu = 0.43, and 0 at nu = 0.47.  With a weight of 1, the difference between the ratio from the
+corners and the Q1 field expels water in every step, however short.  The extreme pressures of a beam with eight cells
+across its depth then have errors of 43 % at nu = 0.49.  At nu = 0.499 the pressures are six to thirty times too large.
 """
 SHARE = 0.5
 """Fraction of the gradient's deviation from its cell mean that laws use in cells of flowing, dilatant soil.
 
-Dilatant flow has a volume strain rate of sin psi times its shear rate. This condition at four points over-constrains a
-Q1 cell, even with F-bar. With the full deviation, the load of a footing (phi = psi = 20 degrees) is 4.4 % too large
-with 9 cells and 3.4 % with 17 cells, and still rises.  With one point per cell, the load is constant, but 6.6 % too
-small with 9 cells and 3.2 % with 17 cells.
+Dilatant flow has a volume strain rate of sin psi times its shear rate.  This condition at four points over-constrains a
+Q1 cell, even with F-bar.  With the full deviation, the load of a footing (phi = psi = 20 degrees) is 4.4 % too large
+with 9 cells, 3.4 % too large with 17 cells, and still rises.  With one point per cell, the load is constant, but 6.6 %
+too small with 9 cells, and 3.2 % too small with 17 cells.
 """
 
 
 def corner_share(material: Skeleton, wet: bool) -> NDArray[np.float64]:
-    """Return the weight of the corner-based volume ratio in cells of a material at the start of a step."""
+    """Return the weight of the volume ratio from the corners at the start of a step."""
     stiffness = material.oedometric / material.shear
     return (
         np.minimum(np.maximum(2 - stiffness / STIFF_WET, 0.0), 1.0) if wet else np.minimum(1.0, STIFF_DRY / stiffness)
@@ -56,7 +55,7 @@ def corner_share(material: Skeleton, wet: bool) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class QuadratureData:
-    """Integration points of a step: of all points, and of each part of the points, see `SceneMaterials.parts`."""
+    """Integration points of a step, with their fields."""
 
     pieces: PointData  # all integration points
     parts: tuple[PointData, ...]  # integration points of each part
@@ -64,7 +63,7 @@ class QuadratureData:
     of_points: PointData  # like `pieces`, but volumes and F are not scaled for F-bar; for user-defined terms
 
     def increments(self, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return I + grad u (n, d, d) at the positions where laws use it.  nodal (nodes, d), m: displacements u."""
+        """Return I + grad u at the positions where laws use it."""
         n, d = self.pieces.x.shape
         out, nodes = np.empty((n, d, d)), self.pieces.points.grid.cell_nodes
         for rows, part in zip(self.rows, self.parts, strict=True):
@@ -87,14 +86,8 @@ class PiecePlaces:
 class QuadraturePoints:
     """Pieces of particle domains as integration points, with the fields of the scene's forms.
 
-    Parameters
-    ----------
-    scene, bodies
-        The materials of the scene with their pore fluid, and all bodies of the scene.
-    weighs
-        Whether the scene has gravity.
-    extended
-        Whether user-defined functions may use any data of the material points.
+    weighs: whether the scene has gravity.
+    extended: whether user-defined functions may use any data of the material points.
 
     Attributes
     ----------
@@ -106,8 +99,6 @@ class QuadraturePoints:
         Whether mobilities change with the deformation.
     layered
         Whether the conductivity differs between points.
-    materials
-        The materials of the scene.
     """
 
     def __init__(self, scene: SceneMaterials, bodies: Sequence[Body], weighs: bool, extended: bool):
@@ -150,7 +141,7 @@ class QuadraturePoints:
         return PiecePlaces(pieces, tuple(parts))
 
     def _law_places(self, cut: CutDomains, pieces: Places) -> Places:
-        """Return the positions at which laws use grad u.  In flowing, dilatant soil these are shifted (`SHARE`)."""
+        """Return the positions at which laws use grad u, shifted in flowing, dilatant soil (`SHARE`)."""
         if not self.materials.dilates or self._grid.axisymmetric:
             return pieces
         flows = cut.to_cells(self.materials.dilating(cut.points))
@@ -167,7 +158,7 @@ class QuadraturePoints:
         return Places(self._grid, cut.cells, middle + share * (cut.x - middle), mixed)
 
     def data(self, cut: CutDomains, places: PiecePlaces, points: MaterialPoints) -> QuadratureData:
-        """Return the integration points of cut domains with all their data at the present state of the points."""
+        """Return the integration points of cut domains with all their data in the present state."""
         within = self._gradients(cut, points) if self._linear is not None and cut.domains else {}
         even = {name: values for name, values in self._changing(points).items() if name not in within}
         fields = {**self._constant(cut, points), **{name: cut.to_cells(values) for name, values in even.items()}}
@@ -229,7 +220,7 @@ class QuadraturePoints:
         return fields
 
     def _gradients(self, cut: CutDomains, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
-        """Return F at the pieces of this process's points, and the out-of-plane stretch if laws use it."""
+        """Return F at the pieces, and the out-of-plane stretch if laws use it."""
         of_materials = self.materials.elastic(points), self.materials.soil_rows(points)
         if not self.materials.across:
             return {"F": self._linear.at_pieces(cut, points.F, *of_materials)}
@@ -237,7 +228,7 @@ class QuadraturePoints:
         return dict(zip(("F", ACROSS), in_plane(F), strict=True))
 
     def _own(self, cut: CutDomains, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
-        """Return the data that differ between pieces of one material point, if user-defined functions use them."""
+        """Return the data that differ between pieces of one material point, for user-defined functions."""
         fields = {}
         if self._extended or self.varies:
             fields["position"] = cut.pieces.x + cut.grid.base
@@ -246,29 +237,29 @@ class QuadraturePoints:
         return {name: cut.pieces_to_cells(values) for name, values in fields.items()}
 
     def rows(self, cut: CutDomains, points: MaterialPoints, value: Callable[[Skeleton], float]) -> NDArray[np.float64]:
-        """Return the values (n,) of a material constant at the integration points."""
+        """Return a material constant at the integration points."""
         return cut.to_cells(self.materials.table(points, value))
 
     def mobility(
         self, cut: CutDomains, law: ConductivityAtPieces | None, data: PointData, begins: bool
     ) -> NDArray[np.float64]:
-        """Return mobilities k / (rho_w g) (n,), m^2/(Pa s), at the integration points, at the present displacement."""
+        """Return the mobilities k / (rho_w g) at the integration points, in m^2/(Pa s)."""
         if law is None:
             return self.rows(cut, cut.points, lambda m: m.conductivity) / self._fluid.unit_weight
         return law.evaluate(data, cut.to_cells(cut.points.material), begins) / self._fluid.unit_weight
 
     def masses(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the masses (n,), kg, of the material points, pore fluid included."""
+        """Return the masses of the material points, in kg, pore fluid included."""
         return self.materials.present_density(points) * points.volume0 * points.J
 
     def conducting(self, cut: CutDomains) -> NDArray[np.float64]:
-        """Return two numbers (n, 2) for each integration point.  Points with equal pairs have equal conductivities."""
+        """Return rows (n, 2) for the integration points.  Points with equal rows have equal conductivities."""
         return cut.to_cells(self.materials.conducting(cut.points))
 
     def fixed_stress(self, cut: CutDomains, points: MaterialPoints, of_fluid: bool) -> NDArray[np.float64]:
-        """Return beta (n,), 1/Pa, at the integration points, for the fixed-stress operator C + f beta V (f: `Scheme`).
+        """Return the coefficient beta of the fixed-stress operator at the integration points, in 1/Pa.
 
-        of_fluid: whether to return 1/K_w in place of beta; the iteration then converges for stiff skeletons only.
+        of_fluid: whether to return 1/K_w in place of beta, with which the iteration converges for stiff skeletons only.
         """
         if of_fluid:
             return np.full(len(cut.cells), 1 / self._fluid.bulk)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """The rigid motion nearest to prescribed displacements: initial guess of Newton's method for bodies that rotate.
 
-A linearised rotation by an angle a causes a spurious stretch of a^2 / 2. Soil may yield at this stretch. Newton's
-method may then fail, even in short steps.
+A linearised rotation by an angle a stretches a body by a^2 / 2.  Soil may yield at this stretch, and Newton's method
+may then fail, even in short steps.  The rigid motion is a better initial guess.
 """
 
 from __future__ import annotations
@@ -27,22 +27,13 @@ ITERATIONS = 9
 def rigid_motion(
     comm: MPI.Intracomm, holds: PointData, x: NDArray[np.float64], counts: NDArray[np.bool_]
 ) -> NDArray[np.float64] | None:
-    """Return the displacements (n, d), m, at positions x in the rigid motion nearest to prescribed displacements.
+    """Return the displacements, in m, of positions x in the rigid motion nearest to prescribed displacements.
 
-    Parameters
-    ----------
-    comm
-        The processes; all must call the function.
-    holds
-        Penalties of prescribed displacements, with direction, gap along it, m, and stiffness, the weight in the fit.
-    x : (n, d), m
-        The positions.
-    counts : (k,)
-        Whether each penalty is used.
+    The result is None for a pure translation, or if a translation fits nearly as well.  All processes must call this
+    function.
 
-    Returns
-    -------
-    The displacements, or None if they are a pure translation, or if a translation fits nearly as well.
+    holds: penalties of prescribed displacements, with direction, gap, in m, and stiffness, the weight in the fit.
+    counts (k,): whether each penalty is used.
     """
     d = x.shape[1]
     e = holds["direction"]
@@ -77,7 +68,7 @@ def rigid_motion(
 def turned(
     comm: MPI.Intracomm, weight: NDArray[np.float64], x: NDArray[np.float64], to: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the rotation (d, d) nearest to a motion of weighted positions from x to `to` (n, d), m (Kabsch 1976).
+    """Return the rotation nearest to a motion of weighted positions (Kabsch 1976).
 
     The result is the identity for a negligible rotation or a poor fit.  All processes must call this function.
     """
@@ -95,13 +86,13 @@ def turned(
 
 
 def _apply(turn: Rotation, x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return rotated vectors (n, d); 2D vectors rotate in the plane."""
+    """Return rotated vectors (n, d).  2D vectors rotate in the plane."""
     d = x.shape[1]
     return x @ turn.as_matrix()[:d, :d].T
 
 
 def _spin(x: NDArray[np.float64], e: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the velocities at x (n, d) along directions e (n, d) for unit angular velocities about each axis."""
+    """Return the velocities along directions e for unit angular velocities about each axis."""
     if x.shape[1] == 2:
         return (x[:, :1] * e[:, 1:] - x[:, 1:] * e[:, :1]).copy()
     return np.cross(x, e)

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: MIT
 """Loads on sides of the bodies in their present position: dead tractions, and pressures that follow the surface.
 
-A traction t is a force per reference area.  Its virtual work is `int t . v dA` on the reference faces.  The virtual
-work of a pressure is `-int p n . v da` on the present area.  The tangent of the pressure's work is symmetric, except
-for a contribution `p/2 (v x du) . dx` of the surface's edges dx.  This contribution vanishes where two surfaces of
-equal pressure meet. It also vanishes on a wall that fixes the normal component of v and du, because v, du and the edge
-lie in the wall.
+A traction t is a force per reference area.  Its virtual work is `int t . v dA` on the reference faces, with the test
+function v.  The virtual work of a pressure p is `-int p n . v da` on the present area with the normal n.  The tangent
+of the pressure's work is symmetric, except for a contribution `p/2 (v x du) . dx` of the edges dx of the surface, with
+the displacement increment du.  This contribution vanishes where two surfaces of equal pressure meet.  It also vanishes
+on a wall that fixes the normal component of v and du.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from mpm_dolfinx.conditions.conditions import Pressure, Traction
 from mpm_dolfinx.domains.cut_domains import Patches
 from mpm_dolfinx.forms.point_forms import FormPoints, Places, PointData, PointForm
 from mpm_dolfinx.grid.grid import SIDES, Grid
-from mpm_dolfinx.parallel.exchange import Exchange, everywhere, over_all
+from mpm_dolfinx.parallel.exchange import Exchange, over_all, together
 from mpm_dolfinx.points.material_points import MaterialPoints
 
 
 class SideLoads(Acting):
-    """Loads of one kind on sides of the bodies in a stage; setting: the stage; loads: these loads by name."""
+    """Loads of one kind on sides of the bodies in a stage, by name."""
 
     def __init__(self, setting: Setting, loads: Mapping[str, Any]):
         self._grid, self._forms = setting.grid, setting.forms
@@ -50,22 +50,22 @@ class SideLoads(Acting):
         return [faces for _, faces in self._loads]
 
     def forces(self, place: Place) -> tuple[Places, NDArray[np.float64]]:
-        """Return integration points in owned cells, and the forces (n, d), N, at these points."""
+        """Return integration points in owned cells, and the forces at these points, in N."""
         grid, patches = self._grid, place.cut.surfaces(self.surfaces)
         travel, places = self._placed(place.cut.key, lambda: owners(grid, patches), grid.comm)
         both = [(load, p) for (load, _), p in zip(self._loads, patches, strict=True)]
-        values = everywhere(grid.comm, lambda: [self._given(of, place.t, p.positions(place.points)) for of, p in both])
+        values = together(grid.comm, lambda: [self._given(of, place.t, p.positions(place.points)) for of, p in both])
         forces = [self._on(of, value, p, place.points) for (of, p), value in zip(both, values, strict=True)]
         return places, travel.send(np.concatenate(forces))
 
     def _given(self, load: Any, t: float, side: Any) -> NDArray[np.float64]:
-        """Return the value of a load at time t, s; side: result of `Patches.positions` for its side."""
+        """Return the value of a load on a side at time t, in s."""
         raise NotImplementedError
 
     def _on(
         self, load: Any, value: NDArray[np.float64], patches: Patches, points: MaterialPoints
     ) -> NDArray[np.float64]:
-        """Return the forces (n, d), N, of a load at the integration points of its side."""
+        """Return the forces of a load at the integration points of its side, in N."""
         raise NotImplementedError
 
 
@@ -111,14 +111,14 @@ class DeadLoads(Loads):
 
 
 def owners(grid: Grid, patches: Sequence[Patches]) -> tuple[Exchange, Places]:
-    """Return the exchange that sends patch data to the owners of their cells, and the positions after this exchange."""
+    """Return the exchange that sends patch data to the owners of cells, and the positions there."""
     cell, x = (np.concatenate([getattr(p, name) for p in patches]) for name in ("cell", "x"))
     travel = Exchange(grid.comm, grid.owner(cell))
     return travel, Places(grid, grid.locals[travel.send(cell)], travel.send(x))
 
 
 class PressureForms:
-    """Forms of the nodal forces of pressures, and of their negative derivative; push: force on the initial area."""
+    """Forms of the nodal forces of pressures, and of their derivatives."""
 
     def __init__(self, grid: Grid, u: fem.Function):
         self.points = p = FormPoints(grid, push=(grid.dim,))
@@ -168,16 +168,16 @@ class PressureLoads(Loads):
         self._forms.work.assemble_vector(b, self._data)
 
     def tangent(self, K: PETSc.Mat) -> None:
-        """Add the tangent, which is due to rotation and stretch of the surface."""
+        """Add the tangent, due to rotation and stretch of the surface."""
         self._forms.slope.assemble_matrix(K, self._data)
 
 
 def closed(grid: Grid, free: NDArray[np.bool_], pressures: Sequence[tuple[Pressure, Surface]]) -> bool:
     """Return whether each surface of equal pressure is closed, or ends on walls that fix the normal displacement.
 
-    A surface does not count as closed if corners of its faces lie on the edges of other faces.
+    The corners of faces must not lie on the edges of other faces.
 
-    free (nodes, d): whether walls leave each displacement component free; pressures: pressures and their faces.
+    free (nodes, d): whether walls leave each displacement component free.
     """
     if not pressures:
         return True
@@ -190,7 +190,7 @@ def closed(grid: Grid, free: NDArray[np.bool_], pressures: Sequence[tuple[Pressu
 
 
 def _held_walls(grid: Grid, free: NDArray[np.bool_]) -> list[tuple[int, float]]:
-    """Return axis and position, m, of each wall that fixes the displacement component normal to the wall."""
+    """Return axis and position, in m, of each wall that fixes its normal displacement component."""
     out = []
     for wall, (axis, end) in SIDES[grid.dim].items():
         if not over_all(grid.comm, int(free[grid.wall_nodes(wall), axis].sum())):
@@ -199,7 +199,7 @@ def _held_walls(grid: Grid, free: NDArray[np.bool_]) -> list[tuple[int, float]]:
 
 
 def _closed(grid: Grid, walls: Sequence[tuple[int, float]], surfaces: Sequence[Surface]) -> bool:
-    """Return whether every edge of the faces belongs to two faces, or lies in a fixed wall."""
+    """Return whether every edge belongs to two faces or lies in a fixed wall."""
     x = np.concatenate([faces.places() for faces in surfaces])
     count, edges = x.shape[1], _EDGES[grid.dim]
     number = np.rint(

@@ -2,7 +2,7 @@
 """Transfer of array rows to other processes, and of the answers back.
 
 A row is the data of one piece of a particle domain, of one corner or of one loaded point.  The row is sent to the
-process that owns its cell and assembles the integrals of the cell.  A single process copies nothing.
+process that owns its cell and assembles the integrals of the cell.
 """
 
 from __future__ import annotations
@@ -35,14 +35,15 @@ traffic = Traffic()
 
 @cache
 def _lasting(handle: int) -> PETSc.Vec:
-    """Return an object that keeps PETSc's duplicate of a communicator.  All processes must take part in duplication."""
+    """Return an object that keeps PETSc's duplicate of a communicator."""
     return PETSc.Vec().create(MPI.Comm.f2py(handle))
 
 
 class Exchange:
     """A fixed assignment of array rows to processes, which can be used for several transfers.
 
-    `comm`: processes of the exchange.  `destination` (n,): rank of the process that receives each row.
+    `comm`: processes of the exchange.
+    `destination` (n,): rank of the process that receives each row.
     """
 
     def __init__(self, comm: MPI.Intracomm, destination: NDArray[np.int32]):
@@ -69,7 +70,7 @@ class Exchange:
         return self._transfer(rows, 1, self._sf.reduceBegin, self._sf.reduceEnd)
 
     def back(self, rows: NDArray) -> NDArray:
-        """Send back one answer for each received row.  Return the answers to own rows, in the order of the rows."""
+        """Send back one answer for each received row, and return the answers for this process's rows."""
         if self.comm.size == 1:
             return rows
         return self._transfer(rows, 0, self._sf.bcastBegin, self._sf.bcastEnd)
@@ -108,7 +109,7 @@ def to_root(comm: MPI.Intracomm, rows: int) -> Exchange:
 def evenly(comm: MPI.Intracomm, numbers: NDArray[np.int64]) -> NDArray[np.int32]:
     """Return ranks (n,) for ascending numbers (n,) >= 0.  All numbers of all processes differ.
 
-    The ranks get equal shares of all numbers, in ascending order: the smallest numbers go to rank 0, and so on.
+    Each rank gets an equal share of all numbers.  The smallest numbers go to rank 0, the next to rank 1, and so on.
     """
     below = over_all(comm, len(numbers)) * np.arange(1, comm.size) // comm.size
     low, high = np.zeros_like(below), np.full_like(below, over_all(comm, int(numbers.max(initial=0)), MPI.MAX) + 1)
@@ -124,20 +125,12 @@ def first(comm: MPI.Intracomm, message: str) -> str:
     return next(filter(None, comm.allgather(message)), "") if comm.size > 1 else message
 
 
-def everywhere(comm: MPI.Intracomm, ask: Callable[[], T]) -> T:
-    """Return the values of user functions on this process.  An error on one process is raised on all processes."""
-    message, value = "", None
-    try:
-        value = ask()
-    except ValueError as error:
-        message = str(error)
-    if message := first(comm, message):
-        raise ValueError(message)
-    return value
-
-
 def together(comm: MPI.Intracomm, action: Callable[[], T]) -> T:
-    """Return the result of an action on this process.  If it fails on any process, all raise the first error."""
+    """Return the result of an action on this process.  If the action fails anywhere, all processes raise the first
+    error.
+    """
+    if comm.size == 1:
+        return action()
     value = error = None
     try:
         value = action()
@@ -151,13 +144,22 @@ def together(comm: MPI.Intracomm, action: Callable[[], T]) -> T:
 
 def at_root(comm: MPI.Intracomm, action: Callable[[], T]) -> T:
     """Return on every process the result of `action` on rank 0.  If `action` raises, all processes raise its error."""
-    value = error = None
-    if comm.rank == 0:
-        try:
-            value = action()
-        except Exception as raised:
-            error = raised
-    value, error = comm.bcast((value, error))
-    if error is not None:
-        raise error
+    return comm.bcast(together(comm, lambda: action() if comm.rank == 0 else None))
+
+
+def by_user(comm: MPI.Intracomm, name: str, action: Callable[[], T]) -> T:
+    """Return the result of a user's function `name`; an error on one process, or Ctrl-C, is raised on all processes.
+
+    Other processes raise a RuntimeError, because errors of user types may not be sent.
+    """
+    value = raised = None
+    try:
+        value = action()
+    except BaseException as error:
+        raised = error
+    where = first(comm, "" if raised is None else f"process {comm.rank}: {raised}")
+    if raised is not None:
+        raise raised
+    if where:
+        raise RuntimeError(f"{name} raised an error on {where}")
     return value

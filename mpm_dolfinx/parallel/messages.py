@@ -14,7 +14,7 @@ from tqdm import tqdm
 logger = logging.getLogger("mpm_dolfinx")
 
 WITHIN = {"mpm_dolfinx", "contextlib", "functools"}
-"""Packages whose frames a warning skips, because warnings name a line of the user's script."""
+"""Packages whose frames a warning skips, so that the warning names a line of the user's script."""
 
 
 class ResultWarning(UserWarning):
@@ -61,10 +61,10 @@ def log(comm: MPI.Intracomm, message: str, *values, level: int = logging.INFO) -
 
 
 def warn(comm: MPI.Intracomm, category: type[ResultWarning], message: str, *values) -> None:
-    """Give a warning on the first process, at the line of the script that caused it.
+    """Give a warning on the first process, at the line of the script that caused it.  All processes must call this.
 
-    All processes must call it.  If a filter turns the warning into an error, all processes raise it.  A caller must
-    therefore warn before it changes any data.
+    If a filter turns the warning into an error, all processes raise the error.  A caller must therefore warn before it
+    changes any data.
     """
     raised = None
     if comm.rank == 0:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Numpy archives (.npz), of which several processes write and read the arrays together, by rows.
+"""Numpy archives (.npz) whose arrays several processes write and read together, by rows.
 
 Each process writes its rows at their places in the file, and reads an equal share of all rows.  No process holds an
 array of all rows.  Neither the file nor the reader depends on the number of processes that wrote the file.
@@ -30,7 +30,7 @@ ONE = 1 << 31  # Source: definition of the same order of the powers
 
 
 class Member(NamedTuple):
-    """An array in an archive: the start of its entries in the file, and data that identify the entries."""
+    """An array in an archive: where its entries start in the file, and data that identify the entries."""
 
     dtype: np.dtype
     shape: tuple[int, ...]
@@ -44,9 +44,9 @@ def write(comm: MPI.Intracomm, file: Path, arrays: Mapping[str, NDArray], rows: 
 
     If a process cannot write, all processes raise its error.
 
-    `arrays`: on rank 0, arrays by name.
-    `rows` (n, ...): rows of this process of further arrays, by name.  The rows of all processes are in the order of the
-    ranks.
+    `arrays`: arrays by name, on rank 0.
+    `rows`: further arrays by name, as the rows (n, ...) of this process.  The file has the rows of all processes, in
+    the order of the ranks.
     """
     part = file.with_name(file.name + ".part")
     rows = {name: np.ascontiguousarray(of) for name, of in rows.items()}
@@ -99,7 +99,7 @@ def write(comm: MPI.Intracomm, file: Path, arrays: Mapping[str, NDArray], rows: 
 
 
 def members(file: Path, names: Iterable[str]) -> dict[str, Member]:
-    """Return the arrays with these names in an archive.  Raise ValueError for compressed or incomplete arrays."""
+    """Return the named arrays in an archive.  Raise ValueError for compressed or incomplete arrays."""
     out = {}
     with open(file, "rb") as f, ZipFile(f) as archive:
         for name in names:
@@ -134,8 +134,8 @@ def read(
     Raise ValueError on all processes if the bytes of an array differ from its checksum.
 
     `of`: the arrays by name.
-    `ranges`: by name, first row of this process, and last row plus one.  The processes read all rows, in the order of
-    the ranks.
+    `ranges`: first row of this process, and last row plus one, by name.  All processes together read all rows, in the
+    order of the ranks.
     """
     rows = together(comm, lambda: {name: some_rows(file, of[name], *ranges[name]) for name in of})
     sums = comm.gather([(zlib.crc32(found), found.nbytes) for found in rows.values()])
@@ -162,7 +162,7 @@ def _row_bytes(dtype: np.dtype, shape: tuple[int, ...]) -> int:
 
 
 def _joined(crc: int, parts: Iterable[tuple[int, int]]) -> int:
-    """Return the checksum of bytes with checksum `crc` and more parts.  `parts`: checksum and length of each."""
+    """Return the checksum of bytes with checksum `crc` and further parts."""
     for more, length in parts:
         for k in range(length.bit_length()):
             crc = _product(_power(k), crc) if length >> k & 1 else crc
@@ -172,12 +172,12 @@ def _joined(crc: int, parts: Iterable[tuple[int, int]]) -> int:
 
 @cache
 def _power(k: int) -> int:
-    """Return `x^(8 2^k)` modulo the polynomial of the checksum.  Multiplication by this factor appends 2^k bytes."""
+    """Return the factor `x^(8 2^k)` that appends 2^k bytes to a checksum."""
     return _product(_power(k - 1), _power(k - 1)) if k else ONE >> 8
 
 
 def _product(a: int, b: int) -> int:
-    """Return the product of two polynomials over two elements, modulo the polynomial of the checksum."""
+    """Return the product of two binary polynomials modulo the polynomial of the checksum."""
     out = 0
     while a:
         out ^= b if a & ONE else 0

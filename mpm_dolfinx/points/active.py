@@ -42,7 +42,7 @@ class ActiveSet:
 
     @cached_property
     def parts_of_cells(self) -> tuple[NDArray[np.int64], int]:
-        """Index (cells,), from 1, of each local cell's connected part, or 0 if it is empty, and the number of parts."""
+        """Connected part (cells,) of each local cell, counted from 1, and the number of parts.  Empty cells have 0."""
         return parts_of_cells(self.grid, self.contains)
 
 
@@ -65,9 +65,9 @@ class Active:
     slot : (cells,)
         Index of each cell among the owned active cells.
     centroid : (cells, d), m
-        Offset of the material's centroid from the midpoint. Empty without fluid.
+        Offset of the material's centroid from the midpoint of the cell.  The array is empty without fluid.
     opening : (cells, d, 2)
-        Open fractions of faces. Empty without fluid.
+        Open fractions of the cell's faces.  The array is empty without fluid.
     """
 
     def __init__(self, grid: Grid, wet: bool, cells: Sequence[NDArray], dofs: Sequence[NDArray]):

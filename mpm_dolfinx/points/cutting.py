@@ -9,12 +9,12 @@ wherever the domain lies on the grid.
 The surface of a domain has 4 edges, or in 3D 4 triangles about the middle of each face.  The triangles of neighbouring
 domains match, and do not favour a diagonal of the face.  The grid planes of one axis after another slice this surface.
 Gauss's theorem gives the volumes and first moments between a slice and the lower face of its cell, and in the column of
-cells below.  The interior of a domain is never cut.  Areas of the faces of pieces need no further cuts.
+cells below.  The interior of a domain is never cut.
 
 In axisymmetry pieces are rings.  The volume of a ring is `2 pi r_c` times the area of its section, where r_c is the
 radius of the section's centroid (Pappus).  Gradients are evaluated at the centroid of the volume,
-`(mean r^2 / r_c, mean r z / r_c)`.  The circumferential strain `u_r / r` is the mean of u_r over the section, divided
-by r_c.  The nodal forces of uniform stresses are then exact.
+`(mean r^2 / r_c, mean r z / r_c)`.  The circumferential strain `u_r / r` is the mean of the radial displacement u_r
+over the section, divided by r_c.  The nodal forces of uniform stresses are then exact.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from mpm_dolfinx.base.tolerances import NEAR
 from mpm_dolfinx.grid.grid import ABOUT_MIDDLE, FACE_SIGNS, FACES, TURN, Grid, corner_bits, in_chunks, sum_by
 
 SLIVER = NEAR**2
-"""Smallest volume fraction of a piece. Pieces thinner than `Grid.snap` have an open face. Source: epsilon."""
+"""Smallest volume fraction of a piece.  Pieces thinner than `Grid.snap` have an open face.  Source: epsilon."""
 CHUNK = 2**15  # simplices cut in one call, so that they fit into the processor's cache
 TANGLED = 0.2  # smallest volume between corners / volume of domain; below it corners are re-initialised from F
 
@@ -64,10 +64,9 @@ def kuhn_simplices(dim: int) -> NDArray[np.int64]:
 
 @cache
 def simplices(dim: int) -> NDArray[np.int64]:
-    """Return the vertices (4 or 24, d+1), as numbered by `vertices`, of the simplices of a domain.
+    """Return the vertices (4 or 24, d+1) of the simplices of a domain, numbered as in `vertices`.
 
-    A simplex consists of a facet of the surface, oriented outward, and the middle.  Rotation and mirroring of the
-    domain preserve the set of simplices.
+    A simplex consists of a facet of the surface, oriented outward, and the middle of the domain.
     """
     rings = FACES[dim][:, [0, 1, 3, 2][: 2 ** (dim - 1)]]
     facets = []
@@ -96,10 +95,7 @@ def simplex_volumes(v: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def volumes(corners: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the volumes (n,), in m^d, of domains with corners (n, 2^d, d).  They are negative for inverted domains.
-
-    In 3D each face contributes a third of the product of its middle and its area vector.
-    """
+    """Return the volumes (n,), in m^d, of domains with corners (n, 2^d, d).  Inverted domains have negative volumes."""
     if corners.shape[1] == 4:
         y = np.ascontiguousarray((corners - corners[:, :1]).transpose(1, 2, 0))
         (ax, ay), (bx, by) = y[3] - y[0], y[2] - y[1]
@@ -127,13 +123,13 @@ def domain_volumes(corners: NDArray[np.float64], axisymmetric: bool) -> NDArray[
 
 
 def edges(corners: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the mean edge vectors of domains with corners (n, 2^d, d), as columns of matrices (n, d, d), in m."""
+    """Return the mean edge vectors of domains, in m, as columns of matrices (n, d, d)."""
     signs = 2.0 * corner_bits(corners.shape[2]) - 1
     return np.einsum("nki,ka->nia", corners, signs) / 2 ** (corners.shape[2] - 1)
 
 
 def centroids(corners: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the centroids (n, d), in m, of domains with corners (n, 2^d, d), or in axisymmetry of their sections.
+    """Return the centroids (n, d), in m, of domains, or in axisymmetry of their sections.
 
     Inverted simplices count with positive volume, as in `cut`.
     """
@@ -151,7 +147,7 @@ def _centroids(corners: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def tangled(corners: NDArray[np.float64], volume: NDArray[np.float64], axisymmetric: bool = False) -> NDArray[np.bool_]:
-    """Return which domains (n,) are inverted, that is, have corners whose volume is far from `volume` (n,), in m^d."""
+    """Return which domains (n,) are inverted, with a volume far from the prescribed `volume` (n,), in m^d."""
     ratio = domain_volumes(corners, axisymmetric) / volume
     return (ratio < TANGLED) | (ratio > 1 / TANGLED)
 
@@ -165,7 +161,7 @@ def parallelepipeds(
 
 
 def _chunks(count: int, dim: int) -> list[slice]:
-    """Divide `count` domains into slices, each so small that its simplices fit into the processor's cache."""
+    """Divide the domains into slices whose simplices fit into the processor's cache."""
     size = CHUNK // len(simplices(dim))
     return [slice(start, start + size) for start in range(0, max(1, count), size)]
 
@@ -178,7 +174,7 @@ def cut(grid: Grid, corners: NDArray[np.float64], second: bool = False, faces: b
 
     Returns
     -------
-    The pieces with at least 1e-12 of their domain's volume.  The fractions of every domain sum to one.
+    The pieces with at least 1e-12 of their domain's volume.  The volume fractions of the pieces of a domain sum to one.
     """
     chunks = _chunks(len(corners), grid.dim)
     if len(chunks) == 1:
@@ -193,10 +189,11 @@ def cut(grid: Grid, corners: NDArray[np.float64], second: bool = False, faces: b
 def on_planes(
     grid: Grid, true: NDArray[np.float64], x: NDArray[np.float64], axes: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return positions in units of cells, and positions for slicing.
+    """Return positions in units of cells, and positions for slicing, both snapped to grid planes nearer than
+    `Grid.snap`.
 
-    Both are snapped to grid planes nearer than `Grid.snap`.  If all cells are equal, positions for slicing are in units
-    of cells.  Otherwise they are in m, because domain edges are straight in m.
+    If all cells are equal, positions for slicing are in units of cells.  Otherwise they are in m, because domain edges
+    are straight in m.
 
     `true`: positions from the grid's lower corner, in units of cells.
     `x`, in m: these positions from the grid's base.
@@ -256,7 +253,7 @@ def _cut(grid: Grid, corners: NDArray[np.float64], second: bool, faces: bool) ->
 
 
 def _area_vectors(s: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the normals (d, m) of segments or triangles (d, d, m), with their length or area as norm."""
+    """Return the normals of segments or triangles, with their length or area as norm."""
     e = s[1:] - s[0]
     if len(e) == 1:
         return np.array([e[0, 1], -e[0, 0]])
@@ -265,10 +262,7 @@ def _area_vectors(s: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _facets(dim: int) -> NDArray[np.int64]:
-    """Return the vertices (k, d+1, d) of the facets of a domain's simplices, oriented outward.
-
-    The i-th facet of a simplex omits its i-th vertex.  The last facets omit the middle, and form the surface.
-    """
+    """Return the vertices of the facets of a domain's simplices.  Facet i omits vertex i."""
     out = np.stack([np.delete(simplices(dim), k, axis=1) for k in range(dim + 1)], axis=1)
     box = vertices(corner_bits(dim).astype(float)[:, :, None])[:, :, 0]
     for simplex, facets in zip(simplices(dim), out, strict=True):
@@ -280,7 +274,7 @@ def _facets(dim: int) -> NDArray[np.int64]:
 
 
 class _Slots:
-    """Cells in the bounding boxes of domains.  Each domain and cell has a slot.  The last axis varies fastest."""
+    """Cells in the bounding boxes of domains.  Each domain and cell has a slot."""
 
     def __init__(self, grid: Grid, y: NDArray[np.float64]):
         top = (grid.shape - 1)[:, None]
@@ -298,7 +292,7 @@ class _Slots:
         self.cell = self.low[:, self.point] + self._place
 
     def of(self, owner: NDArray[np.int64], index: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the slots (m,) of cells with indices (d, m), for the domains `owner` (m,)."""
+        """Return the slots of cells, for the domains `owner`."""
         before = self._start - (self.low * self._stride).sum(axis=0)
         out = before.take(owner) + index[-1].astype(np.int64)  # the last stride is 1
         for place, stride in zip(index[:-1], self._stride, strict=False):
@@ -306,7 +300,7 @@ class _Slots:
         return out
 
     def beyond(self, values: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
-        """Return, for each slot, the sum of the values of the slots further along an axis in the same column."""
+        """Return for each slot the sum of values of the slots further along an axis."""
         out = np.zeros(self.size)
         for steps in range(1, int(np.maximum.reduce(self._span[axis], initial=1))):
             has = (self._place[axis] + steps < self._span[axis][self.point]).nonzero()[0]
@@ -323,7 +317,7 @@ def _sum(
     second: bool,
     faces: bool,
 ) -> Pieces:
-    """Return the pieces, one for each domain and cell, from sums over the slices of the domains' surfaces."""
+    """Return the pieces, one for each domain and cell, from sums over the slices of surfaces."""
     d = grid.dim
     index = np.floor(s.sum(axis=0) / d)
     least = s.min(axis=0)
@@ -421,7 +415,7 @@ def _sum(
 def spreads(corners: NDArray[np.float64], rings: bool) -> NDArray[np.float64]:
     """Return the second moments (n, d, d) of domains about their centroids, divided by their volumes, in m^2.
 
-    The results are exact for parallelepipeds.  `rings`: whether the domains are sections of rings, in axisymmetry.
+    `rings`: whether the domains are sections of rings, in axisymmetry.
     """
     E = edges(corners)
     out = E @ E.swapaxes(1, 2) / 12  # 1/12: second moment of a unit length, exact
@@ -430,8 +424,6 @@ def spreads(corners: NDArray[np.float64], rings: bool) -> NDArray[np.float64]:
 
 def of_rings(spread: NDArray[np.float64], radius: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the second moments (n, 2, 2) of rings about their centroids, divided by their volumes, in m^2.
-
-    Third moments are neglected.  The vector from the section's to the ring's centroid is `spread[:, 0] / radius`.
 
     `spread` (n, 2, 2), in m^2: second moments of the sections, divided by their areas.
     `radius` (n,), in m: radii of the sections' centroids.
@@ -443,14 +435,7 @@ def of_rings(spread: NDArray[np.float64], radius: NDArray[np.float64]) -> NDArra
 def _rings(
     grid: Grid, cell: NDArray[np.int64], c: NDArray[np.float64], squares: NDArray, products: NDArray
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return the radii (n,), in m, of pieces, the centroids (n, 2) of their volumes, and `hoop` of `Pieces`.
-
-    Coordinates r, z of centroids, and in the last parameters, are from 0 to 1 in the cell of each piece.
-
-    `cell` (n, 2): grid indices of the pieces' cells.
-    `c` (n, 2): centroids of the pieces' sections.
-    `squares`, `products` (n,): means of r^2 and of r z over the sections.
-    """
+    """Return the radii of pieces, the centroids of their volumes in cell coordinates, and `hoop` of `Pieces`."""
     (h, height), (x, z) = grid.widths_of(cell).T, c.T
     squares = np.minimum(np.maximum(squares, x**2), x)  # rounding may violate these bounds in very thin pieces
     products = np.minimum(np.maximum(products, np.maximum(0.0, x + z - 1)), np.minimum(x, z))
@@ -471,15 +456,7 @@ def _products(
     total: Callable[[NDArray[np.float64]], NDArray[np.float64]],
     slots: _Slots,
 ) -> list[NDArray[np.float64]]:
-    """Return integrals over the pieces of products of two coordinates, from the lower corners of the pieces' cells.
-
-    `pairs`: axes of the two coordinates, ascending.
-    `x` (d, d, m): vertices of the slices.
-    `sums` (d, m): sums over these vertices.
-    `area` (m,): slice areas projected along the first axis.
-    `pair`: function that returns the sum of the product of two coordinates over the vertices of each slice.
-    `total`: function that returns the sum of slice values in each slot.
-    """
+    """Return integrals over the pieces of products of two coordinates, from the lower corners of the cells."""
     d = len(x)
 
     def mean(*factors: int) -> NDArray[np.float64]:
@@ -506,7 +483,7 @@ def _products(
 def cut_faces(
     grid: Grid, corners: NDArray[np.float64], local: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Cut faces of domains by the grid.  Return integration points, which are exact for products of Q1 functions.
+    """Cut faces of domains by the grid, and return integration points, which are exact for products of Q1 functions.
 
     If a face crosses a grid line, its part on each side must load the nodes of that side.  With one point for each
     face, the error would move nodes of partly filled cells in every step without limit.
@@ -516,9 +493,11 @@ def cut_faces(
 
     Returns
     -------
-    For each of n points: index (n,) of its face, position (n, d), interpolated coordinates (n, e), and the fraction
-    (n,) of the face that the point represents.  The last result is the middle (n, d) of the point's segment or
-    triangle, which is a part of the face in one cell.
+    Index (n,) of the face of each of n points.
+    Position (n, d) of each point.
+    Coordinates (n, e) that are interpolated at each point.
+    Fraction (n,) of the face that each point represents.
+    Middle (n, d) of the segment or triangle of each point, which is a part of the face in one cell.
     """
     d, m = grid.dim, len(corners)
     y = on_planes(grid, grid.in_cells(corners), corners, 2)[1]
@@ -559,13 +538,7 @@ def cut_faces(
 def _polygons(
     grid: Grid, s: NDArray[np.float64], owner: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Return the parts of cut triangles, divided into triangles that do not depend on the order of the axes.
-
-    The slices of a triangle in one cell form a convex polygon. The polygon is divided about the mean of its corners.
-
-    `s` (3, a, n): corners of the slices, as positions for slicing and, last, barycentric coordinates in the triangle.
-    `owner` (n,): index of the triangle of each slice.
-    """
+    """Return the parts of cut triangles, divided into triangles that do not depend on the order of the axes."""
     cut = np.bincount(owner, minlength=1)[owner] > 1
     part, of = s[:, :, cut], owner[cut]
     cell = np.floor(slices_in_cells(grid, part[:, :3]).mean(axis=0)).astype(np.int64)
@@ -602,14 +575,14 @@ def _polygons(
 
 
 def _around(group: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the index (n,) of each entry's successor in its group, cyclically.  `group` (n,) has ascending indices."""
+    """Return the index of the next entry in the same group, cyclically, for ascending groups."""
     after, starts = np.arange(1, len(group) + 1), np.diff(group, prepend=-1).nonzero()[0]
     after[np.append(starts[1:], len(group))[: len(starts)] - 1] = starts
     return after
 
 
 def _size(s: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return lengths of segments, or areas of triangles (k+1, e, m), up to a constant factor."""
+    """Return lengths of segments, or areas of triangles, up to a constant factor."""
     e = s[1:] - s[0]
     if len(e) == 1:
         return np.sqrt((e[0] ** 2).sum(axis=0))
@@ -625,7 +598,7 @@ _RULES = {  # Source: Gauss, Strang and Fix (1973); equal weights, exact to thir
 
 
 def sliced(s: NDArray[np.float64], owner: NDArray[np.int64], axis: int, grid: Grid):
-    """Slice simplices by the grid planes of an axis until no simplex crosses a plane.  For units see `on_planes`."""
+    """Slice simplices by the grid planes of an axis until no simplex crosses a plane."""
     done_s, done_owner = [], []
     while True:
         least, most = np.minimum.reduce(s[:, axis]), np.maximum.reduce(s[:, axis])
@@ -641,7 +614,7 @@ def sliced(s: NDArray[np.float64], owner: NDArray[np.int64], axis: int, grid: Gr
 
 
 def cut_at(s, owner, axis: int, plane):
-    """Cut each simplex at its plane.  Return the parts below and their owners, then the parts above, and theirs."""
+    """Cut each simplex at its plane, and return the parts and owners below the plane, then above it."""
     order = s[:, axis].argsort(axis=0)
     s = s[order[:, None], np.arange(s.shape[1])[:, None], np.arange(s.shape[2])]
     count = (s[:, axis] < plane).sum(axis=0)  # vertices below the plane
@@ -662,7 +635,7 @@ def cut_at(s, owner, axis: int, plane):
 
 
 def _on_plane(a, b, axis: int, plane):
-    """Return the intersections of edges from a to b with the plane.  They have the exact coordinate of the plane."""
+    """Return the intersections of edges from a to b with the plane."""
     t = (plane - a[axis]) / (b[axis] - a[axis])
     x = a + t * (b - a)
     x[axis] = plane

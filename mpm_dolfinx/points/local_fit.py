@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: MIT
 """Values at given positions from polynomials that are fitted to surrounding data (moving least squares).
 
-    sum_i w(o_i) (P(o_i) - v_i)^2 + small terms of P's coefficients -> min.
+For each position, the polynomial P minimises
 
-P is a polynomial, v_i are the data, o_i are the offsets of the data from the position, and w is a weight.  The value is
-the constant term of P (Lancaster and Salkauskas 1981).  Polynomials up to the degree of P are exact.  The weights
-decrease smoothly to zero, so values are continuous when data enter or leave the fit.  Data may not determine all
-coefficients.  The small terms then set coefficients to zero, higher degrees first.
+    sum_i w(o_i) (P(o_i) - v_i)^2 + small terms of P's coefficients,
+
+where v_i are the data, o_i are the offsets of the data from the position, and w is a weight.  The value at the position
+is the constant term of P (Lancaster and Salkauskas 1981).  Polynomials up to the degree of P are exact.  The weights
+decrease smoothly to zero, so values are continuous when data enter or leave the fit.  If data do not determine all
+coefficients, the small terms set coefficients to zero, higher degrees first.
 """
 
 from __future__ import annotations
@@ -47,12 +49,14 @@ def fitted(
     values: NDArray[np.float64],
     weight: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Return the fitted values (count, width) at `count` positions, on every process.  Without data they are zero.
+    """Return the fitted values (count, width) at `count` positions, on every process.  Positions without data have
+    zero.
 
     `degree`: degree of the polynomials, 1 or 2.
-    `at` (r,): index, from 0, of the position to whose fit each row of this process's data belongs.
-    `offset` (r, d): offset from this position, in spacings of the data.
-    `values`, `weight` (r, width), (r,): values and weights of the data.
+    `at` (r,): index of the position to which each row of this process's data belongs, counted from 0.
+    `offset` (r, d): offset of the data from this position, in spacings of the data.
+    `values` (r, width): values of the data.
+    `weight` (r,): weights of the data.
     """
     powers = [rows for k in range(degree + 1) for rows in combinations_with_replacement(range(offset.shape[1]), k)]
     size = len(powers)

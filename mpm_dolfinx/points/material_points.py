@@ -26,22 +26,22 @@ ACROSS = "stretch across"
 def body_of(ids: NDArray[np.int64], starts: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the index (n,) of each point's body.
 
-    `starts` (bodies + 1,) has the first id of each body, and the first id of renewed points.  Successive ids of renewed
-    points belong to the bodies in turn: the first body, the second, and so on cyclically.
+    `starts` (bodies + 1,): first id of each body, and first id of renewed points.  Successive ids of renewed points
+    belong to the bodies in turn, cyclically.
     """
     beyond = ids - starts[-1]
     return np.where(beyond < 0, starts.searchsorted(ids, side="right") - 1, beyond % max(1, len(starts) - 1))
 
 
 def determinant(F: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return `det F` (n,) of F (n, d, d).  numpy's function uses LU factors, and takes twenty times as long."""
+    """Return the determinants (n,) of F (n, d, d), much faster than numpy."""
     if F.shape[1] == 2:
         return F[:, 0, 0] * F[:, 1, 1] - F[:, 0, 1] * F[:, 1, 0]
     return np.einsum("ni,ni->n", F[:, 0], np.cross(F[:, 1], F[:, 2]))
 
 
 def middle(corners: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the means (n, d) of corners (n, 2^d, d).  numpy's mean takes five times as long."""
+    """Return the means (n, d) of corners (n, 2^d, d), much faster than numpy."""
     total = corners[:, 0].copy()
     for k in range(1, corners.shape[1]):
         total += corners[:, k]
@@ -57,7 +57,7 @@ def with_ratio(F: NDArray[np.float64], J: NDArray[np.float64]) -> NDArray[np.flo
 
 
 def in_space(F: NDArray[np.float64], across: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return F (n, 3, 3) from its out-of-plane stretch (n,) and its scaled in-plane part (n, 2, 2), see `in_plane`."""
+    """Return F (n, 3, 3) from the out-of-plane stretch (n,) and the scaled in-plane part (n, 2, 2), see `in_plane`."""
     out = np.zeros((len(F), 3, 3))
     out[:, :2, :2] = F / np.sqrt(across)[:, None, None]
     out[:, 2, 2] = across
@@ -65,20 +65,20 @@ def in_space(F: NDArray[np.float64], across: NDArray[np.float64]) -> NDArray[np.
 
 
 def unstretched(F: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return F (n, 3, 3).  If F is (n, 2, 2), the result has no stretch out of plane."""
+    """Return F (n, 3, 3), without out-of-plane stretch if F is (n, 2, 2)."""
     out = np.tile(np.eye(3), (len(F), 1, 1))
     out[:, : F.shape[1], : F.shape[1]] = F
     return out
 
 
 def in_plane(F: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the in-plane part of F (n, 3, 3), scaled to `det F`, and the out-of-plane stretch.  Inverts `in_space`."""
+    """Return the in-plane part of F (n, 3, 3), scaled to `det F`, and the out-of-plane stretch."""
     across = F[:, 2, 2]
     return F[:, :2, :2] * np.sqrt(across)[:, None, None], across.copy()
 
 
 def cofactor(F: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return `det F F^-T` (n, d, d) of F (n, d, d).  numpy's inverse takes ten times as long."""
+    """Return `det F F^-T` (n, d, d) of F (n, d, d), much faster than numpy."""
     if F.shape[1] == 2:
         flat = F.reshape(-1, 4)[:, ::-1] * [1.0, -1.0, -1.0, 1.0]
         return flat.reshape(F.shape)
@@ -98,7 +98,7 @@ class MaterialPoints:
     corners : (n, 2^d, d), m
         Tracked corners of the particle domain, in the order of `grid.corner_bits`.
     F : (n, d, d)
-        Deformation gradient.  In plane strain with an out-of-plane stretch, this is its in-plane part, scaled to det F.
+        Deformation gradient.  In plane strain with an out-of-plane stretch, F is the in-plane part, scaled to det F.
     volume0 : (n,), m^d
         Reference volume.
     material : (n,)
@@ -138,11 +138,11 @@ class MaterialPoints:
         return type(self), (*(getattr(self, f.name) for f in fields(self) if f.name != "data"), dict(self.data))
 
     def placed(self, base: NDArray[np.float64]) -> MaterialPoints:
-        """Return the points with true positions.  `base` (d,), in m, is added to positions; base 0 returns `self`."""
+        """Return the points with true positions, by adding `base` (d,), in m, to their positions."""
         return PlacedPoints(**self._moved(base)) if base.any() else self
 
     def _moved(self, by: NDArray[np.float64]) -> dict[str, Any]:
-        """Return the fields with all positions translated by the vector `by` (d,), in m."""
+        """Return the fields with all positions translated by a vector."""
         own = {f.name: getattr(self, f.name) for f in fields(self)}
         corners, x = self.corners + by, self.x + by
 
@@ -191,7 +191,7 @@ class MaterialPoints:
         return self.x - centroids(self.origin)
 
     def map(self, function: Callable[[NDArray], NDArray], shared: bool = True) -> MaterialPoints:
-        """Return points with a function applied to each array.  The function selects, copies or transfers entries.
+        """Return the points with a function applied to each array, which selects, copies or transfers entries.
 
         `shared`: whether fields that share an array also share the new array.
         """
@@ -206,7 +206,7 @@ class MaterialPoints:
         return type(self)(**arrays, data={name: once(values) for name, values in self.data.items()})
 
     def where(self, rows: NDArray[np.bool_], other: MaterialPoints) -> MaterialPoints:
-        """Return these points where `rows` (n,) is true, elsewhere `other`, which are these points in another state."""
+        """Return these points where `rows` (n,) is true, and elsewhere `other`, the same points in another state."""
 
         def chosen(a: NDArray, b: NDArray) -> NDArray:
             return a if a is b else np.where(rows.reshape(-1, *[1] * (a.ndim - 1)), a, b)
@@ -222,7 +222,7 @@ class MaterialPoints:
         return type(self)(**{name: np.concatenate(pair)[order] for name, pair in pairs.items()}, data=data)
 
     def of(self, ids: NDArray[np.int64], kept: bool = True) -> MaterialPoints:
-        """Return the points with the given ids.  If `kept` is false, return all other points."""
+        """Return the points with the given ids, or all other points if `kept` is false."""
         rows = np.isin(self.id, ids) == kept
         return self if rows.all() else self.map(lambda values: values[rows])
 
@@ -241,7 +241,7 @@ class MaterialPoints:
         return received.map(lambda rows: rows[order])
 
     def find(self, ids: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the indices of entries of `ids` that are points of this process, and the indices of these points."""
+        """Find the points of this process with given `ids`.  Return their indices in `ids` and among the points."""
         at = self.id.searchsorted(ids)
         found = ((at < len(self)) & (self.id[np.minimum(at, len(self) - 1)] == ids)).nonzero()[0] if len(self) else []
         found = np.asarray(found, dtype=np.int64)
@@ -253,7 +253,7 @@ _ARRAYS = attrgetter(*(f.name for f in fields(MaterialPoints) if f.name != "data
 
 
 class PlacedPoints(MaterialPoints):
-    """Material points with true positions, not relative to the grid's `base`.  A `State` does not accept them."""
+    """Material points with true positions, not relative to the grid's `base`."""
 
     def from_base(self, base: NDArray[np.float64]) -> MaterialPoints:
         """Return the points with positions relative to `base` (d,), in m, as in a state."""

@@ -28,16 +28,13 @@ class Parts:
     nodes: NDArray[np.int64]  # index, from 0, of each active local node's part, else -1
 
     def largest(self, comm: MPI.Comm, part: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the largest value (count, ...) in each part, or -inf if empty.  `part` (n,): parts of `values`."""
+        """Return the largest of `values` (n, ...) in each connected part (count, ...), or -inf for empty parts."""
         return largest_of_parts(comm, part, values, self.count)
 
 
 @dataclass(frozen=True, eq=False)
 class OfParts:
-    """Entries of a distributed vector on this process, with the connected part of each entry.
-
-    `of` (n,) is the index of each entry's part, and `count` is the number of parts.
-    """
+    """Entries of a distributed vector on this process, with the connected part `of` each entry."""
 
     comm: MPI.Comm
     of: NDArray[np.int64]
@@ -45,7 +42,7 @@ class OfParts:
 
     @cached_property
     def _sorted(self) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-        """Order of the entries by part, index of each part's first entry in this order, and the parts with entries."""
+        """Order of the entries by part, the first entry of each part in this order, and the parts with entries."""
         sizes = np.bincount(self.of, minlength=self.count)
         present = sizes.nonzero()[0]
         return self.of.argsort(kind="stable"), (sizes.cumsum() - sizes)[present], present
@@ -68,7 +65,7 @@ class OfParts:
 
 
 def largest_of_parts(comm: MPI.Comm, part: NDArray, values: NDArray, count: int) -> NDArray[np.float64]:
-    """Return the largest value (count, ...) in each part, over all processes.  `part` (n,): part of each value."""
+    """Return the largest value (count, ...) in each connected part, over all processes."""
     out = np.full((count, *values.shape[1:]), -np.inf)
     np.maximum.at(out, part, values)
     return over_all(comm, out, MPI.MAX)
@@ -90,7 +87,10 @@ def largest_of_bodies(
 def relative(
     norms: NDArray[np.float64], scales: NDArray[np.float64], round_off: NDArray[np.float64] | float = 0.0
 ) -> NDArray[np.float64]:
-    """Return the norms divided by the scales.  Norms of at most `round_off` give 0.  Undefined ratios give inf."""
+    """Return the norms divided by the scales.
+
+    Norms of at most `round_off` give 0.  Undefined quotients give inf.
+    """
     ratio = np.empty(norms.shape)
     ratio.fill(np.inf)
     np.divide(norms, scales, out=ratio, where=(scales > 0) & (norms < np.inf))
@@ -99,10 +99,9 @@ def relative(
 
 
 def parts_of_cells(grid: Grid, active: NDArray[np.bool_]) -> tuple[NDArray[np.int64], int]:
-    """Return the index (cells,), from 1, of each active local cell's connected part, and the number of parts.
+    """Return the connected part (cells,) of each active local cell, counted from 1, and the number of parts.
 
-    Cells with common nodes belong to one part.  Inactive cells have index 0.  Parts are numbered in the order of their
-    first cells, so that the numbers do not depend on the number of processes.
+    Cells with common nodes belong to one part.  Inactive cells have index 0.  The number of processes has no influence.
     """
     cells, out = active.nonzero()[0], np.zeros(len(active), dtype=np.int64)
     own, count = _touching(grid.cell_places(cells))
@@ -120,7 +119,10 @@ def parts_of_cells(grid: Grid, active: NDArray[np.bool_]) -> tuple[NDArray[np.in
 
 
 def parts_of_domains(grid: Grid, corners: NDArray[np.float64], copy: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the index (n,), from 0, of each domain's connected part.  `copy` (n,): first cell of its grid copy."""
+    """Return the connected part (n,) of each domain, counted from 0.
+
+    `copy` (n,): first cell of the domain's grid copy.
+    """
     cell = grid.number(grid.index(corners.reshape(-1, grid.dim))).reshape(corners.shape[:2]) + copy.reshape(-1, 1)
     cell, at = np.unique(cell, return_inverse=True)
     own, count = _touching(
@@ -133,10 +135,11 @@ def parts_of_domains(grid: Grid, corners: NDArray[np.float64], copy: NDArray[np.
 def joined_parts(
     grid: Grid, part: NDArray[np.int64], count: int, pairs: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], int]:
-    """Join the parts of some pairs of cells.  Return the new `part` and `count`, results of `parts_of_cells`.
+    """Join the parts of some pairs of cells, and return the new results of `parts_of_cells`.
 
-    `pairs` (m, 2): lexicographic indices of active cells.  Each process may have other pairs.  All processes must call
-    this function.
+    `pairs` (m, 2): lexicographic indices of active cells.  Processes may have different pairs.
+
+    All processes must call this function.
     """
     cells, at = np.unique(np.concatenate(grid.comm.allgather(np.unique(pairs, axis=0))), return_inverse=True)
     of = np.where(grid.owner(cells) == grid.comm.rank, part[grid.locals[cells]], 0)
@@ -147,7 +150,7 @@ def joined_parts(
 
 
 def _touching(index: NDArray[np.int64]) -> tuple[NDArray[np.int64], int]:
-    """Return the part (n,), from 0, of cells, and the number of parts.  `index` (n, d + 1): grid indices and copy."""
+    """Return the connected part of each cell, and the number of parts, from grid indices and copies."""
     if not len(index):
         return np.empty(0, dtype=np.int64), 0
     low = index.min(axis=0)
@@ -160,7 +163,7 @@ def _touching(index: NDArray[np.int64]) -> tuple[NDArray[np.int64], int]:
 
 
 def _joined(rows: NDArray[np.int64], columns: NDArray[np.int64], shape: Sequence[int]) -> tuple[NDArray[np.int64], int]:
-    """Return each row's component, from 0, and the number of components.  Rows with a common column are connected."""
+    """Return the component of each row, and the number of components.  Rows with a common column are connected."""
     n = sum(shape)
     pairs = coo_array((np.ones(len(rows)), (rows, shape[0] + columns)), shape=(n, n)).tocsr()
     count, part = connected_components(pairs, directed=False)
@@ -170,12 +173,7 @@ def _joined(rows: NDArray[np.int64], columns: NDArray[np.int64], shape: Sequence
 def _over_processes(
     grid: Grid, own: NDArray[np.int64], count: int, nodes: NDArray[np.integer], of_node: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], int]:
-    """Return for each cell the index of its connected part, unique on all processes, and the number of parts.
-
-    `own`, `count`: index of each cell's part, and number of parts, on this process alone.
-    `nodes` (n,): local indices of the cells' nodes.
-    `of_node` (n,): index of each node's part on this process.
-    """
+    """Return the connected part of each cell on all processes, and the number of parts."""
     counts = grid.comm.allgather(count)
     start = sum(counts[: grid.comm.rank])
     index, copy = np.split(grid.node_places(nodes), [grid.dim], axis=1)

@@ -22,7 +22,7 @@ class Polygons:
 
     @classmethod
     def rings(cls, x: NDArray[np.float64], edge: NDArray[np.int64] | None = None) -> Polygons:
-        """Return polygons with k vertices x (n, k, 2) each.  By default their edges have no identifiers (n, k)."""
+        """Return polygons with the vertices x (n, k, 2), by default without identifiers of the edges."""
         n, k = x.shape[:2]
         return cls(x, np.full(n, k), np.full((n, k), NONE) if edge is None else edge)
 
@@ -43,7 +43,7 @@ class Polygons:
 
     @property
     def centroid(self) -> NDArray[np.float64]:
-        """Centroids (n, 2), in m.  Polygons without area have the first vertex."""
+        """Centroids (n, 2) of the polygons, in m.  A polygon without area has the first vertex."""
         area, moment = self._moments
         some = area > 0
         return self.x[:, 0] + np.divide(moment, area[:, None], out=np.zeros_like(moment), where=some[:, None])
@@ -89,10 +89,7 @@ class Polygons:
         return out
 
     def simplified(self, near: float) -> Polygons:
-        """Return the polygons without vertices inside straight edges, or within `near`, in m, of the next vertex.
-
-        A trapezoid with such a vertex has two diagonals that divide it equally well.  Rounding would select one.
-        """
+        """Return the polygons without vertices inside straight edges, or within `near`, in m, of the next vertex."""
         used = np.arange(self.edge.shape[1]) < self.count[:, None]
         out = _packed(self.x, self.edge, used & (np.abs(self.after - self.x).max(axis=2) > near))
         k, last = np.arange(out.edge.shape[1]), np.maximum(out.count - 1, 0)[:, None]
@@ -106,12 +103,11 @@ class Polygons:
     def quadrilaterals(self) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64]]:
         """Divide convex polygons into quadrilaterals, by the diagonals that divide the area most evenly.
 
-        The result therefore does not depend on the first vertex or the direction.
-
         Returns
         -------
-        For each quadrilateral: index of its polygon (m,), vertices (m, 4, 2) and edge identifiers (m, 4).  In a
-        triangle the middle of the longest edge is the fourth vertex.
+        Index (m,) of the polygon of each quadrilateral.
+        Vertices (m, 4, 2) and edge identifiers (m, 4) of the quadrilaterals.  In a triangle, the fourth vertex is the
+        middle of the longest edge.
         """
         left, rows = self, np.arange(len(self.count))
         found = []
@@ -132,7 +128,7 @@ class Polygons:
         return rows, x, edge
 
     def _divided(self) -> tuple[Polygons, Polygons]:
-        """Cut a triangle off pentagons, and a quadrilateral off polygons with more vertices.  Return both parts."""
+        """Divide polygons with more than four vertices, and return both parts."""
         n = self.x.shape[1]
         size = 3 if n == 5 else 4
         whole, best = self.area, None
@@ -151,7 +147,7 @@ class Polygons:
         return Polygons.rings(x[:, :size], part), Polygons.rings(x[:, [0, *range(size - 1, n)]], rest)
 
     def _of_four(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Return triangles as vertices (n, 4, 2) and edge identifiers (n, 4), with the middle of the longest edge."""
+        """Return triangles as quadrilaterals, with the middle of the longest edge as a vertex."""
         size = np.linalg.norm(self.after - self.x, axis=2)
         order = (size.argmax(axis=1)[:, None] + np.arange(3)) % 3
         x, edge = np.take_along_axis(self.x, order[:, :, None], axis=1), np.take_along_axis(self.edge, order, axis=1)
@@ -159,7 +155,7 @@ class Polygons:
         return np.concatenate([x[:, :1], middle, x[:, 1:]], axis=1), edge[:, [0, 0, 1, 2]]
 
     def _joined(self, other: Polygons) -> Polygons:
-        """Return these polygons, followed by `other`.  Polygons of `other` have at most as many vertices as these."""
+        """Return these polygons, followed by `other` polygons with at most as many vertices."""
         more = self.x.shape[1] - other.x.shape[1]
         x = np.concatenate([self.x, np.pad(other.x, ((0, 0), (0, more), (0, 0)), mode="edge")])
         edge = np.concatenate([self.edge, np.pad(other.edge, ((0, 0), (0, more)), constant_values=NONE)])
@@ -167,7 +163,7 @@ class Polygons:
 
 
 def _packed(x: NDArray[np.float64], edge: NDArray[np.int64], kept: NDArray[np.bool_]) -> Polygons:
-    """Return polygons with the vertices (n, k) in `kept` only."""
+    """Return polygons with the vertices in `kept` only."""
     count = kept.sum(axis=1)
     most = max(1, int(count.max(initial=0)))
     order = np.argsort(~kept, axis=1, kind="stable")[:, :most]

@@ -11,8 +11,10 @@ from mpm_dolfinx.grid.grid import cross_in_plane, sum_by
 from mpm_dolfinx.points.polygons import NONE, Polygons
 
 EDGES = 4
-"""Number of surface edges in a cell with renewed particle domains.  Halving this value changes the result of scene
-"flow" in tests/plateaus.py by 1.6e-03 (relative), doubling it by 1.5e-03, and finer cells by 9.0e-02.
+"""Number of surface edges in a cell with renewed particle domains.
+
+The result of scene "flow" in tests/plateaus.py changes by the fraction 1.6e-03 with half this value, by 1.5e-03 with
+twice this value, and by 9.0e-02 with finer cells.
 """
 BENT = 1 - 3**0.5 / 2
 """Largest deviation of a surface without a corner from its chord, in cell sizes.  Flatter parts are divided evenly.
@@ -67,7 +69,7 @@ class Region:
         self.simple = (angles.min(axis=1) > 0) & (self.area > NEAR)
 
     def area_of(self, count: int) -> NDArray[np.float64]:
-        """Return the filled area fraction of each of `count` cells.  Cells that are not in `cells` have 1."""
+        """Return the filled area fraction of each of `count` cells, which is 1 for cells that are not in `cells`."""
         out = np.ones(count)
         out[self.cells] = self.area
         return out
@@ -75,7 +77,7 @@ class Region:
     def quadrilaterals(
         self, chosen: NDArray[np.bool_]
     ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.bool_]]:
-        """Return index in `cells` (m,), corners (m, 4, 2) and surface flags (m, 4) of new domains in chosen cells."""
+        """Return the new domains in chosen cells: index in `cells` (m,), corners (m, 4, 2) and surface flags (m, 4)."""
         rows = np.flatnonzero(chosen[self.cells])
         corners, of = [np.zeros((0, 4, 2))], [rows[:0]]
         surface = [np.zeros((0, 4), dtype=bool)]
@@ -104,8 +106,8 @@ def resampled(
 ) -> NDArray[np.float64]:
     """Return the surface in n cells as vertices (n, EDGES + 1, 2) from P to Q (n, 2).
 
-    Vertices lie at sharp bends.  Nearly straight parts are divided evenly.  The vertices are then shifted so that the
-    area between surface and chord is preserved, or in axisymmetry the volume of this area's ring.
+    Vertices lie at sharp bends.  Nearly straight parts are divided evenly.  The vertices are then shifted to preserve
+    the area between surface and chord, or in axisymmetry the volume of the ring of this area.
 
     `of` (m,): index of each segment's cell, ascending.
     `x` (m, 2, 2): both ends of each segment, from 0 to 1 in its cell.
@@ -137,7 +139,7 @@ def resampled(
         out[:, middle] = (place(target - NEAR) + place(target + NEAR)) / 2  # the same result from both ends
 
     def place(target: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the positions (n, 2), from 0 to 1 in each cell, at arc lengths `target` (n,) along the segments."""
+        """Return the positions in each cell at the arc lengths `target` along the segments."""
         part = np.clip(np.searchsorted(arc, target, side="right") - 1, first, stop - 1)
         t = (target - arc[part]) / np.maximum(length[part], TINY)
         return x[part, 0] + t[:, None] * (x[part, 1] - x[part, 0])
@@ -152,7 +154,7 @@ def resampled(
     inner, wider = around[:, 0], around[:, 1] - around[:, 0]
 
     def ring(a: NDArray, b: NDArray, of: NDArray) -> NDArray:
-        """Return twice the areas of triangles (P, P + a, P + b) in cells `of`, in axisymmetry of their rings."""
+        """Return twice the areas of triangles (P, P + a, P + b), or twice the volumes of their rings in axisymmetry."""
         return cross_in_plane(a, b) * (inner[of] + wider[of] * (P[of, 0] + (a[:, 0] + b[:, 0]) / 3))
 
     bulge = sum_by(of, ring(a, b, of), len(P)) + sum_by(of[1:], ring(b[:-1], b[:-1] + gap, of[1:]), len(P))
@@ -168,7 +170,7 @@ def resampled(
 
 
 def _around(x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the distances (n,), from 0 to 4, of positions (n, 2) from (0, 0), anti-clockwise along the unit square."""
+    """Return the distances, from 0 to 4, of positions along the unit square, anti-clockwise from (0, 0)."""
     near = np.stack([x[:, 1], 1 - x[:, 0], 1 - x[:, 1], x[:, 0]], axis=1)
     side = near.argmin(axis=1)
     along = np.stack([x[:, 0], 1 + x[:, 1], 3 - x[:, 0], 4 - x[:, 1]], axis=1)

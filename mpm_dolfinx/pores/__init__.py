@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""Pores: retention curves and pore water."""
+"""Retention curves, and the water in unsaturated pores."""

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Cell pressures from the pore water of the pieces of particle domains, in unsaturated soil.
+"""Pressures of cells from the water content of their pieces, in unsaturated soil.
 
-A piece has the storage s, in m^d/Pa, and the pore volume n, in m^d.  Relative to zero pressure, its fluid content is
-`c(p) = s pi(p) + n (S(p) - 1) rho(p)`, with `pi = K_w (exp(p / K_w) - 1)` and `rho = exp(p / K_w)`.  In a piece away
-from its cell's centroid, the pressure is p + o with an offset o.  The saturation S depends on the soil of the piece.
+A piece is the part of a particle domain in one cell.  The piece has the storage s, in m^d/Pa, and the pore volume n, in
+m^d.  Its fluid content at the pressure p, minus that at zero pressure, is `c(p) = s pi(p) + n (S(p) - 1) rho(p)`.  Here
+`pi = K_w (exp(p / K_w) - 1)` and `rho = exp(p / K_w)`, with the bulk modulus K_w of the fluid, and S is the saturation
+of the soil of the piece.  The pressure of a piece differs from the pressure of its cell by an offset.
 """
 
 from __future__ import annotations
@@ -25,38 +26,38 @@ MOST = 2200  # Source: exact bound, twice the number of halvings of a bracket of
 
 @dataclass(frozen=True)
 class PoreWater:
-    """Water storage of k pieces of particle domains in n cells."""
+    """Water storage of the k pieces of particle domains in n cells."""
 
-    # function of pressures (k,), Pa, that returns S (k,), dS/dp (k,), 1/Pa, and possibly other values
+    # function of pressures (k,), in Pa, that returns S (k,), dS/dp (k,), in 1/Pa, and possibly other values
     saturation: Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], ...]]
     slot: NDArray[np.int64]  # (k,) index, from 0, of each piece's cell
     store: NDArray[np.float64]  # (k,) storage, m^d/Pa
     pores: NDArray[np.float64]  # (k,) pore volume, m^d
     bulk: float  # fluid's bulk modulus, Pa
-    scale: NDArray[np.float64]  # (n,) suction at which the pores of a cell drain, Pa
+    scale: NDArray[np.float64]  # (n,) suction at which the pores of each cell drain, Pa
 
     def emptied(self, p: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return (S - 1) rho of the pieces at pressures p (k,), Pa, and the derivative with respect to p, 1/Pa."""
+        """Return (S - 1) rho of the pieces at pressures p, and its derivative."""
         return emptied(p, self.bulk, *self.saturation(p)[:2])
 
     def of_cells(self, p: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the fluid contents (n,), m^d, of the cells, for pressures p (k,), Pa, of their pieces."""
+        """Return the fluid contents of the cells, in m^d, for pressures p of their pieces, in Pa."""
         return self.sums(mass_potential(p, self.bulk), self.emptied(p)[0])
 
     def sums(self, pi: NDArray[np.float64], empty: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the cells' fluid contents (n,), m^d, for pi (k,), Pa, and `empty` = (S - 1) rho (k,) of the pieces."""
+        """Return the fluid contents of the cells, in m^d, from values of their pieces."""
         return sum_by(self.slot, self.store * pi + self.pores * empty, len(self.scale))
 
     def level(
         self, content: NDArray[np.float64], p: NDArray[np.float64], offset: NDArray[np.float64] | float = 0.0
     ) -> NDArray[np.float64]:
-        """Return the pressures (n,), Pa, at which the cells have the fluid contents `content`.
+        """Return the pressures (n,), in Pa, at which the cells have prescribed fluid contents.
 
-        Newton's method is applied to the logarithm of the suction, within a bracket.
+        Newton's method solves for the logarithm of the suction, within a bracket.
 
-        content (n,), m^d: the fluid contents.
-        p (n,), Pa: initial pressures, which are returned if they already give these contents.
-        offset (k,), Pa: pressures of the pieces minus pressures of their cells.
+        content (n,), in m^d: prescribed fluid contents.
+        p (n,), in Pa: initial pressures, returned unchanged where they already give the fluid contents.
+        offset (k,), in Pa: pressure of each piece minus the pressure of its cell.
         """
         count, scale = len(p), self.scale
         rounding = 4 * EPSILON * sum_by(self.slot, self.pores, count)
@@ -88,6 +89,10 @@ class PoreWater:
 def emptied(
     p: NDArray[np.float64], bulk: float, S: NDArray[np.float64], slope: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return (S - 1) rho at pressures p (k,), Pa, and its derivative by p, 1/Pa; slope (k,): dS/dp, 1/Pa."""
+    """Return (S - 1) rho at pressures p, in Pa, and its derivative with respect to p.
+
+    bulk, in Pa: bulk modulus of the fluid.
+    slope (k,), in 1/Pa: derivative dS/dp.
+    """
     density = np.exp(p / bulk)
     return (S - 1) * density, (slope + (S - 1) / bulk) * density

@@ -1,16 +1,17 @@
 # SPDX-License-Identifier: MIT
 """Retention curves: saturation, relative permeability and Bishop's coefficient as functions of the pore pressure.
 
-Air has zero pressure everywhere, so the suction is s = -p.  For p >= 0 pores are saturated.  With the saturation S and
-the relative permeability k_r as functions of p,
+Pores contain water and air.  Air has zero pressure everywhere, so the suction is s = -p, with the pore pressure p.  At
+p >= 0 the pores are saturated.  The saturation S and the relative permeability k_r are functions of p.  The soil has
 
     content of fluid   n S,      conductivity   k k_r,      stress   sigma = sigma' - alpha chi p
 
-with the porosity n, the saturated conductivity k and Biot's coefficient alpha (Richards 1931; Bishop 1959).  By default
-chi is the effective saturation S_e = (S - S_r) / (1 - S_r).
+with the porosity n, the saturated conductivity k, the effective stress sigma', Biot's coefficient alpha and Bishop's
+coefficient chi (Richards 1931; Bishop 1959).  By default chi is the effective saturation
+S_e = (S - S_r) / (1 - S_r), with the residual saturation S_r.
 
 A user-defined curve is any object with the methods `saturation(p)` and `relative_permeability(p)`, which return UFL.  A
-method `bishop(p)` may return chi; without it, chi = S.  The constants of a derived `Retention` are data, not compiled.
+method `bishop(p)` may return chi; without this method, chi = S.
 """
 
 from __future__ import annotations
@@ -38,8 +39,8 @@ METHODS = ("saturation", "relative_permeability")
 class Retention:
     """Base of retention curves defined by an effective saturation S_e: S = S_r + (1 - S_r) S_e.
 
-    A derived law is a frozen dataclass of numbers.  Its method `effective(s)` returns S_e, and `conducts(s)` returns
-    k_r, as UFL of the suction s >= 0, Pa.  Both must be 1 at s = 0.  `bishop(p)` returns S_e unless the law defines it.
+    A derived law is a frozen dataclass of numbers.  Its method `effective(s)` returns S_e, and its method `conducts(s)`
+    returns k_r, both as UFL of the suction s >= 0, in Pa.  S_e and k_r must be 1 at s = 0.
 
     Parameters
     ----------
@@ -63,25 +64,25 @@ class Retention:
 
     @property
     def scale(self) -> float:
-        """Characteristic suction of the saturation and the permeability, Pa."""
+        """Characteristic suction of the law, in Pa."""
         return self.entry
 
     def bishop(self, p):
-        """Return chi at pressures p, Pa, as UFL."""
+        """Return Bishop's coefficient chi at the pressure p, in Pa, as UFL."""
         return self.effective(ufl.max_value(-p, 0.0))
 
     def saturation(self, p):
-        """Return S at pressures p, Pa, as UFL."""
+        """Return the saturation S at the pressure p, in Pa, as UFL."""
         return self.residual + (1 - self.residual) * self.effective(ufl.max_value(-p, 0.0))
 
     def relative_permeability(self, p):
-        """Return k_r at pressures p, Pa, as UFL."""
+        """Return the relative permeability k_r at the pressure p, in Pa, as UFL."""
         return self.conducts(ufl.max_value(-p, 0.0))
 
 
 @dataclass(frozen=True)
 class VanGenuchten(Retention):
-    """Retention by van Genuchten (1980), permeability by Mualem (1976).
+    """Retention curve of van Genuchten (1980), with the permeability of Mualem (1976).
 
     `S_e = (1 + x^n)^-m` and `k_r = S_e^l [1 - x^(n-1) S_e]^2`, with `x = s / entry` and `m = 1 - 1 / n`.
 
@@ -94,11 +95,11 @@ class VanGenuchten(Retention):
     n
         Exponent that increases with the uniformity of the pore sizes, in (1, 20].
     l
-        Exponent for the connectivity of the pores, a number.
+        Exponent for the connectivity of the pores.
     air_entry
-        Suction below which all pores are saturated, Pa, >= 0 (Ippisch, Vogel and Bastian 2006).  If n < 2 and
-        `air_entry` is zero, the permeability has an infinite slope at s = 0.  A usual value is the pressure of a few
-        centimetres of water.
+        Suction below which all pores are saturated, Pa, >= 0 (Ippisch, Vogel and Bastian 2006).  A usual value is the
+        pressure of a few centimetres of water.  If n < 2 and `air_entry` is zero, the permeability has an infinite
+        slope at s = 0.
     """
 
     n: float = 2.0
@@ -112,27 +113,27 @@ class VanGenuchten(Retention):
         _number(self, "air_entry", lambda v: v >= 0, ">= 0 and finite")
 
     def _wide(self, x):
-        """Return q = x^(n-1) (1 + x^n)^-m; Mualem's integral factor is (1 - q)^2."""
+        """Return q = x^(n-1) (1 + x^n)^-m, which gives Mualem's factor (1 - q)^2."""
         return x ** (self.n - 1) * (1 + x**self.n) ** (1 / self.n - 1)
 
     def _least(self):
-        """Return `air_entry / entry`, but at least `TINY`, because a power has no finite derivative at zero."""
+        """Return `air_entry / entry`, but at least `TINY` so that powers have finite derivatives."""
         return ufl.max_value(self.air_entry / self.entry, TINY)
 
     def effective(self, s):
-        """Return S_e at suctions s, Pa, as UFL."""
+        """Return S_e at the suction s, in Pa, as UFL."""
         x, least = ufl.max_value(s / self.entry, self._least()), self._least()
         return ((1 + x**self.n) / (1 + least**self.n)) ** (1 / self.n - 1)
 
     def conducts(self, s):
-        """Return k_r at suctions s, Pa, as UFL."""
+        """Return k_r at the suction s, in Pa, as UFL."""
         x, least = ufl.max_value(s / self.entry, self._least()), self._least()
         return self.effective(s) ** self.l * ((1 - self._wide(x)) / (1 - self._wide(least))) ** 2
 
 
 @dataclass(frozen=True)
 class Gardner(Retention):
-    """Exponential retention and permeability: `S_e = k_r = exp(-s / entry)` (Gardner 1958; Srivastava and Yeh 1991).
+    """Exponential retention curve: `S_e = k_r = exp(-s / entry)` (Gardner 1958; Srivastava and Yeh 1991).
 
     Parameters
     ----------
@@ -143,7 +144,7 @@ class Gardner(Retention):
     """
 
     def effective(self, s):
-        """Return S_e at suctions s, Pa, as UFL."""
+        """Return S_e at the suction s, in Pa, as UFL."""
         return ufl.exp(-s / self.entry)
 
     conducts = effective
@@ -151,7 +152,7 @@ class Gardner(Retention):
 
 @dataclass(frozen=True)
 class BrooksCorey(Retention):
-    """Powers of the suction: `S_e = (s / entry)^-index`, `k_r = S_e^(3 + 2 / index)` (Brooks and Corey 1964).
+    """Power law: `S_e = (s / entry)^-index` and `k_r = S_e^(3 + 2 / index)` (Brooks and Corey 1964).
 
     Parameters
     ----------
@@ -170,25 +171,22 @@ class BrooksCorey(Retention):
         _number(self, "index", lambda v: (0 < v) & (v <= 20), "in (0, 20]")
 
     def effective(self, s):
-        """Return S_e at suctions s, Pa, as UFL."""
+        """Return S_e at the suction s, in Pa, as UFL."""
         return ufl.max_value(s / self.entry, 1.0) ** (-self.index)
 
     def conducts(self, s):
-        """Return k_r at suctions s, Pa, as UFL."""
+        """Return k_r at the suction s, in Pa, as UFL."""
         return ufl.max_value(s / self.entry, 1.0) ** (-2 - 3 * self.index)
 
 
 def _number(law: Retention, name: str, test: Callable, allowed: str) -> None:
-    """Raise ValueError if a constant of a law fails a test."""
+    """Raise ValueError if a constant of a law is out of its range."""
     what = f"{type(law).__name__}: {name}"
     numbers(what, getattr(law, name), test=lambda v: np.isfinite(v) & test(v), allowed=allowed)
 
 
 def check_retention(what: str, law) -> None:
-    """Raise ValueError if a retention curve is invalid.
-
-    S and k_r must be in [0, 1], must be 1 for p >= 0, and must not increase with the suction.
-    """
+    """Raise ValueError if a retention curve is invalid."""
     missing = [name for name in METHODS if not callable(getattr(law, name, None))]
     if missing:
         raise ValueError(f"{what} = {line(law)}, must have {' and '.join(f'{name}(p)' for name in METHODS)}")
@@ -208,23 +206,23 @@ def check_retention(what: str, law) -> None:
 
 
 def sampled(law) -> list[float]:
-    """Return a fingerprint of a law: saturations and relative permeabilities at some suctions, and the suctions, Pa."""
+    """Return numbers that identify a law: S and k_r at some suctions, and these suctions in Pa."""
     suctions = scale_of(law) * np.exp2(np.arange(-2, 3))
     return [_value(getattr(law, name), -s) for name in METHODS for s in suctions] + suctions.tolist()
 
 
 def _value(function: Callable, p: float) -> float:
-    """Return the value at a pressure p, Pa, of a function of p that returns UFL."""
+    """Return the number that a function with UFL results has at a pressure."""
     return float(apply_algebra_lowering(ufl.as_ufl(function(ufl.as_ufl(float(p)))))(()))
 
 
 def chi_at(law, p: float) -> float:
-    """Return Bishop's coefficient chi at a pressure p, Pa."""
+    """Return Bishop's coefficient chi at a pressure, in Pa."""
     return _value(partial(property_of, law, "bishop"), p)
 
 
 def _empty(function: Callable, suction: float) -> bool:
-    """Return whether a function of p is at most 0.5 at a suction, Pa, or is not a number there."""
+    """Return whether a function is at most 0.5, or not a number, at a suction."""
     try:
         return not _value(function, -suction) > 0.5
     except OverflowError:
@@ -232,9 +230,10 @@ def _empty(function: Callable, suction: float) -> bool:
 
 
 def scale_of(law) -> float:
-    """Return the characteristic suction of a law, Pa: its `scale`, or approximately the suction at which S = 0.5.
+    """Return the characteristic suction of a law, in Pa.
 
-    If S is always above 0.5, the suction at which k_r = 0.5 is returned.
+    Without an attribute `scale` of the law, this is approximately the suction at which S = 0.5.  If S is always above
+    0.5, it is the suction at which k_r = 0.5.
     """
     if (scale := getattr(law, "scale", None)) is not None:
         return float(numbers(f"{line(law)}: scale", scale, test=lambda v: v > 0, allowed="> 0"))
@@ -253,19 +252,18 @@ def scale_of(law) -> float:
 class Retentions:
     """Retention curves of the materials, as UFL expressions of data at the integration points.
 
-    The points' field `retention` is a vector.  Its first entry is the index of the law's class (1, 2, ...), or 0 if the
-    pores stay saturated.  The law's constants follow.  Pieces also have the field `lever`: the vector to the piece from
-    the centroid of the material in its cell.  The pressure of a piece is the cell's pressure plus the hydrostatic rise
-    along `lever`.
+    The points have the field `retention`.  Its first entry is the number of the law (1, 2, ...), or 0 if the pores stay
+    saturated.  Its other entries are the constants of the law.  Pieces also have the field `lever`: the vector from the
+    centroid of the material in their cell to the piece.  The pressure of a piece is the pressure of its cell plus the
+    hydrostatic difference along `lever`.
 
     laws: distinct retention curves of the scene's materials.
     everywhere: whether every material has a retention curve.
-    grid: background grid.
     """
 
     def __init__(self, laws: Sequence, everywhere: bool, grid: Grid):
         self.weight = fem.Constant(grid.mesh, np.zeros(grid.dim))
-        """Unit weight of the fluid at the reset of the grid, N/m^3; zero if no fluid can flow."""
+        """Unit weight of the fluid at the last reset of the grid, in N/m^3; zero if no fluid can flow."""
         self.laws = list(laws)
         self._everywhere = everywhere
         self._kinds = list(dict.fromkeys(type(law) if isinstance(law, Retention) else law for law in self.laws))
@@ -277,7 +275,7 @@ class Retentions:
         return self._kinds.index(type(law) if isinstance(law, Retention) else law)
 
     def row(self, law) -> NDArray[np.float64]:
-        """Return the vector `retention` of a law, or of saturated soil (None)."""
+        """Return the values of the field `retention` for a law, or for saturated soil (None)."""
         out = np.ones(self.width)
         out[0] = 0 if law is None else 1 + self._kind(law)
         if law is not None:
@@ -286,26 +284,28 @@ class Retentions:
         return out
 
     def number(self, law) -> int:
-        """Return the index of a law among all laws (1, 2, ...), or 0 for None."""
+        """Return the number of a law (1, 2, ...), or 0 for None."""
         return 0 if law is None else 1 + self.laws.index(law)
 
     def heads(self, lever: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return for each piece (n,) its pressure minus its cell's pressure, Pa.  lever (n, d), m: see the class."""
+        """Return the pressure of each piece minus the pressure of its cell, in Pa."""
         return lever @ self.weight.value
 
     def at(self, p, points: FormPoints):
-        """Return the pressures of integration points, Pa, as UFL; p: pressures of the points' cells, Pa."""
+        """Return the pressures of the points, in Pa, as UFL, from the pressures p of their cells."""
         return p + ufl.dot(self.weight, points.lever) if "lever" in points.sizes else p
 
     def of(self, name: str, p, points: FormPoints):
-        """Return a property of the pores at integration points as UFL; p: pressures of the points' cells, Pa.
+        """Return a property of the pores at integration points as UFL.
 
         Parameters
         ----------
         name
             "saturation", "relative_permeability" or "bishop".
+        p
+            Pressures of the cells of the points, Pa.
         points
-            Integration points with the field `retention`, and for pieces with `lever`.
+            Integration points with the field `retention`.  Pieces also need the field `lever`.
         """
         row = points.retention
         p = self.at(p, points)
@@ -320,12 +320,12 @@ class Retentions:
 
 
 def _constants(law) -> list[str]:
-    """Return the names of a law's constants.  Forms contain the constants as data, not as compiled numbers."""
+    """Return the names of the constants of a law."""
     return [f.name for f in fields(law)] if isinstance(law, Retention) else []
 
 
 def _lifted(law, values: Sequence):
-    """Return a copy of a law with UFL values as its constants."""
+    """Return a copy of a law whose constants are UFL values."""
     out = copy(law)
     if isinstance(law, Retention):
         vars(out).update(zip(_constants(law), values, strict=False))
@@ -333,20 +333,14 @@ def _lifted(law, values: Sequence):
 
 
 def property_of(law, name: str, p):
-    """Return a property of a law at pressures p, Pa, as UFL; name: see `Retentions.of`."""
+    """Return a property of a law at the pressure p, in Pa, as UFL."""
     if name == "bishop" and not hasattr(law, "bishop"):
         name = "saturation"
     return _called(law, name, p)
 
 
 def _called(law, name: str, p):
-    """Return the result of a law's method at pressures p, Pa, as UFL.
-
-    Raises
-    ------
-    ValueError
-        The method raises an error, or its result is not a scalar.
-    """
+    """Return the result of a method of a law as UFL."""
     what = f"{line(law)}: {name}"
     out = asked(what, "UFL of p", lambda: ufl.as_ufl(getattr(law, name)(p)))
     if out.ufl_shape:
@@ -355,10 +349,7 @@ def _called(law, name: str, p):
 
 
 class SaturationAt:
-    """Saturation and its derivative, Bishop's coefficient and relative permeability at given pressures.
-
-    grid: background grid; retentions: retention curves of the scene.
-    """
+    """Saturation, its derivative, Bishop's coefficient and relative permeability as numbers."""
 
     def __init__(self, grid: Grid, retentions: Retentions):
         self._points = points = FormPoints(grid, p=(), retention=(retentions.width,))
@@ -370,25 +361,26 @@ class SaturationAt:
     def __call__(
         self, rows: NDArray[np.float64], p: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Return S, dS/dp (1/Pa), chi and k_r at pressures p (n,), Pa.  rows (n, width): the field `retention`."""
+        """Return S, dS/dp, chi and k_r at pressures p (n,), in Pa.
+
+        rows (n, width): field `retention` of the points.
+        """
         data = anywhere(self._points, p=p, retention=rows)
         S, slope, chi, k = self._values.evaluate(data).T
         return S, slope, chi, k
 
 
 def anywhere(points: FormPoints, **fields: NDArray[np.float64]) -> PointData:
-    """Return n points in one cell, with fields (n, ...).  The positions of the points must not matter."""
+    """Return points in an arbitrary cell, for expressions that depend only on the fields of the points."""
     count = len(next(iter(fields.values())))
     cells = np.zeros(count, dtype=np.int32)
     return points.at(cells, points.grid.midpoints[cells], np.ones(count), **fields)
 
 
 class Conductance:
-    """Potential of flow: integral of a law's relative permeability with respect to pressure (Kirchhoff 1894).
+    """Integral of the relative permeability with respect to pressure, the potential of flow (Kirchhoff 1894).
 
-    The integral is tabulated against the logarithm of the suction, and interpolated with cubic Hermite polynomials.
-
-    grid: background grid; law: the retention curve.
+    A table holds the integral at suctions with equal steps of the logarithm.  Cubic Hermite polynomials interpolate it.
     """
 
     def __init__(self, grid: Grid, law):
@@ -409,7 +401,7 @@ class Conductance:
         self._edges = edges
 
     def __call__(self, p: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return three columns (n, 3) at pressures p (n,), Pa: the integral, Pa; k_r; and dk_r/dp, 1/Pa."""
+        """Return the integral, k_r and dk_r/dp at pressures p, in Pa, as columns."""
         s = np.clip(-p, self._edges[0], self._edges[-1])
         z = (np.log(s) - self._low) / self._step
         i = np.minimum(z.astype(np.int64), ROWS - 2)
@@ -430,35 +422,35 @@ class Conductance:
 
 
 REACH = (1e-8, 1e8)
-"""Range of tabulated suctions, divided by the law's scale.  Source: the integral is exact to 1e-8 outside the range."""
+"""Range of tabulated suctions, divided by the law's scale.  Source: outside, the integral is exact to 1e-8."""
 ROWS = 4000
-"""Number of tabulated suctions.  Halving this value changes the result of scene "dry" in tests/plateaus.py by 2.1e-08
-(relative), doubling it by 2.6e-09, and finer cells by 6.6e-03.
+"""Number of tabulated suctions.  The result of scene "dry" in tests/plateaus.py changes by the fraction 2.1e-08 with
+half this value, by 2.6e-09 with twice this value, and by 6.6e-03 with finer cells.
 """
 GAUSS = 8
-"""Quadrature points between two tabulated suctions.  Halving this value changes the result of scene "dry" in
-tests/plateaus.py by 8.2e-10 (relative), doubling it by 1.5e-09, and finer cells by 6.6e-03.
+"""Quadrature points between two tabulated suctions.  The result of scene "dry" in tests/plateaus.py changes by the
+fraction 8.2e-10 with half this value, by 1.5e-09 with twice this value, and by 6.6e-03 with finer cells.
 """
 
 
 def logarithm(p: NDArray[np.float64], scale: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return scaled pressures (n,), logarithmic for suctions above `scale`, Pa.  `pressure_at` is the inverse."""
+    """Return scaled pressures, which are logarithmic for suctions above `scale`, in Pa."""
     return np.where(p < 0, np.arcsinh(p / scale), p / scale)
 
 
 def pressure_at(y: NDArray[np.float64], scale: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the pressures (n,), Pa, at which `logarithm` has the values y (n,)."""
+    """Return the pressures, in Pa, at which `logarithm` has the values y."""
     return np.where(y < 0, scale * np.sinh(y), scale * y)
 
 
 FARTHEST = np.log(10)
-"""Largest change of the suction's natural logarithm in a Newton step; without it, fronts in dry soil do not converge.
+"""Largest change of the natural logarithm of the suction in a Newton step.
 
-With a limit of 2, Celia's column takes 310 Newton steps with 25 cells, and 500 with 100 cells, in 28 time steps.  With
-a limit of 4, it takes 330 Newton steps with 25 cells, and 920 with 100 cells, and four time steps are reduced.
+Without this limit, fronts in dry soil do not converge.  With the limit 2, Celia's column takes 310 Newton steps with 25
+cells, and 500 with 100 cells.  With the limit 4, it takes 330 Newton steps with 25 cells, and 920 with 100 cells.
 
-Halving this value changes the result of scene "dry" in tests/plateaus.py by 7.6e-10 (relative), doubling it by 9.8e-10,
-and finer cells by 6.6e-03.
+The result of scene "dry" in tests/plateaus.py changes by the fraction 7.6e-10 with half this value, by 9.8e-10 with
+twice this value, and by 6.6e-03 with finer cells.
 """
 
 
@@ -468,17 +460,16 @@ def restrained(
     scale: NDArray[np.float64] | float,
     previous: NDArray[np.float64] | float = 0.0,
 ) -> NDArray[np.float64]:
-    """Return the pressure decreases (n,), Pa, of a Newton step after limitation.
+    """Return the pressure decreases (n,), in Pa, of a Newton step after limitation.
 
-    A step across the characteristic suction ends at this suction.  On each side of this suction the saturation is
-    convex or concave, so Newton's method converges (Wang and Tchelepi 2013).  The suction's logarithm changes by at
-    most `FARTHEST`.  If the direction of the change reverses, the change is at most half of the previous change, so
-    that the logarithm does not oscillate.
+    A step across the characteristic suction ends at this suction.  On each side of the characteristic suction the
+    saturation is convex or concave, so that Newton's method converges (Wang and Tchelepi 2013).  The logarithm of the
+    suction changes by at most `FARTHEST`.  A change that reverses its direction is at most half of the previous change.
 
-    p (n,), Pa: pressures.
-    dp (n,), Pa: decreases of the pressures by Newton's method.
-    scale (n,), Pa: characteristic suctions.
-    previous (n,): changes of the pressures' `logarithm` in the previous Newton step.
+    p (n,), in Pa: pressures.
+    dp (n,), in Pa: decreases of the pressures in Newton's method.
+    scale (n,), in Pa: characteristic suctions.
+    previous (n,): changes of `logarithm` in the previous Newton step.
     """
     new, limit = p - dp, -scale
     new = np.where((p - limit) * (new - limit) < 0, limit, new)

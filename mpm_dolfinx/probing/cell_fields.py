@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Fields in the cells at the present time: centroids, displacements, pressures and stresses."""
+"""Fields of the cells at the present time: centroids, displacements, pressures and stresses."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from mpm_dolfinx.stepping.state import State
 
 @dataclass(frozen=True)
 class CellFields:
-    """Fields in the non-empty cells of this process; arrays for n cells.
+    """Fields of the n cells of this process that contain material.
 
-    The cells are at the position that the grid has in the next step.  The fields are second-order accurate at `x`, not
-    at the midpoint of the cell.  Means are volume averages over the material in the cell.
+    A mean is a volume average over the material in the cell.  The fields are second-order accurate at the centroid `x`
+    of the material.  The position of the grid is that of the next step.
 
     Attributes
     ----------
@@ -30,14 +30,14 @@ class CellFields:
     volume : (n,), m^d
         Volume of the material in the cell.
     displacement : (n, d), m
-        Mean displacement since the start, or since a stage set it to zero.
+        Mean displacement since the start, or since a stage has reset all displacements.
     effective_stress, stress : (n, d, d), in axisymmetry (n, 3, 3), Pa
-        Mean effective and total Cauchy stress, tension positive.
+        Mean effective Cauchy stress and mean total Cauchy stress, positive in tension.
     pressure : (n,), Pa
         Pore pressure, positive in compression; None without fluid.
     water : (n,), m^d
-        Volume of the pore fluid at zero pressure, or None without fluid. It is computed from porosity and pressure, and
-        corrected by the volume defect `owed` (see `flow/storage.py`).
+        Volume that the pore fluid would have at zero pressure, minus the volume defect `owed` of the points.  None
+        without fluid.
     """
 
     cell: NDArray[np.int64]
@@ -51,7 +51,7 @@ class CellFields:
 
 
 def cell_fields(scene: Scene, state: State) -> CellFields:
-    """Return the cell fields of a state; all processes must call it."""
+    """Return the fields of the cells in a state.  All processes must call this function."""
     scene.rests_at(state.stage, state.t)
     state = scene.followed(state)
     state = state if state.stays else state.at_owners(scene.grid)
@@ -62,7 +62,7 @@ def cell_fields(scene: Scene, state: State) -> CellFields:
     volume = sum_by(places.slots, weight, len(places.filled))
 
     def mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the cell means of values (m, ...) of the pieces."""
+        """Return the mean of piece values in each cell."""
         columns = values.reshape(len(values), -1).T
         sums = [sum_by(places.slots, weight * column, len(volume)) / volume for column in columns]
         return np.stack(sums, axis=1).reshape(len(volume), *values.shape[1:])

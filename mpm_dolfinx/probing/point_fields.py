@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Fields of the material points: stresses in three dimensions, stress invariants, porosity, saturation."""
+"""Fields of the material points: stresses, stress invariants, porosity and saturation."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from mpm_dolfinx.stepping.scene import Scene
 
 @dataclass(frozen=True)
 class PointFields:
-    """Fields of the n material points of this process. Stresses are Cauchy stresses, tension positive.
+    """Fields of the n material points of this process.  Stresses are Cauchy stresses, positive in tension.
 
     Attributes
     ----------
     effective_stress, stress : (n, 3, 3), Pa
-        Effective and total stress.  In axisymmetry x is radial, y is axial, and zz is the circumferential stress.  In
-        plane strain zz is the out-of-plane stress.  User-defined laws may not define this stress; zz and the invariants
-        are then nan.
+        Effective stress and total stress.  In axisymmetry the axes x, y, z are the radial, axial and circumferential
+        directions.  In plane strain z is the out-of-plane direction.  If a user-defined law does not define the
+        out-of-plane stress, this stress and the invariants are nan.
     mean_effective_stress : (n,), Pa
         `p' = -tr(effective stress) / 3`, positive in compression.
     deviatoric_stress : (n,), Pa
-        `q = sqrt(3/2 s : s)`, with the deviatoric stress s. In a triaxial test q is |axial stress - radial stress|.
+        `q = sqrt(3/2 s : s)`, with the deviator s of the stress.  In a triaxial test q is |axial - radial stress|.
     porosity : (n,)
         Present porosity, `1 - (1 - n_0) / J`, with the initial porosity n_0 and the volume ratio J.
     saturation : (n,)
@@ -41,7 +41,7 @@ class PointFields:
 
 
 def point_fields(scene: Scene, points: MaterialPoints) -> PointFields:
-    """Return the fields at some points; all processes must call it."""
+    """Return the fields of material points.  All processes must call this function."""
     materials, effective = scene.materials, scene.materials.effective_stress_3d(points)
     pore = materials.pore_stress(points)
     mean = np.trace(effective, axis1=1, axis2=2) / 3

@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: MIT
-"""Pore pressure and stress at probes, by a weighted fit to surrounding cells and material points (`local_fit`).
+"""Pore pressure and stress at probes, which lie at any position in the bodies.
 
-The fit uses cells that are connected to the probe's cell by open faces.  They are at most three cells away along each
-axis.  Cells with soil of another conductivity or stiffness are excluded.  At faces to cells outside the fit, the fit
-uses the face pressure of the two-point flux.  On drained sides the fit uses the prescribed pressure.  Heads are fitted
-instead of pressures, so hydrostatic states are exact.  The result is bounded by the heads of the probe's cell, of the
-neighbouring cells and of the drained sides in the probe's cell.  Towards an undrained side this bound is extrapolated
-with the gradient of the head in the adjacent cells.
+The pressure at a probe is a weighted polynomial fit (`local_fit`) to the pressures of cells.  The fit uses cells of the
+same soil, at most three cells away, that open faces connect to the cell of the probe.  The fit also uses pressures on
+faces to excluded cells and on drained sides.  Heads are fitted instead of pressures, so hydrostatic states are exact.
+The result is limited to the range of heads in the cell of the probe, in neighbouring cells and on drained sides.
+Towards an undrained side, this range is extended with the gradient of the head.
+
+The stress at a probe is a fit to the stresses of material points.
 """
 
 from __future__ import annotations
@@ -29,11 +30,11 @@ from mpm_dolfinx.stepping.scene import Scene
 from mpm_dolfinx.stepping.state import State
 
 CELLS = int(RADIUS)
-"""Largest distance along each axis, in cells, from a probe's cell to a cell with a weight in `local_fit`."""
+"""Largest distance along each axis, in cells, between the cell of a probe and the cells of the fit."""
 
 
 def probe_pressures(scene: Scene, state: State, probes: Probes) -> NDArray[np.float64]:
-    """Return the pore pressures (n,), in Pa, at n probes; all processes must call it."""
+    """Return the pore pressures at the probes, in Pa.  All processes must call this function."""
     state = scene.followed(state)
     state = state if state.stays else state.at_owners(scene.grid)
     on_grid = scene.on_grid(state.as_cut)  # cached for the next step
@@ -43,13 +44,12 @@ def probe_pressures(scene: Scene, state: State, probes: Probes) -> NDArray[np.fl
 
 
 class _Lattice:
-    """Blocks of (2 `CELLS` + 1)^d cells around the cells of n probes.
+    """Blocks of cells around the cells of n probes.
 
-    number (n, cells): lexicographic indices of the cells, -1 outside the grid.
-    midpoint, size (n, cells, d): midpoints and sizes of the cells, in m.
+    number (n, cells): lexicographic indices of the cells in the grid, -1 outside the grid.
     middle: index of the probe's cell in its block.
-    stride (d,): increment of an index in the block along each axis.
-    neighbours: two index arrays for each axis and end. They list the cells with a neighbour there, and the neighbours.
+    stride (d,): increment of the index in the block along each axis.
+    neighbours: indices of cells and of their neighbours in the block, by axis and end.
     """
 
     def __init__(self, grid: Grid, cell: NDArray[np.int64]):
@@ -74,15 +74,7 @@ class _Lattice:
 
 
 class _Around:
-    """Data of the cells around n probes, equal on every process; arrays (n, cells, ...).
-
-    p: pressures, in Pa.
-    centroid (d,): vectors, in m, from the probe to the centroids of the material in the cells.
-    half (d,): vectors, in m, from the midpoints of the cells to these centroids.
-    open (d, 2): open fractions of the faces.
-    kappa, shift (d,): see `Mobility`.
-    counts, reached: see `_connected`.
-    """
+    """Data of the cells around n probes, in arrays (n, cells, ...) that are equal on all processes."""
 
     def __init__(self, scene: Scene, state: State, on_grid: OnGrid, probes: Probes):
         self._grid = scene.grid
@@ -111,11 +103,10 @@ class _Around:
         self._sides = open_sides([one.placed(wet) for one in state.stage.feeding], d)
 
     def _gathered(self, on_grid: OnGrid, p: NDArray[np.float64], soils: NDArray[np.float64]) -> tuple[NDArray, NDArray]:
-        """Return two arrays: local indices (n, cells) of filled owned cells, -1 for others, and data of all cells.
+        """Return the local indices of the cells in the blocks, and a table of the data of these cells.
 
-        p: pressures of the filled owned cells, in Pa.
+        The index of an empty cell, or of a cell of another process, is -1.
         soils (k, 3): conductivity, index of the conductivity law, and material of each piece.
-        Data columns: 1 for filled cells, p, `half`, `kappa`, `shift`, `soils` (nan if not unique), `open`.
         """
         grid = self._grid
         contents = self._contents
@@ -140,12 +131,12 @@ class _Around:
         return local, over_all(grid.comm, out)
 
     def _connected(self, same: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Return two masks (n, cells): cells that the fit uses, and cells that open faces connect to the probe's cell.
+        """Return a mask of the cells that the fit uses, and a mask of the cells connected to the cell of the probe.
 
-        The fit uses cells that contain only the probe's soil. If there are none, it uses cells that contain only the
-        probe's material. If there are none either, it uses all filled cells.
+        The fit uses cells with only the soil of the probe.  Without such cells, the fit uses cells with only the
+        material of the probe, or else all filled cells.
 
-        same (n, cells, 3): whether all soil in a cell has the probe's conductivity, conductivity law and material.
+        same (n, cells, 3): whether all soil in a cell has the conductivity, conductivity law and material at the probe.
         """
         same = same & self._filled[:, :, None]
         levels = [same.all(axis=2), same[:, :, 2], self._filled]
@@ -163,12 +154,12 @@ class _Around:
         return reached & groups, reached
 
     def _opening(self, axis: int, end: int) -> NDArray[np.bool_]:
-        """Return a mask (n, pairs) of neighbouring cells along an axis: whether their common face is open."""
+        """Return whether the faces between neighbouring cells along an axis are open."""
         one, other = self._lattice.neighbours[axis, end]
         return (self._open[:, one, axis, end] > 0) & (self._open[:, other, axis, 1 - end] > 0)
 
     def pressures(self, weight: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the pressures (n,), in Pa, at the probes; weight (d,): weight of the fluid per volume, N/m^3."""
+        """Return the pressures at the probes, for a fluid with this weight per volume, in N/m^3."""
         comm, head = self._grid.comm, self._p - self._centroid @ weight
         base, (low, high) = head[:, self._lattice.middle], self._bounds(head)
         at, offset, value, share, own = self._drained(weight)
@@ -189,7 +180,7 @@ class _Around:
         return np.clip(base + above, low, high)
 
     def _bounds(self, head: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return a lower and an upper bound (n,), in Pa, of the head at each probe; see the module's docstring."""
+        """Return a lower and an upper bound of the head at each probe."""
         i = self._lattice.middle
         low, high = head[:, i].copy(), head[:, i].copy()
         for axis in range(self._grid.dim):
@@ -216,7 +207,7 @@ class _Around:
         return low, high
 
     def _outside_faces(self, head: NDArray[np.float64]) -> list[tuple[NDArray, ...]]:
-        """Return for faces to cells outside the fit: probe, vector from the probe, head of two-point flux, weight."""
+        """Return the probe, position, head and weight of each face to an excluded cell."""
         out = []
         for (axis, end), pair in self._lattice.neighbours.items():
             own_cells, other_cells = pair
@@ -237,10 +228,9 @@ class _Around:
         return out
 
     def _drained(self, weight: NDArray[np.float64]) -> tuple[NDArray, ...]:
-        """Return for drained sides: probe, vector from the probe, head, weight, and whether in the probe's cell.
+        """Return the probe, position, head and weight of drained sides, and whether they are in the probe's cell.
 
-        For each side of a cell, the fit uses the mean head of all drained faces on this side. Heads of single faces
-        would give false gradients.
+        The head is a mean over all drained faces on one side of a cell.  Heads of single faces give false gradients.
         """
         sides, d = self._sides, self._grid.dim
         probe, place = np.nonzero(self._counts & (self._local >= 0))
@@ -262,6 +252,6 @@ class _Around:
 
 
 def probe_stresses(scene: Scene, state: State, probes: Probes) -> NDArray[np.float64]:
-    """Return the effective stresses (n, 3, 3), in Pa, at n probes; all processes must call it."""
+    """Return the effective stresses (n, 3, 3) at the probes, in Pa.  All processes must call this function."""
     comm, sizes = scene.grid.comm, list(map(len, scene.bodies))
     return fitted_at(comm, sizes, state.points, probes.id, probes.xi, scene.materials.effective_stress_3d)

@@ -22,7 +22,7 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 
 @dataclass(frozen=True, eq=False)
 class Probes:
-    """Tracked material particles, n in number."""
+    """Material particles at which a run records results."""
 
     x0: NDArray[np.float64]  # (n, d) reference positions, in m
     id: NDArray[np.int64]  # (n,) identifier of each probe's particle domain
@@ -42,26 +42,26 @@ class Probes:
             raise ValueError(f"probe at {self.x0[first]}: body {body[first]} is absent, must be present")
 
     def displacement(self, points: MaterialPoints, comm: MPI.Intracomm) -> NDArray[np.float64]:
-        """Return the displacements (n, d), in m, of all probes; every process gets the whole array."""
+        """Return the displacements (n, d) of all probes on every process, in m."""
         known, at = points.find(self.id)
         return self._shared(comm, known, interpolate(points.corners[at] - points.origin[at], self.xi[known]))
 
     def position(self, points: MaterialPoints, comm: MPI.Intracomm) -> NDArray[np.float64]:
-        """Return the present positions (n, d), in m, of all probes; every process gets the whole array."""
+        """Return the present positions (n, d) of all probes on every process, in m."""
         known, at = points.find(self.id)
         return self._shared(comm, known, interpolate(points.corners[at], self.xi[known]))
 
     def _shared(
         self, comm: MPI.Intracomm, known: NDArray[np.int64], values: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return the values (n, ...) of all probes from values of the probes `known` on this process."""
+        """Return the values of all probes from the values of the probes on each process."""
         out = np.zeros((len(self.id), *values.shape[1:]))
         out[known] = values
         return over_all(comm, out)
 
 
 def check_there(probes: Probes, points: MaterialPoints, comm: MPI.Intracomm) -> None:
-    """Raise ValueError if renewal of particle domains has replaced the domain of a probe."""
+    """Raise ValueError if renewal has replaced the particle domain of a probe."""
     found = np.zeros(len(probes.id))
     found[points.find(probes.id)[0]] = 1.0
     missing = np.flatnonzero(over_all(comm, found) == 0)
@@ -88,8 +88,7 @@ def positions(x0: ArrayLike, dim: int) -> NDArray[np.float64]:
 def probes(bodies: Sequence[Body], x0: ArrayLike, *, stress: bool = False) -> Probes:
     """Return the material particles at which `Simulation.run` records results, for its argument `probes`.
 
-    A run records their displacements and positions, see `Row`. In scenes with fluid it also records their pore
-    pressures, and on request their effective stresses.
+    A run records displacements and positions of the particles, and in scenes with fluid also pore pressures.
 
     Parameters
     ----------
@@ -97,10 +96,10 @@ def probes(bodies: Sequence[Body], x0: ArrayLike, *, stress: bool = False) -> Pr
         All bodies, in the order in which the scene lists them.
     x0 : (n, d), m
         Reference positions inside the bodies or on their surfaces, before the map of `mapped`.  A probe on a common
-        surface of two bodies belongs to the body that comes first in `bodies`.  To select the other body, move the
-        position slightly.
+        surface of two bodies belongs to the first of these bodies in `bodies`.  To select the second body, move the
+        position into this body.
     stress
-        Whether to record the effective stress too.
+        Whether the run also records effective stresses.
 
     Raises
     ------
@@ -123,7 +122,7 @@ def probes(bodies: Sequence[Body], x0: ArrayLike, *, stress: bool = False) -> Pr
 def _domains_at(
     bodies: Sequence[Body], x: NDArray[np.float64], rounded: float
 ) -> Iterator[tuple[int, NDArray[np.float64]]]:
-    """Yield the identifier of each point whose domain contains the position x (d,), and the local coordinates of x."""
+    """Yield each particle domain that contains the position `x`, and the local coordinates of `x` in this domain."""
     start = 0
     for body in bodies:
         for part in in_chunks(len(body)):
@@ -137,10 +136,7 @@ def _domains_at(
 
 
 def coordinates(corners: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the local coordinates (n, d) of a position x (d,) in n domains with corners (n, 2^d, d).
-
-    Coordinates of positions inside a domain are in [-1, 1].
-    """
+    """Return the local coordinates of a position in n domains; inside a domain, they are between -1 and 1."""
     signs, xi = 2 * corner_bits(len(x)) - 1, np.zeros((len(corners), len(x)))
     for _ in range(20):  # Newton's method; the first step is exact for parallelepipeds
         hats = 0.5 * (1 + signs * xi[:, None, :])

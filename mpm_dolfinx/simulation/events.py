@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: MIT
-"""Events that end a run: zeros of functions of the simulation, located within a step."""
+"""Events that end a run: a function of the user changes its sign within a step."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple, Protocol
+
+from mpi4py import MPI
 
 import numpy as np
 import scipy
@@ -14,26 +16,26 @@ from numpy.typing import NDArray
 from mpm_dolfinx.base.errors import Report, StepFailed
 from mpm_dolfinx.base.time_integration import Substep
 from mpm_dolfinx.base.validation import functions, line
-from mpm_dolfinx.parallel.exchange import first
+from mpm_dolfinx.parallel.exchange import by_user
 from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
 from mpm_dolfinx.stepping.scene import Scene
 from mpm_dolfinx.stepping.state import State
 
 LOCATED = 1e-3
-"""Accuracy of an event's time, relative to the length of the step.  Source: definition, as documented in `until`."""
+"""Accuracy of the time of an event, divided by the length of the step.  Source: definition, see `until` of `run`."""
 
 Event = Callable[[Any], float]
 """A function of the simulation that returns a number or a boolean."""
 
 
 class Simulated(Protocol):
-    """Interface of a `Simulation`. Its `state` is only replaced as a whole."""
+    """Interface of a `Simulation` for the time loop."""
 
     scene: Scene
     state: State
 
     def advanced(self, dt: float, *how: Sequence[Substep]) -> tuple[State, Report]:
-        """Return the state after a step of dt, s, and its report; how: substeps, by default the scene's substeps."""
+        """Return the state after a step of length `dt`, in s, and the report of the step."""
 
 
 class Step(NamedTuple):
@@ -41,7 +43,7 @@ class Step(NamedTuple):
 
     start: State  # state at the start
     dt: float  # length of the step, s
-    how: tuple  # substeps, if they differ from those of the scene
+    how: tuple  # substeps; empty for the substeps of the scene
 
 
 class Found(NamedTuple):
@@ -54,7 +56,7 @@ class Found(NamedTuple):
 
 
 class Events:
-    """The events of a run.
+    """Search for the events of a run.
 
     Parameters
     ----------
@@ -67,7 +69,7 @@ class Events:
     Raises
     ------
     ValueError
-        An entry is not a function, returns no number, or returns different numbers on different processes.
+        An entry of `until` is not a function.  A function returns no number, or different numbers on two processes.
     """
 
     def __init__(self, simulation: Simulated, until: Event | Sequence[Event] | None):
@@ -80,10 +82,9 @@ class Events:
     def within(self, step: Step, new: State) -> Found | None:
         """Return the first event within a step that ends in the state `new`, or None if there is no event.
 
-        Trial steps from `step.start` locate the event. Brent's method chooses their lengths for functions that return
-        numbers; booleans are located by bisection. The result is the first state found after the event, at most the
-        fraction `LOCATED` of the step later. Afterwards, even after an error, `state` of the simulation is
-        `step.start`.
+        Trial steps locate the event, by Brent's method for numbers and by bisection for booleans.  The state that is
+        returned follows the event by at most the fraction `LOCATED` of the step.  The simulation is then in the state
+        at the start of the step.
         """
         if not self._until:
             return None
@@ -111,7 +112,7 @@ class Events:
         return Found(int(_crossed(before, tried[end]).argmax()), end, new, report)
 
     def _at(self, step: Step, dt: float, tried: dict[float, list[float]]) -> list[float]:
-        """Return the functions' values at the end of a step of length dt, s, and store them in `tried`."""
+        """Return the values of the functions after a trial step of length `dt`."""
         if dt not in tried:
             self._simulation.state = step.start
             new, _ = self._simulation.advanced(dt, *step.how)
@@ -120,34 +121,31 @@ class Events:
         return tried[dt]
 
     def _values(self) -> list[float]:
-        """Return the values of the functions, with booleans as 1 or -1. An error on one process is raised on all."""
-        comm = self._simulation.scene.grid.comm
-        out = []
-        error = None
-        try:
-            out = [_number(k, event(self._simulation)) for k, event in enumerate(self._until)]
-        except BaseException as raised:  # also Ctrl-C
-            error = raised
-        where = first(comm, "" if error is None else f"process {comm.rank}: {error}")
-        if error is not None:
-            raise error
-        if where:
-            raise RuntimeError(f"until: a function raised an error on {where}")
-        given = comm.allgather(out)
-        for rank, other in enumerate(given):
-            if other != given[0]:
-                raise ValueError(f"until: {given[0]} on process 0, {other} on process {rank}, must be the same on all")
+        """Return the values of the functions, and raise an error of one process on all processes."""
+        s, comm = self._simulation, self._simulation.scene.grid.comm
+        out = by_user(comm, "until: a function", lambda: [_number(k, of(s)) for k, of in enumerate(self._until)])
+        check_alike(comm, {f"until: function {k}": value for k, value in enumerate(out)})
         return out
 
 
+def check_alike(comm: MPI.Intracomm, given: Mapping[str, Any]) -> None:
+    """Raise ValueError if the values differ between processes."""
+    texts = comm.allgather([line(value) for value in given.values()])
+    for k, name in enumerate(given):
+        for rank, text in enumerate(texts):
+            if text[k] != texts[0][k]:
+                what = f"{name} = {texts[0][k]} on process 0, {text[k]} on process {rank}"
+                raise ValueError(f"{what}, must be the same on all")
+
+
 def _crossed(before: Sequence[float], now: Sequence[float]) -> NDArray[np.bool_]:
-    """Return a mask of values with another sign than at the start of a step, where they are not zero."""
+    """Return which values have changed their sign since the start of a step."""
     sign = np.sign(before)
     return (sign != 0) & (np.sign(now) != sign)
 
 
 def _number(k: int, value) -> float:
-    """Return the value of a function as a number; booleans are 1 or -1."""
+    """Return the value of a function as a number: 1 for True, and -1 for False."""
     if isinstance(value, (bool, np.bool_)):
         return 1.0 if value else -1.0
     try:

@@ -12,18 +12,17 @@ from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.base.errors import Report, StepFailed, raise_interrupt
 from mpm_dolfinx.base.validation import instance, line, numbers
-from mpm_dolfinx.bodies.bodies import Body, points_in_cells
+from mpm_dolfinx.bodies.bodies import Body, Later, Moving, points_in_cells
 from mpm_dolfinx.conditions.conditions import OnSide, Source, sorted_terms
 from mpm_dolfinx.conditions.names import ByName
 from mpm_dolfinx.conditions.unit_weights import under
 from mpm_dolfinx.conditions.walls import with_axis
 from mpm_dolfinx.contact.groups import grouped
 from mpm_dolfinx.diagnostics.resolution import check_stiff, warn_thin
-from mpm_dolfinx.diagnostics.scene_parts import check_axisymmetry, check_options, check_parts
+from mpm_dolfinx.diagnostics.scene_parts import check_axisymmetry, check_options, checked_parts, initial_velocity
 from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.materials.initial_stress import InitialStress, by_body
 from mpm_dolfinx.materials.skeleton import Fluid, Skeleton
-from mpm_dolfinx.mechanics.inertia import checked_velocity
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.probing.cell_fields import CellFields, cell_fields
 from mpm_dolfinx.probing.point_fields import PointFields, point_fields
@@ -35,7 +34,7 @@ from mpm_dolfinx.stepping.distribution import distribute
 from mpm_dolfinx.stepping.initial_state import balanced, begin_stage, first_state
 from mpm_dolfinx.stepping.result import Result
 from mpm_dolfinx.stepping.scene import Scene
-from mpm_dolfinx.stepping.stage import Condition, checked
+from mpm_dolfinx.stepping.stage import Condition, checked, contacts_of
 from mpm_dolfinx.stepping.state import State
 from mpm_dolfinx.stepping.step import step
 
@@ -46,7 +45,7 @@ class Simulation:
     Parameters
     ----------
     grid, bodies
-        Background grid, and seeded bodies.
+        Background grid, and seeded bodies. `Later(body)` is absent until a stage adds it.
     materials
         Materials; bodies refer to them by index.
     walls
@@ -72,21 +71,17 @@ class Simulation:
     terms
         User-defined terms in UFL. Functions are terms of the momentum balance, see `user_functions`; `OnSide` applies
         such a function to a side. A `Source` is a term of the fluid balance.
-    later
-        Indices of bodies that are absent until a stage adds them. Each index is listed once.
     numerics
         Quadrature, coupling, tolerance and time integration, see `Numerics`.
     inertia
-        True: bodies have inertia, and need no walls. False: quasi-static; a later stage may switch inertia on. None:
-        quasi-static in all stages. Inertia excludes `quadrature="point"`.
-    velocity : (d,) or callable x (n, d) -> (n, d), m/s
-        Initial velocity of bodies with inertia; by default zero.
+        True: bodies have inertia, and need no walls. `Moving`: they also have an initial velocity. False: quasi-static;
+        a later stage may switch inertia on. None: quasi-static in all stages. Inertia excludes `quadrature="point"`.
 
     Attributes
     ----------
     state
-        The complete state between two steps (`State`). It is replaced as a whole at the end of a step. If an error or
-        Ctrl-C stops a step, the state is unchanged, and the next `run` continues from it.
+        The complete state between two steps (`State`).  If an error or Ctrl-C stops a step, the state does not change,
+        and the next `run` continues from this state.
     scene
         Grid, bodies and materials, with the compiled forms.
 
@@ -99,7 +94,7 @@ class Simulation:
     def __init__(
         self,
         grid: Grid,
-        bodies: Sequence[Body],
+        bodies: Sequence[Body | Later],
         materials: Sequence[Skeleton],
         *,
         walls: Mapping[str, str],
@@ -109,22 +104,20 @@ class Simulation:
         pressure: float | Callable[[NDArray], ArrayLike] = 0.0,
         initial_stress: InitialStress | Mapping[int, InitialStress] | None = None,
         terms: Sequence[Callable | OnSide | Source] = (),
-        later: Sequence[int] = (),
         numerics: Numerics = DEFAULT,
-        inertia: bool | None = None,
-        velocity: ArrayLike | Callable[[NDArray], ArrayLike] | None = None,
+        inertia: bool | Moving | None = None,
     ):
         instance("numerics", numerics, Numerics)
         quadrature = numerics.quadrature
-        check_parts(grid, bodies, materials, later)
+        bodies, later = checked_parts(grid, bodies, materials)
         terms, sources = sorted_terms(terms)
         check_options(bodies, fluid, pressure, terms, sources, quadrature)
-        grid = grouped(grid, bodies, checked(conditions), quadrature, {"terms": terms, "sources": sources})
+        grid = grouped(grid, bodies, contacts_of(checked(conditions)), quadrature, {"terms": terms, "sources": sources})
         grid = grid.shared(points_in_cells(grid, bodies), keep=bool(len(terms) + len(sources)))
         check_stiff(grid, bodies)
         warn_thin(grid, bodies, with_axis(grid, walls), fluid is not None)
         check_axisymmetry(grid, bodies, quadrature)
-        velocity = checked_velocity(grid, quadrature, inertia, velocity)
+        velocity = initial_velocity(grid, quadrature, inertia)
         start = time.perf_counter()
         initial = by_body(initial_stress, bodies, later)
         self.scene = Scene(
@@ -144,10 +137,10 @@ class Simulation:
         if initial:
             self.state = balanced(self.scene, self.state)
         self.jit = time.perf_counter() - start
-        """Time for compiling or loading the forms, s."""
+        """Wall time for compiling or loading the forms, in s."""
 
     def __str__(self) -> str:
-        """Return a table of the scene's terms and solvers, with the reason for each that is absent."""
+        """Return a table of terms and solvers: whether the scene uses each of them, and why."""
         return summary.table(self.scene, self.state)
 
     # ---- results --------------------------------------------------------------------------------
@@ -181,7 +174,7 @@ class Simulation:
 
     @property
     def t(self) -> float:
-        """Time, s; it may be set between two runs."""
+        """Time, in s.  You may set the time between two runs."""
         return self.state.t
 
     @t.setter
@@ -195,49 +188,50 @@ class Simulation:
 
     @property
     def conditions(self) -> tuple[Condition, ...]:
-        """Conditions of the present stage, as they were given."""
+        """Conditions of the present stage, as passed by the user."""
         return tuple(self.state.stage.given.values())
 
     @property
     def reactions(self) -> ByName[NDArray[np.float64]]:
-        """Force (d,), in N (N/m in plane strain), of each prescribed displacement on the bodies, by name.
+        """Force (d,) of each prescribed displacement on the bodies in the last step, by name, in N.
 
-        The force is that of the last step, and nan before a stage's first step. In axisymmetry it acts on the full
-        circumference, and its radial component is positive outwards.
+        In plane strain the unit is N/m.  In axisymmetry the force acts on the full circumference, and the radial
+        component is positive outwards.  Before the first step of a stage, the force is nan.
         """
         return self.outcome("reactions")
 
     @property
     def wall_reactions(self) -> ByName[NDArray[np.float64]]:
-        """Force (d,), in N (N/m in plane strain), of each wall of the grid on the bodies; zero for free components.
+        """Force (d,) of each wall of the grid on the bodies in the last step, by name, in N.
 
-        Where two walls fix the same component, the wall normal to this component carries its whole force. If neither
-        wall is normal to the component, each wall carries half.
+        In plane strain the unit is N/m.  Components that the wall does not fix are zero.  If two walls fix the same
+        component of a node, the wall normal to this component carries the force.  If neither wall is normal to the
+        component, each wall carries half of the force.
         """
         return self.outcome("wall_reactions")
 
     @property
     def outflows(self) -> ByName[NDArray[np.float64]]:
-        """Outflow, in m^3/s (m^2/s in plane strain), through each drained side and each side with inflow, by name."""
+        """Outflow through each drained side and each side with inflow, by name, in m^3/s (m^2/s in plane strain)."""
         return self.outcome("outflows")
 
     @property
     def tool_forces(self) -> ByName[NDArray[np.float64]]:
         """Force, in N, and moment, in N m, of each `Tool` and `Contact` on the bodies, by name.
 
-        Force and moment are one array: (3,) in 2D, (6,) in 3D.
+        An array with three components in 2D, and with six components in 3D, contains the force and the moment.
         """
         return self.outcome("tool_forces")
 
     @property
     def tool_travel(self) -> ByName[NDArray[np.float64]]:
-        """Displacement, in m, of each load-controlled `Tool` in addition to its prescribed displacement, by name."""
+        """Displacement of each `Tool` under its load, by name, in m.  Prescribed displacements are not included."""
         return self.outcome("tool_travel")
 
     def outcome(self, quantity: str) -> ByName[NDArray[np.float64]]:
-        """Return a quantity of all conditions at the end of the last step, by name of the condition.
+        """Return one result of all conditions at the end of the last step, for example "reactions", by name.
 
-        User-defined conditions are included. The result is empty if no condition of the stage has the quantity.
+        User-defined conditions are included.  If no condition of the stage has this result, the dictionary is empty.
 
         Raises
         ------
@@ -255,19 +249,19 @@ class Simulation:
         return self.state.stage.present
 
     def effective_stress(self) -> NDArray[np.float64]:
-        """Return the effective Cauchy stress (n, d, d), in Pa, tension positive, at the material points.
+        """Return the effective Cauchy stresses (n, d, d) of the material points, in Pa, positive in tension.
 
-        In axisymmetry its shape is (n, 3, 3), in the radial, axial and circumferential directions. All processes must
-        call it.
+        In axisymmetry the stresses (n, 3, 3) have radial, axial and circumferential components.  All processes must
+        call this method.
         """
         return self.scene.materials.effective_stress(self.state.points)
 
     def point_fields(self) -> PointFields:
-        """Return stresses, p', q and porosity of the points, see `PointFields`; all processes must call it."""
+        """Return stresses and porosity of the material points.  All processes must call this method."""
         return point_fields(self.scene, self.state.points)
 
     def cells(self) -> CellFields:
-        """Return centroids and fields of the cells, see `CellFields`; all processes must call it."""
+        """Return the fields of the cells.  All processes must call this method."""
         return cell_fields(self.scene, self.state)
 
     # ---- stages and steps -----------------------------------------------------------------------
@@ -286,43 +280,43 @@ class Simulation:
     ) -> None:
         """Begin a stage: add and remove bodies, and replace walls, conditions or gravity.
 
-        The stage changes no stress and no pressure. The next `run` finds the new equilibrium: at once under constant
-        loads, gradually under varying loads.
+        Stresses and pressures do not change until the next `run`, which finds the new equilibrium.
 
         Parameters
         ----------
         walls, gravity
-            New walls and gravity, as for the scene. `gravity` requires a scene with gravity.
+            New walls and new gravity, as for `Simulation`.  A scene without gravity cannot get gravity later.
         inertia
-            Whether bodies have inertia from now on, if the scene allows it. Bodies that get inertia start without
+            Whether bodies have inertia from now on, if the scene allows it.  Bodies that get inertia start without
             velocity.
         conditions
-            All conditions from now on; by default the present ones. `[*simulation.conditions, more]` adds one. Every
-            `Contact` remains in force, whether it is listed or not.
+            All conditions from now on; by default the present conditions.  Pass `[*simulation.conditions, more]` to
+            add the condition `more`.  Every `Contact` remains in force, even if it is not listed.
         add
-            Indices of bodies in `later`, such as a fill. They start without velocity, and without stress unless
-            `initial_stress` lists them. A fill is placed on the present surface of the bodies that it touched when it
-            was seeded. The opposite side of the fill remains where it was seeded.
+            Indices of bodies that are `Later`, for example a fill.  Added bodies have no velocity, and no stress unless
+            `initial_stress` lists them.  A fill is placed on the present surface of the bodies that it touched at
+            seeding.  The free side of the fill remains where it was seeded.
         remove
-            Indices of bodies to be removed, such as an excavation.
+            Indices of bodies to be removed, for example by an excavation.
         reset_displacement
             Whether displacements are measured from the present positions from now on. The values of conditions are not
             adapted: a `Displacement` of value d that remains in force moves its side by d again.
         fields
-            New values for entries of `points.data`: rows (n, ...) for the points of this process, or one value for all.
-            Entries are material constants that vary with position, state variables of laws, or new data of the user.
+            New values of entries of `points.data`, by name.  A value is an array (n, ...) for the n points of this
+            process, or one value for all points.  An entry is a state variable of a law, a material constant that
+            varies with position, or data of the user.
 
         Raises
         ------
         ValueError
-            The input is invalid; the scene is unchanged.
+            An argument is invalid.  The scene does not change.
         """
         given = {"walls": walls, "conditions": conditions, "gravity": gravity, "inertia": inertia}
         named = {name: value for name, value in given.items() if value is not None}
         self.state = begin_stage(self.scene, self.state, named, add, remove, reset_displacement, fields or {})
 
     def step(self, dt: float) -> Report:
-        """Advance by a step of dt, s, > 0; return the report of the step.
+        """Advance by one step of length `dt`, in s, and return the report of the step.
 
         Raises
         ------
@@ -336,7 +330,7 @@ class Simulation:
         return report
 
     def advanced(self, dt: float, *how: tuple) -> tuple[State, Report]:
-        """Return the state after a step of dt, s, and its report, without changing `state`; how: its substeps."""
+        """Return the state after a step of length `dt`, in s, and the report of the step; `state` does not change."""
         numbers("dt", dt, test=lambda v: (0 < v) & (v < np.inf), allowed="> 0 and finite")
         try:
             return step(self.scene, self._state, dt, *how)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Length of the steps of a run: equal steps, or adaptive steps from their estimated error.
+"""Length of the steps of a run: all equal, or adapted to the estimated error of each step.
 
-`note_pressures` of `solve/newton.py` estimates the error of the pressures, and `filling` of `flow/storage.py` estimates
-the error of the water content. `dynamics/motion_error.py` estimates the error of the motion.
+Three errors are estimated: the error of the pressures in `solve/newton.py`, the error of the water content in
+`flow/storage.py`, and the error of the motion in `dynamics/motion_error.py`.
 """
 
 from __future__ import annotations
@@ -24,39 +24,71 @@ from mpm_dolfinx.stepping.scene import Scene
 from mpm_dolfinx.stepping.state import StepControl
 
 MIN_CUT, MIN_CUT_BY_ERROR = 2.0**-10, 2.0**-30
-"""Smallest reduced step, divided by the nominal step: the first number for equal, the second for adaptive steps.
+"""Shortest length of equal steps and of adaptive steps, divided by the nominal length.
 
-Adaptive steps may grow by several powers of ten. At the onset of sliding they must shrink to the slide's time scale.
+Adaptive steps may have grown by several powers of ten before a slide begins, and must then shrink again.
 """
 FINEST = NEAR**2
-"""Smallest adaptive step, divided by the time.  It stops the decrease of steps at a singularity in time.
+"""Smallest adaptive step, divided by the time.
 
 Source: epsilon, a smaller step changes only the last four digits of the time.
 """
 SAFETY, SHRINKS, GROWS, KEEPS = 0.9, 0.2, 5.0, 1.2
-"""Factor of the next adaptive step: `SAFETY` times a power of (tolerance / error), between `SHRINKS` and `GROWS`.
+"""Constants for the ratio of an adaptive step to the step before.
 
-A factor from 1 to `KEEPS` counts as 1.  Source: Hairer, Norsett and Wanner (1993), eq. 4.13; for `KEEPS` Hairer and
-Wanner (1996), IV.8.
+The ratio is `SAFETY` times a power of (tolerance / error), but at least `SHRINKS` and at most `GROWS`.  If the ratio is
+between 1 and `KEEPS`, the step keeps its length.  Source: Hairer, Norsett and Wanner (1993), eq. 4.13; for `KEEPS`
+Hairer and Wanner (1996), IV.8.
 """
 RINGS = 5e-3
-"""If a sudden pressure change exceeds this fraction of the largest change so far, two half steps replace the step.
+"""Largest sudden pressure change for which a step is not halved, divided by the largest pressure change so far.
 
-The stability function is never below -0.21, so an undetected jump overshoots by at most 0.1 % of the largest change.
+SDIRK2 overshoots a jump by at most 0.21 times the jump.
 """
 AGAIN = 2.0
-"""A pressure jumps if its rate is more than `AGAIN` times the rate in the first substep of the previous step."""
+"""A pressure change is sudden if its rate is more than `AGAIN` times the rate at the start of the last step."""
 MOST = SAME / EPSILON
-"""Largest number of output intervals. Source: exact; with more, `SAME` times an interval is below rounding."""
+"""Largest number of output intervals.  Source: exact; `SAME` times a shorter interval would be below rounding."""
 RESOLVED = 10
-"""Smallest ratio of `rtol` to the solver tolerance; below it, solver errors would hide the error of the step."""
+"""Smallest `rtol`, divided by the tolerance of the solver.  Errors of the solver would hide smaller errors in time."""
 FIRST = 1e-3
-"""Smallest first adaptive step, relative to the first output interval."""
+"""Smallest default length of the first adaptive step, divided by the first output interval."""
+
+
+@dataclass(frozen=True)
+class Adaptive:
+    """Adaptive steps with limits of their length, for example `run(t_end, rtol=Adaptive(1e-3, max_step=60.0))`.
+
+    Parameters
+    ----------
+    rtol
+        Tolerance, see `run`.
+    first_step : s
+        First trial step of a new run, > 0.  The default is 18 `rtol` times the diffusion time of a cell.  This default
+        is at least 0.001 times the first output interval, and at most this interval.  With inertia, the default is also
+        at most the time in which a wave crosses a cell.
+    max_step : s
+        Longest step, > 0.
+
+    Raises
+    ------
+    ValueError
+        `first_step` or `max_step` is not positive.
+    """
+
+    rtol: float
+    first_step: float | None = None
+    max_step: float = inf
+
+    def __post_init__(self):
+        for name in ("first_step", "max_step"):
+            if (value := getattr(self, name)) is not None and value != inf:
+                numbers(name, value, test=lambda v: v > 0, allowed="> 0")
 
 
 @dataclass(frozen=True)
 class StepSize:
-    """Rule for the length of a run's steps.
+    """Rule for the length of the steps of a run.
 
     Parameters
     ----------
@@ -65,8 +97,7 @@ class StepSize:
     longest : s
         Length of equal steps, or of the longest adaptive step.
     rtol
-        Tolerance of the pressure error, or None for equal steps. It is relative to the larger of two changes: the
-        largest pressure change since the start of the run, and the undrained pressure change of the step.
+        Tolerance of adaptive steps, see `run`; None for equal steps.
     """
 
     first: float
@@ -79,20 +110,20 @@ class StepSize:
         return self.rtol is not None
 
     def ended(self, t: float, target: float, control: StepControl) -> bool:
-        """Return whether the time t, s, equals the target up to rounding."""
+        """Return whether the time `t` has reached the time `target`, up to rounding."""
         slack = ROUND_OFF * abs(target) if self.by_error else SAME * min(control.small, self.longest)
         return target - t <= slack
 
     def least(self, size: float, t: float) -> float:
-        """Return the smallest allowed step, s, at time t, s; size: nominal step, s."""
+        """Return the smallest allowed step at the time `t`, for the nominal step `size`."""
         return max(MIN_CUT_BY_ERROR * size, FINEST * abs(t)) if self.by_error else MIN_CUT * size
 
     def preferred(self, size: float) -> float:
-        """Return the nominal step, s, for `least`; size: first trial step, s."""
+        """Return the nominal step, for the first trial step `size`."""
         return size if self.by_error else self.longest
 
     def fitted(self, left: float, small: float) -> float:
-        """Return the length of the next step, s: `small`, adjusted to the next output time, `left` seconds away."""
+        """Return the step length `small`, adjusted to an output time that is `left` seconds away."""
         if self.by_error:  # avoids a tiny step before an output
             small = min(small, self.longest)  # `small` may be longer if an earlier run had other steps
             return left if left <= min(1.05 * small, (1 + SAME) * self.longest) else min(small, left / 2)
@@ -100,17 +131,14 @@ class StepSize:
         return left if not left > (1 - SAME) * small else small
 
     def refused(self, size: float, report: Report, control: StepControl) -> float:
-        """Return the factor, < 1, by which a solved step must be shortened to meet the tolerance; 1 if it is accepted.
-
-        After a jump of the loads one step overshoots by up to a fifth of the remaining change; two half steps do not.
-        """
+        """Return the factor by which a computed step must be shortened, or 1 if the step is accepted."""
         if not self.by_error:
             return 0.5 if size > 0.75 * self.longest and self._rings(size, report, control) else 1.0
         # most rejected steps are at jumps or kinks of the loads, where the error is of first order
         return 1.0 if self._excess(report, control) <= 1 else self._factor(report, control, 1.0)
 
     def next(self, size: float, report: Report, control: StepControl, failed: bool) -> float:
-        """Return the next trial step, s, after a completed step; failed: whether a longer trial did not converge."""
+        """Return the length of the next trial step; `failed` means that a longer trial did not converge."""
         if not self.by_error:
             grows = report.easy and not self._rings(size, report, control)  # twice the step would be rejected
             return max(control.small, min(2 * size, self.longest)) if grows else control.small
@@ -122,17 +150,17 @@ class StepSize:
         return size * factor
 
     def cut(self, size: float, control: StepControl) -> StepControl:
-        """After a step that did not converge, return the step control with half of this step, s, as the next trial."""
+        """Return the step control after a step that did not converge.  The next trial is half as long."""
         whole = size > (1 - SAME) * control.small
         waits = 2 * control.waits + 1 if whole and control.kept == 0 else control.waits
         return replace(control, small=size / 2, waits=waits, kept=1)
 
     def grown(self, size: float, report: Report, control: StepControl, failed: bool) -> StepControl:
-        """Return the step control with the next trial step after a completed step, s; failed: see `next`.
+        """Return the step control after a completed step.
 
-        Equal steps grow at once after a reduction, until a newly grown step fails too. Then `waits`, the number of
-        steps before they grow again, becomes 1, 3, 7 and so on. When a newly grown step converges, `waits` is halved.
-        `kept` counts the steps since the last reduction or growth; it is 0 directly after growth.
+        After a reduction, equal steps are doubled again as soon as `waits` steps have converged.  At first `waits` is
+        0.  When a doubled step fails, `waits` increases to 2 `waits` + 1.  When a doubled step converges, `waits` is
+        halved.
         """
         small, whole = self.next(size, report, control, failed), size > (1 - SAME) * control.small
         if self.by_error:
@@ -144,26 +172,23 @@ class StepSize:
         return replace(control, waits=waits, kept=control.kept + whole)
 
     def _rings(self, size: float, report: Report, control: StepControl) -> bool:
-        """Return whether a step may have overshot a jump of the loads.
+        """Return whether the step may have overshot a jump of the loads.
 
-        A step completes at least four fifths of a jump. Equally sudden changes in successive steps are therefore no
-        jumps. For example, an edge pushed into a body causes a sudden change in every step, because the grid is reset.
-        Changes as small as the rounding errors of other bodies' changes are no jumps either.
+        A sudden pressure change is no jump if pressures also changed suddenly in the last step.
         """
         excess = report.sudden - AGAIN * size * np.asarray(control.first)
         return bool((excess > np.maximum(RINGS * np.asarray(control.change), NEAR * max(control.change))).any())
 
     def _factor(self, report: Report, control: StepControl, power: float) -> float:
-        """Return the length of a step with the tolerated error, divided by the length of the solved step."""
+        """Return the ratio of the next step to the computed step, from the error of the computed step."""
         excess = self._excess(report, control)
         return min(GROWS, max(SHRINKS, SAFETY / excess**power if excess > 0 else GROWS))
 
     def _excess(self, report: Report, control: StepControl) -> float:
-        """Return the largest ratio of error to tolerance in a step, among pressure, motion and water content.
+        """Return the largest ratio of an error to its tolerance, for the pressure, the motion and the water content.
 
-        The tolerance of the pressure includes the undrained pressure change of the step, because freely draining
-        pressures follow the motion. The time error of such pressures affects no motion. The grid causes an error of
-        some percent in such pressures, and this error does not decrease with the step.
+        If pressures drain freely within a step, their error in time does not affect the motion.  The tolerance of the
+        pressure is therefore at least `rtol` times the undrained pressure change of the step.
         """
         error, motion = report.moves
         motion = max(control.motion or 0.0, motion)
@@ -178,7 +203,7 @@ class StepSize:
 
 
 def measured(control: StepControl, report: Report) -> StepControl:
-    """Return the step control with the largest changes of pressure, motion and water content, including this step's."""
+    """Return the step control with the largest changes of pressure, motion and water content so far."""
     change = np.maximum(np.maximum(control.change, report.change), NEAR * report.stress)
     start = control.start
     if report.extremes is not None:
@@ -194,17 +219,19 @@ class Times:
 
     Parameters
     ----------
-    start, now : s
-        Time of the first row of the histories, and time at which the run begins or continues.
+    start : s
+        Time of the first row of the histories.
+    now : s
+        Time at which the run begins.
     end, interval, given, rtol
         Arguments t_end, dt, t_eval and rtol of `run`.
     goes_on
-        Whether the run continues histories of an earlier run.
+        Whether the run continues the histories of an earlier run.
 
     Raises
     ------
     ValueError
-        An argument is invalid, no time is left, or there are more steps than floating-point times can resolve.
+        An argument is invalid, no time is left, or the output intervals are too short for floating-point times.
     """
 
     def __init__(self, start: float, now: float, end, interval, given, rtol, goes_on: bool):
@@ -218,7 +245,7 @@ class Times:
                 f"dt = {line(interval)}: with rtol and t_eval there is no output interval, must be left out"
             )
         self.interval, self.each = 0.0, given is None and interval is None
-        """Output interval, s, or 0 if there is none; and whether every step is an output."""
+        """Output interval, in s, or 0 without equal intervals; and whether every step is an output."""
         if interval is not None:
             allowed = f"> 0, and not below {(self.end - now) / MOST:g} s"
             test = lambda v: (v > 0) & (v * MOST >= self.end - now)  # noqa: E731
@@ -234,7 +261,7 @@ class Times:
         self.start = start
 
     def after(self, t: float) -> list[float]:
-        """Return the output times later than time t, s, including the end of the run."""
+        """Return the output times after the time `t`, including the end of the run."""
         if self._times is not None:
             return [*(time for time in self._times if t < time < self.end), *([self.end] if t < self.end else [])]
         # the last interval may be a fraction of dt
@@ -244,12 +271,12 @@ class Times:
         return [start + k * dt for k in range(done + 1, count)] + [self.end] * (count > done)
 
     def next(self, t: float) -> float:
-        """Return the latest end, s, of steps towards the first output after time t, s: time of output plus rounding."""
+        """Return the first output time after the time `t`, plus a margin for rounding."""
         return max([*self.after(t)[:1], t]) + SAME * self.interval
 
 
 def diffusion_time(scene: Scene, points: MaterialPoints) -> float:
-    """Return the shortest time of diffusion through a cell, s: its size squared / c_v; 0 without conductivity."""
+    """Return the shortest diffusion time of a cell, in s, or 0 without conductivity."""
     if scene.fluid is None:
         return 0.0
     stored = scene.materials.table(points, lambda m: m.biot**2 / m.oedometric)
@@ -263,7 +290,7 @@ def diffusion_time(scene: Scene, points: MaterialPoints) -> float:
 
 
 def cell_time(scene: Scene, points: MaterialPoints) -> float:
-    """Return the shortest time, s, in which a wave crosses a cell."""
+    """Return the shortest time in which a wave crosses a cell, in s."""
     density = scene.materials.density(points)
     at = density > 0
     grid = scene.grid
@@ -273,14 +300,12 @@ def cell_time(scene: Scene, points: MaterialPoints) -> float:
     return of_all / fastest**0.5 if fastest > 0 else inf
 
 
-def step_rule(times: Times, rtol, first_step, max_step: float, scene: Scene, points: MaterialPoints) -> StepSize:
-    """Return the rule for the steps of a run, see `run`; ValueError for invalid arguments."""
-    positive = {"test": lambda v: v > 0, "allowed": "> 0"}
+def step_rule(times: Times, rtol: float | Adaptive | None, scene: Scene, points: MaterialPoints) -> StepSize:
+    """Return the rule for the steps of a run; raise ValueError for invalid arguments."""
     if rtol is None:
-        for name, value in {"first_step": first_step, "max_step": max_step if max_step != inf else None}.items():
-            if value is not None:
-                raise ValueError(f"{name} = {line(value)}, must be left out without rtol: steps are equal")
         return StepSize(times.interval, times.interval)
+    given = rtol if isinstance(rtol, Adaptive) else Adaptive(rtol)
+    rtol, longest = given.rtol, float(given.max_step)
     least = RESOLVED * scene.scheme.tolerance
     numbers("rtol", rtol, test=lambda v: (least <= v) & (v < 1), allowed=f"in [{least:g}, 1), >= {RESOLVED} tolerance")
     if scene.numerics.method == "backward-euler":
@@ -290,13 +315,12 @@ def step_rule(times: Times, rtol, first_step, max_step: float, scene: Scene, poi
     if (scene.momentum.own.rates or timed) and not scene.flows and not inertia:
         why = "without flow of fluid, velocities have no error estimate"
         raise ValueError(f"rtol = {line(rtol)}: {why}, must be left out")
-    longest = float(numbers("max_step", max_step, **positive)) if max_step != inf else inf
     first = times.after(times.start)[0] - times.start
     if len(scene.substeps) > 1:  # a scene without time derivatives has no such error
         # for a load that grows from zero the relative error is ERROR dt c_v / h^2
         first = min(first, max(FIRST * first, SAFETY * rtol / ERROR * diffusion_time(scene, points)))
     if inertia:  # bodies may be released or loaded suddenly
         first = min(first, cell_time(scene, points))
-    if first_step is not None:
-        first = float(numbers("first_step", first_step, **positive))
+    if given.first_step is not None:
+        first = float(given.first_step)
     return StepSize(min(first, longest), longest, float(rtol))

@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: MIT
-"""The factor of safety by strength reduction: the largest divisor of the soil's strength at which bodies stay at rest.
+"""Factor of safety: the largest number by which the strength of the soil can be divided before the bodies fail.
 
-A factor F divides cohesion, tensile strength and the tangents of the angles of friction and dilation (Griffiths and
-Lane 1999). Dilation is divided too, so that associated flow stays associated. Soil that is too weak has no equilibrium,
-but a failure of the solver is no proof that the soil is too weak. Each trial therefore adds a viscous stress and
-follows the motion in time. The criterion is the overload: the ratio of viscous stress to shear stress in the moving
-soil. If a body comes to rest, the soil's strength bears the load, and the overload vanishes. In a slide the overload
-remains. It equals the missing strength for any viscosity and cell size.
+Trials with different factors bracket this number.  A factor divides cohesion, tensile strength and the tangents of the
+angles of friction and dilation (Griffiths and Lane 1999).  If Newton's method fails, the soil need not be too weak, so
+this failure is no criterion.  A trial adds a viscous stress to the soil instead, and follows the motion in time.  The
+criterion is the overload, the ratio of the viscous stress to the shear stress.  If the soil is strong enough, the
+bodies come to rest, and the overload vanishes.  In a slide the overload remains, and equals the missing strength for
+any viscosity and cell size.
 
-Before the trials, one step is computed with soil of unlimited strength. In this step bodies in equilibrium keep their
-stresses. Bodies that cannot stand, and were therefore not run, get elastic stresses.
+All trials start after one step with soil that cannot yield.  In this step, bodies in equilibrium keep their stresses.
+Bodies that cannot stand, and were not run before, get elastic stresses.
 """
 
 from __future__ import annotations
@@ -45,20 +45,17 @@ if TYPE_CHECKING:
     from mpm_dolfinx.simulation.simulation import Simulation
 
 WIDER, WIDEST = 2**0.5, 16.1
-"""Ratio of successive trial factors until bodies rest at one and slide at another; largest factor, largest inverse."""
+"""`WIDER` is the ratio of two successive factors in the search for bounds; `WIDEST` is the largest factor."""
 LACKS = 0.25
-"""Largest overload, divided by `rtol`, of a trial that comes to rest.
+"""Largest overload of a trial that comes to rest, divided by `rtol`.
 
-A trial that slides starts with an overload of 0.9 times the missing strength in a uniform block, and 0.6 times in a
-slope. By the end of the trial the overload has halved. The factor of the slope changes by 1.1 % if this number is 1/8,
-and by 0.5 % if it is 1/2.
+With half this value the factor of safety of a slope changes by 1.1 %, with twice this value by 0.5 %.
 """
 STRAINS = 4.0
-"""Strain of a marginal slide in a trial, divided by the smaller of its overload and the elastic strain at yield.
+"""Strain in a trial that barely slides, divided by the smaller of the overload and the elastic strain at yield.
 
-When soil begins to yield, its stresses redistribute within a few times the strain at yield.  In soft soil such large
-strains would change the shape of the body; a larger viscosity limits them.  If this number is halved or doubled, the
-factor of a slope changes by 0.5 %.  With twice the number of steps it changes by less than 0.1 %.
+With half or twice this value the factor of safety of a slope changes by 0.5 %.  With twice the number of steps the
+factor of safety changes by less than 0.1 %.
 """
 STRENGTHS = ("cohesion", "residual", "hardening", "tension", "friction", "dilation")
 ANGLES = ("friction", "dilation")
@@ -73,8 +70,8 @@ class Safety:
     bounds
         Largest factor of a trial that came to rest, and smallest factor of a trial that did not.
     overloads
-        Overloads (n,) in the n steps of each trial, by trial factor. An overload is the work of the viscous stress in a
-        step, divided by the work of the shear stress.
+        Overloads (n,) in the n steps of each trial, by factor of the trial.  The overload of a step is the work of the
+        viscous stress, divided by the work of the shear stress.
     newton
         Number of Newton steps of all trials.
     """
@@ -88,34 +85,33 @@ class Safety:
 def factor_of_safety(
     simulation: Simulation, *, dt: float | None = None, rtol: float = 0.01, steps: int = 10, progress: bool = True
 ) -> Safety:
-    """Return the factor of safety by strength reduction: the largest divisor of the strength without failure.
+    """Return the factor of safety: the largest number by which the strength can be divided before the bodies fail.
 
-    The simulation is unchanged. A scene that cannot stand need not be run: trials start after a step of length `dt` in
-    which the soil cannot yield. Suction, as part of the effective stress, adds to the strength. Friction of tools is
-    not divided. If a thin weak surface layer slides alone, the factor depends on `rtol` and the layer's share of the
-    load. All processes must call this.
+    The simulation does not change.  A scene that cannot stand need not be run before.  Suction contributes to the
+    strength through the effective stress.  The friction of tools is not divided.  If a thin weak layer slides on the
+    surface, the factor depends on `rtol`.  All processes must call this function.
 
     Parameters
     ----------
     simulation
         Scene under its loads, which must be constant in time from now on.
     dt
-        Length of a step, s, > 0. It must be long compared with the viscous time scales of laws and terms. It is
-        required if fluid flows; choose it short for undrained failure, and long for drained failure.
+        Length of a step, in s, > 0.  The step must be long compared with viscous time scales of laws and terms.  If
+        fluid flows, `dt` is required.  Choose a short step for undrained failure, and a long step for drained failure.
     rtol
         Final relative difference of the bounds, in [1e-4, 0.5].
     steps
-        Largest number of steps in a trial, >= 8. Bodies that still move after these steps are said to slide.
+        Largest number of steps in a trial, >= 8.  A body that still moves after these steps counts as sliding.
     progress
         Whether to show a progress bar on a terminal.
 
     Raises
     ------
     ValueError
-        An argument is invalid, the strength of a soil cannot be divided, or the bodies have no stress.  The bodies do
-        not slide with 1/16 of their strength, or do not come to rest with 16 times their strength.
+        An argument is invalid, the strength of a soil cannot be divided, or the bodies have no stress.  The bodies
+        still rest with 1/16 of their strength, or still slide with 16 times their strength.
     GaveUp
-        A step of a trial does not converge, however short.
+        Even the shortest step of a trial does not converge.
     """
     if not isinstance(getattr(simulation, "scene", None), Scene):
         raise ValueError(f"simulation = {line(simulation)}, must be a Simulation")
@@ -149,7 +145,7 @@ def factor_of_safety(
 
 
 class _Bar:
-    """A terminal line with the results of trials, and the progress of the current trial."""
+    """Progress bar that shows the trials on a terminal."""
 
     def __init__(self, shown: bool):
         self._bar = tqdm(bar_format="{desc}, {n_fmt} steps, {elapsed}{postfix}", disable=None if shown else True)
@@ -166,18 +162,18 @@ class _Bar:
         self._bar.close()
 
     def show(self, factor: float, count: int, overload: float) -> None:
-        """Show a step of a trial: factor, number of the step, overload."""
+        """Show the number and the overload of a step in a trial."""
         self._bar.update()
         known = "".join(f", {what} at {at}" for what, at in self._known.items() if at)
         self._bar.set_postfix_str(f"strength over {factor:.4g}: step {count}, overload {overload:.1e}{known}")
 
     def tried(self, factor: float, judged: str) -> None:
-        """Store the result of a trial, "rests" or "slides", for the next lines."""
+        """Store the result of a trial: "rests" or "slides"."""
         self._known[judged] = f"{factor:.4g}"
 
 
 def _bracket(rests: Callable[[float], bool]) -> tuple[float, float]:
-    """Return a factor at which bodies rest and a larger factor at which they slide; the first trial factor is 1."""
+    """Return a factor at which the bodies rest, and a larger factor at which they slide."""
     known, wider = 1.0, WIDER if (begins := rests(1.0)) else 1 / WIDER
     while 1 / WIDEST <= (trial := known * wider) <= WIDEST:
         if rests(trial) != begins:
@@ -189,10 +185,10 @@ def _bracket(rests: Callable[[float], bool]) -> tuple[float, float]:
 
 
 def _ends(overloads: Sequence[float], steps: int, least: float) -> bool:
-    """Return whether the overloads of the steps so far determine the result of a trial.
+    """Return whether the overloads of the first steps determine the result of a trial.
 
-    The overload decreases ever more slowly. If its last rate of decrease does not bring the bodies to rest in the
-    remaining steps, they slide.
+    The overload decreases ever more slowly.  The bodies slide if its present rate of decrease is too small for the
+    remaining steps.
     """
     *before, last = overloads
     rate = min(1.0, last / before[-1]) if before else 0.0
@@ -201,21 +197,21 @@ def _ends(overloads: Sequence[float], steps: int, least: float) -> bool:
 
 @dataclass
 class _Trial:
-    """A trial that the time loop runs; newton: list to which each time step appends its number of Newton steps."""
+    """Trial for the time loop, which counts its Newton steps in a list."""
 
     scene: Scene
     state: State
     newton: list[int]
 
     def advanced(self, dt: float) -> tuple[State, Report]:
-        """Return the state after a step of dt, s, and its report."""
+        """Return the state after a step of length `dt`, and the report of the step."""
         state, report = step(self.scene, self.state, dt)
         self.newton.append(report.newton)
         return state, report
 
 
 class _Weakened:
-    """Copy of the simulated scene with strengths as point data, and a viscous stress; see `factor_of_safety`."""
+    """Copy of a scene with variable strength and with a viscous stress."""
 
     def __init__(self, simulation: Simulation, dt: float, steps: int, least: float):
         scene = simulation.scene
@@ -258,7 +254,7 @@ class _Weakened:
         self._viscosity.value = steps / STRAINS * max(least * modulus, stress) * dt
 
     def overloads(self, factor: float, tell: Callable[[int, float], None]) -> NDArray[np.float64]:
-        """Return the overloads (n,) in n steps of a trial, until its result is known; tell: called after each step."""
+        """Return the overloads in the steps of a trial, and call `tell` after each step."""
         trial, out = self._trial(self._start, lambda name, value: _over(name, value, factor)), []
         while len(out) < self._steps and not (out and _ends(out, self._steps, self._least)):
             before = trial.state.points
@@ -268,30 +264,27 @@ class _Weakened:
         return np.array(out)
 
     def _unyielding(self, initial: State) -> State:
-        """Return the state after a step in which the soil cannot yield, because its strength exceeds its modulus."""
+        """Return the state after a step in which the soil is too strong to yield."""
         moduli = self._scene.materials.table(initial.points, lambda m: m.oedometric)
         trial = self._trial(initial, lambda name, value: value if name in ANGLES else np.maximum(value, moduli))
         self._go_on(trial, "soil that cannot yield")
         return replace(trial.state, t=initial.t)
 
     def _trial(self, start: State, strength: Callable[[str, NDArray[np.float64]], NDArray[np.float64]]) -> _Trial:
-        """Return a trial from the state `start`; strength: function of the name and the values (n,) of a strength."""
+        """Return a trial that starts from a state, with strengths from the function `strength`."""
         data = {name: strength(name, value) for name, value in self._strengths.items()}
         points = replace(start.points, data={**start.points.data, **data})
         return _Trial(self._scene, replace(start, points=points, velocity=None, result=None, control=None), self.newton)
 
     def _go_on(self, trial: _Trial, what: str) -> None:
-        """Take a step of a trial; what: description of the strength for an error message."""
+        """Take a step of a trial; `what` describes the soil in an error message."""
         try:
             run(trial, trial.state.t + self._dt, self._dt, progress=False)
         except GaveUp as error:
             raise GaveUp(f"factor_of_safety: {what}: {error}", error.result, error.history) from error
 
     def _overload(self, before: MaterialPoints, now: MaterialPoints) -> float:
-        """Return a step's viscous work, divided by the integral of |deviatoric stress| |deviatoric strain increment|.
-
-        Points that moved to another process are excluded.
-        """
+        """Return the overload of a step.  Points that moved to another process are excluded."""
         _, old, new = np.intersect1d(before.id, now.id, assume_unique=True, return_indices=True)
         d = before.F.shape[1]
         increment = now.F[new] @ np.linalg.inv(before.F[old]) - np.eye(d)
@@ -310,7 +303,7 @@ def _deviator(tensors: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _mean_stress(scene: Scene, points: MaterialPoints) -> float:
-    """Return the mean norm of the effective stress, Pa; raise ValueError if it may be a rounding error."""
+    """Return the mean norm of the effective stress, in Pa; raise ValueError if there is no stress."""
     grid = scene.grid
     size = np.linalg.norm(scene.materials.effective_stress_3d(points), axis=(1, 2))
     moduli, volume = scene.materials.table(points, lambda m: m.oedometric), points.volume0 * points.J
@@ -323,7 +316,7 @@ def _mean_stress(scene: Scene, points: MaterialPoints) -> float:
 
 
 def _shear_modulus(scene: Scene, points: MaterialPoints) -> float:
-    """Return the harmonic mean of G, Pa, of soil with a strength; soft soil, which yields first, counts more."""
+    """Return the harmonic mean of the shear moduli of soil that may yield, in Pa."""
     softness = scene.materials.table(points, lambda m: 1 / m.shear if isinstance(m, Frictional) else 0 * m.shear)
     volume = points.volume0 * points.J
     total, whole_volume = over_all(scene.grid.comm, np.array([softness @ volume, (softness > 0) @ volume]))
@@ -331,7 +324,7 @@ def _shear_modulus(scene: Scene, points: MaterialPoints) -> float:
 
 
 def _of(m: Skeleton) -> list[str]:
-    """Return the names of the material's constants that the factor divides."""
+    """Return the names of the material constants that a factor divides."""
     if not isinstance(m, Frictional):
         return []
     own = {f.name for f in fields(m)} & set(STRENGTHS)
@@ -339,7 +332,7 @@ def _of(m: Skeleton) -> list[str]:
 
 
 def _as_fields(m: Skeleton) -> Skeleton:
-    """Return a material with its strengths as functions of position, so that they are point data."""
+    """Return a material whose strengths are functions of position."""
     carried = {name: partial(_constant, value=getattr(m, name)) for name in _of(m) if not callable(getattr(m, name))}
     if isinstance(m, Frictional) and m.symmetric:
         carried |= {"dilation": carried.get("friction", m.friction)}
@@ -351,7 +344,7 @@ def _constant(X: NDArray[np.float64], value: float) -> NDArray[np.float64]:
 
 
 def _strengths(scene: Scene, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
-    """Return the values (n,) of each strength at the points, by name; zero in materials without this strength."""
+    """Return the values of each strength at the points, by name.  Materials without this strength have zeros."""
     out = {}
     for i, m in enumerate(scene.materials.materials):
         rows = np.flatnonzero(points.material == i)
@@ -362,5 +355,5 @@ def _strengths(scene: Scene, points: MaterialPoints) -> dict[str, NDArray[np.flo
 
 
 def _over(name: str, value: NDArray[np.float64], factor: float) -> NDArray[np.float64]:
-    """Return a strength divided by a factor; the factor divides the tangents of angles."""
+    """Return a strength divided by a factor.  For an angle, the factor divides the tangent."""
     return np.degrees(np.arctan(np.tan(np.radians(value)) / factor)) if name in ANGLES else value / factor

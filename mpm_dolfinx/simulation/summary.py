@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Summary of a scene: its terms and solvers, why others are absent, and its distribution over processes."""
+"""Summary of a scene: its terms and solvers, and its distribution over processes."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Part:
 
 
 def parts(scene: Scene, state: State) -> list[Part]:
-    """Return the terms and solvers of a scene at present; some are compiled only when a step needs them."""
+    """Return the terms and solvers of a scene at present."""
     return [*_momentum(scene, state), *_storage(scene, state), *_solvers(scene, state)]
 
 
@@ -113,10 +113,10 @@ def table(scene: Scene, state: State) -> str:
 
 
 def imbalance(scene: Scene, state: State) -> dict[str, float]:
-    """Return for points, pieces and active cells the largest number on a process, divided by the mean over processes.
+    """Return the imbalance of points, pieces and active cells over the processes.
 
-    The ratio 1 means perfect balance. Before the first step, the ratios of pieces and cells are set to 1. The time of a
-    step is proportional to the number of pieces. All processes must call it.
+    The imbalance is the largest number on a process, divided by the mean over all processes.  Before the first step,
+    the imbalance of pieces and cells is 1.  All processes must call this function.
     """
     comm, (on_grid, _) = scene.grid.comm, scene.last
     pieces = on_grid.data.pieces if on_grid else None
@@ -128,7 +128,7 @@ def imbalance(scene: Scene, state: State) -> dict[str, float]:
 
 
 def peak_memory() -> float:
-    """Return the peak memory of this process, MB."""
+    """Return the peak memory of this process, in MB."""
     status = Path("/proc/self/status")
     if status.exists():  # getrusage includes the parent process on Linux
         (line,) = (line for line in status.read_text().splitlines() if line.startswith("VmHWM:"))

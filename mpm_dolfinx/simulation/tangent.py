@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Tangent of momentum and fluid at the present state as sparse matrices, for modes and sensitivities."""
+"""Tangent of the momentum balance and the fluid balance, as sparse matrices for modes and sensitivities."""
 
 from __future__ import annotations
 
@@ -24,13 +24,14 @@ class Tangent:
 
     Let du (n,), in m, be changes of the displacements, and dp (k,), in Pa, changes of the pressures. Forces, in N (N/m
     in plane strain), then change by `stiffness` du + `pressure` dp. Fluid contents, in m^d, change by `content` du +
-    `storage` dp. Without fluid, `pressure` and the fields after it are None.
+    `storage` dp. Without fluid, `pressure`, `content`, `storage` and `cells` are None.
 
     Parameters
     ----------
     stiffness : (n, n)
-        Stiffness, including the ghost penalty and the penalties of prescribed displacements and contacts. It excludes
-        fixed components and the inertia of bodies. Free tools move with the bodies; their inertia is included.
+        Derivative of forces with respect to displacements.  The matrix includes the ghost penalty, the penalties of
+        prescribed displacements and contacts, and the inertia of free tools, but not the inertia of bodies.  Fixed
+        components are excluded.
     nodes, components : (n,)
         Grid node and axis of each displacement.
     x : (n, d)
@@ -56,12 +57,12 @@ class Tangent:
 
 
 def tangent(simulation: Simulated, dt: float) -> Tangent:
-    """Return the tangent at the present state; dt: length of the step that starts now, s, > 0; see `Tangent`.
+    """Return the tangent at the present state, for a step of length `dt`, in s.
 
     Raises
     ------
     ValueError
-        The scene runs on several processes.
+        The scene runs on several processes, or `dt` is not positive.
     """
     scene, state = simulation.scene, simulation.state
     numbers("dt", dt, test=lambda v: (0 < v) & (v < np.inf), allowed="> 0 and finite")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Time loop and histories of a run; steps that do not converge are reduced, and later steps grow again."""
+"""Time loop of a run, which takes steps and records histories."""
 
 from __future__ import annotations
 
@@ -7,12 +7,10 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
+from functools import partial
 from inspect import signature
 from logging import INFO, WARNING
-from math import inf
 from typing import Any
-
-from mpi4py import MPI
 
 import numpy as np
 from tqdm import tqdm
@@ -25,12 +23,12 @@ from mpm_dolfinx.base.time_integration import EULER
 from mpm_dolfinx.base.tolerances import SAME
 from mpm_dolfinx.base.validation import flag, functions, instance, line
 from mpm_dolfinx.dynamics.energies import initial_energies
-from mpm_dolfinx.parallel.exchange import first
+from mpm_dolfinx.parallel.exchange import by_user
 from mpm_dolfinx.parallel.messages import ResolutionWarning, log, logger, warn
 from mpm_dolfinx.probing.probe_fields import probe_pressures, probe_stresses
 from mpm_dolfinx.probing.probes import Probes, check_there
-from mpm_dolfinx.simulation.events import Event, Events, Simulated, Step
-from mpm_dolfinx.simulation.step_size import StepSize, Times, measured, step_rule
+from mpm_dolfinx.simulation.events import Event, Events, Simulated, Step, check_alike
+from mpm_dolfinx.simulation.step_size import Adaptive, StepSize, Times, measured, step_rule
 from mpm_dolfinx.simulation.summary import imbalance, peak_memory
 from mpm_dolfinx.stepping.distribution import distribute
 from mpm_dolfinx.stepping.result import GaveUp, Result
@@ -49,10 +47,10 @@ PARTS = (
     "move points",
     "output",
 )
-"""Timed parts of a run."""
+"""Parts of a run whose wall time is measured."""
 
 Observer = Callable[[Any], None]
-"""A function of the simulation."""
+"""A function that is called with the simulation."""
 
 
 def run(
@@ -60,10 +58,8 @@ def run(
     t_end: float,
     dt: float | None = None,
     *,
-    rtol: float | None = None,
+    rtol: float | Adaptive | None = None,
     t_eval: Sequence[float] | None = None,
-    first_step: float | None = None,
-    max_step: float = inf,
     until: Event | Sequence[Event] | None = None,
     probes: Probes | None = None,
     observe: Observer | Sequence[Observer] = (),
@@ -84,20 +80,17 @@ def run(
         Length of a step, and output interval, s, > 0; limited to t_end - t. With `rtol`, `dt` is only the output
         interval. With `rtol`, but without `dt` and `t_eval`, every step is an output.
     rtol
-        Tolerance of adaptive steps. The estimated error of the pore pressures stays below about `rtol` times the
-        larger of two changes: the largest since the start of the run, and the undrained change of the step. `rtol` is
-        at least ten times `tolerance`, and < 1. If no fluid flows, the steps are the output intervals. A term or law
-        that depends on velocity then raises ValueError, because its error cannot be estimated. With inertia the error
-        of the motion is limited too, relative to the largest motion since the start, see `motion_error`. In unsaturated
-        soil the error of the water content is limited too, relative to its largest change in a step so far. The
-        estimate is a fraction of a first-order step's error, see `solve.newton.ERROR`. The largest true error of a run
-        was 0.7 to 5 times the largest estimate. The ratio is largest directly after a jump of the load.
+        Tolerance of adaptive steps, or `Adaptive`: the tolerance with limits of the steps. The estimated error of the
+        pore pressures stays below about `rtol` times the larger of two changes: the largest since the start of the run,
+        and the undrained change of the step. `rtol` is at least ten times `tolerance`, and < 1. If no fluid flows, the
+        steps are the output intervals. A term or law that depends on velocity then raises ValueError, because its error
+        cannot be estimated. With inertia the error of the motion is limited too, relative to the largest motion since
+        the start, see `motion_error`. In unsaturated soil the error of the water content is limited too, relative to
+        its largest change in a step so far. The estimate is a fraction of a first-order step's error, see
+        `solve.newton.ERROR`. The largest true error of a run was 0.7 to 5 times the largest estimate. The ratio is
+        largest directly after a jump of the load.
     t_eval : (n,), s
         Output times, increasing, in (t, t_end]; t_end is always an output time. Steps end at output times.
-    first_step, max_step
-        First trial step of a new run, and longest step, s, > 0. Both require `rtol`. The default first step is 18 rtol
-        times the diffusion time of a cell, but at least 0.001 and at most 1 times the first output interval. With
-        inertia it is also at most the time in which a wave crosses a cell.
     until
         One function of the simulation, or several, that end the run before t_end. An event occurs within a step when a
         returned number changes its sign, or a returned boolean changes. A number that is zero at the start is no event.
@@ -134,7 +127,7 @@ def run(
     """
     comm = simulation.scene.grid.comm
     simulation.scene.check(simulation.state)
-    _check_alike(comm, {"t_end": t_end, "dt": dt, "rtol": rtol, "t_eval": t_eval, "max_step": max_step})
+    check_alike(comm, {"t_end": t_end, "dt": dt, "rtol": rtol, "t_eval": t_eval})
     if probes is not None and not isinstance(probes, Probes):
         raise ValueError(f"probes = {line(probes)}, must be a result of `probes`")
     observers = [observe] if callable(observe) else observe
@@ -155,7 +148,7 @@ def run(
     start = now if after is None else after.rows[0].t
     times = Times(start, now, t_end, dt, t_eval, rtol, after is not None)
     state = simulation.scene.followed(simulation.state)  # the first step depends on the size of the cells
-    rule = step_rule(times, rtol, first_step, max_step, simulation.scene, state.points)
+    rule = step_rule(times, rtol, simulation.scene, state.points)
     result, control = _histories(simulation, times, rule, probes, after)
     stopwatch, last = _Stopwatch(result), result.rows[-1].t
     events = Events(simulation, until)
@@ -168,7 +161,7 @@ def run(
             ended = replace(simulation.state.result, converged=converged)
             _note(simulation, stopwatch.read(ended).more(_row(simulation, probes)))
             for observer in observers:
-                _observe(observer, simulation, comm)
+                by_user(comm, f"observe: {line(observer)}", partial(observer, simulation))
             if checkpoint is not None:
                 _note(simulation, stopwatch.read(simulation.state.result))
                 checkpoint(simulation)
@@ -190,24 +183,14 @@ def run(
     return _note(simulation, stopwatch.read(_measured(simulation)))
 
 
-def _check_alike(comm: MPI.Intracomm, given: dict[str, Any]) -> None:
-    """Raise ValueError if arguments differ between processes, which would then wait for each other."""
-    texts = comm.allgather([line(value) for value in given.values()])
-    for k, name in enumerate(given):
-        for rank, text in enumerate(texts):
-            if text[k] != texts[0][k]:
-                what = f"{name} = {texts[0][k]} on process 0, {text[k]} on process {rank}"
-                raise ValueError(f"{what}, must be the same on all")
-
-
 def _bar(start: float, now: float, end: float, shown: bool) -> tqdm:
-    """Return a progress bar for the time from start to end, s."""
+    """Return a progress bar for the time of a run."""
     form = "{percentage:3.0f}%|{bar}| {elapsed}<{remaining}{postfix}"
     return tqdm(total=end - start, initial=now - start, bar_format=form, disable=None if shown else True)
 
 
 def _show(bar: tqdm, state: State, before: float) -> None:
-    """Update the progress bar; before: time at the last update, s."""
+    """Update the progress bar, which shows the time `before`."""
     result = state.result
     bar.update(state.t - before)
     counts = {"t": f"{state.t:.4g} s", "steps": result.steps, "newton": result.newton, "coupling": result.coupling}
@@ -216,37 +199,23 @@ def _show(bar: tqdm, state: State, before: float) -> None:
 
 
 def _note(simulation: Simulated, result: Result, control: StepControl | None = None) -> Result:
-    """Store the histories in the state, and the step control if it is given."""
+    """Store histories in the state, and also a step control if one is passed."""
     simulation.state = replace(simulation.state, result=result, control=control or simulation.state.control)
     return result
 
 
 def _takes_nothing(function: Callable) -> bool:
-    """Return whether a function has no parameter; False for built-in functions without a signature."""
+    """Return whether a function has no parameters."""
     try:
         return not signature(function).parameters
     except (TypeError, ValueError):
         return False
 
 
-def _observe(observer: Callable, simulation: Simulated, comm: MPI.Intracomm) -> None:
-    """Call an observer; an error on one process is raised on all, so that no process waits for the others."""
-    raised = None
-    try:
-        observer(simulation)
-    except BaseException as error:  # including Ctrl-C
-        raised = error
-    where = first(comm, "" if raised is None else f"process {comm.rank}")
-    if raised is not None:
-        raise raised
-    if where:
-        raise RuntimeError(f"observe: {line(observer)} raised an error on {where}")
-
-
 def _histories(
     simulation: Simulated, times: Times, rule: StepSize, probes: Probes | None, after: Result | None
 ) -> tuple[Result, StepControl]:
-    """Return histories that start at the present state or that the run continues, and the step control."""
+    """Return the histories and the step control at the start of a run."""
     state = simulation.state
     latest = simulation.state.result
     control = simulation.state.control
@@ -274,7 +243,7 @@ def _histories(
 
 
 def _counting(scene: Scene, state: State, energies: bool, goes_on: bool) -> State:
-    """Return the state with energies that start now, with the energies of the continued run, or without energies."""
+    """Return the state with the energies at the start of a run, or without energies."""
     if energies and not state.stage.inertia:
         raise ValueError("energies = True: bodies have no inertia, must be in a stage with inertia=True")
     if energies and goes_on and "energy" in state.outcome:
@@ -287,7 +256,7 @@ def _counting(scene: Scene, state: State, energies: bool, goes_on: bool) -> Stat
 
 
 class _Stopwatch:
-    """Wall time and profile of a run, including the earlier run that this run continues."""
+    """Wall time and profile of a run, including the time of a run that it continues."""
 
     def __init__(self, result: Result):
         self._start = time.perf_counter() - result.wall
@@ -300,7 +269,7 @@ class _Stopwatch:
 
 
 def _take_step(simulation: Simulated, rule: StepSize, target: float, verbose: bool, events: Events) -> bool:
-    """Take one step towards the time `target`, s; return whether an event has ended the run."""
+    """Take one step towards the time `target`, and return whether an event ends the run."""
     distribute(simulation)
     step, new = _advance(simulation, rule, target, verbose)
     found = events.within(step, new)
@@ -316,7 +285,7 @@ def _take_step(simulation: Simulated, rule: StepSize, target: float, verbose: bo
 def _accepted(
     rule: StepSize, start: State, size: float, new: State, report: Report, preferred: float | None = None
 ) -> State:
-    """Return the state after a step of length `size`, s, with updated histories; preferred: nominal step, s."""
+    """Return the state after an accepted step, with new histories and a new step control."""
     grown = measured(start.control, report)
     grown = rule.grown(size, report, grown, failed=size < (1 - SAME) * (preferred or size))
     grown = replace(grown, first=np.divide(report.first, size).tolist())
@@ -324,11 +293,9 @@ def _accepted(
 
 
 def _advance(simulation: Simulated, rule: StepSize, target: float, verbose: bool) -> tuple[Step, State]:
-    """Return a step towards the time `target`, s, and the state at the end of the step.
+    """Return a step towards the time `target`, and the state at the end of this step.
 
-    The step is reduced until it meets its tolerances.
-
-    verbose: whether to warn of the first reduced step of a run.
+    The step is shortened until it converges and meets the tolerances.
     """
     comm = simulation.scene.grid.comm
     preferred = whole = None
@@ -372,9 +339,9 @@ def _advance(simulation: Simulated, rule: StepSize, target: float, verbose: bool
 
 
 def _by_euler(simulation: Simulated, dt: float, failed: StepFailed) -> tuple[State, Report] | None:
-    """Return the state after a step of dt, s, by backward Euler, and its report; None if this step fails too.
+    """Return the state and the report after a step by backward Euler, or None if this step fails too.
 
-    After a jump of the loads the second substep of SDIRK2 overshoots. Soil may be too weak for the overshoot.
+    After a jump of the loads, SDIRK2 overshoots, and the soil may be too weak for the overshoot.
     """
     if isinstance(failed, LeftGrid) or len(simulation.scene.substeps) == 1:
         return None
@@ -389,14 +356,14 @@ def _by_euler(simulation: Simulated, dt: float, failed: StepFailed) -> tuple[Sta
 
 
 def _has_left(failed: StepFailed, rule: StepSize, size: float, state: State) -> bool:
-    """Return whether points leave the grid in an accurate step, so that shorter steps cannot prevent it."""
+    """Return whether points leave the grid in a step that is short enough."""
     if not isinstance(failed, LeftGrid) or failed.report is None:
         return False
     return rule.refused(size, failed.report, measured(state.control, failed.report)) == 1
 
 
 def _why(t: float, small: float, failed: StepFailed) -> str:
-    """Return the message of a run that gave up at time t, s, after a step `small`, s."""
+    """Return the error message of a run that gave up."""
     if isinstance(failed, LeftGrid):
         return str(failed)
     why = "shorter steps help only where loads grow with time, as functions of t; the soil may have no equilibrium"
@@ -404,7 +371,7 @@ def _why(t: float, small: float, failed: StepFailed) -> str:
 
 
 def _row(simulation: Simulated, probes: Probes | None) -> Row:
-    """Return the results at the present time, as one row of the histories."""
+    """Return the results at the present time as a row of the histories."""
     scene, state = simulation.scene, simulation.state
     comm = scene.grid.comm
     d = scene.grid.dim

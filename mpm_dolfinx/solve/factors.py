@@ -1,28 +1,16 @@
 # SPDX-License-Identifier: MIT
-"""Direct linear solvers, which are used where they are faster than multigrid (`multigrid`), see `plan`.
+"""Direct linear solvers, used where they are faster than multigrid (`multigrid`): see `plan`.
 
-PETSc's own factors of displacement matrices, with a block for each node, take a third of the time of scalar factors.
-With 44000 unknowns in 2D and minimum degree ordering, the first factorisation takes 110 ms in blocks, 430 ms in
-scalars, 260 ms with MUMPS, 290 ms with UMFPACK and 285 ms with CHOLMOD. The next factorisation with the same sparsity
-pattern takes 60 ms in blocks, 150 ms in scalars, 155 ms with MUMPS, 265 ms with UMFPACK and 290 ms with CHOLMOD. A
-solve takes 4 ms in blocks, 15 ms with MUMPS, and 9 ms with CHOLMOD. Copying the entries into blocks takes a tenth of
-the factorisation. On two processes, MUMPS factorises in the same time as on one process, and a solve takes 25 ms. On
-several processes, one of them therefore holds the factors of displacements, which many solves use. Another process
-computes and holds the factors of pressures at the same time. When each of four processes computed both factors itself,
-this took 1.7 times as long, because processes share the bandwidth of the memory. In large scenes MUMPS distributes the
-factors over processes (`Thresholds.mumps`). SuperLU_DIST is slower. With 100100 unknowns, SuperLU_DIST takes 841 ms for
-the factors of K (MUMPS 476 ms), and 56 ms for a solve (MUMPS 57 ms). With 25500 unknowns, SuperLU_DIST takes 125 ms for
-the factors, and 9 ms for a solve. MUMPS then factorises K and the storage together in 385 ms, four times as long as K
-alone.
+On one process, PETSc factorises displacement matrices with a block for each node.  `dissection` orders the nodes along
+grid lines.  `bash demos/run.sh calibrate` prints the times of this solver and of others.  In 2D with 33000 unknowns and
+a symmetric matrix, the first factorisation, the next one, and a solve take the following times, in ms:
 
-Large bodies need nested dissection. With 504000 unknowns in 2D, a repeated factorisation ordered by grid lines
-(`dissection`) takes 3.0 s, and the factors have 4.6e7 entries. PETSc's nested dissection takes 5.1 s, with 5.0e7
-entries. Minimum degree takes 6 to 12 s, with 7.5e7 entries. MUMPS takes 6.2 s, with 5.3e7 entries. With a tenth of the
-unknowns, ordering by grid lines takes 80 ms, PETSc's nested dissection 110 ms, and minimum degree 120 ms. With even
-fewer unknowns, these three orderings take equal times.
+    blocks of nodes 214, 108, 6        scalar entries, minimum degree 888, 450, 12
+    CHOLMOD 185, 150, 9                UMFPACK 286, 200, 17                MUMPS 722, 524, 175
 
-The times are for the reference BLAS. Only MUMPS, UMFPACK and CHOLMOD use BLAS. With OpenBLAS, MUMPS takes 1/3 to 1/2 of
-the time.
+On several processes, one process holds the factors of displacements, because many solves use them.  Another process
+computes and holds the factors of pressures at the same time.  In large scenes all processes share the factors, and
+MUMPS computes them (`Thresholds.mumps`).
 """
 
 from __future__ import annotations
@@ -96,7 +84,7 @@ def renew(A: PETSc.Mat) -> None:
 def solved(ksp: PETSc.KSP, name: str) -> int:
     """Return the number of iterations of a solver's last solve. Raise NotConverged if this solve failed.
 
-    The line search judges results after the largest number of iterations, or with an indefinite tangent.
+    With an indefinite tangent, or after the largest number of iterations, the line search judges the result.
     """
     count, reason = ksp.getIterationNumber(), ksp.getConvergedReason()
     if reason < 0 and reason not in TOLERABLE:
@@ -105,7 +93,7 @@ def solved(ksp: PETSc.KSP, name: str) -> int:
 
 
 def negative_pivots(solver: PETSc.KSP) -> int:
-    """Return the number of negative eigenvalues of a matrix, from the L D L^T factors of its direct solver."""
+    """Return the number of negative eigenvalues of a matrix from the L D L^T factors of a direct solver."""
     factors = solver.pc.getFactorMatrix()
     return factors.getMumpsInfog(12) if factors.comm.size > 1 else factors.getInertia()[0]
 
@@ -121,7 +109,7 @@ def displacement_solver(A: PETSc.Mat, name: str, unknowns: Unknowns, how: str, s
 
 
 def _set_gathered(ksp: PETSc.KSP, A: PETSc.Mat, factors: NodalFactors | SingleFactors, rank: int) -> None:
-    """Make a solver use factors on the process `rank`."""
+    """Make a solver use factors on one process."""
     ksp.pc.setType(PETSc.PC.Type.PYTHON)
     ksp.pc.setPythonContext(Gathered(A.createVecRight(), factors, rank))
 
@@ -138,17 +126,12 @@ def factorise(*preconditioners: PETSc.PC) -> None:
 class Gathered:
     """Preconditioner for PETSc: factors of a matrix on one process.
 
-    Parameters
-    ----------
-    x
-        Vector with an entry for each column of the matrix.
-    factors
-        Factors of the whole matrix.
-    rank
-        Process that holds the factors.
+    `x`: vector with an entry for each column of the matrix.
+    `factors`: factors of the whole matrix.
+    `rank`: process that holds the factors.
 
-    `setUp` gathers a matrix. The factors are computed at the next solve, or by the function `factorise`. This function
-    gathers all matrices first, so that the processes compute their factors at the same time.
+    `setUp` gathers a matrix. The factors are computed at the next solve, or by the function `factorise`, which lets the
+    processes compute their factors at the same time.
     """
 
     def __init__(self, x: PETSc.Vec, factors: NodalFactors | SingleFactors, rank: int):
@@ -191,10 +174,7 @@ class Gathered:
 class SingleFactors:
     """Factors of matrices on one process, computed on demand.
 
-    Parameters
-    ----------
-    name, symmetric
-        See `direct_solver`.
+    `name`, `symmetric`: see `direct_solver`.
     """
 
     def __init__(self, name: str, symmetric: bool):
@@ -276,7 +256,7 @@ def dissection(x: NDArray[np.float64]) -> NDArray[np.int64]:
 
 
 def _lines(x: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return the index (n,) of the grid line of each coordinate (n,). Only lines with nodes are counted."""
+    """Return the index of the grid line of each coordinate, among the lines with nodes."""
     values, at = np.unique(x, return_inverse=True)
     return np.cumsum(np.diff(values, prepend=values[:1]) > SAME * (values[-1:] - values[:1]))[at]
 
@@ -284,18 +264,11 @@ def _lines(x: NDArray[np.float64]) -> NDArray[np.int64]:
 class BlockFactors:
     """Factors of matrices with one sparsity pattern, with a block for each node.
 
-    Parameters
-    ----------
-    rows, columns
-        The sparsity pattern, in compressed rows.
-    block, axis
-        Node and component of each unknown.
-    x : (n, d)
-        Position of each unknown, m.
-    dim
-        Number of components of a node.
-    symmetric
-        Whether the factors are U^T D U instead of L U.
+    `rows`, `columns`: the sparsity pattern, in compressed rows.
+    `block`, `axis`: node and component of each unknown.
+    `x` (n, d): position of each unknown, m.
+    `dim`: number of components of a node.
+    `symmetric`: whether the factors are U^T D U instead of L U.
     """
 
     def __init__(self, rows, columns, block, axis, x, dim: int, symmetric: bool):

@@ -8,21 +8,21 @@ enormously.
 In yielding soil, the criterion is the work of the residual forces along the step. The step is full if the work at its
 end is less than half of the initial work. The step is also full if the residual falls, and the work does not exceed the
 initial work. Otherwise bracketed secants look for the step length at which the work is zero. The secants end at less
-than half of the initial work (Matthies and Strang 1979). If the work were nearer to zero, soil might unload, and would
-then be elastic in the next tangent. The work of the fluid's residual is added, because forces do nearly no work if only
-the fluid is out of balance. Shorter steps with smaller residuals would lead to more short steps. Soil that has lost its
-strength needs several secants: with one secant, a slumping bank takes twice the Newton steps.
+than half of the initial work (Matthies and Strang 1979). Nearer to zero work, soil might unload, and would be elastic
+in the next tangent. The work of the fluid's residual is added, because forces do nearly no work if only the fluid is
+out of balance. Soil that has lost its strength needs several secants: with one secant, a slumping bank takes twice the
+Newton steps.
 
-Flowing soil has almost no stiffness along its mechanisms, and negative stiffness with non-associated flow. Full steps
-therefore overshoot far. The tangent is therefore regularised by a fraction of the elastic shear stiffness, proportional
-to the relative residual of the forces (Levenberg 1944, Marquardt 1963). The residual of the fluid is not used: it grows
+Flowing soil has almost no stiffness along its mechanisms, and negative stiffness with non-associated flow, so full
+steps overshoot far. The tangent is therefore regularised by a fraction of the elastic shear stiffness, proportional to
+the relative residual of the forces (Levenberg 1944, Marquardt 1963). The residual of the fluid is not used: it grows
 with the step length for any soil. Soil that has not yielded is regularised too, because full steps overshoot just as
 far when this soil first yields. Before any soil yields, there is no regularisation while the tangents converge. With
 regularisation, wet elastic soil would take 1.6 times the Newton steps.
 
-A few flowing points may give the tangent a negative stiffness. Newton's direction then leads backwards: a step unloads
-these points, the next step loads them again, and the iterations cycle. The work of the residuals along the direction is
-then negative, and the step is reversed.
+A few flowing points may give the tangent a negative stiffness. A Newton step then unloads these points, the next step
+loads them again, and the iterations cycle. The work of the residuals along such a step is negative, and the step is
+reversed.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ import numpy as np
 EXPLODES, SHORTEST = 1e4, 1e-3
 """Largest growth of the residual in a step without yield, and smallest fraction of the full step.
 
-Scenes take the same steps with 1e3 or 1e5 as largest growth, because the growth is below 1e3, or the residual is not
+Scenes take equal steps with 1e3 and 1e5 as largest growth, because the growth is below 1e3, or the residual is not
 finite.
 """
 WORK = 0.5
@@ -50,21 +50,27 @@ steps with 0.05, 41 with 0.1, and 43 with 0.2.
 
 @dataclass(frozen=True)
 class Halving:
-    """Search for the step length without yield. `step`: next trial, as a fraction of the full step."""
+    """Search for the step length without yield.
+
+    `step`: next trial, as a fraction of the full step.
+    """
 
     step: float = 1.0
     limit = EXPLODES
     """Largest growth of the residual at the end of a step."""
 
     def after(self, work: float, growth: float) -> Halving | None:
-        """Return the next trial, or None if the search ends. `growth`: factor by which the residual grew."""
+        """Return the next trial, or None if the search ends.
+
+        `growth`: growth factor of the residual in the last trial.
+        """
         ends = growth <= self.limit or self.step < 2 * SHORTEST
         return None if ends else Halving(0.5 * self.step)
 
 
 @dataclass(frozen=True)
 class Search:
-    """Search for a step length at which the work of the residuals is less than half of their initial work."""
+    """Search for a step length in yielding soil, by the work of the residuals."""
 
     step: float = 1.0  # next trial, as a fraction of the full step
     low: float = 0.0  # from `low` to `high` the work changes its sign

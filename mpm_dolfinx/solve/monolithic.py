@@ -5,31 +5,26 @@
     [ B   C   ] [dp] = [R_p]
 
 K is the stiffness, C the storage and B the coupling of the balances (`newton`).  The solver is GMRES, preconditioned
-from the right with the upper block triangle. In this triangle the fixed-stress operator `P = C + beta V` replaces the
+from the right with the upper block triangle.  In this triangle the fixed-stress operator `P = C + beta V` replaces the
 Schur complement `C + B K^-1 B^T`.  Here beta is the fixed-stress coefficient, and V are the cell volumes.  One
 multigrid cycle approximates K^-1, and another cycle P^-1.  The bodies that need this solver are larger in 2D than in 3D
 (see `plan`).
 
-In 3D, GMRES takes 7 to 12 iterations to the tolerance 1e-3, each with one cycle on K.  Other methods are slower.  They
-were tested with algebraic multigrid and Jacobi smoothing, with which GMRES takes 10 to 15 iterations.  Conjugate
-gradients on the Schur complement took 3 iterations, but 35 to 60 cycles in their inner solves.  Flexible GMRES with
-inner solves to tolerances of 0.1 or 0.01 took 12 to 24 cycles.  MINRES with the diagonal blocks took 17 to 23 cycles,
-and left a residual five times as large.  In 2D, GMRES takes 8 iterations to the tolerance 1e-5, and 12 iterations with
-algebraic multigrid on P.
+In 3D, GMRES takes 7 to 12 iterations to the tolerance 1e-3, each with one cycle on K.  In 2D, GMRES takes 8 iterations
+to the tolerance 1e-5.  Other methods were tested in 3D with algebraic multigrid and Jacobi smoothing, with which GMRES
+takes 10 to 15 iterations.  Conjugate gradients on the Schur complement took 35 to 60 cycles in their inner solves.
+Flexible GMRES with inner solves to tolerances of 0.1 or 0.01 took 12 to 24 cycles.  MINRES with the diagonal blocks
+took 17 to 23 cycles, and left a residual five times as large.
 
 At nu = 0.499 the cycle is inaccurate, and GMRES takes more than 100 iterations with 14^3 cells.  If a solve takes too
 many iterations (see `plan`), or is predicted to take too many, factors of K replace the cycle.  These factors are kept
 until a solve with them takes too many iterations.  With factors of an earlier tangent, a solve takes about 10
 iterations.  With new factors, a solve takes 4 to 6 iterations.  A step takes 6.2 s with kept factors, and 8.5 s with
-new factors for each tangent.  Four steps of yielding soil with 12^3 cells take 33 s with kept factors, and 41 s with
-new factors.  MUMPS factorises 3190 unknowns in 0.2 s, and 8610 unknowns in 1.4 s.  PETSc takes 3.4 s for 8610 unknowns.
-With factors, solves take up to 19 iterations (22 at nu = 0.49 with stiffness contrasts of 1e3).
+new factors for each tangent.
 
-In 2D yielding soil would take 20 to 500 iterations (footing, 41 cells, any smoother). Shear bands are one cell wide, so
-coarse grids cannot represent these bands.  With a viscosity of 0.05, GMRES takes 28 iterations.  Its time is then 0.9
-times that of a direct solver on 41 cells, but 1.7 times on 81 cells.  If the volumetric stiffness of K is moved to the
-storage (`p -> p + k B u`), K is conditioned as at nu = 0.3.  But GMRES takes 500 iterations, because alternating
-pressures have almost no stiffness.
+In 2D yielding soil would take 20 to 500 iterations (footing, 41 cells, any smoother).  Shear bands are one cell wide,
+so coarse grids cannot represent these bands.  With a viscosity of 0.05, GMRES takes 28 iterations.  The time of GMRES
+is then 0.9 times the time of a direct solver on 41 cells, but 1.7 times on 81 cells.
 """
 
 from __future__ import annotations
@@ -51,8 +46,8 @@ from mpm_dolfinx.solve.solver_choice import MUMPS, SolverPlan
 LEAST = 1e-4
 """Smallest scale of the fluid residual, divided by the fluid volume that residual forces displace in a drained body.
 
-Undrained bodies exchange nearly no fluid.  If the fluid volume is 5e5 times the scale, rounding leaves 2e-5 of a
-residual.
+Undrained bodies exchange nearly no fluid.  If the displaced volume is 5e5 times the scale, rounding leaves a residual
+of 2e-5.
 """
 
 IDLE = object()
@@ -66,18 +61,10 @@ Inverses = tuple[PETSc.PC, PETSc.PC]
 class BlockOperator:
     """Operator and preconditioner of one solve for PETSc, with scaled equations.
 
-    Parameters
-    ----------
-    momentum, storage
-        The matrices.
-    inverses
-        Approximations of K^-1 and P^-1.
-    work
-        Work vectors: two of displacements and two of pressures.
-    scale
-        Scales of the equations of both balances.
-    slopes
-        Derivative of the fluxes with respect to displacements, if the tangent includes it.
+    `inverses`: approximations of K^-1 and P^-1.
+    `work`: work vectors: two of displacements and two of pressures.
+    `scale`: scales of the equations of both balances.
+    `slopes`: derivative of the fluxes with respect to displacements, if the tangent includes it.
     """
 
     momentum: MomentumSystem
@@ -118,14 +105,14 @@ class BlockOperator:
 
     @staticmethod
     def part(x: PETSc.Vec, u: PETSc.Vec, p: PETSc.Vec, scale_u: Scale = 1.0, scale_p: Scale = 1.0) -> None:
-        """Set u to the displacement entries of x times `scale_u`, and p to the pressure entries times `scale_p`."""
+        """Split x into displacements u and pressures p, multiplied by their scales."""
         values = x.array_r
         np.multiply(values[: u.local_size], scale_u, out=u.array_w)
         np.multiply(values[u.local_size :], scale_p, out=p.array_w)
 
     @staticmethod
     def join(u: PETSc.Vec, p: PETSc.Vec, x: PETSc.Vec, scale_u: Scale = 1.0, scale_p: Scale = 1.0) -> None:
-        """Set the displacement entries of x to u times `scale_u`, and the pressure entries to p times `scale_p`."""
+        """Set x to the displacements u and the pressures p, multiplied by their scales."""
         values = x.array_w
         np.multiply(u.array_r, scale_u, out=values[: u.local_size])
         np.multiply(p.array_r, scale_p, out=values[u.local_size :])
@@ -134,7 +121,8 @@ class BlockOperator:
 class BlockSolver:
     """GMRES for displacements and pressures together.
 
-    `how`: solver plan.  `momentum`, `storage`: the matrices.
+    `how`: solver plan.
+    `momentum`, `storage`: the matrices.
     `cycles`: two preconditioners, a multigrid cycle on K and a multigrid cycle on P.
     """
 
@@ -170,16 +158,11 @@ class BlockSolver:
     ) -> tuple[int, Inverses | None]:
         """Solve for (du, dp) with the residuals of both balances as right-hand side.
 
-        Parameters
-        ----------
-        scales : (parts,) and (parts,)
-            Scales of the momentum residual (N) and of the fluid residual (m^d) in each connected part.
-        rtol
-            Tolerance relative to the norm of both scaled residuals, for each part.
-        slopes
-            Derivative of the fluxes with respect to displacements, if the tangent includes it.
-        factors
-            Factors that already replace the cycles, or None.
+        `scales` (parts,) and (parts,): scales of the momentum residual (N) and of the fluid residual (m^d) in each
+        connected part.
+        `rtol`: tolerance relative to the norm of both scaled residuals, for each part.
+        `slopes`: derivative of the fluxes with respect to displacements, if the tangent includes it.
+        `factors`: factors that already replace the cycles, or None.
 
         Returns
         -------
@@ -208,7 +191,7 @@ class BlockSolver:
         return count, factors
 
     def _iterate(self, inverses: Inverses, scale: tuple, slopes: tuple, rtol: float, most: int) -> int:
-        """Solve with approximations of K^-1 and P^-1.  Return the number of iterations, at most `most`."""
+        """Solve with approximations of K^-1 and P^-1, and return the number of iterations."""
         operator = BlockOperator(self._momentum, self._storage, inverses, self._work, scale, slopes)
         self._A.setPythonContext(operator)
         self._ksp.pc.setPythonContext(operator)
@@ -219,7 +202,7 @@ class BlockSolver:
         return solved(self._ksp, "momentum and storage")
 
     def _factorised(self) -> Inverses:
-        """Return preconditioners for this and later tangents: factors of the present K, and in 2D also of P."""
+        """Return factors of K, and in 2D of P, as preconditioners for this and later tangents."""
         K, unknowns = self._momentum.K, self._momentum.unknowns
         solvers = [displacement_solver(K, "factors", unknowns, self._plan.fallback, self._plan.symmetric)]
         if unknowns.dim == 2:
@@ -232,7 +215,7 @@ class BlockSolver:
 
 
 def _foresight(many: int) -> Callable[[PETSc.KSP, int, float], None]:
-    """Return a monitor that ends a solve if the last `many / 4` iterations predict more than `many` in all."""
+    """Return a monitor that ends a solve if its last iterations predict more than `many` iterations."""
     quarter = max(1, many // 4)
 
     def monitor(ksp: PETSc.KSP, count: int, norm: float) -> None:

@@ -3,7 +3,7 @@
 
 A coarse unknown belongs to a node, or a cell, of a grid with half as many cells along each axis. Displacements are
 interpolated linearly along each axis between nodes, and pressures between cell centres. Coarse matrices are Q^T A Q
-(Galerkin) with the interpolation Q, so cut cells, penalties and laws need no special treatment.
+(Galerkin) with the fine matrix A and the interpolation Q, so cut cells, penalties and laws need no special treatment.
 
 With 504000 displacements and 251000 pressures in 2D (10^6 points), both hierarchies of grids take 0.33 s. The coarse
 matrices of a tangent take 0.1 s, and a cycle takes 0.06 s. A step takes 2.6 s, but 7.6 s with factors (including
@@ -37,8 +37,7 @@ FIRMLY = {"mg_levels_ksp_type": "chebyshev", "mg_levels_ksp_max_it": "3"}
 """Smoother for nearly incompressible bodies where a direct solver cannot replace multigrid.
 
 The test is a cube of 14^3 cells with nu = 0.49, in layers with a stiffness ratio of 1000. GMRES takes 126 iterations
-with this smoother, and 112 iterations with GAMG. With the smoother of `OPTIONS`, GMRES fails. If a direct solver
-replaces multigrid after a failure, both smoothers are equally fast.
+with this smoother, and 112 iterations with GAMG. With the smoother of `OPTIONS`, GMRES fails.
 """
 MAYBE, NOT, IS = range(3)  # see `_shared`
 NONE = np.iinfo(np.int64).max
@@ -58,25 +57,17 @@ def multigrid_solver(
 
     GMRES also solves with tangents that are unsymmetric or, in buckling bodies, indefinite.
 
-    Parameters
-    ----------
-    A
-        Matrix, which may still be empty.
-    name
-        Prefix of the solver's PETSc options.
-    places : (n, d + 1)
-        Unknowns of this process: indices along the grid axes, and index of the component, all >= 0. Each component is
-        interpolated separately.
-    held : (m, d + 1)
-        Fixed degrees of freedom in cells of bodies, described like `places`. Interpolated displacements vanish there.
-    nodal
-        Whether the unknowns belong to nodes.
-    coarsest
-        Largest number of unknowns of the coarsest grid, which has a direct solver.
-    firmly
-        Whether to use the stronger smoother `FIRMLY`.
-    lines : (n,) along each axis, m
-        Grid lines, for cells of different sizes. Interpolation of displacements then uses the distances of nodes.
+    `A`: matrix, which may still be empty.
+    `name`: prefix of the solver's PETSc options.
+    `places` (n, d + 1): unknowns of this process: indices along the grid axes, and index of the component, all >= 0.
+    Each component is interpolated separately.
+    `held` (m, d + 1): fixed degrees of freedom in cells of bodies, described like `places`. Interpolated displacements
+    vanish there.
+    `nodal`: whether the unknowns belong to nodes.
+    `coarsest`: largest number of unknowns of the coarsest grid, which has a direct solver.
+    `firmly`: whether to use the stronger smoother `FIRMLY`.
+    `lines` (n,) along each axis, m: grid lines, for cells of different sizes. Interpolation of displacements then uses
+    the distances of nodes.
     """
     ksp = PETSc.KSP().create(A.comm)
     ksp.setType(PETSc.KSP.Type.GMRES)
@@ -104,7 +95,7 @@ def interpolations(
 ) -> list[PETSc.Mat]:
     """Return the interpolations from each coarse grid to the next finer grid, beginning with the finest grid.
 
-    comm: processes that share the unknowns; other parameters as in `multigrid_solver`.
+    `comm`: processes that share the unknowns. For other parameters see `multigrid_solver`.
     """
     steps: list[PETSc.Mat] = []
     size = before = over_all(comm, len(places))
@@ -157,7 +148,7 @@ def interpolation(
 def _hats(
     places: NDArray[np.int64], nodal: bool, lines: Sequence[NDArray[np.float64]] | None = None
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-    """Return three arrays for the m entries of an interpolation: fine unknown, coarse place (m, d + 1), and weight."""
+    """Return the fine unknown, the coarse place, and the weight of each entry of an interpolation."""
     half, odd = np.divmod(places[:, :-1], 2)
     if nodal:
         share = 0.5
@@ -181,13 +172,10 @@ def _hats(
 def _shared(
     comm: MPI.Intracomm, keys: NDArray[np.int64], count: int, stated: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Return two arrays (n,) for the candidates: index of the unknown or `NONE`, and whether this process owns it.
+    """Return the index of the unknown of each candidate, and whether this process owns it.
 
-    The process of lowest rank with a candidate owns the unknown. Keys are distributed over processes to find owners.
-
-    `keys` (n,): coarse candidates of this process, ascending, below `count`.
-    `stated` (n,): status `MAYBE`, `NOT` or `IS` of each candidate on this process. The largest value of all processes
-    counts.
+    The process of lowest rank with a candidate owns the unknown. Keys are distributed over processes to find owners. A
+    candidate has the largest status (`MAYBE`, `NOT` or `IS`) of all processes.
     """
     ask = Exchange(comm, (keys * comm.size // count).astype(np.int32))
     distinct, who = np.unique(ask.send(keys), return_inverse=True)

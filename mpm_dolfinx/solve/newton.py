@@ -3,22 +3,23 @@
 
 Unconnected parts of the bodies are in equilibrium independently of each other. In each part, the momentum residual is
 divided by the forces, and the fluid residual by the exchanged fluid volume. A line search sets the step length of each
-part, whatever the state and stiffness of other parts.
+part separately.
 
 A Newton step of the two problems reads
 
     [ K  -B^T ] [du]     [R_u]
     [ B   C   ] [dp] = - [R_p].
 
-K, B and C are derivatives of the residuals: R_u changes by `K du - B^T dp`, and R_p by `B du + C dp`. `schur-cg`
-eliminates du, and solves for dp by conjugate gradients with the Schur complement `S = C + B K^-1 B^T`. The
+K, B and C are derivatives of the residuals: R_u changes by `K du - B^T dp`, and R_p by `B du + C dp`. The scheme
+`schur-cg` eliminates du, and solves for dp by conjugate gradients with the Schur complement `S = C + B K^-1 B^T`. The
 preconditioner is the fixed-stress operator `C + beta V`, with cell volumes V and `beta = 0.75 alpha^2 / K_dr`. Here
 alpha is Biot's coefficient, and K_dr is the drained bulk modulus. This operator is filtered: beta V is smaller for
-pressures that alternate from cell to cell (`StorageProblem.assemble_preconditioner`). `schur-fgmres` uses FGMRES and
-the full, slightly unsymmetric Jacobian instead. `fixed-stress` is the Richardson iteration of the fixed-stress split.
-Storage solves with `C + beta V` at constant stress alternate with momentum solves. Large bodies use multigrid, because
-a direct solver is too expensive. With multigrid, `schur-cg` and `schur-fgmres` solve for both unknowns together, see
-`monolithic`.
+pressures that alternate from cell to cell (`StorageProblem.assemble_preconditioner`).
+
+The scheme `schur-fgmres` uses FGMRES and the full, slightly unsymmetric Jacobian instead. The scheme `fixed-stress` is
+the Richardson iteration of the fixed-stress split: storage solves with `C + beta V` at constant stress alternate with
+momentum solves. Large bodies use multigrid, because a direct solver is too expensive. With multigrid, `schur-cg` and
+`schur-fgmres` solve for both unknowns together, see `monolithic`.
 """
 
 from __future__ import annotations
@@ -48,12 +49,13 @@ INNER = 1e-3  # momentum tolerance / storage error; it is small because unconver
 MOMENTUM_STEPS = 10
 REBALANCED = 6  # largest number of iterations if contacts change, divided by the number if they do not
 LOOSEST = 1e-2
-"""Largest ratio of the residual after a linear solve to the residual before this solve. Halving this value changes the
-result of scene "soil" in tests/plateaus.py by 2.2e-11 (relative), doubling it by 6.0e-12, and finer cells by 3.0e-02.
+"""Largest ratio of the residual after a linear solve to the residual before this solve. The result of scene "soil" in
+tests/plateaus.py changes by the fraction 2.2e-11 with half this value, by 6.0e-12 with twice this value, and by 3.0e-02
+with finer cells.
 """
 SOLVED = 0.05
-"""Residual after the last linear solve, divided by the tolerance.  Halving this value changes the result of scene
-"soil" in tests/plateaus.py by 4.0e-12 (relative), doubling it by 3.1e-11, and finer cells by 3.0e-02.
+"""Residual after the last linear solve, divided by the tolerance.  The result of scene "soil" in tests/plateaus.py
+changes by the fraction 4.0e-12 with half this value, by 3.1e-11 with twice this value, and by 3.0e-02 with finer cells.
 """
 SETTLED = 1e-2  # residual below which slip of contacts may end; above it the contact area still changes
 ERROR = 1 / 20
@@ -67,12 +69,12 @@ source, and 0.01 to 0.05 e late in a consolidation. The error is 0.17 e in a fir
 a jump. In a run it is at most 5 e / 20.
 """
 SUDDEN = np.sqrt(2)
-"""sdirk2 overshoots if the ratio of pressure changes in the second and the first substep is less than this value.
+"""Limit of the ratio of pressure changes in the second and the first substep, below which sdirk2 overshoots.
 
 With `z = -(decay rate) dt`, the stability function `(1 + (1 - 2 gamma) z) / (1 - gamma z)^2` changes its sign at `z =
 -1 - sqrt(2)`. At this z, a pressure changes by `-gamma z / (1 - gamma z) = sqrt(2) - 1` in the first substep, and by `2
-- sqrt(2)` in the second substep. If pressures follow loads, the ratio of these changes is `(1 - gamma) / gamma`.
-Source: exact, the ratio of these changes.
+- sqrt(2)` in the second substep. If pressures follow loads, the ratio of the two changes is `(1 - gamma) / gamma`.
+Source: exact, this ratio.
 """
 
 
@@ -82,7 +84,7 @@ AsReset = Callable[[], AbstractContextManager[QuadratureData]]
 
 @dataclass(frozen=True, eq=False)
 class Errors:
-    """Relative residuals of momentum and storage in the connected parts of the bodies; arrays (parts,)."""
+    """Relative residuals of momentum and storage. Arrays have an entry for each connected part of the bodies."""
 
     u: NDArray[np.float64]  # relative residual of momentum
     p: NDArray[np.float64]  # relative residual of storage
@@ -114,20 +116,12 @@ def solve_substep(
 ) -> Rates | None:
     """Solve the equations of a substep for the functions (u, p) of the forms. Return the outflow rates at the end.
 
-    Parameters
-    ----------
-    solvers
-        Linear solvers for the unknowns of the active cells.
-    momentum, storage
-        The balances. `storage` is None without fluid.
-    ahead
-        Function that extrapolates (u, p) at active dofs and cells from the last steps, or None.
-    as_reset, key
-        See `OnGrid.as_reset`. Linear laws use the tangent at the reset until `key` changes.
-    report
-        Report of the step, to which this function adds the counts of the substep.
-    kept
-        Data that the tangents of the step share.
+    `solvers`: linear solvers for the unknowns of the active cells.
+    `momentum`, `storage`: the balances. `storage` is None without fluid.
+    `ahead`: function that extrapolates (u, p) at active dofs and cells from the last steps, or None.
+    `as_reset`, `key`: see `OnGrid.as_reset`. Linear laws use the tangent at the reset until `key` changes.
+    `report`: report of the step. The counts of the substep are added to this report.
+    `kept`: data that the tangents of the step share.
 
     Raises
     ------
@@ -171,11 +165,11 @@ def note_pressures(
     The fluid volumes after the step and after a first-order step differ by `seconds` times the change of rates between
     substeps. The fixed-stress operator converts this difference into a pressure that is bounded for stiff modes, as in
     Hosea and Shampine (1996). The error of the step is assumed to be `ERROR` times this pressure. Errors and changes in
-    a cell are weighted by the filling of the cell.
+    a cell are weighted by the volume fraction of material in the cell.
 
-    `seconds`, s: time weight of the rates of the first substep. `dt`, s: length of the step.
-    `of_bodies`: function of n active owned cells and values (k, n), which returns the largest values (k, bodies) in
-    each body; see `Motion.of_bodies`.
+    `seconds`, s: time weight of the rates of the first substep.
+    `dt`, s: length of the step.
+    `of_bodies`: function for the largest values in each body, see `Motion.of_bodies`.
     """
     if storage is None or not report.newton:
         return
@@ -201,10 +195,7 @@ def note_pressures(
 class Newton:
     """Newton's method for the balances in one substep.
 
-    Parameters
-    ----------
-    solvers, momentum, storage, kept
-        See `solve_substep`.
+    `solvers`, `momentum`, `storage`, `kept`: see `solve_substep`.
     """
 
     def __init__(self, solvers: LinearSolvers, momentum: MomentumProblem, storage: StorageProblem | None, kept: Kept):
@@ -223,7 +214,9 @@ class Newton:
         """Solve the balances by Newton's method.
 
         A tangent is reused while the iterations converge, and with linear laws over many steps.
-        `serves`: whether the tangent of the previous substep may be reused. `ahead`: see `solve_substep`.
+
+        `serves`: whether the tangent of the previous substep may be reused.
+        `ahead`: see `solve_substep`.
         """
         errors, other = self._begin(ahead)
         fresh = self._linear or not serves
@@ -236,7 +229,10 @@ class Newton:
         return self._stable(self._iterations(errors, as_reset, key, fresh))
 
     def _iterations(self, errors: Errors, as_reset: AsReset, key: Hashable, fresh: bool) -> Errors:
-        """Iterate from the present (u, p). `errors`: errors at (u, p). `fresh`: whether to start with a new tangent."""
+        """Iterate from the present (u, p).
+
+        `fresh`: whether to start with a new tangent.
+        """
         elastic = self._momentum.forms.elastic
         tolerance = self._scheme.tolerance
         keep = self._solvers.plan.keep
@@ -270,9 +266,9 @@ class Newton:
         return found
 
     def _augmented(self, errors: Errors) -> Errors:
-        """Update contacts until no contact changes or a residual exceeds the tolerance. Return the errors.
+        """Update contacts until no contact changes or a residual exceeds the tolerance, and return the errors.
 
-        Raise NotConverged if the updates are as many as the largest number of Newton iterations.
+        The largest number of updates is the largest number of Newton iterations.
         """
         momentum = self._momentum
         count = 0
@@ -282,10 +278,10 @@ class Newton:
         return errors
 
     def _begin(self, ahead: Callable | None) -> tuple[Errors, list[NDArray[np.float64]] | None]:
-        """Choose the start of Newton's method, and return the errors at this start.
+        """Choose the start of Newton's method. Return the errors at the start, and the previous (u, p) or None.
 
-        The second result is the previous (u, p), or None if the start is the previous (u, p). The start is `ahead` if
-        the square of its residual is small. Otherwise each part starts at its guess of least residual.
+        The start is `ahead` if the square of its residual is small. Otherwise each part starts at its guess of least
+        residual. The result is None instead of the previous (u, p) if the start is the previous (u, p).
         """
         start = self._iterate()
         if ahead is not None:
@@ -321,7 +317,7 @@ class Newton:
         return (errors, None) if at is start[0] and not guesses else (found, None if at is start[0] else start)
 
     def _iterate(self) -> list[NDArray[np.float64]]:
-        """Return copies of the present u (m) at active degrees of freedom, and p (Pa) in active cells."""
+        """Return copies of the present u and p."""
         return [x.array[rows] for x, rows in self._vectors]
 
     @cached_property
@@ -339,10 +335,10 @@ class Newton:
     def _stable(self, found: Errors) -> Errors:
         """Return the errors. Raise NotConverged if the equilibrium is unstable.
 
-        Smaller steps find the path that leaves an unstable equilibrium. The tangent of an unstable equilibrium has
-        negative eigenvalues. Only dry bodies with symmetric, factorised tangents are checked, because water delays
-        buckling. A tangent kept for a step shows an instability only in the next step. If only soft springs resist a
-        motion, a stable solution may seem unstable. One more Newton step decides such cases.
+        The tangent of an unstable equilibrium has negative eigenvalues. Smaller steps find the path that leaves this
+        equilibrium. Only dry bodies with symmetric, factorised tangents are checked, because water delays buckling. A
+        tangent kept for a step shows an instability only in the next step. If only soft springs resist a motion, a
+        stable solution may seem unstable. One more Newton step decides such cases.
         """
         plan = self._solvers.plan
         if not self.report.newton or self._storage is not None or not plan.symmetric or plan.iterative:
@@ -401,13 +397,11 @@ class Newton:
             raise NotConverged(f"no convergence in {count} iterations", self.report.history)
 
     def _errors(self, start: NDArray[np.float64] | None = None) -> Errors:
-        """Assemble both residuals. Return the norm of each residual divided by its scale, and add both to the history.
+        """Assemble both residuals, add their relative norms to the history, and return the norms.
 
-        `start` (parts,), N: forces at the start of the step. Forces at earlier iterates are not part of the scale,
-        because after a diverging iterate every residual would seem small.
-
-        Residuals within round-off are returned as 0. In the history these residuals are divided by scales of at least
-        `round_off / tolerance`.
+        The scales contain the forces at the start of the step, but no forces at earlier iterates: after a diverging
+        iterate every residual would seem small. Residuals within round-off are returned as 0. The history has their
+        true norms, divided by scales of at least `round_off / tolerance`.
         """
         first = not self.report.history
         with _compat.Timer("residual"):
@@ -430,7 +424,7 @@ class Newton:
         return Errors(u, p, forces, exchanged, forces if start is None else start, fluid)
 
     def _linearise(self, firmness: NDArray[np.float64] | float = 0.0) -> None:
-        """Set the tangent at the present (u, p), for this step only. `firmness`: see `LinearSolvers.linearise`."""
+        """Set the tangent at the present (u, p), for this step only."""
         self._solvers.tangent.clear()
         self._solvers.linearise(self._momentum, self._storage, self._kept, firmness=firmness)
 
@@ -444,8 +438,8 @@ class Newton:
     def _direction(self, errors: Errors, slow: bool) -> int:
         """Solve the linearised problem, and return the number of coupling iterations.
 
-        `slow`: whether a new tangent has hardly reduced the residual of the storage, and this is the larger residual.
-        The tangent then also contains the derivative of fluxes with respect to displacements.
+        `slow`: whether a new tangent has hardly reduced the residual of the storage, and this residual is the larger
+        one. The tangent then also contains the derivative of fluxes with respect to displacements.
         """
         # the next residual needs no more accuracy
         iterative, least = self._solvers.plan.iterative, self._solvers.plan.forcing
@@ -476,7 +470,7 @@ class Newton:
             return count
 
     def _line_search(self, before: Errors, elastic: bool) -> Errors:
-        """Move u and p against the Newton direction, with a line search in each part, and return the errors."""
+        """Move u and p against the Newton direction in each part, and return the errors."""
         self.report.newton += 1
         of = self._momentum.system.of_parts
         moved = np.zeros(of.count)
@@ -505,10 +499,7 @@ class Newton:
                 return errors
 
     def _tried(self, before: Errors | None) -> tuple[Errors | None, NotConverged | None]:
-        """Return the errors after a trial step, and None.
-
-        If a law fails, the errors are infinite (None without `before`), and the second result is the exception.
-        """
+        """Return the errors after a trial step, and the exception if a law fails."""
         try:
             return self._errors(before and before.start), None
         except NotConverged as failed:
@@ -519,9 +510,9 @@ class Newton:
             return replace(before, u=away, p=away), failed
 
     def _work(self) -> NDArray[np.float64]:
-        """Return the work (parts,), in J, of both residuals along the Newton direction.
+        """Return the work of both residuals along the Newton direction, in J.
 
-        The coupling terms cancel in the sum of the two works. The work thus depends only on the diagonal blocks of the
+        The coupling terms cancel in the sum of the two works. The sum thus depends only on the diagonal blocks of the
         tangent.
         """
         system = self._momentum.system
@@ -532,7 +523,7 @@ class Newton:
         return work + system.of_parts.sums(system.residual.array_r * self._solvers.dp.array_r)
 
     def _move(self, steps: NDArray[np.float64]) -> None:
-        """Add the fractions `steps` (parts,) of the Newton direction to u and p in each part."""
+        """Add fractions of the Newton direction to u and p in each part."""
         system = self._momentum.system
         system.unknowns.add(self._momentum.forms.u, steps[system.of_parts.of], self._solvers.du)
         if self._storage is not None:
@@ -541,5 +532,5 @@ class Newton:
 
 
 def _ratio(part: float, whole: float) -> float:
-    """Return the ratio of `part` to `whole`, or nan if this ratio is not finite."""
+    """Return a ratio, or nan if it is not finite."""
     return part / whole if whole and np.isfinite(part) else np.nan

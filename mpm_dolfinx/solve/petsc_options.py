@@ -37,7 +37,7 @@ def check(options: Mapping[str, Any]) -> None:
 
 @contextmanager
 def using(options: Mapping[str, Any], unread: set[str] | None = None) -> Iterator[None]:
-    """Set the user's PETSc options while solvers are created.  Remove the options that solvers read from `unread`."""
+    """Set the user's PETSc options while solvers are created. Options that solvers read are removed from `unread`."""
     given, before = PETSc.Options(), {}
     for name, value in options.items():
         full = f"mpm_{name}"
@@ -62,7 +62,7 @@ def set_defaults(solver: PETSc.KSP, values: Mapping[str, Any]) -> None:
 
 
 def _read(name: str) -> bool:
-    """Return whether PETSc has read an option; petsc4py lacks this function."""
+    """Return whether PETSc has read an option."""
     found = ctypes.c_int()
     ctypes.CDLL(PETSc.__file__).PetscOptionsUsed(None, name.encode(), ctypes.byref(found))
     return bool(found.value)

@@ -17,8 +17,8 @@ COUPLINGS = {
     "fixed-stress-full": 1.0,
     "fixed-stress-fluid": None,
 }
-"""Coupling schemes, each with the factor f in the fixed-stress coefficient `beta = f alpha^2 / K_dr`. None means `beta
-= 1 / K_w`.
+"""Coupling schemes, each with the factor f in the fixed-stress coefficient `beta = f alpha^2 / K_dr`. With None, beta
+is `1 / K_w`.
 """
 
 
@@ -69,5 +69,5 @@ class Scheme:
 
     @property
     def beta(self) -> float:
-        """Factor f in the fixed-stress coefficient, see `COUPLINGS`, or 1 in the scheme with `beta = 1 / K_w`."""
+        """Factor f in the fixed-stress coefficient, see `COUPLINGS`. It is 1 in the scheme with `beta = 1 / K_w`."""
         return COUPLINGS[self.coupling] or 1.0

@@ -8,9 +8,9 @@
 solved by conjugate gradients (or FGMRES), with the fixed-stress operator as preconditioner. For large bodies GMRES
 solves for both unknowns (`monolithic`).
 
-PETSc's PCFIELDSPLIT (full Schur factorisation) with equal solvers takes equally many iterations, and its results have
-equal digits. It takes 0.8 to 1 times the time of the present solves. But PCFIELDSPLIT needs a copy of -B^T for each
-tangent, and fixed-stress iterations would still need separate blocks.
+PETSc's PCFIELDSPLIT (full Schur factorisation) takes 0.8 to 1 times the time of these solves, and equally many
+iterations. But PCFIELDSPLIT needs a copy of -B^T for each tangent, and fixed-stress iterations would still need
+separate blocks.
 """
 
 from __future__ import annotations
@@ -41,7 +41,10 @@ from mpm_dolfinx.solve.solver_choice import AT_ONCE, MULTIGRID, MUMPS, SolverPla
 
 
 def planned(scheme: Scheme, momentum: MomentumSystem, storage: StorageSystem | None, symmetric: bool) -> SolverPlan:
-    """Return the solver plan for problems with these matrices. `symmetric`: whether K is symmetric."""
+    """Return the solver plan for problems with these matrices.
+
+    `symmetric`: whether K is symmetric.
+    """
     unknowns = momentum.unknowns
     return plan(
         unknowns.global_size,
@@ -59,7 +62,8 @@ def planned(scheme: Scheme, momentum: MomentumSystem, storage: StorageSystem | N
 class SchurComplement:
     """Matrix-free Schur complement `S = C + B K^-1 B^T` for PETSc's Krylov solvers.
 
-    `storage`: the matrices B and C. `solve`: solver for systems with K.
+    `storage`: the matrices B and C.
+    `solve`: solver for systems with K.
     `f`, `v`: work vectors for the forces `B^T x` and the displacements `K^-1 f`.
     `slopes`: derivative of the fluxes with respect to displacements, if the tangent includes this derivative.
     """
@@ -96,8 +100,9 @@ class Kept:
 class LinearSolvers:
     """Linear solvers for the matrices of one set of active cells.
 
-    `how`: solver plan, see `planned`. `scheme`: coupling scheme.
-    `momentum`, `storage`: matrices and vectors of the balances; `storage` is None without fluid.
+    `how`: solver plan, see `planned`.
+    `scheme`: coupling scheme.
+    `momentum`, `storage`: matrices and vectors of the balances. `storage` is None without fluid.
     """
 
     def __init__(self, how: SolverPlan, scheme: Scheme, momentum: MomentumSystem, storage: StorageSystem | None):
@@ -168,8 +173,7 @@ class LinearSolvers:
 
         `kept`: data that the tangents of the step share.
         `data`: integration points, by default the points of the problems.
-        `firmness`: fraction of the elastic shear stiffness that is added, as one number or as one for each connected
-        part.
+        `firmness`: fraction of the elastic shear stiffness that is added, as one number or one for each connected part.
         """
         kept = kept or Kept()
         with _compat.Timer("tangent"):
@@ -200,7 +204,7 @@ class LinearSolvers:
         return True
 
     def _tell_unread(self) -> None:
-        """Warn of options that no solver has read, once all solvers have been created."""
+        """Warn of options that no solver has read."""
         if not self.scheme.petsc_options:
             return
         comm = self.du.comm.tompi4py()
@@ -218,16 +222,10 @@ class LinearSolvers:
     ) -> int:
         """Solve for (du, dp) with the present residuals, and return the number of coupling iterations.
 
-        Parameters
-        ----------
-        kept
-            Data that the tangents of the step share.
-        rtol
-            Relative tolerance, for each connected part.
-        forces, exchanged : (parts,)
-            Scales of the residuals: forces (N) and exchanged fluid volume (m^d).
-        slope
-            Derivative of the fluxes with respect to displacements, if the tangent includes it.
+        `kept`: data that the tangents of the step share.
+        `rtol`: relative tolerance, for each connected part.
+        `forces`, `exchanged` (parts,): scales of the residuals: forces (N) and exchanged fluid volume (m^d).
+        `slope`: derivative of the fluxes with respect to displacements, if the tangent includes it.
         """
         slopes = () if slope is None else (slope,)
         if self._storage is None:
@@ -265,7 +263,7 @@ class LinearSolvers:
         of: OfParts,
         measured: Callable[[PETSc.Vec, PETSc.Vec], None] | None = None,
     ) -> None:
-        """Solve iteratively for x with equal relative accuracy in all connected parts, whose scales may differ.
+        """Solve iteratively for x with equal relative accuracy in all connected parts.
 
         `measured`: function that converts b to the vector whose norm the solver computes, or None for b itself.
         """
@@ -282,7 +280,7 @@ class LinearSolvers:
         x.array_w[:] *= scale
 
     def restrain(self, storage: StorageProblem, log_change: NDArray[np.float64] | float) -> NDArray[np.float64] | float:
-        """Limit the pressure decreases of the Newton direction (see `restrained`), and update its displacements."""
+        """Limit the pressure decreases of the Newton direction (see `restrained`), and update the displacements."""
         if not storage.forms.retains:
             return log_change
         dp, log_change = storage.restrained(self.dp.array_r, log_change)
@@ -294,13 +292,13 @@ class LinearSolvers:
         return log_change
 
     def _follow(self) -> None:
-        """Solve the balance of momentum for the displacements of the Newton direction, with its pressures."""
+        """Solve the balance of momentum for the displacements at the pressures of the Newton direction."""
         self._storage.B_momentum.multTranspose(self.dp, self._rhs)
         self._rhs.axpy(1.0, self._momentum.residual)
         self.solve_u.solve(self._rhs, self.du)
 
     def turn_round(self, parts: NDArray[np.bool_] | None = None) -> None:
-        """Reverse the Newton direction in the parts of a mask (parts,), or in all parts."""
+        """Reverse the Newton direction in some parts, or in all parts."""
         directions = [(self.du, self._momentum)] + ([(self.dp, self._storage)] if self._storage is not None else [])
         for direction, system in directions:
             if parts is None or parts.all():
@@ -316,7 +314,7 @@ class LinearSolvers:
         return self._g
 
     def filtered(self, volumes: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return pressures `P^-1 volumes` (Pa) from volumes (m^d) of owned cells. P: fixed-stress operator."""
+        """Apply the inverse of the fixed-stress operator to volumes (m^d) of owned cells, and return pressures (Pa)."""
         self._g.array_w[:] = volumes
         self._solve_s.pc.apply(self._g, self.dp)
         return self.dp.array_r
@@ -331,6 +329,6 @@ class LinearSolvers:
             self.solve_u.solve(self._momentum.residual, self.du)
 
     def solve_storage(self) -> PETSc.Vec:
-        """Solve for dp at fixed stress, and return it."""
+        """Solve for dp at fixed stress, and return dp."""
         self._solve_s.solve(self._storage.residual, self.dp)
         return self.dp

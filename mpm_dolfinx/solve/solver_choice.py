@@ -21,26 +21,20 @@ class Thresholds:
     """Thresholds between methods. `bash demos/run.sh calibrate` measures times on both sides of each threshold.
 
     multigrid_3d
-        Number of unknown displacements in 3D from which multigrid is used. Five load steps of a square beam take 0.5 s
-        (1200 unknowns), 2.5 s (2600) and 8.2 s (4900) with a direct solver. They take 0.5 s (1200 unknowns), 1.4 s
-        (2600) and 2.1 s (4900) with multigrid.
+        Number of unknown displacements in 3D from which multigrid is used. Two steps of a block take, with a direct
+        solver and with multigrid: 0.66 and 0.59 s with 1656 unknowns, 5.6 and 1.8 s with 5460, 32 and 4.0 s with 12784.
     multigrid_2d
-        Number of unknown displacements in wet 2D scenes without yield from which multigrid is used. A step of the beam
-        takes 0.06 s (10400 unknowns), 0.19 s (25500), 0.53 s (51000) and 2.3 s (151000) with a direct solver. It takes
-        0.05 s (10400 unknowns), 0.14 s (25500), 0.32 s (51000) and 1.0 s (151000) with multigrid.
+        The same limit in wet 2D scenes without yield. From 8000 to 74000 unknowns, the times of both solvers are equal
+        within 15 %. Beyond, the work of factors grows faster, with the number of unknowns to the power 1.5.
     mumps
-        Number of unknown displacements from which MUMPS computes factors in wet scenes. MUMPS is used only if K is not
-        symmetric, or on several processes. The processes then share the factors. Below this number one process holds
-        the factors of K, which have 1.5e7 entries (0.12 GB) at the limit. On two processes, the factors of K take 20 ms
-        (5700 unknowns), 174 ms (25500), 708 ms (61400) and 1481 ms (100100) with PETSc on one of the processes. With
-        MUMPS they take 16 ms (5700 unknowns), 98 ms (25500), 306 ms (61400) and 476 ms (100100). A solve takes 0.5 ms
-        (5700 unknowns), 3.5 ms (25500), 11 ms (61400) and 18 ms (100100) with PETSc. With MUMPS it takes 3.8 ms (5700
-        unknowns), 15 ms (25500), 37 ms (61400) and 57 ms (100100). Without pressures, MUMPS thus pays if a tangent is
-        used for fewer solves than 1 (5700 unknowns), 7 (25500), 16 (61400) or 26 (100100). A Newton step of a footing
-        takes 15 solves.
+        Number of unknown displacements from which MUMPS computes the factors in wet scenes. With unsymmetric K this
+        holds on any number of processes, with symmetric K on several processes. The processes then share the factors.
+        Below this number, one process holds the factors of K. On one process, two steps of a yielding block take with
+        blocks of nodes and with MUMPS: 1.4 and 3.1 s with 8192 unknowns, 6.6 and 8.3 s with 32768, 18 and 36 s with
+        73728. With 100000 unknowns, the factors of K have 1.5e7 entries (0.12 GB).
     fallback_3d
-        Largest number of unknown displacements in 3D for which a direct solver may replace multigrid. MUMPS takes 8 s
-        and 0.2 GB for this number, and 15 s and 0.4 GB with an unsymmetric K.
+        Largest number of unknown displacements in 3D for which a direct solver may replace multigrid. Beyond, factors
+        need too much memory and time.
     many
         If a solve takes more iterations than this, a direct solver replaces multigrid, or the next tangent renews the
         factors of the fixed-stress operator. Limits of 12, 25, 50 and 500 give equally many Newton steps (footing, 9
@@ -59,18 +53,19 @@ class Thresholds:
 
 THRESHOLDS = Thresholds()
 FORCING = 1e-5
-"""Tightest relative tolerance of a linear solve.  Halving this value changes the result of scene "soil" in
-tests/plateaus.py by 4.0e-11 (relative), doubling it by 1.2e-11, and finer cells by 3.0e-02.
+"""Tightest relative tolerance of a linear solve.  The result of scene "soil" in tests/plateaus.py changes by the
+fraction 4.0e-11 with half this value, by 1.2e-11 with twice this value, and by 3.0e-02 with finer cells.
 """
 FORCING_3D = 1e-3
 """Tightest relative tolerance of a linear solve with multigrid in 3D."""
 KEEP = 0.05
-"""Largest ratio of successive residuals for which the tangent is reused.  Halving this value changes the result of
-scene "soil" in tests/plateaus.py by 4.9e-11 (relative), doubling it by 1.0e-11, and finer cells by 3.0e-02.
+"""Largest ratio of successive residuals for which the tangent is reused.  The result of scene "soil" in
+tests/plateaus.py changes by the fraction 4.9e-11 with half this value, by 1.0e-11 with twice this value, and by 3.0e-02
+with finer cells.
 """
 KEEP_WET = 0.01
-"""Value of `KEEP` in wet 2D scenes without yield.  Halving this value changes the result of scene "beam" in
-tests/plateaus.py by 1.8e-11 (relative), doubling it by 2.9e-10, and finer cells by 1.5e-02.
+"""Value of `KEEP` in wet 2D scenes without yield.  The result of scene "beam" in tests/plateaus.py changes by the
+fraction 1.8e-11 with half this value, by 2.9e-10 with twice this value, and by 1.5e-02 with finer cells.
 """
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""End of a step. Particle domains move with the grid, their corners determine F, and their pieces store pressures.
+"""End of a step: particle domains move with the grid, their corners determine F, and their pieces store pressures.
 
 The grid is reset at the start of the next step, see `grid_reset`.
 """
@@ -50,14 +50,15 @@ from mpm_dolfinx.stepping.state import State, Stay, Trend
 TAKES_IN = 0.1
 """Rate of correction of the volume defect `owed` of the points, for a motion of their connected part by a cell size.
 
-The mean defect of an undrained part without sources is corrected at once, so that this part keeps its volume. Twenty
-undrained cycles of a beam of 5 cells leave spurious stresses of 7.7 % with a rate of 0, 3.8 % with 0.1, 3.7 % with 0.2,
-and 3.6 % with 0.4. The corrected share of the defect grows with the number of cells. Observed orders of pressures in
-space are therefore below 2, and below 1.75 at rates of 0.2 and above. The order in time is unaffected. The mean defect
-of drained parts is not corrected. If it were, a column under varying gravity would have order 1.2 in the time step.
+In an undrained part without sources, the mean defect is corrected at once, so that the part keeps its volume. In
+drained parts the mean defect is not corrected. If it were, a column under varying gravity would have order 1.2 in the
+time step. Twenty undrained cycles of a beam of 5 cells leave spurious stresses of 7.7 % with a rate of 0, 3.8 % with
+0.1, 3.7 % with 0.2, and 3.6 % with 0.4. The corrected share of the defect grows with the number of cells. Observed
+orders of pressures in space are therefore below 2, and below 1.75 at rates of 0.2 and above. The order in time is
+unaffected.
 
-Halving this value changes the result of scene "beam" in tests/plateaus.py by 1.7e-03 (relative), doubling it by
-2.8e-03, and finer cells by 1.5e-02.
+The result of scene "beam" in tests/plateaus.py changes by the fraction 1.7e-03 with half this value, by 2.8e-03 with
+twice this value, and by 1.5e-02 with finer cells.
 """
 
 
@@ -65,7 +66,7 @@ class Motion:
     """Motion of a scene's material points in a step.
 
     `materials`, `bodies`: all materials and bodies of the scene.
-    `momentum`, `storage`: forms of the two balances, with u and p of a solved step; `storage` is None without fluid.
+    `momentum`, `storage`: forms of the two balances, with u and p of a solved step. `storage` is None without fluid.
     `keeps_volumes`: whether yielded domains keep the volumes of their points, see `kept_volumes`.
     """
 
@@ -98,23 +99,15 @@ class Motion:
     ) -> tuple[State, int]:
         """Return the state at time t (s) after a solved step, and the number of inverted domains.
 
-        Parameters
-        ----------
-        state
-            State at the start of the step.
-        on_grid, data
-            The bodies on the grid, and their integration points at the start of the step.
-        loads
-            Loads at the end of the step.
-        net_inflow : (n,), m^d
-            Net inflow of fluid into the filled owned cells in the step. Without it the volume defect stays unchanged.
-        report
-            Report of the step, for the exception if a point leaves the grid.
-        stays
-            Whether points that hardly move may keep their pieces.
-        carried
-            Function that returns new velocities, see `Mass.carried`. Its argument (n,) is the motion of the points in
-            cell sizes, which is 0 for points that keep their pieces.
+        `state`: state at the start of the step.
+        `on_grid`, `data`: the bodies on the grid, and their integration points at the start of the step.
+        `loads`: loads at the end of the step.
+        `net_inflow` (n,), m^d: net inflow of fluid into the filled owned cells in the step. Without it the volume
+        defect stays unchanged.
+        `report`: report of the step, for the exception if a point leaves the grid.
+        `stays`: whether points that hardly move may keep their pieces.
+        `carried`: function that returns new velocities, see `Mass.carried`. Its argument (n,) is the motion of the
+        points in cell sizes, which is 0 for points that keep their pieces.
 
         Raises
         ------
@@ -180,7 +173,7 @@ class Motion:
         return replace(state, **new, **kept, stay=Stay(cut.points, keeps) if some else None), folded
 
     def _followed(self, state: State, points: MaterialPoints, dt: float) -> Trend:
-        """Return the trend of the points after a step of dt (s)."""
+        """Return the trend of the points after a step."""
         (n, d), before = points.x.shape, state.trend
         change, gradient_change = points.x - state.points.x, (points.F - state.points.F)[:, :d, :d].reshape(n, d * d)
         pressure = (points.pressure - state.points.pressure)[:, None] if self._storage is not None else change[:, :0]
@@ -190,9 +183,10 @@ class Motion:
         return Trend(np.array([dt, *before.lengths[:2]]), np.concatenate([rates, before.rates[:, :2]], axis=1))
 
     def ahead(self, on_grid: OnGrid, state: State, seconds: float, first: float, implicit: bool) -> list[NDArray]:
-        """Return the expected displacements (active dofs,), in m, and with fluid also pressures (active cells,), in Pa.
+        """Return the expected displacements (m) of active dofs, and with fluid also the expected pressures (Pa) of
+        active cells.
 
-        Both are extrapolated over `seconds` (s) from the trend, see `Trend.over`. If `first` > 0, the change in a first
+        Both are extrapolated from the trend over `seconds` (s), see `Trend.over`. If `first` > 0, the change in a first
         substep of this length (s), times `seconds / first`, is added. Domains move affinely. The value of a cell is the
         volume mean of its pieces, and the value of a node is the volume mean of its cells. Ten load steps of a drained
         beam take 50 Newton steps from rest, and 29 Newton steps from this guess.
@@ -221,11 +215,7 @@ class Motion:
         return out
 
     def _at_rest(self, stage: Stage, t: float, nodal: NDArray[np.float64] | None) -> AtPlaces | None:
-        """Return a function for the hydrostatic pressures (Pa) at time t (s), up to a constant, or None without
-        gravity.
-
-        `nodal` (nodes, d), m: displacement since the domains were cut.
-        """
+        """Return a function for the hydrostatic pressures up to a constant, or None without gravity."""
         gravity, grid = stage.gravity_at(t), self._momentum.grid
         if gravity is None:  # even if nothing conducts: a distant body that conducts must not change pressures
             return None
@@ -235,7 +225,7 @@ class Motion:
     def _kept(
         self, values: NDArray[np.float64] | None, on_grid: OnGrid, keeps: NDArray[np.bool_]
     ) -> NDArray[np.float64] | None:
-        """Return local nodal values that are zero except at nodes of cells whose points keep their pieces."""
+        """Return the values at nodes of cells whose points keep their pieces, and zeros at all other nodes."""
         if values is None:
             return None
         cut = on_grid.cut
@@ -245,9 +235,9 @@ class Motion:
     def pressures(
         self, on_grid: OnGrid, stage: Stage, t: float, nodal: NDArray[np.float64] | None = None
     ) -> NDArray[np.float64]:
-        """Return the pressures (n,) of the points, in Pa, from the pressures of the cells at time t (s).
+        """Return the pressures (Pa) of the points from the pressures of the cells at time t (s).
 
-        nodal (nodes, d), m: displacement since the reset of the grid, if any.
+        `nodal` (nodes, d), m: displacement since the reset of the grid, if any.
         """
         at_rest = self._at_rest(stage, t, nodal)
         return on_grid.cut.in_plane(on_grid.pressures_up_to_surface(self._reconstruction, stage, t, at_rest))
@@ -260,7 +250,7 @@ class Motion:
         return replace(after, data=self._materials.updated_state(after, points, 0.0))
 
     def _dried(self, points: MaterialPoints, on_grid: OnGrid, data: QuadratureData) -> MaterialPoints:
-        """Return the points with their suctions, means over the pieces of domains, if laws depend on suction."""
+        """Return the points with their mean suctions, if laws depend on suction."""
         if self._storage is None or "suction" not in self._materials.state_names:
             return points
         cut, pieces = on_grid.cut, data.pieces
@@ -269,10 +259,10 @@ class Motion:
         return replace(points, data=points.data | {"suction": mean})
 
     def _deformed(self, cut: CutDomains, data: QuadratureData, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return F of the points after a step, as (n, 3, 3), or as (n, 2, 2) if laws need no more components.
+        """Return F of the points after a step.
 
-        F is the mean of `(increment of F) F_n` over the pieces of the point. It is scaled so that det F is the mean of
-        det F over these pieces.
+        F is the mean of `(increment of F) F_n` over the pieces of the point, scaled so that det F is the mean of det F
+        over the pieces.
         """
         pieces = data.pieces
         grid = cut.grid
@@ -284,8 +274,7 @@ class Motion:
         if d > grid.dim:
             delta = np.pad(delta, ((0, 0), (0, 1), (0, 1)))
             delta[:, 2, 2] = pieces.places.stretch(nodal) if grid.axisymmetric else 1.0
-        if self._momentum.dilatation is not None:
-            self._momentum.dilatation.average(delta, data)
+        self._momentum.average(delta, data)
         columns = np.empty((len(F), d * d + 1))
         for part in in_chunks(len(F)):  # products of all pieces at once would take as much memory as a step
             product = delta[part] @ F[part]
@@ -306,12 +295,11 @@ class Motion:
         followed: Iterable[NDArray[np.float64]],
         deformed: Callable[[], NDArray[np.float64]],
     ) -> tuple[MaterialPoints, NDArray[np.bool_], int]:
-        """Return the points with new F, and with corners moved by the two terms of `CutDomains.followed`.
+        """Return the points with new F and corners, a mask of points that keep their pieces, and the number of inverted
+        domains.
 
-        Also return whether each point (n,) keeps its pieces (see `OnGrid.valid`), and the number of inverted domains.
-
-        If Q1 cells would lock, F is scaled so that det F equals that of `deformed`. In yielded soil F is `deformed`.
-        Kinks in the motion of this soil are permanent, and the corners of domains in kinks would give a wrong F.
+        If Q1 cells would lock, F is scaled so that det F equals that of `deformed`. In yielded soil F is `deformed`,
+        because the corners of domains in permanent kinks of the motion would give a wrong F.
         """
         cut, stage = on_grid.cut, state.stage
         grid, folded = cut.grid, 0
@@ -347,14 +335,14 @@ class Motion:
         return points.strained(F, corners=corners, x=centroids(corners)), keeps, folded
 
     def _own(self, stage: Stage, points: MaterialPoints) -> NDArray[np.bool_]:
-        """Return a mask (n, 2^d, d) of components of corners that are neither prescribed nor fixed by walls."""
+        """Return a mask of corner components that are neither prescribed nor fixed by walls."""
         fixed = fixed_corners(self._momentum.grid, stage.conditions["walls"], points.corners)
         return ~(given(stage.lattices, points) | fixed)
 
     def _corrected(
         self, points: MaterialPoints, state: State, loads: Sequence[Loads], keeps: NDArray[np.bool_]
     ) -> MaterialPoints:
-        """Return the points after `with_volumes` has corrected yielded domains that are not in `keeps` (n,)."""
+        """Return the points after `with_volumes` has corrected the yielded domains that do not keep their pieces."""
         grid, stage = self._momentum.grid, state.stage
         yielded = self._materials.evolved(points) & ~keeps
         if not over_all(grid.comm, int(yielded.sum())):
@@ -382,12 +370,11 @@ class Motion:
         net_inflow: NDArray[np.float64],
         keeps: NDArray[np.bool_],
     ) -> dict[str, NDArray[np.float64]]:
-        """Return the volume defects (n,) of the points after a step, per reference volume, and the corrections `due`.
+        """Return the volume defects of the points after a step, per reference volume, and their corrections.
 
         The step adds `(c - q) / alpha` to the defect. Here c is the increase of the fluid content, which follows from
         volumes and cell pressures, and q is the net inflow. Both c and q are fluid masses divided by the density at
-        zero pressure. Soil with a free surface has no defect, because the fluid content of this soil excludes drained
-        water. Points in `keeps` (n,) have no correction.
+        zero pressure. Soil with a free surface has no defect, because its fluid content excludes drained water.
         """
         before = state.points
         cut = on_grid.cut
@@ -421,32 +408,32 @@ class Motion:
         return {"owed": defect, "due": np.where(none | keeps, 0.0, mean[part] + share * (defect - mean[part]))}
 
     def _sealed(self, state: State, on_grid: OnGrid, pieces: PointData) -> NDArray[np.bool_]:
-        """Return a mask (count,) of connected parts without open sides, and without sources at the end of the step."""
+        """Return a mask of connected parts without open sides and without sources."""
         cut, (part, count) = on_grid.cut, on_grid.parts
         fed = [one.fed(cut, pieces) for one in state.stage.feeding]
         at = np.concatenate([np.zeros(0, dtype=np.int64), *fed])
         return over_all(cut.grid.comm, np.bincount(part[at], minlength=count)) == 0
 
     def of_bodies(self, on_grid: OnGrid, cells: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the largest values (k, bodies) in each body, from values (k, n) in active owned cells (n,)."""
+        """Return the largest values (k, bodies) in each body, from values (k, n) in the active owned cells."""
         (part, count), points = on_grid.active.parts_of_cells, on_grid.cut.points
         inside = np.zeros((len(self._bodies), count), dtype=bool)
         inside[self._body(points), on_grid.parts[0]] = True
         return largest_of_bodies(self._momentum.grid.comm, part[cells] - 1, values, inside)
 
     def _body(self, points: MaterialPoints) -> NDArray[np.int64]:
-        """Return the index of each point's body (n,)."""
+        """Return the index of each point's body."""
         return body_of(points.id, self._starts)
 
     def _sizes(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the edge lengths (n, d), in m, of boxes with the reference volumes of the points' domains."""
+        """Return the edge lengths of boxes with the reference volumes of the domains."""
         body = self._body(points)
         rows = [points.id[body == i] - start for i, start in enumerate(self._starts[:-1])]
         size = np.concatenate([one.boxes(row) for one, row in zip(self._bodies, rows, strict=True)])
         return size * (points.volume0 / size.prod(axis=1))[:, None] ** (1 / size.shape[1])
 
     def _check_volumes(self, points: MaterialPoints, cut: CutDomains) -> None:
-        """Raise NotConverged for states that a body cannot have: inverted points, and pores without volume."""
+        """Raise NotConverged for inverted points, and for pores without volume."""
         wet, J = self._storage is not None, points.J
         least = 1 - self._materials.table(points, lambda m: m.porosity) if wet else np.zeros(len(J))
         bad = (~(J > least)).nonzero()[0]
@@ -463,7 +450,7 @@ class Motion:
     def _left(
         self, carried: PiecePressures, points: MaterialPoints, stage: Stage, t: float, on_grid: OnGrid, some: bool
     ) -> PiecePressures:
-        """Return the pieces with pressures at t (s) for the next grid. `some`: whether any point keeps its pieces."""
+        """Return the pieces with pressures for the next grid."""
         with _compat.Timer("remap"):
             pieces = on_grid.cut.pieces
             store = self._materials.storage(points) * points.volume0 * points.J
@@ -478,7 +465,7 @@ class Motion:
 
 
 def _check_inside(cut: CutDomains, points: MaterialPoints, t: float, report: Report | None) -> None:
-    """Raise LeftGrid if a corner of a point is outside the grid. The message states the farthest corner."""
+    """Raise LeftGrid if a corner of a point is outside the grid."""
     grid = cut.grid
     x = points.corners if cut.domains else points.x[:, None]
     message = ""
@@ -502,7 +489,7 @@ def untangled(
     grid: Grid,
     loads: Sequence[Loads],
 ) -> NDArray[np.float64]:
-    """Return corners (n, 2^d, d), in m, with the corners of inverted domains `bad` (n,) re-initialised from F."""
+    """Return the corners (m) after the inverted domains `bad` are re-initialised from F."""
     at = bad.nonzero()[0]
     X = points.reference[bad]
     d = grid.dim

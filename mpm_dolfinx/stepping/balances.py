@@ -50,7 +50,10 @@ class Start(NamedTuple):
     renewed: int = 0  # number of renewed particle domains
 
     def begun(self, acting: Acting, earlier: Sequence[Any] | None) -> Acting:
-        """Return the loads at the beginning of a substep.  `earlier`: data of the loads in the previous substep."""
+        """Return the loads at the beginning of a substep.
+
+        `earlier`: data of the loads in the previous substep.
+        """
         if not self.state.stage.inertia:
             return acting
         shares = Shares(acting.substep.own * self.dt, acting.substep.before * self.dt, acting.gravity)
@@ -64,10 +67,10 @@ class Start(NamedTuple):
         return partial(self.matrices.mass.carried, self.state.points, (flight.start, flight.velocity))
 
     def moves(self, flights: Sequence[Flight | None], substep: Substep) -> tuple[float, float]:
-        """Return the error and the size of the motion in the step (see `motion_error`), or zeros if a run does not need
-        these.
+        """Return the error and the size of the motion in the step, see `motion_error`.  They are zero if a run does not
+        need them.
 
-        `flights`: velocities after each substep.  `substep`: the last substep.
+        `flights`: velocities after each substep.
         """
         control = self.state.control
         if control is None or control.motion is None or len(flights) < 2:
@@ -85,7 +88,10 @@ class Balances(NamedTuple):
     ahead: Callable[[], list[NDArray[np.float64]]] | None = None  # see `Motion.ahead`; None without a trend
 
     def flown(self, flight: Flight | None, substep: Substep, dt: float) -> Flight | None:
-        """Return the velocities at the end of a solved substep, or None without inertia.  `dt`: step length, s."""
+        """Return the velocities at the end of a solved substep, or None without inertia.
+
+        `dt`, s: length of the step.
+        """
         if self.inertia is None:
             return None
         acceleration = self.inertia.acceleration(self.momentum.at)
@@ -98,7 +104,8 @@ class Balances(NamedTuple):
     def outcome(self, state: State, passed: Sequence[Sequence[Mapping]], seconds: NDArray[np.float64]) -> Outcome:
         """Return the results of conditions at the end of a step, by quantity and name, see `State`.
 
-        `passed`: flow in each substep, see `passing`.  `seconds`, s: time weights of the substeps.
+        `passed`: flow in each substep, see `passing`.
+        `seconds`, s: time weights of the substeps.
         """
         stage, out = state.stage, {quantity: {} for quantity in QUANTITIES} | self.momentum.outcome()
         out["wall_reactions"] = self.momentum.wall_forces(stage.conditions["walls"])
@@ -146,13 +153,13 @@ def flight_of(start: Start) -> Flight | None:
 
 
 def leads(scene: Scene, loads: Sequence[Loads]) -> bool:
-    """Return whether Newton's method may start from extrapolated motion: with yield, or quasi-static contact."""
+    """Return whether Newton's method may start from extrapolated motion.  It may with yield or quasi-static contact."""
     momentum = scene.momentum
     return not momentum.elastic or (momentum.inertia is None and any([one.touches for one in loads]))
 
 
 def going_on(scene: Scene, start: Start, acting: Acting) -> NDArray[np.float64] | None:
-    """Return displacements (unknowns,), in m, extrapolated from the previous substep or step, as a local array.
+    """Return the displacements (m) extrapolated from the previous substep or step, as a local array.
 
     The result is None without previous motion, or if previous motion is a bad guess, see `leads`.
     """
@@ -176,7 +183,8 @@ def balances(
 ) -> Balances:
     """Return the balances at the end of a substep, at the present u and p.
 
-    `before`: rates of the previous substep.  `flight`: present velocities, or None without inertia.
+    `before`: rates of the previous substep.
+    `flight`: present velocities, or None without inertia.
     """
     substep = acting.substep
     on_grid = start.on_grid
@@ -210,6 +218,6 @@ def balances(
 
 
 def pushed_back(scene: Scene, on_grid: OnGrid) -> NDArray[np.float64]:
-    """Return the inertia forces (n, d) on the pore fluid in the filled owned cells at u, in N/m^3."""
+    """Return the inertia forces (n, d) on the pore fluid in the filled owned cells, in N/m^3."""
     contents = on_grid.contents
     return -scene.fluid.density * scene.momentum.inertia.at(contents.filled, contents.shape_values)

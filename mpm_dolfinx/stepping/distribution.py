@@ -2,8 +2,8 @@
 """New distribution of the cells among processes at a reset of the grid, after bodies have moved, arrived or left.
 
 The scene is created again on a grid with other owners, but its forms are not compiled again.  The state is transferred
-like that of a checkpoint.  Points and pieces move to the owners of their cells, and nodal data move to the nodes of
-each process.  The conditions of the stage find their faces again.
+as from a checkpoint.  Points and pieces move to the owners of their cells, and nodal data move to the nodes of each
+process.  The conditions of the stage find their faces again.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class Distributed(Protocol):
 
 
 def distribute(simulation: Distributed) -> None:
-    """Distribute the cells anew before a step that resets the grid, if this makes the numbers of points more even.
+    """Distribute the cells anew before a step that resets the grid, if the numbers of points then become more even.
 
     Otherwise points move to the owners of their cells.  On a grid with `follow`, lines and points move later.
     """

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: MIT
 """Division and merging of elastic particle domains where grid cells become finer or coarser.
 
-A domain is bisected along a local axis if each half then extends over as many cells as the whole domain at seeding. Two
-halves merge if the merged domain extends over as many cells as one domain at seeding. Whole domains on the lattice of a
-box merge too, except at the surface. Domains are not replaced if they yield, contain probes, or have a side whose
-displacement a condition needs.
+A domain is bisected along a local axis if each half then extends over as many cells as the whole domain at seeding. A
+domain that stretches extends over more cells, and may therefore be divided too. Two halves merge if the merged domain
+extends over as many cells as one domain at seeding. Whole domains on the lattice of a box merge too, except at the
+surface. Domains are not replaced if they yield, contain probes, or have a side whose displacement a condition needs.
 
 The corners of elastic domains determine F, so a division adds no error: both halves have the mapping of the whole
 domain. After merging, F follows from the outer corners. Mass, fluid, and the volume that the fluid has to fill are
-exact. Stretching of a domain may also cause a division, because it changes the number of cells.
+exact.
 """
 
 from __future__ import annotations
@@ -32,7 +32,8 @@ from mpm_dolfinx.stepping.state import State
 class Division:
     """Division and merging of the particle domains in a scene.
 
-    `faces`: faces of the bodies. `materials`: materials of the scene.
+    `faces`: faces of the bodies.
+    `materials`: materials of the scene.
     """
 
     def __init__(self, faces: SeededFaces, materials: SceneMaterials):
@@ -41,7 +42,9 @@ class Division:
         self._domains = SeededDomains(faces.bodies)
 
     def divided(self, state: State) -> tuple[State, int]:
-        """Return the state with divided and merged domains, and their number. All processes must call it."""
+        """Return the state with divided and merged domains, and the number of replaced domains. All processes must call
+        it.
+        """
         now, seeded = self._domains.sizes(self._grid, state.points)
         some = _divides(now, seeded).any() or _merges(now, seeded).any()
         if not self._grid.comm.allreduce(int(some and state.stay is None)):
@@ -58,7 +61,7 @@ class Division:
         return state, count
 
     def _free(self, state: State) -> NDArray[np.bool_]:
-        """Return a mask (n,) of elastic points that may be divided or merged."""
+        """Return a mask of elastic points that may be divided or merged."""
         points, stage = state.points, state.stage
         free = ~self._materials.evolved(points) & (is_part(points) | (points.id < self._domains.starts[-1]))
         if state.watched is not None:
@@ -75,7 +78,7 @@ class Division:
         return np.concatenate(ids), np.concatenate([face for _, face in found])
 
     def _outside(self, points: MaterialPoints) -> NDArray[np.bool_]:
-        """Return a mask (n,) of points with a face on the surface of the seeded body."""
+        """Return a mask of points with a face on the surface of the seeded body."""
         ids, faces = self._outer
         out = np.isin(points.id, ids)
         out[faces_of_parts(points, ids, faces)[1]] = True
@@ -84,10 +87,7 @@ class Division:
     def _replaced(
         self, state: State, old: MaterialPoints, new: MaterialPoints, into: NDArray[np.int64], rule: Callable
     ) -> tuple[State, int]:
-        """Return the state with new points, and the number of old points.
-
-        `into`: see `with_defect`. `rule`: function that returns the pieces of the new points.
-        """
+        """Return the state with new points, and the number of old points."""
         new, ids = with_defect(new, old, into), old.id
         pieces = state.pieces
         if pieces is not None:
@@ -122,7 +122,7 @@ class Division:
     # ---- merging --------------------------------------------------------------------------------
 
     def _merging(self, state: State, axis: int) -> NDArray[np.bool_]:
-        """Return a mask (n,) of points whose domains should merge along a local axis, if their other half exists."""
+        """Return a mask of domains that are short enough along a local axis to merge with their other half."""
         now, seeded = self._domains.sizes(self._grid, state.points)
         wants = _merges(now, seeded)[:, axis]
         if self._grid.comm.allreduce(int(wants.any())):
@@ -132,7 +132,7 @@ class Division:
         return wants
 
     def _intervals(self, points: MaterialPoints, axis: int) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Return keys (n, k) of the points, and whether each point (n,) is an upper half.
+        """Return keys of the points, and whether each point is an upper half.
 
         Two halves of a domain have equal keys. A domain that has no other half has a key with nan.
         """
@@ -182,10 +182,10 @@ class Division:
 
 
 def _divides(now: NDArray[np.float64], seeded: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return for each domain and axis (n, d) whether a half extends over as many cells as the domain at seeding."""
+    """Return whether a half of each domain extends over as many cells as the domain at seeding."""
     return now >= 2 * seeded * (1 - SAME)
 
 
 def _merges(now: NDArray[np.float64], seeded: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return for each domain and axis (n, d) whether a pair extends over no more cells than one domain at seeding."""
+    """Return whether a pair of domains extends over no more cells than one domain at seeding."""
     return 2 * now <= seeded * (1 + SAME)

@@ -50,16 +50,11 @@ AtPlaces = Callable[[NDArray[np.integer], NDArray[np.float64]], NDArray[np.float
 class OnGrid(Keyed):
     """The bodies on the grid since its last reset.
 
-    Parameters
-    ----------
-    quadrature
-        Integration points of the scene.
-    momentum, storage
-        Forms, whose coefficients are set from the material in the cells. `storage` is None without fluid.
-    cut
-        The cut particle domains.
-    of_fluid
-        Whether the fixed-stress coefficient beta is 1/K_w, see `Scheme`.
+    `quadrature`: integration points of the scene.
+    `momentum`, `storage`: forms, whose coefficients are set from the material in the cells. `storage` is None without
+    fluid.
+    `cut`: the cut particle domains.
+    `of_fluid`: whether the fixed-stress coefficient beta is 1/K_w, see `Scheme`.
     """
 
     def __init__(
@@ -129,12 +124,12 @@ class OnGrid(Keyed):
 
     @property
     def mixes(self) -> bool:
-        """Whether any cell contains several soils with a pressure-dependent ratio of conductivities."""
+        """Whether any cell contains several soils whose conductivities have a ratio that depends on the pressure."""
         return self._mixed is not None and self._storage.fluxes.relative is not None
 
     @cached_property
     def not_full(self) -> NDArray[np.int32]:
-        """Faces between active cells that have a ghost mass, because at least one of the two cells is not full."""
+        """Faces with a ghost mass: between two active cells, at least one of which is not full."""
         return self.facets[self.fill[self.cut.grid.facet_cells[self.facets]].min(axis=1) < FULL]
 
     @property
@@ -143,7 +138,7 @@ class OnGrid(Keyed):
         return self._quadrature.masses(self.cut.points)
 
     def data_of(self, state: State) -> QuadratureData:
-        """Return the integration points with the present data of the material points, which have hardly moved."""
+        """Return the integration points with the present data of the material points."""
         if not state.stay:
             return self.data
         with _compat.Timer("integration data"):
@@ -178,10 +173,10 @@ class OnGrid(Keyed):
         return p[self.contents.filled]
 
     def _carried(self, state: State, pi: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the piece pressures (m,), in Pa, for which the pieces contain the pore water of the points.
+        """Return the pressures of the pieces for which the pieces contain the pore water of the points.
 
-        Linear fields are preserved by the mass potentials pi (m,), in Pa (`fluid_content`). The water of each point is
-        then preserved by adding a constant to the pressures of its pieces.
+        The mass potentials pi (Pa) preserve linear fields (`fluid_content`). A constant is then added to the pressures
+        of the pieces of each point, which preserves the water of the point.
         """
         materials = self._quadrature.materials
         points = self.cut.points
@@ -205,12 +200,14 @@ class OnGrid(Keyed):
         return self.cut.pieces_to_cells(there + more[pieces.point])
 
     def of_pieces(self, state: State, name: str, fresh: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the data `name` (m, ...) of the pieces: stored values for pieces that points keep, else `fresh`."""
+        """Return the data `name` (m, ...) of the pieces. Pieces that points do not keep have the values `fresh`."""
         return state.of_pieces(name, fresh, self.cut.pieces.point)
 
     @contextmanager
     def as_reset(self, state: State) -> Iterator[QuadratureData]:
-        """Yield the integration points at the last reset. Until exit, u is 0, and p has its values at the reset."""
+        """Yield the integration points at the last reset. Within this context u is 0, and p is the pressure at the
+        reset.
+        """
         at = [(self._u.x.array, self._momentum.active.now.dofs)]
         if self._storage is not None:
             at += [(f.x.array, self.cells) for f in (self._storage.p, self._storage.p_n)]
@@ -231,13 +228,13 @@ class OnGrid(Keyed):
         return self.cut.to_pieces(self._storage.p_n.x.array[self.cut.cells])
 
     def set_pressures(self, at_pieces: NDArray[np.float64]) -> None:
-        """Set the cell pressures at the start of a step from the pressures (m,), in Pa, of the pieces."""
+        """Set the cell pressures at the start of a step from the pressures (Pa) of the pieces."""
         p_n = self._storage.p_n.x
         p_n.array[self.cut.cells] = self.cut.pieces_to_cells(at_pieces)
         p_n.scatter_forward()
 
     def _means(self, at_pieces: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the mean potentials (cells,) in the filled owned cells, from the potentials (m,) of the pieces.
+        """Return the mean potentials of the pieces in the filled owned cells.
 
         Means are weighted by the storage of the points, so that fluid is conserved. In cells without storage, means are
         weighted by volume.
@@ -259,13 +256,14 @@ class OnGrid(Keyed):
         water: PoreWater | None,
         at_rest: AtPlaces | None,
     ) -> list[NDArray[np.float64]]:
-        """Return pressures (m,), slopes (m, d) and bounds (m, 2) in the pieces, from the cells' pressures.
+        """Return pressures (m,), slopes (m, d) and bounds (m, 2) in the pieces, from the pressures of the cells.
 
         In each cell, the mean of the mass potentials of the pieces is the potential of the cell. Means are weighted by
         storage, or by volume in cells without storage. With `water`, the sum of pore water in a cell is conserved. With
         gravity the reconstruction then acts on differences from the hydrostatic pressures `at_rest`.
 
-        `store` (m,), m^d/Pa: storage of the pieces. `t`, s: time of the pressures on open sides.
+        `store` (m,), m^d/Pa: storage of the pieces.
+        `t`, s: time of the pressures on open sides.
         """
         pieces = self.data.pieces
         contents = self.contents
@@ -298,7 +296,9 @@ class OnGrid(Keyed):
         return [self.cut.to_pieces(rows) for rows in values]
 
     def softness(self, state: State) -> NDArray[np.float64] | float:
-        """Return the ratios (m,) of elastic to tangent shear modulus of the pieces at the start of the step."""
+        """Return the elastic shear modulus of the pieces (m,) at the start of the step, divided by the tangent shear
+        modulus.
+        """
         data = state.points.data
         return self.cut.to_cells(data["softness"]) if "softness" in data else 1.0
 
@@ -317,7 +317,8 @@ class OnGrid(Keyed):
         from hydrostatic pressures, which cause no flow through no-flow sides. In axisymmetry centroids and means refer
         to the sections.
 
-        `t`, s: time of the pressures on drained sides. `at_rest`: hydrostatic pressures, or None without gravity.
+        `t`, s: time of the pressures on drained sides.
+        `at_rest`: hydrostatic pressures, or None without gravity.
         """
         places, p = self._places.pieces, self._storage.p.x.array
         seen = self._cell_pressures(p, stage, t, at_rest=at_rest)
@@ -330,11 +331,7 @@ class OnGrid(Keyed):
     def _cell_pressures(
         self, p: NDArray[np.float64], stage: Stage, t: float, bulk: float = np.inf, at_rest: AtPlaces | None = None
     ) -> CellPressures:
-        """Return the cell pressures as mass potentials, with the data from which slopes are computed.
-
-        `p` (cells,), Pa: pressures of the local cells. `bulk`, Pa: bulk modulus of the fluid.
-        `at_rest`: hydrostatic pressures that are subtracted.
-        """
+        """Return the cell pressures as mass potentials, with the data from which slopes are computed."""
         contents = self.contents
         wet = Wet(self.cut, self.cut.points, contents, t)
         place = lambda: open_sides([one.placed(wet) for one in stage.feeding], self.cut.grid.dim)  # noqa: E731
@@ -352,7 +349,10 @@ class OnGrid(Keyed):
         return CellPressures(contents.filled, seen, contents.centroid, contents.open, outer)
 
     def mobility(self, data: QuadratureData, begins: bool) -> Mobility:
-        """Return the mobility of the filled owned cells at u. `begins`: whether invalid values raise ValueError."""
+        """Return the mobility of the filled owned cells at u.
+
+        `begins`: whether invalid values raise ValueError.
+        """
         at_pieces = self._quadrature.mobility(self.cut, self._storage.conductivity, data.pieces, begins)
         mean, share = self.contents.mean(at_pieces), None
         if self._storage.conductivity is not None:
@@ -364,7 +364,7 @@ class OnGrid(Keyed):
     def _relative_mobility(
         self, full: NDArray[np.float64], mean: NDArray[np.float64], share: NDArray[np.float64] | None
     ) -> Mobility:
-        """Return the mobility of cells in unsaturated soil. `full` (m,), m^2/(Pa s): mobilities at saturation."""
+        """Return the mobility of cells in unsaturated soil."""
         cut = self.cut
         law = cut.to_cells(self._quadrature.materials.retention_of(cut.points))
         count = self._storage.fluxes.relative.count
@@ -392,7 +392,7 @@ class OnGrid(Keyed):
 
     @property
     def heads(self) -> NDArray[np.float64]:
-        """Differences (m,), in Pa, of the pressures of unsaturated pieces from the pressures of their cells."""
+        """Pressures (m,) of unsaturated pieces minus the pressures of their cells, in Pa."""
         return self._quadrature.materials.retentions.heads(self._places.lever)
 
     @cached_property
@@ -412,7 +412,7 @@ class OnGrid(Keyed):
         return Mobility(mean) if self._mixed is None else self._mixed.mobility(at_pieces, mean, None)
 
     def rests(self, state: State) -> NDArray[np.int64] | None:
-        """Return the filled owned cells in which all points keep their pieces, or None if no point keeps its pieces."""
+        """Return the filled owned cells in which all points keep their pieces, or None without such points."""
         if not state.stay:
             return None
         moves = self.cut.to_cells(~state.stay.keeps).astype(float)
@@ -432,14 +432,14 @@ class OnGrid(Keyed):
 
     @cached_property
     def parts(self) -> tuple[NDArray[np.int64], int]:
-        """Index (n,), from 0, of the connected part of each point, and the number of parts.
+        """Index of the connected part of each point, from 0, and the number of parts.
 
         The unknowns of a part are independent of all other parts.
         """
         return self._of_points(*self.active.parts_of_cells)
 
     def _of_points(self, part: NDArray[np.int64], count: int) -> tuple[NDArray[np.int64], int]:
-        """Return the index (n,) of each point's part, from 0, and `count`. `part`: index for each cell, from 1."""
+        """Return the index of each point's part, and the number of parts."""
         out = np.zeros(len(self.cut.points), dtype=np.int64)
         out[self.cut.pieces.point] = self.cut.to_pieces(part[self.cut.cells] - 1)
         return out, count
@@ -454,22 +454,11 @@ class OnGrid(Keyed):
 class System:
     """Vectors, matrices and solvers for one set of active cells.
 
-    Parameters
-    ----------
-    momentum, storage
-        Compiled forms. `storage` is None without fluid.
-    scheme
-        Coupling scheme.
-    on_grid
-        The bodies on the grid.
-    dofs
-        Local indices of the unknown components of displacement.
-    stiff
-        Whether plates or prescribed displacements have a penalty.
-    symmetric
-        Whether the tangent of the momentum is symmetric.
-    loads
-        Loads at the positions at which domains were cut.
+    `momentum`, `storage`: compiled forms. `storage` is None without fluid.
+    `dofs`: local indices of the unknown components of displacement.
+    `stiff`: whether plates or prescribed displacements have a penalty.
+    `symmetric`: whether the tangent of the momentum is symmetric.
+    `loads`: loads at the positions at which domains were cut.
     """
 
     def __init__(
@@ -501,7 +490,7 @@ class System:
         return LinearSolvers(self.plan, self._scheme, self.momentum, self.storage)
 
     def end_step(self) -> None:
-        """Delete multigrid's coarse grids if no tangent is kept, to free memory before the points move."""
+        """Delete multigrid's coarse grids if no tangent is kept. This frees memory before the points move."""
         if "solvers" in vars(self) and self.plan.iterative and self.solvers.tangent.value is None:
             del self.solvers
             collect_garbage(self.momentum.unknowns.comm)
@@ -510,18 +499,7 @@ class System:
 class Assembled(Keyed):
     """Data that are reused until pieces or stage change: penalties and fluxes, in the matrices of a system.
 
-    Parameters
-    ----------
-    momentum, storage
-        Compiled forms.
-    system
-        The matrices.
-    on_grid
-        The bodies on the grid.
-    stage
-        The conditions.
-    loads
-        Loads at the positions at which domains were cut.
+    `loads`: loads at the positions at which domains were cut.
     """
 
     def __init__(
@@ -568,10 +546,10 @@ class Assembled(Keyed):
         return self._system.solvers
 
     def _rounding(self, momentum: MomentumForms, loads: Sequence[Loads]) -> NDArray[np.float64]:
-        """Return the rounding errors (nodes,) of the residual at the active local nodes, in N.
+        """Return the rounding errors of the residual at the active local nodes, in N.
 
-        A rounding error has two terms. One term is proportional to the stiffness of the cells at the node, and the
-        other term to the penalties at the node.
+        A rounding error has two terms: one is proportional to the stiffness of the cells at the node, and one to the
+        penalties at the node.
         """
         grid, on_grid = self._on_grid.cut.grid, self._on_grid
         cells, of_cells = on_grid.cells, np.zeros(grid.num_local)
@@ -590,8 +568,10 @@ class Assembled(Keyed):
         Without a conductivity law, cells whose points all keep their pieces have the flux geometry of the last reset.
 
         `state`: state at the start of the step.
-        `weight` (d,), N/m^3: unit weight of the fluid, or None without gravity. `data`: integration points.
-        `t`, s: time of the pressures and fluxes on open sides. `dt`, s: length of the step.
+        `weight` (d,), N/m^3: unit weight of the fluid, or None without gravity.
+        `data`: integration points.
+        `t`, s: time of the pressures and fluxes on open sides.
+        `dt`, s: length of the step.
         """
         on_grid = self._on_grid
         contents = self._on_grid.contents
@@ -655,7 +635,7 @@ def assembled(
 ) -> Assembled:
     """Return the matrices for cut domains and a stage.
 
-    `begins`: whether every connected part of a body must have supports. `pairs`: keys of the pattern of contacts.
+    `begins`: whether every connected part of a body must have supports.
 
     Raises
     ------

@@ -30,7 +30,6 @@ from mpm_dolfinx.bodies.touching import check_apart
 from mpm_dolfinx.conditions.acting import Place
 from mpm_dolfinx.conditions.conditions import Quiet
 from mpm_dolfinx.conditions.unit_weights import warn_levels, warn_units, waters
-from mpm_dolfinx.contact.groups import contacts_of
 from mpm_dolfinx.domains.fitted import fitted_at
 from mpm_dolfinx.domains.pressure_transport import PiecePressures, at_start
 from mpm_dolfinx.dynamics.at_rest import balancing_tractions
@@ -41,14 +40,14 @@ from mpm_dolfinx.materials.initial_stress import strained
 from mpm_dolfinx.mechanics.inertia import resting
 from mpm_dolfinx.mechanics.momentum import MomentumProblem
 from mpm_dolfinx.mechanics.tractions import owners
-from mpm_dolfinx.parallel.exchange import everywhere, over_all
+from mpm_dolfinx.parallel.exchange import over_all, together
 from mpm_dolfinx.parallel.messages import ConditionWarning, log, warn
 from mpm_dolfinx.points.material_points import MaterialPoints, body_of
 from mpm_dolfinx.solve.newton import solve_substep
 from mpm_dolfinx.solve.schur import Kept, LinearSolvers, planned
 from mpm_dolfinx.stepping.balances import Start, at_rest
 from mpm_dolfinx.stepping.scene import Scene, When
-from mpm_dolfinx.stepping.stage import Condition, Stage, checked
+from mpm_dolfinx.stepping.stage import Condition, Stage, checked, contacts_of
 from mpm_dolfinx.stepping.state import State, Stay
 from mpm_dolfinx.stepping.step import set_up
 
@@ -57,17 +56,17 @@ DEPTH, PATIENCE, LESS = 40, 16, 0.7
 
 The tests are a wet bank, elastic or frictional, and blocks on a rough base, one of which is half supported. Depth 40
 with patience 16 takes as many iterations as depth 80 with patience 24. Both leave relative forces of 4e-5 to 3e-9.
-Depth 40 with patience 8 leaves 6e-3.
+Depth 40 with patience 8 leaves relative forces of 6e-3.
 """
 REMARKABLE = 0.05
 """Largest change of stress by balancing without a warning, divided by the largest initial stress.
 
-The value is also the largest allowed relative residual of the forces, which is due to errors of the discretisation.
+This value is also the largest allowed relative residual of the forces.
 """
 
 
 def first_state(scene: Scene, conditions: Mapping[str, Any], later: Sequence[int]) -> State:
-    """Return the state of a scene in its first stage, with initial stresses that are not balanced yet."""
+    """Return the state of a scene in its first stage. Its initial stresses are not balanced yet."""
     present = [body not in later for body in range(len(scene.bodies))]
     check_apart(scene.grid, scene.bodies, present)
     first = scene.stage(conditions, present, later)
@@ -108,7 +107,7 @@ def begin_stage(
     reset_displacement: bool,
     fields: Mapping[str, ArrayLike],
 ) -> State:
-    """Return the state at the beginning of a stage, see `Simulation.stage`. `named`: new conditions."""
+    """Return the state at the beginning of a stage with the new conditions `named`, see `Simulation.stage`."""
     before = state.stage
     if "gravity" in named and scene.gravity is None:
         raise ValueError("gravity: the scene has none; for changes it must be created with gravity=(0, 0)")
@@ -177,11 +176,10 @@ def begin_stage(
 def _released(
     scene: Scene, state: State, after: Stage, quiet: Mapping[str, Quiet]
 ) -> tuple[State, dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]]:
-    """Return the state on the grid of the next step, and tractions on quiet sides.
+    """Return the state on the grid of the next step, and the tractions on quiet sides.
 
-    The tractions are a dict by name of point data. Its values are the ids (n,) of points on a side, and the tractions
-    (n, d), in Pa, at these points. The stresses are in equilibrium with these tractions, the loads of the previous
-    stage, and the remaining supports. `after`: the new stage.
+    The tractions are a dict by name of point data, with ids and tractions of points on a side. The stresses are in
+    equilibrium with these tractions, the loads of the previous stage, and the remaining supports.
     """
     start = set_up(scene, state, 0.0)
     state, momentum = start.state, scene.momentum
@@ -192,7 +190,7 @@ def _released(
     cut = start.on_grid.cut
 
     def near(some: Sequence[Surface], axes: Sequence[int]) -> NDArray[np.bool_]:
-        """Return a mask (nodes, d) of components along `axes`, at nodes of cells with faces of the surfaces `some`."""
+        """Return a mask of displacement components along `axes`, at nodes of cells with these surfaces."""
         nodes = momentum.active_nodes(np.unique(owners(scene.grid, cut.surfaces(some))[1].cells))
         return nodes[:, None] & np.isin(np.arange(scene.grid.dim), list(axes))
 
@@ -213,11 +211,11 @@ def _released(
 
 
 def _kept_at_rest(scene: Scene, state: State) -> State:
-    """Return the state on the grid of the next step, with the forces `State.held` that keep its bodies at rest.
+    """Return the state on the grid of the next step, with forces that keep its bodies at rest.
 
-    Bodies are in equilibrium under the loads of the present stage.  A reset of the grid leaves a small imbalance, and
-    the forces balance it. With contact `State.held` is None, because contact removes penetrations that the last step
-    has left.
+    Bodies are in equilibrium under the loads of the present stage. A reset of the grid leaves a small imbalance, which
+    the forces balance. With contact the state has no such forces, because contact removes penetrations of the last
+    step.
     """
     start, forms = set_up(scene, state, 0.0), scene.momentum
     state, system = start.state, start.matrices.momentum
@@ -236,7 +234,7 @@ def _kept_at_rest(scene: Scene, state: State) -> State:
 def _gripped(
     scene: Scene, after: Stage, points: MaterialPoints, before: MaterialPoints | None = None
 ) -> MaterialPoints:
-    """Return the points with the data that conditions store: initial values, or data of the points `before`."""
+    """Return the points with the data that conditions store."""
     kept = after.kept(len(points))
     if clashes := sorted(kept.keys() & scene.materials.seeded.data.keys()):
         raise ValueError(f"{clashes[0]!r}: points have data of this name, the condition must have another name")
@@ -248,7 +246,7 @@ def _gripped(
 
 
 def _without_data(points: MaterialPoints, names: Collection[str]) -> MaterialPoints:
-    """Return the points without the data of these names."""
+    """Return the points without the named data."""
     return replace(points, data={name: rows for name, rows in points.data.items() if name not in names})
 
 
@@ -261,7 +259,7 @@ def _holds_as(after: Stage, before: Stage) -> bool:
 
 
 def _check_weight(after: Stage, before: Stage | None, t: float) -> None:
-    """Raise ValueError if a stage with quiet sides changes the weight, which their tractions would not bear."""
+    """Raise ValueError if a stage with quiet sides changes the weight, which their tractions cannot balance."""
     quiet = after.of(Quiet)
     now = after.gravity_at(t) if quiet else None
     was = None if before is None else before.gravity_at(t)
@@ -273,7 +271,7 @@ def _check_weight(after: Stage, before: Stage | None, t: float) -> None:
 
 
 def _with_contacts(before: Stage, conditions: Sequence[Condition]) -> list[Condition]:
-    """Return the conditions with the scene's contacts, which stages cannot change."""
+    """Return the conditions with the scene's contacts."""
     standing, given = contacts_of(before.given.values()), contacts_of(checked(conditions))
     if given and str([vars(one) for one in given]) != str([vars(one) for one in standing]):
         raise ValueError(f"stage: conditions: {line(given[0])}, must be the contacts of the scene, or left out")
@@ -281,7 +279,7 @@ def _with_contacts(before: Stage, conditions: Sequence[Condition]) -> list[Condi
 
 
 def _warn_moved_on(scene: Scene, before: Stage, after: Stage) -> None:
-    """Warn of each unchanged condition that also acts on faces that an excavation has exposed."""
+    """Warn of each unchanged condition that also acts on faces exposed by an excavation."""
     stop = np.cumsum([len(body) for body in scene.bodies])
     for name, condition in after.given.items():
         if not hasattr(condition, "side") or before.given.get(name) is not condition:
@@ -301,7 +299,7 @@ def _warn_moved_on(scene: Scene, before: Stage, after: Stage) -> None:
 def _filled(
     scene: Scene, points: MaterialPoints, standing: Sequence[int], add: Sequence[int], gravity: NDArray | None
 ) -> tuple[MaterialPoints, MaterialPoints]:
-    """Return all points, and the points of added bodies. Bodies that touch others are added first."""
+    """Return all points, and the points of added bodies."""
     standing = list(standing)
     waiting = list(add)
     new = scene.materials.seeded.of(np.empty(0, np.int64))
@@ -323,7 +321,7 @@ def _filled(
 def _without_extra(
     scene: Scene, points: MaterialPoints, add: Sequence[int], fields: Mapping[str, ArrayLike]
 ) -> MaterialPoints:
-    """Return the points without data that added bodies lack. Raise ValueError if `fields` lacks these data."""
+    """Return the points without data that added bodies lack, or raise ValueError."""
     extra = points.data.keys() - scene.materials.seeded.data.keys()
     for name in sorted(extra - fields.keys()):
         what = f"stage: add: body {add[0]}: its points have no {name!r}"
@@ -350,7 +348,7 @@ def _changed(scene: Scene, points: MaterialPoints, fields: Mapping[str, ArrayLik
         if name not in data and (close := get_close_matches(name, data)):
             warn(comm, ConditionWarning, "%s: new data that no law reads; is %r meant?", what, close[0])
         data[name] = new.copy()
-    return everywhere(comm, lambda: scene.materials.changed("stage: fields", replace(points, data=data), fields))
+    return together(comm, lambda: scene.materials.changed("stage: fields", replace(points, data=data), fields))
 
 
 def pieces_at_start(scene: Scene, points: MaterialPoints) -> PiecePressures:
@@ -385,9 +383,9 @@ def balanced(scene: Scene, state: State) -> State:
 
     For points with the strain of a displacement w, a step of the momentum balance gives a further displacement u(w).
     Points store only mean strains of their domains, so `w + u(w)` is not in equilibrium yet. The fixed-point iteration
-    `w <- w + u(w)` follows, with Anderson mixing (Walker and Ni 2011). Mean strains cannot balance all nodes. Nodal
+    `w <- w + u(w)` follows, with Anderson mixing (Walker and Ni 2011). Mean strains cannot balance all nodes. The nodal
     forces `State.held` balance the remainder. Support forces are evaluated at the displacement w (`State.rest`). Sides
-    then stay at their seeded positions, whatever displacement is prescribed at the start.
+    therefore stay at their seeded positions for any displacement prescribed at the start.
 
     Raises
     ------
@@ -428,7 +426,6 @@ def balanced(scene: Scene, state: State) -> State:
             seen = [*seen[-DEPTH:], (w, forms.u.x.array.copy())]
             w, count = _mixed(unknowns, seen), count + 1
             forms.u.x.array[:] = w
-            forms.internal(start.data)  # sets the mean dilatation at w
             points = strained(materials, seeded.points, scene.motion.strained(seeded.points, start.on_grid, start.data))
     except StepFailed as error:
         scene.forget()
@@ -442,10 +439,9 @@ def balanced(scene: Scene, state: State) -> State:
 
 
 def _report(scene: Scene, seeded: State, points: MaterialPoints, count: int, left: float, touches: bool) -> None:
-    """Log the changes by balancing. Raise ValueError for a large relative residual.
+    """Log the changes by balancing, and raise ValueError for a large relative residual.
 
-    `touches`: whether contact may act. Contact is detected only in the first step, so a large residual then causes only
-    a warning.
+    Contact is detected only in the first step. With contact, a large residual therefore causes only a warning.
     """
     materials, comm = scene.materials, scene.grid.comm
     if left > REMARKABLE and not touches:
@@ -462,12 +458,12 @@ def _report(scene: Scene, seeded: State, points: MaterialPoints, count: int, lef
 
 
 def _rest(scene: Scene, cells: NDArray[np.int32], w: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the nodal displacements w (a local array, in m), with zeros outside the cells at supported sides."""
+    """Return the nodal displacements, with zeros outside the cells at supported sides."""
     return np.where(np.repeat(scene.momentum.active_nodes(cells), scene.grid.dim), w, 0.0)
 
 
 def _problem(scene: Scene, start: Start, state: State) -> MomentumProblem:
-    """Return the momentum balance with zero displacement and rates, for points with the strain found so far."""
+    """Return the momentum balance with zero displacement and rates, for points with the present strain."""
     matrices, data = start.matrices, start.on_grid.data_of(state)
     at = start.on_grid.cut, start.on_grid.fill, state.points, data
     place = Place(*at, state.t, 0.0, state.t, state.outcome)
@@ -477,7 +473,7 @@ def _problem(scene: Scene, start: Start, state: State) -> MomentumProblem:
 
 
 def _as_reset(scene: Scene, start: Start) -> State:
-    """Return the state at the start, in the form after a reset of the grid without motion."""
+    """Return the state as after a reset of the grid without motion."""
     cut, pieces = start.on_grid.cut, None
     if scene.storage is not None:
         p = cut.to_pieces(scene.storage.p_n.x.array[start.data.pieces.cells])
@@ -487,7 +483,7 @@ def _as_reset(scene: Scene, start: Start) -> State:
 
 
 def _mixed(unknowns: Unknowns, seen: Sequence[tuple[NDArray, NDArray]]) -> NDArray[np.float64]:
-    """Return the next displacement of a fixed-point iteration. `seen`: earlier displacements and steps."""
+    """Return the next displacement of a fixed-point iteration with Anderson mixing."""
     (w, u), owned = seen[-1], unknowns.owned
     if len(seen) == 1:
         return w + u

@@ -22,13 +22,9 @@ from mpm_dolfinx.stepping.state import State
 def with_lines(grid: Grid, state: State, left: Callable[[State], State]) -> State:
     """Return the state for its next step, and move the grid to the lines of that step.
 
-    All domains are cut anew if any line moves by more than `STILL` cells, the limit for the motion of corners.
+    All domains are cut anew if any line moves by more than `STILL` cells.
 
-    Parameters
-    ----------
-    left
-        Function that adds pressures of pieces to a state with kept pieces, for a reset.  It is called before the grid
-        moves.
+    `left`: function that adds pressures of pieces to a state with kept pieces. It is called before the grid moves.
     """
     grid.move(state.lines)
     before = grid.lines
@@ -50,7 +46,7 @@ def with_lines(grid: Grid, state: State, left: Callable[[State], State]) -> Stat
 
 
 def _wanted(grid: Grid, state: State, before: Sequence[NDArray[np.float64]]) -> Sequence[NDArray[np.float64]]:
-    """Return the coordinates (n,), in m, of the grid lines along each axis for a state, relative to the base."""
+    """Return the wanted coordinates of the grid lines along each axis."""
     if hasattr(grid.follow, "pose"):
         moved = state.stage.moved(grid, state.t, state.outcome)
         return before if moved is None else carried(grid.seeded, moved)
@@ -65,7 +61,7 @@ def _wanted(grid: Grid, state: State, before: Sequence[NDArray[np.float64]]) -> 
 
 
 def _of_all(grid: Grid, state: State) -> NDArray[np.float64]:
-    """Return the true positions (n, d), in m, of the points of all processes, ordered by id."""
+    """Return the true positions of the points of all processes, ordered by id."""
     found = grid.comm.allgather((state.points.id, state.points.x))
     ids, x = (np.concatenate(values) for values in zip(*found, strict=True))
     return x[np.argsort(ids)] + grid.base

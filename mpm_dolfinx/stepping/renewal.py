@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Renewal: replacement of distorted particle domains of flowing soil by new ones, at a reset of the grid.
 
-F of yielded soil is updated by increments, so domains are used for integration only. Old domains may be replaced if new
-domains fill their region, and keep the surface and the contents of the region. Cells with a piece of a domain longer
-than `LONGEST` are filled anew:
+F of yielded soil is updated by increments, so its domains are used for integration only. They may be replaced if the
+new domains fill the region of the old domains, and keep the surface and the contents of the region. Cells with a piece
+of a domain longer than `LONGEST` are filled anew:
 
 * A full cell is divided into four equal domains.
 * A cell that the surface crosses once is filled with quadrilaterals about the centroid of the filled part. `EDGES`
@@ -48,7 +48,8 @@ LONGEST = 1.0
 class Renewal:
     """Renewal of the particle domains in a scene.
 
-    `faces`: faces of the bodies. `materials`: materials of the scene.
+    `faces`: faces of the bodies.
+    `materials`: materials of the scene.
     """
 
     def __init__(self, faces: SeededFaces, materials: SceneMaterials):
@@ -71,7 +72,7 @@ class Renewal:
         return known & (self._materials.evolved(points) | (points.id >= self._starts[-1]) & ~is_part(points))
 
     def _free(self, state: State) -> NDArray[np.bool_]:
-        """Return a mask (n,) of `flowed` points without probes, kept pieces, or faces that conditions need."""
+        """Return a mask of `flowed` points whose domains may be replaced."""
         free = self.flowed(state.points) & ~self._faces.needed(state.stage.lasting, state.points)
         if state.watched is not None:
             free &= ~np.isin(state.points.id, state.watched)
@@ -136,11 +137,9 @@ class Renewal:
     def _pressures(
         self, old: PiecePressures, points: MaterialPoints, work: RefilledCells, made: MaterialPoints, group: NDArray
     ) -> NDArray[np.float64]:
-        """Return the pressures (m,), in Pa, of new domains, so that their cells contain the fluid of the old domains.
+        """Return the pressures of new domains, so that their cells contain the fluid of the old domains.
 
-        All domains of a group have equal pressures: the mean of the old pressures, weighted by storage, or by volume
-        without storage.
-        `group` (m,): group of each new domain, see `RefilledCells`.
+        Domains of a group have the mean of the old pressures, weighted by storage, or by volume without storage.
         """
         materials, pieces = self._materials, work.pieces
         bulk = materials.fluid.bulk
@@ -200,7 +199,7 @@ class Renewal:
         ratio = volume / volume0
 
         def kept(values: NDArray) -> NDArray:
-            """Return means, corrected within the range of the values so that their mass-weighted sum is exact."""
+            """Return means within the range of the values, with the exact mass-weighted sum."""
             means = mean(values).reshape(n, -1)
             for column, of in zip(means.T, values.reshape(len(values), means.shape[1]).T, strict=True):
                 missing = sum_by(groups, part * (mass * of)[source], count) - sum_by(group, volume0 * column, count)
@@ -252,23 +251,23 @@ class Renewal:
         )
 
     def _elastic(self, points: MaterialPoints, rows: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the elastic left Cauchy-Green tensors (m, 3, 3) of the points with indices `rows`."""
+        """Return the elastic left Cauchy-Green tensors of some points."""
         F = unstretched(points.F_of_laws[rows])
         return F @ points.data["plastic"][rows] @ F.swapaxes(1, 2)
 
 
 def _joined(points: MaterialPoints, made: MaterialPoints, kept: NDArray[np.bool_]) -> MaterialPoints:
-    """Return the points where `kept` (n,) is true, together with the new points `made`."""
+    """Return the points that are kept, together with the new points."""
     return with_faces(points).map(lambda rows: rows[kept]).joined(made)
 
 
 def _of_tensors(function: np.ufunc, b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the value of `function`, such as np.log, for symmetric tensors b (n, 3, 3)."""
+    """Return the value of a function, such as np.log, for symmetric tensors."""
     value, axes = np.linalg.eigh(b)
     return (axes * function(value)[:, None]) @ axes.swapaxes(1, 2)
 
 
 def _pulled(F: NDArray[np.float64], across: NDArray[np.float64] | None, b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return C_p^-1 (n, 3, 3) for elastic left Cauchy-Green tensors b (n, 3, 3) and F."""
+    """Return the inverse plastic tensors C_p^-1 for elastic left Cauchy-Green tensors b and F."""
     inverse = np.linalg.inv(unstretched(F if across is None else in_space(F, across)))
     return inverse @ b @ inverse.swapaxes(1, 2)

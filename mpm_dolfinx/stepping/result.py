@@ -17,7 +17,7 @@ from mpm_dolfinx.conditions.acting import MOTIONS, QUANTITIES
 from mpm_dolfinx.conditions.names import ByName
 
 OUTCOMES = (*QUANTITIES, *MOTIONS, "energy", "runoff", "flowed", "ran_off", "ponded")
-"""Quantities of the package's conditions; user-defined conditions may have others."""
+"""Quantities of the package's conditions. User-defined conditions may have others."""
 
 
 @dataclass(frozen=True)
@@ -113,32 +113,32 @@ class Result:
 
     @property
     def probe_stress(self) -> NDArray[np.float64]:
-        """Effective stresses (n, probes, 3, 3), in Pa, tension positive, or (n, 0, 3, 3) if not recorded."""
+        """Effective stresses (n, probes, 3, 3) with tension positive, in Pa, or (n, 0, 3, 3) if not recorded."""
         return self.rows.column("probe_stress")
 
     @cached_property
     def reactions(self) -> ByName[NDArray[np.float64]]:
-        """Force (times, d), in N, of each prescribed displacement on the bodies at the output times, by name."""
+        """Force (times, d) of each prescribed displacement on the bodies by name, in N."""
         return self.outcome("reactions")
 
     @cached_property
     def wall_reactions(self) -> ByName[NDArray[np.float64]]:
-        """Force (times, d), in N, of each wall of the grid on the bodies at the output times, see `Simulation`."""
+        """Force (times, d) of each wall of the grid on the bodies, in N, see `Simulation`."""
         return self.outcome("wall_reactions")
 
     @cached_property
     def outflows(self) -> ByName[NDArray[np.float64]]:
-        """Outflow (times,), in m^3/s, through each open side at the output times, by name."""
+        """Outflow (times,) through each open side by name, in m^3/s."""
         return self.outcome("outflows")
 
     @cached_property
     def tool_forces(self) -> ByName[NDArray[np.float64]]:
-        """Forces (N) and moments (N m) (times, 3), in 3D (times, 6), of tools and contacts on bodies, by name."""
+        """Forces (N) and moments (N m) of tools and contacts on bodies by name: arrays (times, 3), in 3D (times, 6)."""
         return self.outcome("tool_forces")
 
     @cached_property
     def tool_travel(self) -> ByName[NDArray[np.float64]]:
-        """Displacement (times,), in m, of each load-controlled tool without its prescribed displacement, by name."""
+        """Displacement (times,) of each load-controlled tool by name, in m, without its prescribed displacement."""
         return self.outcome("tool_travel")
 
     @cached_property
@@ -146,26 +146,26 @@ class Result:
         """Energies and works (times,), in J (J/m in plane strain), of a `run(energies=True)`, by name.
 
         `kinetic` and `elastic` are energies of bodies and free tools. `elastic` is 0 for laws of unknown elastic
-        energy. Works are summed from the start of the run. `external` is the work of all loads, and `viscous` that of
-        quiet sides and user's terms. `friction` is the work of slip at tools and between groups, and `internal` is the
-        work of the stresses. `dissipated` is `internal` minus `elastic`. In wet bodies `dissipated` includes the work
-        of flow and storage of water. With `Numerics(renewal=True)`, `renewal` is the kinetic and elastic energy that
-        renewed domains have lost. `kinetic` + `elastic` + `dissipated` + `viscous` + `friction` + `renewal` -
+        energy. Works are summed from the start of the run. `external` is the work of all loads. `viscous` is the work
+        of quiet sides and of the user's terms. `friction` is the work of slip at tools and between groups. `internal`
+        is the work of the stresses. `dissipated` is `internal` minus `elastic`, in wet bodies with the work of flow and
+        storage of water. With `Numerics(renewal=True)`, `renewal` is the kinetic and elastic energy that renewed
+        domains have lost. The sum `kinetic` + `elastic` + `dissipated` + `viscous` + `friction` + `renewal` -
         `external` is constant, up to numerical dissipation.
         """
         return self.outcome("energy")
 
     def outcome(self, quantity: str) -> ByName[NDArray[np.float64]]:
-        """Return the results (n, ...) of conditions at the output times, by name.
+        """Return the results (n, ...) of conditions at the output times, by name. Times without the condition have nan.
 
-        Values are nan at times without the condition. `quantity`: name of the results, such as "reactions".
+        `quantity`: name of the results, such as "reactions".
         """
         rows = [outcome.get(quantity, {}) for outcome in self.rows.outcomes]
         like = {name: np.full_like(value, np.nan) for row in rows for name, value in row.items()}
         return ByName({name: np.array([row.get(name, none) for row in rows]) for name, none in like.items()})
 
     def to_dataframe(self):
-        """Return the histories as a pandas data frame, one row for each output time, with the columns of `history.csv`.
+        """Return the histories as a pandas data frame with the columns of `history.csv`, and one row for each time.
 
         `attrs["units"]` of the frame contains the unit of each column. Raise ImportError if pandas is not installed.
         """
@@ -200,7 +200,7 @@ class Result:
         )
 
     def shares(self) -> str:
-        """Return a table: time (s) and share of the wall time of each part of the run, memory, and imbalance."""
+        """Return a table with the time (s) and the share of each part of the run, the memory, and the imbalance."""
         rows = [*self.profile.items(), ("rest", self.wall - sum(self.profile.values()))]
         lines = [f"{name:18} {s:8.2f} s {100 * s / max(self.wall, 1e-9):5.1f} %" for name, s in rows]
         if self.points:  # measured at the end of a run
@@ -213,9 +213,10 @@ class Result:
 
 
 class GaveUp(RuntimeError):
-    """Error that ends a run because a step fails, even if it is shortened.
+    """Error that ends a run because a step fails, even after it is shortened.
 
-    The simulation is in the state of the last good step. A new run may continue it with other conditions or steps.
+    The simulation is in the state of the last good step. A new run may continue from this state with other conditions
+    or steps.
 
     Attributes
     ----------

@@ -63,20 +63,12 @@ class When(NamedTuple):
 class Scene:
     """A compiled scene, which does not change between steps.  Data that change are in the `State`.
 
-    Parameters
-    ----------
-    grid, bodies, materials, fluid, numerics
-        See `Simulation`.
-    weighs
-        Whether the scene has gravity.
-    pressure
-        Initial pore pressure, Pa, or a function of position.
-    extensions
-        User-defined terms in the balance of momentum, and in the storage of fluid.
-    initial
-        Initial stresses of bodies, see `initial_stress.by_body`.
-    velocity
-        Initial velocity, m/s, if bodies may have inertia, see `Simulation`.  Otherwise None.
+    `grid`, `bodies`, `materials`, `fluid`, `numerics`: see `Simulation`.
+    `weighs`: whether the scene has gravity.
+    `pressure`: initial pore pressure, Pa, or a function of position.
+    `extensions`: user-defined terms in the balance of momentum, and in the storage of fluid.
+    `initial`: initial stresses of bodies, see `initial_stress.by_body`.
+    `velocity`: initial velocity, m/s, if bodies may have inertia, see `Simulation`.  Otherwise None.
     """
 
     def __init__(
@@ -177,9 +169,10 @@ class Scene:
     ) -> MomentumProblem:
         """Return the balance of momentum at the end of a substep, with all coefficients of its forms set.
 
-        `when`: the substep.  `system`, `data`, `loads`, `options`: see `MomentumProblem`.
-        `u` (unknowns,), m: displacements at which the iterations begin, a local array, by default the present
-        displacements.
+        `when`: the substep.
+        `system`, `data`, `loads`, `options`: see `MomentumProblem`.
+        `u` (unknowns,), m: displacements at which the iterations begin, as a local array.  By default these are the
+        present displacements.
         """
         self.t.value, self.dt.value = when.t, when.since
         if when.gravity is not None:
@@ -194,7 +187,7 @@ class Scene:
 
     @cached_property
     def _warned(self) -> set[str]:
-        """Subjects of earlier warnings, which affect only the log."""
+        """Subjects of earlier warnings.  They affect only the log."""
         return set()
 
     def look_at(self, gravity: Sequence[NDArray[np.float64] | None]) -> None:
@@ -211,18 +204,19 @@ class Scene:
         """Set the unit weight of the fluid, from which `Retentions` computes the pressure variation in unsaturated
         cells.
 
-        If gravity varies, each step resets the grid.
-        `t`, s: start of a step, at which the gravity of `stage` is evaluated.
+        If gravity varies, each step resets the grid.  `t`, s: start of a step, at which the gravity of `stage` is
+        evaluated.
         """
         if self.materials.retentions is not None:
             gravity = stage.gravity_at(t) if self.materials.conducts else None
             self.materials.retentions.weight.value = 0.0 if gravity is None else self.fluid.density * gravity
 
     def distributed(self, boxes: NDArray[np.int64]) -> Scene | None:
-        """Return an equal scene on a grid distributed by boxes (ranks, 2, d) (see `Partition`), or None.
+        """Return an equal scene on a grid distributed by boxes (ranks, 2, d), see `Partition`, or None.
 
-        It is None if a function of position, such as a random field, does not return the same values when called again.
-        It is also None if terms may be defined on the present mesh.
+        Scenes with user-defined terms give None, because the terms may be defined on the present mesh.  Scenes with a
+        function of position that does not return the same values when called again, such as a random field, give None
+        too.
         """
         if self.extended:
             return None
@@ -238,7 +232,7 @@ class Scene:
         return out
 
     def adopted(self, state: State) -> State:
-        """Convert the state of an equal scene with another distribution to a state of this scene."""
+        """Convert a state of an equal scene with another distribution to this scene."""
         before = state.stage
         given = {**before.conditions, "conditions": tuple(before.given.values())}
         nodal = {name: rows for name in NODAL if (rows := getattr(state, name)) is not None}
@@ -252,7 +246,7 @@ class Scene:
         return stage(self.bodies, self.materials, self.momentum, fed, conditions, present, later)
 
     def check(self, state: State) -> None:
-        """Raise ValueError for an object that is not a state of this scene, with the materials of this scene."""
+        """Raise ValueError if an object is not a state of this scene with the materials of this scene."""
         if not isinstance(state, State) or state.stage.materials is not self.materials:
             raise ValueError(f"state = {line(state)}, must be a state of this simulation")
 
@@ -316,10 +310,11 @@ class Scene:
         return [one for one, possible in both if possible]
 
     def for_reset(self, state: State, renew: bool) -> tuple[State, int]:
-        """Return a state for a reset of the grid, with points on the owners of their cells, and the number of renewed
-        domains.
+        """Return a state for a reset of the grid, and the number of renewed domains.
 
-        renew: whether renewal is allowed. A state in which all points keep their pieces is unchanged.
+        Points are on the owners of their cells.  A state in which all points keep their pieces is unchanged.
+
+        `renew`: whether renewal is allowed.
         """
         if state.stays:
             return state, 0
@@ -345,7 +340,8 @@ class Scene:
     ) -> Assembled:
         """Return the matrices for a stage of the bodies on the grid.
 
-        `now`: present loads.  `as_cut`: function that returns the loads at the positions at which domains were cut.
+        `now`: present loads.
+        `as_cut`: function that returns the loads at the positions at which domains were cut.
         `begins`: whether all parts of the bodies must have supports.
         """
 
@@ -394,6 +390,6 @@ class Scene:
         return self._on_grid.value, self._assembled.value or self._systems.value
 
     def forget(self) -> None:
-        """Delete all data of a step, which may have been interrupted anywhere."""
+        """Delete all data of a step that may have been interrupted."""
         for made in (self._systems, self._on_grid):
             made.clear()

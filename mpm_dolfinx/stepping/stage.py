@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, get_args
@@ -28,7 +29,6 @@ from mpm_dolfinx.conditions.conditions import (
     Tied,
     Traction,
 )
-from mpm_dolfinx.conditions.names import named
 from mpm_dolfinx.conditions.sides import Sides
 from mpm_dolfinx.conditions.unit_weights import with_weight
 from mpm_dolfinx.conditions.walls import fixed_nodes, with_axis
@@ -71,6 +71,43 @@ def checked(conditions: Sequence[Condition]) -> Sequence[Condition]:
     return conditions
 
 
+def contacts_of(conditions: Sequence[Any]) -> list[Contact]:
+    """Return the contacts among the conditions."""
+    return [one for one in conditions if isinstance(one, Contact)]
+
+
+def named(conditions: Sequence[Any]) -> dict[str, Any]:
+    """Return the conditions by name.  A default name consists of kind and side, and a number if necessary.
+
+    Raises
+    ------
+    ValueError
+        A name is invalid, or two conditions have an equal name.
+    """
+    given = [getattr(one, "name", None) for one in conditions]
+    for name, one in zip(given, conditions, strict=True):
+        if name is not None and not (isinstance(name, str) and re.fullmatch(r"[\w .-]+", name)):
+            raise ValueError(f"{line(one)}: name = {line(name)}, must consist of letters, digits, blanks and _ . -")
+        if name is not None and given.count(name) > 1:
+            raise ValueError(f"{line(one)}: name = {line(name)} is the name of another condition, must be unique")
+    out: dict[str, Any] = {}
+    for name, one in zip(given, conditions, strict=True):
+        base, count = name or _default(one), 1
+        name = base
+        while name in out or (name in given and one is not conditions[given.index(name)]):
+            count += 1
+            name = f"{base}_{count}"
+        out[name] = one
+    return out
+
+
+def _default(condition: Any) -> str:
+    """Return the default name of a condition, from its kind and side."""
+    kind = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", type(condition).__name__).lower()
+    side = getattr(condition, "side", None)
+    return kind if side is None else f"{kind}_{re.sub(r'[^A-Za-z0-9]+', '_', str(side))}"
+
+
 @dataclass(frozen=True, eq=False)
 class Stage:
     """The conditions of a stage."""
@@ -103,7 +140,7 @@ class Stage:
         return [*self.surfaces, *(one.outside for one in self.acting if one.outside is not None)]
 
     def of(self, *kinds: type) -> dict[str, Any]:
-        """Return the conditions of the given classes, by name."""
+        """Return the conditions of some classes, by name."""
         return {name: one for name, one in self.named.items() if isinstance(one, kinds)}
 
     def followed(self, grid: Grid) -> str | None:
@@ -114,7 +151,10 @@ class Stage:
         return None
 
     def moved(self, grid: Grid, t: float, outcome: Outcome) -> NDArray[np.float64] | None:
-        """Return the displacement (d,), in m, at time t (s) of the tool that grid lines follow, or None without it."""
+        """Return the displacement (d,) of the tool that grid lines follow, in m, or None without such a tool.
+
+        `t`, s: time of the displacement.
+        """
         if (name := self.followed(grid)) is None:
             return None
         tool = self.given[name]
@@ -129,7 +169,7 @@ class Stage:
 
     @property
     def held(self) -> list[tuple[Any, Surface, Sequence[int]]]:
-        """Conditions that support faces, each with its faces and axes."""
+        """Conditions that support faces, each with faces and axes."""
         return [one for acting in self.acting for one in acting.held]
 
     def placed(self, place: Place) -> list[Loads]:
@@ -138,7 +178,7 @@ class Stage:
             return [one.placed(place) for one in self.acting]
 
     def check_start(self, place: Place) -> None:
-        """Raise an error if this is the stage's first step, and the positions of bodies or tools do not allow it."""
+        """Raise an error before the stage's first step if the positions of bodies or tools do not allow it."""
         for one in self.acting if place.begins else ():
             one.check_start(place)
 
@@ -166,7 +206,7 @@ class Stage:
         return QUANTITIES + OF_RAIN + MOTIONS
 
     def unknown(self, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return the results of conditions before the first step, by quantity and name.  All are equal to `value`."""
+        """Return the results of conditions before the first step, by quantity and name, all equal to `value`."""
         d = self.free.shape[1]
         out = {quantity: {} for quantity in QUANTITIES}
         out["wall_reactions"] = {wall: np.full(d, value) for wall in SIDES[d]}
@@ -193,14 +233,14 @@ class Stage:
         }
 
     def kinetic(self, outcome: Outcome) -> float:
-        """Return the kinetic energy (J) of free tools.  `outcome`: results of conditions, with velocities of tools."""
+        """Return the kinetic energy (J) of free tools from the results of conditions."""
         d, tools = self.free.shape[1], self.of(Tool)
         moving = [(tools[name].mass, v) for name, v in outcome.get("tool_velocity", {}).items() if name in tools]
         moving += [(tools[name].inertia(d), v) for name, v in outcome.get("tool_spin", {}).items() if name in tools]
         return sum(m / 2 * float((v**2).sum()) for m, v in moving)
 
     def gravity_at(self, t: float) -> NDArray[np.float64] | None:
-        """Return the acceleration of gravity (d,), in m/s^2, at time t (s), or None without gravity."""
+        """Return the acceleration of gravity (d,) at time t (s), in m/s^2, or None without gravity."""
         gravity = self.conditions["gravity"]
         name = f"gravity at t = {t:g} s"
         d = self.free.shape[1]
@@ -220,18 +260,11 @@ def stage(
 ) -> Stage:
     """Return a stage.
 
-    Parameters
-    ----------
-    bodies, materials
-        All bodies and materials of the scene.
-    momentum, fed
-        Forms, with the loads of all stages, and terms that act in the balance of fluid in all stages.
-    conditions
-        walls, conditions, gravity and inertia: see `Simulation`.
-    present
-        Whether each body is present.
-    later
-        Indices of bodies still to be added.
+    `bodies`, `materials`: all bodies and materials of the scene.
+    `momentum`, `fed`: forms, with the loads of all stages, and terms that act in the balance of fluid in all stages.
+    `conditions`: walls, conditions, gravity and inertia: see `Simulation`.
+    `present`: whether each body is present.
+    `later`: indices of bodies still to be added.
 
     Raises
     ------
@@ -283,10 +316,7 @@ def stage(
 
 
 def _check_inertia(by_name: Mapping[str, Any], inertia: bool) -> None:
-    """Raise ValueError in a stage with inertia for conditions that do not support inertia.
-
-    In a quasi-static stage, raise ValueError for conditions that require inertia.
-    """
+    """Raise ValueError for conditions that a stage with, or without, inertia does not allow."""
     for name, one in by_name.items():
         if isinstance(one, Quiet) and not inertia:
             raise ValueError(f"{name}: bodies have no inertia, must be given with inertia=True")

@@ -45,7 +45,7 @@ class StepControl:
     change : (bodies,), Pa
         Largest pressure change of each body since the start of the run.
     first : (bodies,), Pa/s
-        `Report.first` of the last step: pressure change in its first substep, divided by the length of the step.
+        Pressure change in the first substep of the last step (`Report.first`), divided by the length of this step.
     start : (2, bodies), Pa
         Smallest and largest cell pressures of each body at the start of the run, or None before the first step.
     motion : J^(1/2)
@@ -72,7 +72,7 @@ class Stay:
     points
         The material points at the reset of the grid.
     keeps : (n,)
-        Whether each point keeps its pieces, because its connected part hardly moves. None if all points keep them.
+        Whether each point keeps its pieces, or None if all points keep them.
     """
 
     points: MaterialPoints
@@ -101,8 +101,9 @@ class Trend:
     def over(self, seconds: float, implicit: bool = False, first: float = 0.0) -> NDArray[np.float64]:
         """Return the changes (n, ...) in a time `seconds` (s), from the polynomial through the last states.
 
-        `implicit`: whether the rate at the end of this time replaces the mean rate. If `first` > 0, the implicit change
-        in a first substep of this length (s), times `seconds / first`, is subtracted.
+        `implicit`: whether the rate at the end of this time replaces the mean rate.
+        `first`, s: length of a first substep. If it is positive, the implicit change in this substep, times
+        `seconds / first`, is subtracted.
         """
         order, last = np.arange(1, len(self.lengths) + 1), self.lengths[0]
         ends, powers = -self.lengths.cumsum()[:, None] / last, (seconds / last) ** order * (order if implicit else 1)
@@ -195,16 +196,15 @@ class State:
 
     @property
     def as_cut(self) -> MaterialPoints:
-        """Points at the positions of their cut: at the last reset if they keep their pieces, else at present."""
+        """Points at the positions of their cut. Points that do not keep their pieces are at their present positions."""
         if self.stay is None:
             return self.points
         return self.stay.points if self.stay.keeps is None else self.stay.points.where(self.stay.keeps, self.points)
 
     def of_pieces(self, name: str, fresh: NDArray[np.float64], point: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the data `name` (m, ...) of the pieces: stored values for pieces that points keep, else `fresh`.
+        """Return the data `name` (m, ...) of the pieces. Pieces that points do not keep have the values `fresh`.
 
-        point : (m,)
-            Index of the point of each piece.
+        `point` (m,): index of the point of each piece.
         """
         if self.stay is None:
             return fresh

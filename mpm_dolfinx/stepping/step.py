@@ -19,7 +19,7 @@ from mpm_dolfinx.stepping.state import State
 
 
 def set_up(scene: Scene, state: State, dt: float, how: tuple = ()) -> Start:
-    """Return the start of a step of length dt (s): the state on the grid, matrices, and the loads of the substeps."""
+    """Return the start of a step of length dt (s): the state on the grid, the matrices, and the loads."""
     scene.check(state)
     scene.rests_at(state.stage, state.t)
     collect_garbage(scene.grid.mesh.comm)

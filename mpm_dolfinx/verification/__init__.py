@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""Exact solutions, laboratory tests of laws, and the finite element reference."""
+"""Exact solutions, laboratory tests of laws, and the finite element reference solution."""

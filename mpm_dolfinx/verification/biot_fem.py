@@ -1,23 +1,29 @@
 # SPDX-License-Identifier: MIT
 """Reference solution: body-fitted, total-Lagrangian finite elements for Biot's equations at finite strain.
 
-The unknowns are the total displacement u and the pore pressure p, positive in compression.  A step starts from state n.
-With F = I + grad u and J = det F, the equations in the reference configuration of a box are
+The unknowns are the total displacement u and the pore pressure p, positive in compression.  The deformation gradient is
+F = I + grad u, and J = det F.  A step starts from state n.  The equations in the reference configuration of a box are
 
     momentum   int [d psi/dF - alpha chi p dJ/dF] : grad v dV  =  int t . v dA + int m g . v dV
     storage    int rho [zeta(J, p) - zeta_n] q dV
                + int int kappa J F^-1 (F^-T grad pi - rho rho_w g) . grad q dV dt  =  0
 
-Here t are tractions (dead loads or pressures), and m is the mass of soil and fluid.  The mobility is kappa =
-k/(rho_w g), and the relative density is rho = exp((p + p_n)/(2 K_w)).  `fluid_content` defines the content zeta and the
-mass potential pi.  In unsaturated soil, kappa is multiplied by k_r, and rho [zeta - zeta_n] is replaced by S rho
-[zeta - zeta_n] + (S - S_n) J_n n_n exp(p_n/K_w).  S(p) is the saturation, and n_n the porosity in state n.  Saturated
-pores have chi = S = k_r = 1.  If the pressure is constant in each cell, two-point fluxes replace the last integral.
-They are kappa J |F^-T N|^2 / h times the jump of pi and of the potential of gravity, with the distance h between the
-centres of two cells.  Two-point fluxes contain the mean of k_r between the two pressures.  They are not consistent
-under shear.  In axisymmetry F contains the circumferential stretch, and integrals extend over the full circumference.
-Materials, retention, user-defined terms and time integration use the code of the material point method.  The two
-methods therefore differ only in discretisation.
+with the stored energy psi, Biot's coefficient alpha, Bishop's coefficient chi, tractions t (dead loads or pressures),
+the mass m of soil and fluid, the acceleration of gravity g, and test functions v and q.  The mobility is
+kappa = k/(rho_w g), and the relative density is rho = exp((p + p_n)/(2 K_w)).  `fluid_content` defines the content zeta
+and the mass potential pi.  In saturated soil chi = 1.
+
+In unsaturated soil, kappa is multiplied by the relative permeability k_r.  With the saturation S and the porosity n_n
+in state n, rho [zeta - zeta_n] becomes S rho [zeta - zeta_n] + (S - S_n) J_n n_n exp(p_n/K_w).
+
+If the pressure is constant in each cell, two-point fluxes replace the last integral.  A two-point flux is
+kappa J |F^-T N|^2 / h times the jump of pi and of the potential of gravity.  N is the normal of the face between two
+cells, and h is the distance of their centres.  The mean of k_r between the two pressures multiplies kappa.  Two-point
+fluxes are not consistent under shear.
+
+In axisymmetry F contains the circumferential stretch, and integrals extend over the full circumference.  Materials,
+retention, user-defined terms and time integration use the code of the material point method.  The two methods therefore
+differ only in discretisation.
 """
 
 from __future__ import annotations
@@ -51,7 +57,7 @@ from mpm_dolfinx.conditions.conditions import RIGIDITY, Drained, Pressure, Rigid
 from mpm_dolfinx.conditions.walls import with_axis
 from mpm_dolfinx.forms.axes import block
 from mpm_dolfinx.forms.point_forms import PointMeasure
-from mpm_dolfinx.grid.grid import TURN, Grid, side
+from mpm_dolfinx.grid.grid import TURN, Grid, begin_with, side
 from mpm_dolfinx.materials.skeleton import Field, Fluid, Skeleton
 from mpm_dolfinx.materials.user_functions import call, compiling, term_of
 from mpm_dolfinx.materials.user_functions import form as form_of
@@ -65,13 +71,13 @@ CUT_DEGREE = 20  # quadrature degree on a partly loaded side, because an edge of
 
 
 class Space:
-    """Space W of the unknowns w = (u, p/scale), or w = u without fluid, and functions in this space.
+    """Space of the unknowns w = (u, p/scale), without fluid w = u, and functions in it.
 
     old: w at the start of the step
     past: change of w due to the rate of the previous substep
     b, f: residual and loads
     same: copy of w that is not differentiated
-    u, p: displacement and pressure, parts of w
+    u, p: displacement and pressure in w
     p_dofs: degrees of freedom of the pressures
     of_p: space of the pressures alone
     """
@@ -103,14 +109,12 @@ class Forms(NamedTuple):
 
 
 class BiotFEM:
-    """Finite element model of a box, with its state; without fluid a model of the drained skeleton.
+    """Finite element model of a box, with its state.  Without fluid it is a model of the drained skeleton.
 
     Parameters
     ----------
-    lower, upper : (d,), m
-        Corners of the body; d = 2 (plane strain) or 3.
-    cells : (d,)
-        Number of cells along each axis, at least 1.
+    grid
+        The body, a box: `Grid` with equal cells, whose forms the model owns.
     material, fluid
         Skeleton without state, and pore fluid.  Steps may not converge for steep retention curves (n > 2.5, or with
         an air entry).
@@ -120,7 +124,7 @@ class BiotFEM:
         `Traction`, `Pressure`, `RigidPlate` and `Drained` on sides.  With "taylor-hood", `Drained` acts on facets that
         lie wholly in its region.  All other sides are free of loads, and undrained.
     pressure : Pa
-        Initial pore pressure, or a function of positions x (n, d), in m.  The initial effective stress is zero, so
+        Initial pore pressure, or a function of positions x (n, d), in m.  The initial effective stress is zero, so that
         loads or strains must balance the initial pressure.
     gravity : callable t -> (d,), m/s^2
         Acceleration of gravity as a function of time.
@@ -128,19 +132,16 @@ class BiotFEM:
         User-defined terms as for `Simulation`, but no terms on sides; see `user_functions` and `Source`.  The argument
         q of a `Source` is a test function of the elements for pressure.
     element
-        "taylor-hood": Q2 displacement, Q1 pressure; "q1-dg0": Q1 displacement, cellwise pressure, two-point fluxes.
+        "taylor-hood" has Q2 displacements and Q1 pressures.  "q1-dg0" has Q1 displacements, cellwise pressures and
+        two-point fluxes.
     numerics
         Time integration, and tolerance of the residual.  The tolerance is relative to the loads, or to the first
         residual of a step if this residual is larger.
-    axisymmetric
-        As for `Grid`.
     """
 
     def __init__(
         self,
-        lower: ArrayLike,
-        upper: ArrayLike,
-        cells: Sequence[int],
+        grid: Grid,
         material: Skeleton,
         *,
         walls: Mapping[str, str],
@@ -151,8 +152,10 @@ class BiotFEM:
         terms: Sequence[Callable | Source] = (),
         element: str = "taylor-hood",
         numerics: Numerics = DEFAULT,
-        axisymmetric: bool = False,
     ):
+        begin_with("grid", grid)
+        if not grid.even:
+            raise ValueError("grid: cells of several sizes, must be equal in the reference")
         all_of("material", [material], Skeleton)
         all_of("fluid", [fluid] if fluid is not None else [], Fluid)
         instance("numerics", numerics, Numerics)
@@ -175,17 +178,17 @@ class BiotFEM:
                 f"{type(material).__name__}: the reference has no state and no local unknowns; only moduli, "
                 "conductivity and parameters of the law may be functions of position, other data must be numbers"
             )
-        self.grid = Grid(lower, upper, cells, axisymmetric=axisymmetric)
+        self.grid = grid
         self.material, self.fluid = material, fluid
         radius = ufl.SpatialCoordinate(self.grid.mesh)[0]
-        self._around = TURN * radius if axisymmetric else 1.0  # factor from plane to volume integrals
+        self._around = TURN * radius if grid.axisymmetric else 1.0  # factor from plane to volume integrals
         self.tolerance, self._t = numerics.tolerance, fem.Constant(self.grid.mesh, 0.0)
         self._substeps = substeps(numerics.method, fluid is not None or bool(terms))  # terms may depend on the velocity
         self.scale = float(np.max(material.at(self.grid.midpoints + self.grid.base).oedometric))
-        """Unit of the unknown pressure, Pa; both equations are divided by this unit."""
+        """Unit of the unknown pressure, in Pa.  Both equations are divided by it."""
         self._pores = Pores(self.grid.mesh, material.retention if fluid else None, self.scale)
         self._whole = fem.Constant(self.grid.mesh, 1.0)
-        """Factor of the derivative of k_r in the tangent, 0 or 1."""
+        """Factor, 0 or 1, of the derivative of k_r in the tangent."""
         self._space = Space(self.grid, fluid is not None, *ELEMENTS[element])
         if fluid is not None:
             start = fem.Function(self._space.of_p)
@@ -215,16 +218,16 @@ class BiotFEM:
 
     @property
     def _places(self):
-        """True reference positions as UFL."""
+        """Reference positions in the coordinates of the scene, as UFL."""
         return ufl.SpatialCoordinate(self.grid.mesh) + self._constant(self.grid.base)
 
     def _constant(self, value: ArrayLike) -> fem.Constant:
         return fem.Constant(self.grid.mesh, np.asarray(value, dtype=float))
 
     def _field(self, value: Field) -> fem.Constant | fem.Function:
-        """Return a parameter as UFL; a function of position is interpolated quadratically in each cell.
+        """Return a parameter as UFL.  A function of position is interpolated quadratically in each cell.
 
-        The interpolation points are slightly inside the cells, so that the parameter may jump between cells.
+        The interpolation points are slightly inside the cells, because a parameter may jump between cells.
         """
         if not callable(value):
             return self._constant(value)
@@ -240,7 +243,7 @@ class BiotFEM:
         return f
 
     def _box(self, name: str, region: Region | None = None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the corners of a flat box around a side, or around the part of a side in a region."""
+        """Return the corners of a flat box around a side or a part of it."""
         grid, (axis, end) = self.grid, side(name, self.grid.dim)
         low, high = limits(region, grid.dim) - grid.base
         plane, near = (grid.low, grid.high)[end][axis], NEAR * grid.h
@@ -251,7 +254,7 @@ class BiotFEM:
         return low, high
 
     def _prescribe(self, space, value: float, name: str, region: Region | None = None):
-        """Return the boundary condition that prescribes a value of a scalar subspace on a side within a region."""
+        """Return the boundary condition for a value on a side or a part of it."""
         msh = self.grid.mesh
         d = self.grid.dim
         (low, high) = np.array(self._box(name, region))[:, :, None]
@@ -259,7 +262,7 @@ class BiotFEM:
         return fem.dirichletbc(PETSc.ScalarType(value), fem.locate_dofs_topological(space, d - 1, facets), space)
 
     def _conditions(self, walls: Mapping[str, str], drained: Sequence[Drained]) -> list:
-        """Return the boundary conditions of zero displacement and of nodal pressure."""
+        """Return the boundary conditions for zero displacements and for nodal pressures."""
         axes = "xyz"[: self.grid.dim]
         bcs = []
         space = self._space.u.function_space
@@ -275,7 +278,7 @@ class BiotFEM:
         return (1 - 2 * end) * np.eye(self.grid.dim)[axis]
 
     def _area(self, condition: RigidPlate) -> float:
-        """Return the area, in m^(d-1), of the part of a side on which a condition acts."""
+        """Return the area, in m^(d-1), on which a condition acts."""
         low, high = self._box(condition.side, condition.region)
         within = np.minimum(high, self.grid.high) - np.maximum(low, self.grid.low)
         area = float(np.delete(within, side(condition.side, self.grid.dim)[0]).prod())
@@ -283,7 +286,7 @@ class BiotFEM:
         return area * float(np.squeeze(self.grid.around(middle[None])))
 
     def _on(self, condition: Traction | Pressure | Drained | RigidPlate, integrand):
-        """Return the integral over the part of a side on which a condition acts, as UFL."""
+        """Return the integral over the area on which a condition acts, as UFL."""
         low, high = map(self._constant, self._box(condition.side, condition.region))
         for a, x in enumerate(ufl.SpatialCoordinate(self.grid.mesh)):
             integrand = ufl.conditional(ufl.And(ufl.ge(x, low[a]), ufl.le(x, high[a])), integrand, 0.0)
@@ -293,7 +296,7 @@ class BiotFEM:
     def _compile(
         self, loads: Sequence, outlets: Sequence | None, gravity: Callable | None, terms: Sequence, sources: Sequence
     ) -> Forms:
-        """Compile loads, residual and tangent.  With `outlets` (drained sides), cells have constant pressures."""
+        """Compile loads, residual and tangent.  If `outlets` (drained sides) is not None, cells have one pressure."""
         dt, since, t = (self._constant(1.0) for _ in range(3))
         law = self.material
         space = self._space
@@ -352,7 +355,7 @@ class BiotFEM:
         return Forms(_compat.compiled(residual), _compat.compiled(tangent), flux, load, dt, since, t, given)
 
     def _grad(self, f):
-        """Return grad f as UFL; in axisymmetry the gradient of a vector has the shape (3, 3)."""
+        """Return grad f as UFL, with the shape (3, 3) for vectors in axisymmetry."""
         grad = ufl.grad(f)
         if not (self.grid.axisymmetric and f.ufl_shape):
             return grad
@@ -365,11 +368,11 @@ class BiotFEM:
         return block(F) if self.grid.axisymmetric else F
 
     def _in_plane(self, T):
-        """Return a tensor without its circumferential components: (2, 2) in axisymmetry, otherwise unchanged."""
+        """Return a tensor without its circumferential components."""
         return ufl.as_matrix([[T[i, j] for j in (0, 1)] for i in (0, 1)]) if self.grid.axisymmetric else T
 
     def _begin(self, pressure: float | Callable, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the initial pressures (n,), in Pa, at positions x (3, n), in m, of the mesh."""
+        """Return the initial pressures, in Pa, at positions x (3, n), in m."""
         n, places = x.shape[1], x[: self.grid.dim].T + self.grid.base
         values = pressure(places) if callable(pressure) else pressure
         return np.broadcast_to(numbers("pressure", values, (), (n,), allowed="a number, or one for each position"), n)
@@ -379,9 +382,9 @@ class BiotFEM:
         return self._pores.of("saturation", p) * (J - self._constant(1 - self.material.porosity))
 
     def _storage(self, F, u, J_n, p, p_n, q, dt: fem.Constant, outlets: Sequence[Drained] | None, pull):
-        """Return two UFL expressions: the change of fluid content times q, and the flux in a time dt (s).
+        """Return the change of the fluid content times q, and the flux, as UFL.
 
-        pull: acceleration of gravity, m/s^2
+        pull: acceleration of gravity, in m/s^2
         """
         law, J = self.material, ufl.det(F)
         # S is linear in the porosity; S_0 and S_1 are finite for infinite bulk moduli
@@ -416,7 +419,7 @@ class BiotFEM:
 
     @property
     def _seen(self):
-        """Pressure that determines k_r, divided by `scale`, as UFL.
+        """Pressure, divided by `scale`, that determines k_r, as UFL.
 
         The factor `_whole` selects whether the tangent contains the derivative of k_r.
         """
@@ -424,7 +427,10 @@ class BiotFEM:
         return self._whole * now + (1 - self._whole) * same
 
     def _two_point(self, kappa, F, inverse, p, q, outlets: Sequence[Drained], weight):
-        """Return the two-point flux between cells and to drained sides as UFL; weight: unit weight / `scale`."""
+        """Return the flux between cells and to drained sides as UFL.
+
+        weight: unit weight divided by `scale`
+        """
         compliance = self._constant(self.scale / self.fluid.bulk)
         pi = mass_potential_form(p, compliance)
         normal, h = ufl.FacetNormal(self.grid.mesh), self._constant(self.grid.h)
@@ -494,7 +500,7 @@ class BiotFEM:
         return _compat.petsc_vec(out)
 
     def step(self, dt: float) -> tuple[int, float]:
-        """Advance by dt (s), > 0; return the number of Newton iterations, and the relative residual.
+        """Advance by dt, in s, > 0, and return the number of Newton iterations and the relative residual.
 
         If `NotConverged` is raised, the state has not changed.
         """
@@ -508,12 +514,12 @@ class BiotFEM:
         return newton, worst
 
     def _acceleration(self, gravity: Callable[[float], ArrayLike], t: float) -> NDArray[np.float64]:
-        """Return the acceleration of gravity (d,), in m/s^2, at time t (s)."""
+        """Return the acceleration of gravity (d,), in m/s^2, at a time."""
         d = self.grid.dim
         return numbers("gravity", gravity(t), (d,), allowed=f"{d} finite numbers")
 
     def _solve(self, substep: Substep, dt: float) -> tuple[int, float]:
-        """Solve one substep of a step of length dt (s); return the number of Newton iterations and the residual."""
+        """Solve one substep, and return the number of Newton iterations and the residual."""
         forms = self._forms
         space = self._space
         snes = self._snes
@@ -545,15 +551,15 @@ class BiotFEM:
         return len(norms) - 1, norms[-1] / scale
 
     def _free(self, x: PETSc.Vec) -> tuple[NDArray[np.float64], int]:
-        """Solve by SNES; return the norms of the residuals, and PETSc's reason for ending."""
+        """Solve by SNES, and return the norms of the residuals and PETSc's reason for ending."""
         self._snes.solve(None, x)
         return self._snes.getConvergenceHistory()[0], self._snes.reason
 
     def _restrained(self, x: PETSc.Vec) -> tuple[list[float], int]:
-        """Solve by single Newton steps with limited pressure changes (`retention.restrained`); return as `_free` does.
+        """Solve by Newton steps with limited pressure changes, see `retention.restrained`.  Return as `_free` does.
 
-        The first tangent omits the derivative of k_r (Celia, Bouloutas and Zarba 1990).  Tangents after a limited step,
-        and after an increase of the residual, also omit this derivative.  In dry soil under gravity, it can reverse the
+        The first tangent omits the derivative of k_r (Celia, Bouloutas and Zarba 1990), and so do tangents after a
+        limited step or after an increase of the residual.  In dry soil under gravity, this derivative can reverse the
         Newton step.
         """
         snes, of_p = self._snes, self._space.p_dofs
@@ -579,7 +585,7 @@ class BiotFEM:
         return [*norms, last], reason
 
     def _traction(self, load: Traction | Pressure, t: float) -> NDArray[np.float64] | float:
-        """Return the components (d,), in Pa, of a traction at time t (s), or the value, in Pa, of a pressure."""
+        """Return a traction (d,) or a pressure, in Pa, at a time."""
         if isinstance(load, Pressure):
             return float(load.at(t))
         value = load.at(t, self.grid.dim)
@@ -590,7 +596,7 @@ class BiotFEM:
         return value
 
     def _parts(self, x: PETSc.Vec, scale: float) -> tuple[float, float]:
-        """Return the norms of the residuals of momentum and storage at x, relative to `scale`."""
+        """Return the norms of the residuals of momentum and of storage, relative to `scale`."""
         self._residual(self._snes, x, x.duplicate())
         squares = (self._space.b.x.array / scale) ** 2
         squares[_compat.petsc_vec(self._space.b).getLocalSize() :] = 0.0  # ghosts
@@ -628,11 +634,11 @@ class BiotFEM:
         return replace(result, wall=time.perf_counter() - start, converged=True)
 
     def displacement(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the displacements (n, d), in m, at reference positions x (n, d) in the body, on every process."""
+        """Return the displacements (n, d), in m, at reference positions x (n, d), on every process."""
         return self._at(self._space.u, x, self.grid.dim)
 
     def pressure(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the pore pressures (n,), in Pa, at reference positions x (n, d) in the body, on every process."""
+        """Return the pore pressures (n,), in Pa, at reference positions x (n, d), on every process."""
         return self.scale * self._at(self._space.p, x, 1)[:, 0]
 
     def water(self) -> float:
@@ -643,7 +649,7 @@ class BiotFEM:
         return self.grid.comm.allreduce(fem.assemble_scalar(held))
 
     def _at(self, f: fem.Function, x: NDArray[np.float64], size: int) -> NDArray[np.float64]:
-        """Return the values (n, size) of a function at reference positions x (n, d) in the body, on every process."""
+        """Return the values of a function at reference positions on every process."""
         grid = self.grid
         out = np.zeros((len(x), size))
         x = x - self.grid.base
@@ -654,7 +660,7 @@ class BiotFEM:
         return grid.comm.allreduce(out)
 
     def _row(self, x: NDArray[np.float64]) -> Row:
-        """Return the results at the present time, as one row of the histories."""
+        """Return the present results as one row of the histories."""
         pressure = np.zeros(0)
         if self.fluid:
             p, comm = self.scale * self._space.w.x.array[self._space.p_dofs], self.grid.comm

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""One-dimensional expansion of cylindrical cavities in soil at finite strain, as a reference for laws and scenes.
+"""Expansion of a cylindrical cavity in soil at finite strain, as a reference for laws and scenes.
 
-The initial radius of the cavity is 1. In the initial state, the pressures at the wall of the cavity and at the outer
-radius are equal.
+The model is one-dimensional.  The initial radius of the cavity is 1.  The initial pressures at the wall of the cavity
+and at the outer radius are equal.
 """
 
 from __future__ import annotations
@@ -26,10 +26,7 @@ CLOSE, MOST = 1e-10, 60  # largest relative residual, and largest number of Newt
 
 
 class _Rings:
-    """A law at n rings, with radial and circumferential stretches (n, 2).
-
-    A state contains values (n, ...) by name; `start` is the initial state.
-    """
+    """A law at n rings, with radial and circumferential stretches (n, 2)."""
 
     def __init__(self, material: Skeleton, count: int, state: Mapping[str, ArrayLike] | None = None):
         law = type(material)
@@ -48,26 +45,26 @@ class _Rings:
     def kirchhoff(self, stretches: NDArray[np.float64], state: State, repeat: int = 1) -> NDArray[np.float64]:
         """Return the radial and circumferential Kirchhoff stresses (n, 2), in Pa.
 
-        repeat: number of copies of all rings in the stretches (n, 2)
+        repeat: number of copies of all rings in the stretches (n, 2).
         """
         stress = self._law.stress(self._data(stretches, state, repeat))
         return stress[:, [0, 1], [0, 1]] * stretches.prod(axis=1, keepdims=True)
 
     def nominal(self, stretches: NDArray[np.float64], state: State) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return two arrays: the nominal stresses (n, 2), in Pa, and their derivatives (n, 2, 2) by the stretches."""
+        """Return the nominal stresses, in Pa, and their derivatives with respect to the stretches."""
         nudges = SAME * np.array([[0, 0], [1, 0], [0, 1]])
         near = (stretches + nudges[:, None, :]).reshape(-1, 2)
         P = (self.kirchhoff(near, state, len(nudges)) / near).reshape(len(nudges), -1, 2)
         return P[0], (P[1:] - P[0]).transpose(1, 2, 0) / SAME
 
     def updated(self, stretches: NDArray[np.float64], state: State) -> State:
-        """Return the state at the end of a step that ends with these stretches."""
+        """Return the state after a step that ends with these stretches."""
         return state | dict(self._law.new_state(self._data(stretches, state), 0.0))
 
 
 @dataclass(frozen=True)
 class Cavity:
-    """A thick cylinder of soil in plane strain under inner and outer pressure; linear elements have one point each."""
+    """A thick cylinder of soil in plane strain under inner and outer pressure, with linear elements."""
 
     rings: _Rings  # law
     R: NDArray[np.float64]  # initial radii of the nodes, m
@@ -77,7 +74,7 @@ class Cavity:
     pressure: float  # pressure at the cavity wall, Pa
 
     def widened(self, radius: float) -> Cavity:
-        """Return the cylinder after drained expansion of the cavity to a radius (in m) in one step."""
+        """Return the cylinder after drained expansion of the cavity to a radius, in m, in one step."""
         n, r = len(self.R), self.r.copy()
         r += (radius - r[0]) * r[0] / r  # initial guess, the motion of incompressible soil
         r[0] = radius
@@ -121,7 +118,7 @@ def cavity(
     material
         The soil.
     outer
-        Outer radius, divided by the radius of the cavity; at least 100 to represent infinite soil.
+        Outer radius divided by the initial radius of the cavity; at least 100 to represent infinite soil.
     elements
         Number of elements; their sizes form a geometric progression.
     state
@@ -133,12 +130,13 @@ def cavity(
 
 
 def undrained(material: Skeleton, outer: float, radii: Sequence[float], rings: int = 2000) -> tuple[float, float]:
-    """Return two radial stresses, in Pa.
+    """Return two radial stresses, in Pa, after undrained expansion of a cavity.
 
-    The first one is the total stress at the outer radius minus that at the wall.  The second one is the effective
-    stress at the wall.  The radius of each element follows from constant volume, r^2 - a^2 = R^2 - 1.
+    The first stress is the total stress at the outer radius minus the total stress at the wall.  The second stress is
+    the effective stress at the wall.  The volume of soil is constant, so that a ring of initial radius R has the radius
+    r with r^2 - a^2 = R^2 - 1.
 
-    radii: successive radii a of the cavity, in small steps
+    radii: successive radii a of the cavity, in small steps.
     """
     edges = np.geomspace(1, outer, rings + 1)
     R, law = np.sqrt((edges[1:] ** 2 + edges[:-1] ** 2) / 2), _Rings(material, rings)

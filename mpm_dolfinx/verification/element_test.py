@@ -37,13 +37,13 @@ ITERATIONS, CUTS, CLOSE = 30, 12, 1e-11  # limits: Newton iterations, halvings o
 
 @dataclass(frozen=True)
 class ElementTest:
-    """Results of an element test: arrays with one row for the start, and one for each step.
+    """Results of an element test, as arrays with rows for the start and each step.
 
     F, stress : (n, 3, 3), -, Pa
         Deformation gradient, and effective Cauchy stress, tension positive.
     strain : (n,)
-        Prescribed quantity: logarithmic axial strain, compression positive.  In shear it is F_xy, and in wetting it is
-        the suction, Pa.
+        Prescribed quantity.  In shear it is F_xy, and in wetting it is the suction, Pa.  In other tests it is the
+        logarithmic axial strain, compression positive.
     pressure : (n,), Pa
         Excess pore pressure; zero in drained tests.
     state
@@ -75,7 +75,7 @@ class ElementTest:
         return -np.log(np.linalg.det(self.F))
 
     def draw(self, file: str | Path, title: str = "") -> None:
-        """Draw the stress path, the stress-strain curve, and the volume strain or pore pressure, to an image file."""
+        """Write an image of the stress path, the stress-strain curve, and the volume strain or pore pressure."""
         from matplotlib.figure import Figure
 
         fig = Figure(figsize=(12, 3.6), layout="constrained")
@@ -116,8 +116,8 @@ def element_test(
         isotropic" (constant net stresses), "wetting oedometer" (constant axial net stress, no lateral strain).
     strain
         Final value, or successive turning points, of the prescribed quantity.  In shear this quantity is F_xy, and in
-        wetting the suction, Pa, >= 0.  In all other tests it is the logarithmic axial strain, compression positive.
-        In an isotropic test, all axes have this strain.
+        wetting it is the suction, Pa, >= 0.  In all other tests it is the logarithmic axial strain, compression
+        positive.  In an isotropic test, all axes have this strain.
     steps
         Number of equal steps to each turning point.
     confinement
@@ -128,7 +128,7 @@ def element_test(
     cell_size
         Cell size, m, > 0, for laws that depend on it.
     suction
-        Initial suction, Pa, >= 0, for laws that depend on suction.  It is constant in all tests except wetting.
+        Initial suction, Pa, >= 0, for laws that depend on suction.  The suction changes in wetting tests only.
 
     Raises
     ------
@@ -165,7 +165,7 @@ def element_test(
         out.append(point.moved(out[-1], test, start, goal))
     states = {name: np.array([s.state[name] for s in out]) for name in material.state}
     F, stress = (np.array([getattr(s, name) for s in out]) for name in ("F", "stress"))
-    # in undrained tests the lateral total stress is constant, in shear the normal total stress
+    # undrained tests keep the lateral total stress constant, shear tests the normal total stress
     pressure = (stress - stress[0])[:, 1, 1] * test.endswith("undrained")
     return ElementTest(F, stress, np.array([first, *path]), pressure, states)
 
@@ -185,7 +185,7 @@ class _At:
 
 
 class _Point:
-    """A law at a single point."""
+    """A law at one point."""
 
     def __init__(self, material: Skeleton, rate: float | None, cell_size: float | None, suction: float):
         self._rate, law = rate or 1.0, type(material)
@@ -201,7 +201,7 @@ class _Point:
         self._bulk = float(material.bulk)
 
     def _data(self, F: NDArray[np.float64], state: dict[str, NDArray[np.float64]]):
-        """Return the data of the point that forms need, for several deformation gradients F (m, 3, 3) and one state."""
+        """Return the form data of the point for several deformation gradients and one state."""
         m, grid = len(F), self._law.grid
         inputs = {name: np.tile(v, (m, *[1] * v.ndim)) for name, v in (self._parameters | state).items()}
         cells = np.arange(m, dtype=np.int32) % 8
@@ -221,7 +221,7 @@ class _Point:
         return _At(np.eye(3), self._stress(np.eye(3)[None], self._rest)[0], 0.0, self._rest)
 
     def compressed(self, confinement: float) -> _At:
-        """Return the sample after loading, in steps, to an isotropic effective stress (Pa)."""
+        """Return the sample after gradual loading to an isotropic effective stress, in Pa."""
         at = self.at_rest()
         first = -np.trace(at.stress) / 3
         for share in np.linspace(0, 1, 21)[1:]:
@@ -230,7 +230,7 @@ class _Point:
         return at
 
     def moved(self, at: _At, test: str, start: _At, strain: float) -> _At:
-        """Return the sample at a new strain; steps that fail are halved."""
+        """Return the sample at a new strain.  Steps that fail are halved."""
         parts, done = [strain], 0
         while parts:
             try:
@@ -263,7 +263,7 @@ class _Point:
         return self._balanced(at, F, free, start.stress[[0, 1], [0, 1]], strain, dt)
 
     def _wetted(self, at: _At, start: _At, suction: float, free: Sequence, dt: float) -> _At:
-        """Return the sample at a new suction (Pa), with constant net stresses in the free components."""
+        """Return the sample at a new suction, with constant net stresses."""
         m = self._material
         effective, before = (m.biot * chi_at(m.retention, -s) * s for s in (suction, start.strain))
         goal = [start.stress[i] + before - effective for i in free]
@@ -273,7 +273,7 @@ class _Point:
     def _balanced(
         self, at: _At, F: NDArray[np.float64], free: Sequence, goal: ArrayLike, strain: float, dt: float
     ) -> _At:
-        """Return the sample after dt (s).  The free components of F follow from prescribed Cauchy stresses (Pa)."""
+        """Return the sample after dt, in s, with prescribed stresses in the free components."""
         if not free:
             return self._updated(F, strain, at, dt)
         F, rows, columns = F.copy(), *np.array(free).T

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: MIT
 """Exact solutions for comparison: consolidation, columns, beams and rods.  The module needs no dolfinx.
 
-Stress is positive in tension, pore pressure in compression, as in the rest of the package.  The dimensionless time is
-T = c_v t / length².  The series of exponentials converges slowly for small T.  For T < `SWITCH` a closed inverse
-of the Laplace transform is used.  In this transform, 1 replaces tanh X and coth X, with X = sqrt(s).  Errors of the
-series and of the closed inverse are at most of the order of erfc(1/sqrt(`SWITCH`)) < 2e-23.  Both are therefore exact
-to round-off.
+Stress is positive in tension, pore pressure in compression, as in the rest of the package.  The dimensionless time of
+consolidation is T = c_v t / length².  The series of exponentials converges slowly for small T.  For T < `SWITCH` the
+Laplace transform of the solution is inverted in closed form, with tanh X and coth X replaced by 1, where X = sqrt(s).
+The errors of the series and of the closed form are at most of the order of erfc(1/sqrt(`SWITCH`)) < 2e-23.  Both are
+therefore exact to round-off.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from scipy.special import ellipe, ellipeinc, ellipkinc, ellipkm1, erf, erfc, erf
 
 from mpm_dolfinx.base.tolerances import EPSILON, ROUND_OFF, SAME, TINY
 
-SWITCH = 0.02  # dimensionless time below which the closed inverse is used.  Source: both forms are exact
+SWITCH = 0.02  # dimensionless time below which the closed form is used.  Source: both forms are exact
 TERMS = 20  # number of exponentials.  Source: exact bound, the last is below exp(-70)
 Array = NDArray[np.float64]
 
@@ -44,7 +44,7 @@ def _within(name: str, value: ArrayLike, upper: float) -> Array:
 
 
 def _by_time(short, long, T: ArrayLike) -> Array:
-    """Return short(T) where T < `SWITCH`, else long(T); each function is evaluated only in its own range of T."""
+    """Return short(T) where T < `SWITCH`, and long(T) elsewhere."""
     T = np.asarray(T)
     return np.where(T < SWITCH, short(np.minimum(T, SWITCH)), long(np.maximum(T, SWITCH)))[()]
 
@@ -54,12 +54,12 @@ def _series(amplitudes: Array, roots: Array, T: Array) -> Array:
 
 
 def _transient(k: complex, z: ArrayLike, T: Array) -> NDArray:
-    """Return the inverse Laplace transform of exp(-z X) / (X (X - k)), X = sqrt(s); Abramowitz & Stegun 29.3.90."""
+    """Return the inverse of the transform exp(-z X) / (X (X - k)); Abramowitz & Stegun 29.3.90."""
     return np.exp(-np.square(z) / (4 * T)) * erfcx(z / (2 * np.sqrt(T)) - k * np.sqrt(T))
 
 
 def terzaghi_pressure(z: ArrayLike, t: ArrayLike, height: float, cv: float, p0: float = 1.0) -> Array:
-    """Return the pore pressure of a layer that drains at one end and is undrained at the other end.
+    """Return the pore pressure of a layer that drains at one end only.
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ def terzaghi_pressure(z: ArrayLike, t: ArrayLike, height: float, cv: float, p0: 
 
 
 def terzaghi_consolidation(t: ArrayLike, height: float, cv: float) -> Array:
-    """Return the degree of consolidation: settlement since t = 0+, divided by its final value.
+    """Return the degree of consolidation: the settlement since t = 0+, divided by the final settlement.
 
     Parameters as for `terzaghi_pressure`: t (...), s, > 0; height, m, > 0; cv, m²/s, > 0.
     Returns (...), in (0, 1]. Source: Terzaghi (1923); Verruijt.
@@ -95,14 +95,14 @@ def terzaghi_consolidation(t: ArrayLike, height: float, cv: float) -> Array:
 
 @dataclass(frozen=True)
 class Mandel:
-    """Mandel's slab in plane strain, loaded from t = 0 by rigid smooth plates, free and drained at its lateral sides.
+    """Mandel's slab in plane strain, loaded by rigid smooth plates and drained at its lateral sides.
 
     The model is a quarter of the slab, with symmetry at x = 0 and y = 0.  The plate is at y = b, and the drained side
     is at x = a.
 
     Parameters
     ----------
-    a, b : m, > 0; width and height of the quarter; each is half of that of the slab
+    a, b : m, > 0; width and height of the quarter, half the width and half the height of the slab
     bulk, shear : Pa, > 0; drained moduli K (in three dimensions) and G
     mobility : m²/(Pa s), > 0; kappa = permeability / viscosity = conductivity / (density of the fluid * g)
     storage : 1/Pa, >= 0; S at constant strain, n/K_w + (alpha - n)/K_s
@@ -110,7 +110,7 @@ class Mandel:
     force : N/m; resultant on the plate of width a, per metre of depth, positive in compression
 
     Source: Mandel (1953), Géotechnique 3; Cheng & Detournay (1988), Int. J. Numer. Anal. Methods Geomech. 12;
-    Abousleiman et al. (1996), Géotechnique 46. Their ratio (1 - nu)/(nu_u - nu) is here expressed by K, G, alpha and S.
+    Abousleiman et al. (1996), Géotechnique 46. The ratio (1 - nu)/(nu_u - nu) is expressed by K, G, alpha and S.
     """
 
     a: float
@@ -149,7 +149,7 @@ class Mandel:
 
     @property
     def _ratio(self) -> float:
-        """(1 - nu)/(nu_u - nu) > 1, computed without cancellation."""
+        """The ratio (1 - nu)/(nu_u - nu) > 1, computed without cancellation."""
         return 1 + (self.bulk / self.shear + 1 / 3) * (1 + self._oedometric * self.storage / self.alpha**2)
 
     @cached_property
@@ -179,8 +179,7 @@ class Mandel:
         t (...), s, > 0: times
 
         Returns (u_x, u_y), m; u_x is independent of y, and u_y is independent of x. Source: computed from the pressure
-        and the force on the plate, with zero total stress at the lateral side. The displacement agrees with the papers
-        cited for the class.
+        and the force on the plate, with zero total stress at the lateral side; agrees with the papers cited above.
         """
         x, y = np.asarray(x, dtype=float), _within("y", y, self.b)
         plane = self.bulk + self.shear / 3  # lambda + G
@@ -190,7 +189,7 @@ class Mandel:
         return lateral / self._oedometric, strain * y
 
     def _pressures(self, x: ArrayLike, t: ArrayLike) -> Array:
-        """Return one array (2, ...), in Pa: the pressure, and the integral of the pressure from 0 to x divided by a."""
+        """Return the pressure, and its integral from 0 to x divided by a, in Pa."""
         _positive(t=t)
         xi, T = np.broadcast_arrays(_within("x", x, self.a) / self.a, self.cv * np.asarray(t, dtype=float) / self.a**2)
         p0 = self.skempton * (1 + self.nu_undrained) * self.force / (3 * self.a)
@@ -209,7 +208,7 @@ class Mandel:
 
 
 def cryer_pressure(t: ArrayLike, radius: float, cv: float, nu: float, p0: float = 1.0) -> Array:
-    """Return the pore pressure at the centre of a sphere that is loaded and drains at its surface.
+    """Return the pore pressure at the centre of a sphere that is loaded and drained at its surface.
 
     Parameters
     ----------
@@ -229,7 +228,7 @@ def cryer_pressure(t: ArrayLike, radius: float, cv: float, nu: float, p0: float 
 
 
 def _cryer_short(mu: float, T: Array) -> Array:
-    """Return the inverse Laplace transform of (1 - 2 X exp(-X)) / (X² - mu X + mu); poles are k and its conjugate."""
+    """Return the inverse of the transform (1 - 2 X exp(-X)) / (X² - mu X + mu)."""
     k = (mu + 1j * np.sqrt(mu * (4 - mu))) / 2
     uniform = (k * _transient(k, 0, T)).imag / k.imag
     gauss = np.exp(-1 / (4 * T)) / np.sqrt(np.pi * T)
@@ -248,8 +247,8 @@ def _cryer_long(mu: float, T: Array) -> Array:
 class SelfWeightColumn:
     """Column of Hencky's material without lateral strain, standing at Y = 0 under its own weight.
 
-    Without lateral stretch, the Cauchy stress and the first Piola-Kirchhoff stress along the column are both
-    tau / stretch.  This stress balances the weight above. For nu = 0 the modulus K + 4G/3 is Young's modulus.
+    The Cauchy stress and the first Piola-Kirchhoff stress along the column are both tau / stretch, because there is no
+    lateral stretch.  This stress balances the weight above Y.  For nu = 0, K + 4G/3 is Young's modulus.
 
     Parameters
     ----------
@@ -357,7 +356,7 @@ def shear_flexible_rod(
 
 
 def _rod(loads: Array, axial: float, shear: float):
-    """Solve for (x, y, rotation, moment) of the rod with unit length and unit bending stiffness, in load steps."""
+    """Solve for (x, y, rotation, moment) of the rod with unit length and stiffness."""
     s, state = np.linspace(0, 1, 41), np.zeros((4, 41))
     state[0] = s
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Unsaturated pores of the finite element reference.  Pressures are relative to a unit; see also `retention`."""
+"""Unsaturated pores of the finite element reference, with pressures relative to a unit."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ class Pores:
             self._drains = fem.Constant(domain, self._scale)
 
     def of(self, name: str, p):
-        """Return a property at pressures p as UFL; name: see `Retentions.of`."""
+        """Return a property of the pores at the pressure p as UFL; see `Retentions.of` for the names."""
         return ufl.as_ufl(1.0) if self.law is None else property_of(self.law, name, self._unit * p)
 
     def between(self, p0, p1):
         """Return the mean of k_r between the pressures p0 and p1 as a UFL expression.
 
-        The mean is a Gauss quadrature on the scale of `retention.logarithm`. On the scale of the pressure, all
-        integration points between a wet cell and a very dry cell would be dry.
+        The mean is a Gauss quadrature over `retention.logarithm`.  With a quadrature over the pressure, all points
+        between a wet cell and a very dry cell would be dry.
         """
         if self.law is None:
             return 1.0
@@ -57,5 +57,9 @@ class Pores:
         return mean / total
 
     def reached(self, p: NDArray[np.float64], dp: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the limited decreases (n,) of pressures p (n,) in a Newton step; dp (n,): decreases without limit."""
+        """Return the pressure decreases of a Newton step after limitation.
+
+        p (n,): pressures.
+        dp (n,): pressure decreases without limitation.
+        """
         return restrained(p, dp, self._scale)

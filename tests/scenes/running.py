@@ -93,7 +93,8 @@ class _Builder:
         options = self.options(later)
         terms = [*conditions.pop("terms"), *map(mpm.Source, conditions.pop("sources"))]
         acting = [one for values in conditions.values() for one in values]
-        options |= {"walls": walls, "conditions": acting, "terms": terms, "later": later}
+        options |= {"walls": walls, "conditions": acting, "terms": terms}
+        found = [mpm.Later(body) if i in later else body for i, body in enumerate(found)]
         simulation = mpm.Simulation(self.grid, found, materials, **options)
         return Built(scene, frame, simulation, self.order, self.loads, numbers, materials)
 
