@@ -1,21 +1,20 @@
 # SPDX-License-Identifier: MIT
 """A bank of clay loses strength and slides against a rigid barrier: run-out, and force on the barrier.
 
-The scene is half of a bank of undrained clay on a rough floor.  This half is H = 10 m high and 10 m long, with a
-vertical side.  Within ten minutes the strength c of the clay decreases from 0.3 to 0.07 gamma H, with the unit weight
-gamma.  The bank is stable while c > 0.26 gamma H.  Inertia is neglected.  A viscous stress (a term in UFL) limits the
-velocity, and vanishes at rest.  A wall with an adhesion of c / 2 stops the clay.
+By symmetry, half of the bank is computed, H = 10 m high and 10 m long. The bank has a vertical side and stands on a
+rough floor. The clay is undrained. The strength c of the clay decreases within ten minutes from 0.3 to 0.07 gamma H,
+where gamma is the unit weight. The bank is stable while c > 0.26 gamma H. A viscous stress (a term in UFL) limits the
+velocity and vanishes at rest. Inertia is neglected. A wall with an adhesion of c / 2 stops the clay.
 
-After the slide the shear stress on any plane is at most c.  Consider a plane of inclination theta and length l through
-the foot of the wall.  The clay between the wall and this plane is a wedge of weight W.  The shear force V on the wall
-is at most c D / 2, with the depth D of the clay at the wall.  The equilibrium of the wedge then bounds the force F
-normal to the wall:
+The final force on the wall is compared with limit analysis (Culmann 1866). After the slide, the shear stress on any
+plane is at most c. Consider a plane through the foot of the wall, with inclination theta and length l. The clay between
+the plane and the wall is a wedge of weight W. The shear force V on the wall is at most c D / 2, where D is the depth of
+the clay at the wall. The equilibrium of the wedge bounds the force F normal to the wall:
 
     F >= ((W - V) sin(theta) - c l) / cos(theta),        F <= ((W + V) sin(theta) + c l) / cos(theta).
 
-The largest lower bound is Coulomb's active force, and the smallest upper bound is Coulomb's passive force, for the
-deformed surface (Culmann 1866).  Planes that end on the axis of symmetry are omitted.  The computed final force lies
-between the two bounds.
+The largest lower bound of all planes is Coulomb's active force, and the smallest upper bound is Coulomb's passive
+force. Planes that end on the axis of symmetry are omitted. The computed force lies between the two bounds.
 """
 
 from __future__ import annotations
@@ -41,7 +40,7 @@ ANGLES = np.radians(np.linspace(20, 85, 261))  # angles of the planes of wedges
 
 
 def bank(cells: int, barrier: bool) -> mpm.Simulation:
-    """Return the bank, `cells` cells high, in equilibrium at t = 0."""
+    """Return the bank in equilibrium at t = 0, with `cells` cells over its height."""
     h = HEIGHT / cells
     grid = mpm.Grid([0, 0], [LENGTH, HEIGHT + h], [round(LENGTH / h), cells + 1])
     clay = mpm.DruckerPrager(
@@ -62,12 +61,12 @@ def bank(cells: int, barrier: bool) -> mpm.Simulation:
 
 @dataclass
 class Frame:
-    """The bank at a time, s.
+    """State of the bank at one time, in s.
 
     corners (n, 4, 2): corners of the domains, in m.
     moved (n,): magnitudes of the displacements of the points, in m.
-    force (3,): normal and shear force on the barrier, in N/m, and moment about its foot, in N.
-    bounds: bounds of the normal force, in N/m.
+    force (3,): normal force and shear force on the barrier, in N/m, and moment about the foot of the barrier, in N.
+    bounds: active and passive force on the barrier, in N/m.
     depth: depth of the clay at the barrier, in m.
     """
 
@@ -80,12 +79,12 @@ class Frame:
 
     @property
     def run_out(self) -> float:
-        """Run-out of the bank: distance of its toe from the axis of symmetry, m."""
+        """Distance of the toe of the bank from the axis of symmetry, in m."""
         return float(self.corners[:, :, 0].max())
 
 
 def bounds(s: mpm.Simulation, depth: float) -> tuple[float, float]:
-    """Return the active and the passive force, N/m, on the barrier for the present strength of the clay."""
+    """Return the active and the passive force on the barrier for the present strength of the clay, in N/m."""
     x, c = s.points.x, s.points.data["cohesion"][0]
     sin, cos, rubs = np.sin(ANGLES), np.cos(ANGLES), ADHESION * depth
     off = x[:, 1, None] * cos - (WALL - x[:, 0, None]) * sin  # (n, planes), m
@@ -99,7 +98,7 @@ def bounds(s: mpm.Simulation, depth: float) -> tuple[float, float]:
 
 @dataclass
 class Slump:
-    """A run: the bank after each step, the number of steps, and the number of cut steps."""
+    """Results of a run: the bank after each step, the number of steps, and the number of cut steps."""
 
     frames: list[Frame] = field(default_factory=list)
     steps: int = 0
@@ -107,7 +106,7 @@ class Slump:
 
 
 def slump(cells: int, steps: int, barrier: bool) -> Slump:
-    """Let the bank lose its cohesion in a number of steps, and come to rest."""
+    """Reduce the strength of the bank in a number of steps, and let the bank come to rest."""
     s, out, dt = bank(cells, barrier), Slump(), DURATION / steps
     start = s.points.x
 
@@ -120,7 +119,7 @@ def slump(cells: int, steps: int, barrier: bool) -> Slump:
         out.frames.append(Frame(s.t, corners, moved, force, between, depth))
 
     def weaken(s: mpm.Simulation) -> None:
-        """Set the strength that the clay has at the end of the next step."""
+        """Set the strength of the clay at the end of the next step."""
         s.stage(fields={"cohesion": STRONG + min(1.0, (s.t + dt) / DURATION) * (WEAK - STRONG)})
 
     def go(t_end: float, dt: float, *observers) -> None:
@@ -136,7 +135,7 @@ def slump(cells: int, steps: int, barrier: bool) -> Slump:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return the results of --json."""
+    """Run the demo and return its results."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=20, help="cells over the height")
     parser.add_argument("--steps", type=int, default=60, help="steps in which the cohesion is lost")
@@ -172,7 +171,7 @@ def report(out: dict) -> None:
 
 
 def draw(o: Namespace, free: Slump, held: Slump) -> None:
-    """Draw the bank at first contact and at the end, with and without barrier, and the force as a function of time."""
+    """Draw the bank with and without barrier, and the force against time."""
     fig, axes = common.figure(2, 2, (13, 6.6))
     meets = next(k for k, f in enumerate(held.frames) if f.force[0] > 0)
     shown = [

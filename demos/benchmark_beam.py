@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: MIT
-"""Run times of the poroelastic beam: material points with several schemes, and finite elements.
+"""Run times of the poroelastic beam, with material points and with finite elements.
 
-The beam of `poroelastic_beam.py` takes 60 steps.  Material points are run with the default scheme, with fixed-stress
-iterations, with backward Euler, and in adaptive steps.  Two body-fitted finite element methods are timed: Q1/DG0 on
-cells of the same size, and Taylor-Hood.  Both solve monolithic systems with MUMPS, to the tolerance of the material
-points.  Every case runs `--repeat` times, in turn with the others.  The shortest time is used, because other work on
-the machine only increases times.  Compile times are given separately.  Three errors of the tip deflection are given: at
-0.02 s, at 0.06 s, and the largest error from 0.1 s on.  The reference is a solution with Taylor-Hood elements,
-converged in time (`beam.TRUTH`).
+The beam of `poroelastic_beam.py` takes 60 steps. Material points are run with the default scheme, with fixed-stress
+iterations, with backward Euler, and in adaptive steps. The finite element methods are Q1/DG0 on cells of equal size,
+and Taylor-Hood. Both finite element methods solve monolithic systems with MUMPS, to the tolerance of the material
+points.
+
+Each case runs `--repeat` times, in turn with the other cases. The shortest time is used, because other work on the
+machine only increases times. Compile times are given separately. The error of the tip deflection is given at 0.02 s and
+at 0.06 s, and its largest value from 0.1 s on. The reference is a solution with Taylor-Hood elements, converged in time
+(`beam.TRUTH`).
 """
 
 from __future__ import annotations
@@ -31,7 +33,7 @@ CASES = {
 
 
 def run(name: str, options: str) -> tuple[mpm.Result, float]:
-    """Run one case; return (result, compile seconds)."""
+    """Run one case and return its result and its compile time, in s."""
     o, probe = beam.arguments(f"{options} {CASES[name]}".split()), np.array([[beam.LENGTH, beam.HEIGHT / 2]])
     if name.startswith("mpm"):
         simulation, bottom = beam.scene(o)
@@ -45,10 +47,7 @@ def run(name: str, options: str) -> tuple[mpm.Result, float]:
 
 
 def errors(result: mpm.Result) -> list[float]:
-    """Return relative errors of the tip deflection: at 0.02 s, at 0.06 s, and the largest from 0.1 s on.
-
-    An error is nan if the run ends before this time.
-    """
+    """Return three relative errors of the tip deflection: at 0.02 s, at 0.06 s, and the largest from 0.1 s on."""
     found = {round(t, 9): u[0, 1] for t, u in zip(result.t, result.displacement, strict=True)}
     off = {t: abs(found.get(t, np.nan) / u - 1) for t, u in zip(beam.TIMES, beam.TRUTH, strict=True)}
     late = [error for t, error in off.items() if t >= 0.1 and error == error]
@@ -56,7 +55,7 @@ def errors(result: mpm.Result) -> list[float]:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the benchmark; return the results of --json."""
+    """Run the benchmark and return its results."""
     parser = common.Parser(__doc__, __file__, writes=False)
     parser.add_argument("--h", type=float, default=0.015, help="cell size, m")
     parser.add_argument("--t-end", type=float, default=1.2, help="end time, s")

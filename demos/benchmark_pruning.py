@@ -1,16 +1,14 @@
 # SPDX-License-Identifier: MIT
-"""Cost of each feature of a scene, measured with a pair of scenes, one with and one without this feature.
+"""Cost of each feature of a scene, measured with a pair of scenes: one with the feature, and one without.
 
-A square block of 1 m between smooth walls carries a load so small that the active cells do not change.  In each pair,
-one scene lacks the feature, and the other scene has it almost without effect.  Examples are a gravity of zero, a
-conductivity of 1e-30 m/s, a plastic law far from yield, and a stabilisation without anything to damp.  `settlement` is
-the relative difference between the final settlements of the two scenes.  In the pair "mean dilatation" (F-bar),
-different Poisson ratios cause this difference.
+The scene is a square block of 1 m between smooth walls. The load is so small that the active cells do not change. The
+feature has almost no effect. Examples are a gravity of zero, a conductivity of 1e-30 m/s, and a plastic law far from
+yield. `settlement` is the relative difference between the final settlements of the two scenes. In the pair "mean
+dilatation" (F-bar), the two scenes have different Poisson ratios and therefore different settlements.
 
-The two scenes are timed in turn, one step each, --repeat times.  The shortest step of each scene is used, because other
-work on the machine only increases times.  The compile time is the extra time for a scene and its first step with an
-empty cache of compiled forms.  Memory is the peak memory with a full cache of compiled forms.  All times are processor
-times.
+The two scenes of a pair take one step each in turn, --repeat times. The shortest step of each scene is used, because
+other work on the machine only increases times. All times are processor times. The compile time is the extra time for
+the first step if the cache of compiled forms is empty. The memory is the peak memory if this cache is full.
 """
 
 from __future__ import annotations
@@ -45,7 +43,7 @@ HEAVY = {"gravity": (0, 0), "numerics": mpm.Numerics(coupling="schur-fgmres"), *
 
 
 def soil(law: type[mpm.Skeleton] = mpm.Hencky, nu: float = 0.0, **options) -> mpm.Skeleton:
-    """Return a skeleton with the law `law` and the Poisson ratio nu."""
+    """Return a skeleton with this law and this Poisson ratio."""
     return law(bulk=2 * SHEAR * (1 + nu) / (3 * (1 - 2 * nu)), shear=SHEAR, **options)
 
 
@@ -58,10 +56,7 @@ def block(
     grid: mpm.Grid | None = None,
     **options,
 ) -> mpm.Simulation:
-    """Return the block, `cells` cells wide.
-
-    box: width of the grid, m; the grid is two cells higher than wide.
-    """
+    """Return the block, `cells` cells wide, in a grid of width `box`, in m."""
     h = 1 / cells
     count = [round(box * cells), round(box * cells) + 2]
     grid = grid or mpm.Grid([0, 0], [box, box + 2 * h], count, axisymmetric=axisymmetric)
@@ -74,7 +69,7 @@ def block(
 
 
 def meshed(grid: mpm.Grid, cells: int):
-    """Return the block, made from a mesh; its particle domains equal the domains that `mpm.box` makes."""
+    """Return the block, made from a mesh."""
     square = mesh.create_rectangle(MPI.COMM_SELF, [[0, 0], [1, 1]], [2 * cells] * 2, mesh.CellType.quadrilateral)
     top = np.sort(mesh.locate_entities_boundary(square, 1, lambda x: np.isclose(x[1], 1)))
     tags = mesh.meshtags(square, 1, top, np.ones(len(top), dtype=np.int32))
@@ -82,7 +77,7 @@ def meshed(grid: mpm.Grid, cells: int):
 
 
 def weighted(cells: int) -> mpm.Simulation:
-    """Return the block with the ghost penalty on all faces: every cell is treated as nearly empty."""
+    """Return the block with the ghost penalty on all faces."""
     ratio, ghost_penalty.RATIO = ghost_penalty.RATIO, 1e6
     try:
         simulation = block(cells)
@@ -93,7 +88,7 @@ def weighted(cells: int) -> mpm.Simulation:
 
 
 def restless(cells: int, **options) -> mpm.Simulation:
-    """Return the block with the grid reset in each step, as if the block had moved."""
+    """Return the block with a grid that is reset in each step."""
     simulation = block(cells, **options)
     motion = simulation.scene.motion
     motion.advanced = partial(motion.advanced, stays=False)
@@ -101,7 +96,7 @@ def restless(cells: int, **options) -> mpm.Simulation:
 
 
 def of_many_sizes(cells: int, moves: bool, **options) -> mpm.Simulation:
-    """Return the block in cells of two sizes, with the grid reset in each step; moves: whether grid lines oscillate."""
+    """Return the block in cells of two sizes, with grid lines that oscillate if `moves` is True."""
 
     def lines(t: float) -> list[np.ndarray]:
         even = [np.linspace(0, end, n + 1) for end, n in ((1, cells), (1 + 2 / cells, cells + 2))]
@@ -113,14 +108,14 @@ def of_many_sizes(cells: int, moves: bool, **options) -> mpm.Simulation:
 
 
 def refactorised(cells: int) -> mpm.Simulation:
-    """Return the draining block of a linear law that is treated as nonlinear."""
+    """Return the draining block, with a linear law that is treated as nonlinear."""
     simulation = linear(cells)
     simulation.scene.momentum.linear = False
     return simulation
 
 
 def linear(cells: int) -> mpm.Simulation:
-    """Return the draining block of a linear law."""
+    """Return the draining block with a linear law."""
     return block(cells, soil(mpm.LinearElastic, conductivity=1e-4), **WATER)
 
 
@@ -130,7 +125,7 @@ def draining(cells: int, **options) -> mpm.Simulation:
 
 
 def layered(cells: int, off: float) -> mpm.Simulation:
-    """Return the draining block with four layers of alternating conductivity; off: offset from grid lines, in cells."""
+    """Return the draining block with four layers of alternating conductivity, `off` cells away from grid lines."""
     h, heights = 1 / cells, np.arange(5) / 4
     heights[1:-1] += off * h
     grid = mpm.Grid([0, 0], [1, 1 + 2 * h], [cells, cells + 2])
@@ -142,7 +137,7 @@ def layered(cells: int, off: float) -> mpm.Simulation:
 
 
 class Watched(mpm.Hencky):
-    """A skeleton with four times the damping tau: `conducting` evaluates pressure jumps, but does not damp them."""
+    """A skeleton with four times the damping tau, so that `conducting` computes pressure jumps without damping."""
 
     def pressure_damping(self) -> float:
         return 4 * super().pressure_damping()
@@ -151,18 +146,14 @@ class Watched(mpm.Hencky):
 def conducting(cells: int, law: type[mpm.Skeleton]) -> mpm.Simulation:
     """Return the draining block, with the mobility `kappa = 8 tau h² / dt` for the damping tau of Hencky's law.
 
-    In a substep dt, pressure jumps are evaluated if `kappa dt < 4 tau h²`, and damped if `kappa dt < tau h²`. In these
-    conditions tau is the damping of the law `law`.
+    A substep dt computes pressure jumps if `kappa dt < 4 tau h²`, and damps them if `kappa dt < tau h²`.
     """
     kappa = 8 * soil().pressure_damping() / cells**2 / (GAMMA * DT)
     return block(cells, soil(law, conductivity=kappa * WATER["fluid"].unit_weight), **WATER)
 
 
 def sealed_soil(cells: int, yields: bool = True) -> mpm.Simulation:
-    """Return the undrained block of plastic soil.
-
-    yields: whether pressure jumps are damped as in yielding soil, instead of as in elastic soil.
-    """
+    """Return the undrained block of plastic soil, with pressure damping as in yielding soil if `yields` is True."""
     simulation = block(cells, soil(mpm.DruckerPrager, friction=0.0, dilation=0.0, cohesion=LOAD), **SEALED)
     if not yields:
         simulation.scene.materials._softness.clear()
@@ -170,21 +161,18 @@ def sealed_soil(cells: int, yields: bool = True) -> mpm.Simulation:
 
 
 def plastic(cells: int, law: type[mpm.Skeleton], **constants) -> mpm.Simulation:
-    """Return the block of plastic soil that is far from yielding."""
+    """Return the block of plastic soil far from yield."""
     return block(cells, soil(law, friction=30.0, dilation=0.0, cohesion=1e9, **constants))
 
 
 def yielded(cells: int, **options) -> mpm.Simulation:
-    """Return the block of soil that yields, with the grid reset in each step."""
+    """Return the block of yielding soil, with a grid that is reset in each step."""
     clay = soil(mpm.DruckerPrager, friction=0.0, dilation=0.0, cohesion=LOAD / 10)
     return restless(cells, material=clay, numerics=mpm.Numerics(**options))
 
 
 def clayey(cells: int) -> mpm.Simulation:
-    """Return the block of overconsolidated clay, under its initial stress and a load.
-
-    Its initial bulk modulus is that of `soil`.
-    """
+    """Return the block of overconsolidated clay under an initial stress and a load."""
     p = 1e5  # Pa
     moduli = {"shear": SHEAR, "kappa": p / soil().bulk, "lambda_": 5 * p / soil().bulk}
     clay = mpm.ModifiedCamClay(M=1.2, OCR=4.0, initial_stress=(-p, -p, -p), **moduli)
@@ -195,7 +183,7 @@ LOOSE = {"r": 0.5, "beta": 1e-5, "reference": 1e4}
 
 
 def drying(cells: int, law: type[mpm.ModifiedCamClay], **constants) -> mpm.Simulation:
-    """Return the draining block of overconsolidated clay, with suction that increases at the top."""
+    """Return the draining block of overconsolidated clay, with suction that grows at the top."""
     p = 1e5  # Pa
     moduli = {"shear": SHEAR, "kappa": p / soil().bulk, "lambda_": 5 * p / soil().bulk, "conductivity": 1e-8}
     clay = law(M=1.2, OCR=4.0, initial_stress=(-p, -p, -p), retention=mpm.VanGenuchten(1e6), **moduli, **constants)
@@ -204,7 +192,7 @@ def drying(cells: int, law: type[mpm.ModifiedCamClay], **constants) -> mpm.Simul
 
 
 def apart(cells: int, **options) -> mpm.Simulation:
-    """Return the block and a second body that is a quarter as wide and touches nothing."""
+    """Return the block and a narrower second body that touches nothing."""
     h = 1 / cells
     grid = mpm.Grid([0, 0], [1.5, 1 + 2 * h], [round(1.5 * cells), cells + 2])
     bodies = [mpm.box(grid, [0, 0], [1, 1]), mpm.box(grid, [1.25, 0], [1.5, 1])]
@@ -310,7 +298,7 @@ MAKES = [make for pair in PAIRS.values() for make in pair]
 
 
 def take(simulation: mpm.Simulation, folder: str | None) -> tuple[float, mpm.Result]:
-    """Take `STEPS` steps; return the processor time per step, s, and the result."""
+    """Take `STEPS` steps, and return the processor time of a step, in s, and the result."""
     probe = mpm.probes(simulation.bodies, [[0.5, 1.0]])
     observe = [mpm.Writer(simulation, folder)] if folder else []
     end, began = simulation.t + STEPS * DT, time.process_time()
@@ -319,7 +307,7 @@ def take(simulation: mpm.Simulation, folder: str | None) -> tuple[float, mpm.Res
 
 
 def first_step(make: Make, cells: int) -> dict[str, float]:
-    """Return the processor time, s, to the end of a scene's first step, and the peak memory of this process, MB."""
+    """Return the processor time until the end of the first step, in s, and the peak memory, in MB."""
     began = sum(os.times()[:4])  # the C compiler's too
     make(cells).step(DT)
     return {"seconds": sum(os.times()[:4]) - began, "memory": peak_memory()}
@@ -327,10 +315,10 @@ def first_step(make: Make, cells: int) -> dict[str, float]:
 
 @cache
 def compiled(make: Make, cells: int) -> tuple[float, float]:
-    """Return the compilation time, s, and the peak memory, MB, of a scene and its first step.
+    """Return the compilation time of a scene, in s, and its peak memory, in MB.
 
     The compilation time is the difference between two processes: one with an empty cache of compiled forms, and one
-    with a full cache.  The memory is that of the process with the full cache.
+    with a full cache. The memory is that of the process with the full cache.
     """
     command = [sys.executable, __file__, "--cells", str(cells), "--one", str(MAKES.index(make))]
     with TemporaryDirectory() as folder:
@@ -341,7 +329,7 @@ def compiled(make: Make, cells: int) -> tuple[float, float]:
 
 
 def measure(name: str, cells: int, repeat: int) -> dict:
-    """Return the costs of a pair of scenes. Each cost is a list of two: without and with the feature."""
+    """Return the costs of a pair of scenes, each as a list of two values: without and with the feature."""
     pair = [make(cells) for make in PAIRS[name]]
     least, tops = [np.inf, np.inf], [0.0, 0.0]
     with TemporaryDirectory() as folder:
@@ -366,7 +354,7 @@ def line(name: str, row: dict) -> str:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return the results of --json."""
+    """Run the demo and return its results."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=40, help="cells over the width of the block")
     parser.add_argument("--repeat", type=int, default=8, help="turns of a pair, after one that is not counted")

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: MIT
 """Thresholds between linear solvers: run times of both solvers below and above each threshold.
 
-Each row is a scene with a given number of displacement unknowns.  Both solvers are measured, by changing the threshold.
-A time is the processor time of two steps, the shortest of --repeat runs.  On several processes it is the largest time
-of all processes, and includes waiting.  The table of thresholds is in `mpm_dolfinx/solve/solver_choice.py`.
+Each row of the table is a scene with a given number of displacement unknowns. The demo changes the threshold, so that
+both solvers are measured. A time is the processor time of two steps, and the shortest of --repeat runs. On several
+processes, the time is the largest time of all processes, including waiting. The thresholds are in
+`mpm_dolfinx/solve/solver_choice.py`.
 
-On one process a second table follows.  For each direct solver it lists three times: of a first factorisation of the
+On one process a second table follows. For each direct solver, it lists the times of a first factorisation of the
 stiffness, of a repeated factorisation, and of a solve.
 """
 
@@ -55,17 +56,16 @@ CASES: dict[str, tuple[Callable[[int], mpm.Simulation], tuple[int, ...], tuple[i
     "multigrid_2d": (lambda n: block(2, n, ELASTIC, True), (64, 96, 128, 192), (16,)),
     "mumps": (lambda n: block(2, n, YIELDS, True), (64, 128, 192, 256), (12,)),
 }
-"""For each threshold: function that returns a scene of n cells along an axis, numbers n, numbers n with --quick."""
+"""Scenes for each threshold: a function of the number n of cells along an axis, values of n, and values of n with
+--quick.
+"""
 
 FACTORED = (16, 128, 256)
-"""Cells along an axis of the blocks whose stiffness each direct solver factorises; --quick: only the first."""
+"""Cells along an axis of the blocks in the second table. With --quick, only the first block is computed."""
 
 
 def took(make: Callable[[int], mpm.Simulation], n: int, name: str, least: int) -> tuple[float, int, plan.SolverPlan]:
-    """Return the time of the steps (s), the number of unknowns and the chosen solvers.
-
-    least: value of the threshold `name`.
-    """
+    """Return the time of the steps, in s, the number of unknowns, and the chosen solvers, for one threshold."""
     usual, plan.THRESHOLDS = plan.THRESHOLDS, replace(plan.THRESHOLDS, **{name: least})
     try:
         s = make(n)
@@ -80,10 +80,7 @@ def took(make: Callable[[int], mpm.Simulation], n: int, name: str, least: int) -
 
 
 def factored(n: int, soil: mpm.Skeleton) -> Iterator[tuple[str, int, list[float]]]:
-    """Yield for each direct solver its name, the number of unknowns, and three processor times, s.
-
-    Timed are a first factorisation of the stiffness, the next factorisation with the same pattern, and a solve.
-    """
+    """Yield for each direct solver its name, the number of unknowns, and the three times of the second table, in s."""
     s = block(2, n, soil, True)
     s.step(1.0)
     tangent = s.tangent(1.0)
@@ -118,7 +115,7 @@ def factored(n: int, soil: mpm.Skeleton) -> Iterator[tuple[str, int, list[float]
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Print the table; return its times by threshold and number of unknowns."""
+    """Print the tables, and return the times by threshold and number of unknowns."""
     parser = common.Parser(__doc__, __file__, processes=True)
     parser.add_argument("--repeat", type=int, default=2, help="turns of a pair")
     parser.add_argument("--quick", action="store_true", help="small blocks, one turn")

@@ -1,19 +1,19 @@
 # SPDX-License-Identifier: MIT
 """Large deflection of a cantilever under a dead load at its end, until it hangs.
 
-A dry, slender beam of 1 m x 0.05 m, clamped at its left end, carries a dead load P, spread evenly over its right end.
-The load parameter `alpha = P L² / (E I)` is 1, 2, 5 and 10.  P and I = height³ / 12 are per unit depth.  At alpha = 10
-the tip deflection is 0.81 L, and the shortening is 0.56 L.  E = 12 MPa and nu = 0, so plane strain equals plane stress.
-Of the package's laws, the neo-Hookean law is closest to the linear law of a rod: its stress at a strain e is
-`E (e - e²/2 + ...)`.
+A dry beam, 1 m long and 0.05 m high, is clamped at its left end. A dead load P is spread evenly over its right end. The
+load parameter `alpha = P L² / (E I)` is 1, 2, 5 and 10, with the length L, Young's modulus E and the second moment of
+area I. P and I = height³ / 12 are per unit depth. At alpha = 10 the tip deflection is 0.81 L, and the shortening is
+0.56 L. Poisson's ratio is zero, so plane strain equals plane stress. The law is neo-Hookean.
 
-There are two references.  The elastica (Bisshopp & Drucker 1945) neither stretches nor shears.  The geometrically exact
-rod (Reissner 1972, Simo 1985) has the stiffnesses E A, 5/6 G A and E I.  The demo runs on one process.
+There are two references. The elastica (Bisshopp & Drucker 1945) neither stretches nor shears. The geometrically exact
+rod (Reissner 1972, Simo 1985) has the stiffnesses E A, 5/6 G A and E I, with the area A and the shear modulus G. The
+demo runs on one process.
 
-Errors `v_1` to `v_10`: difference between the tip deflections v of beam and rod, divided by L, at each alpha.  Errors
-`u_1` to `u_10`: difference between the shortenings u, divided by L.  The table gives these errors for 8 cells over the
-height and 40 steps (MPM), and for converged finite elements (FE), which also differ from the rod.  On fine grids the
-material points converge to these elements with second order in the cell size.
+Errors `v_1` to `v_10` are the differences between the tip deflections v of beam and rod at each alpha, divided by L.
+Errors `u_1` to `u_10` are the differences between the shortenings u. The table gives these errors for material points
+(MPM), with 8 cells over the height and 40 steps, and for converged finite elements (FE). On fine grids the material
+points converge to these finite elements with second order in the cell size.
 
     alpha       1        2        5        10
     v, MPM    0.05 %   0.11 %   0.13 %   0.12 %
@@ -42,7 +42,7 @@ ARC = np.linspace(0, LENGTH, 41)  # m; arc lengths of the probes on the axis
 
 
 def traction(alpha: float) -> tuple[float, float]:
-    """Return the traction (Pa) on the right end for a load parameter, which is the time of the scene."""
+    """Return the traction on the right end for a load parameter, in Pa."""
     return 0.0, -alpha * STIFFNESS / LENGTH**2 / HEIGHT
 
 
@@ -51,16 +51,16 @@ PHYSICS = {"walls": {"left": "xy"}, "conditions": [mpm.Traction("right", tractio
 
 @dataclass
 class Outcome:
-    """The axis (k, 2) of the beam by alpha, in m, relative to the middle of the clamp; and the result of the run."""
+    """Results of a run: the axis (k, 2) of the beam for each alpha, in m, and the `mpm.Result`."""
 
     axis: dict[int, np.ndarray]
     result: mpm.Result
 
 
 def run(cells: int = 8, steps: int = 40, last: int = 10) -> tuple[dict[str, float], Outcome]:
-    """Bend the beam, `cells` cells high, to alpha = `last` in increments of 10 / `steps`.
+    """Bend the beam to alpha = `last` in increments of 10 / `steps`.
 
-    Returns two results: the errors that the module's docstring defines, and the axes.
+    Returns the errors that the module's docstring defines, and the results of the run.
     """
     h = HEIGHT / cells
     grid = mpm.Grid([0, 0], BOX, np.rint(BOX / h).astype(int))
@@ -76,7 +76,7 @@ def run(cells: int = 8, steps: int = 40, last: int = 10) -> tuple[dict[str, floa
 
 
 def rod(alpha: float) -> np.ndarray:
-    """Return the axis (k, 2) of the rod, in m, at the arc lengths `ARC`."""
+    """Return the axis (k, 2) of the rod at the arc lengths `ARC`, in m."""
     axial, transverse = YOUNG * HEIGHT, 5 / 6 * RUBBER.shear * HEIGHT
     return shear_flexible_rod(LENGTH, axial, transverse, STIFFNESS, -alpha * STIFFNESS / LENGTH**2, points=ARC)
 
@@ -88,7 +88,7 @@ def errors(out: Outcome) -> dict[str, float]:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return the results of --json."""
+    """Run the demo and return its results."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=8, help="cells over the height")
     parser.add_argument("--steps", type=int, default=40, help="equal increments of the load to alpha = 10")
@@ -105,7 +105,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def report(out: Outcome, found: dict[str, float]) -> None:
-    """Print deflection and shortening of the tip, the rod and the elastica."""
+    """Print the deflection and the shortening of beam, rod and elastica."""
     print("alpha |     v/L      rod elastica  v - rod |     u/L      rod elastica  u - rod")
     for alpha, axis in out.axis.items():
         (x, y), (rod_x, rod_y), (u, v) = axis[-1] / LENGTH, rod(alpha)[-1] / LENGTH, elastica_tip(alpha)
@@ -114,7 +114,7 @@ def report(out: Outcome, found: dict[str, float]) -> None:
 
 
 def draw(o: Namespace, out: Outcome) -> None:
-    """Draw the deformed axes of beam and rod, and the tips of beam and elastica."""
+    """Draw the axes of beam and rod, and the tips of beam and elastica."""
     fig, ((left, right),) = common.figure(1, 2, (11, 4.8))
     for i, (alpha, axis) in enumerate(out.axis.items()):
         left.plot(*rod(alpha).T, color="black", lw=1, label=None if i else "shear-flexible rod")

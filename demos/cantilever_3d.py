@@ -1,19 +1,20 @@
 # SPDX-License-Identifier: MIT
-"""A cantilever of square section with a load inclined to the grid: tip, number of load steps, cost of a step.
+"""A cantilever of square section with a load inclined to the grid: tip displacement, and cost of a step.
 
-A dry beam of 1 m x 0.1 m x 0.1 m, clamped at x = 0, carries a dead load P on its free end, along (0, 3, -4) / 5.  A
-square section has the same stiffness about all axes.  The beam must therefore bend in the direction of the load, like
-the geometrically exact rod with stretch and shear (Reissner 1972, Simo 1985).  The load parameter is alpha = P
-L² / (E I).  The material is elastic, so the deflection must not depend on the number of steps.  This tests the exact
-integration over the particle domains.  The demo runs on any number of processes; --profile prints the cost of a step.
+A dry beam, 1 m long and 0.1 m high and wide, is clamped at x = 0. A dead load P acts on its free end in the direction
+(0, 3, -4) / 5. A square section has equal stiffness about all axes, so the beam must bend in the direction of the load.
+The reference is the geometrically exact rod with stretch and shear (Reissner 1972, Simo 1985). The load parameter is
+`alpha = P L² / (E I)`, with the length L, Young's modulus E and the second moment of area I. The material is elastic,
+so the deflection must not depend on the number of steps. The demo runs on any number of processes. --profile prints the
+cost of a step.
 
-All errors are divided by L.  `v` is the error of the tip deflection, and `u` that of the shortening, compared with the
-rod.  `w` is the displacement of the tip normal to the plane of bending.  `drift` is the largest distance of the tip
-from its position in the run with the most steps.
+All errors are divided by L. `v` is the error of the tip deflection against the rod, and `u` is the error of the
+shortening. `w` is the displacement of the tip normal to the plane of bending. `drift` is the largest distance of the
+tip from its position in the run with the most steps.
 
-The tip deflection is too large because the stress is constant in each domain.  With n domains over the height the error
-is about 1/n².  In 10 steps, `v` is 0.0129 with 2 cells (n = 4), 0.0034 with 4 cells and 0.0010 with 8 cells.  In plane
-strain it is 0.0127 with 2 cells, 0.0033 with 4 cells and 0.0010 with 8 cells.
+The tip deflection is too large because the stress is constant in each domain. With n domains over the height the error
+is about 1/n². In 10 steps, `v` is 0.0129 with 2 cells over the height, 0.0034 with 4 cells, and 0.0010 with 8 cells. In
+plane strain, `v` is 0.0127 with 2 cells, 0.0033 with 4 cells, and 0.0010 with 8 cells.
 """
 
 from __future__ import annotations
@@ -36,14 +37,14 @@ OFFSET = np.array([0, 0.37, 0.5])  # offset of the beam from the grid lines, cel
 
 
 def rod(alpha: float) -> tuple[float, float]:
-    """Return (shortening, deflection) of the rod's tip, m."""
+    """Return the shortening and the deflection of the rod's tip, in m."""
     area, load = SIDE**2, alpha * STIFFNESS / LENGTH**2
     x, y = shear_flexible_rod(LENGTH, YOUNG * area, 5 / 6 * RUBBER.shear * area, STIFFNESS, load, points=2)[-1]
     return LENGTH - x, y
 
 
 def scene(cells: int, alpha: float) -> tuple[mpm.Simulation, mpm.surface.Probes]:
-    """Return the beam, `cells` cells high, and the middle of its free end; at time 1 s the load parameter is alpha."""
+    """Return the beam and the middle of its free end; at 1 s the load parameter is alpha."""
     h = SIDE / cells
     reach = np.abs(ALONG) * rod(alpha)[1] * 1.05
     span = np.array([LENGTH * 1.05, SIDE, SIDE]) + reach + 3 * h
@@ -65,7 +66,7 @@ def run(cells: int, steps: int, alpha: float, taken: int | None = None) -> tuple
     """Return the tip displacement (3,), in m, the result and the costs of a run.
 
     steps: number of steps to the full load.
-    taken: number of these steps that are computed; None means all.
+    taken: number of computed steps; None means all steps.
     """
     simulation, tip = scene(cells, alpha)
     result = simulation.run((taken or steps) / steps, 1 / steps, probes=tip)
@@ -87,7 +88,7 @@ def run(cells: int, steps: int, alpha: float, taken: int | None = None) -> tuple
 
 
 def surface(simulation: mpm.Simulation) -> tuple[np.ndarray, np.ndarray]:
-    """Return the k outer faces (k, 4, 3) of the body, in m, and the axial stretch (k,) at each face."""
+    """Return the outer faces (k, 4, 3) of the body, in m, and the axial stretch (k,) at each face."""
     (corners, F), (body,) = common.whole(simulation, "corners", "F"), simulation.bodies
     bits, faces, stretch = corner_bits(3), [], []
     for axis in range(3):
@@ -99,7 +100,7 @@ def surface(simulation: mpm.Simulation) -> tuple[np.ndarray, np.ndarray]:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return the results of --json."""
+    """Run the demo and return its results."""
     parser = common.Parser(__doc__, __file__, processes=True)
     add = parser.add_argument
     add("--cells", type=int, default=4, help="cells over the height")
@@ -130,7 +131,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def errors(tips: np.ndarray, alpha: float) -> dict[str, float]:
-    """Return the errors of the run with most steps, see the module's docstring."""
+    """Return the errors that the module's docstring defines, for the run with the most steps."""
     u, v = rod(alpha)
     tip = tips[-1]
     drift = np.linalg.norm(tips - tip, axis=1).max()
@@ -139,7 +140,7 @@ def errors(tips: np.ndarray, alpha: float) -> dict[str, float]:
 
 
 def report(o: Namespace, tips: np.ndarray, found: dict[str, float]) -> None:
-    """Print the tips of the beam and of the rod."""
+    """Print the tip displacements of the beam and of the rod."""
     u, v = rod(o.alpha)
     rows = {steps: (tip @ ALONG, tip @ ACROSS, -tip[0]) for steps, tip in zip(o.steps, tips, strict=True)}
     head = ["load steps", "along (m)", "across (m)", "shortening (m)"]

@@ -1,23 +1,21 @@
 # SPDX-License-Identifier: MIT
 """Expansion of a cylindrical cavity in clay and in sand, on a grid of squares.
 
-The body is a quarter of a ring, with initial radius a0 of the cavity and outer radius b = 5 a0.  In each step the wall
-moves by a fifth of a cell in drained soil, and by a tenth of a cell in undrained soil.  Such small steps are needed
-because laws with history are first-order accurate in the step.  A radial solution without a grid has such errors too.
-In steps of a0 / 40, its pore pressures in normally consolidated clay are 1.5 % too low at a = 1.1 a0.
+The body is a quarter of a ring, with the initial radius a0 of the cavity and the outer radius b = 5 a0. In each step
+the wall of the cavity moves by a fifth of a cell in drained soil, and by a tenth of a cell in undrained soil. Small
+steps are needed because laws with history are first-order accurate in the step.
 
-1. A cavity expands in saturated Modified Cam Clay of two overconsolidation ratios, so fast that no water flows.  The
-   initial pressure acts on the outer boundary.  In incompressible soil the exact motion is known.  As the cavity grows
-   to radius a, a point moves from radius R to r, with `r^2 - a^2 = R^2 - a0^2`.
-2. Then the wall is fixed, the clay drains at the outer boundary, and excess pressures dissipate.
-3. Drained cavities are a well in Modified Cam Clay (Chen and Abousleiman 2013), and cavities in Mohr-Coulomb sand with
-   phi = 30 degrees, without and with associated dilation (Yu and Houlsby 1991).  The published solutions are for
-   infinite soil.  The outer boundary of the ring therefore follows a radial solution
-   (`mpm_dolfinx.verification.cavity`).
+1. A cavity expands in saturated Modified Cam Clay, so fast that no water flows. The initial pressure acts on the outer
+   boundary. The soil is incompressible, so the motion is known exactly. When the cavity has grown to radius a, a point
+   has moved from radius R to r, with `r^2 - a^2 = R^2 - a0^2`.
+2. The wall is fixed after the expansion, and excess pressures dissipate through the outer boundary.
+3. Drained cavities expand in Modified Cam Clay around a well (Chen and Abousleiman 2013), and in Mohr-Coulomb sand with
+   phi = 30 degrees, without and with associated dilation (Yu and Houlsby 1991). The published solutions are for
+   infinite soil. The outer boundary therefore follows a radial solution (`mpm_dolfinx.verification.cavity`).
 
-Pressures are divided by p_0.  Errors are relative errors of the cavity pressure, and in undrained clay also of the pore
-pressure at the wall.  Errors are evaluated at the radii `MARKS` in undrained clay, and at the radii with published
-pressures in drained soil.
+Pressures are divided by the initial pressure p_0. Errors are relative errors of the cavity pressure, and in undrained
+clay also of the pore pressure at the wall. In undrained clay errors are evaluated at the radii `MARKS`, and in drained
+soil at the radii with published pressures.
 """
 
 from __future__ import annotations
@@ -45,7 +43,10 @@ SAND = mpm.MohrCoulomb(bulk=G * 2.6 / 1.2, shear=G, friction=30.0, dilation=0.0,
 
 
 def well() -> mpm.ModifiedCamClay:
-    """Return the clay of Chen and Abousleiman; lambda and kappa refer to ln(specific volume) and Kirchhoff stress."""
+    """Return the clay of Chen and Abousleiman.
+
+    lambda and kappa are converted to ln(specific volume) and Kirchhoff stress.
+    """
     lambda_, kappa = (index / 2.064 / (1 - index / 2.064) for index in (0.15, 0.03))
     stress = (-P0, -P0, -1.6 * P0)
     clay = mpm.ModifiedCamClay(M=1.2, lambda_=lambda_, kappa=kappa, shear=43.02 * P0, initial_stress=stress)
@@ -54,12 +55,11 @@ def well() -> mpm.ModifiedCamClay:
 
 @dataclass(frozen=True)
 class Drained:
-    """A drained cavity in infinite soil.
+    """A drained cavity in infinite soil; all radii are divided by the initial radius of the cavity.
 
-    soil, state: the soil and its initial state variables.
-    known: published pressure divided by p_0, for each radius.
+    state: initial state variables of the soil.
+    known: published cavity pressure divided by p_0, for each radius.
     reach: outer radius of the radial solution.
-    Radii are divided by the initial radius of the cavity.
     """
 
     soil: mpm.Skeleton
@@ -78,17 +78,17 @@ SHOWN = {"well": "Modified Cam Clay", "sand-0": "Mohr–Coulomb, ψ = 0", "sand-
 
 
 def ray(X: np.ndarray) -> np.ndarray:
-    """Return the outward direction (n, 2) at reference positions (n, 2) in the box that becomes the ring."""
+    """Return the outward direction (n, 2) at reference positions (n, 2)."""
     angle = X[:, 1:] * np.pi / (2 * (OUTER - 1))
     return np.concatenate([np.cos(angle), np.sin(angle)], axis=1)
 
 
 def ring(cells: int, soil: mpm.Skeleton, widest: float, outside: Callable | None = None, **scene) -> mpm.Simulation:
-    """Return a quarter of the ring, with `cells` cells over the initial radius of the cavity.
+    """Return a quarter of the ring around a cavity of radius 1 + t, in m.
 
-    The radius of the cavity is 1 + t, in m.
+    cells: number of cells over the initial radius of the cavity.
     widest: largest radius of the cavity, in m.
-    outside: displacement of the outer boundary, in m, as a function of time.
+    outside: displacement of the outer boundary as a function of time, in m.
     """
     h = 1 / cells
     size = int(np.ceil(np.sqrt(OUTER**2 + widest**2 - 1) / h)) + 2
@@ -108,7 +108,7 @@ def ring(cells: int, soil: mpm.Skeleton, widest: float, outside: Callable | None
 
 
 def widen(s: mpm.Simulation, cells: int, radius: float, push: float) -> float:
-    """Widen the cavity to a radius, m, by `push` cells in a step; return the cavity pressure divided by p_0."""
+    """Widen the cavity to a radius, in m, by at most `push` cells in a step, and return its `pressure`."""
     steps = max(1, int(np.ceil((radius - 1 - s.t) * cells / push - 1e-6)))
     s.run(radius - 1, (radius - 1 - s.t) / steps, progress=False)
     return pressure(s, radius)
@@ -120,7 +120,7 @@ def pressure(s: mpm.Simulation, radius: float) -> float:
 
 
 def drained(name: str, cells: int) -> dict[float, tuple[float, float]]:
-    """Return, for each radius, the computed cavity pressure and that of the radial solution, divided by p_0."""
+    """Return the computed cavity pressure and that of the radial solution for each radius, divided by p_0."""
     case = DRAINED[name]
     widest = max(case.known)
     reference, radii, out, p = cavity(case.soil, case.reach, 150, state=case.state), [1.0], [0.0], {}
@@ -137,13 +137,12 @@ def drained(name: str, cells: int) -> dict[float, tuple[float, float]]:
 
 @dataclass
 class Undrained:
-    """Results of an undrained expansion and of the consolidation after it.
+    """Results of an undrained expansion and of the consolidation that follows; pressures are divided by p_0.
 
-    total: for each radius, the computed and the exact cavity pressure minus p_0.
-    water: for each radius, the computed and the exact pore pressure at the wall.
-    profiles: (time after the expansion, in s, radii of the points, in m, pore pressures).
+    total: computed and exact cavity pressure minus p_0, for each radius.
+    water: computed and exact pore pressure at the wall, for each radius.
+    profiles: times after the expansion, in s, with radii of the points, in m, and pore pressures.
     balance: error of the fluid balance.
-    All pressures are divided by p_0.
     """
 
     total: dict[float, tuple[float, float]]
@@ -160,7 +159,7 @@ def at_wall(s: mpm.Simulation, radius: float, h: float) -> float:
 
 
 def push(OCR: float, cells: int) -> Undrained:
-    """Widen the cavity in undrained clay to the last radius in `MARKS`, then let the clay drain."""
+    """Widen the cavity in undrained clay to the last radius of `MARKS`, then let the clay drain."""
     soil = replace(CLAY, OCR=OCR, bulk=None)
     water = {"fluid": mpm.Fluid(), "conditions": [mpm.Pressure("right", P0), mpm.Drained("right")]}
     widest = MARKS[-1]
@@ -189,7 +188,7 @@ def push(OCR: float, cells: int) -> Undrained:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return the results of --json."""
+    """Run the demo and return its results."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=8, help="cells over the hole's radius")
     parser.add_argument("--cases", nargs="*", default=list(DRAINED), choices=list(DRAINED), help="drained cases")
@@ -223,7 +222,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(out: Path, dry: dict, wet: dict[float, Undrained]) -> None:
-    """Draw pressures in drained cavities, and dissipating pore pressures around undrained cavities."""
+    """Draw cavity pressures in drained soil, and dissipating pore pressures in undrained clay."""
     from matplotlib.cm import viridis
 
     fig, ((left, right),) = common.figure(1, 2, (12, 4.2))

@@ -1,20 +1,20 @@
 # SPDX-License-Identifier: MIT
 """Columns of dry sand collapse: run-out and height against published experiments, and energies.
 
-Columns of width L and height a L stand against a smooth wall on a rough floor, with a = 0.5, 1, 4 and 8.  Their right
-side is released suddenly.  Lube et al. (2005) measured sand, sugar and rice in a channel, with angles of repose near 31
-degrees.  In these experiments the front moves by 1.2 a L for a < 1.8, and by 1.9 a^(2/3) L for a > 2.8.
+A column of width L and height a L stands on a rough floor against a smooth wall, with a = 0.5, 1, 4 and 8. The right
+side of the column is released suddenly. In the experiments of Lube et al. (2005) with sand, sugar and rice, the front
+moves by 1.2 a L for a < 1.8, and by 1.9 a^(2/3) L for a > 2.8. The angles of repose are near 31 degrees.
 
-The sand follows the Mohr-Coulomb law without dilation.  In simple shear its strength is sin(phi) times the normal
-stress (Davis 1968), so sin(phi) = tan(31 degrees).  In fast flow the friction coefficient grows by 0.93 I, with the
-inertial number I (Jop, Forterre and Pouliquen 2006).  This increase is equivalent to a viscosity of
-`0.93 d sqrt(p rho_s)`, with the grain size d = L/100 and the grain density rho_s.  The pressure p is that in the middle
-of a heap half as high as the column.  With a constant viscosity, run-outs are as accurate as with a local viscosity
-(Ionescu et al. 2015).  Without viscosity, shear localises in single cells and dissipates energy numerically.  The front
-is the point at which the depth of the sand is one grain.
+The sand follows the Mohr-Coulomb law without dilation. In simple shear its strength is sin(phi) times the normal stress
+(Davis 1968), so sin(phi) = tan(31 degrees). In fast flow the friction coefficient grows by 0.93 I, with the inertial
+number I (Jop, Forterre and Pouliquen 2006). The growth of the friction coefficient is equivalent to a viscosity of
+`0.93 d sqrt(p rho_s)`, with the grain size d = L/100, the pressure p and the grain density rho_s. In the demo the
+viscosity is constant, and p is the pressure in the middle of a heap half as high as the column. With a constant
+viscosity, run-outs are as accurate as with a local viscosity (Ionescu et al. 2015). Without viscosity, shear localises
+in single cells. The front is the point at which the depth of the sand is one grain.
 
-Sources: Lube, Huppert, Sparks and Freundt (2005), Phys. Rev. E 72, 041301, as in Lagree, Staron and Popinet (2011),
-J. Fluid Mech. 686, 378.
+Sources: Lube, Huppert, Sparks and Freundt (2005), Phys. Rev. E 72, 041301, as in Lagree, Staron and Popinet (2011), J.
+Fluid Mech. 686, 378.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ STEPS = 50  # in the time sqrt(H/g)
 
 
 class Heap(NamedTuple):
-    """Results for a column, run_out and height in m.
+    """Results for a column; `run_out` and `height` are in m.
 
     lost: largest error of the energy balance, divided by the work of the weight.
     left: final kinetic energy, divided by the work of the weight.
-    before, after: corners of the domains, in m.
+    before, after: initial and final corners of the domains, in m.
     profiles: middles of vertical strips, and depths of sand in these strips, in m.
     """
 
@@ -56,7 +56,7 @@ class Heap(NamedTuple):
 
 
 def published(aspect: float) -> float:
-    """Return the run-out by Lube et al., divided by the width; between their two laws it is interpolated."""
+    """Return the run-out by Lube et al., divided by the width of the column."""
     return float(np.interp(aspect, (1.8, 2.8), (0, 1)) * (1.9 * aspect ** (2 / 3) - 1.2 * aspect) + 1.2 * aspect)
 
 
@@ -90,7 +90,7 @@ def column(aspect: float, cells: int, grain: float = GRAIN, renewal: bool = Fals
 
 
 def depths(s: mpm.Simulation, h: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the middles of vertical strips of width h, and the depths of sand in these strips; all in m."""
+    """Return the middles of vertical strips of width h, and the depths of sand in these strips, in m."""
     low, high = (end(s.points.corners[:, :, 0], axis=1) for end in (np.min, np.max))
     edges = np.arange(0, s.grid.upper[0] + h / 2, h)
     share = np.clip((edges - low[:, None]) / (high - low)[:, None], 0, 1)
@@ -100,7 +100,8 @@ def depths(s: mpm.Simulation, h: float) -> tuple[np.ndarray, np.ndarray]:
 def collapsed(aspect: float, cells: int, steps: float, grain: float = GRAIN, renewal: bool = False) -> Heap:
     """Release a column and return its `Heap`.
 
-    steps: number of steps in the time sqrt(H/g); grain, renewal: see `column`.
+    steps: number of steps in the time sqrt(H/g) for the height H.
+    grain, renewal: see `column`.
     """
     s = column(aspect, cells, grain, renewal)
     fall = np.sqrt(aspect / GRAVITY)
@@ -124,7 +125,7 @@ def collapsed(aspect: float, cells: int, steps: float, grain: float = GRAIN, ren
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return the results of --json."""
+    """Run the demo and return its results."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--aspects", type=float, nargs="+", default=list(CELLS), help="height-to-width ratios")
     parser.add_argument("--finer", type=float, default=1.0, help="factor for the number of cells over the width")
@@ -157,7 +158,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, heaps: dict[float, Heap]) -> None:
-    """Draw a column in motion, run-outs with the published law, and energies."""
+    """Draw a column in motion, the run-outs, and the energies."""
     fig, ((way, runs, energy),) = common.figure(1, 3, (15, 4))
     a = min(heaps, key=lambda a: abs(a - 1))
     one = heaps[a]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Functions that several demos share: options, first and last printed lines, tables, pictures, two terms in UFL."""
+"""Functions that several demos share: options, printed lines, tables, pictures, and two terms in UFL."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ import mpm_dolfinx as mpm
 
 GALLERY = Path(__file__).with_name("README.md")
 COLOURS = "#0072B2 #E69F00 #009E73 #D55E00 #CC79A7 #56B4E9 #882255 #7F7F7F #999933 #332288".split()
-"""Colours of lines, in order, distinct even for the colour-blind (Okabe and Ito 2008, Tol 2021)."""
+"""Colours of lines, distinct even for the colour-blind (Okabe and Ito 2008, Tol 2021)."""
 
 
 class Parser(argparse.ArgumentParser):
-    """Command line of a demo: its own options, --json and, if the demo writes files, --out.
+    """Command line of a demo, with the options --json and, if the demo writes files, --out.
 
     processes: whether the demo also runs on several processes.
     """
 
     class Formatter(argparse.ArgumentDefaultsHelpFormatter, argparse.RawDescriptionHelpFormatter):
-        """Help text with unchanged line breaks, and the default of each option."""
+        """Help text with unchanged line breaks and the default of each option."""
 
     def __init__(self, description: str, file: str, writes: bool = True, processes: bool = False):
         super().__init__(description=description, formatter_class=self.Formatter)
@@ -42,10 +42,9 @@ class Parser(argparse.ArgumentParser):
         self.add_argument("--json", action="store_true", help="print the results as one line of JSON at the end")
 
     def parse_args(self, args: Sequence[str] | None = None, namespace=None) -> argparse.Namespace:
-        """Return the options, with the run time of the demo (s or min, as text) in `takes`.
+        """Return the options, with the run time of the demo as text in `takes`.
 
-        The run time is taken from the table Gallery of README.md. It is None if the table has no row with these
-        options.
+        The run time comes from the table Gallery of README.md, or is None if the table has no row with these options.
         """
         args = sys.argv[1:] if args is None else list(args)
         o = super().parse_args(args, namespace)
@@ -58,7 +57,7 @@ class Parser(argparse.ArgumentParser):
         return o
 
     def refuse_processes(self, what: str = "") -> None:
-        """End a demo on several processes, because the output would contain only a part of the points."""
+        """Refuse to run on several processes, where the output would contain only a part of the points."""
         if (size := MPI.COMM_WORLD.size) == 1:
             return
         if not first():
@@ -68,9 +67,9 @@ class Parser(argparse.ArgumentParser):
 
 @contextmanager
 def results(o: argparse.Namespace) -> Iterator[dict]:
-    """Yield a dict for the results; print the expected run time at the start and, with --json, the results at the end.
+    """Yield a dict for the results, and print it at the end with --json.
 
-    If the run fails (`mpm.GaveUp`), print one line, set `converged` to False, and keep the earlier results.
+    The expected run time is printed at the start. If the run fails (`mpm.GaveUp`), `converged` is False in the dict.
     """
     out, start = {}, time.perf_counter()
     if first() and o.takes:
@@ -104,7 +103,7 @@ def whole(s: mpm.Simulation, *names: str) -> list[np.ndarray]:
 
 
 def table(rows: Iterable[Iterable[str]]) -> None:
-    """Print rows of text, the head first, in aligned columns; the first column is left-aligned."""
+    """Print rows of text as a table; the first row is the head."""
     rows = [list(row) for row in rows]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for name, *entries in rows:
@@ -113,7 +112,7 @@ def table(rows: Iterable[Iterable[str]]) -> None:
 
 
 def markdown(rows: Iterable[Iterable[str]]) -> str:
-    """Return rows of text, the head first, as a Markdown table."""
+    """Return rows of text as a Markdown table; the first row is the head."""
     head, *body = ("| " + " | ".join(row) + " |" for row in rows)
     return "\n".join([head, "|" + "---|" * (head.count(" | ") + 1), *body])
 
@@ -126,7 +125,7 @@ def write_csv(path: Path, head: Iterable[str], rows: Iterable[Iterable]) -> None
 
 
 def figure(rows: int, columns: int, size: tuple[float, float]):
-    """Return a figure of matplotlib, which needs no display, and its axes (rows, columns); `size` is in inches."""
+    """Return a figure of matplotlib and its axes (rows, columns); `size` is in inches."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -139,7 +138,7 @@ def figure(rows: int, columns: int, size: tuple[float, float]):
 
 
 def save(fig, path: Path, dpi: int = 130) -> None:
-    """Write a figure as a picture of at most 256 colours, which reduces the size of the file to a third."""
+    """Write a figure as a picture of at most 256 colours, so that the file is small."""
     from PIL import Image
 
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -150,7 +149,7 @@ def save(fig, path: Path, dpi: int = 130) -> None:
 
 
 def weight(unit_weight: float) -> Callable:
-    """Return a term for `terms=`: a downward weight, given in N/m³ of undeformed ground."""
+    """Return a term for `terms=`: a downward weight, in N/m³ of undeformed ground."""
 
     def weight(points, v):
         return unit_weight / ufl.det(points.F) * points.value(v)[1] * points.dx
@@ -159,7 +158,10 @@ def weight(unit_weight: float) -> Callable:
 
 
 def viscous(viscosity: float) -> Callable:
-    """Return a term for `terms=`: the viscous stress `2 eta D` with eta in Pa s and `D = sym(grad(u)) / dt`."""
+    """Return a term for `terms=`: the viscous stress `2 eta D`, with the viscosity eta, in Pa s.
+
+    D is the rate of deformation, `sym(grad(u)) / dt`.
+    """
 
     def viscous(points, u, dt):
         strain = ufl.sym(points.grad(u))
@@ -169,7 +171,7 @@ def viscous(viscosity: float) -> Callable:
 
 
 def domains(ax, corners: np.ndarray, values: np.ndarray | None = None, **style):
-    """Draw particle domains with corners (n, 4, 2), coloured by values (n,); return matplotlib's collection."""
+    """Draw particle domains with corners (n, 4, 2), coloured by values (n,)."""
     from matplotlib.collections import PolyCollection
 
     style = {"edgecolors": "face", "linewidth": 0.2} | style

@@ -1,30 +1,27 @@
 # SPDX-License-Identifier: MIT
 """A cone penetrometer is pushed from the surface into weightless clay, and the pore pressures then dissipate.
 
-The cone has a tip angle of 60 degrees and a roughness of 0.3: its adhesion is 0.3 s_u.  The shaft behind the cone is a
-second tool, which is smooth.  The force on the cone is therefore known separately.  The scene is axisymmetric.  The
-clay is undrained and follows Tresca's law with the strength s_u.  With --mises it follows von Mises's law with this
-strength in pure shear.  The shear modulus of the clay is G = 100 s_u.  The resistance is compared with that of a deep
-cone in clay with Tresca's law and equal initial stresses in all directions (Lu, Randolph, Hu and Bugarski 2004,
-Geotechnique 54),
+The cone has a tip angle of 60 degrees and an adhesion of 0.3 s_u, where s_u is the strength of the clay. The shaft
+behind the cone is a second tool, which is smooth, so the force on the cone is known separately. The scene is
+axisymmetric. The clay is undrained and follows Tresca's law, or with --mises von Mises's law with the strength s_u in
+pure shear. The shear modulus of the clay is G = 100 s_u. The resistance is F / (pi R^2 s_u), with the force F on the
+cone and the radius R of the shaft. The resistance is compared with a formula for a deep cone in Tresca clay with equal
+initial stresses in all directions (Lu, Randolph, Hu and Bugarski 2004, Geotechnique 54):
 
-    N_c = F / (pi R^2 s_u) = 3.4 + 1.6 ln(G / s_u) + 1.3 alpha,
+    N_c = 3.4 + 1.6 ln(G / s_u) + 1.3 alpha,
 
-with the radius R of the shaft and the roughness alpha.
+where alpha = 0.3 is the adhesion divided by s_u. Domains of clay longer than a cell are replaced by new domains
+(renewal). The shaft and the surface of the clay lie in the middle of cells, because renewal does not refill cells that
+a surface crosses several times. The edge between cone and shaft has a radius of one cell.
 
-Domains of clay that become longer than a cell are replaced by new domains (renewal).  Without renewal the run ends at a
-depth of two radii.  The shaft and the surface of the clay lie in the middle of cells.  A surface along a grid line
-would cross the same cells several times, and renewal does not refill such cells.  The edge between cone and shaft
-has a radius of one cell.
+The cone is also pushed into saturated ("wet") clay, so fast that the clay is undrained. Then the cone stops, and the
+excess pressure at the edge between cone and shaft dissipates. The fraction of the excess pressure that remains is
+compared with the curve of Teh and Houlsby (1991, Geotechnique 41) for a deep cone. The time factor of this curve is
+`T* = c_v t / (R^2 sqrt(G / s_u))`, with the coefficient of consolidation c_v and the time t. Near the surface pressures
+dissipate faster. Half of the pressure has dissipated at T* = 0.03 if the tip is three radii deep, and at T* = 0.08 if
+the tip is five radii deep.
 
-The cone is pushed so fast into saturated ("wet") clay that the clay is undrained.  Then the cone stops, and the excess
-pressure at the edge between cone and shaft dissipates.  The fraction of this pressure that remains is compared with the
-curve of Teh and Houlsby (1991, Geotechnique 41) as a function of `T* = c_v t / (R^2 sqrt(G / s_u))`.  This curve is for
-a deep cone.  Near the surface pressures dissipate faster: half of the pressure has dissipated at T* = 0.03 with the tip
-three radii deep, and at T* = 0.08 with the tip five radii deep.
-
-With --follow the cone is pushed once more into undrained clay, on grid lines that follow the cone.  The small cells
-then surround only the cone, and move with it.  Both runs start with the same points.
+With --follow, the cone is pushed once more into undrained clay, on grid lines that follow the cone.
 """
 
 from __future__ import annotations
@@ -54,7 +51,7 @@ CV = WET.conductivity / WATER.unit_weight * WET.oedometric  # m²/s
 TIMES = np.logspace(-3, 0.2, 25)  # T*, of the outputs while pressures dissipate
 DISSIPATED = np.array([0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8])
 TEH = np.array([0.038, 0.078, 0.142, 0.245, 0.439, 0.804, 1.60])
-"""Degree of dissipation at the edge between cone and shaft, and the time factor T*, by Teh and Houlsby (1991)."""
+"""Degrees of dissipation at the edge between cone and shaft, and time factors T*, by Teh and Houlsby (1991)."""
 
 
 def published() -> float:
@@ -67,10 +64,10 @@ class Push:
     """Results of a push into undrained clay.
 
     depth: depth of the tip after each step, divided by R.
-    N: force on the cone after each step, divided by pi R^2 s_u.
+    N: resistance after each step.
     frame: final corners (n, 4, 2) of the domains, in m, a field (n,), and the outline (k, 2) of the cone, in m.
     seeded: number of points at the start.
-    cells: number of grid cells, and number of cells if all were as small as the smallest.
+    cells: number of grid cells, and number of cells if all cells were as small as the smallest.
     """
 
     depth: list[float] = field(default_factory=list)
@@ -94,8 +91,7 @@ def scene(
 
     cells: number of cells over the radius R, minus one half.
     depth: greatest depth of the cone, in m.
-    speed: velocity of the cone, in m/s, until the time `end`, in s.
-    follow: whether grid lines follow the cone.
+    speed: velocity of the cone until the time `end`, in m/s.
     """
     h = R / (cells + 0.5)
     low, fine = -(np.ceil(depth / h) + 2 * cells + 0.5) * h, np.ceil(FINE / h) * h
@@ -129,7 +125,7 @@ def scene(
 
 
 def push(cells: int, depth: float, clay: mpm.Skeleton, follow: bool = False) -> Push:
-    """Push the cone to `depth`, m, into undrained clay; grid lines may follow the cone."""
+    """Push the cone into undrained clay to `depth`, in m."""
     out = Push()
     simulation, outline = scene(cells, depth, clay, 1.0, depth, None, follow)
     lines = simulation.grid.lines
@@ -151,8 +147,8 @@ def push(cells: int, depth: float, clay: mpm.Skeleton, follow: bool = False) -> 
 class Dissipation:
     """Excess pressure at the edge between cone and shaft, divided by s_u.
 
-    rest: fraction of this pressure that remains at the times T* of `TIMES`.
-    frame: corners (n, 4, 2), in m, excess pressures (n,) divided by s_u, and outline of the cone, in m, when it stops.
+    rest: fraction of the excess pressure that remains at the times T* of `TIMES`.
+    frame: corners of the domains, excess pressures divided by s_u, and outline of the cone, when the cone stops.
     """
 
     N: float = 0.0
@@ -167,7 +163,7 @@ class Dissipation:
 
 
 def push_wet(cells: int, depth: float) -> Dissipation:
-    """Push the cone to `depth`, m, into saturated clay, then let the pore pressures dissipate."""
+    """Push the cone into saturated clay to `depth`, in m, then let the pore pressures dissipate."""
     out = Dissipation()
     speed = FAST * CV / (2 * R)
     end = depth / speed
@@ -176,7 +172,7 @@ def push_wet(cells: int, depth: float) -> Dissipation:
     edge = np.array([R, outline[-2, 1] - depth])
 
     def excess(s: mpm.Simulation) -> float:
-        """Return the mean pressure of the points at a distance of less than a cell from the edge, divided by s_u."""
+        """Return the mean excess pressure of the points within a cell of the edge, divided by s_u."""
         near = np.linalg.norm(s.points.x - edge, axis=1) < h
         volume = s.points.volume0[near]
         return float(volume @ s.points.pressure[near] / volume.sum() / STRENGTH)
@@ -196,7 +192,7 @@ def push_wet(cells: int, depth: float) -> Dissipation:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return the results of --json."""
+    """Run the demo and return its results."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=2, help="whole cells over the radius, which has half a cell more")
     parser.add_argument("--depth", type=float, default=10.0, help="depth of the tip, divided by R")
@@ -235,10 +231,10 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def following(o: Namespace, clay: mpm.Skeleton, fixed: Push) -> dict[str, float]:
-    """Push the cone on grid lines that follow it; print and return relative resistances and numbers of cells.
+    """Push the cone on grid lines that follow it, and compare the run with the run on fixed grid lines.
 
-    load: relative difference of the mean N in the second half of the push from its mean with fixed grid lines.
-    last: relative difference of the final N from the final N with fixed grid lines.
+    load: relative difference of the mean N in the second half of the push.
+    last: relative difference of the final N.
     cells: number of cells, divided by the number if all cells were as small as the smallest.
     fixed: number of cells, divided by the number with fixed grid lines.
     """
@@ -258,7 +254,7 @@ def following(o: Namespace, clay: mpm.Skeleton, fixed: Push) -> dict[str, float]
 
 
 def draw(o: Namespace, run: Push, wet: Dissipation | None) -> None:
-    """Draw the resistance, the displacements and, in wet clay, the pore pressures and their dissipation."""
+    """Draw the resistance, the displacements, and the dissipation of pore pressures in wet clay."""
     columns = 2 if wet is None else 4
     fig, axes = common.figure(1, columns, (4.25 * columns, 6))
     ax = axes[0, 0]
@@ -280,7 +276,7 @@ def draw(o: Namespace, run: Push, wet: Dissipation | None) -> None:
 
 
 def show(ax, frame: tuple, depth: float, label: str, title: str, clim: tuple[float, float]) -> None:
-    """Draw the clay and the cone; `frame` contains corners of domains, their values, and the outline of the cone."""
+    """Draw the clay and the cone of a `frame`."""
     corners, values, outline = frame
     domains = common.domains(ax, corners, values, cmap="viridis" if clim[0] == 0 else "RdBu_r", clim=clim)
     inside = np.concatenate([outline, [[0, outline[-1, 1]]]])

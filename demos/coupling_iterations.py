@@ -1,22 +1,23 @@
 # SPDX-License-Identifier: MIT
 """Numbers of iterations that couple displacement and pore pressure, from drained to undrained steps.
 
-The linear systems of Newton's first step are solved to a relative true residual of 1e-8.  Scenes are a cantilever (the
-poroelastic beam, undeformed and bent) and a footing on a column.  Only the product of conductivity and step length
-matters.  This product ranges from 1e-23 m (1e-14 m/s, 1e-9 s) to 1e11 m (1e2 m/s, 1e9 s).  The bulk modulus of the
+The scenes are a cantilever (the poroelastic beam, undeformed and bent) and a footing on a column. The linear systems of
+Newton's first step are solved to a relative true residual of 1e-8. Only the product of conductivity and step length
+matters. The product ranges from 1e-23 m (1e-14 m/s, 1e-9 s) to 1e11 m (1e2 m/s, 1e9 s). The bulk modulus K_w of the
 water ranges from 1e4 Pa to infinity.
 
-Three schemes are compared.  The first scheme, used by the package, is conjugate gradients on the Schur complement
-`S = C + B K^-1 B^T`.  C is the matrix of storage and flow, K is the stiffness matrix, and B is the coupling matrix.
-The preconditioner is the filtered fixed-stress operator C + beta (V - 3/4 L), with the cell volumes V and a five-point
-Laplacian L.  The second scheme uses the plain operator C + beta V as preconditioner.  The third scheme is the plain
-fixed-stress (Richardson) iteration, with beta = 0.5, 0.75 and 1 times alpha²/K_dr.  Here alpha is Biot's coefficient,
-and K_dr is the drained bulk modulus.  With beta = 1/K_w this iteration diverges, where K_w is the bulk modulus of the
-water.  An iteration consists of one solve of the storage and one solve of the momentum.
+Three schemes are compared. An iteration of each scheme consists of one solve of the storage and one solve of the
+momentum.
 
-Undrained Q1/DG0 elements have checkerboard modes of the pressure.  Only the damping of pressure jumps (`storage.py`)
-limits these modes, and thereby also the number of iterations.  The second picture shows the pressure with and without
-damping.
+1. Conjugate gradients on the Schur complement `S = C + B K^-1 B^T`, as in the package. C is the matrix of storage and
+   flow, K is the stiffness matrix, and B is the coupling matrix. The preconditioner is the filtered fixed-stress
+   operator `C + beta (V - 3/4 L)`, with a number beta, the cell volumes V and a five-point Laplacian L.
+2. Conjugate gradients with the plain operator `C + beta V` as preconditioner.
+3. The plain fixed-stress (Richardson) iteration with beta = 0.5, 0.75 and 1 times alpha²/K_dr, where alpha is Biot's
+   coefficient and K_dr is the drained bulk modulus. With beta = 1/K_w this iteration diverges.
+
+Undrained Q1/DG0 elements have checkerboard modes of the pressure, which the damping of pressure jumps (`storage.py`)
+limits. The second picture shows the pressure with and without damping.
 """
 
 from __future__ import annotations
@@ -48,7 +49,10 @@ SCHEMES = {
     "fixed stress, 1": ("richardson", 1.0, 0.0),
     "fixed stress, 1/K_w": ("richardson", None, 0.0),
 }
-"""For each scheme: Krylov method, beta divided by alpha^2/K_dr (None for beta = 1/K_w), and factor of the filter L."""
+"""Krylov method, beta divided by alpha^2/K_dr, and factor of the filter L of each scheme.
+
+None in place of the second value means beta = 1/K_w.
+"""
 MOST = 200  # iterations after which a scheme counts as divergent
 RAMP_STEP = 0.02  # s: all systems have the load increment of this time, for any dt
 CLEAR = 0.1  # m from the corners of the clamp, where the pressure is singular
@@ -68,9 +72,9 @@ LAWS = {"damped": mpm.Hencky, "undamped": Undamped}
 
 @dataclass(frozen=True)
 class Count:
-    """Number of iterations of a scheme for one linear system; None if the scheme diverges.
+    """Number of iterations of a scheme for one linear system, or None if the scheme diverges.
 
-    lowest, highest: extreme eigenvalues of P^-1 S (CG only).
+    lowest, highest: extreme eigenvalues of P^-1 S, with the preconditioner P (conjugate gradients only).
     """
 
     scene: str
@@ -84,7 +88,7 @@ class Count:
 
 
 def cantilever(h: float) -> mpm.Simulation:
-    """Return the poroelastic beam with cells of h."""
+    """Return the poroelastic beam with cells of size h, in m."""
     return beam.scene(beam.arguments(["--h", str(h)]))[0]
 
 
@@ -96,7 +100,7 @@ def bent(h: float) -> mpm.Simulation:
 
 
 def column(h: float) -> mpm.Simulation:
-    """Return a drained column of 0.5 m x 1 m between smooth walls with a load on half of its top."""
+    """Return a drained column of 0.5 m x 1 m between smooth walls, with a load on half of its top."""
     cells = np.rint(np.array([0.5, 1.2]) / h).astype(int)
     grid = mpm.Grid([0, 0], [0.5, 1.2], cells)
     soil = beam.material(beam.arguments([]))
@@ -116,7 +120,7 @@ SCENES = {"beam": cantilever, "bent beam": bent, "column": column}
 
 @dataclass(frozen=True)
 class System:
-    """The linear system of a Newton step: its solvers, the storage problem, the water's bulk modulus, and the soil."""
+    """Linear system of a Newton step, with its solvers."""
 
     solvers: LinearSolvers
     storage: StorageProblem
@@ -125,10 +129,9 @@ class System:
 
 
 def with_water(s: mpm.Simulation, bulk: float) -> mpm.Simulation:
-    """Return the scene in its present state with water of another bulk modulus, Pa.
+    """Return the scene in its present state, with water of another bulk modulus, in Pa.
 
-    All pressures are scaled so that they are at most a tenth of this modulus; otherwise the density of the water would
-    be unphysical.
+    Pressures are scaled to at most a tenth of the bulk modulus, so that the density of the water stays physical.
     """
     soils, walls = s.scene.materials.materials, s.state.stage.conditions["walls"]
     other = mpm.Simulation(s.grid, s.bodies, soils, fluid=mpm.Fluid(bulk=bulk), walls=walls, conditions=s.conditions)
@@ -142,10 +145,7 @@ def with_water(s: mpm.Simulation, bulk: float) -> mpm.Simulation:
 
 
 def linearise(s: mpm.Simulation, dt: float) -> System:
-    """Return the first Newton system of a step of length dt, s.
-
-    For any dt, the load increment is that of a step of `RAMP_STEP`.
-    """
+    """Return the first Newton system of a step of length dt, in s, with the load increment of a step of `RAMP_STEP`."""
     start = step.set_up(s.scene, s.state, RAMP_STEP)
     momentum = balances(s.scene, start, start.acting[-1]).momentum
     matrices, pieces, contents = start.matrices, start.data.pieces, start.on_grid.contents
@@ -159,7 +159,7 @@ def linearise(s: mpm.Simulation, dt: float) -> System:
 
 
 def count(s: System, scheme: str) -> tuple[int | None, float, float]:
-    """Solve the linear system of `linearise` to 1e-8; return iterations and the extreme eigenvalues of P^-1 S."""
+    """Return the number of iterations for a linear system, and the extreme eigenvalues of P^-1 S."""
     method, factor, share = SCHEMES[scheme]
     if factor is None:
         factor = s.soil.drained_modulus(2) / s.soil.biot**2 / s.bulk
@@ -180,7 +180,7 @@ def count(s: System, scheme: str) -> tuple[int | None, float, float]:
 
 
 def scan(scene: str, h: float, bulks=BULK, k_dt=K_DT, schemes=tuple(SCHEMES)) -> list[Count]:
-    """Count the iterations of the schemes for all fluids and all values of k dt."""
+    """Count the iterations of each scheme for all fluids and all values of k dt."""
     start, out = SCENES[scene](h), []
     for bulk in bulks:
         s = with_water(start, bulk)
@@ -191,12 +191,12 @@ def scan(scene: str, h: float, bulks=BULK, k_dt=K_DT, schemes=tuple(SCHEMES)) ->
 
 
 def worst(counts: list[Count]) -> float:
-    """Return the largest number of iterations; infinite if a scheme diverges or takes more than `MOST` iterations."""
+    """Return the largest number of iterations, or infinity if a scheme diverges or needs more than `MOST`."""
     return max(np.inf if c.iterations is None else c.iterations for c in counts)
 
 
 def cells(s: mpm.Simulation) -> NDArray[np.float64]:
-    """Return the pressure of the cells (nx, ny), in Pa; nan in empty cells and near the corners of the clamp."""
+    """Return the pressures of the cells (nx, ny), in Pa; they are nan in empty cells and near the clamp's corners."""
     p = np.full(s.grid.shape.prod(), np.nan)
     body = s.bodies[0]
     corners = [[0, body.lower[:, 1].min()], [0, (body.lower + body.spacing)[:, 1].max()]]
@@ -208,7 +208,7 @@ def cells(s: mpm.Simulation) -> NDArray[np.float64]:
 
 
 def roughness(p: NDArray[np.float64]) -> float:
-    """Return rms(p - mean of the four neighbours) / max |p| over the cells (nx, ny) that have four neighbours."""
+    """Return the roughness of cell pressures (nx, ny): rms(p - mean of the four neighbours) / max |p|."""
     deviation = p[1:-1, 1:-1] - (p[:-2, 1:-1] + p[2:, 1:-1] + p[1:-1, :-2] + p[1:-1, 2:]) / 4
     return float(np.sqrt(np.nanmean(deviation**2)) / np.nanmax(np.abs(p)))
 
@@ -222,7 +222,7 @@ def undrained(h: float, law: type[mpm.Hencky]) -> tuple[mpm.Simulation, mpm.Resu
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return the results of --json."""
+    """Run the demo and return its results."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--h", type=float, nargs="+", default=[0.06, 0.03, 0.015], help="cell sizes, m")
     parser.add_argument("--quick", action="store_true", help="fewer cases: every other k dt, stiff water only")
@@ -248,12 +248,12 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def shown(iterations: float) -> str:
-    """Return a count as text."""
+    """Return a number of iterations as text."""
     return f"{iterations:.0f}" if np.isfinite(iterations) else "none"
 
 
 def write(o: Namespace, counts: list[Count]) -> None:
-    """Write all counts as CSV, and the largest count for each scene and cell size as Markdown."""
+    """Write all counts as CSV, and the largest counts as Markdown."""
     head = ["scene", "h_m", "fluid_bulk_Pa", "k_dt_m", "scheme", "iterations", "lowest", "highest"]
     common.write_csv(o.out / "iterations.csv", head, (asdict(c).values() for c in counts))
     rows = [["scene", "h (m)", *SCHEMES, "eigenvalues of P⁻¹S"]]
@@ -267,7 +267,7 @@ def write(o: Namespace, counts: list[Count]) -> None:
 
 
 def write_roughness(o: Namespace, runs: dict) -> None:
-    """Write the roughness of the undrained pressure and the iterations of a linear solve as Markdown."""
+    """Write the roughness of the undrained pressure and the numbers of iterations as Markdown."""
     rows = [["h (m)", *(f"roughness, {name}" for name in LAWS), *(f"iterations to 1e-3, {name}" for name in LAWS)]]
     for h in o.h:
         here = [runs[h, name] for name in LAWS]
@@ -285,7 +285,7 @@ def tabulate(path: Path, rows: list[list[str]]) -> None:
 
 
 def draw(o: Namespace, counts: list[Count]) -> None:
-    """Draw iterations against k dt: a panel per scene, a colour per scheme, a line style per cell size."""
+    """Draw iterations against k dt, with one panel for each scene."""
     fig, ((*axes, side),) = common.figure(1, len(SCENES) + 1, (16, 4.6))
     styles = dict(zip(o.h, ("-", "--", ":", "-."), strict=False))
     for ax, scene in zip(axes, SCENES, strict=True):
@@ -308,7 +308,7 @@ def draw(o: Namespace, counts: list[Count]) -> None:
 
 
 def draw_pressure(o: Namespace, runs: dict) -> None:
-    """Draw the undrained pressure of the cells in two panels, for the middle cell size."""
+    """Draw the undrained pressure of the cells with and without damping."""
     h = o.h[len(o.h) // 2]
     fig, (axes,) = common.figure(1, len(LAWS), (13, 3.9))
     limit = np.nanmax(np.abs(cells(runs[h, "damped"][0]))) / 1e3

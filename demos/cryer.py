@@ -1,15 +1,14 @@
 # SPDX-License-Identifier: MIT
 """Cryer's sphere: loaded and drained at its surface, with a rise of pressure at the centre.
 
-A saturated sphere is loaded suddenly by a constant normal traction p0, and its surface is drained.  The outer shell
-drains first, shrinks and compresses the core.  The pressure at the centre rises by nearly a third above p0 before it
-falls (Cryer 1963).  Uncoupled theories of consolidation cannot show this rise.  Fluid and grains are incompressible,
-and nu is 0.25.  One octant is computed: a lattice of boxes, mapped smoothly into the sphere.  With --axisymmetric, a
-quarter of a disc is computed.
+A saturated sphere is loaded suddenly by a constant normal traction p0, and its surface is drained. The outer shell
+drains first, shrinks, and compresses the core. The pressure at the centre rises by nearly a third above p0 before it
+falls (Cryer 1963). Fluid and grains are incompressible, and Poisson's ratio is 0.25. One octant is computed: a lattice
+of boxes, mapped smoothly into the sphere. With --axisymmetric, a quarter of a disc is computed.
 
-Errors are given for the pressure at the centre. `peak` is the relative error of the largest pressure. `curve` is the
-largest error from T = 0.02 on, divided by p0. The reduced time is `T = c_v t / R²`, with the coefficient of
-consolidation c_v and the radius R.
+`peak` is the relative error of the largest pressure at the centre. `curve` is the largest error of the pressure at the
+centre from T = 0.02 on, divided by p0. T is the reduced time `c_v t / R²`, with the coefficient of consolidation c_v,
+the time t and the radius R.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ OUTER = ("right", "back", "top")  # sides of the lattice that become the surface
 
 
 def ball(x: np.ndarray) -> np.ndarray:
-    """Map positions (n, 3), in m, from the cube [-`CUBE`, `CUBE`]^3 to the ball; planes of symmetry do not move."""
+    """Map positions (n, 3), in m, from the cube [-`CUBE`, `CUBE`]^3 to the ball."""
     a = x / CUBE
     b, c = np.roll(a, -1, axis=1) ** 2, np.roll(a, -2, axis=1) ** 2
     return RADIUS * a * np.sqrt(1 - b / 2 - c / 2 + b * c / 3)
@@ -48,7 +47,7 @@ def disc(x: np.ndarray) -> np.ndarray:
 
 
 def scene(cells: int, axisymmetric: bool = False, grid: mpm.Grid | None = None) -> mpm.Simulation:
-    """Return the octant, or the quarter disc, on `grid` or else with `cells` cells over the radius."""
+    """Return the octant or the quarter disc, with `cells` cells over the radius unless `grid` is given."""
     h = RADIUS / cells
     if axisymmetric:
         grid = grid or mpm.Grid([0] * 2, [RADIUS + h] * 2, [cells + 1] * 2, axisymmetric=True)
@@ -66,7 +65,7 @@ def scene(cells: int, axisymmetric: bool = False, grid: mpm.Grid | None = None) 
 
 @dataclass
 class Outcome:
-    """Reduced times (k,), pressures at the centre divided by p0 (k,), and the cost of the run."""
+    """Reduced times (k,), pressures (k,) at the centre divided by p0, and the cost of the run."""
 
     T: np.ndarray
     pressure: np.ndarray
@@ -77,7 +76,7 @@ class Outcome:
 def run(
     cells: int = 20, steps: int = 100, axisymmetric: bool = False, grid: mpm.Grid | None = None
 ) -> tuple[dict[str, float], Outcome]:
-    """Run to the reduced time `END` in equal steps; return the errors that the module's docstring defines."""
+    """Run to the reduced time `END` in equal steps, and return the errors that the module's docstring defines."""
     simulation, history = scene(cells, axisymmetric, grid), []
 
     def observe(s: mpm.Simulation) -> None:
@@ -95,7 +94,7 @@ def run(
 
 
 def exact(T: np.ndarray) -> np.ndarray:
-    """Return the exact pressure at the centre divided by p0, at reduced times."""
+    """Return the exact pressure at the centre at reduced times, divided by p0."""
     return cryer_pressure(T, 1.0, 1.0, NU)
 
 
@@ -110,7 +109,7 @@ def errors(out: Outcome) -> dict[str, float]:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return the results of --json."""
+    """Run the demo and return its results."""
     parser = common.Parser(__doc__, __file__, processes=True)
     parser.add_argument("--cells", type=int, default=20, help="cells over the radius")
     parser.add_argument("--steps", type=int, default=100, help=f"equal steps to the reduced time {END}")

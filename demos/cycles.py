@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: MIT
 """Residual stress of an elastic body after load cycles and after a rotation by 360 degrees.
 
-The drained beam of `poroelastic_beam.py` is loaded and unloaded repeatedly.  The beam is elastic, so its stress must
-vanish after unloading.  Displacements of the grid have kinks at grid lines.  Domains that followed these kinks
-would accumulate stress with every grid line that they cross, as points of standard MPM do.
+The drained beam of `poroelastic_beam.py` is loaded and unloaded repeatedly. The beam is elastic, so its stress must
+vanish after unloading. Grid displacements have kinks at grid lines. Particle domains must not follow these kinks. If
+they did, stress would accumulate at every grid line that a domain crosses, as at the points of standard MPM.
 
-A block is stretched between two fixed sides and then rotated by 360 degrees.  Its final stresses must equal the
-stresses before the rotation.
+A block is stretched between two fixed sides and then rotated by 360 degrees. The stresses after and before the rotation
+must be equal.
 
-The undrained beam has singular edges at the clamp.  At a distance r from an edge the stress grows as `r^(x - 1)`, where
-x = 0.595 is the root of `cos(pi x / 2) = x` (Williams 1952).  The rms stress within a few cells of the edges decreases
-with the cell size h as h^x.  The residual stress decreases in the same way.  Results are given for the whole beam, far
-from the clamp, near the clamp, and with springs instead of the clamp.
+The undrained beam has singular edges at the clamp. At a distance r from an edge the stress grows as `r^(x - 1)`, where
+x = 0.595 is the root of `cos(pi x / 2) = x` (Williams 1952). Near the edges the rms stress and the residual stress
+therefore decrease with the cell size h as h^x. Results are given for the whole beam, far from the clamp, near the
+clamp, and with springs instead of the clamp.
 """
 
 from __future__ import annotations
@@ -41,14 +41,14 @@ def options(h: float, load: float, quadrature: str = "domain") -> Namespace:
 
 
 def conditions(o: Namespace) -> dict:
-    """Return the beam's conditions, with a load that rises and falls once a second."""
+    """Return the beam's conditions, with a load that rises and falls once in a second."""
     region = ((beam.CLAMP, -np.inf), (beam.LENGTH, np.inf))
     load = mpm.Traction("top", lambda t: (0.0, -o.load * (1 - abs(2 * (t % 1) - 1))), region=region)
     return {"walls": {"left": "xy"}, "conditions": [load]}
 
 
 def rms(simulation: mpm.Simulation, away: float = 0.0) -> float:
-    """Return the rms stress of the points, Pa; the stress of points within `away`, m, of the wall counts as zero."""
+    """Return the rms stress of the points, in Pa, if the stress within `away`, in m, of the wall counts as zero."""
     stress, volume = simulation.effective_stress(), simulation.points.volume0
     counts = simulation.points.reference.mean(axis=1)[:, 0] > away
     squares = (volume * counts * (stress**2).sum(axis=(1, 2))).sum()
@@ -67,32 +67,20 @@ def cycle(
     fluid: mpm.Fluid | None = None,
     springs: float = 0.0,
 ) -> dict:
-    """Load and unload the beam; return the residual stress and the motion.
+    """Load and unload the beam, and return the residual stress and the motion.
 
-    Parameters
-    ----------
-    h, load
-        Cell size, in m, and largest load, in Pa.
-    cycles, steps
-        Number of cycles, and number of steps in a cycle, which is even.
-    quadrature
-        Quadrature rule, see `mpm.Numerics`.
-    material
-        Material of the body; by default the material of the beam.
-    seed
-        Function that returns the body. Its arguments are the grid, the lower and the upper corner, and the number of
-        points per cell and direction.
-    fluid
-        Pore fluid; the beam is undrained.
-    springs
-        Largest stiffness, Pa/m, of springs along the wall that support the beam in place of the clamp.  The stiffness
-        decreases from the middle to zero at the edges, so that no stress is singular.
+    h: cell size, in m.
+    load: largest load, in Pa.
+    steps: number of steps in a cycle. The number is even.
+    quadrature: quadrature rule, see `mpm.Numerics`.
+    seed: function that returns the body, such as `mpm.box`.
+    fluid: pore fluid of an undrained beam, or None.
+    springs: largest stiffness, in Pa/m, of springs that support the beam in place of the clamp. The stiffness decreases
+    to zero at the edges of the wall, so that no stress is singular.
 
-    Returns
-    -------
+    Returns these values by name:
     left: rms stress after each cycle, divided by the rms stress at the first peak.
-    away: rms stress after each cycle without points near the wall, divided by the rms stress of all points at that
-    peak.
+    away: rms stress after each cycle without points near the wall, divided by the rms stress at the first peak.
     times, tips: time, in s, and tip deflection, in m, of each step.
     lost: work of the load in each cycle, divided by the work up to the first peak.
     volume: volume change of the beam minus the volume change of its water, divided by the volume of the beam.
@@ -147,9 +135,9 @@ def cycle(
 
 
 def turn(h: float, nu: float = 0.3, steps: int = 90, fluid: mpm.Fluid | None = None) -> float:
-    """Return the rms change of the total stress in the middle of the stretched block, divided by the rms stress.
+    """Rotate the stretched block by 360 degrees, and return the relative rms change of the total stress in its middle.
 
-    The change is due to a rotation by 360 degrees.  With a fluid the block is undrained.
+    With a fluid the block is undrained.
     """
     cells = round(1.8 * BLOCK / h)
     grid = mpm.Grid([0] * 2, [cells * h] * 2, [cells] * 2)
@@ -187,7 +175,7 @@ def orders(h: list[float], left: list[float]) -> list[float]:
 
 
 def reference(o: Namespace) -> tuple[np.ndarray, np.ndarray]:
-    """Return the tip deflection (m) in a load cycle, computed with finite elements, and the load (Pa)."""
+    """Return the tip deflection in a load cycle, in m, by finite elements, and the load, in Pa."""
     case = options(o.h[-1], o.load)
     size = [0, 0], [beam.LENGTH, beam.HEIGHT], beam.REFERENCE_CELLS
     fem = BiotFEM(mpm.Grid(*size), beam.material(case), **conditions(case))
@@ -196,7 +184,7 @@ def reference(o: Namespace) -> tuple[np.ndarray, np.ndarray]:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return the results of --json."""
+    """Run the demo and return its results."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument(
         "--h", type=float, nargs="+", default=[0.06, 0.03], help="cell sizes, m; the last is also used for standard MPM"
@@ -266,7 +254,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, runs: dict[float, dict], points: dict, fem: tuple[np.ndarray, np.ndarray]) -> None:
-    """Draw the residual stress against the cycles, and the last cycle with the finite elements."""
+    """Draw the residual stress against the cycles, and the tip deflection in the last cycle."""
     fig, ((left, loop),) = common.figure(1, 2, (11, 4.2))
     for (h, run), color in zip(runs.items(), COLORS, strict=False):
         label = f"exact integration, h = {h:g} m"

@@ -1,21 +1,21 @@
 # SPDX-License-Identifier: MIT
 """Seepage with a free surface through a dam of unsaturated soil, while the level of the reservoir falls.
 
-A dam 6 m high with slopes of 1:2 stands on an impervious base.  At first the water table is at the level of the
-reservoir, 5 m.  Then the downstream slope becomes permeable, and the flow becomes steady.  After that the
-level of the reservoir falls by 2 m in five days, and the free surface (p = 0) falls as the soil drains.  Above the free
-surface, water flows under suction (`mpm.VanGenuchten`).  The water of the reservoir loads the upstream slope.  The
-upstream slope above the reservoir and the downstream slope are seepage faces.
+A dam, 6 m high with slopes of 1:2, stands on an impervious base. At first the water table is at the level of the
+reservoir, 5 m. Then the downstream slope becomes permeable, and the flow becomes steady. Finally the reservoir falls by
+2 m in five days, and the free surface (zero pressure) falls as the soil drains. Above the free surface, water flows
+under suction (`mpm.VanGenuchten`). The water of the reservoir loads the upstream slope. Slopes above water are seepage
+faces.
 
 Checks:
 
-* `flow`: ratio of the outflow of a rectangular dam to the exact outflow.  The rectangular dam is 9.6 m wide, with 10 m
-  and 2 m of water at its sides.  Above these levels the suction at the sides is hydrostatic.  Without suction the exact
-  flow is `k (H1^2 - H2^2) / (2 L)` (Dupuit, Charny), with the water levels H1 and H2 and the width L.  With suction,
-  Kirchhoff's potential (the integral of k_r over the head) replaces the head;
-* `steady`: ratio of the inflow of the dam to its outflow, before the reservoir falls;
-* `drained`: ratio of the outflow of a column to the outflow by finite elements on cells of a quarter of the size.  The
-  free surface in the column falls from 8 m towards 2 m.
+* `flow`: outflow of a rectangular dam, divided by the exact outflow. The dam is L = 9.6 m wide, with water levels of H1
+  = 10 m and H2 = 2 m at its sides, and hydrostatic suction above these levels. Without suction, the exact flow is
+  `k (H1^2 - H2^2) / (2 L)` (Dupuit, Charny), with the conductivity k. With suction, Kirchhoff's potential replaces the
+  head. The potential is the integral of the relative permeability over the head.
+* `steady`: inflow of the dam divided by its outflow, before the reservoir falls.
+* `drained`: outflow of a column, divided by the outflow by finite elements on cells of a quarter of the size. The free
+  surface in the column falls from 8 m towards 2 m.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ FALLS, SEEN = 5.0, (5.0, 15.0, 40.0)  # days: duration of the fall; times since 
 
 @dataclass
 class Dam:
-    """Flows, corners and pressures of the dam, in steady flow and at each time of `SEEN`.
+    """Results of the dam in steady flow and at each time of `SEEN`.
 
     flows: outflows (2,) through both slopes, in m^2/s.
     frames: corners (n, 4, 2), in m, and pressures (n,), in Pa, of the domains.
@@ -67,13 +67,13 @@ class Dam:
         self.balance = max(self.balance, result.balance)
 
     def see(self, simulation: mpm.Simulation) -> None:
-        """Record the present flows, corner positions and pressures."""
+        """Record the present flows, corners and pressures."""
         self.flows.append(simulation.outflows.array)
         self.frames.append((simulation.points.corners.copy(), simulation.points.pressure))
 
 
 def run(h: float = 0.5, steps: int = 10) -> Dam:
-    """Run the dam on cells of size h, m: first `steps` steps of each length in `SETTLES`, then the drawdown."""
+    """Run the dam on cells of size h, in m, first to steady flow and then during the drawdown."""
     grid = mpm.Grid([0, 0], [BASE + 2, HEIGHT + 1], np.rint(np.array([BASE + 2, HEIGHT + 1]) / h).astype(int))
 
     def trapezoid(X: np.ndarray) -> np.ndarray:
@@ -138,11 +138,7 @@ def rectangular(cells: int) -> float:
 
 
 def driving(level: float, top: float) -> float:
-    """Return the integral of Kirchhoff's potential over a hydrostatic side, m^2.
-
-    level: height of the water, in m.
-    top: height of the dam, in m.
-    """
+    """Return the integral of Kirchhoff's potential over a hydrostatic side of height `top`, in m^2."""
     law, suction = LOAM.retention, np.linspace(0, top - level, 100001)
     filled = (1 + (suction * WEIGHT / law.entry) ** law.n) ** (1 / law.n - 1)
     k_r = filled**law.l * (1 - (suction * WEIGHT / law.entry) ** (law.n - 1) * filled) ** 2
@@ -152,9 +148,9 @@ def driving(level: float, top: float) -> float:
 
 
 def drained(cells: int, days: float = 100.0) -> tuple[float, float]:
-    """Return the outflow, m, of a column of 10 m: with `cells` cells, and by four times as many finite elements.
+    """Return the outflow of a column of 10 m, in m, by material points and by finite elements.
 
-    Initially the free surface is at 8 m. Then the head at the base is lowered to 2 m.
+    The free surface starts at 8 m, and the head at the base is lowered to 2 m.
     """
     high, head, h = 8.0, 2.0, 10.0 / cells
     grid = mpm.Grid([0, 0], [h, 10.0 + h], [1, cells + 1])
@@ -175,7 +171,7 @@ def drained(cells: int, days: float = 100.0) -> tuple[float, float]:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return the results of --json."""
+    """Run the demo and return its results."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--h", type=float, default=0.5, help="cell size, m")
     parser.add_argument("--steps", type=int, default=10, help="steps in each period until steady flow, and in the fall")
@@ -210,7 +206,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, dam: Dam) -> None:
-    """Draw pressures in steady flow, and the free surfaces at all recorded times."""
+    """Draw pressures in steady flow, and the free surfaces during the drawdown."""
     fig, axes = common.figure(2, 1, (9, 4.9))
     (corners, p), ax = dam.frames[0], axes[0, 0]
     domains = common.domains(ax, corners, p / 1e3, cmap="viridis", clim=(-WEIGHT * 2 / 1e3, WEIGHT * LEVELS[0] / 1e3))

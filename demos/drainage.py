@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: MIT
 """Liakopoulos's column: saturated sand drains at its foot under gravity, and settles under suction.
 
-A column of 1 m initially has p = 0 everywhere, as in uniform downward flow.  Then no water enters at the top, and the
-column drains at its foot.  Its retention curve is user-defined.  The effective stress contains chi p, where chi is the
-saturation.  The reference is a converged solution with 400 finite volumes, for small strain.  Source: Liakopoulos
-(1965), with the constants of Lewis and Schrefler (1998).
+The pressure in a column of 1 m is initially zero, as in uniform downward flow. Then no more water enters at the top,
+and the column drains at its foot. The retention curve is user-defined. The effective stress is the total stress plus
+the product of saturation and pore pressure. The scene is that of Liakopoulos (1965), with the constants of Lewis and
+Schrefler (1998). The reference is a converged small-strain solution with 400 finite volumes.
 
-Three errors are given at 5, 10, 30 and 120 minutes.  The pressure error is the largest error at five heights, divided
-by the suction at the highest of these.  The others are the relative errors of the settlement and of the outflow at the
-foot.  The demo runs on one process.
+Three errors are given after 5, 10, 30 and 120 minutes. The first is the largest error of the pressure at five heights,
+divided by the suction at the highest of the five. The second and the third are the relative errors of the settlement
+and of the outflow at the foot. The demo runs on one process.
 """
 
 from __future__ import annotations
@@ -29,23 +29,23 @@ CONVERGED = {
     30: ((-631.67, -1582.23, -3205.4, -4983.1, -6211.2), 1.15932e-3, 1.57255e-6),
     120: ((-906.99, -2267.84, -4542.4, -6847.5, -8264.9), 1.55827e-3, 3.33066e-7),
 }
-"""Converged values by time (min): pressures (Pa) at the five heights, settlement (m), and outflow (m/s) at the foot."""
+"""By time, in min: pressures at the five heights, in Pa, settlement, in m, and outflow at the foot, in m/s."""
 
 
 class Sand:
     """Del Monte sand."""
 
     def saturation(self, p):
-        """Return the saturation S (UFL) at the pore pressure p, Pa."""
+        """Return the saturation (UFL) at the pore pressure p, in Pa."""
         return ufl.max_value(1 - 1.9722e-11 * ufl.max_value(-p, 0.0) ** 2.4279, 0.2)
 
     def relative_permeability(self, p):
-        """Return the relative permeability k_r (UFL) at the pore pressure p, Pa."""
+        """Return the relative permeability (UFL) at the pore pressure p, in Pa."""
         return ufl.max_value(1 - 2.207 * ufl.max_value(1 - self.saturation(p), 1e-30) ** 1.0121, 0.0)
 
 
 def column(cells: int) -> mpm.Simulation:
-    """Return the column, `cells` cells high."""
+    """Return the column, with `cells` cells over its height."""
     h = 1 / cells
     grid = mpm.Grid([0, 0], [h, 1 + 2 * h], [1, cells + 2])
     moduli = {"bulk": E / 3 / (1 - 2 * NU), "shear": E / 2 / (1 + NU)}
@@ -56,7 +56,7 @@ def column(cells: int) -> mpm.Simulation:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return the results of --json."""
+    """Run the demo and return its results."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=40, help="cells over the height")
     parser.add_argument("--step", type=float, default=60.0, help="step up to 10 minutes, s; later three times as long")
@@ -87,7 +87,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, curves: list, settlement: list[float]) -> None:
-    """Draw pressures against height and settlements against time, with the converged solution."""
+    """Draw pressures against height and settlements against time."""
     fig, ((left, right),) = common.figure(1, 2, (11, 4.6))
     for i, (minutes, p, z) in enumerate(curves):
         left.plot(p / 1e3, z, color=f"C{i}", lw=1.2, label=f"{minutes} min")

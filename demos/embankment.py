@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: MIT
 """An embankment under water is built in lifts on soft clay, and the clay consolidates.
 
-The scene is half of the section; x = 0 is a plane of symmetry.  On 6 m of clay, a lift of 1 m with slopes of 1:2 is
-built every 90 days.  After four lifts the clay consolidates for ten years.  Each lift is a polygon with named edges
-(`mpm.polygon`, by gmsh).  A lift is placed on the settled ground and filled up to its design level, so it is thicker
-than 1 m.  Pressures are in excess of the hydrostatic pressure of the sea, and weights are buoyant.  The weight of the
-lifts is a term in UFL; the clay is in equilibrium with its own weight from the start.  The surface below a lift is no
-longer drained; the lift is drained at its slope and crest.  The demo runs on one process.
+By symmetry, half of the section is computed, with the plane of symmetry at x = 0. On 6 m of clay, a lift of 1 m with
+slopes of 1:2 is built every 90 days. After four lifts the clay consolidates for ten years. Each lift is a polygon with
+named edges (`mpm.polygon`, by gmsh). A lift is placed on the settled ground and filled up to its design level, so it is
+thicker than 1 m. Each lift is drained at its slope and crest. Pressures are in excess of the hydrostatic pressure of
+the sea, and weights are buoyant. The weight of the lifts is a term in UFL. The clay is in equilibrium with its own
+weight from the start. The demo runs on one process.
 
-Check: at the end the lowest points of the clay carry the weight of all lifts.  `carried` is the integral of the
-effective stress over these points, divided by the weight of all lifts.  In equilibrium it is 1.
+Check: at the end the lowest points of the clay carry the weight of all lifts. `carried` is the integral of the
+effective stress over the lowest points, divided by the weight of all lifts. In equilibrium `carried` is 1.
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ BUOYANT = 0.6 * (2650 - 1000) * 9.81  # N/m^3
 
 @dataclass(frozen=True)
 class Weighed(mpm.Hencky):
-    """Hencky's law, with a buoyant unit weight, N/m^3, stored on the points for the term `weight`."""
+    """Hencky's law with a buoyant unit weight, in N/m^3, for the term `weight`."""
 
     unit_weight: mpm.Field = 0.0
 
     @staticmethod
     def energy(F, bulk, shear, unit_weight):
-        """Return the energy psi, Pa, in UFL; F (d, d): deformation gradient."""
+        """Return the energy (UFL), in Pa."""
         return mpm.Hencky.energy(F, bulk, shear)
 
 
@@ -52,7 +52,7 @@ SAND = Weighed(bulk=1e7, shear=6e6, conductivity=1e-6, unit_weight=lambda X: np.
 
 
 def weight(points, v):
-    """Return the work (UFL) of the buoyant weight along the test function v."""
+    """Return the work (UFL) of the buoyant weight, with the test function v."""
     return points.unit_weight / ufl.det(points.F) * points.value(v)[1] * points.dx
 
 
@@ -66,9 +66,9 @@ def lift(grid: mpm.Grid, k: int):
 
 @dataclass
 class Bund:
-    """Histories: times (s), settlements of axis and toe (m), excess pressures (Pa) in the middle of the clay.
+    """Histories of times, in s, of settlements of axis and toe, in m, and of excess pressures in the clay, in Pa.
 
-    frames: title, corners (n, 4, 2), in m, and excess pressures (n,), in Pa, of sections at some times.
+    frames: title, corners (n, 4, 2), in m, and excess pressures (n,), in Pa, at some times.
     carried: fraction of the lifts' weight that the lowest points carry at the end.
     """
 
@@ -83,10 +83,7 @@ class Bund:
 
 
 def run(h: float = 0.5, steps: int = 6) -> Bund:
-    """Build the embankment on cells of size h, m.
-
-    steps: number of steps for each lift; the consolidation takes about 6 times as many steps.
-    """
+    """Build the embankment on cells of size h, in m, in `steps` steps for each lift."""
     grid = mpm.Grid([0, 0], [WIDTH, CLAY + LIFTS + 1], np.rint(np.array([WIDTH, CLAY + LIFTS + 1]) / h).astype(int))
     bodies = [mpm.box(grid, [0, 0], [WIDTH, CLAY]), *[lift(grid, k) for k in range(LIFTS)]]
     simulation = mpm.Simulation(
@@ -129,7 +126,7 @@ def run(h: float = 0.5, steps: int = 6) -> Bund:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return the results of --json."""
+    """Run the demo and return its results."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--h", type=float, default=0.5, help="cell size, m")
     parser.add_argument("--steps", type=int, default=6, help="steps between two lifts")
@@ -149,7 +146,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, bund: Bund) -> None:
-    """Draw the section after the last lift and at the end, and settlements and excess pressures against time."""
+    """Draw the section at two times, and settlements and excess pressures against time."""
     fig, axes = common.figure(2, 2, (13, 6.4))
     most = max(np.quantile(np.abs(p), 0.995) for _, _, p in bund.frames) / 1e3
     for ax, (title, corners, excess) in zip(axes[0], bund.frames, strict=True):

@@ -1,18 +1,18 @@
 # SPDX-License-Identifier: MIT
 """Error against run time, for material points and finite elements, in one run.
 
-Five cases have an exact or converged solution.  In each case the demo varies the cell size, and for material points
-also the points per cell, the quadrature and the coupling.  Two body-fitted finite element methods are compared: Q1/DG0
-on cells of the same size, and Taylor-Hood.  The time is the shortest of `--repeat` runs of the time loop; compile times
-are separate.  Reference solutions are converged in space and in time.
+Five cases have an exact or converged solution. In each case the cell size varies. For material points, the points per
+cell, the quadrature and the coupling vary too. Two body-fitted finite element methods are compared: Q1/DG0 on cells of
+equal size, and Taylor-Hood. The time is the shortest of `--repeat` runs of the time loop. Compile times are separate.
+Reference solutions are converged in space and in time.
 
-* beam: the poroelastic beam; largest error of the tip deflection at all output times `beam.TIMES`, and largest error
-  from 0.1 s on.  The reference has 67 x 20 Taylor-Hood elements and steps of 0.005 s
-* drained: the poroelastic beam without water, loaded in ten steps; error of the tip deflection against 67 x 20
-  Taylor-Hood elements
-* terzaghi: error of the settlement at T_v = 0.5, against the exact settlement
-* mandel: error of the settlement of the plate at T = 0.1, against the exact settlement
-* column: error of the height of the soft column under its own weight, against the exact height
+* beam: the poroelastic beam. Errors are the largest error of the tip deflection at the output times `beam.TIMES`, and
+  the largest from 0.1 s on. The reference has 67 x 20 Taylor-Hood elements and steps of 0.005 s.
+* drained: the poroelastic beam without water, loaded in ten steps. The tip deflection is compared with that of 67 x 20
+  Taylor-Hood elements.
+* terzaghi: the settlement at T_v = 0.5 is compared with the exact settlement.
+* mandel: the settlement of the plate at T = 0.1 is compared with the exact settlement.
+* column: the height of the soft column under its own weight is compared with the exact height.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from mpm_dolfinx.verification.exact import Mandel, terzaghi_consolidation
 PEER, TRUTH = "FEM Q1/DG0, same grid", "FEM Taylor-Hood"
 BY_ERROR, EQUAL, STANDARD = "MPM, steps by error", "MPM, equal steps", "standard MPM, at the points"
 RTOL = 6e-3
-"""Tolerance of adaptive steps in the runs of different cell size."""
+"""Tolerance of adaptive steps in the runs with different cell sizes."""
 STYLES = {  # colour and marker of each method, the same in all cases
     BY_ERROR: ("C0", "o"),
     EQUAL: ("C5", "x"),
@@ -49,12 +49,12 @@ STYLES = {  # colour and marker of each method, the same in all cases
     TRUTH: ("black", "s"),
 }
 Run = Callable[[], tuple[float | tuple[float, float], mpm.Result, float]]
-"""Error (for the beam also the error from 0.1 s on), result, and compile time, s, of a run."""
+"""Function that returns the error, the result, and the compile time, in s. The beam has two errors."""
 
 
 @dataclass
 class Row:
-    """A measured run; late: error of the beam from 0.1 s on."""
+    """A measured run. `late` is the error of the beam from 0.1 s on."""
 
     case: str
     method: str
@@ -70,7 +70,7 @@ class Row:
 
 
 def beam_runs(drained: bool, quick: bool) -> Iterator[tuple[str, str, Run]]:
-    """Yield (method, setting, run) of the beam; drained: whether the beam has no water."""
+    """Yield method, setting and run of the beam, with or without water."""
     time = "--drained --ramp 1 --t-end 1 --dt 0.1" if drained else f"--t-end {0.4 if quick else 1.2}"
     times, truth = np.array(beam.TIMES), np.array(beam.TRUTH)
     if drained:
@@ -116,7 +116,7 @@ def beam_runs(drained: bool, quick: bool) -> Iterator[tuple[str, str, Run]]:
 
 
 def beam_fem(time: str, element: str, cells: tuple[int, int]) -> tuple[mpm.Result, float]:
-    """Return (result, compile seconds) of finite elements for the beam."""
+    """Return the finite element result for the beam, and the compile time, in s."""
     o = beam.arguments(time.split())
     fem = BiotFEM(
         mpm.Grid([0, 0], [beam.LENGTH, beam.HEIGHT], cells), beam.material(o), element=element, **beam.physics(o)
@@ -130,7 +130,7 @@ def beam_fem(time: str, element: str, cells: tuple[int, int]) -> tuple[mpm.Resul
 def scene_runs(
     physics: dict, material, size: tuple[float, float], width: int, time: tuple[float, int], exact: float, cells, steps
 ) -> Iterator[tuple[str, str, Run]]:
-    """Yield (method, setting, run) of a box, first for all cell sizes, then for all numbers of steps.
+    """Yield method, setting and run of a box, first for all cell sizes, then for all numbers of steps.
 
     width: number of cells over the width, or -1 for as many as over the height.
     time: end time, in s, and number of steps in runs of different cell size.
@@ -174,7 +174,7 @@ def scene_runs(
 
 
 def terzaghi_runs(quick: bool) -> Iterator[tuple[str, str, Run]]:
-    """Yield the runs of Terzaghi's column under a load that causes a strain of 1e-5."""
+    """Yield the runs of Terzaghi's column."""
     cells = (5, 20) if quick else (5, 10, 20, 50)
     load = 1e-5 * terzaghi.SOIL.oedometric
     physics = {
@@ -189,7 +189,7 @@ def terzaghi_runs(quick: bool) -> Iterator[tuple[str, str, Run]]:
 
 
 def mandel_runs(quick: bool) -> Iterator[tuple[str, str, Run]]:
-    """Yield the runs of a quarter of Mandel's slab, 1 m x 1 m, until T = 0.1."""
+    """Yield the runs of a quarter of Mandel's slab until T = 0.1."""
     soil = mpm.LinearElastic(bulk=4e6 / 3, shear=1e6, conductivity=1e-5)
     water = mpm.Fluid(bulk=np.inf)
     slab = Mandel(1.0, 1.0, soil.bulk, soil.shear, soil.conductivity / water.unit_weight, force=20.0)
@@ -229,7 +229,7 @@ CASES = {
 
 
 def measure(case: str, quick: bool, repeat: int) -> list[Row]:
-    """Return the measured runs of one case; the error of a run that fails (`mpm.GaveUp`) is nan."""
+    """Return the measured runs of one case; the error of a failed run is nan."""
     rows = []
     for method, setting, run in CASES[case](quick):
         try:
@@ -250,12 +250,12 @@ def measure(case: str, quick: bool, repeat: int) -> list[Row]:
 
 
 def time_at(rows: list[Row], error: float) -> float:
-    """Return the shortest run time, s, of the runs with at most this error; nan if there is none."""
+    """Return the shortest time of the runs with at most this error, in s, or nan without such a run."""
     return min((r.wall_s for r in rows if r.error <= error), default=np.nan)
 
 
 def compare(rows: list[Row]) -> list[dict]:
-    """Compare runs with Q1/DG0 elements: errors and run times on equal cells, and run times at equal error."""
+    """Compare material points with Q1/DG0 elements, on equal cells and at equal error."""
     out = []
     for r in (r for r in rows if r.method in (BY_ERROR, EQUAL)):
         peers = [q for q in rows if q.case == r.case and q.method == PEER]
@@ -284,7 +284,7 @@ def table(comparison: list[dict]) -> list[list[str]]:
 
 
 def draw(out: Path, case: str, rows: list[Row]) -> None:
-    """Draw error against time; solid lines join runs of different cell size, dashed lines of different steps."""
+    """Draw error against run time for one case."""
     fig, ((ax,),) = common.figure(1, 1, (9.5, 5))
     usual = Counter(r.steps for r in rows if r.method != BY_ERROR).most_common(1)[0][0]
     for method in dict.fromkeys(r.method for r in rows):
@@ -306,7 +306,7 @@ def draw(out: Path, case: str, rows: list[Row]) -> None:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return the results of --json."""
+    """Run the demo and return its results."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cases", nargs="+", choices=tuple(CASES), default=list(CASES), help="cases to run")
     parser.add_argument("--quick", action="store_true", help="a few coarse runs of each case")

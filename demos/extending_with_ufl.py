@@ -1,17 +1,18 @@
 # SPDX-License-Identifier: MIT
 """Your own physics in a few lines of UFL: ten columns with exact solutions.
 
-In each example, a column of 1 m between smooth walls stands on a floor (plane strain).  Each example adds one feature.
-Seven features concern the skeleton: a stored energy, fibres with a direction at each point, an elastic foundation, a
-law with its own state variable (damage), plastic flow, an implicit stress, and a return mapping in numpy.  Three
-features concern the fluid: two conductivities that depend on the deformation, and a source.  The parameter names of a
-user function select its arguments.  `materials/skeleton.py` and `materials/user_functions.py` of the package list them.
+Each example is a column of 1 m between smooth walls on a floor, in plane strain, with one additional feature. Seven
+features concern the skeleton: a stored energy, fibres with a direction at each point, an elastic foundation, a law with
+its own state variable (damage), plastic flow, an implicit stress, and a return mapping in numpy. Three features concern
+the fluid: two conductivities that depend on the deformation, and a source. The parameter names of a user function
+select its arguments. `mpm_dolfinx/materials/skeleton.py` and `mpm_dolfinx/materials/user_functions.py` list all
+arguments.
 
-The error is the largest difference from the exact solution, divided by the largest exact value.  With 20 cells it is
-8e-4 for the energy and 6e-4 for the fibres, because their layers are stretched in a single step.  It is 3e-3 for both
-conductivities, 6e-4 for the foundation and 5e-4 for the source.  These errors decrease with the cell size.  The error
-of the stress with damage is 1e-5, because the penalty of the prescribed displacement lets the top move a little.
-The error of plastic flow is 1e-11.  The errors of the implicit stress and of the return mapping are 1e-15.
+The error is the largest difference from the exact solution, divided by the largest exact value. With 20 cells the error
+is 8e-4 for the energy, 6e-4 for the fibres, 3e-3 for each of the two conductivities, 6e-4 for the foundation, and 5e-4
+for the source. The errors named so far decrease with the cell size. The error of the stress with damage is 1e-5,
+because the penalty of the prescribed displacement lets the top move a little. The error of plastic flow is 1e-11. The
+errors of the implicit stress and of the return mapping are 1e-15.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ def column(cells: int, material: mpm.Skeleton, load: float = LOAD, **scene) -> m
 
 @dataclass
 class Example:
-    """Computed values (n,) and exact values (n,) of a column, at the abscissas x (n,)."""
+    """Computed values (n,) and exact values (n,) of a column, with their abscissas x (n,)."""
 
     title: str
     xlabel: str
@@ -61,29 +62,26 @@ class Example:
 
 
 def displacements(s: mpm.Simulation) -> tuple[np.ndarray, np.ndarray]:
-    """Return the initial heights of the points (m), ascending, and their displacements along the column (m)."""
+    """Return the initial heights of the points, in ascending order, and their vertical displacements, in m."""
     Y = s.bodies[0].centre[:, 1]
     order = np.argsort(Y)
     return Y[order], (s.points.x[:, 1] - Y)[order]
 
 
 def pressures(s: mpm.Simulation) -> tuple[np.ndarray, np.ndarray]:
-    """Return the heights of the cells' centroids (m), in ascending order, and the pore pressures of the cells (Pa)."""
+    """Return the heights of the cells, in ascending order, in m, and the pore pressures of the cells, in Pa."""
     cells = s.cells()
     order = np.argsort(cells.x[:, 1])
     return cells.x[order, 1], cells.pressure[order]
 
 
 def stretch(stress: Callable[[float], float]) -> float:
-    """Return the stretch at which the first Piola-Kirchhoff stress, a function of the stretch, balances the load."""
+    """Return the stretch at which the first Piola-Kirchhoff stress balances the load."""
     return brentq(lambda s: stress(s) + LOAD, 0.3, 2.0, xtol=1e-15)
 
 
 def settlement(s: mpm.Simulation, stretches: np.ndarray) -> tuple:
-    """Return labels and values of an `Example`: displacements of the points.
-
-    stretches: exact stretches of four layers, from below.
-    """
+    """Return labels and values of an `Example` of displacements, for exact stretches of four layers from below."""
     Y, u = displacements(s)
     exact = np.interp(Y, np.linspace(0, 1, 5), np.concatenate([[0], np.cumsum(stretches - 1) / 4]))
     return "height at the start (m)", "displacement (m)", Y, u, exact
@@ -102,7 +100,7 @@ class SaintVenantKirchhoff(mpm.Skeleton):
 
 
 def layered(X: np.ndarray) -> np.ndarray:
-    """Return a modulus, Pa, at reference positions (n, 2); it doubles from each quarter of the height to the next."""
+    """Return a modulus at reference positions (n, 2), in Pa, which doubles from layer to layer."""
     return 1e6 * 2.0 ** np.floor(4 * (1 - X[:, 1]))
 
 
@@ -120,7 +118,7 @@ def energy(cells: int) -> Example:
 
 @dataclass(frozen=True)
 class Fibrous(mpm.NeoHookean):
-    """Neo-Hookean matrix with fibres of direction a. They add the energy `c/4 (I_4 - 1)^2` with `I_4 = |F a|^2`."""
+    """Neo-Hookean matrix with fibres of direction a, which add the energy `c/4 (I_4 - 1)^2` with `I_4 = |F a|^2`."""
 
     fibre: float = 0.0  # c, Pa
     direction: mpm.Field = (1.0, 0.0)
@@ -132,7 +130,7 @@ class Fibrous(mpm.NeoHookean):
 
 
 def direction(X: np.ndarray) -> np.ndarray:
-    """Return the direction of the fibres at reference positions (n, 2): vertical in every other layer."""
+    """Return the direction of the fibres at reference positions (n, 2): vertical in every second layer."""
     return np.where(np.floor(4 * X[:, [1]]) % 2, (0.0, 1.0), (1.0, 0.0))
 
 
@@ -151,12 +149,12 @@ def fibres(cells: int) -> Example:
 
 
 def of_strain(conductivity, J):
-    """Return k = k0 exp(8 (J - 1))."""
+    """Return the conductivity k0 exp(8 (J - 1))."""
     return conductivity * ufl.exp(8 * (J - 1))
 
 
 def flow(cells: int, law: Callable, exact_law: Callable, title: str) -> Example:
-    """Let water flow upwards through a column of two layers; the load compresses the lower layer more."""
+    """Let water flow upwards through a column of two layers, which the load compresses unequally."""
 
     def modulus(X):
         return np.where(X[:, 1] < 0.5, 1e6, 4e6)
@@ -210,7 +208,7 @@ RATE = 1e-7  # 1/s
 
 
 def source(points, q):
-    """Return the form (UFL) of a uniform source of `RATE`: volume of water per volume of soil and time."""
+    """Return the form (UFL) of a uniform source of water."""
     return RATE * q * points.dx
 
 
@@ -248,7 +246,7 @@ PATH = "logarithmic compression (-)", "axial pressure (kPa)"
 
 
 def path(s: mpm.Simulation, steps: int) -> tuple[np.ndarray, np.ndarray]:
-    """Run to t = 1 s; return logarithmic compression and axial Kirchhoff pressure, Pa, after each step."""
+    """Run to t = 1 s, and return logarithmic compression and axial Kirchhoff pressure, in Pa, after each step."""
     out = []
     s.run(1, 1 / steps, observe=lambda s: out.append((s.points.J, s.points.J * s.effective_stress()[:, 1, 1])))
     J, stress = np.array(out).mean(axis=2).T
@@ -256,7 +254,7 @@ def path(s: mpm.Simulation, steps: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def damage(cells: int) -> Example:
-    """Compress, unload and reload the column to a larger compression."""
+    """Compress the column, unload it, and compress it further."""
 
     def top(t, X):
         return 0, 0.3 * np.interp(t, [0, 0.4, 0.7, 1], [0, -0.6, -0.1, -1])
@@ -274,7 +272,7 @@ def damage(cells: int) -> Example:
 
 
 def plasticity(cells: int) -> Example:
-    """Load sand in an oedometer; the law is in `mpm_dolfinx/materials/drucker_prager.py`."""
+    """Load sand in an oedometer."""
     sand = mpm.DruckerPrager(bulk=1e7, shear=1e7, friction=20.0, dilation=5.0, cohesion=5e4)
     strain, stress = path(column(cells, sand, load=1e6), 20)
     shear = 2 * sand.shear / np.sqrt(3)  # growth of sqrt(J_2) with the compression; -p grows by K
@@ -290,7 +288,7 @@ def plasticity(cells: int) -> Example:
 
 @dataclass(frozen=True)
 class Hardening(mpm.Skeleton):
-    """Law with the pressure `K y`. Newton's method with exact tangent solves `y + a y^3 = ln J` for y; a is `power`."""
+    """Law with the pressure `K y`, where Newton's method solves `y + power y^3 = ln J` for y."""
 
     power: mpm.Field = 100.0
 
@@ -312,7 +310,7 @@ class Hardening(mpm.Skeleton):
 
 @dataclass(frozen=True)
 class Crushable(mpm.Skeleton):
-    """Foam that is crushed irreversibly when its pressure reaches a limit; the return mapping is in numpy."""
+    """Foam that is crushed irreversibly above a limit pressure, with a return mapping in numpy."""
 
     limit: mpm.Field = 1e5  # Pa
 
@@ -347,7 +345,7 @@ def local_unknown(cells: int) -> Example:
 
 
 def numpy_law(cells: int) -> Example:
-    """Crush, unload and reload the foam to a larger compression."""
+    """Crush the foam, unload it, and compress it further."""
     foam = Crushable(bulk=1e6, shear=2e5)
 
     def load(t: float) -> float:
@@ -369,7 +367,7 @@ EXAMPLES = (energy, fibres, kozeny_carman, strain_law, springs, well, damage, pl
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return the results of --json."""
+    """Run the demo and return its results."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=20, help="cells over the height, a multiple of 4")
     o = parser.parse_args(argv)

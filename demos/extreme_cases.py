@@ -1,20 +1,19 @@
 # SPDX-License-Identifier: MIT
 """Stiff and extreme scenes: each converges, recovers or is refused, and none is silently wrong.
 
-Every scene is tiny and has one extreme property.  Scenes with the same extreme property form a family.  Each scene has
-one of these outcomes:
+Every scene is tiny and has one extreme property. Scenes with equal extreme property form a family. Each scene has one
+of these outcomes:
 
-* converged: the error is below the bound of the family.  The reference is an exact solution, a solution with finite
-  elements, or the same scene with a moderate setting.  The residuals of momentum and fluid, and the error of the fluid
-  balance, are below 1e-8;
-* recovered: the run has converged, but some steps were cut;
-* refused: the run ends with an error that gives the reason, as it must in a scene without equilibrium;
-* warned: the error is above the bound, and the package has issued a warning;
-* wrong, nan or hung: a defect, which the exit status reports.
+* converged: the error is below the bound of the family. The reference is an exact solution, a solution with finite
+  elements, or the same scene with a moderate setting. The residuals of momentum and fluid, and the error of the fluid
+  balance, are below 1e-8.
+* recovered: the run has converged, but some steps were cut.
+* refused: the run ends with an error that gives the reason. A scene without equilibrium must be refused.
+* warned: the error is above the bound, and the package has issued a warning.
+* wrong, nan or hung: a defect, which the exit status reports. An unexpected exception counts as wrong.
 
-An error is divided by the largest exact value, unless the docstring of its family defines the error otherwise.  The
-condition number refers to the last tangent of the momentum balance, scaled to a unit diagonal.  Unexpected exceptions
-also count as wrong.  The demo runs on one process.
+An error is divided by the largest exact value, unless the docstring of its family defines another error. The condition
+number is that of the last tangent of the momentum balance, scaled to a unit diagonal. The demo runs on one process.
 """
 
 from __future__ import annotations
@@ -50,7 +49,7 @@ OUTCOMES = ("converged", "recovered", "refused", "warned", "wrong", "nan", "hung
 
 @dataclass
 class Row:
-    """Outcome of a case: largest residual and largest error of the fluid balance, total numbers of iterations."""
+    """Outcome of a case, with its largest residual and its total numbers of iterations."""
 
     family: str
     setting: str
@@ -76,7 +75,10 @@ def hang(*_) -> None:
 
 
 def judge(row: Row, make: Make, bound: float, rtol: float | None = None) -> Row:
-    """Run a case and fill in its row. With `rtol`, steps are adaptive, and not longer than the scene's steps."""
+    """Run a case and fill in its row.
+
+    rtol: tolerance of adaptive steps. Adaptive steps are not longer than the scene's steps.
+    """
     signal.signal(signal.SIGPROF, hang)
     signal.setitimer(signal.ITIMER_PROF, LIMIT)
     began, result = time.process_time(), mpm.Result()
@@ -124,7 +126,7 @@ def check(row: Row, scene: Scene, result: mpm.Result, bound: float) -> None:
 
 
 def condition(K) -> float:
-    """Return the condition number of a matrix scaled to a unit diagonal; nan if there was no matrix."""
+    """Return the condition number of a matrix scaled to a unit diagonal, or nan without a matrix."""
     if not K.assembled:
         return nan
     A = csr_matrix(K.getValuesCSR()[::-1], shape=K.getSize()).toarray()
@@ -134,12 +136,12 @@ def condition(K) -> float:
 
 
 def worst(rows: list[Row], name: str) -> float:
-    """Return the largest value of the field `name` of all rows, without nan."""
+    """Return the largest value of a field of all rows, without nan."""
     return max((v for r in rows if not isnan(v := getattr(r, name))), default=nan)
 
 
 def table(head: list[str], rows: list[list]) -> str:
-    """Return a Markdown table, with short numbers, and blanks for missing numbers."""
+    """Return a Markdown table, with blanks for missing numbers."""
 
     def cell(v) -> str:
         if isinstance(v, float):
@@ -150,7 +152,7 @@ def table(head: list[str], rows: list[list]) -> str:
 
 
 def summary(rows: list[Row]) -> str:
-    """Return a table with a row for each family: subject, bound, number of cases by outcome, worst values."""
+    """Return a table with one row for each family."""
     names = ("error", "residual", "balance", "condition")
     lines = []
     for name, f in FAMILIES.items():
@@ -172,7 +174,7 @@ def write(out: Path, rows: list[Row]) -> None:
 
 
 def draw(out: Path, rows: list[Row]) -> None:
-    """Draw errors, condition numbers, and Newton iterations per step of all cases, with one row for each family."""
+    """Draw errors, condition numbers and numbers of Newton iterations by family."""
     names = [name for name in FAMILIES if any(r.family == name for r in rows)]
     colours = dict(zip(OUTCOMES, ("C0", "C2", "0.5", "C1", "C3", "black", "C4"), strict=True))
     fig, (axes,) = common.figure(1, 3, (13, 1.5 + 0.34 * len(names)))
@@ -204,7 +206,7 @@ def draw(out: Path, rows: list[Row]) -> None:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return the results of --json."""
+    """Run the demo and return its results."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--families", nargs="+", choices=tuple(FAMILIES), default=list(FAMILIES), metavar="NAME")
     parser.add_argument("--quick", action="store_true", help="four cases of each family, the first and last among them")

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: MIT
 """A box slides, a ball rolls and a second ball bounces down an incline, compared with the motion of rigid bodies.
 
-The incline has an angle of b = 30 degrees to the grid, and the friction coefficient mu = 0.3.  In the time t a rigid
-box slides by `g t^2 (sin(b) - mu cos(b)) / 2`.  A rigid disc rolls by `g t^2 sin(b) / 3`, if mu > tan(b) / 3.  Another
-disc falls on the incline from a height of its own radius.  After the impact it bounces and rotates.  Box and discs are
-stiff rubber, and touch the incline only, not each other.  The final energy is the work of gravity, minus the energy
-that friction and elastic waves dissipate.  The demo needs gmsh.
+The incline has an angle of b = 30 degrees to the grid. The friction coefficient is mu = 0.3. In the time t a rigid box
+slides by `g t^2 (sin(b) - mu cos(b)) / 2`, with gravity g. A rigid disc rolls by `g t^2 sin(b) / 3`, if
+`mu > tan(b) / 3`. A second disc falls on the incline from a height of its radius, bounces and rotates. Box and discs
+are stiff rubber, and touch only the incline. The final energy is the work of gravity, minus the energy that friction
+and elastic waves dissipate. The demo needs gmsh.
 """
 
 from __future__ import annotations
@@ -50,9 +50,9 @@ def scene(cells: int) -> tuple[mpm.Simulation, list[np.ndarray]]:
 
 
 def fall(s: mpm.Simulation, parts: list[np.ndarray], dt: float) -> tuple[mpm.Result, np.ndarray, list]:
-    """Release the bodies; return the result, rows (times, 7), and corners of the domains, m, at some times.
+    """Release the bodies, and return the result, the paths (times, 7), and the corners of the domains at some times.
 
-    Each row has the time, s, and the positions (x, y), in m, of three centres of mass.
+    Each row of the paths has the time, in s, and the positions (x, y) of three centres of mass, in m.
     """
     mass = s.scene.materials.density(s.points) * s.points.volume0 * s.points.J
     rows, shapes = [], []
@@ -69,7 +69,7 @@ def fall(s: mpm.Simulation, parts: list[np.ndarray], dt: float) -> tuple[mpm.Res
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return the results of --json."""
+    """Run the demo and return its results."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=5, help="cells over a ball's radius")
     parser.add_argument("--dt", type=float, default=0.005, help="step, s")
@@ -104,7 +104,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, result: mpm.Result, t, way, above, shapes, rigid) -> None:
-    """Draw the bodies at some times, the distances that they and rigid bodies move, and the energies."""
+    """Draw the bodies, their distances against those of rigid bodies, and the energies."""
     fig, ((scene_, ways, energy),) = common.figure(1, 3, (15, 4.2))
     for k, corners in enumerate(shapes):
         shade = 0.25 + 0.75 * k / max(1, len(shapes) - 1)

@@ -1,58 +1,57 @@
 # SPDX-License-Identifier: MIT
 """A strip footing is pushed into saturated soil, to a depth of its width, at three rates.
 
-B is the width of the footing, which is rough and rigid.  By symmetry half of the footing is computed.  This half is a
-prescribed displacement on a part of the soil's top.  The soil is a weightless layer 2.5 B thick on rough rock.  It
-follows Drucker and Prager's law with cohesion c, and drains at its free top.  The dimensionless velocity of the footing
-is V = v B / c_v, with the velocity v and the coefficient of consolidation c_v.
+The footing is rough and rigid, and has the width B. By symmetry half of the footing is computed, as a prescribed
+displacement on a part of the soil's top. The soil is a weightless layer, 2.5 B thick, on rough rock. The soil follows
+Drucker and Prager's law with cohesion c, and drains at its free top. The dimensionless velocity of the footing is
+`V = v B / c_v`, with the velocity v and the coefficient of consolidation c_v.
 
-A smooth, impervious wall bounds the soil at 8 B from the middle of the footing.  With a wall at 16 B, loads change by
-less than 1 % at any depth and rate; the demo shows this on coarser cells.  With a wall at 4 B, drained loads are up to
-8 % too large before the limit load, while the soil below the footing yields.  The thickness of the layer matters.  In
-plane strain the settlement increases with the logarithm of this thickness, without bound.  With a layer 5 B thick,
-loads are 11 % smaller at a settlement of 0.1 B, and 3 % smaller at 0.5 B.
+A smooth, impervious wall bounds the soil at 8 B from the middle of the footing. With a wall at 16 B, loads change by
+less than 1 % at any depth and rate. With a wall at 4 B, drained loads are up to 8 % too large before the limit load.
+With a layer 5 B thick, loads are 11 % smaller at a settlement of 0.1 B, and 3 % smaller at 0.5 B. In plane strain the
+settlement grows with the logarithm of the thickness of the layer, without bound.
 
-Without friction the bearing capacity is `q = (2 + pi) s_u` (Prandtl 1921).  With friction and associated flow it is
-`q = c N_c`, with `N_c = (exp(pi tan(phi)) tan^2(45 deg + phi/2) - 1) / tan(phi)`.  Limit loads are computed with very
-stiff soil, which flows before the geometry changes.  The footing has --cells cells over its width, and about twice as
-many in a second run.
+Limit loads are computed with very stiff soil, which flows before the geometry changes. Without friction the bearing
+capacity is `q = (2 + pi) s_u` (Prandtl 1921), with the undrained strength s_u. With the friction angle phi and
+associated flow it is `q = c N_c`, with `N_c = (exp(pi tan(phi)) tan^2(45 deg + phi/2) - 1) / tan(phi)`. The footing has
+--cells cells over its width, and about twice as many in a second run.
 
-In the deep push the soil does not dilate.  Its undrained strength is s_u = xi c, with the coefficient xi of the
-cohesion in the yield function.  A footing at depth D carries (1 + 0.27 sqrt(D/B)) times the undrained load of a footing
-at the surface (fit to bounds of limit analysis, Salgado et al. 2004). The drained capacity at the surface lies between
-the capacity for the reduced friction of Davis (1968) and c N_c.
+In the deep push the soil does not dilate. The undrained strength is s_u = xi c, with the coefficient xi of the cohesion
+in the yield function. A footing at depth D carries (1 + 0.27 sqrt(D/B)) times the undrained load of a footing at the
+surface (fit to bounds of limit analysis, Salgado et al. 2004). The drained capacity at the surface lies between the
+capacity for the reduced friction of Davis (1968) and c N_c.
 
 The undrained limit load converges from below, with order 1.5: its error is -5.9 % with 5 cells, -2.4 % with 9 cells and
--0.85 % with 17 cells. The outermost node of the footing also carries the half cell outside this node.  With an odd
-number of cells the effective width is therefore the true width.  With 4, 8, 16 cells this node lies at the edge of the
-footing, and the effective width exceeds the true width by half a cell on each side.
+-0.85 % with 17 cells. The outermost node of the footing also carries the half cell outside this node. With an odd
+number of cells the effective width is therefore the true width. With 4, 8 or 16 cells, the outermost node lies at the
+edge of the footing, and the effective width exceeds the true width by a cell.
 
 In associated flow the dilation of each point is proportional to its shear, but with F-bar a cell has a single
-dilatation.  The load would therefore increase without limit (de Borst and Groen 1995).  In this demo the error of the
-load would be +4.4 % with 9 cells and +3.4 % with 17 cells.  In fully yielding cells, laws therefore use half of the
-deviation of the gradient from its mean.  This reduces the error to -0.5 % with 5 cells, +0.5 % with 9 cells and +0.9 %
-with 17 cells.
+dilatation. The load would therefore increase without limit (de Borst and Groen 1995). In this demo the error of the
+load would be +4.4 % with 9 cells and +3.4 % with 17 cells. In fully yielding cells, laws therefore use half of the
+deviation of the gradient from its mean. The error is then -0.5 % with 5 cells, +0.5 % with 9 cells and +0.9 % with 17
+cells.
 
 The limit load of a rough circular footing on Tresca's soil, in axisymmetry, is 6.05 s_u (Cox, Eason and Hopkins 1961).
 
-With --graded, cells are fine in a region of 2 B x 0.75 B below the footing.  Outside this region, the length of cells
-increases by a tenth from cell to cell, up to eight times the smallest length.  The 20 B x 10 B of soil then have hardly
-more cells than 4 B x 2.5 B with fine cells only.
+With --graded, cells are fine in a region of 2 B x 0.75 B below the footing. Outside this region, the length of cells
+increases by a tenth from cell to cell, up to eight times the smallest length. A box of 20 B x 10 B then has hardly more
+cells than a box of 4 B x 2.5 B with equal cells.
 
-With --square, square and circular footings, rough and smooth, are pushed into Tresca's soil, on graded cells.  The
-footings are tools: below a smooth prescribed displacement, faces of the soil would move outward and enlarge the
-footing.  A quarter of the square is computed in 3D, also on several processes.  N_c is the limit load, divided by area
-and c.  Its bounds for a rough square are 5.52 and 6.22 (Salgado et al. 2004).  The bounds for a smooth square are 2 +
-pi and 5.71 (Shield and Drucker 1955).  Circles are computed in axisymmetry, with about twice as many cells over the
-width.  Exact values of N_c are 6.05 for rough circles (Cox, Eason and Hopkins 1961), and 5.69 for smooth circles
-(Shield 1955).
+With --square, square and circular footings, rough and smooth, are pushed into Tresca's soil, on graded cells. The
+footings are tools, because below a smooth prescribed displacement the faces of the soil would move outward and enlarge
+the footing. A quarter of the square is computed in 3D, also on several processes. N_c is the limit load, divided by
+area and c. The bounds of N_c are 5.52 and 6.22 for a rough square (Salgado et al. 2004), and 2 + pi and 5.71 for a
+smooth square (Shield and Drucker 1955). Circles are computed in axisymmetry, with about twice as many cells over the
+width. The exact N_c is 6.05 for a rough circle (Cox, Eason and Hopkins 1961), and 5.69 for a smooth circle (Shield
+1955).
 
-With non-associated flow the solution is not unique.  Shear bands are one cell wide and change their position between
-steps, more often on finer cells (Rudnicki and Rice 1975).  On fine grids many steps are therefore cut.  The option
+With non-associated flow the solution is not unique. Shear bands are one cell wide and change their position between
+steps, more often on finer cells (Rudnicki and Rice 1975). On fine grids many steps are therefore cut. The option
 --viscosity adds a viscous stress, small compared with the cohesion, which makes the solution unique (Needleman 1988).
-With --explicit-friction, friction follows from the mean stress at the start of each step (Krabbenhoft et al. 2012).
-Flow is then associated within a step.  With 9 cells over the width, this changes the load by 0.8 % in a run of 4 steps,
-and by 0.3 % in a run of 16 steps.
+With --explicit-friction, the strength by friction is computed from the mean stress at the start of each step
+(Krabbenhoft et al. 2012), so flow is associated within a step. With 9 cells over the width, this option changes the
+load by 0.8 % in a run of 4 steps, and by 0.3 % in a run of 16 steps.
 """
 
 from __future__ import annotations
@@ -108,7 +107,7 @@ LIMIT_DEPTH, LIMIT_STEPS = 0.0015, 8  # for --square: depth / B, number of steps
 
 
 def capacity(friction: float) -> float:
-    """Return Prandtl's N_c of a friction angle (degrees)."""
+    """Return Prandtl's N_c of a friction angle, in degrees."""
     t = np.tan(np.radians(friction))
     return 2 + np.pi if t == 0 else (np.exp(np.pi * t) * np.tan(np.pi / 4 + np.radians(friction) / 2) ** 2 - 1) / t
 
@@ -129,10 +128,10 @@ def embedded(depth):
 class ExplicitFriction(mpm.DruckerPrager):
     """Drucker-Prager soil whose friction follows from the mean stress at the start of each step.
 
-    Within a step, the friction angle equals the dilation angle, so flow is associated.  The strength at zero mean
-    stress contains the rest of the friction.  Source: Krabbenhoft, Karim, Lyamin and Sloan (2012).  Two state variables
-    are added: `mean`, the mean Kirchhoff stress, Pa, and `strength`, the strength at zero mean stress in the last step,
-    Pa.
+    Within a step, the friction angle equals the dilation angle, so flow is associated. The strength at zero mean stress
+    contains the rest of the friction (Krabbenhoft, Karim, Lyamin and Sloan 2012). Two state variables are added:
+    mean: mean Kirchhoff stress, in Pa.
+    strength: strength at zero mean stress in the last step, in Pa.
     """
 
     state: ClassVar = mpm.DruckerPrager.state | {"mean": 0.0, "strength": 0.0}
@@ -143,13 +142,13 @@ class ExplicitFriction(mpm.DruckerPrager):
 
     @staticmethod
     def kirchhoff(F, bulk, shear, eta, xi, eta_flow, cohesion, plastic, hardened, mean, strength, dt):
-        """Return the Kirchhoff stress (3, 3), in Pa, as UFL."""
+        """Return the Kirchhoff stress (3, 3) in UFL, in Pa."""
         now = ExplicitFriction.present(eta, xi, eta_flow, cohesion, mean, strength, dt)
         return mpm.DruckerPrager.kirchhoff(F, bulk, shear, eta_flow, 1.0, eta_flow, now, 0.0, plastic, hardened)
 
     @staticmethod
     def update(F, bulk, shear, eta, xi, eta_flow, cohesion, plastic, hardened, mean, strength, dt):
-        """Return the state variables at the end of the step, as UFL by name."""
+        """Return the state variables at the end of the step in UFL, by name."""
         now = ExplicitFriction.present(eta, xi, eta_flow, cohesion, mean, strength, dt)
         law = F, bulk, shear, eta_flow, 1.0, eta_flow, now, 0.0, plastic, hardened
         stress = ufl.tr(mpm.DruckerPrager.kirchhoff(*law)) / 3
@@ -157,7 +156,7 @@ class ExplicitFriction(mpm.DruckerPrager):
 
     @staticmethod
     def present(eta, xi, eta_flow, cohesion, mean, strength, dt):
-        """Return the strength at zero mean stress, Pa; for dt = 0 it is the strength of the last step."""
+        """Return the strength at zero mean stress, in Pa."""
         return ufl.conditional(ufl.gt(dt, 0), ufl.max_value(xi * cohesion - (eta - eta_flow) * mean, 0), strength)
 
 
@@ -165,7 +164,8 @@ class ExplicitFriction(mpm.DruckerPrager):
 class Frame:
     """State of footing and soil at one time of a push.
 
-    t: time divided by the duration of the push; settlement: settlement of the footing, divided by B.
+    t: time divided by the duration of the push.
+    settlement: settlement of the footing, divided by B.
     corners (n, 4, 2), pressure (n,): corners, in m, and pore pressures, in Pa, of the domains.
     top (k, 2): positions of the soil's surface, in m, from the middle outward.
     """
@@ -184,8 +184,6 @@ class Push:
     settlement, load: settlement divided by B, and load divided by area and c, after each step.
     frames: states at some times.
     pushed: index of the last step of the push; later steps are consolidation.
-    results: results of all runs.
-    Heights are measured from the initial surface of the soil.
     """
 
     settlement: list[float] = field(default_factory=lambda: [0.0])
@@ -195,12 +193,12 @@ class Push:
     results: list[mpm.Result] = field(default_factory=list)
 
     def total(self, name: str) -> float:
-        """Return the sum of the field `name` of all results, such as the number of steps."""
+        """Return the sum of a field of all results, such as the number of steps."""
         return sum(getattr(result, name) for result in self.results)
 
     @property
     def at_end(self) -> Frame:
-        """The frame at the end of penetration."""
+        """The frame at the end of the push."""
         return next(frame for frame in self.frames if frame.t >= 1 - 1e-9)
 
 
@@ -221,7 +219,7 @@ def push(
 
     cells: number of cells over the footing's width, odd.
     depth: depth of the push, divided by B.
-    rate: velocity V = v B / c_v, or None for a scene without water.
+    rate: dimensionless velocity V, or None for a scene without water.
     box: width and height of the computed half of the soil, divided by B.
     rest: time of consolidation after the push, divided by B²/c_v.
     steps: number of equal steps of the push; by default a step moves the footing by `STEP` cells.
@@ -271,11 +269,11 @@ def push(
 def limit_load(
     how: str, cells: int, box: tuple[float, float] | None = None, graded: bool = False, steps: int = 40
 ) -> Push:
-    """Push the footing into very stiff soil; return the push, with loads divided by the theoretical limit load.
+    """Push the footing into very stiff soil, with loads divided by the theoretical limit load.
 
     how: key of `LIMITS_OF`.
     box, graded: see `push`; by default the box in `LIMITS_OF`, with equal cells.
-    steps: number of steps to take out of 40, if undrained.
+    steps: number of computed steps out of 40, if undrained.
     """
     soil, (depth, own) = replace(SOIL, bulk=STIFF * SOIL.bulk, shear=STIFF * SOIL.shear), LIMITS_OF[how]
     box = box or own
@@ -293,11 +291,7 @@ def limit_load(
 
 
 def bearing(shape: str, roughness: str, cells: int) -> dict[str, float]:
-    """Push a square (a quarter, in 3D) or a circle (in axisymmetry) to its limit load; print and return the results.
-
-    shape, roughness: keys of `KNOWN`.  The results are N_c, its distance to the bounds (0 between the bounds), and
-    costs.
-    """
+    """Push a square in 3D or a circle in axisymmetry to its limit load, and print and return N_c and costs."""
     began, h, flat = time.process_time(), WIDTH / cells, 2 if shape == "square" else 1
     wide, deep = (round(edge * cells) * h for edge in SOLID["near"])
     size = [0.0] * flat + [-SOLID["box"]], [SOLID["box"]] * flat + [2 * h]
@@ -327,7 +321,7 @@ def bearing(shape: str, roughness: str, cells: int) -> dict[str, float]:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return the results of --json."""
+    """Run the demo and return its results."""
     parser = common.Parser(__doc__, __file__, processes=True)
     parser.add_argument("--cells", type=int, default=9, help="cells over the footing's width, odd")
     parser.add_argument("--depth", type=float, default=1.0, help="final depth divided by the footing's width")
@@ -382,9 +376,9 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def of_many_sizes(cells: int, folder: Path) -> dict:
-    """Print and draw the undrained limit load on graded cells in a large box, and on equal cells in a small box.
+    """Compare the undrained limit load on graded cells in a large box with that on equal cells in a small box.
 
-    Returns the load, the number of points and the processor time, s, for both boxes, and their ratios.
+    Returns the load, the number of points and the processor time, in s, for both boxes, and their ratios.
     """
     out, runs = {}, {}
     for how, box in FAR.items():
@@ -413,7 +407,7 @@ def of_many_sizes(cells: int, folder: Path) -> dict:
 
 
 def draw_cells(ax, frame: Frame) -> None:
-    """Draw the particle domains, coloured by their pore pressures divided by c."""
+    """Draw the particle domains, coloured by pore pressure divided by c."""
     from matplotlib.collections import PolyCollection
 
     corners, p = frame.corners[:, [0, 1, 3, 2]], frame.pressure / COHESION
@@ -427,10 +421,7 @@ def draw_cells(ax, frame: Frame) -> None:
 
 
 def viscous(viscosity: float, seconds: float) -> mpm.DruckerPrager:
-    """Return the soil with a viscosity, Pa s: the factor `viscosity` times the cohesion times the duration `seconds`.
-
-    A shear strain of 1 in this duration then increases the shear stress by `viscosity` times the cohesion.
-    """
+    """Return the soil with a viscosity: `viscosity` times the cohesion times the duration `seconds` of a push."""
     if viscosity == 0:
         return SOIL
     own = OF_SOIL | {"residual": COHESION, "slip": WIDTH}  # no softening
@@ -440,10 +431,9 @@ def viscous(viscosity: float, seconds: float) -> mpm.DruckerPrager:
 def effort(
     cells: int, depth: float, steps: int, width: float, method: str, viscosity: float = 0.0, explicit: bool = False
 ) -> dict:
-    """Push at the intermediate rate in equal steps; print and return load, numbers of steps, and processor time.
+    """Push at the intermediate rate in equal steps, and print and return load, numbers of steps, and processor time.
 
     width: width of the computed half of the soil, divided by B.
-    viscosity: see `viscous`; explicit: see `ExplicitFriction`.
     """
     began, rate = time.process_time(), RATES["intermediate"]
     soil = ExplicitFriction(**OF_SOIL) if explicit else viscous(viscosity, depth * WIDTH**2 / (CV * rate))
@@ -461,7 +451,7 @@ def effort(
 
 
 def errors(stiff: dict[tuple[str, int], Push]) -> dict[str, float]:
-    """Print and return the relative errors of the limit loads of stiff soil against theory."""
+    """Print and return the relative errors of the limit loads of stiff soil."""
     out = {}
     for (how, cells), run in stiff.items():
         out[f"{how}_{cells}"] = run.load[-1] - 1
@@ -472,7 +462,7 @@ def errors(stiff: dict[tuple[str, int], Push]) -> dict[str, float]:
 
 
 def twice_the_box(cells: int, depth: float) -> dict[str, float]:
-    """Print and return, for each rate, the largest relative change of the load if the box is twice as wide as `BOX`."""
+    """Print and return, for each rate, the largest change of the load in a box twice as wide as `BOX`."""
     out = {}
     for name, rate in RATES.items():
         near, far = (push(SOIL, cells, depth, rate, box=(wide * BOX[0], BOX[1])) for wide in (1, 2))
@@ -511,10 +501,7 @@ def report(runs: dict[str, Push]) -> dict:
 
 
 def view(ax, pair: tuple[Frame, Frame], limits: tuple[float, float]):
-    """Draw the footing, and the pore pressures (divided by c) of two frames as left and right half of the soil.
-
-    White gaps at the edge of the footing are due to inverted domains that were replaced.
-    """
+    """Draw the footing with the pore pressures of two frames, one on each side."""
     from matplotlib.collections import PolyCollection
 
     for sign, frame in zip((-1, 1), pair, strict=True):
@@ -528,7 +515,7 @@ def view(ax, pair: tuple[Frame, Frame], limits: tuple[float, float]):
 
 
 def block(ax, frame: Frame) -> None:
-    """Draw the footing, and the initial surface of the soil."""
+    """Draw the footing and the initial surface of the soil."""
     from matplotlib.patches import Rectangle
 
     place = (-WIDTH / 2, -frame.settlement * WIDTH)
@@ -543,7 +530,7 @@ def scale(run: Push) -> tuple[float, float]:
 
 
 def draw(out: Path, runs: dict[str, Push], stiff: dict[tuple[str, int], Push]) -> None:
-    """Draw pressures, load against settlement, the soil's surface, and the limit loads of stiff soil."""
+    """Draw pressures, loads, the soil's surface, and the limit loads of stiff soil."""
     fig, ((soil, curve), (surface, limit)) = common.figure(2, 2, (12, 7.5))
     run = runs["intermediate"]
     quads = view(soil, (run.at_end, run.frames[-1]), scale(run))
@@ -577,7 +564,7 @@ def draw(out: Path, runs: dict[str, Push], stiff: dict[tuple[str, int], Push]) -
 
 
 def draw_loads(ax, runs: dict[str, Push]) -> None:
-    """Draw load against settlement at all rates, and the theoretical limit loads."""
+    """Draw load against settlement at all rates, with the theoretical limit loads."""
     for (name, each), colour in zip(runs.items(), COLOURS, strict=True):
         upto = each.pushed + 1
         ax.plot(each.settlement[:upto], each.load[:upto], color=colour, label=f"{name}, V = {RATES[name]:g}")
@@ -597,7 +584,7 @@ def draw_loads(ax, runs: dict[str, Push]) -> None:
 
 
 def animate(out: Path, run: Push) -> None:
-    """Draw penetration and consolidation as an animation."""
+    """Draw the push and the consolidation as an animation."""
     from matplotlib.animation import FuncAnimation, PillowWriter
 
     fig, ((ax,),) = common.figure(1, 1, (6.4, 3.9))

@@ -1,17 +1,16 @@
 # SPDX-License-Identifier: MIT
 """A rigid cylinder is pressed into a saturated gel and stays there; the force relaxes as the gel drains.
 
-The scene is in plane strain, and only half of the gel is computed, by symmetry.  This half is 5 m wide and high, lies
-on a smooth base, and drains at its side, far from the cylinder.  The cylinder moves down in the first step and is then
-held.
+The scene is in plane strain, and by symmetry half of the gel is computed, 5 m wide and high. The gel lies on a smooth
+base, and drains at its side, far from the cylinder.
 
-* Initially no water has flowed, and the gel is incompressible.  By Hertz's theory the pressure under the cylinder is
+* At first no water has flowed, and the gel is incompressible. By Hertz's theory the pressure under the cylinder is
 
       p = p_0 sqrt(1 - x^2 / a^2),    a = 2 sqrt(F R / (pi E*)),    p_0 = sqrt(F E* / (pi R)),
 
-  at a distance x from the middle, with the half-width a of the contact, the radius R of the cylinder, and E* = 4 G of
-  the undrained gel.  For a layer of finite height, these equations hold with the computed force F per length.
-* Finally the pore pressure has dissipated.  Hertz's theory then holds with `E* = E / (1 - nu^2)` of the drained gel.
+  at a distance x from the middle, with the half-width a of the contact, the computed force F per length, the radius R
+  of the cylinder, and E* = 4 G for the shear modulus G.
+* In the end the pore pressure has dissipated. Hertz's theory then holds with `E* = E / (1 - nu^2)` of the drained gel.
   The force must equal the force on a dry gel, which the demo also computes.
 """
 
@@ -37,9 +36,9 @@ TIMES = np.geomspace(1e-4, 10, 21)  # times at which the force is recorded, divi
 
 @dataclass
 class Contact:
-    """Contact at one time; force, in N/m.
+    """State of the contact at one time, with the force in N/m.
 
-    x, p (k,): positions, in m, and pressures, in Pa, of points at the gel's surface.
+    x, p: positions, in m, and pressures, in Pa, of points at the gel's surface.
     most, half: largest pressure, in Pa, and half-width, in m, of the ellipse fitted to these pressures.
     """
 
@@ -50,13 +49,16 @@ class Contact:
     half: float
 
     def errors(self, stiff: float) -> tuple[float, float]:
-        """Return the relative errors of half-width and largest pressure against Hertz for this force; stiff: E*, Pa."""
+        """Return the relative errors of half-width and largest pressure against Hertz for the computed force.
+
+        stiff: modulus E* of the gel, in Pa.
+        """
         half = 2 * np.sqrt(self.force * RADIUS / (np.pi * stiff))
         return self.half / half - 1, self.most / np.sqrt(self.force * stiff / (np.pi * RADIUS)) - 1
 
 
 def contact(s: mpm.Simulation) -> Contact:
-    """Return the present `Contact`; half-width and largest pressure are from a linear fit of p^2 against x^2."""
+    """Return the present `Contact`, with a linear fit of p^2 against x^2."""
     p, x = s.points.data["ball_pressure"], s.points.x[:, 0]
     on = p > 0
     order = np.argsort(x[on])
@@ -67,7 +69,7 @@ def contact(s: mpm.Simulation) -> Contact:
 
 
 def scene(cells: int, wet: bool) -> mpm.Simulation:
-    """Return half of the gel under the cylinder, with `cells` cells per metre; wet: with pore water."""
+    """Return half of the gel under the cylinder, with `cells` cells per metre."""
     n, h = round(SIZE * cells), 1 / cells
     grid = mpm.Grid([0, 0], [SIZE, SIZE + 4 * h], [n, n + 4])
     top = SIZE + 0.3 * h  # the surface is not on a grid line
@@ -90,8 +92,8 @@ def scene(cells: int, wet: bool) -> mpm.Simulation:
 class Pressed:
     """Results of a run.
 
-    contacts: initial contact and, if wet, final contact.
-    forces: forces, in N/m, initially and at `TIMES`.
+    contacts: initial contact, and in wet gel final contact.
+    forces: forces at the start and at `TIMES`, in N/m.
     frame: initial corners, pore pressures, and shape of the cylinder.
     balance: largest error of the fluid balance.
     cuts: number of cut steps.
@@ -105,7 +107,7 @@ class Pressed:
 
 
 def pressed(cells: int, wet: bool) -> Pressed:
-    """Press the cylinder into the gel; if the gel is saturated (`wet`), let it drain."""
+    """Press the cylinder into the gel, and let wet gel drain."""
     s = scene(cells, wet)
     tool = s.conditions[0]
     result = s.run(INSTANT * TIME, INSTANT * TIME, progress=False)
@@ -121,7 +123,7 @@ def pressed(cells: int, wet: bool) -> Pressed:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return the results of --json."""
+    """Run the demo and return its results."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=12, help="cells per metre; the contact is about 1.5 m wide")
     o = parser.parse_args(argv)
@@ -146,7 +148,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, wet: Pressed, contacts: tuple[Contact, Contact]) -> None:
-    """Draw initial pore pressures, contact pressures with Hertz's solution, and the force against time."""
+    """Draw pore pressures, contact pressures with Hertz's solution, and the force against time."""
     fig, ((left, middle, right),) = common.figure(1, 3, (13, 4))
     corners, p, tool = wet.frame
     domains = common.domains(left, corners, p / 1e3, cmap="viridis")

@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: MIT
 """Water infiltrates unsaturated soil: comparison with exact and converged solutions.
 
-The first scene is rain on exponential soil (`Gardner`) above a water table.  At t = 0 the rain increases from a tenth
-to nine tenths of the conductivity.  Heads are compared with the series of Srivastava and Yeh (1991).  The second scene
-is a wetting front in dry soil (`VanGenuchten`), which is the second case of Celia, Bouloutas and Zarba (1990).  The
-front is compared with a converged solution of Richards' equation, and with finite elements (Q1/DG0) on the same cells
-in the same steps.
+The first scene is rain on exponential soil (`Gardner`) above a water table. At t = 0 the rain increases from a tenth to
+nine tenths of the conductivity. Heads are compared with the series of Srivastava and Yeh (1991). The second scene is a
+wetting front in dry soil (`VanGenuchten`), the second case of Celia, Bouloutas and Zarba (1990). The front is compared
+with a converged solution of Richards' equation. Finite elements (Q1/DG0) are computed on the same cells in the same
+steps.
 
-The error for the rain, at 1, 6 and 12 h, is the largest error of the head, divided by the largest head.  The errors for
-the front, at 6 and 12 h, are the errors of the depth at which the head is -5 m, and of the infiltrated water.  They are
-given for material points and for finite elements.  The demo runs on one process.
+In rain, the error after 1, 6 and 12 h is the largest error of the head, divided by the largest head. The front has two
+errors after 6 and 12 h: the error of the depth at which the head is -5 m, and the error of the infiltrated water. The
+demo runs on one process.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ STIFF = {"bulk": 1e10, "shear": 5e9}  # Pa: soil that hardly deforms
 ALPHA, K = 5.0, 1e-5  # 1/m, m/s, of the exponential soil
 HOURS = (1, 6, 12)
 FRONT = {6: (0.2544, 0.017406), 12: (0.375096, 0.026335)}
-"""By hour: depth, m, at which the head is -5 m, and infiltrated water, m; extrapolated from 1600 finite volumes."""
+"""By hour: depth at which the head is -5 m, and infiltrated water, both in m, extrapolated from 1600 finite volumes."""
 DRY = {
     "soil": mpm.LinearElastic(
         **STIFF,
@@ -51,7 +51,7 @@ def column(cells: int, soil: mpm.Skeleton, pressure, sides) -> mpm.Simulation:
 
 
 def series(z: np.ndarray, t: float, before: float = 0.1, after: float = 0.9) -> np.ndarray:
-    """Return the exact heads, m, at heights z, m, and time t, s, from the roots l of `tan(l L) + 2 l = 0`."""
+    """Return the exact heads at heights z, in m, and time t, in s, from the roots l of `tan(l L) + 2 l = 0`."""
     Z, L, T = ALPHA * z, ALPHA, ALPHA * K * t / 0.35
     low = (np.arange(1, 200) - 0.5) * np.pi / L
     high = np.arange(1, 200) * np.pi / L
@@ -68,7 +68,7 @@ def series(z: np.ndarray, t: float, before: float = 0.1, after: float = 0.9) -> 
 
 
 def rain(cells: int, dt: float) -> tuple[list, list[float], bool]:
-    """Return heights and heads of the cells, m, at each time of `HOURS`, the errors, and whether the run converged."""
+    """Return heights and heads of the cells at the times `HOURS`, the errors, and whether the run converged."""
     soil = mpm.LinearElastic(**STIFF, porosity=0.35, conductivity=K, retention=mpm.Gardner(WEIGHT / ALPHA))
     sides = [mpm.Drained("bottom"), mpm.Rain("top", 0.9 * K)]
     s = column(cells, soil, lambda x: WEIGHT / ALPHA * np.log(0.1 + 0.9 * np.exp(-ALPHA * x[:, 1])), sides)
@@ -84,7 +84,7 @@ def rain(cells: int, dt: float) -> tuple[list, list[float], bool]:
 
 
 def front(cells: int, dt: float) -> tuple[list, list[float], list[float], bool]:
-    """Return depths and heads, m, at 6 and 12 h, errors of front (m) and water, and whether the run converged."""
+    """Return depths and heads at 6 and 12 h, errors of front and water, and whether the run converged."""
     s = column(cells, **DRY)
     start = s.cells().water.sum()
     found, places, waters = [], [], []
@@ -99,7 +99,7 @@ def front(cells: int, dt: float) -> tuple[list, list[float], list[float], bool]:
 
 
 def by_elements(cells: int, dt: float) -> tuple[list[float], list[float]]:
-    """Return the errors of front (m) and water (relative) at 6 and 12 h, for `cells` finite elements."""
+    """Return the errors of front, in m, and of water, relative, for `cells` finite elements."""
     walls, pull = {"left": "x", "right": "x", "bottom": "y"}, lambda t: (0, -9.81)
     scene = {"conditions": DRY["sides"], "pressure": DRY["pressure"], "walls": walls, "gravity": pull}
     size = [0, 0], [1 / cells, 1], [1, cells]
@@ -115,7 +115,7 @@ def by_elements(cells: int, dt: float) -> tuple[list[float], list[float]]:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return the results of --json."""
+    """Run the demo and return its results."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=40, help="cells over the height")
     parser.add_argument("--rain-step", type=float, default=600.0, help="step under rain, s")
@@ -141,7 +141,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, heads: list, depths: list) -> None:
-    """Draw two diagrams: heads in rain with the series; heads of the front with its converged positions."""
+    """Draw heads in rain and at the wetting front, with their references."""
     fig, ((left, right),) = common.figure(1, 2, (11, 4.6))
     z = np.linspace(0, 1, 201)
     for i, (hour, (heights, head)) in enumerate(zip(HOURS, heads, strict=True)):

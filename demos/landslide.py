@@ -1,14 +1,13 @@
 # SPDX-License-Identifier: MIT
 """A slope at rest loses strength, slides and comes to rest: speed, energies, and run-out with and without inertia.
 
-A slope of 2:1, H = 10 m high, stands on a layer of 5 m.  Both are Mohr-Coulomb soil, with the friction angle phi = 20
-degrees and the cohesion c = 0.05 gamma H (unit weight gamma).  The slope settles under its weight without inertia; its
-factor of safety is 1.4.  Then its strength is suddenly divided by 1.6.
+A slope of 2:1, H = 10 m high, stands on a layer of 5 m. Slope and layer are Mohr-Coulomb soil, with the friction angle
+phi = 20 degrees and the cohesion c = 0.05 gamma H (unit weight gamma). The slope settles under its weight without
+inertia. The factor of safety of the slope is 1.4. Then its strength is suddenly divided by 1.6.
 
-With inertia the slope accelerates until its shape is stable, and then moves on until friction stops it.  Without
-inertia, as in the demo `slope`, a viscous stress controls the motion from one equilibrium to the next.  The slope then
-stops at the first stable shape, so its run-out is shorter.  Energies balance: friction dissipates the work of gravity,
-except for the part that is stored elastically.
+With inertia the slope accelerates until its shape is stable, and then moves on until friction stops it. Without
+inertia, as in the demo `slope`, a viscous stress controls the motion. The slope then stops at the first stable shape,
+so its run-out is shorter. Friction dissipates the work of gravity, except for the part that is stored elastically.
 """
 
 from __future__ import annotations
@@ -47,7 +46,7 @@ def slope(cells: int) -> mpm.Simulation:
 
 
 def slide(s: mpm.Simulation, dt: float) -> tuple[mpm.Result, np.ndarray]:
-    """Divide the strength and let the slope slide; return the result and the largest speeds, m/s, at output times."""
+    """Divide the strength, let the slope slide, and return the result and the largest speeds, in m/s."""
     friction = np.degrees(np.arctan(np.tan(np.radians(still.FRICTION)) / still.WEAKER))
     s.stage(inertia=True, fields={"friction": friction, "cohesion": still.COHESION / still.WEAKER})
     speeds = [0.0]
@@ -59,7 +58,7 @@ def slide(s: mpm.Simulation, dt: float) -> tuple[mpm.Result, np.ndarray]:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return the results of --json."""
+    """Run the demo and return its results."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=10, help="cells over the slope's height, even")
     parser.add_argument("--dt", type=float, default=0.05, help="step of the slide, s")
@@ -92,7 +91,7 @@ def main(argv: list[str] | None = None) -> dict:
 def draw(
     o: Namespace, result: mpm.Result, speed: np.ndarray, corners: np.ndarray, moved: np.ndarray, before: np.ndarray
 ) -> None:
-    """Draw the slope before and after its slide, speed and energies."""
+    """Draw the slope before and after its slide, the speed and the energies."""
     fig, ((after, moves, energy),) = common.figure(1, 3, (15, 3.8))
     quads = common.domains(after, corners, moved, cmap="viridis", linewidth=0.1)
     common.domains(after, before, facecolor="none", edgecolors="grey", linewidth=0.1, alpha=0.5)

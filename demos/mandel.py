@@ -1,19 +1,19 @@
 # SPDX-License-Identifier: MIT
 """Mandel's slab is compressed between rigid plates; the pore pressure in its middle rises before it decreases.
 
-A saturated slab between rigid, smooth, impervious plates carries a force from the first step on.  Its free sides drain
-and soften first, so the plates load the middle more.  The pressure in the middle therefore rises above its initial
-value p0 = force / (2a).  This Mandel-Cryer effect needs a two-way coupling.  By symmetry a quarter of the slab is
-computed, a = 1 m wide and 1 m high, in plane strain.  Poisson's ratio is 0.2, and water and grains are incompressible.
-The mean strain is 1e-5, so small-strain theory is accurate.  The reduced time is `T = c t / a²`, with
-`c = kappa (K + 4G/3)`.  Displacements are linear in y, so few cells over the height suffice.  Source: Mandel (1953);
-Abousleiman et al. (1996), Géotechnique 46.  The demo runs on one process.
+A saturated slab between rigid, smooth, impervious plates carries a force from the first step on. The free sides of the
+slab drain and soften first, so the plates load the middle more. The pressure in the middle therefore rises above its
+initial value p0 = force / (2a). By symmetry a quarter of the slab is computed, a = 1 m wide and 1 m high, in plane
+strain. Poisson's ratio is 0.2, and water and grains are incompressible. The mean strain is 1e-5, so small-strain theory
+is accurate. Displacements are linear in y, so few cells over the height suffice. The reduced time is `T = c t / a²`,
+with `c = kappa (K + 4G/3)`. Here t is the time, kappa the mobility, K the bulk modulus and G the shear modulus. Source:
+Mandel (1953); Abousleiman et al. (1996), Géotechnique 46. The demo runs on one process.
 
 Errors:
 
-* `p_0.01` to `p_1`: largest value of |p - exact| a / force at the centroids of all cells, at T = 0.01, 0.1, 0.5 and 1;
-* `p_max`: relative error of the highest pressure in the innermost cell, which occurs at T = 0.07;
-* `p_rise`, a stricter measure: relative error of the difference between the highest pressure and p0;
+* `p_0.01` to `p_1`: largest value of |p - exact| a / force at the centroids of all cells, at T = 0.01, 0.1, 0.5 and 1.
+* `p_max`: relative error of the highest pressure in the innermost cell, which occurs at T = 0.07.
+* `p_rise`: relative error of the difference between the highest pressure and p0.
 * `settlement`: largest relative error of the plate's settlement at T = 0.01, 0.1, 0.5 and 1.
 
 Most of the error is spatial, and decreases with the square of the cell size.
@@ -45,7 +45,7 @@ class Outcome:
 
     time: reduced time T.
     x, p (columns, rows): positions, in m, and pressures, in Pa, of the cells.
-    settlement: settlements, in m, of eleven positions on the top, from the middle to the side.
+    settlement: settlements at eleven positions on the top, from the middle to the side, in m.
     """
 
     time: list[float] = field(default_factory=list)
@@ -55,7 +55,7 @@ class Outcome:
     stages: list[mpm.Result] = field(default_factory=list)
 
     def at(self, time: float) -> int:
-        """Return the index of the step that ends nearest to the reduced time `time`."""
+        """Return the index of the step that ends nearest to a reduced time."""
         return int(np.argmin(np.abs(np.array(self.time) - time)))
 
 
@@ -93,7 +93,7 @@ def run(cells: int = 40, steps: int = 30, method: str = "sdirk2") -> tuple[dict[
 
 
 def exact_peak(x: float) -> float:
-    """Return the largest exact pressure, Pa, over all times, at the position x, m."""
+    """Return the largest exact pressure over all times at a position, in Pa."""
     return float(EXACT.pressure(x, np.geomspace(1e-3, 1, 5001) * WIDTH**2 / EXACT.cv).max())
 
 
@@ -111,7 +111,7 @@ def errors(out: Outcome) -> dict[str, float]:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return the results of --json."""
+    """Run the demo and return its results."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=40, help="cells over the width; over the height: a quarter")
     parser.add_argument("--steps", type=int, default=30, help="equal steps to each of T = 0.01, 0.1, 0.5, 1")
@@ -129,7 +129,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, out: Outcome) -> None:
-    """Draw the pressure against x, and the pressure in the middle against time, with the exact curves."""
+    """Draw pressures against x and against time, with the exact curves."""
     fig, ((left, right),) = common.figure(1, 2, (11, 4.6))
     unit, scale, x = WIDTH**2 / EXACT.cv, FORCE / WIDTH, np.linspace(0, WIDTH, 201)
     for i, k in enumerate(map(out.at, SAMPLES)):

@@ -1,29 +1,28 @@
 # SPDX-License-Identifier: MIT
 """A T-bar, which is a rigid cylinder, is pushed through clay, normal to its axis and deep below the surface.
 
-The clay is undrained, and follows von Mises's law with the plane-strain strength s_u.  F is the force per length of the
-bar, and D is its diameter.  The bar starts inside the clay and is pushed until the clay flows all around it.  Then the
-resistance of the bar is that of Randolph and Houlsby (1984) for an adhesion alpha s_u on its surface,
+The clay is undrained, and follows von Mises's law with the plane-strain strength s_u. F is the force per length of the
+bar, and D is its diameter. The bar starts inside the clay and is pushed until the clay flows all around it. Then the
+resistance N of the bar is that of Randolph and Houlsby (1984) for an adhesion alpha s_u on its surface,
 
     N = F / (s_u D) = pi + 2 asin(alpha) + 4 cos(pi/4 - asin(alpha)/2) (sqrt(2) + sin(pi/4 - asin(alpha)/2)).
 
-The clay is a block, eight diameters wide and high, between smooth walls; half of the block is computed.  A pressure on
-the top keeps the gap behind the bar closed.  The clay settles under this pressure, and therefore first loads the bar
-downwards.  In a narrower block the resistance is lower.  In a block four diameters wide, N of a rough bar is 10.9 with
-8 cells over the diameter, and 10.8 with 16 cells.
+The clay is a block, eight diameters wide and high, between smooth walls. Half of the block is computed. A pressure on
+the top keeps the gap behind the bar closed. In a narrower block the resistance is lower. In a block four diameters
+wide, N of a rough bar is 10.9 with 8 cells over the diameter, and 10.8 with 16 cells.
 
 Clay ahead of the bar flows around the bar and stretches exponentially, by a factor of about e^4 for each diameter of
-depth.  After each quarter of a diameter, new points are therefore seeded around the bar, with the present stresses
-(remeshing and interpolation: Hu and Randolph 1998, Int. J. Numer. Anal. Meth. Geomech. 22).  Stress is the only state
-variable of this clay.  After each new seeding, N is lower for one or two steps.  Errors refer to the mean of N in the
-last steps of each quarter.  `spread` is the range of N in these steps, divided by this mean.
+depth. After each quarter of a diameter, new points are therefore seeded around the bar, with the present stresses
+(remeshing and interpolation: Hu and Randolph 1998, Int. J. Numer. Anal. Meth. Geomech. 22). After each new seeding, N
+is lower for one or two steps. Errors refer to the mean of N in the last steps of each quarter. `spread` is the range of
+N in these steps, divided by their mean.
 
-Saturated ("wet") clay is also computed: a smooth bar is pushed through it by one diameter, at three rates V = v D /
-c_v.  The water on top has the pressure that loads the clay, so the clay starts without effective stress.  Wet clay is
-seeded only once.  Domains longer than a cell are replaced by new domains (renewal).
+A smooth bar is also pushed through saturated ("wet") clay by one diameter, at three rates `V = v D / c_v`, with the
+velocity v and the coefficient of consolidation c_v. The pressure on the top is that of water, so the clay starts
+without effective stress. Wet clay is seeded only once. Domains longer than a cell are replaced by new domains
+(renewal).
 
-With --follow the bar is pushed once more, on grid lines that follow the bar.  Small cells then move with the bar, and
-the larger cells widen behind the bar and narrow ahead of the bar.  The number of cells does not change.
+With --follow the bar is pushed once more, on grid lines that follow the bar. The number of cells does not change.
 """
 
 from __future__ import annotations
@@ -64,9 +63,10 @@ def exact(alpha: float) -> float:
 
 
 def clay(cells: int, y: float = 0.0, follow: mpm.Tool | None = None) -> tuple:
-    """Return the grid, half of the block around a bar at the height y, m, and the region of the block's top.
+    """Return the grid, half of the block around a bar at the height y, in m, and the region of the block's top.
 
-    cells: number of cells over the diameter; follow: the bar if grid lines follow it, or None.
+    cells: number of cells over the diameter.
+    follow: bar that grid lines follow, or None.
     """
     h = D / cells
     n = round(HALF * cells)
@@ -94,11 +94,11 @@ def clay(cells: int, y: float = 0.0, follow: mpm.Tool | None = None) -> tuple:
 class Push:
     """Results of a push.
 
-    depth, N, excess: depth divided by D, resistance divided by s_u D, and excess pressure divided by s_u in each step.
+    depth: depth divided by D, for each step.
+    N: resistance, for each step.
+    excess: excess pressure divided by s_u, for each step.
     steady: whether a step counts in the error of N.
-    frame: final corners (n, 4, 2), in m, a field (n,), and the shape of the bar (k, 4, 2), in m.  The field is the
-    displacement of the points since the clay was seeded, divided by the displacement of the bar.  In wet clay the field
-    is the excess pressure divided by s_u.
+    frame: final corners (n, 4, 2), in m, a field (n,), and the shape of the bar (k, 4, 2), in m.
     lines: final grid lines along both axes, in m.
     """
 
@@ -114,10 +114,7 @@ class Push:
 
 
 def push(alpha: float, cells: int, depth: float, follow: bool = False) -> Push:
-    """Load the clay, then push a bar of roughness alpha to `depth` diameters; seed the clay again after each `LEG`.
-
-    follow: whether grid lines follow the bar.
-    """
+    """Load the clay, then push a bar of roughness alpha to `depth` diameters, with new points after each `LEG`."""
     out, stress, legs = Push(), None, max(1, round(depth / LEG))
     for k in range(legs):
         stress = leg(out, stress, alpha, cells, depth * (0.5 - k / legs), depth / legs, follow)
@@ -125,9 +122,11 @@ def push(alpha: float, cells: int, depth: float, follow: bool = False) -> Push:
 
 
 def leg(out: Push, stress: Callable | None, alpha: float, cells: int, y: float, way: float, follow: bool) -> Callable:
-    """Push a bar down by `way` D from the height y D, append the results to `out`, and return the final stresses.
+    """Push a bar down, append the results to `out`, and return the final stresses.
 
     stress: initial stresses, see `kept`. With None, the clay is first loaded by the pressure on its top.
+    y: initial height of the bar, divided by D.
+    way: displacement of the bar, divided by D.
     """
     begin, gone = 1.0 if stress is None else 0.0, max(out.depth, default=0.0)
     soil = mpm.DruckerPrager(bulk=50 * SHEAR, shear=SHEAR, friction=0.0, dilation=0.0, cohesion=STRENGTH)
@@ -154,9 +153,9 @@ def leg(out: Push, stress: Callable | None, alpha: float, cells: int, y: float, 
 
 
 def kept(simulation: mpm.Simulation) -> Callable:
-    """Return a function that returns the effective stress (n, 3, 3), in Pa, at positions x (n, 2), in m.
+    """Return a function that interpolates the effective stress (n, 3, 3), in Pa, at positions x (n, 2), in m.
 
-    The stress is interpolated between the points, and reduced to the strength where it exceeds the strength.
+    Interpolated stresses beyond the strength are reduced to the strength.
     """
     x, stress = simulation.points.x, simulation.point_fields().effective_stress
     flat = [stress[:, a, b] for a, b in ((0, 0), (1, 1), (2, 2), (0, 1))]
@@ -205,7 +204,7 @@ def push_wet(rate: float, cells: int, depth: float) -> Push:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return the results of --json."""
+    """Run the demo and return its results."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=8, help="cells over the diameter")
     parser.add_argument("--rough", nargs="*", type=float, default=list(ROUGH), help="roughnesses alpha of the bar")
@@ -245,7 +244,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def following(o: Namespace, alpha: float, equal: Push) -> dict[str, float]:
-    """Push a bar on grid lines that follow the bar; return resistance and number of cells, relative to equal cells."""
+    """Push a bar on grid lines that follow it, and compare resistance and number of cells with those on equal cells."""
     run = push(alpha, o.cells, o.depth, follow=True)
     N, beside = (np.array(each.N)[each.steady].mean() for each in (run, equal))
     count, whole = (np.prod([len(x) - 1 for x in each.lines]) for each in (run, equal))
@@ -268,7 +267,7 @@ def following(o: Namespace, alpha: float, equal: Push) -> dict[str, float]:
 
 
 def draw(o: Namespace, runs: dict[float, Push], wet: dict[str, Push]) -> None:
-    """Draw resistances, displacements of the clay around smoothest and roughest bar, and pore pressures in wet clay."""
+    """Draw resistances, displacements of the clay, and pore pressures in wet clay."""
     fig, axes = common.figure(2, 4, (17, 8.5))
     for k, (alpha, run) in enumerate(runs.items()):
         axes[0, 0].plot(run.depth, run.N, color=f"C{k}", label=f"α = {alpha:g}")
@@ -294,7 +293,7 @@ def draw(o: Namespace, runs: dict[float, Push], wet: dict[str, Push]) -> None:
 
 
 def show(ax, run: Push, label: str, title: str, clim: tuple[float, float]) -> None:
-    """Draw the final state of a push, coloured by the field of its frame."""
+    """Draw the final state of a push."""
     corners, values, bar = run.frame
     domains = common.domains(ax, corners, values, cmap="viridis" if clim[0] == 0 else "RdBu_r", clim=clim)
     common.domains(ax, bar, facecolor="0.6", edgecolor="0.6")

@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: MIT
 """A poroelastic beam of 1 m x 0.3 m: a saturated cantilever under a constant load.
 
-A beam of 1 m x 0.3 m, clamped at x = 0, carries a dead load on its top from x = 0.05 m on.  The load increases linearly
-until the end of the ramp (--ramp), and then remains constant.  The ends of the beam are permeable, and its long sides
-are impervious.  The beam is in plane strain, or equivalently 0.1 m deep between smooth walls (--dim 3).  At first the
-pore water carries a part of the load.  The beam drains and sags by a third of its length.  Two other solutions are
-drawn.  One is Euler-Bernoulli's small-strain beam without water.  The other (--reference) solves the same finite-strain
-Biot problem with body-fitted Taylor-Hood elements, in steps of a quarter of --dt.
+The beam is clamped at x = 0 and carries a dead load on its top from x = 0.05 m on. The load increases linearly until
+the end of the ramp (--ramp), and then remains constant. The ends of the beam are permeable, and its long sides are
+impervious. The beam is in plane strain, or equivalently 0.1 m deep between smooth walls (--dim 3). At first the pore
+water carries a part of the load. The beam drains and sags by a third of its length.
+
+Two other solutions are drawn. The first solution is Euler-Bernoulli's small-strain beam without water. The second
+solution (--reference) is a finite-strain Biot solution with body-fitted Taylor-Hood elements, in steps of a quarter of
+--dt.
 """
 
 from __future__ import annotations
@@ -29,9 +31,9 @@ REFERENCE_CELLS = (67, 20)
 TIMES = (0.02, 0.04, 0.06, 0.1, 0.2, 0.4, 0.6, 0.8, 1.0, 1.2)  # s
 TRUTH = (-0.0665718, -0.1444268, -0.2306306, -0.2652579, -0.3085867)
 TRUTH += (-0.3378547, -0.3453412, -0.3474797, -0.3481624, -0.3484207)
-"""u_y of the tip (m) at `TIMES`, from `REFERENCE_CELLS` Taylor-Hood elements, steps of 0.005 s (see --reference).
+"""u_y of the tip at `TIMES`, in m, from `REFERENCE_CELLS` Taylor-Hood elements in steps of 0.005 s (see --reference).
 
-Steps of 0.0025 s change the last digit but one; 100 x 30 cells change the fifth digit.
+With steps of 0.0025 s, the last digit but one changes. With 100 x 30 cells, the fifth digit changes.
 """
 
 
@@ -74,7 +76,7 @@ def arguments(argv: list[str] | None = None) -> Namespace:
 
 
 def physics(o: Namespace, dim: int = 2) -> dict:
-    """Return boundary conditions and fluid, which are the same for material points and finite elements."""
+    """Return the boundary conditions and the fluid."""
     inner = [np.inf] * (dim - 1)
     load = mpm.Traction(
         "top",
@@ -90,12 +92,12 @@ def physics(o: Namespace, dim: int = 2) -> dict:
 
 
 def material(o: Namespace) -> mpm.Hencky:
-    """Return the constitutive law of the skeleton."""
+    """Return the law of the skeleton."""
     return mpm.Hencky(bulk=o.bulk, shear=o.shear, porosity=o.porosity, conductivity=o.conductivity)
 
 
 def scene(o: Namespace) -> tuple[mpm.Simulation, float]:
-    """Return the simulation, and the height of the beam's lower side on the grid, m."""
+    """Return the simulation, and the height of the beam's lower side on the grid, in m."""
     cells = np.rint(BOX / o.h).astype(int)
     h = BOX / cells
     # a larger box adds whole cells below and above the beam, so the beam lies on the grid as before
@@ -116,14 +118,14 @@ def scene(o: Namespace) -> tuple[mpm.Simulation, float]:
 
 
 def output_times(o: Namespace) -> dict:
-    """Return arguments of `run`: the length of equal steps, or `rtol` and output times `TIMES` of adaptive steps."""
+    """Return the arguments of `run` for equal or adaptive steps."""
     if o.rtol is None:
         return {"dt": o.dt}
     return {"rtol": o.rtol, "t_eval": [t for t in TIMES if t <= o.t_end]}
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return the results of --json."""
+    """Run the demo and return its results."""
     o = arguments(argv)
     try:
         simulation, bottom = scene(o)
@@ -167,7 +169,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def reference(o: Namespace, result: mpm.Result, axis: np.ndarray) -> mpm.Result:
-    """Return the finite element result at the times of `result`, for positions `axis` (n, 2) on the beam's axis."""
+    """Return the finite element result at the times of `result`, at positions `axis` (n, 2)."""
     fem = BiotFEM(mpm.Grid([0, 0], [LENGTH, HEIGHT], REFERENCE_CELLS), material(o), **physics(o))
     found = fem.run(o.t_end, o.dt / 4, probes=axis, progress=True)
     at = [int(np.argmin(np.abs(found.t - t))) for t in result.t]
@@ -175,7 +177,7 @@ def reference(o: Namespace, result: mpm.Result, axis: np.ndarray) -> mpm.Result:
 
 
 def summary(simulation: mpm.Simulation, result: mpm.Result) -> dict:
-    """Return the run's results as plain numbers."""
+    """Return the results of the run as plain numbers."""
     comm = simulation.grid.comm
     return {
         "tip": [[t, *map(float, u[-1])] for t, u in zip(result.t[1:], result.displacement[1:], strict=True)],
@@ -194,7 +196,7 @@ def summary(simulation: mpm.Simulation, result: mpm.Result) -> dict:
 
 
 def report(o: Namespace, result: mpm.Result, fem) -> None:
-    """Print the tip deflection, and the reference deflection if it was computed."""
+    """Print the tip deflection and, if computed, the reference deflection."""
     rows = [["tip: t (s)", "u_x (m)", "u_y (m)", *(["FEM (m)", "difference"] if fem else [])]]
     every = max(1, len(result.t) // 12)
     for k in sorted({*range(1, min(4, len(result.t))), *range(every, len(result.t), every), len(result.t) - 1}):
@@ -215,7 +217,7 @@ def report(o: Namespace, result: mpm.Result, fem) -> None:
 
 
 def write_tables(o: Namespace, axis: np.ndarray, result: mpm.Result, fem) -> None:
-    """Write the history of the tip deflection, and the deflection curves, as CSV."""
+    """Write the tip deflection against time, and the deflection curves, as CSV."""
     names = ["t_s", "ux_m", "uy_m", *([] if o.drained else ["p_min_Pa", "p_max_Pa"])]
     rows = []
     for k, t in enumerate(result.t):
@@ -228,7 +230,7 @@ def write_tables(o: Namespace, axis: np.ndarray, result: mpm.Result, fem) -> Non
 
 
 def draw_pressure(o: Namespace, snapshots: list) -> None:
-    """Draw the pore pressure of the material points at six times, all with the same colour scale."""
+    """Draw the pore pressure of the material points at six times."""
     from matplotlib.colors import SymLogNorm
 
     rows = 1 + (len(snapshots) > 3)
@@ -249,7 +251,7 @@ def draw_pressure(o: Namespace, snapshots: list) -> None:
 
 
 def draw_deflection(o: Namespace, axis: np.ndarray, result: mpm.Result, fem, shown) -> None:
-    """Draw the beam's axis at several times, with Euler-Bernoulli's beam and the finite elements."""
+    """Draw the beam's axis at several times, with the reference solutions."""
     import matplotlib
 
     fig, ((ax,),) = common.figure(1, 1, (8, 5))

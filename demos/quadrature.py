@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Exact integration over particle domains: tip deflection of the drained beam for different numbers of load steps.
 
-The beam of `poroelastic_beam.py` without water takes its whole load in n equal steps.  The material is elastic, so the
-deflection must not depend on n.  If the exact pieces of the domains are integrated, the deflection is independent of n.
-With integration at the points, as in standard MPM, every cell that a point crosses adds to the error.  The finite
+The beam of `poroelastic_beam.py` without water takes its whole load in n equal steps. The material is elastic, so the
+deflection must not depend on n. With integration over the exact pieces of the domains, the deflection is independent of
+n. With integration at the points, as in standard MPM, every cell that a point crosses adds to the error. The finite
 element reference takes the load in ten steps.
 """
 
@@ -23,7 +23,7 @@ PROBE = np.array([[beam.LENGTH, beam.HEIGHT / 2]])
 
 
 def tip(h: float, steps: int, quadrature: str) -> tuple[float, float]:
-    """Return the deflection of the tip, m, and the run time, s; the deflection is nan if the run failed."""
+    """Return the deflection of the tip, in m, and the run time, in s; the deflection of a failed run is nan."""
     o = options(h, steps, quadrature)
     simulation, bottom = beam.scene(o)
     try:
@@ -41,7 +41,7 @@ def options(h: float, steps: int, quadrature: str = "domain") -> Namespace:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return the results of --json."""
+    """Run the demo and return its results."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--h", type=float, default=0.015, help="cell size, m")
     parser.add_argument("--steps", type=int, nargs="+", default=[10, 20, 40, 80, 160], help="numbers of load steps")

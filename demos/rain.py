@@ -1,29 +1,27 @@
 # SPDX-License-Identifier: MIT
 """Rain on slopes that suction stabilises: factors of safety against time, and a bank that slides.
 
-A slope of b = 35 degrees is much longer than deep, so the problem is one-dimensional, normal to the slope.  The
-computed column reaches from the surface to a water table at a depth of 5 m.  Only the component of gravity normal to
-the slope acts on it.  The column starts at rest.  Then vertical rain of nine tenths of the conductivity falls until the
-flow is steady.  At a vertical depth d the factor of safety is
+A slope of b = 35 degrees is much longer than deep, so the problem is one-dimensional, normal to the slope. The computed
+column reaches from the surface to a water table at a depth of 5 m. Only the component of gravity normal to the slope
+acts on the column. Vertical rain of nine tenths of the conductivity falls until the flow is steady. At a vertical depth
+d the factor of safety is
 
     FS = tan phi / tan b + 2 c / (gamma d sin 2b) + chi s (tan b + cot b) tan phi / (gamma d)
 
-with friction angle phi, cohesion c, Bishop's suction stress chi s and a constant unit weight gamma.  At rest and in
+with friction angle phi, cohesion c, Bishop's suction stress chi s and a constant unit weight gamma. At rest and in
 steady flow the suction s of exponential soil is known exactly:
 
     exp(-alpha s / gamma_w) = q / k + (1 - q / k) exp(-alpha z cos(b)^2).
 
 Here alpha is Gardner's constant, gamma_w is the unit weight of water, q is the rain, k is the conductivity, and z is
-the height above the water table.
+the height above the water table. The error is the largest relative error of FS at depths of 1, 2, 3 and 5 m, at rest
+and in steady flow. Source: Lu and Godt (2008) for vertical flow.
 
-Source: Lu and Godt (2008) for vertical flow. In this demo the component of gravity normal to the slope replaces
-gravity. Errors: the largest relative error of FS at depths of 1, 2, 3 and 5 m, at rest and in steady flow.
-
-With `--slope 10` rain falls on a bank of soil, 5 m high and inclined at 60 degrees, on rough rock.  Suction and
-cohesion stabilise the bank; the cohesion decreases to a tenth with slip.  The suction decreases until equilibrium is
-impossible.  With inertia the bank then slides, runs out over the rock and comes to rest.  An animation shows failure
-and slide.  Checks: balances of energy and water.  With 6 cells over its height, the bank fails after 1.7 h and runs out
-by 3.2 m.  With 10 cells it fails after 1.5 h and runs out by 2.7 m.  The demo runs on one process.
+With `--slope 10` rain falls on a bank of soil, 5 m high and inclined at 60 degrees, on rough rock. Suction and cohesion
+stabilise the bank. The cohesion decreases to a tenth with slip. The suction decreases until equilibrium is impossible.
+Then the bank slides with inertia, runs out over the rock and comes to rest. With 6 cells over its height, the bank
+fails after 1.7 h and runs out by 3.2 m. With 10 cells it fails after 1.5 h and runs out by 2.7 m. Checks are the
+balances of energy and water. The demo runs on one process.
 """
 
 from __future__ import annotations
@@ -51,7 +49,7 @@ BALANCE = 0.01  # allowed error of the energy balance, relative to the work of t
 
 
 def column(cells: int) -> mpm.Simulation:
-    """Return a column normal to the slope, `cells` cells high, at rest, with its base at the water table."""
+    """Return a column normal to the slope, at rest, with its base at the water table."""
     height = TABLE * np.cos(SLOPE)
     h = height / cells
     grid = mpm.Grid([0, 0], [h, height + 2 * h], [1, cells + 2])
@@ -71,7 +69,7 @@ def column(cells: int) -> mpm.Simulation:
 
 
 class Shot(NamedTuple):
-    """State of the bank: time, s, corners, m, and saturations of the domains, and the largest speed, m/s."""
+    """State of the bank: time, in s, corners, in m, and saturations of the domains, and largest speed, in m/s."""
 
     t: float
     corners: np.ndarray
@@ -80,7 +78,7 @@ class Shot(NamedTuple):
 
 
 def bank(cells: int) -> mpm.Simulation:
-    """Return a bank, `cells` cells high, on rough rock, with rain on its top and its slope."""
+    """Return a bank on rough rock, with rain on its top and its slope."""
     h = BANK / cells
     toe = CREST + BANK / np.tan(BANK_ANGLE)
     width = np.ceil(RANGE / h) * h
@@ -105,7 +103,7 @@ def bank(cells: int) -> mpm.Simulation:
 
 
 def slide(o: Namespace) -> dict:
-    """Run the bank in the rain until it has failed and come to rest; draw it, and return the results."""
+    """Run the bank in the rain until it has failed and come to rest, draw the bank, and return the results."""
     s = bank(o.slope)
     start = float(s.cells().water.sum())
     film = [shot(s)]
@@ -146,7 +144,7 @@ def shot(s: mpm.Simulation) -> Shot:
 
 
 def draw_slide(o: Namespace, film: list[Shot], rained: int) -> None:
-    """Draw the bank before rain, at failure and at rest, and an animation; rained: number of states until failure."""
+    """Draw the bank before rain, at failure and at rest, and an animation."""
     fig, (panels,) = common.figure(1, 3, (13, 3.2))
     failed = film[rained - 1].t
     titles = ("before the rain", f"{failed / 3600:.1f} h: it fails", f"{film[-1].t - failed:.0f} s later")
@@ -159,7 +157,7 @@ def draw_slide(o: Namespace, film: list[Shot], rained: int) -> None:
 
 
 def bank_in(ax, one: Shot):
-    """Draw a state of the bank; return matplotlib's collection of the domains."""
+    """Draw a state of the bank, and return its collection of domains."""
     import matplotlib.pyplot as plt
 
     cmap = plt.get_cmap("viridis_r", 9)  # few colours: a small animation
@@ -170,7 +168,7 @@ def bank_in(ax, one: Shot):
 
 
 def animate(path: Path, film: list[Shot], rained: int) -> None:
-    """Draw the hours of rain and the seconds of the slide as an animation."""
+    """Draw the rain and the slide as an animation."""
     from PIL import Image
 
     fig, ((ax,),) = common.figure(1, 1, (5.6, 3.3))
@@ -199,20 +197,20 @@ def animate(path: Path, film: list[Shot], rained: int) -> None:
 
 
 def exact(depth: np.ndarray, share: float) -> np.ndarray:
-    """Return the exact factors of safety (n,) at depths (n,), in m; share: rain divided by the conductivity."""
+    """Return the exact factors of safety (n,) at depths (n,), in m, for rain of `share` times the conductivity."""
     filled = share + (1 - share) * np.exp(-ALPHA * (TABLE - depth) * np.cos(SLOPE) ** 2)
     return safety(depth, -filled * np.log(filled) / ALPHA * WATER)
 
 
 def safety(depth: np.ndarray, suction_stress: np.ndarray) -> np.ndarray:
-    """Return the factors of safety (n,) at depths (n,), in m, for suction stresses chi s (n,), in Pa."""
+    """Return the factors of safety (n,) at depths (n,), in m, for suction stresses (n,), in Pa."""
     angles = np.tan(SLOPE) + 1 / np.tan(SLOPE)
     held = 2 * COHESION / (UNIT * depth * np.sin(2 * SLOPE)) + np.tan(FRICTION) / np.tan(SLOPE)
     return held + suction_stress / (UNIT * depth) * angles * np.tan(FRICTION)
 
 
 def found(s: mpm.Simulation) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return depths, m, heads, m, and suction stresses chi s, Pa, of the cells, from the surface downwards."""
+    """Return depths, heads and suction stresses of the cells, from the surface downwards."""
     cell = s.cells()
     depth = TABLE - cell.x[::-1, 1] / np.cos(SLOPE)
     p = cell.pressure[::-1]
@@ -221,13 +219,13 @@ def found(s: mpm.Simulation) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def error(depth: np.ndarray, suction_stress: np.ndarray, share: float) -> float:
-    """Return the largest relative error of the factors of safety at `DEPTHS`; suction is zero at the water table."""
+    """Return the largest relative error of the factors of safety at `DEPTHS`."""
     at = np.interp(DEPTHS, np.append(depth, TABLE), np.append(suction_stress, 0.0))
     return float(np.abs(safety(DEPTHS, at) / exact(DEPTHS, share) - 1).max())
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return the results of --json."""
+    """Run the demo and return its results."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=50, help="cells across the slope")
     parser.add_argument("--step", type=float, default=1800.0, help="step in the first two days, s")
@@ -266,7 +264,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, curves: list) -> None:
-    """Draw heads and factors of safety against depth, with exact curves at rest and in steady flow."""
+    """Draw heads and factors of safety against depth, with exact curves."""
     fig, ((left, right),) = common.figure(1, 2, (11, 4.6))
     for days, depth, head, felt in curves:
         left.plot(head, depth, lw=1.4, label=f"{days:g} d")

@@ -1,21 +1,21 @@
 # SPDX-License-Identifier: MIT
 """Active and passive pressure on a rigid retaining wall that tilts about its toe, away from the sand or into it.
 
-The weightless sand lies on a rough floor and carries a surcharge q.  Its friction and dilation angles phi and psi are
-30 degrees, and the friction angle of the wall is delta.  The wall tilts until a wedge of the sand flows.  The effect of
-cohesion is removed by adding c cot(phi) to the surcharge q and to the normal pressure on the wall.  This pressure is
-then K q, with
+The weightless sand lies on a rough floor and carries a surcharge q. The friction angle phi and the dilation angle of
+the sand are 30 degrees. The friction angle of the wall is delta. The wall tilts until a wedge of the sand flows. The
+effect of a cohesion c is removed: c cot(phi) is added to q and to the normal pressure on the wall. The normal pressure
+is then K q, with
 
     K = (1 ± sin(phi) cos(w)) / (1 ∓ sin(phi)) exp(± w tan(phi)),    w = asin(sin(delta) / sin(phi)) ± delta,
 
-where the upper sign is for passive pressure.  The flowing sand consists of a zone at the wall, a fan about the crest of
-the wall, and Rankine's zone (Prandtl, Sokolovskii).  Without wall friction (delta = 0), this is Rankine's
-`K = (1 ± sin(phi)) / (1 ∓ sin(phi))`.  Coulomb's solution is the critical wedge with a plane slip surface.
+where the upper sign is for passive pressure (Prandtl, Sokolovskii). The flowing sand consists of a zone at the wall, a
+fan about the crest of the wall, and Rankine's zone. Without wall friction, K is Rankine's
+`(1 ± sin(phi)) / (1 ∓ sin(phi))`. Coulomb's solution is the critical wedge with a plane slip surface.
 
-The moment about the toe, which is work-conjugate to the rotation, also gives K.  A tilting wall opens no gap at its
-toe.  A translating wall opens a gap at its toe, in which no force acts.  Without the force on the lowest of ten cells,
-the active thrust is a tenth too small.  The sand is stiff, so that it flows at a small tilt.  At two and a half times
-this tilt, the active thrust is 2.5 to 3 % larger.
+The moment about the toe also gives K. A tilting wall opens no gap at its toe. A translating wall opens a gap at its
+toe, in which no force acts. Without the force on the lowest of ten cells, the active thrust is a tenth too small. The
+sand is stiff, so that it flows at a small tilt. At two and a half times this tilt, the active thrust is 2.5 to 3 %
+larger.
 """
 
 from __future__ import annotations
@@ -38,14 +38,14 @@ STEPS = {"active": 5, "passive": 12}
 
 
 def exact(delta: float, way: int) -> float:
-    """Return the exact K for a wall with friction angle delta, degrees; way: -1 for active, 1 for passive."""
+    """Return the exact K for a wall with friction angle delta, in degrees; `way` is -1 (active) or 1 (passive)."""
     p, d = np.radians([PHI, delta])
     w = np.arcsin(np.sin(d) / np.sin(p)) + way * d
     return (1 + way * np.sin(p) * np.cos(w)) / (1 - way * np.sin(p)) * np.exp(way * w * np.tan(p))
 
 
 def coulomb(delta: float, way: int) -> float:
-    """Return K of Coulomb's wedge; parameters: see `exact`."""
+    """Return K of Coulomb's wedge; for the parameters see `exact`."""
     (p, d), angle = np.radians([PHI, delta]), np.radians(np.linspace(5, 85, 8001))
     K = np.cos(d) / np.tan(angle) * np.tan(angle + way * p)
     K /= np.cos(d) - way * np.sin(d) * np.tan(angle + way * p)
@@ -53,7 +53,7 @@ def coulomb(delta: float, way: int) -> float:
 
 
 def slip_line(delta: float, way: int) -> np.ndarray:
-    """Return the edge (n, 2), in m, of the yielding sand, from the toe to the surface."""
+    """Return the edge (n, 2) of the yielding sand from the toe to the surface, in m."""
     p, d = np.radians([PHI, delta])
     fan, rankine = (np.arcsin(np.sin(d) / np.sin(p)) + way * d) / 2, np.pi / 4 - way * p / 2
     at_wall, apex = np.pi / 2 - rankine - fan, np.pi / 2 - way * p
@@ -65,9 +65,9 @@ def slip_line(delta: float, way: int) -> np.ndarray:
 
 @dataclass
 class Tilted:
-    """Results of a run: tilts (n,), in rad, and K (n,) from the thrust and from the moment.
+    """Results of a run: tilts (n,), in rad, K (n,) from the thrust, and K (n,) from the moment.
 
-    frame: final corners of the domains, m, plastic shear strains, and shape of the wall.
+    frame: final corners of the domains, in m, plastic shear strains, and shape of the wall.
     """
 
     tilt: np.ndarray
@@ -79,7 +79,7 @@ class Tilted:
 
 
 def tilted(name: str, delta: float, cells: int) -> Tilted:
-    """Load the sand, then tilt the wall in the direction that `name` gives."""
+    """Load the sand, then tilt the wall."""
     way, length, h, mu = WAYS[name], LENGTH[name], 1 / cells, np.tan(np.radians(delta))
     grid = mpm.Grid([-4 * h, -2.5 * h], [length, 1 + 5.5 * h], [round(length / h) + 4, cells + 8])
     turn = {"rotation_rad": lambda t: -way * TILT[name] * max(0, t - 1)}
@@ -98,7 +98,7 @@ def tilted(name: str, delta: float, cells: int) -> Tilted:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return the results of --json."""
+    """Run the demo and return its results."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=10, help="cells over the height of the wall")
     parser.add_argument("--delta", nargs="*", type=float, default=[0, 15], help="friction angles of the wall, degrees")

@@ -1,32 +1,32 @@
 # SPDX-License-Identifier: MIT
 """Cost of a step: time of each part, memory, and messages, for different numbers of material points and processes.
 
-Two saturated bodies move slowly through the grid.  One is the beam of `poroelastic_beam.py` in 2D (direct solvers, in a
-background box six times as large).  The other is a cube of 1 m in 3D, sheared and compressed (multigrid).  Each run is
-a new process, or several processes under mpirun (--processes 1 2).  The first step compiles and fills the caches.  Then
-single steps are measured, and the fastest step is used, since other work on the machine only adds time.  Time is
-processor time, divided among the parts of a step in proportion to their wall time.  On several processes, the time is
-the largest of all processes, including waiting.  Memory is the peak since the start of the process, including libraries
-and compiler.  If the demo itself is started by mpirun, all runs share its processes, and memory is the peak of all runs
-so far.
+Two saturated bodies move slowly through the grid. The first body is the beam of `poroelastic_beam.py` in 2D, with
+direct solvers, in a background box six times as large. The second body is a cube of 1 m in 3D, sheared and compressed,
+with multigrid. Each run is a new process, or several processes under mpirun (--processes 1 2). The first step compiles
+and fills the caches. Then single steps are measured, and the fastest step is used, because other work on the machine
+only adds time. Time is processor time, divided among the parts of a step in proportion to their wall time. On several
+processes, the time is the largest time of all processes, including waiting. Memory is the peak since the start of the
+process. If the demo itself is started by mpirun, all runs share its processes, and memory is the peak of all runs so
+far.
 
 The exponent of a part is the slope of log(time) against log(points), fitted by least squares to the larger half of the
-sizes.  `kB a point` is the slope of the memory against the number of points, fitted to all sizes by least squares of
-relative errors.  Runs on several processes also print the load balance (`imbalance`: largest number of pieces of a
-process divided by the mean) and the messages of a step on the process with the most messages.  `exchange` are the
-messages of the package (pieces, corners, points).  `solvers` are the messages that PETSc counts in set-up and solution
-of its Krylov solvers.  Messages of MUMPS and of dolfinx are not counted.
+sizes. `kB a point` is the slope of the memory against the number of points, fitted to all sizes by least squares of
+relative errors. Runs on several processes also print the load balance and the messages of a step. The load balance
+(`imbalance`) is the largest number of pieces of a process divided by the mean. Messages are those of the process with
+the most messages. `exchange` are the messages of the package (pieces, corners, points). `solvers` are the messages that
+PETSc counts in set-up and solution of its Krylov solvers. Messages of MUMPS and of dolfinx are not counted.
 
-With runs on one and on several processes, a cost model is fitted to the seconds of a step of n points on P processes,
+With runs on one and on several processes, a cost model is fitted to the seconds T of a step of n points on P processes,
 
     T = e + a n / P + b H + c log2 P,
 
-where e is a fixed cost.  The term a n / P is the work for the points; in a measured run it is multiplied by the
-imbalance.  The term b H is the work for points at faces between processes.  The last term is a cost of messages that
-does not depend on their size.  The coefficients, all >= 0, are fitted by least squares of relative errors.  H is the
-number of points along the faces that a process shares with others, for a cube that is halved repeatedly.  If a run has
-more processes than the machine has processors, its message counts are used, but not its times.  In 2D the model
-excludes the solvers: the cost of factorisations is not proportional to n / P.
+where e is a fixed cost, a n / P is the work for the points, b H is the work for points at faces between processes, and
+c log2 P is a cost of messages that does not depend on their size. In a measured run, a n / P is multiplied by the
+imbalance. H is the number of points along the faces that a process shares with others, for a cube that is halved
+repeatedly. The coefficients, all >= 0, are fitted by least squares of relative errors. If a run has more processes than
+the machine has processors, its times are not used. In 2D the model excludes the solvers, because the cost of
+factorisations is not proportional to n / P.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ SOLVERS = ("factorisation", "linear solve")
 
 
 def scene(dim: int, points: float) -> tuple[mpm.Simulation, float]:
-    """Return the scene of a body with about `points` points, and its time step, s."""
+    """Return the scene of a body with about `points` points, and its time step, in s."""
     if dim == 2:
         h = np.sqrt(4 * beam.LENGTH * beam.HEIGHT / points)
         return beam.scene(beam.arguments(["--h", str(h), "--ramp", "0.6"]))[0], 0.02
@@ -95,7 +95,7 @@ def scene(dim: int, points: float) -> tuple[mpm.Simulation, float]:
 
 
 def sent() -> np.ndarray:
-    """Return five counts so far: messages and bytes of exchanges; messages, bytes and reductions of solvers."""
+    """Return five counts: messages and bytes of exchanges, and messages, bytes and reductions of solvers."""
     events = [PETSc.Log.Event(name).getPerfInfo() for name in ("KSPSolve", "PCSetUp")]
     solver = [sum(e[name] for e in events) for name in ("numMessages", "messageLength", "numReductions")]
     return np.array([traffic.messages, traffic.bytes, *solver], dtype=float)
@@ -142,10 +142,10 @@ def measure(dim: int, points: float) -> dict:
 
 
 def held(root: object, buffers: bool = True) -> tuple[dict[str, int], set[int]]:
-    """Return two results for the arrays that an object refers to on this process: bytes by kind, lengths of axes.
+    """Return two results for the arrays of an object on this process: bytes by kind, and lengths of axes.
 
-    Shared memory counts once.  Arrays in files that are mapped into memory have the kind "files"; their axes are left
-    out.
+    Shared memory counts once. Arrays in files that are mapped into memory have the kind "files", and no lengths of
+    axes.
 
     buffers: whether to count the buffers of integrands too, which have a fixed largest number of rows.
     """
@@ -184,7 +184,7 @@ def held(root: object, buffers: bool = True) -> tuple[dict[str, int], set[int]]:
 
 
 def in_own_process(dim: int, points: float, processes: int) -> dict:
-    """Return the result of `measure`, run in a new process or in several."""
+    """Return the result of `measure` in a new process, or in several."""
     command = [sys.executable, "-m", "mpi4py", __file__, "--one", str(dim), str(points)]
     if processes > 1:
         command = ["mpirun", "--oversubscribe", "-n", str(processes), *command]
@@ -200,7 +200,7 @@ def in_own_process(dim: int, points: float, processes: int) -> dict:
 
 
 def exponents(rows: list[dict]) -> dict[str, float]:
-    """Return the exponents of the parts for the larger half of the sizes, and the memory: initial MB, kB per point."""
+    """Return the exponents of the parts, and the memory: initial memory, in MB, and kB per point."""
     upper = rows[(len(rows) - 1) // 2 :]
     n, memory = (np.array([row[name] for row in rows], dtype=float) for name in ("points", "memory_MB"))
     slope, base = np.polyfit(n, memory, 1, w=1 / memory)
@@ -213,7 +213,7 @@ def exponents(rows: list[dict]) -> dict[str, float]:
 
 
 def halo(dim: int, n: float, processes: int) -> float:
-    """Return the number of points along faces that a process shares with others; processes: a power of two."""
+    """Return the number of points along faces that a process shares with others, for a power of two of processes."""
     turn = round(np.log2(processes))
     halved = np.array([turn // dim + (axis < turn % dim) for axis in range(dim)])
     sides = n ** (1 / dim) / 2.0**halved
@@ -221,17 +221,17 @@ def halo(dim: int, n: float, processes: int) -> float:
 
 
 def terms(dim: int, n: float, processes: int, imbalance: float = 1.0) -> list[float]:
-    """Return the terms of the cost model, which the coefficients multiply: 1, n / P, H, log2 P."""
+    """Return the terms of the cost model: 1, n / P, H and log2 P."""
     return [1.0, imbalance * n / processes, halo(dim, n, processes), np.log2(processes)]
 
 
 def modelled(row: dict) -> float:
-    """Return the time of a step, s, to which the cost model is fitted; in 2D it excludes the solvers."""
+    """Return the time of a step to which the cost model is fitted, in s."""
     return row["step"] - (sum(row[part] for part in SOLVERS) if row["dim"] == 2 else 0.0)
 
 
 def fit(rows: list[dict]) -> dict[str, float]:
-    """Return the fitted coefficients of the cost model, s, and the largest relative error for the runs."""
+    """Return the coefficients of the cost model, in s, and the largest relative error for the runs."""
     timed = [row for row in rows if row["processes"] <= (os.cpu_count() or 1)]
     A = np.array([terms(row["dim"], row["points"], row["processes"], row["imbalance"]) for row in timed])
     T = np.array([modelled(row) for row in timed])
@@ -241,7 +241,7 @@ def fit(rows: list[dict]) -> dict[str, float]:
 
 
 def predicted(model: dict[str, float], dim: int, n: float, processes: int) -> float:
-    """Return the time of a step, s, that the cost model predicts."""
+    """Return the time of a step that the cost model predicts, in s."""
     return float(np.dot(terms(dim, n, processes), [model[name] for name in "eabc"]))
 
 
@@ -249,7 +249,7 @@ def predicted(model: dict[str, float], dim: int, n: float, processes: int) -> fl
 
 
 def by_part(rows: list[dict], found: dict[str, float]) -> str:
-    """Return a Markdown table of runs on equally many processes: seconds of each part, its exponent, and memory."""
+    """Return a Markdown table of the time of each part, its exponent, and memory."""
     lines = [["seconds of a step", *(f"{row['points']}" for row in rows), "exponent"]]
     for part in ("step", *PARTS, "rest"):
         lines.append([part, *(f"{row[part]:.2g}" for row in rows), f"{found.get(part, np.nan):.2f}"])
@@ -258,7 +258,7 @@ def by_part(rows: list[dict], found: dict[str, float]) -> str:
 
 
 def by_processes(rows: list[dict]) -> str:
-    """Return time, memory, imbalance and traffic of a step as a Markdown table."""
+    """Return a Markdown table of time, memory, imbalance and messages of a step."""
     columns = {
         "points": "points",
         "processes": "processes",
@@ -278,7 +278,7 @@ def by_processes(rows: list[dict]) -> str:
 
 
 def prediction(model: dict[str, float], dim: int) -> str:
-    """Return the cost model as text, and its predictions for many processes."""
+    """Return the cost model and its predictions for many processes as text."""
     form = f"{model['e']:.2g} + {model['a']:.2g} n/P + {model['b']:.2g} H + {model['c']:.2g} log2 P"
     lines = [f"{dim}D: T = {form} s, within {100 * model['worst']:.0f} % of the runs"]
     for share in (1e4, 1e5):
@@ -309,7 +309,7 @@ def draw(out: Path, rows: list[dict]) -> None:
 
 
 def draw_parts(left, right, rows: list[dict]) -> None:
-    """Draw times of the eight most expensive parts of a step, and memory; dotted lines are linear in the points."""
+    """Draw times of the eight most expensive parts of a step, and memory."""
     n, found = np.array([row["points"] for row in rows]), exponents(rows)
     for k, part in enumerate(sorted((*PARTS, "rest"), key=lambda part: -rows[-1][part])[:8]):
         label = f"{part}, {found.get(part, np.nan):.2f}"
@@ -321,7 +321,7 @@ def draw_parts(left, right, rows: list[dict]) -> None:
 
 
 def write(out: Path, rows: list[dict]) -> dict:
-    """Write tables and pictures, print them; return exponents and cost models, by dimension."""
+    """Write tables and pictures, print the tables, and return exponents and cost models, by dimension."""
     common.write_csv(out / "scaling.csv", rows[0], (row.values() for row in rows))
     text, found = [], {}
     for dim in sorted({row["dim"] for row in rows}):
@@ -347,7 +347,7 @@ def write(out: Path, rows: list[dict]) -> dict:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return the results of --json."""
+    """Run the demo and return its results."""
     parser = common.Parser(__doc__, __file__, processes=True)
     add = parser.add_argument
     add("--dims", type=int, nargs="+", choices=(2, 3), default=[2, 3], help="dimensions")

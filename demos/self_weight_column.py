@@ -1,19 +1,18 @@
 # SPDX-License-Identifier: MIT
 """A soft column settles to less than half its height under its own weight.
 
-A dry column, 50 m high, has E = 10 kPa, nu = 0 and a density of 80 kg/m³.  The column stands between smooth walls.
-Gravity, increased to 10 m/s² in equal steps, compresses the column to 24.06 m.  The soil at its foot is compressed to
-0.3 of its initial height, so points cross many cells.  The first Piola-Kirchhoff stress at the reference height Y
-carries the weight above: `P = -rho0 g (l0 - Y)`, with the initial density rho0 and the initial height l0.  In a column
-of constant width this stress equals Cauchy's stress.  With Hencky's law, the stretch follows from Lambert's W function.
-Source: the column of AMPLE (Coombs & Augarde 2020, doi:10.1016/j.advengsoft.2019.102748), here with a hundredth of its
-stiffness.  The demo runs on one process.
+A dry column between smooth walls, l0 = 50 m high, has E = 10 kPa, nu = 0 and the density rho0 = 80 kg/m³. Gravity,
+increased to g = 10 m/s² in equal steps, compresses the column to 24.06 m. The soil at its foot is compressed to 0.3 of
+its initial height, so points cross many cells. The first Piola-Kirchhoff stress at the reference height Y carries the
+weight above: `P = -rho0 g (l0 - Y)`. In a column of constant width P equals Cauchy's stress. With Hencky's law, the
+stretch follows from Lambert's W function. Source: the column of AMPLE (Coombs & Augarde 2020,
+doi:10.1016/j.advengsoft.2019.102748), here with a hundredth of its stiffness. The demo runs on one process.
 
-Errors: `stress` is the mean of |sigma - exact(Y)| / (rho0 g l0) over the points, weighted by volume; `height` is the
-relative error of the column's height.  With 16 cells over the initial height, `stress` is 3.4e-4; the published error
-of GIMP is 3.7e-3.  With 64 cells, `stress` is 6.4e-6; the published error of GIMP is 4.4e-4.  `--quadrature point`
-integrates at the points instead of over the pieces of their domains. The error is then about 8 % with any number of
-cells.
+`stress` is the mean error of the stress over the points, divided by rho0 g l0 and weighted by volume. `height` is the
+relative error of the column's height. With 16 cells over the initial height, `stress` is 3.4e-4, and the published
+error of GIMP is 3.7e-3. With 64 cells, `stress` is 6.4e-6, and the published error of GIMP is 4.4e-4.
+`--quadrature point` integrates at the points instead of over the pieces of their domains. The error is then about 8 %
+with any number of cells.
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ FOAM = mpm.Hencky(bulk=EXACT.bulk, shear=EXACT.shear, porosity=POROSITY, grain_d
 
 @dataclass
 class Outcome:
-    """The column at rest: initial (Y) and present (y) heights (n,), in m, stress (n,), in Pa, initial volumes (n,)."""
+    """The column at rest, with initial heights Y (n,) and present heights y (n,) of the points, in m."""
 
     Y: np.ndarray
     y: np.ndarray
@@ -45,7 +44,7 @@ class Outcome:
 
 
 def run(cells: int = 64, steps: int = 40, quadrature: str = "domain") -> Outcome:
-    """Load the column, `cells` cells high, in `steps` equal steps."""
+    """Load the column, `cells` cells high, in equal steps."""
     h = EXACT.l0 / cells
     grid = mpm.Grid([0, 0], [h, EXACT.l0], [1, cells])
     column = mpm.box(grid, [0, 0], [h, EXACT.l0], per_cell=2)
@@ -72,7 +71,7 @@ def errors(out: Outcome) -> dict[str, float]:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return the results of --json."""
+    """Run the demo and return its results."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=64, help="cells over the initial height")
     parser.add_argument("--steps", type=int, default=40, help="equal steps in which gravity increases")

@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: MIT
 """A shear wave from the ground enters a soft layer: amplification at the surface against the exact solution.
 
-Shear waves have a velocity of 100 m/s in a layer of 10 m, and of 300 m/s in the ground below the layer.  The computed
-ground ends at an absorbing base, 5 m below the layer.  A shear pulse enters through this base, and reflections from
-layer and surface leave through it.  The sides have no vertical displacement, as in an infinite layer. The reference is
-the motion of the ground's free surface without a layer, which is twice the incoming wave.  The spectrum of the surface
-motion, divided by the spectrum of the reference motion, is
+Shear waves have a velocity of 100 m/s in a layer of 10 m, and of 300 m/s in the ground below the layer. The computed
+ground ends at an absorbing base, 5 m below the layer. A shear pulse enters through this base, and reflections from
+layer and surface leave through it. The sides have no vertical displacement, as in an infinite layer. The reference
+motion is that of the ground's free surface without a layer, which is twice the incoming wave. The spectrum of the
+surface motion, divided by the spectrum of the reference motion, is
 
     1 / |cos(w H / c) + i a sin(w H / c)|,        a = rho c / (rho_g c_g),
 
-with the angular frequency w, the thickness H, the wave velocity c and the density rho of the layer.  The wave velocity
-and the density of the ground are c_g and rho_g.  The energy balance includes the work of the incoming wave and of the
+with the angular frequency w, the thickness H, the wave velocity c and the density rho of the layer. The wave velocity
+and the density of the ground are c_g and rho_g. The energy balance includes the work of the incoming wave and of the
 absorbing base.
 """
 
@@ -31,20 +31,20 @@ BOUNDS = {"amplification": 0.03, "energy": 0.01}
 
 
 def soil(speed: float, density: float) -> mpm.LinearElastic:
-    """Return a soil with the given velocity of shear waves, m/s, and density, kg/m³."""
+    """Return a soil with this velocity of shear waves, in m/s, and this density, in kg/m³."""
     shear = density * speed**2
     bulk = 2 * shear * (1 + POISSON) / (3 - 6 * POISSON)
     return mpm.LinearElastic(bulk=bulk, shear=shear, porosity=0.4, grain_density=density / 0.6)
 
 
 def incoming(t: np.ndarray) -> np.ndarray:
-    """Return the velocity, m/s, of the incoming wave, Ricker's wavelet."""
+    """Return the velocity of the incoming wave, Ricker's wavelet, in m/s."""
     s = (np.pi * PULSE * (t - CENTRE)) ** 2
     return 0.1 * (1 - 2 * s) * np.exp(-s)
 
 
 def shaken(cells: int, steps: int) -> tuple[mpm.Result, np.ndarray]:
-    """Return the result of a run with `cells` cells over the layer, and the velocity of the surface, m/s."""
+    """Return the result of a run, and the velocity of the surface, in m/s."""
     h = LAYER / cells
     rows = round(GROUND / h)
     grid = mpm.Grid([0, -GROUND - h], [4 * h, LAYER + h], [4, cells + rows + 2])
@@ -64,14 +64,14 @@ def shaken(cells: int, steps: int) -> tuple[mpm.Result, np.ndarray]:
 
 
 def exact(f: np.ndarray) -> np.ndarray:
-    """Return the exact amplification at the frequencies f, Hz."""
+    """Return the exact amplification at the frequencies f, in Hz."""
     phase = 2 * np.pi * f * LAYER / SPEEDS[1]
     a = DENSITIES[1] * SPEEDS[1] / (DENSITIES[0] * SPEEDS[0])
     return 1 / np.abs(np.cos(phase) + 1j * a * np.sin(phase))
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return the results of --json."""
+    """Run the demo and return its results."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=20, help="cells over the layer, even")
     parser.add_argument("--steps", type=int, default=500, help="steps of the run")

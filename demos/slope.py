@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: MIT
 """Factor of safety of a slope, and run-out after a larger loss of strength.
 
-A slope of 2:1, H = 10 m high, stands on a layer of 5 m. Both are Mohr-Coulomb soil without dilation, with the friction
-angle phi = 20 degrees and the cohesion c = 0.05 gamma H (unit weight gamma).
+A slope of 2:1, H = 10 m high, stands on a layer of 5 m. Slope and layer are Mohr-Coulomb soil without dilation, with
+the friction angle phi = 20 degrees and the cohesion c = 0.05 gamma H (unit weight gamma).
 
-1. Factor of safety: the largest divisor of c and tan(phi) for which the slope is stable.  `mpm.factor_of_safety`
-   reduces the strength of the slope at rest, and checks whether the viscous stress decays.  The best log-spiral
+1. The factor of safety is the largest divisor of c and tan(phi) for which the slope is stable. `mpm.factor_of_safety`
+   reduces the strength of the slope at rest, and checks whether the viscous stress decays. The best log-spiral
    mechanism gives 1.368, and finite elements give 1.4 (Griffiths and Lane 1999).
-2. Run-out: the strength of viscous soil is suddenly divided by 1.6.  The slope slides until its new
-   shape is just stable.  The factor of safety of this shape differs from one by less than 0.1.
+2. For the run-out, the strength of viscous soil is suddenly divided by 1.6. The slope slides until its new shape is
+   just stable. The factor of safety of the new shape differs from one by less than 0.1.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def shape(cells: int) -> tuple[mpm.Grid, list[mpm.Body]]:
 
 
 def slope(cells: int) -> mpm.Simulation:
-    """Return the slope at rest at t = 0, with `cells` cells over its height."""
+    """Return the slope at rest at t = 0."""
     grid, bodies = shape(cells)
     soil = mpm.MohrCoulomb(
         bulk=YOUNG / (3 - 6 * POISSON),
@@ -70,7 +70,7 @@ def slide(s: mpm.Simulation, steps: int) -> mpm.Result:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return the results of --json."""
+    """Run the demo and return its results."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=10, help="cells over the slope's height, even")
     parser.add_argument("--steps", type=int, default=40, help="steps of the slide")
@@ -96,7 +96,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(out: Path, safety: mpm.Safety, before: np.ndarray, corners: np.ndarray, moved: np.ndarray) -> None:
-    """Draw overloads (viscous divided by shear stress) of the trials, and the slope before and after its slide."""
+    """Draw the viscous stress in the trials, and the slope before and after its slide."""
     fig, ((trials, after),) = common.figure(1, 2, (13, 3.6))
     for factor, shares in sorted(safety.overloads.items()):
         rests = factor <= safety.bounds[0]

@@ -1,31 +1,31 @@
 # SPDX-License-Identifier: MIT
 """A submarine bank loses its strength and slumps: large plastic deformation with pore pressures.
 
-A bank of saturated soil with a vertical side stands on a rough floor under water.  The computed half is 10 m high and
-10 m long; x = 0 is a plane of symmetry.  Pressures are in excess of the hydrostatic pressure outside.  The weight is a
-term in UFL.  The buoyant unit weight is `gamma' = (1 - n) (rho_s - rho_w) g`, with the porosity n and the densities
-rho_s of the grains and rho_w of the water.  Inertia is neglected.  The demo runs on one process.
+A bank of saturated soil with a vertical side stands on a rough floor under water. By symmetry, half of the bank is
+computed, 10 m high and 10 m long, with the plane of symmetry at x = 0. Pressures are in excess of the hydrostatic
+pressure outside. The weight is a term in UFL, with the buoyant unit weight `gamma' = (1 - n) (rho_s - rho_w) g`. Here n
+is the porosity, rho_s the density of the grains, and rho_w the density of the water. Inertia is neglected. The demo
+runs on one process.
 
-1. Critical strength.  Without friction and drainage, the strength c is reduced by 1 % in each step.  A vertical side of
-   height H is stable while gamma' H / c < 3.78 (limit analysis: between 3.76 and 3.79, Pastor, Thai and Francescato
-   2000; critical slip circle: 3.83, Fellenius 1927).  The bank has failed when its crest settles 20 times as much in a
-   step as in the first steps.  With a factor of 10 or 40 instead of 20, the result changes by 1 %.  With 10 cells over
-   the height the bank fails at gamma' H / c = 3.93, which is 3.9 % too large. With 20 cells it fails at 3.85, which is
-   1.9 % too large. This error is of first order in the cell size, and the extrapolated value is 3.78.
-2. Run-out.  The consolidated bank, with friction, loses its cohesion within T = 10 minutes, far faster than it drains.
-   The bank slumps, and its crest is carried along by the flowing soil.  In front of the initial toe, the water carries
-   more than half of the soil's weight.  At rest the bank is twice as long as before; then the excess pressure drains.
-   The final inclination of the slope is 23.5 degrees, and 29.3 degrees in its steepest part of length H / 3.  The
-   friction angle is 25 degrees.  Without dilation a Drucker-Prager cone mobilises only 24.2 degrees, the arcsine of the
-   cone's slope.  The remaining cohesion, a hundredth of gamma' H, makes the slope slightly steeper.  Twice the number
-   of cells or steps, or half the viscosity, changes run-out and height by less than 2 %.
+1. Critical strength. The soil has no friction and does not drain. The strength c of the soil is reduced by 1 % in each
+   step. A vertical side of height H is stable while gamma' H / c < 3.78. Limit analysis gives 3.76 to 3.79 (Pastor,
+   Thai and Francescato 2000), and the critical slip circle 3.83 (Fellenius 1927). The bank has failed when its crest
+   settles 20 times as much in a step as in the first steps. With a factor of 10 or 40 instead of 20, the result changes
+   by 1 %. With 10 cells over the height the bank fails at gamma' H / c = 3.93, which is 3.9 % too large. With 20 cells
+   it fails at 3.85, which is 1.9 % too large. The error is of first order in the cell size, and the extrapolated value
+   is 3.78.
+2. Run-out. The consolidated bank, with friction, loses its cohesion within T = 10 minutes, far faster than it drains.
+   The bank slumps. In front of the initial toe, the water carries more than half of the soil's weight. At rest the bank
+   is twice as long as before. Then the excess pressure drains. The final inclination of the slope is 23.5 degrees, and
+   29.3 degrees in its steepest part of length H / 3. The friction angle is 25 degrees. Without dilation a
+   Drucker-Prager cone mobilises only 24.2 degrees, the arcsine of the cone's slope. The remaining cohesion, a hundredth
+   of gamma' H, makes the slope slightly steeper. Twice the number of cells or steps, or half the viscosity, changes
+   run-out and height by less than 2 %.
 
-The cohesion is a function of position, so the points carry it (`points.data["cohesion"]`).  A function in `observe`
-reduces it after each step.  A step that does not converge is cut, and repeated with unchanged strength.  The shorter
-step converges because a viscous stress of 2 eta times the strain rate, also a term in UFL, limits the velocity of the
-bank.  The ratio eta / T is a hundredth of gamma' H.  Part 1 has no viscosity.  A mesh could not represent this
-deformation, because the vertical side of the bank finally lies on the floor, and plastic strains are several hundred
-per cent.
+The points carry the cohesion (`points.data["cohesion"]`), because it is a function of position. A function in `observe`
+reduces the cohesion after each step. A viscous stress of 2 eta times the strain rate, also a term in UFL, limits the
+velocity of the bank in part 2. A step that does not converge is cut, and converges because of this viscous stress. The
+ratio eta / T is a hundredth of gamma' H.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ CV = CONDUCTIVITY / mpm.Fluid().unit_weight * (2 + 4 / 3) * SHEAR  # m²/s
 
 
 def bank(cells: int, length: float, room: float, friction: float, cohesion: float, conductivity: float, **scene):
-    """Return the consolidated bank, `cells` cells high, with a probe on its crest; room: length of free floor, m."""
+    """Return the consolidated bank, with a probe on its crest and `room` metres of free floor."""
     h = HEIGHT / cells
     grid = mpm.Grid([0, 0], [length + room, HEIGHT + h], [round((length + room) / h), cells + 1])
     body = mpm.box(grid, [0, 0], [length, HEIGHT])
@@ -81,7 +81,7 @@ def bank(cells: int, length: float, room: float, friction: float, cohesion: floa
 class Failure:
     """Stability numbers gamma' H / c (n,), and settlement rates (n,) of the crest.
 
-    A rate is the settlement in a step, divided by the mean settlement in the first five steps.
+    A settlement rate is the settlement in a step, divided by the mean settlement in the first five steps.
     critical: stability number at which the bank fails.
     """
 
@@ -112,12 +112,12 @@ def fail(cells: int, start: float = 3.0, ratio: float = 0.99) -> Failure:
 
 @dataclass
 class Frame:
-    """State of the bank at one time, s.
+    """State of the bank at one time, in s.
 
     corners: corners of the domains, in m.
     surface (k, 2): positions from the crown to the toe, in m.
     pressure, strain: excess pore pressures, in Pa, and plastic strains of the points.
-    volume, cohesion: volume of the bank, in m², and its cohesion, in Pa.
+    volume, cohesion: volume, in m², and cohesion, in Pa, of the bank.
     """
 
     t: float
@@ -130,16 +130,16 @@ class Frame:
 
     @property
     def run_out(self) -> float:
-        """Run-out of the bank: distance of its toe from the plane of symmetry, m."""
+        """Distance of the toe of the bank from the plane of symmetry, in m."""
         return float(self.corners[:, :, 0].max())
 
     @property
     def slope(self) -> float:
-        """Slope from the crown to the toe, degrees."""
+        """Slope from the crown to the toe, in degrees."""
         return float(np.degrees(np.arctan2(self.surface[:, 1].max(), self.run_out)))
 
     def steepest(self, length: float) -> float:
-        """Return the steepest inclination, degrees, of a part of the surface with this horizontal length, m."""
+        """Return the steepest inclination of a part of the surface with this horizontal length, in degrees."""
         x, y = self.surface[: np.argmax(self.surface[:, 0]) + 1].T
         at = np.linspace(0, self.run_out - length, 200)
         fall = np.interp(at, x, y) - np.interp(at + length, x, y)
@@ -148,9 +148,9 @@ class Frame:
 
 @dataclass
 class Slump:
-    """Results of a run; `rest` and `drained` are the indices of the frames at which the two stages end.
+    """Results of a run; `rest` and `drained` are the indices of the last frames of slumping and of drainage.
 
-    alternating: largest rms, Pa, of the part of the pressures in front of the bank that alternates from cell to cell.
+    alternating: largest rms of the `alternating` part of the pressures in front of the bank, in Pa.
     """
 
     frames: list[Frame] = field(default_factory=list)
@@ -172,7 +172,7 @@ def alternating(p: np.ndarray) -> np.ndarray:
 
 
 def at_toe(s: mpm.Simulation) -> float:
-    """Return the rms, Pa, of the alternating part of the pressures in cells beyond the initial side of the bank."""
+    """Return the rms of the alternating part of the pressures beyond the initial side of the bank, in Pa."""
     cells, p = s.cells(), np.full(tuple(s.grid.shape), np.nan)
     p[tuple(s.grid.index(cells.x).T)] = cells.pressure
     found = alternating(p)[round(HEIGHT / s.grid.h[0]) - 1 :]
@@ -203,7 +203,7 @@ def slump(cells: int, steps: int) -> Slump:
         out.alternating = max(out.alternating, at_toe(s))
 
     def weaken(s: mpm.Simulation) -> None:
-        """Set the cohesion to the value prescribed for the end of the next step."""
+        """Set the cohesion at the end of the next step."""
         lost = min(1.0, (s.t + dt) / DURATION)
         s.stage(fields={"cohesion": STRONG + lost * (WEAK - STRONG)})
 
@@ -244,7 +244,7 @@ def errors(failures: list[Failure], run: Slump) -> dict[str, float]:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return the results of --json."""
+    """Run the demo and return its results."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=20, help="cells over the height")
     parser.add_argument("--steps", type=int, default=100, help="number of steps in which the cohesion decreases")
@@ -286,7 +286,7 @@ def report(run: Slump, found: dict[str, float]) -> None:
 
 
 def stages(run: Slump) -> dict[str, int]:
-    """Return names of the stages that are drawn, each with the index of its frame."""
+    """Return names of the drawn stages, each with the index of its frame."""
     lost = np.array([f.cohesion for f in run.frames])
     weak = int(np.argmax(lost <= 1.001 * WEAK))
     return {"failing": int(0.6 * weak), "slumping": int(0.9 * weak), "at rest": run.rest, "drained": run.drained}
@@ -312,7 +312,7 @@ class Panel:
 
 
 def shown(frame: Frame) -> tuple[np.ndarray, np.ndarray]:
-    """Return the values of the points that are drawn: pressures, kPa, and plastic strains."""
+    """Return the drawn values of the points: pressures, in kPa, and plastic strains."""
     return frame.pressure / 1e3, np.maximum(frame.strain, 1e-3)
 
 

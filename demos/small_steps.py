@@ -1,27 +1,26 @@
 # SPDX-License-Identifier: MIT
 """As the time step tends to zero, the error tends to the spatial error, for columns at rest and in motion.
 
-Terzaghi's column (demo `terzaghi`) consolidates until the reduced time `T_v = c_v t / height²` is 0.1.  It takes 1, 10,
-..., 10 000 equal steps, of 0.1 to 1e-5 of the consolidation time.  The error is the root mean square of (p - exact) /
-p0 at the centroids of all cells.  The error of time integration decreases with the step.  The remaining error must be
-the spatial error.  The spatial error is known, because the semi-discrete equations have an exact solution in time.  The
-remaining error must not depend on the number of steps.  If pressures were averaged to points and back in every step,
-they would diffuse.  Three columns are computed:
+Terzaghi's column (demo `terzaghi`) consolidates until the reduced time `T_v = c_v t / height²` is 0.1, with the
+coefficient of consolidation c_v and the time t. The column takes 1, 10, ..., 10 000 equal steps. The error is the root
+mean square of (p - exact) / p0 at the centroids of all cells, with the pressure p and its initial value p0. With many
+steps, the remaining error must be the spatial error. The spatial error is known, because the semi-discrete equations
+have an exact solution in time. Three columns are computed:
 
-* column at rest on the grid;
-* moving column: during consolidation the base moves down by half the height, through half of all cells;
-* moving column with soft water: the fluid stores as much as the skeleton, S = 1/M (storage coefficient S, oedometric
-  modulus M).  The pressure of stiff water follows from the strain of the points.  The pressure of soft water is also
-  remapped from grid to grid.
+* column at rest on the grid.
+* moving column: during consolidation the base moves down by half the height, through half of all cells.
+* moving column with soft water: the water stores as much as the skeleton, so its storage coefficient is 1/M with the
+  oedometric modulus M. The pressure of soft water is remapped from grid to grid. The pressure of stiff water follows
+  from the strain of the points.
 
-Motion adds an error, because all points of a cell have the same strain increment in a step.  This error is largest at
-the drained top, in cells that contain little of the column.  The error of the remap itself is smaller than the spatial
-error, and of second order in the cell size.
+Motion adds an error, because all points of a cell have equal strain increments in a step. The error due to motion is
+largest at the drained top, in cells that contain little of the column. The error of the remap is smaller than the
+spatial error, and of second order in the cell size.
 
-The overshoot, the largest p / p0 - 1 in all steps, is zero for the column at rest, with steps of any length.  In one
-dimension, the scheme therefore has no smallest time step.  In more dimensions, small steps cause checkerboard modes of
-the pressure, unless the jumps of the pressure are damped (`storage.py`).  The demo shows these modes in the first step
-after a strip load on a layer in a rough box, with and without damping.  The demo runs on one process.
+The overshoot, the largest p / p0 - 1 in all steps, is zero for the column at rest, with steps of any length. In more
+dimensions, small steps cause checkerboard modes of the pressure, unless the jumps of the pressure are damped
+(`storage.py`). The demo shows these modes in the first step after a strip load on a layer, with and without damping.
+The demo runs on one process.
 """
 
 from __future__ import annotations
@@ -42,16 +41,13 @@ from mpm_dolfinx.verification.exact import terzaghi_pressure
 HEIGHT, SOIL = terzaghi.HEIGHT, terzaghi.SOIL
 T_END = 0.1
 CASES = {"resting": (0.0, 0.0), "moving": (0.5, 0.0), "moving, soft water": (0.5, 1.0)}
-"""For each column: base displacement divided by height; storage coefficient of the water times oedometric modulus M."""
+"""For each column: base displacement divided by height, and storage coefficient of the water times M."""
 STRIP_STEPS = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)  # length of the step, divided by the time of consolidation
 
 
 @dataclass
 class Run:
-    """A column at `T_END`: depths z of the centroids, pressures, and the errors that the module's docstring defines.
-
-    Depths are divided by the height, pressures by p0.
-    """
+    """A column at `T_END`: depths of the centroids divided by the height, and pressures divided by p0."""
 
     z: NDArray[np.float64]
     p: NDArray[np.float64]
@@ -90,7 +86,7 @@ def column(cells: int, steps: int, way: float = 0.0, softness: float = 0.0, stra
 
 
 def error_of_cells(cells: int) -> float:
-    """Return the spatial error of two-point fluxes with the damping of small steps, by exact time integration."""
+    """Return the spatial error of two-point fluxes, by exact integration in time."""
     laplacian = 2 * np.eye(cells) - np.eye(cells, k=1) - np.eye(cells, k=-1)
     laplacian[0, 0] = laplacian[-1, -1] = 1
     outflow = laplacian.copy()
@@ -124,7 +120,7 @@ def strip(cells: int, dt: float, law: type[mpm.Skeleton]) -> NDArray[np.float64]
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return the results of --json."""
+    """Run the demo and return its results."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=25, help="cells over the height of the column")
     parser.add_argument("--steps", type=int, nargs="+", default=[1, 10, 100, 1000, 10000], help="numbers of steps")
@@ -159,7 +155,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, runs: dict[str, list[Run]], limit: float) -> None:
-    """Draw the error against the step, and the pressure against depth for the longest and the shortest steps."""
+    """Draw the error against the step, and pressures against depth."""
     fig, ((left, *profiles),) = common.figure(1, 3, (14, 4.6))
     dt = T_END / np.array(o.steps)
     marks = dict(zip(runs, "ox+", strict=True))
@@ -183,7 +179,7 @@ def draw(o: Namespace, runs: dict[str, list[Run]], limit: float) -> None:
 
 
 def draw_strip(o: Namespace, strips: dict[str, list[NDArray[np.float64]]]) -> None:
-    """Draw the pressure after the smallest first step, and the roughness of the pressure against the step."""
+    """Draw the pressure after the smallest step, and the roughness of the pressure against the step."""
     fig, ((*axes, right),) = common.figure(1, len(strips) + 1, (15, 3.8))
     for ax, (name, fields) in zip(axes, strips.items(), strict=True):
         extent = (0, 2 * HEIGHT, 0, HEIGHT)

@@ -1,21 +1,20 @@
 # SPDX-License-Identifier: MIT
 """Large consolidation under a strip load: a layer settles by an eighth of its height, and its porosity decreases.
 
-A layer between smooth walls, on a smooth, impervious base, carries a dead load q on a fifth of its drained surface.
-Half of the layer is computed, which is as wide as high; x = 0 is the plane of symmetry.  The soil is elastic (Hencky,
-nu = 0) with porosity 0.6.  Its conductivity `k0 10^(5 (J - 1))` decreases as pores close.  Grains and water are
-incompressible.  The reduced time is `T = k0 E t / (gamma_w H²)`, and the load increases until T = 0.01.  Source:
-Carter, Small and Booker (1977), as in Abaqus' benchmark 1.14.3.  With q = E/2 (--load 0.5) the pores under the strip
-close at T = 0.37, and the law, which has no stiffness of the grains, fails.  The package reports this, and the demo
-shows the results up to this time.
+A layer between smooth walls, on a smooth, impervious base, carries a dead load q on a fifth of its drained surface. By
+symmetry half of the layer is computed, as wide as its height H. The soil is elastic (Hencky, nu = 0) with Young's
+modulus E and porosity 0.6. The conductivity of the soil, `k0 10^(5 (J - 1))` with the volume ratio J, decreases as
+pores close. Grains and water are incompressible. The reduced time is `T = k0 E t / (gamma_w H²)`, with the time t and
+the unit weight gamma_w of water. The load increases until T = 0.01. Source: Carter, Small and Booker (1977), as in
+Abaqus' benchmark 1.14.3. With q = E/2 (--load 0.5) the pores under the strip close at T = 0.37. The law has no
+stiffness of the grains, so the run fails at this time.
 
-The references for q/E = 0.25 are results of Taylor-Hood elements.  They are extrapolated in time, and in the cell size
-from 20, 40 and 80 cells. The extrapolated settlements differ from the settlements on 40 cells by 0.6 % at T = 0.01, and
-by 0.2 % at T = 0.1.  Errors: `settlement` is the largest error of the displacement of the strip's middle from T = 0.1
-on, and `at_once` is the error of this displacement at T = 0.01.  `edge` is the largest error from T = 0.1 on at the
-strip's edge, where the load jumps.  `beside` is the largest error from T = 0.1 on at the far end of the drained
-surface.  All errors are relative to the displacement of the middle.  --reference also runs Taylor-Hood elements on the
-same cells.  The demo runs on one process.
+The references for q/E = 0.25 are results of Taylor-Hood elements, extrapolated in time, and in the cell size from 20,
+40 and 80 cells. The extrapolated settlements differ from the settlements on 40 cells by 0.6 % at T = 0.01, and by 0.2 %
+at T = 0.1. All errors are relative to the displacement of the strip's middle. `settlement` is the largest error of the
+middle from T = 0.1 on, and `at_once` is the error of the middle at T = 0.01. `edge` is the largest error from T = 0.1
+on at the strip's edge, where the load jumps. `beside` is the largest error from T = 0.1 on at the far end of the
+drained surface. --reference also runs Taylor-Hood elements on the same cells. The demo runs on one process.
 """
 
 from __future__ import annotations
@@ -54,20 +53,22 @@ ELEMENTS = np.array(
         [-0.129321, -0.090335, -0.006179],
     ]
 )
-"""Upward displacements at `TIMES` and `PLACES`, divided by `HEIGHT`: extrapolated Taylor-Hood elements, q/E = 0.25."""
+"""Upward displacements of extrapolated Taylor-Hood elements at `TIMES` and `PLACES`, divided by `HEIGHT`, for q/E =
+0.25.
+"""
 WALLS = {"left": "x", "right": "x", "bottom": "y"}
 
 
 def conditions(load: float) -> dict:
-    """Return the conditions; load: q / E."""
+    """Return the conditions for a load, divided by E."""
     strip = mpm.Traction("top", lambda t: (0, -load * E * min(1, t / (RAMP * UNIT))), ((0, 0), (STRIP, 2 * HEIGHT)))
     return {"fluid": WATER, "walls": WALLS, "conditions": [strip, mpm.Drained("top")]}
 
 
 def times(a_decade: int) -> NDArray[np.float64]:
-    """Return the times T at which steps end.
+    """Return the reduced times at which steps end.
 
-    a_decade: number of steps in which T grows tenfold after `RAMP`; two thirds as many steps end at or before `RAMP`.
+    a_decade: number of steps in which T grows tenfold after `RAMP`.
     """
     ramp = RAMP * np.linspace(0, 1, 1 + 2 * a_decade // 3)[1:]
     return np.append(ramp, RAMP * 10 ** (np.arange(1, 5 * a_decade // 2 + 1) / a_decade))
@@ -75,7 +76,7 @@ def times(a_decade: int) -> NDArray[np.float64]:
 
 @dataclass
 class Outcome:
-    """Histories: reduced times T, and upward displacements of `PLACES` divided by `HEIGHT`.
+    """Histories of reduced times, and of upward displacements at `PLACES` divided by `HEIGHT`.
 
     frames: T, corners, pressures divided by E, and porosities of the points.
     why: reason if the run ended early.
@@ -113,12 +114,12 @@ def run(cells: int = 40, load: float = 0.25, a_decade: int = 30) -> Outcome:
 
 
 def seen(s: mpm.Simulation, T: float) -> tuple[float, NDArray, NDArray, NDArray]:
-    """Return the present frame, see `Outcome`; T: reduced time."""
+    """Return the present frame at the reduced time T, see `Outcome`."""
     return T, s.points.corners.copy(), s.points.pressure / E, s.point_fields().porosity
 
 
 def elements(cells: int, load: float, a_decade: int) -> NDArray[np.float64]:
-    """Return the upward displacements at `TIMES` and `PLACES`, divided by `HEIGHT`, of Taylor-Hood elements."""
+    """Return the upward displacements of Taylor-Hood elements at `TIMES` and `PLACES`, divided by `HEIGHT`."""
     fem, out = BiotFEM(mpm.Grid([0, 0], [HEIGHT] * 2, [cells] * 2), SOIL, **conditions(load)), []
     for T in times(a_decade):
         fem.step(T * UNIT - fem.t)
@@ -136,7 +137,7 @@ def errors(out: Outcome) -> dict[str, float]:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return the results of --json."""
+    """Run the demo and return its results."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=40, help="cells over the height")
     parser.add_argument("--load", type=float, default=0.25, help="q/E")
@@ -166,7 +167,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, out: Outcome) -> None:
-    """Draw the initial pressure, the final porosity, and the displacements of the surface against time."""
+    """Draw the initial pressure, the final porosity, and the displacements of the surface."""
     fig, ((left, middle, right),) = common.figure(1, 3, (14, 4.4))
     kinds = (("pore pressure / E (-)", 2, "viridis"), ("porosity (-)", 3, "cividis"))
     for ax, (T, *values), (label, k, colours) in zip(

@@ -37,12 +37,12 @@ TABLE = re.compile(
 
 
 def kept(run: str) -> Path:
-    """Return the path of the file in demos/results with the output of a run."""
+    """Return the path of the stored output of a run."""
     return RESULTS / (re.sub(r"\W+", "_", run) + ".json")
 
 
 def figure(value: float, form: str) -> str:
-    """Return a number as text; form: %, +%, min (a time), or a format of Python."""
+    """Return a number as text; `form` is %, +%, min (a time), or a format of Python."""
     if form.endswith("%"):
         return f"{100 * value:{form[:-1]}.2g}"
     if form == "min":
@@ -51,7 +51,7 @@ def figure(value: float, form: str) -> str:
 
 
 def figures(run: str, entries: str, form: str) -> str:
-    """Return the numbers, as text, that a comment requests."""
+    """Return the numbers that a comment requests, as text."""
     if not kept(run).exists():
         sys.exit(f"{kept(run)}: missing: bash demos/run.sh tables --run {run.split()[0]}")
     printed, values = json.loads(kept(run).read_text()), []
@@ -79,7 +79,7 @@ def runs(pages: Iterable[str]) -> dict[str, str]:
 
 
 def take(run: str, table: str, pictures: bool) -> None:
-    """Run a demo; store its output, its table and, if `pictures` is set, its pictures for the pages."""
+    """Run a demo, and store its output, its table and, if `pictures` is True, its pictures."""
     import dolfinx
 
     demo, *options = shlex.split(run)
@@ -103,7 +103,7 @@ def take(run: str, table: str, pictures: bool) -> None:
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Run the demos given by --run, if any, and update the pages."""
+    """Run the demos that --run names, and update the pages."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--run", nargs="+", default=[], metavar="DEMO", help="first run these demos, or all")
     o = parser.parse_args(argv)

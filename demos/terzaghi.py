@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: MIT
 """Terzaghi's consolidation: a saturated layer is loaded suddenly and drains at its top.
 
-A column of 1 m between smooth walls, impervious at its foot, carries a load p0 from the first step on.  Initially the
-incompressible pore water carries the whole load, p = p0.  As water drains, the load is transferred to the skeleton:
-`dp/dt = c_v d²p/dz²`, with `c_v = kappa (K + 4G/3)`.  The load strains the skeleton by 1e-5, so small-strain theory is
-accurate.  The reduced time is `T_v = c_v t / height²`.  Source: Terzaghi (1923); series in Verruijt, Theory and
-Problems of Poroelasticity (2016).  The demo runs on one process.
+A column of 1 m between smooth walls, impervious at its foot, carries a load p0 from the first step on. At first the
+incompressible pore water carries the whole load. As water drains, the load is transferred to the skeleton. The pore
+pressure p at depth z and time t follows `dp/dt = c_v d²p/dz²`. The coefficient of consolidation is
+`c_v = kappa (K + 4G/3)`, with the mobility kappa, the bulk modulus K and the shear modulus G. The load strains the
+skeleton by 1e-5, so small-strain theory is accurate. The reduced time is `T_v = c_v t / height²`. Source: Terzaghi
+(1923); series in Verruijt, Theory and Problems of Poroelasticity (2016). The demo runs on one process.
 
-Errors: the largest |p - exact| / p0 at the centroids of all cells, at T_v = 0.1, 0.5 and 1, and the relative error of
-the `settlement` at T_v = 0.5.  Steps are equal, or adaptive with --rtol.
+Errors are the largest |p - exact| / p0 at the centroids of all cells, at T_v = 0.1, 0.5 and 1, and the relative error
+of the `settlement` at T_v = 0.5. Steps are equal, or adaptive with --rtol.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ CV = SOIL.conductivity / WATER.unit_weight * SOIL.oedometric  # m²/s
 
 @dataclass
 class Outcome:
-    """Results at each output time: T_v; depths and pressures of the cells; settlement.
+    """Results at each output time: T_v, depths and pressures of the cells, and settlement.
 
     Depths are divided by the height, pressures by p0, and settlements by the final settlement.
     """
@@ -44,17 +45,14 @@ class Outcome:
     settlement: list[float] = field(default_factory=list)
 
     def at(self, time: float) -> int:
-        """Return the index of the output time nearest to the reduced time `time`."""
+        """Return the index of the output time nearest to a reduced time."""
         return int(np.argmin(np.abs(np.array(self.time) - time)))
 
 
 def run(
     cells: int = 50, steps: int = 100, strain: float = 1e-5, method: str = "sdirk2", rtol: float | None = None
 ) -> Outcome:
-    """Consolidate a column of `cells` cells to T_v = 1 under a load that strains it by `strain`.
-
-    Steps are equal, or adaptive if `rtol` is given.
-    """
+    """Consolidate a column of `cells` cells to T_v = 1, in adaptive steps if `rtol` is given."""
     h, load = HEIGHT / cells, strain * SOIL.oedometric
     grid = mpm.Grid([0, 0], [h, HEIGHT], [1, cells])
     column = mpm.box(grid, [0, 0], [h, HEIGHT], per_cell=2)
@@ -94,7 +92,7 @@ def errors(out: Outcome) -> dict[str, float]:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return the results of --json."""
+    """Run the demo and return its results."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=50, help="cells over the height")
     parser.add_argument("--steps", type=int, default=100, help="equal steps to T_v = 1")
@@ -116,7 +114,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, out: Outcome) -> None:
-    """Draw the pressure against depth and the settlement against time, with the exact curves."""
+    """Draw pressure against depth and settlement against time, with the exact curves."""
     fig, ((left, right),) = common.figure(1, 2, (11, 4.6))
     z = np.linspace(0, 1, 201)
     for i, time in enumerate(SAMPLES):

@@ -1,19 +1,18 @@
 # SPDX-License-Identifier: MIT
 """Triaxial tests of soil laws at a point, compared with closed-form solutions, to check a law before its use.
 
-Modified Cam Clay is tested at three overconsolidation ratios R, drained and undrained, from the same isotropic stress
-p_0.  The mean and the deviatoric Kirchhoff stress are P and Q.  The mean and the deviatoric Cauchy stress are p and q.
-The size of the yield surface is P_c.  In an undrained test the volume is constant, so the test ends at
-`P = P_cs = p_0 (R/2)^(1 - kappa/lambda)` and `Q = M P_cs`.  During yield, `Q = M sqrt(P (P_c - P))`.  In a drained test
-the stress path is `q = 3 (p - p_0)`, and ends at `q = M p`.  Tests of Mohr-Coulomb sand, in compression and in
-extension, end at `t_1 (1 + sin(phi)) - t_3 (1 - sin(phi)) = 2 c cos(phi)`, with the largest and smallest principal
-Kirchhoff stresses t_1 and t_3.
-
-Errors are relative, and refer to the final states.
+Modified Cam Clay is tested at three overconsolidation ratios R, drained and undrained, from the isotropic stress p_0.
+The parameters of Modified Cam Clay are M, lambda and kappa. The mean and the deviatoric Kirchhoff stress are P and Q.
+The mean and the deviatoric Cauchy stress are p and q. The size of the yield surface is P_c. During yield,
+`Q = M sqrt(P (P_c - P))`. In an undrained test the volume is constant, so the test ends at
+`P = P_cs = p_0 (R/2)^(1 - kappa/lambda)` and `Q = M P_cs`. In a drained test the stress path is `q = 3 (p - p_0)`, and
+ends at `q = M p`. Tests of Mohr-Coulomb sand, in compression and in extension, end at
+`t_1 (1 + sin(phi)) - t_3 (1 - sin(phi)) = 2 c cos(phi)`, with the friction angle phi, the cohesion c, and the largest
+and smallest principal Kirchhoff stresses t_1 and t_3. Errors are relative, and refer to the final states.
 
 With --cost N, blocks of N x N cells are compressed until all of their soil yields. The laws are Drucker-Prager,
-Mohr-Coulomb and Cam Clay. They are timed in turn, one step each. The demo prints the processor time of a step, divided
-by the time of Drucker-Prager soil.
+Mohr-Coulomb and Cam Clay. The laws are timed in turn, one step each. The demo prints the processor time of a step,
+divided by the time of Drucker-Prager soil.
 """
 
 from __future__ import annotations
@@ -35,13 +34,13 @@ KINDS = ("triaxial drained", "triaxial undrained")
 
 
 def clays(steps: int) -> dict[tuple[str, float], mpm.ElementTest]:
-    """Return the tests of the clay; keys: kind of test (drained or undrained) and overconsolidation ratio."""
+    """Return the tests of the clay by kind of test (drained or undrained) and overconsolidation ratio."""
     ends = {"triaxial drained": 1.5, "triaxial undrained": 0.6}
     return {(k, R): mpm.element_test(replace(CLAY, OCR=R), k, ends[k], steps=steps) for k in KINDS for R in RATIOS}
 
 
 def end_of(kind: str, R: float) -> float:
-    """Return the exact mean effective stress at the end of a test of the clay, Pa."""
+    """Return the exact mean effective stress at the end of a test of the clay, in Pa."""
     if kind == "triaxial drained":
         return 3 * P0 / (3 - CLAY.M)
     return P0 * (R / 2) ** (1 - CLAY.kappa / CLAY.lambda_)
@@ -58,7 +57,7 @@ def sand_errors(tests: dict[float, mpm.ElementTest]) -> dict[str, float]:
 
 
 def block(soil: mpm.Skeleton, cells: int) -> mpm.Simulation:
-    """Return a block, compressed by a thousandth of its height in 1 s, under the pressure p_0 on its free side."""
+    """Return a block that is compressed by a thousandth of its height in 1 s, with the pressure P0 on its free side."""
     h = 1 / cells
     grid = mpm.Grid([0] * 2, [1 + 2 * h] * 2, [cells + 2] * 2)
     squeeze = mpm.Displacement("top", lambda t, X: (0, -1e-3 * t), components="y")
@@ -72,8 +71,8 @@ def block(soil: mpm.Skeleton, cells: int) -> mpm.Simulation:
 def costs(cells: int, steps: int = 30) -> dict[str, float]:
     """Return the processor time of a step of each law, divided by that of Drucker and Prager's law.
 
-    The laws are timed in turn, one step each, so that a varying load of the machine affects all alike.  Sands have
-    associated flow, because otherwise shear bands form in the block.
+    The laws are timed in turn, so that a varying load of the machine affects all laws alike. Sands have associated
+    flow, because otherwise shear bands form in the block.
     """
     sand = replace(SAND, dilation=SAND.friction)
     same = {name: getattr(sand, name) for name in ("bulk", "shear", "friction", "dilation", "cohesion")}
@@ -94,7 +93,7 @@ def costs(cells: int, steps: int = 30) -> dict[str, float]:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return the results of --json."""
+    """Run the demo and return its results."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--steps", type=int, default=100, help="steps of a test")
     parser.add_argument("--cost", type=int, metavar="N", help="also print the cost of a step, N x N cells")

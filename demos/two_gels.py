@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: MIT
 """Two gels are pressed together, slide along each other with friction, and separate.
 
-Each of two half-discs is a group of bodies with its own displacements.  The lower gel is fixed, and the upper gel
-follows a prescribed path.  While the gels are apart, no force acts between them, however narrow the gap is.  As the
-upper gel passes over the top of the lower gel, the contact surface inclines.  The ratio of horizontal to vertical force
-is then less than the friction coefficient.
+Each of two half-discs is a group of bodies with its own displacements. The lower gel is fixed, and the upper gel
+follows a prescribed path. While the gels are apart, no force acts between them, however narrow the gap is. As the upper
+gel passes over the top of the lower gel, the contact surface inclines. The ratio of horizontal to vertical force is
+then less than the friction coefficient.
 
-A second scene is the contact of a curved and a flat elastic body.  Largest pressure and half-width are compared with
-Hertz's solution for the computed force.  The errors of both are due to the small number of cells over the half-width.
+A second scene is the contact of a curved and a flat elastic body. Largest pressure and half-width are compared with
+Hertz's solution for the computed force. The errors are due to the small number of cells over the half-width.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ SHOWN = (0.0, 1.0, 2.0, 3.0)
 
 
 def half_disc(grid: mpm.Grid, centre: tuple[float, float], up: float):
-    """Return a half-disc; centre: centre of its flat side, m; up: 1 if its round side faces up, -1 if down."""
+    """Return a half-disc with this centre of its flat side, in m; its round side faces up (1) or down (-1)."""
     flat = mpm.box(grid, [centre[0] - RADIUS, min(centre[1], centre[1] + up)], np.add(centre, [RADIUS, max(up, 0)]))
     return mpm.mapped(grid, flat, lambda x: centre + _round((x - centre) / RADIUS) * RADIUS)
 
@@ -37,7 +37,7 @@ def _round(x: np.ndarray) -> np.ndarray:
 
 
 def path(t: float) -> tuple[float, float]:
-    """Return the displacement (x, y), in m, of the upper gel, which moves down, then sideways, then up."""
+    """Return the displacement (x, y) of the upper gel, in m."""
     down = -DOWN * min(t / TIMES[0], 1) - GAP * min(t / TIMES[0], 1)
     along = ALONG * np.clip((t - TIMES[0]) / (TIMES[1] - TIMES[0]), 0, 1)
     return along, down + UP * np.clip((t - TIMES[1]) / (TIMES[2] - TIMES[1]), 0, 1)
@@ -83,7 +83,7 @@ def hertz(cells: int) -> dict[str, float]:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return the results of --json."""
+    """Run the demo and return its results."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=10, help="cells over the radius of a gel")
     parser.add_argument("--hertz", type=int, default=18, help="cells per metre of the elastic bodies")

@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: MIT
 """Vibration of a beam and of a bar: frequencies and energy loss against exact values.
 
-1. A clamped beam, 1 x 0.3 m, in plane strain, receives a transverse and an axial impulse, so small that small-strain
-   theory is accurate.  The reference of the first bending frequency is 3.24419 Hz; it is computed with spectral
-   elements that are graded towards the corners of the clamp.  The first axial frequency is exactly c / (4 L) = 17.67767
-   Hz, with the axial wave velocity c and the length L.  The computed frequencies are fitted to the motion of the tip
-   over three periods.
-2. A free bar of length L has the law `P = E (F - 1)`, with the first Piola-Kirchhoff stress P.  It vibrates with
-   strains of A = 5 % and moves over fifty cells in 25 periods.  In the exact solution the ends oscillate about the
-   uniform motion by `(A L / pi) sin(pi c t / L)`, without loss of energy.  In each step dt, SDIRK2 itself loses the
-   fraction `gamma^4 y^4 / (1 + gamma^2 y^2)^2` of the energy.  Here y is omega dt, with the angular frequency omega,
-   and gamma is the coefficient of SDIRK2.  The remaining loss is due to grid resets.
+1. A clamped beam, 1 m x 0.3 m, in plane strain, receives a transverse and an axial impulse, so small that small-strain
+   theory is accurate. The reference of the first bending frequency is 3.24419 Hz, computed with spectral elements that
+   are graded towards the corners of the clamp. The first axial frequency is exactly c / (4 L) = 17.67767 Hz, with the
+   axial wave velocity c and the length L. The computed frequencies are fitted to the motion of the tip over three
+   periods.
+2. A free bar of length L has the law `P = E (F - 1)`, with the first Piola-Kirchhoff stress P. The bar vibrates with
+   strains of A = 5 % and moves over fifty cells in 25 periods. In the exact solution the ends oscillate about the
+   uniform motion by `(A L / pi) sin(pi c t / L)`, without loss of energy. In each step dt, SDIRK2 loses the fraction
+   `gamma^4 y^4 / (1 + gamma^2 y^2)^2` of the energy. Here y is omega dt, with the angular frequency omega, and gamma is
+   the coefficient of SDIRK2. The remaining loss is due to grid resets.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ class Bar(mpm.LinearElastic):
 
     @staticmethod
     def energy(F, bulk, shear):
-        """Return the energy, Pa, in UFL."""
+        """Return the energy (UFL), in Pa."""
         return shear * ((F[0, 0] - 1) ** 2 + (F[1, 1] - 1) ** 2 + F[0, 1] ** 2 + F[1, 0] ** 2)
 
 
 def struck(h: float, way: str, steps: int = 80) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return times, s, displacements of the tip, m, and the frequency, Hz, of a beam after an impulse."""
+    """Return times, displacements of the tip, and the frequency, in Hz, of a beam after an impulse."""
     grid = mpm.Grid([0, 0], [LENGTH + 3 * h, DEPTH + 4 * h], [round(LENGTH / h) + 3, round(DEPTH / h) + 4])
     beam, axis = mpm.box(grid, [0, 2 * h], [LENGTH, DEPTH + 2 * h]), ("along", "across").index(way)
 
@@ -62,7 +62,9 @@ def struck(h: float, way: str, steps: int = 80) -> tuple[np.ndarray, np.ndarray,
 
 
 def flown(cells: int, periods: int, steps: int) -> dict[str, np.ndarray]:
-    """Move the free bar; return times in periods, oscillation of its end, m, and energy divided by initial energy."""
+    """Move the free bar, and return times in periods, oscillation of its end, in m, and energy divided by initial
+    energy.
+    """
     h, count = 1 / cells, 3 * cells + 8 + round(2.5 * cells)
     grid = mpm.Grid([0, 0], [count * h, h], [count, 1])
     low, speed = 2.3 * h, 2.5 / (2 * periods)  # over 2.5 lengths
@@ -83,13 +85,13 @@ def flown(cells: int, periods: int, steps: int) -> dict[str, np.ndarray]:
 
 
 def own_loss(t: np.ndarray, steps: int) -> np.ndarray:
-    """Return the fraction of the energy that remains with SDIRK2 after t periods, with `steps` steps in a period."""
+    """Return the fraction of the energy that SDIRK2 retains after t periods, with `steps` steps in a period."""
     y = (GAMMA * 2 * np.pi / steps) ** 2
     return (1 - (y / (1 + y)) ** 2) ** (t * steps)
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return the results of --json."""
+    """Run the demo and return its results."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument(
         "--h", type=float, nargs="+", default=[0.1, 0.05], help="cell sizes of the beam, m; 0.3 / h must be an integer"

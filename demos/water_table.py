@@ -1,18 +1,18 @@
 # SPDX-License-Identifier: MIT
 """Water tables in unsaturated soil: in a slab under rain (Vauclin), and in a levee during a flood.
 
-A slab of sand, 6 m wide and 2 m high, stands on an impervious base between ditches; half of it is computed.  Rain falls
-on its middle metre for eight hours.  Above the water table, water spreads through unsaturated soil.  The reference is a
-converged solution of finite volumes, with cells of 1.25 cm.  Scene and soil laws are those of Vauclin, Khanji and
-Vachaud (1979).  The side above the level of the ditch is a seepage face; no water flows through it in this scene.
+A slab of sand, 6 m wide and 2 m high, stands on an impervious base between ditches. By symmetry half of the slab is
+computed. Rain falls on its middle metre for eight hours. Above the water table, water spreads through unsaturated soil.
+Scene and soil laws are those of Vauclin, Khanji and Vachaud (1979). The reference is a converged solution of finite
+volumes, with cells of 1.25 cm. The side above the level of the ditch is a seepage face.
 
-The second scene is a levee of 3 m with slopes of 1:2 on an impervious base.  The water level rises by 2.5 m in two
-days, is constant for two days, and falls again in two days.  The soil of the levee retains water under suction, so
-water that infiltrates late also drains late.
+The second scene is a levee of 3 m with slopes of 1:2 on an impervious base. The water level rises by 2.5 m in two days,
+is constant for two days, and falls again in two days. The soil of the levee retains water under suction, so water that
+infiltrates late also drains late.
 
-The errors after 2, 3, 4 and 8 hours are the largest errors, in m, of the height of the water table at six positions.  A
-further error is the relative error of the final outflow into the ditch.  `balance` is the error of the slab's water
-balance, divided by the volume of rain.  The demo runs on one process.
+Errors after 2, 3, 4 and 8 hours are the largest errors of the height of the water table at six positions, in m. A
+further error is the relative error of the final outflow into the ditch. `balance` is the error of the slab's water
+balance, divided by the volume of rain. The demo runs on one process.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ CONVERGED = {
     4: (1.1005, 1.0426, 0.9378, 0.8528, 0.7834, 0.7210),
     8: (1.2187, 1.1601, 1.0531, 0.9557, 0.8642, 0.7720),
 }
-"""By hour: heights, m, of the water table at the six positions."""
+"""By hour: heights of the water table at the six positions, in m."""
 FLOW = 653.1e-4 / HOUR  # m²/s into the ditch after 8 hours
 LEVEE, CREST, SLOPE, FLOOD = 3.0, 2.0, 2.0, 2.5  # m, m, slope: run divided by rise, m
 SEEN = (2.0, 4.0, 6.0, 8.0)  # days
@@ -46,16 +46,16 @@ class Sand:
     """River sand of Vauclin, Khanji and Vachaud."""
 
     def saturation(self, p):
-        """Return the saturation S (UFL) at the pore pressure p, Pa."""
+        """Return the saturation (UFL) at the pore pressure p, in Pa."""
         return 4e4 / (4e4 + ufl.max_value(-100 * p / WEIGHT, 1e-12) ** 2.90)
 
     def relative_permeability(self, p):
-        """Return the relative permeability k_r (UFL) at the pore pressure p, Pa."""
+        """Return the relative permeability (UFL) at the pore pressure p, in Pa."""
         return 2.99e6 / (2.99e6 + ufl.max_value(-100 * p / WEIGHT, 1e-12) ** 5.0)
 
 
 def slab(h: float) -> mpm.Simulation:
-    """Return half of the slab at rest, on cells of size h, m."""
+    """Return half of the slab at rest, on cells of size h, in m."""
     grid = mpm.Grid([0, 0], [WIDTH, HEIGHT + 2 * h], [round(WIDTH / h), round(HEIGHT / h) + 2])
     soil = mpm.LinearElastic(bulk=1e10, shear=5e9, porosity=0.3, conductivity=0.35 / HOUR, retention=Sand())
     beside = ((WIDTH - 0.1, -1), (WIDTH + 0.1, DITCH))
@@ -76,7 +76,7 @@ def slab(h: float) -> mpm.Simulation:
 
 
 def tables(s: mpm.Simulation) -> tuple[np.ndarray, np.ndarray]:
-    """Return positions and heights, m, of the water table, one for each column of cells."""
+    """Return positions and heights of the water table in each column of cells, in m."""
     cell = s.cells()
     columns = np.unique(np.round(cell.x[:, 0], 6))
     heights = []
@@ -88,12 +88,12 @@ def tables(s: mpm.Simulation) -> tuple[np.ndarray, np.ndarray]:
 
 
 def level(t: float) -> float:
-    """Return the water level of the flood, m, at the time t, s."""
+    """Return the water level of the flood at the time t, in m."""
     return float(np.interp(t / DAY, [0, 2, 4, 6], [0, FLOOD, FLOOD, 0]))
 
 
 def levee(h: float) -> mpm.Simulation:
-    """Return the levee on cells of size h, m, with hydrostatic water and the water table at its base."""
+    """Return the levee with hydrostatic water and the water table at its base."""
     base = CREST + 2 * SLOPE * LEVEE
     grid = mpm.Grid([0, 0], [base, LEVEE + 2 * h], [round(base / h), round(LEVEE / h) + 2])
     corners = [(0, 0), (base, 0), (base - SLOPE * LEVEE, LEVEE), (SLOPE * LEVEE, LEVEE)]
@@ -113,7 +113,7 @@ def levee(h: float) -> mpm.Simulation:
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return the results of --json."""
+    """Run the demo and return its results."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--h", type=float, default=0.1, help="cell size of the slab, m; cell size of the levee: 2.5 h")
     parser.add_argument("--step", type=float, default=600.0, help="step of the slab, s; that of the levee: 9 times")
@@ -147,7 +147,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(o: Namespace, curves: list, frames: list) -> None:
-    """Draw the water tables of the slab, with the converged solution, and pressures in the levee."""
+    """Draw the water tables of the slab, and pressures in the levee."""
     fig, axes = common.figure(1 + len(frames), 1, (8, 10))
     first, *others = np.ravel(axes)
     for i, (hours, x, z) in enumerate(curves):

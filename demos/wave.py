@@ -1,20 +1,20 @@
 # SPDX-License-Identifier: MIT
 """Waves in soil columns, dry and saturated, against exact solutions.
 
-1. A sudden load q acts on a dry column of height L = 10 m.  The base is rigid and reflects the wave, or it absorbs the
-   wave.  The stress on the base is zero until the time L / c, with the wave velocity c.  Then the stress is 2 q on a
-   rigid base (until 3 L / c), and q on an absorbing base.  Behind the front the velocity of the soil is q / (rho c),
-   with the density rho.  Stresses oscillate behind a front, so their means are compared.
+1. A sudden load q acts on a dry column of height L = 10 m. The base is rigid and reflects the wave, or it absorbs the
+   wave. The stress on the base is zero until the time L / c, with the wave velocity c. Then the stress is 2 q on a
+   rigid base (until 3 L / c), and q on an absorbing base. Behind the front the velocity of the soil is q / (rho c),
+   with the density rho. Stresses oscillate behind a front, so their means are compared.
 2. A slow or a fast harmonic load acts on a saturated column of 10 m, drained at its top (Zienkiewicz, Chang and Bettess
-   1980).  The complex amplitudes of settlement and pore pressures in the steady oscillation are compared.  In the slow
+   1980). The complex amplitudes of settlement and pore pressures in the steady oscillation are compared. In the slow
    case, water drains only from a layer of 0.3 m below the top.
-3. The same column, with incompressible water and grains and k = 0.01 m/s, carries a sudden load (after de Boer, Ehlers
-   and Liu 1993).  Until a wave returns from the base, the settlement of the top at the time t is
-   `q / (M a^(1/2)) int_0^t exp(-r s) I_0(r s) ds`.  Here `r = b / (2 a)`, I_0 is the modified Bessel function,
-   `a = n_s (rho_s - rho_w) / M` and `b = g rho_w / (k M)`.  M is the oedometric modulus, and n_s is the volume fraction
-   of the grains.  The density of the grains is rho_s, and the density of the water is rho_w.
+3. The column of part 2, with incompressible water and grains and the conductivity k = 0.01 m/s, carries a sudden load q
+   (after de Boer, Ehlers and Liu 1993). Until a wave returns from the base, the settlement of the top at the time t is
+   `q / (M a^(1/2)) int_0^t exp(-r s) I_0(r s) ds`. Here `r = b / (2 a)`, I_0 is the modified Bessel function,
+   `a = n_s (rho_s - rho_w) / M` and `b = g rho_w / (k M)`. M is the oedometric modulus, and n_s is the volume fraction
+   of the grains. The density of the grains is rho_s, the density of the water is rho_w, and gravity is g.
 
-The equations are the u-p form: water accelerates with the grains.  In the saturated columns each cell is 1.05 times as
+The equations are the u-p form: water accelerates with the grains. In the saturated columns each cell is 1.05 times as
 high as the cell above, so that cells resolve the layer that drains.
 """
 
@@ -46,9 +46,9 @@ GROWTH = 1.05  # height of a cell of saturated columns, divided by that of the c
 def column(
     cells: int, conditions: list, soil: mpm.Skeleton, growth: float = 1.0, **options
 ) -> tuple[mpm.Simulation, np.ndarray]:
-    """Return a column, one cell wide, with an empty cell of the grid below its base, and its middle line.
+    """Return a column, one cell wide, and the base and the top of its middle line, in m.
 
-    growth: height of a cell divided by the height of the cell above.  The middle line is given by its base and top, m.
+    growth: height of a cell divided by the height of the cell above.
     """
     h = growth ** np.arange(cells)[::-1]
     h *= LENGTH / h.sum()
@@ -60,10 +60,7 @@ def column(
 
 
 def sudden(cells: int, base: str) -> dict[str, np.ndarray]:
-    """Return times divided by L / c, stress on the base divided by q, and velocity of the top divided by q / (rho c).
-
-    The stress on a rigid base is computed from the reaction, and the stress on an absorbing base from the velocity.
-    """
+    """Return histories of the stress on the base and of the velocity of the top, divided by q and by q / (rho c)."""
     soil, h = SOIL(grain_density=GRAINS), LENGTH / cells
     c = np.sqrt(MODULUS / ((1 - POROSITY) * GRAINS))
     foot = mpm.Quiet("bottom") if base == "quiet" else mpm.Displacement("bottom", (0, 0), "y")
@@ -75,7 +72,7 @@ def sudden(cells: int, base: str) -> dict[str, np.ndarray]:
 
 
 def harmonic(w: float, conductivity: float, z: np.ndarray) -> tuple[complex, np.ndarray]:
-    """Return the exact amplitudes of the settlement, m, and of pressures, Pa, at depths z, m, for a load of 1 Pa."""
+    """Return the exact amplitudes of settlement, in m, and pressures, in Pa, at depths z, in m, for a load of 1 Pa."""
     k = conductivity / (WATER * GRAVITY)
     # u, p ~ exp(i w t + l z), x = l²
     A = np.array([-k * MODULUS, 0, 0], dtype=complex)
@@ -94,7 +91,7 @@ def harmonic(w: float, conductivity: float, z: np.ndarray) -> tuple[complex, np.
 def swinging(
     cells: int, steps: int, periods: int, w: float, conductivity: float, growth: float = GROWTH
 ) -> tuple[complex, np.ndarray, np.ndarray]:
-    """Return computed amplitudes of settlement, m, and pressures, Pa, and their depths, m, for a load of 1 Pa."""
+    """Return computed amplitudes of settlement, in m, and pressures, in Pa, and their depths, for a load of 1 Pa."""
     soil = SOIL(grain_density=GRAINS, conductivity=conductivity)
     load = mpm.Traction("top", lambda t: (0, -np.cos(w * t)))
     foot = mpm.Displacement("bottom", (0, 0), "y")
@@ -109,7 +106,7 @@ def swinging(
 
 
 def hard_exact(t: np.ndarray) -> np.ndarray:
-    """Return the exact settlement, m, at times t, s, of the half-space with incompressible water and grains."""
+    """Return the exact settlement of the half-space at times t, in s, with incompressible water and grains, in m."""
     young, n, k = HARD["young"], HARD["porosity"], HARD["conductivity"]
     M = young * 0.7 / 1.3 / 0.4
     a, b = (1 - n) * (HARD["grains"] - WATER) / M, 1e4 / (k * M)
@@ -119,7 +116,7 @@ def hard_exact(t: np.ndarray) -> np.ndarray:
 
 
 def hard(cells: int, steps: int, growth: float = GROWTH) -> dict[str, np.ndarray]:
-    """Return times, s, and computed and exact settlements, m, of the top of a saturated column under a sudden load."""
+    """Return times, in s, and computed and exact settlements of a saturated column under a sudden load, in m."""
     soil = mpm.LinearElastic(
         bulk=HARD["young"] / 1.2,
         shear=HARD["young"] / 2.6,
@@ -136,7 +133,7 @@ def hard(cells: int, steps: int, growth: float = GROWTH) -> dict[str, np.ndarray
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Run the demo; return the results of --json."""
+    """Run the demo and return its results."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=40, help="cells over the height of the columns")
     parser.add_argument("--steps", type=int, default=50, help="steps in a period of the harmonic load")

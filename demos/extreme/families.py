@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The families of `extreme_cases`.  Scenes of a family have one extreme property, a reference, and an error bound."""
+"""Families of scenes for `extreme_cases`. Scenes of a family share one extreme property and an error bound."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ from mpm_dolfinx.verification.exact import SelfWeightColumn
 class Family:
     """Scenes that share one extreme property.
 
-    cases: generator of pairs (setting, scene)
-    bound: largest allowed error of a scene
+    cases: generator of pairs (setting, scene).
+    bound: largest allowed error of a scene.
     """
 
     cases: Callable[[], Iterator[tuple[str, Make]]]
@@ -59,7 +59,7 @@ def family(bound: float):
 
 
 def decades(low: int, high: int, step: int = 1) -> list[float]:
-    """Return the powers of ten from 10^low to 10^high.  `step` is the increment of the exponent."""
+    """Return powers of ten from 10^low to 10^high, by factors of 10^step."""
     return [float(f"1e{n}") for n in range(low, high + 1, step)]
 
 
@@ -79,11 +79,10 @@ def time_step():
 
 
 def terzaghi(h: float, s: mpm.Simulation, r: mpm.Result) -> float:
-    """Return the larger of two errors: that of the pressures, and that of the settlement.
+    """Return the error of the pressures or the error of the settlement, whichever is larger.
 
-    The error of the pressures is the mean of |p - exact| over the points, divided by the load.  The load is 1e-5 times
-    the oedometric modulus M.  The exact pressures are sums of modes, averaged over each cell of size `h`, in m.  The
-    error of the settlement is divided by the final settlement.
+    The error of the pressures is the mean of |p - exact| over the points, divided by the load. The error of the
+    settlement is divided by the final settlement.
     """
     m = (np.arange(20000) + 0.5) * np.pi
     left = np.exp(-(m**2) * s.t * SOIL.conductivity / INCOMPRESSIBLE.unit_weight * M)
@@ -117,10 +116,7 @@ def fluid_bulk():
 
 @family(0.02)
 def combined():
-    """Beam near its undrained or drained limit, three K_w, two nu: tip against finite elements in this limit.
-
-    Extreme k and dt cause the limits.  The undrained limit is a no-flow beam, the drained limit a beam without water.
-    """
+    """Beam near its undrained or drained limit, three K_w, two nu: tip against finite elements in this limit."""
     for bulk in (1e4, 2.2e9, inf):
         for nu in (0.0, 0.499):
             sealed = Beam(soil(nu=nu, conductivity=0), mpm.Fluid(bulk), drained=())
@@ -130,7 +126,7 @@ def combined():
 
 
 def beside(beam: Beam, limit: Beam) -> Scene:
-    """Return the scene of `beam`.  Its reference is the finite element solution of `limit`."""
+    """Return the scene of `beam`, with the finite element solution of `limit` as reference."""
     return replace(beam(), error=lambda s, r: off(tip(r), limit.elements()))
 
 
@@ -168,7 +164,7 @@ def contrast_of_conductivity():
 
 
 def series(cut: float, ratio: float, s: mpm.Simulation, r: mpm.Result) -> float:
-    """Return the largest error of the pressures, divided by the pressure drop.  `cut`, m: height of the interface."""
+    """Return the largest error of the pressures, divided by the pressure drop across the layers."""
     cells = s.cells()
     y = cells.x[:, 1]
     lost = np.where(y < cut, y, cut + (y - cut) / ratio) / (cut + (1 - cut) / ratio)
@@ -214,13 +210,13 @@ DRAINING = {"cells": 24, "fluid": WATER, "end": 0.4, "steps": 16, "drained": ("l
 
 
 def held(s: mpm.Simulation) -> float:
-    """Return the mean pressure, in Pa, of the points, weighted by initial volumes."""
+    """Return the mean pressure of the points, in Pa."""
     return float(s.points.volume0 @ s.points.pressure / s.points.volume0.sum())
 
 
 @cache
 def half_drained() -> float:
-    """Return the final mean pressure, in Pa, on a fine grid whose lines coincide with the sides of the square."""
+    """Return the final mean pressure of the square on a fine grid that fits its sides, in Pa."""
     scene = square(0, None, **{**DRAINING, "cells": 48})()
     scene.simulation.run(scene.end, scene.end / scene.steps, progress=False)
     return held(scene.simulation)
@@ -267,8 +263,8 @@ def few_points():
 def thin():
     """Beam half a cell, one or two cells high: error of the tip, divided by that of Q1 elements on as many cells.
 
-    The beam that is half a cell high has at least two points over its height.  With one point the beam would creep, and
-    the package would warn.
+    The thinnest beam has at least two points over its height. With one point the beam would creep, and the package
+    would warn.
     """
     for height, h, cells in ((0.05, 0.1, (10, 1)), (0.1, 0.1, (10, 1)), (0.1, 0.05, (20, 2))):
         for n in (3, 4) if height < h else (2, 3):
@@ -278,7 +274,7 @@ def thin():
 
 
 def beside_q1(beam: Beam, cells: tuple[int, int]) -> Scene:
-    """Return the scene of the beam.  The error of its tip is divided by that of Q1 elements on `cells` cells."""
+    """Return the scene of the beam; its error is divided by that of Q1 elements on `cells` cells."""
     scene = beam()
     bound = off(beam.elements("q1-dg0", cells), beam.elements())
     return replace(scene, error=lambda s, r: off(tip(r), beam.elements()) / bound)
@@ -366,8 +362,7 @@ def units():
 def rain():
     """Column under rain, k = 1e-12 to 1 m/s, alpha h = 1e-3 to 1e3: error against exact heads.
 
-    The rain increases from (k / 20) to (k / 2).  The soil stands on a water table.  Here alpha is the constant of
-    Gardner's law, in 1/m, and h the cell size, in m.
+    The rain increases from (k / 20) to (k / 2). Here alpha is Gardner's constant, in 1/m, and h is the cell size, in m.
     """
     for k in [*decades(-12, 0, 4), 0.1]:
         for steep in decades(-3, 3):
@@ -375,7 +370,7 @@ def rain():
 
 
 def rained(k: float, steep: float) -> Scene:
-    """Return the column under rain of (k / 2), with k in m/s, until heads are steady.  `steep`: alpha h of `rain`."""
+    """Return the column under rain until heads are steady, with `steep` = alpha h."""
 
     def steady(share: float, alpha: float, z: np.ndarray) -> np.ndarray:
         return np.log(share + (1 - share) * np.exp(-alpha * z)) / alpha
@@ -393,7 +388,7 @@ def rained(k: float, steep: float) -> Scene:
 def evaporation():
     """Drying column above a water table, k = 1e-12 to 1 m/s, alpha h = 1e-3 to 1e2: error against exact heads.
 
-    The surface dries to a pressure head of -1.5 m at most.  `rain` defines alpha h.
+    The pressure head at the surface does not fall below -1.5 m. `rain` defines alpha h.
     """
     for k in decades(-12, 0, 4):
         for steep in decades(-3, 2):
@@ -401,10 +396,7 @@ def evaporation():
 
 
 def dried(k: float, steep: float, driest: float = -1.5) -> Scene:
-    """Return the column with water at rest that dries at its top.  `driest`, m: lowest pressure head at the top.
-
-    The potential evaporation is larger than the flow from the water table.
-    """
+    """Return the drying column, with `steep` = alpha h and the lowest pressure head `driest`, in m."""
     alpha = 10 * steep
 
     def exact(z: np.ndarray) -> np.ndarray:
@@ -419,7 +411,7 @@ def dried(k: float, steep: float, driest: float = -1.5) -> Scene:
 def layered_rain():
     """Two layers under rain, ratio of k 1e-3 to 1e3, alpha h = 1e-2 to 1e2: error against exact heads.
 
-    `rain` defines alpha h.  The interface is off the grid lines.  One scene is in axisymmetry, and one in 3D.
+    `rain` defines alpha h. The interface is off the grid lines.
     """
     for ratio in decades(-3, 3, 2):
         for steep in decades(-2, 2):
@@ -431,11 +423,10 @@ def layered_rain():
 
 
 def rained_layers(ratio: float, steep: float, other: float, grid: str = "plane") -> Scene:
-    """Return a column of two layers.
+    """Return a column of two layers under rain, with `steep` = alpha h of the lower layer.
 
-    steep: alpha h of the lower layer, see `rain`
-    ratio, other: k and alpha of the upper layer, divided by those of the lower layer
-    grid: see `kind` of `exponential`
+    ratio: conductivity of the upper layer, divided by that of the lower layer.
+    other: alpha of the upper layer, divided by that of the lower layer.
     """
     k, alpha, edge = [1e-6, 1e-6 * ratio], [10 * steep, 10 * steep * other], 0.53
     rain = min(k) / 2
@@ -462,11 +453,13 @@ def exponential(
     edge: float | None = None,
     kind: str = "plane",
 ) -> Scene:
-    """Return a column of one or two exponential soils over a water table, 1 m and ten cells high, with exact heads.
+    """Return a column of one or two exponential soils over a water table, with its exact heads.
 
-    k: conductivity of each soil, m/s.  alpha: rate of its decrease with the suction head, 1/m.  sides: conditions.
-    exact, start: functions of the height, m, that return the final and the initial head, m.  end: end time, s.
-    edge: height of the lower end of the second soil, m.  kind: "plane", "axisymmetric" or "3D".
+    k: conductivity of each soil, in m/s.
+    alpha: Gardner's constant of each soil, in 1/m.
+    exact, start: final and initial head as functions of the height, in m.
+    edge: height of the lower end of the second soil, in m.
+    kind: "plane", "axisymmetric" or "3D".
     """
     h, weight, d = 0.1, 9810.0, 3 if kind == "3D" else 2
     grid = mpm.Grid([0] * d, [h] * (d - 1) + [1 + 2 * h], [1] * (d - 1) + [12], axisymmetric=kind == "axisymmetric")
@@ -510,10 +503,10 @@ def ponding():
 
 
 def ponded(n: float, head: float, alpha: float) -> Scene:
-    """Return a column of 1 m, ponded by 0.1 m of water until it is saturated, and drained at its base.
+    """Return a column that is ponded by 0.1 m of water until it is saturated, and drained at its base.
 
-    n, alpha (1/m): van Genuchten's parameters
-    head (m): initial head
+    n, alpha: van Genuchten's parameters; alpha is in 1/m.
+    head: initial head, in m.
     """
     law = mpm.VanGenuchten(9810.0 / alpha, residual=0.1, n=n, air_entry=100.0)
     soil = mpm.LinearElastic(1e9, 5e8, porosity=0.4, conductivity=1e-5, retention=law)

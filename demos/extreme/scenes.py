@@ -31,9 +31,9 @@ Error = Callable[[mpm.Simulation, mpm.Result], float]
 
 @dataclass
 class Scene:
-    """A simulation, which must be run until `end`, in s, in equal steps.
+    """A simulation that must be run in equal steps until `end`, in s.
 
-    error: function of the simulation and its result that returns the error, or None for a scene without equilibrium
+    error: function of the simulation and its result that returns the error, or None for a scene without equilibrium.
     """
 
     simulation: mpm.Simulation
@@ -47,17 +47,17 @@ Make = Callable[[], Scene]
 
 
 def off(measured, exact, scale: float | None = None) -> float:
-    """Return the largest difference, divided by `scale`.  By default the scale is the largest exact value."""
+    """Return the largest difference, divided by `scale` or by the largest exact value."""
     return float(np.abs(np.subtract(measured, exact)).max() / (np.abs(exact).max() if scale is None else scale))
 
 
 def tip(result: mpm.Result) -> np.ndarray:
-    """Return the final displacement (2,), in m, of the first probe."""
+    """Return the final displacement (2,) of the first probe, in m."""
     return result.displacement[-1][0]
 
 
 def settled(exact: float) -> Error:
-    """Return a function that returns the relative error of the first probe's vertical displacement."""
+    """Return a function that returns the relative error of the settlement at the first probe."""
     return lambda s, r: off(tip(r)[1], exact)
 
 
@@ -68,7 +68,7 @@ def turned(x: np.ndarray, angle: float) -> np.ndarray:
 
 
 def place(s: mpm.Simulation, corners: np.ndarray) -> None:
-    """Move and rotate the undeformed body to new corners (n, 4, 2) of its domains."""
+    """Move the undeformed body to new corners (n, 4, 2) of its domains."""
     corners = corners - s.grid.base
     points = replace(s.state.points, corners=corners, origin=corners, x=corners.mean(axis=1))
     s.state = replace(s.state, points=points)
@@ -76,7 +76,7 @@ def place(s: mpm.Simulation, corners: np.ndarray) -> None:
 
 @dataclass(frozen=True)
 class Beam:
-    """A cantilever, clamped at its left end.  The reference is the tip displacement with Taylor-Hood elements."""
+    """A cantilever, clamped at its left end, with the tip displacement of Taylor-Hood elements as reference."""
 
     material: mpm.materials.Skeleton = SOIL
     fluid: mpm.Fluid | None = None
@@ -127,7 +127,7 @@ class Beam:
         return Scene(s, self.end, self.steps, lambda s, r: off(turned(tip(r), -self.angle), self.elements()), probes)
 
     def elements(self, element: str = "taylor-hood", cells: tuple[int, int] | None = None) -> np.ndarray:
-        """Return the displacement (2,), in m, of the tip of the unrotated beam, computed with finite elements."""
+        """Return the tip displacement (2,) of the unrotated beam by finite elements, in m."""
         steps = self.steps if self.fluid and self.drained else self.truth_steps
         seen = replace(self, steps=steps, h=(1, 1), offset=0, per_cell=0, angle=0, truth=cells or self.truth)
         return finite_elements(seen, element)
@@ -135,7 +135,7 @@ class Beam:
 
 @cache
 def finite_elements(beam: Beam, element: str) -> np.ndarray:
-    """Return the displacement (2,), in m, of the beam's tip on a mesh of `beam.truth` finite elements."""
+    """Return the tip displacement (2,) of the beam by finite elements, in m."""
     fem = BiotFEM(
         mpm.Grid([0, 0], beam.size, beam.truth), beam.material, walls={"left": "xy"}, element=element, **beam.physics()
     )
@@ -145,10 +145,10 @@ def finite_elements(beam: Beam, element: str) -> np.ndarray:
 def column(error: Error | None, *layers, h=0.05, end=1.0, steps=1, per_cell=2, load=0.0, room=2, **physics) -> Make:
     """Return a function that makes a column, one cell wide, between smooth walls.
 
-    layers: material and height of the top (m) of each layer, from below
-    h (m): cell size
-    load (Pa): load on the top of the column
-    room: number of empty cells above the column
+    layers: material, and height of the top, in m, of each layer, from below.
+    h: cell size, in m.
+    load: load on the top, in Pa.
+    room: number of empty cells above the column.
     """
 
     def make() -> Scene:
@@ -174,15 +174,15 @@ def column(error: Error | None, *layers, h=0.05, end=1.0, steps=1, per_cell=2, l
 
 
 def stretch(ratio: float) -> float:
-    """Return the stretch a of a column with Hencky's law under a load `q = ratio M`.  It solves `M ln(a) / a = -q`."""
+    """Return the stretch a of a column with Hencky's law under a load `q = ratio M`, from `M ln(a) / a = -q`."""
     return float(np.exp(-lambertw(ratio).real))
 
 
 def square(angle: float, error: Error | None, cells: int = 12, end=1.0, steps=4, fluid=None, drained=()) -> Make:
     """Return a function that makes a square of 0.6 m in the corner between two walls, under 1e5 Pa on all sides.
 
-    angle (degrees): rotation of the square
-    drained: names of the drained sides of the square
+    angle: rotation of the square, in degrees.
+    drained: names of the drained sides of the square.
     """
 
     def make() -> Scene:

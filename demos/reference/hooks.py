@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Convert formulas of pages to MathML, which browsers draw without a script.  Link public names to the reference."""
+"""Convert formulas of pages to MathML, and link public names to the reference."""
 
 import re
 from pathlib import Path
@@ -16,7 +16,7 @@ def on_page_markdown(markdown: str, **_) -> str:
 
 
 def on_page_content(html: str, page, **_) -> str:
-    """Return the page with links from public names in code to the reference.  Links and headings stay unchanged."""
+    """Return the page with links from public names in code to the reference."""
     up = "../" * page.url.count("/")
 
     def linked(m: re.Match) -> str:

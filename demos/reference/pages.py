@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Copy the pages of the reference into a folder: `python demos/reference/pages.py FOLDER`.
 
-Pages, and the files that pages link to, keep their relative paths.  The tutorial and the short examples become pages.
+The tutorial and the short examples become pages. Pages, and the files that pages link to, keep their relative paths.
 """
 
 import re
@@ -21,7 +21,7 @@ def parts(path: Path) -> tuple[str, str]:
 
 
 def tutorial(path: Path) -> str:
-    """Return the tutorial as a page: lines that begin with a comment become text, all other lines become code."""
+    """Return the tutorial as a page; comments become text, and other lines become code."""
     text, code = parts(path)
     out = [f"# Tutorial\n\n{text}\n"]
     for block in re.findall(r"(?:^#.*\n?)+|(?:^(?!#).*\n?)+", code, re.M):
@@ -51,14 +51,14 @@ def documented(folder: Path) -> dict[str, str]:
 
 
 def names(folder: Path) -> str:
-    """Return a page with links to all public names.  Unlike the search box, the page needs no server."""
+    """Return a page with links to all public names, which needs no server."""
     found = documented(folder)
     rows = [f"* [`{name}`]({found[name]}.md#mpm_dolfinx.{name})" for name in sorted(found, key=str.lower)]
     return "# All names\n\n" + "\n".join(rows) + "\n"
 
 
 def lay(out: Path) -> None:
-    """Copy all pages into a folder, after its earlier contents are removed."""
+    """Empty a folder and copy all pages into it."""
     shutil.rmtree(out, ignore_errors=True)
     for pattern in (*PAGES, *LINKED):
         for path in ROOT.glob(pattern):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Settlement under the middle of an embankment.  The soft clay below consolidates after the construction."""
+"""Settlement under the middle of an embankment on soft clay, which consolidates after the construction."""
 
 import mpm_dolfinx as mpm
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Pumping rate of a pit below the water table.  The pit is excavated in three lifts, and kept dry."""
+"""Pumping rate of a pit below the water table, which is excavated in three lifts and kept dry."""
 
 import mpm_dolfinx as mpm
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Your own term in UFL, the springs of a Winkler foundation, supports a raft under 30 kPa."""
+"""Your own term in UFL: the springs of a Winkler foundation support a raft under 30 kPa."""
 
 import ufl
 

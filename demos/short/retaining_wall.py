@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Active thrust of sand on a smooth retaining wall of 3 m.  The wall tilts about its toe, away from the sand."""
+"""Active thrust of sand on a smooth retaining wall of 3 m that tilts about its toe, away from the sand."""
 
 import mpm_dolfinx as mpm
 

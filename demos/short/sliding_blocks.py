@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Of two blocks in contact, the upper block is pressed down and slides with friction."""
+"""Two blocks are in contact, and the upper block is pressed down and slides with friction."""
 
 import mpm_dolfinx as mpm
 
