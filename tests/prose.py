@@ -26,8 +26,8 @@ LONG = 25
 PRIVATE = set(
     "told tells came owed said says apart beside amiss gone felt aslant lies foot offence begun began aloud loud mine "
     "lone sought borne fall falls rise rises way ways reach room travel drives resists stays taken spread turned turns "
-    "met meets passed here there went back lost due wanted asked serves rederived uneven grips firm firmness sealed hoops "
-    "smeared overfilled folded".split()
+    "met meets passed here there went back lost due wanted asked serves rederived uneven grips firm firmness "
+    "sealed hoops smeared overfilled folded".split()
 )
 """Verbs, participles and adverbs that name values in place of a noun of the field."""
 ENTRY = re.compile(
