@@ -11,8 +11,8 @@ runs on one process.
    step. A vertical side of height H is stable while gamma' H / c < 3.78. Limit analysis gives 3.76 to 3.79 (Pastor,
    Thai and Francescato 2000), and the critical slip circle 3.83 (Fellenius 1927). The bank has failed when its crest
    settles 20 times as much in a step as in the first steps. With a factor of 10 or 40 instead of 20, the result changes
-   by 1 %. With 10 cells over the height the bank fails at gamma' H / c = 3.93, which is 3.9 % too large. With 20 cells
-   it fails at 3.85, which is 1.9 % too large. The error is of first order in the cell size, and the extrapolated value
+   by 1 %. With 10 cells over the height the bank fails at gamma' H / c = 3.94, which is 4.2 % too large. With 20 cells
+   it fails at 3.86, which is 2.0 % too large. The error is of first order in the cell size, and the extrapolated value
    is 3.78.
 2. Run-out. The consolidated bank, with friction, loses its cohesion within T = 10 minutes, far faster than it drains.
    The bank slumps. In front of the initial toe, the water carries more than half of the soil's weight. At rest the bank
