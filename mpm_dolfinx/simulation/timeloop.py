@@ -87,8 +87,8 @@ def run(
         cannot be estimated. With inertia the error of the motion is limited too, relative to the largest motion since
         the start, see `motion_error`. In unsaturated soil the error of the water content is limited too, relative to
         its largest change in a step so far. The estimate is a fraction of a first-order step's error, see
-        `solve.newton.ERROR`. The largest true error of a run was 0.7 to 5 times the largest estimate. The ratio is
-        largest directly after a jump of the load.
+        `solve.newton.ERROR`. The largest true error of a run was 0.7 to 5 times the largest estimate, and 5 times
+        directly after a jump of the load.
     t_eval : (n,), s
         Output times, increasing, in (t, t_end]; t_end is always an output time. Steps end at output times.
     until
