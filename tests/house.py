@@ -5,11 +5,11 @@ A number is *structure* where it cannot be another one: see `structure` below. I
 or the string below it, names one of two things:
 
     Source: an equation, a paper (with its year), a definition, a format, or an exact bound, see `SOURCE`;
-    The result of scene "name" in tests/plateaus.py changes by the fraction a with half this value, by b with twice this
-    value, and by c with finer cells.
+    Plateau (scene "name" of tests/plateaus.py): half this value changes the result by a, twice this value by b, and
+    finer cells by c.
 
-One of a and b is not zero, so the number affects the scene; both are below c. `python tests/plateaus.py` measures
-them again. All other numbers are *ad hoc*.
+The changes are relative. One of a and b is not zero, so the number affects the scene. Both are below c. `python
+tests/plateaus.py` measures them again. All other numbers are *ad hoc*.
 """
 
 import ast
@@ -25,8 +25,8 @@ SOURCE = re.compile(
     re.DOTALL,
 )
 PLATEAU = re.compile(
-    r'\bThe result of scene "(\w+)" in tests/plateaus.py changes by the fraction ([\d.e+-]+) with half this value, '
-    r"by ([\d.e+-]+) with twice this value, and by ([\d.e+-]*[\d]) with finer cells"
+    r'\bPlateau \(scene "(\w+)" of tests/plateaus.py\): half this value changes the result by ([\d.e+-]+), '
+    r"twice this value by ([\d.e+-]+), and finer cells by ([\d.e+-]*[\d])"
 )
 UNITS = {60, 90, 100, 180, 360, 1000, 1e6, 1024, 86400}
 """Per cent, degrees, and the like."""

@@ -148,8 +148,8 @@ def main(arguments: list[str]) -> None:
         began = time.time()
         found = moved(where, name, scene)
         half, twice, cells = (f"{value:.1e}" for value in found)
-        where = f'The result of scene "{scene}" in tests/plateaus.py changes by the fraction {half}'
-        told = f"{where} with half this value, by {twice} with twice this value, and by {cells} with finer cells."
+        where = f'Plateau (scene "{scene}" of tests/plateaus.py): half this value changes the result by {half}'
+        told = f"{where}, twice this value by {twice}, and finer cells by {cells}."
         print(f"{number} {told}  {time.time() - began:.0f} s", flush=True)
 
 

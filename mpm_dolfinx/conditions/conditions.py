@@ -396,15 +396,15 @@ HOLD = 3e2
 
 The penalty acts on means over cells.  The displacement error is the change of traction in the step (without its
 rotation), divided by the stiffness.  The error does not accumulate, because each step measures it from the prescribed
-position.  If a body is much stiffer than the penalty, multipliers remove the error, see `HoldLoads.augment`.  The
-result of scene "soil" in tests/plateaus.py changes by the fraction 5.9e-05 with half this value, by 2.0e-05 with twice
-this value, and by 3.0e-02 with finer cells.
+position.  If a body is much stiffer than the penalty, multipliers remove the error, see `HoldLoads.augment`.  Plateau
+(scene "soil" of tests/plateaus.py): half this value changes the result by 5.9e-05, twice this value by 2.0e-05, and
+finer cells by 3.0e-02.
 """
 YIELDING = 0.1
 """Factor on the elastic modulus in the penalty of laws with state variables.
 
-Yielding soil is much softer than elastic soil. The result of scene "soil" in tests/plateaus.py changes by the fraction
-6.5e-05 with half this value, by 1.9e-05 with twice this value, and by 3.0e-02 with finer cells.
+Yielding soil is much softer than elastic soil. Plateau (scene "soil" of tests/plateaus.py): half this value changes the
+result by 6.5e-05, twice this value by 1.9e-05, and finer cells by 3.0e-02.
 """
 
 

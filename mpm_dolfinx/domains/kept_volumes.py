@@ -35,8 +35,8 @@ SOFT = 0.15
 """Weight of the motion d of the corners, and of its changes along edges.
 
 Volume errors may alternate between the domains of a regular lattice.  To first order, no motion of the corners reduces
-such errors, so the weight is needed.  The result of scene "flow" in tests/plateaus.py changes by the fraction 1.5e-04
-with half this value, by 2.4e-04 with twice this value, and by 9.1e-02 with finer cells.
+such errors, so the weight is needed.  Plateau (scene "flow" of tests/plateaus.py): half this value changes the result
+by 1.5e-04, twice this value by 2.4e-04, and finer cells by 9.1e-02.
 """
 
 

@@ -43,8 +43,8 @@ FAST = 10
 """Fraction of a wave with a length of two domains that the filter removes for each crossed cell, at most the whole
 wave.
 
-The result of scene "cycles" in tests/plateaus.py changes by the fraction 1.5e-04 with half this value, by 3.4e-04 with
-twice this value, and by 6.2e-03 with finer cells.
+Plateau (scene "cycles" of tests/plateaus.py): half this value changes the result by 1.5e-04, twice this value by
+3.4e-04, and finer cells by 6.2e-03.
 """
 THIRD = (-1, 3, -3, 1)
 MARGIN = len(THIRD) - 1

@@ -33,13 +33,13 @@ from mpm_dolfinx.grid.grid import Grid, sum_by
 ALONG = 1e-4
 """Largest offset of two centroids along a face, divided by the cell size, for which fluxes need no correction."""
 NEAREST = 0.1
-"""Lower bound of distances in the weights of the least-squares fit, divided by the cell size.  The result of scene
-"slope" in tests/plateaus.py changes by the fraction 3.0e-08 with half this value, by 1.2e-06 with twice this value, and
-by 3.4e-03 with finer cells."""
+"""Lower bound of distances in the weights of the least-squares fit, divided by the cell size.  Plateau (scene "slope"
+of tests/plateaus.py): half this value changes the result by 3.0e-08, twice this value by 1.2e-06, and finer cells by
+3.4e-03."""
 SIDES = 2.0
-"""Total weight of the open sides of a cell in the least-squares fit, divided by the weight of one neighbour.  The
-result of scene "slope" in tests/plateaus.py changes by the fraction 4.8e-06 with half this value, by 2.8e-06 with twice
-this value, and by 3.4e-03 with finer cells.
+"""Total weight of the open sides of a cell in the least-squares fit, divided by the weight of one neighbour.  Plateau
+(scene "slope" of tests/plateaus.py): half this value changes the result by 4.8e-06, twice this value by 2.8e-06, and
+finer cells by 3.4e-03.
 """
 
 

@@ -68,8 +68,8 @@ from mpm_dolfinx.pores.retention import logarithm, restrained
 
 FILTER = 0.75
 """Fraction, in [0, 1], of `beta V` that the filtered fixed-stress operator omits for checkerboard modes.  Here beta is
-the fixed-stress coefficient, and V is the volume.  The result of scene "beam" in tests/plateaus.py changes by the
-fraction 5.2e-11 with half this value, by 1.3e-10 with twice this value, and by 1.5e-02 with finer cells.
+the fixed-stress coefficient, and V is the volume.  Plateau (scene "beam" of tests/plateaus.py): half this value changes
+the result by 5.2e-11, twice this value by 1.3e-10, and finer cells by 1.5e-02.
 """
 
 

@@ -212,8 +212,8 @@ def mean_size(grid: Grid) -> float:
 MOST = 100.0
 """Upper limit of the softness, because softness is infinite in perfectly plastic flow.
 
-The result of scene "soil" in tests/plateaus.py changes by the fraction 4.0e-03 with half this value, by 5.0e-03 with
-twice this value, and by 3.0e-02 with finer cells.
+Plateau (scene "soil" of tests/plateaus.py): half this value changes the result by 4.0e-03, twice this value by 5.0e-03,
+and finer cells by 3.0e-02.
 """
 
 

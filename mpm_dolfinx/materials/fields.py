@@ -41,14 +41,14 @@ RESERVED = frozenset(
 """Names of data at quadrature points that parameters and state variables cannot have."""
 WHAT_IS_NAMED = "parameters, state and unknowns"
 EVOLVED = 1e-3
-"""Soil has yielded if a state variable differs from its initial value by more than this number.  The result of scene
-"soil" in tests/plateaus.py changes by the fraction 6.6e-05 with half this value, by 1.4e-04 with twice this value, and
-by 3.0e-02 with finer cells.
+"""Soil has yielded if a state variable differs from its initial value by more than this number.  Plateau (scene "soil"
+of tests/plateaus.py): half this value changes the result by 6.6e-05, twice this value by 1.4e-04, and finer cells by
+3.0e-02.
 """
 STIFFEST = 100.0
 """Upper limit of (alpha^2 / S) / (lambda + 2G), the ratio of the pore fluid's stiffness to the skeleton's stiffness.  S
-is the storage coefficient.  The limit keeps rounding errors small.  The result of scene "soil" in tests/plateaus.py
-changes by the fraction 1.2e-07 with half this value, by 1.0e-07 with twice this value, and by 3.0e-02 with finer cells.
+is the storage coefficient.  The limit keeps rounding errors small.  Plateau (scene "soil" of tests/plateaus.py): half
+this value changes the result by 1.2e-07, twice this value by 1.0e-07, and finer cells by 3.0e-02.
 """
 
 

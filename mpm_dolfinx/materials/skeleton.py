@@ -46,9 +46,8 @@ nu = 0.499: -10.3 % without F-bar, -0.02 % with F-bar.
 """
 
 SEPARATION = 1e-4
-"""Relative difference added to equal eigenvalues, for finite derivatives.  The result of scene "beam" in
-tests/plateaus.py changes by the fraction 1.8e-09 with half this value, by 7.2e-09 with twice this value, and by 1.5e-02
-with finer cells.
+"""Relative difference added to equal eigenvalues, for finite derivatives.  Plateau (scene "beam" of tests/plateaus.py):
+half this value changes the result by 1.8e-09, twice this value by 7.2e-09, and finer cells by 1.5e-02.
 """
 
 

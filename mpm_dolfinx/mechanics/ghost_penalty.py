@@ -33,16 +33,16 @@ from mpm_dolfinx.grid.grid import TURN, Grid, across_faces
 from mpm_dolfinx.materials.skeleton import Skeleton
 
 GHOST = 0.05
-"""Strength of the ghost penalty.  The result of scene "beam" in tests/plateaus.py changes by the fraction 9.9e-06 with
-half this value, by 1.9e-05 with twice this value, and by 1.5e-02 with finer cells.
+"""Strength of the ghost penalty.  Plateau (scene "beam" of tests/plateaus.py): half this value changes the result by
+9.9e-06, twice this value by 1.9e-05, and finer cells by 1.5e-02.
 """
 YIELDING = 0.02
 """Smallest reduction factor of the penalty for nearly incompressible laws with a state."""
 RATIO = 0.3
 """A face has the penalty if the filling of the emptier cell, divided by that of the fuller cell, is below this value.
 
-The result of scene "soil" in tests/plateaus.py changes by the fraction 1.3e-03 with half this value, by 5.9e-04 with
-twice this value, and by 3.0e-02 with finer cells.
+Plateau (scene "soil" of tests/plateaus.py): half this value changes the result by 1.3e-03, twice this value by 5.9e-04,
+and finer cells by 3.0e-02.
 """
 SPARSE, FULL = 0.2, 0.9
 """Two numbers for integration at points: strength of the penalty, and largest volume fraction of a cell with it."""

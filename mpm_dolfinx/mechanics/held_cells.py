@@ -25,19 +25,19 @@ from mpm_dolfinx.parallel.exchange import over_all
 ALIGNED = 1e-2
 """Largest slope of a side against a grid axis at which cells can follow all points of the side at constant volume."""
 WEAK = 8.0
-"""Pointwise penalty stiffness for deviations from the means, in units of (modulus + 10 stress) / cell size.  The result
-of scene "soil" in tests/plateaus.py changes by the fraction 5.0e-06 with half this value, by 7.9e-06 with twice this
-value, and by 3.0e-02 with finer cells.
+"""Pointwise penalty stiffness for deviations from the means, in units of (modulus + 10 stress) / cell size.  Plateau
+(scene "soil" of tests/plateaus.py): half this value changes the result by 5.0e-06, twice this value by 7.9e-06, and
+finer cells by 3.0e-02.
 """
 EVERYWHERE = 1e2
-"""Normal penalty stiffness at points of sides with slopes below `ALIGNED`, in units of resistance / cell size. The
-result of scene "soil" in tests/plateaus.py changes by the fraction 2.2e-05 with half this value, by 1.7e-05 with twice
-this value, and by 3.0e-02 with finer cells.
+"""Normal penalty stiffness at points of sides with slopes below `ALIGNED`, in units of resistance / cell size. Plateau
+(scene "soil" of tests/plateaus.py): half this value changes the result by 2.2e-05, twice this value by 1.7e-05, and
+finer cells by 3.0e-02.
 """
 TENSE = 10
-"""Factor on a side's stress in the modulus of the penalty: a side would buckle if its stress exceeded this modulus. The
-result of scene "soil" in tests/plateaus.py changes by the fraction 2.8e-06 with half this value, by 4.7e-06 with twice
-this value, and by 3.0e-02 with finer cells.
+"""Factor on a side's stress in the modulus of the penalty: a side would buckle if its stress exceeded this modulus.
+Plateau (scene "soil" of tests/plateaus.py): half this value changes the result by 2.8e-06, twice this value by 4.7e-06,
+and finer cells by 3.0e-02.
 """
 CARRIED = 0.3  # largest plausible traction increment of a step, divided by (resisting modulus + TENSE * stress)
 

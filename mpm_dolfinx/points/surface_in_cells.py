@@ -13,8 +13,8 @@ from mpm_dolfinx.points.polygons import NONE, Polygons
 EDGES = 4
 """Number of surface edges in a cell with renewed particle domains.
 
-The result of scene "flow" in tests/plateaus.py changes by the fraction 1.6e-03 with half this value, by 1.5e-03 with
-twice this value, and by 9.0e-02 with finer cells.
+Plateau (scene "flow" of tests/plateaus.py): half this value changes the result by 1.6e-03, twice this value by 1.5e-03,
+and finer cells by 9.0e-02.
 """
 BENT = 1 - 3**0.5 / 2
 """Largest deviation of a surface without a corner from its chord, in cell sizes.  Flatter parts are divided evenly.

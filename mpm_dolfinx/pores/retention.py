@@ -424,12 +424,12 @@ class Conductance:
 REACH = (1e-8, 1e8)
 """Range of tabulated suctions, divided by the law's scale.  Source: outside, the integral is exact to 1e-8."""
 ROWS = 4000
-"""Number of tabulated suctions.  The result of scene "dry" in tests/plateaus.py changes by the fraction 2.1e-08 with
-half this value, by 2.6e-09 with twice this value, and by 6.6e-03 with finer cells.
+"""Number of tabulated suctions.  Plateau (scene "dry" of tests/plateaus.py): half this value changes the result by
+2.1e-08, twice this value by 2.6e-09, and finer cells by 6.6e-03.
 """
 GAUSS = 8
-"""Quadrature points between two tabulated suctions.  The result of scene "dry" in tests/plateaus.py changes by the
-fraction 8.2e-10 with half this value, by 1.5e-09 with twice this value, and by 6.6e-03 with finer cells.
+"""Quadrature points between two tabulated suctions.  Plateau (scene "dry" of tests/plateaus.py): half this value
+changes the result by 8.2e-10, twice this value by 1.5e-09, and finer cells by 6.6e-03.
 """
 
 
@@ -449,8 +449,8 @@ FARTHEST = np.log(10)
 Without this limit, fronts in dry soil do not converge.  With the limit 2, Celia's column takes 310 Newton steps with 25
 cells, and 500 with 100 cells.  With the limit 4, it takes 330 Newton steps with 25 cells, and 920 with 100 cells.
 
-The result of scene "dry" in tests/plateaus.py changes by the fraction 7.6e-10 with half this value, by 9.8e-10 with
-twice this value, and by 6.6e-03 with finer cells.
+Plateau (scene "dry" of tests/plateaus.py): half this value changes the result by 7.6e-10, twice this value by 9.8e-10,
+and finer cells by 6.6e-03.
 """
 
 

@@ -49,13 +49,13 @@ INNER = 1e-3  # momentum tolerance / storage error; it is small because unconver
 MOMENTUM_STEPS = 10
 REBALANCED = 6  # largest number of iterations if contacts change, divided by the number if they do not
 LOOSEST = 1e-2
-"""Largest ratio of the residual after a linear solve to the residual before this solve. The result of scene "soil" in
-tests/plateaus.py changes by the fraction 2.2e-11 with half this value, by 6.0e-12 with twice this value, and by 3.0e-02
-with finer cells.
+"""Largest ratio of the residual after a linear solve to the residual before this solve. Plateau (scene "soil" of
+tests/plateaus.py): half this value changes the result by 2.2e-11, twice this value by 6.0e-12, and finer cells by
+3.0e-02.
 """
 SOLVED = 0.05
-"""Residual after the last linear solve, divided by the tolerance.  The result of scene "soil" in tests/plateaus.py
-changes by the fraction 4.0e-12 with half this value, by 3.1e-11 with twice this value, and by 3.0e-02 with finer cells.
+"""Residual after the last linear solve, divided by the tolerance.  Plateau (scene "soil" of tests/plateaus.py): half
+this value changes the result by 4.0e-12, twice this value by 3.1e-11, and finer cells by 3.0e-02.
 """
 SETTLED = 1e-2  # residual below which slip of contacts may end; above it the contact area still changes
 ERROR = 1 / 20

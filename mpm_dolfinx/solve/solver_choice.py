@@ -53,19 +53,18 @@ class Thresholds:
 
 THRESHOLDS = Thresholds()
 FORCING = 1e-5
-"""Tightest relative tolerance of a linear solve.  The result of scene "soil" in tests/plateaus.py changes by the
-fraction 4.0e-11 with half this value, by 1.2e-11 with twice this value, and by 3.0e-02 with finer cells.
+"""Tightest relative tolerance of a linear solve.  Plateau (scene "soil" of tests/plateaus.py): half this value changes
+the result by 4.0e-11, twice this value by 1.2e-11, and finer cells by 3.0e-02.
 """
 FORCING_3D = 1e-3
 """Tightest relative tolerance of a linear solve with multigrid in 3D."""
 KEEP = 0.05
-"""Largest ratio of successive residuals for which the tangent is reused.  The result of scene "soil" in
-tests/plateaus.py changes by the fraction 4.9e-11 with half this value, by 1.0e-11 with twice this value, and by 3.0e-02
-with finer cells.
+"""Largest ratio of successive residuals for which the tangent is reused.  Plateau (scene "soil" of tests/plateaus.py):
+half this value changes the result by 4.9e-11, twice this value by 1.0e-11, and finer cells by 3.0e-02.
 """
 KEEP_WET = 0.01
-"""Value of `KEEP` in wet 2D scenes without yield.  The result of scene "beam" in tests/plateaus.py changes by the
-fraction 1.8e-11 with half this value, by 2.9e-10 with twice this value, and by 1.5e-02 with finer cells.
+"""Value of `KEEP` in wet 2D scenes without yield.  Plateau (scene "beam" of tests/plateaus.py): half this value changes
+the result by 1.8e-11, twice this value by 2.9e-10, and finer cells by 1.5e-02.
 """
 
 

@@ -57,8 +57,8 @@ time step. Twenty undrained cycles of a beam of 5 cells leave spurious stresses 
 orders of pressures in space are therefore below 2, and below 1.75 at rates of 0.2 and above. The order in time is
 unaffected.
 
-The result of scene "beam" in tests/plateaus.py changes by the fraction 1.7e-03 with half this value, by 2.8e-03 with
-twice this value, and by 1.5e-02 with finer cells.
+Plateau (scene "beam" of tests/plateaus.py): half this value changes the result by 1.7e-03, twice this value by 2.8e-03,
+and finer cells by 1.5e-02.
 """
 
 
@@ -94,8 +94,8 @@ class Motion:
         loads: Sequence[Loads],
         net_inflow: NDArray[np.float64] | None = None,
         report: Report | None = None,
-        stays: bool = True,
         carried: Callable[[NDArray[np.float64]], dict[str, NDArray[np.float64]]] | None = None,
+        stays: bool = True,
     ) -> tuple[State, int]:
         """Return the state at time t (s) after a solved step, and the number of inverted domains.
 

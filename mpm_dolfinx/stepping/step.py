@@ -71,9 +71,7 @@ def step(scene: Scene, state: State, dt: float, how: tuple = ()) -> tuple[State,
     seconds = dt * np.array([acting.substep.before, acting.substep.own])
     at, outcome = both.momentum.at, both.outcome(state, passed, seconds)
     end = state.t + dt, [one.ended(at) for one in acting.loads], both.net_inflow(rates[-1]), report
-    new, report.reinitialised = scene.motion.advanced(
-        state, on_grid, start.data, *end, carried=start.carrying(flights[-1])
-    )
+    new, report.reinitialised = scene.motion.advanced(state, on_grid, start.data, *end, start.carrying(flights[-1]))
     velocity = scene.momentum.u.x.array / dt if leads(scene, acting.loads) else None
     now = {"outcome": outcome, "points": left(end[1], at, state.points, new.points), "velocity": velocity}
     if found:
