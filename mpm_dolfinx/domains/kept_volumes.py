@@ -10,8 +10,8 @@ After a step the corners of yielded domains therefore move by the vectors d that
 
 The sums are over the points p.  V_p is the volume of a point, V is the volume of its domain, and dV/dx is the
 derivative of V with respect to the corners.  The relative volume error after the motion is e_p.  The mean is over the
-domain's corners, and h are the edges of cells.  Shared corners move together.  Corners of elastic domains and held
-corners do not move.  Kugelstadt et al. (2019) correct densities of cells in this way.
+corners of the domain, and h contains the edge lengths of the domain's cell.  Shared corners move together.  Fixed
+corners, and corners of elastic domains, do not move.  Kugelstadt et al. (2019) correct cell densities in this way.
 """
 
 from __future__ import annotations

@@ -109,7 +109,7 @@ class Gradients:
 
     @cached_property
     def _units(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the gradients for a unit pressure difference to a neighbour, and to an open side."""
+        """Return two arrays of gradients: for a unit pressure difference to a neighbour, and to an open side."""
         known, d = self._known, self._separation.shape[2]
         at, no_flow = self._at[known], self._no_flow(self._contents, self._sides)[self.rows]
         size = np.linalg.norm(self._sides.area, axis=1)[self._faces[known]]

@@ -568,12 +568,12 @@ class Grid:
         return self._cells
 
     def share(self, load: NDArray[np.float64]) -> None:
-        """Create the mesh, unless it exists, with cells distributed among processes by their loads (cells,)."""
+        """Create the mesh if it does not exist.  Divide the loads (cells,) of cells evenly among processes."""
         if self._cells is None:
             self._cells = self._made(boxes(load.reshape(self.shape), self.comm.size))
 
     def shared(self, load: NDArray[np.float64], keep: bool) -> Grid:
-        """Return a grid whose cells are distributed by their loads: this grid, or an equal grid with another mesh.
+        """Return this grid, or an equal grid with another mesh, whose loads are evenly distributed among processes.
 
         `load` (cells,): load >= 0 of each cell, such as its number of points
         `keep`: whether to return this grid in any case, because other objects were created on its mesh
@@ -690,7 +690,7 @@ class Grid:
         return TURN * x[:, 0] if self.axisymmetric else 1.0
 
     def number(self, index: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the lexicographic indices (n,) of cells of the first copy with indices (n, d) along the axes."""
+        """Convert indices (n, d) of cells along axes to lexicographic indices (n,) in the first copy of the grid."""
         return np.ravel_multi_index(tuple(index.T), tuple(self.shape))
 
     def index(self, x: NDArray[np.float64]) -> NDArray[np.int64]:

@@ -11,7 +11,7 @@ points
     (3, 3), with f_r / r.  `points.F` is the deformation gradient at the start of the step, in the shape of grad u, with
     the volume ratio as determinant.  `points.position` is the position at the start of the step.
     `points.displacement` is the displacement since the start of the run, or since a stage that set it to zero.  Other
-    attributes are parameters that are functions of position, and the laws' state variables.
+    attributes are the laws' state variables, and parameters that are functions of position.
 t
     Time at which the balances hold, s, as a UFL constant: the end of the step or of its first substep.
 
