@@ -9,7 +9,7 @@ multilinear function v on a box of dimension d equals the first d + 1 terms of i
 with the offset xi = x_p - x_mid of the point p from the midpoint x_mid.  The right side is evaluated at the midpoint.
 It is plain UFL, integrated by the one-point rule.
 
-The list of cells of the integral contains each cell once for each point in the cell, so that the assembler calls the
+The list of cells of the integral contains each cell once for each point in the cell.  The assembler therefore calls the
 kernel once for each point.  The offset xi and all other data of the points are DG0 coefficients, with one row for each
 entry of the list.  The integral of f w / |cell| over the list is sum_p w_p f(x_p), with the weights w_p of the points
 and the cell volume |cell|.

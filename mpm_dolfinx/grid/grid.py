@@ -322,7 +322,7 @@ class Grid:
         lines along all axes give a grid of equal cells.
     follow : Tool, or callable -> (n,) along each axis, m
         Object that the lines follow, at each reset of the grid.  With a tool, the smallest cells of `lines` move like
-        the centre of the tool's ball, the tip of its cone, or the mean of its corners.  If the tool's shape is a
+        one point: the centre of a ball, the tip of a cone, or the mean of the corners.  If the tool's shape is a
         function, they move like its `centre`.  The other cells widen or narrow.  The tool must be a condition of the
         first stage.  Lines do not move in stages without this tool.  A function depends on time t (s), the positions x
         (n, d) of all points, or both.  The function returns all lines.  Along each axis, their number, first and last

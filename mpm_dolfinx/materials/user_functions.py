@@ -73,8 +73,8 @@ def call(function: Callable, kind: str = "UFL", /, **available):
 def expression(function: Callable, shapes: Sequence[tuple[int, ...]], of: str = "", **available):
     """Return the result of a user-defined function as a UFL expression with one of the given shapes.
 
-    ValueError is raised if the function fails, or if its result is not UFL, has a wrong shape, or does not depend on
-    the argument `of`.
+    ValueError is raised if the function fails.  It is also raised if the result is not UFL, has a wrong shape, or does
+    not depend on `of`.
     """
     value = call(function, **available)
     allowed = f"UFL of shape {' or '.join(map(str, shapes))}{f' that depends on {of}' if of else ''}"

@@ -532,7 +532,7 @@ class MomentumProblem:
 
         For the first result, the rounding error at each node is subtracted from the residual.  With `first` it is not
         subtracted, so that even a load below the error causes a solve.  For the second result, the force scale at an
-        unknown is at least `of_whole` divided by the tolerance, so that a residual within rounding has converged.
+        unknown is at least `of_whole` divided by the tolerance.  A residual within rounding has thus converged.
 
         r, scales (parts,), in N: residuals and force scales.
         """

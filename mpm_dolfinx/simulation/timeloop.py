@@ -86,9 +86,9 @@ def run(
         fluid flows, the steps are the output intervals. A term or law that depends on velocity then raises ValueError,
         because its error cannot be estimated. With inertia the error of the motion is limited too, relative to the
         largest motion since the start, see `motion_error`. In unsaturated soil the error of the water content is
-        limited too, relative to the largest change of the water content in a step so far. The estimate is a fraction of
-        a first-order step's error, see `solve.newton.ERROR`. The largest true error of a run was 0.7 to 5 times the
-        largest estimate. The factor was 5 directly after a jump of the load.
+        limited too. Its limit is relative to the largest change of the water content in a step so far. The estimate is
+        a fraction of a first-order step's error, see `solve.newton.ERROR`. The largest true error of a run was 0.7 to 5
+        times the largest estimate. The factor was 5 directly after a jump of the load.
     t_eval : (n,), s
         Output times, increasing, in (t, t_end]; t_end is always an output time. Steps end at output times.
     until
