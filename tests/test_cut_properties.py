@@ -321,12 +321,19 @@ def columns(tetrahedra, axes):
 @repeatable(80)
 @given(hexahedra(folds=True))
 def test_a_hexahedron_has_the_pieces_of_its_tetrahedra(scene):
-    """Inverted tetrahedra count as positive."""
+    """Inverted tetrahedra count as negative; pieces whose sign is not that of the whole are left out."""
     grid, corners = scene
     found, y, slack, parts = pieces(grid, corners), snapped(grid, corners), error(grid, corners), {}
-    for cell, tetrahedra in columns(tetrahedra_of(y), (0, 1, 2)).items():
-        volumes = np.abs([volume(t) for t in tetrahedra])
-        parts[cell] = volumes.sum(), volumes @ [t.mean(axis=0) - cell for t in tetrahedra]
+    for whole, upright in zip(tetrahedra_of(y), tetrahedra_of(1.0 * BITS[3]), strict=True):
+        sign = np.sign(volume(whole) * volume(upright))
+        for cell, tetrahedra in columns([whole], (0, 1, 2)).items():
+            volumes = sign * np.abs([volume(t) for t in tetrahedra])
+            v, moment = parts.get(cell, (0.0, 0.0))
+            parts[cell] = v + volumes.sum(), moment + volumes @ [t.mean(axis=0) - cell for t in tetrahedra]
+    net, both = sum(v for v, _ in parts.values()), sum(abs(v) for v, _ in parts.values())
+    assume(abs(net) > 1e-2 * both)
+    of = {cell: (np.sign(net) * v, moment / (v or 1)) for cell, (v, moment) in parts.items()}
+    parts = {cell: (v, v * np.clip(x, SNAP, 1 - SNAP)) for cell, (v, x) in of.items() if v > 0}
     total, extent = sum(v for v, _ in parts.values()), np.ptp(y, axis=0)
     surface = 2 * sum(extent[a - 1] * extent[a] for a in range(3))
     assume(slack * surface < 1e-3 * total)

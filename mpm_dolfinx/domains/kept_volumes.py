@@ -6,12 +6,14 @@ the cell.  In elastic soil, F and the volume ratios of cells are computed from t
 updated by increments.  The volumes of domains and of points would therefore drift apart, and domains would overlap.
 After a step the corners of yielded domains therefore move by the vectors d that minimise
 
-    sum_p V_p e_p^2 + SOFT^2 sum_p V_p mean |d / h|^2,  V_p e_p = V_p - V - dV/dx d.
+    sum_p V_p e_p^2 + SOFT^2 sum_p V_p (mean |d / h|^2 + sum_a mean |D_a / h|^2),  V_p e_p = V_p - V - dV/dx d.
 
 The sums are over the points p.  V_p is the volume of a point, and V is the volume of its domain.  The derivative of V
-with respect to the corners is dV/dx.  The relative volume error after the motion is e_p.  The mean is over the corners
-of the domain, and h contains the edge lengths of the domain's cell.  Shared corners move together.  Fixed corners, and
-corners of elastic domains, do not move.  Kugelstadt et al. (2019) correct cell densities in this way.
+with respect to the corners is dV/dx.  The relative volume error after the motion is e_p.  D_a is the change of d along
+an edge of axis a.  Without D_a, more narrow domains would become inverted, and corners of renewed domains would leave
+the edges on which they lie.  The means are over the domain's corners and edges, and h contains the edge lengths of the
+domain's cell.  Shared corners move together.  Fixed corners, and corners of elastic domains, do not move.  Kugelstadt
+et al. (2019) correct cell densities in this way.
 """
 
 from __future__ import annotations
@@ -20,21 +22,21 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix, csr_matrix
+from scipy.sparse import bmat, coo_matrix, csr_matrix, diags, identity
 from scipy.sparse.csgraph import connected_components
-from scipy.sparse.linalg import lsmr
+from scipy.sparse.linalg import lsmr, norm
 
 from mpm_dolfinx.base.tolerances import NEAR, SAME
 from mpm_dolfinx.domains.domain_gradient import volume_slopes
-from mpm_dolfinx.grid.grid import Grid
+from mpm_dolfinx.grid.grid import Grid, sum_by
 from mpm_dolfinx.parallel.exchange import to_root
 
-SOFT = 0.1
-"""Weight of the motion d of the corners.
+SOFT = 0.15
+"""Weight of the motion d of the corners, and of its changes along edges.
 
 Volume errors may alternate between the domains of a regular lattice.  To first order, no motion of the corners reduces
-such errors, so the weight is needed.  The result of scene "flow" in tests/plateaus.py changes by the fraction 2.5e-04
-with half this value, by 1.4e-04 with twice this value, and by 9.2e-02 with finer cells.
+such errors, so the weight is needed.  The result of scene "flow" in tests/plateaus.py changes by the fraction 1.5e-04
+with half this value, by 2.4e-04 with twice this value, and by 9.1e-02 with finer cells.
 """
 
 
@@ -72,15 +74,28 @@ def _motion(grid: Grid, domains: Domains) -> NDArray[np.float64]:
     at, whole = number[yielded], domains.volume[yielded]
     n, corners = at.shape
     share = whole[:, None] / corners / grid.sizes_at(domains.corners[yielded].mean(axis=1)) ** 2
-    weight = np.stack([np.bincount(at.ravel(), column.repeat(corners), count) for column in share.T], axis=1)
+    weight = sum_by(at.ravel(), share.T.repeat(corners, axis=1), count).T
     scale = np.divide(~held, np.sqrt(weight), out=np.zeros((count, d)), where=weight > 0)
-    # the unknowns are weighted motions and errors e, so that rows may be scaled: narrow domains have large slopes
-    values = np.column_stack([(slope * scale[at]).reshape(n, -1) / np.sqrt(whole)[:, None], np.full(n, SOFT)])
-    columns = np.column_stack([(at[:, :, None] * d + np.arange(d)).reshape(n, -1), count * d + np.arange(n)])
-    size = np.linalg.norm(values, axis=1)
-    A = csr_matrix(((values / size[:, None]).ravel(), columns.ravel(), np.arange(n + 1) * columns.shape[1]))
-    found = lsmr(A, (whole - now) / np.sqrt(whole) / size, atol=SAME**1.5, btol=SAME**1.5)[0]
+    ends = [(k, k + 2**a) for a in range(d) for k in range(corners) if not k >> a & 1]
+    edge, of = np.unique(np.sort(at[:, ends]).reshape(-1, 2) @ [count, 1], return_inverse=True)
+    stiff = np.sqrt(2 * sum_by(of.ravel(), share.T.repeat(len(ends), axis=1), len(edge)).T)
+    pairs, axes = np.stack(divmod(edge, count), axis=1)[:, None], np.arange(d)
+    values = stiff[:, :, None] * scale[pairs[:, 0]].swapaxes(1, 2) * [1, -1]
+    changes = _sparse(values.reshape(-1, 2), pairs * d + axes[:, None], count * d)
+    values = (slope * scale[at] / np.sqrt(whole)[:, None, None]).reshape(n, -1)
+    A = _sparse(values, at[:, :, None] * d + axes, count * d)
+    # the unknowns are weighted d, e and D, so that rows may be scaled: narrow domains have large slopes
+    A = bmat([[A, SOFT * identity(n), None], [changes, None, identity(changes.shape[0])]], "csr")
+    size = norm(A, axis=1)
+    off = np.append((whole - now) / np.sqrt(whole), np.zeros(changes.shape[0])) / size
+    found = lsmr(diags(1 / size) @ A, off, atol=SAME**1.5, btol=SAME**1.5)[0]
     return (found[: count * d].reshape(-1, d) * scale)[number]
+
+
+def _sparse(values: NDArray[np.float64], columns: NDArray[np.int64], count: int) -> csr_matrix:
+    """Return a matrix (m, count) with values (m, k) in columns (m, k)."""
+    m, k = values.shape
+    return csr_matrix((values.ravel(), columns.ravel(), np.arange(m + 1) * k), (m, count))
 
 
 def _joined(
@@ -93,9 +108,7 @@ def _joined(
     keys = [body.repeat(x.shape[1])]
     for column in x.reshape(-1, x.shape[2]).T:
         order = column.argsort()
-        key = np.zeros(len(column), dtype=np.int64)
-        key[order[1:]] = np.cumsum(np.diff(column[order]) > tolerance)
-        keys.append(key)
+        keys.append(np.cumsum(np.diff(column[order], prepend=-np.inf) > tolerance)[order.argsort()])
     seeded = number.ravel() >= 0
     place, node = (
         np.unique(np.ravel_multi_index(keys, [int(key.max(initial=0)) + 1 for key in keys]), return_inverse=True)[1]

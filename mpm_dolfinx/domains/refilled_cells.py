@@ -27,8 +27,8 @@ from mpm_dolfinx.points.surface_in_cells import BOX, EDGES, RING, Region, resamp
 GAP = 0.01
 """Largest gap, divided by the cell size, at which faces of two domains count as one surface.
 
-The result of scene "flow" in tests/plateaus.py changes by the fraction 2.5e-05 with half this value, by 0.0e+00 with
-twice this value, and by 9.0e-02 with finer cells.
+The result of scene "flow" in tests/plateaus.py changes by the fraction 3.1e-05 with half this value, by 0.0e+00 with
+twice this value, and by 9.1e-02 with finer cells.
 """
 CRUMB = NEAR
 """Smallest area of a part of a domain, divided by the area of its cell.

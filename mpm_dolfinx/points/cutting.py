@@ -9,7 +9,8 @@ wherever the domain lies on the grid.
 The surface of a domain has 4 edges, or in 3D 4 triangles about the middle of each face.  The triangles of neighbouring
 domains match, and do not favour a diagonal of the face.  The grid planes of one axis after another slice this surface.
 Gauss's theorem gives the volumes and first moments between a slice and the lower face of its cell, and in the column of
-cells below.  The interior of a domain is never cut.
+cells below.  The interior of a domain is never cut.  Inverted parts of a domain have negative volume, and cancel its
+overlap with neighbours.  Pieces with negative volume are left out.
 
 In axisymmetry pieces are rings.  The volume of a ring is `2 pi r_c` times the area of its section, where r_c is the
 radius of the section's centroid (Pappus).  Gradients are evaluated at the centroid of the volume,
@@ -131,7 +132,7 @@ def edges(corners: NDArray[np.float64]) -> NDArray[np.float64]:
 def centroids(corners: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the centroids (n, d), in m, of domains, or in axisymmetry of their sections.
 
-    Inverted simplices count with positive volume, as in `cut`.
+    Inverted simplices have negative volume, as in `cut`.
     """
     chunks = _chunks(len(corners), corners.shape[2])
     return _centroids(corners) if len(chunks) == 1 else np.concatenate([_centroids(corners[part]) for part in chunks])
@@ -139,11 +140,11 @@ def centroids(corners: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _centroids(corners: NDArray[np.float64]) -> NDArray[np.float64]:
     v = vertices(np.ascontiguousarray(corners.transpose(1, 2, 0)))
-    volume, middle = np.abs(simplex_volumes(v)), v[-1]
+    volume, middle = simplex_volumes(v), v[-1]
     whole, moment = np.add.reduce(volume), np.zeros(middle.shape)
     for share, simplex in zip(volume, simplices(v.shape[1]), strict=True):
         moment += share * (np.add.reduce(v[simplex]) / len(simplex) - middle)
-    return (middle + np.divide(moment, whole, out=np.zeros(moment.shape), where=whole > 0)).T.copy()
+    return (middle + np.divide(moment, whole, out=np.zeros(moment.shape), where=whole != 0)).T.copy()
 
 
 def tangled(corners: NDArray[np.float64], volume: NDArray[np.float64], axisymmetric: bool = False) -> NDArray[np.bool_]:
@@ -226,23 +227,14 @@ def _cut(grid: Grid, corners: NDArray[np.float64], second: bool, faces: bool) ->
     x = true if grid.even else np.ascontiguousarray(corners.transpose(1, 2, 0))
     in_cells, y = on_planes(grid, true, x, 1)
     v = vertices(y)
-    volume = simplex_volumes(v)
-    flat = (~volume.any(axis=0)).nonzero()[0]
+    flat = (~simplex_volumes(v).any(axis=0)).nonzero()[0]
     if len(flat):  # domains on a plane and thinner than the snapping distance: snapping would leave no volume
         in_cells[:, :, flat] = true[:, :, flat]
         y[:, :, flat] = x[:, :, flat]
         v = vertices(y)
-        volume = simplex_volumes(v)
     # segments or triangles (d, d, m): vertices and coordinates first, for fast loops in numpy
-    s = np.concatenate([v[facet] for facet in _FACETS[d][:, -1]], axis=2)
-    outward, owner = _area_vectors(s), np.arange(len(corners))[None].repeat(len(_FACETS[d]), axis=0).ravel()
-    # an inverted simplex counts with positive volume: its negative volume is subtracted twice
-    simplex, folded = np.nonzero(volume < 0)
-    if len(folded):
-        turned = v[_FACETS[d][simplex], :, folded[:, None, None]].transpose(2, 3, 0, 1).reshape(d, d, -1)
-        s = np.concatenate([s, turned, turned], axis=2)
-        outward = np.concatenate([outward, *[-_area_vectors(turned)] * 2], axis=1)
-        owner = np.concatenate([owner, *[folded.repeat(d + 1)] * 2])
+    s = np.concatenate([v[facet] for facet in simplices(d)[:, :-1]], axis=2)
+    outward, owner = _area_vectors(s), np.arange(len(corners))[None].repeat(len(simplices(d)), axis=0).ravel()
     facet = np.arange(s.shape[2])
     for axis in range(d):
         s, facet = sliced(s, facet, axis, grid)
@@ -259,18 +251,6 @@ def _area_vectors(s: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.array([e[0, 1], -e[0, 0]])
     (ax, ay, az), (bx, by, bz) = e
     return 0.5 * np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
-
-
-def _facets(dim: int) -> NDArray[np.int64]:
-    """Return the vertices of the facets of a domain's simplices.  Facet i omits vertex i."""
-    out = np.stack([np.delete(simplices(dim), k, axis=1) for k in range(dim + 1)], axis=1)
-    box = vertices(corner_bits(dim).astype(float)[:, :, None])[:, :, 0]
-    for simplex, facets in zip(simplices(dim), out, strict=True):
-        for facet in facets:
-            away = box[facet].mean(axis=0) - box[simplex].mean(axis=0)
-            if _area_vectors(box[facet][:, :, None])[:, 0] @ away < 0:
-                facet[:2] = facet[1::-1].copy()
-    return out
 
 
 class _Slots:
@@ -651,4 +631,3 @@ _CUTS = {
         2: {"below": [(_A, _B, (1, 2)), (_A, (1, 2), (0, 2))], "above": [((0, 2), (1, 2), _C)]},
     },
 }
-_FACETS = {d: _facets(d) for d in (2, 3)}
