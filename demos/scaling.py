@@ -17,7 +17,8 @@ relative errors. Runs on several processes also print the load balance and the m
 the most messages. `exchange` are the messages of the package (pieces, corners, points). `solvers` are the messages that
 PETSc counts in set-up and solution of its Krylov solvers. Messages of MUMPS and of dolfinx are not counted.
 
-With runs on one and on several processes, a cost model is fitted to the seconds T of a step of n points on P processes,
+If there are runs on one process and on several, a cost model is fitted. The time T of a step, in s, with n points on P
+processes is
 
     T = e + a n / P + b H + c log2 P,
 

@@ -188,11 +188,11 @@ CASES = {
     "couplings": (lambda: scene(numerics=mpm.Numerics(coupling=["schur-cg"])), "coupling", "['schur-cg']"),
     "a number that is to come": (lambda: mpm.Later(1), "Later: body = 1", "must be a Body"),
     "an excavation of a number": (lambda: two().stage(remove=1), "stage: remove = 1", "must be a list"),
-    "an excavation of a body": (lambda: two().stage(remove=[UPPER]), "stage: remove", "each once: 0, 1"),
+    "an excavation of a body": (lambda: two().stage(remove=[UPPER]), "stage: remove", "(0, 1), and listed once"),
     "a fill that comes twice": (
         lambda: scene([BODY, mpm.Later(UPPER)]).stage(add=[1, 1]),
         "stage: add: body 1",
-        "each once: 1",
+        "(1), and listed once",
     ),
     "reset in words": (lambda: two().stage(reset_displacement="no"), "reset_displacement", "'no'"),
     "sides in a list": (lambda: sides("Traction", ["top", "left"], 1.0), "Traction: side = ", "['top', 'left']"),

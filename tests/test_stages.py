@@ -127,8 +127,8 @@ def test_walls_plates_and_given_displacements_come_and_go():
 @pytest.mark.parametrize(
     "stage, message",
     [
-        ({"remove": [2]}, "stage: remove: body 2, must be one of the bodies that are present, each once: 0"),
-        ({"add": [0]}, "stage: add: body 0, must be one of the bodies that are still to be added, each once"),
+        ({"remove": [2]}, r"remove: body 2, must be one of the bodies that are present \(0, 1\), and listed once"),
+        ({"add": [0]}, "stage: add: body 0, must be one of the bodies that are still to be added"),
         ({"conditions": [mpm.Drained("top")]}, "must be in a scene with fluid"),
         ({"gravity": (0, -1)}, "gravity: the scene has none"),
     ],

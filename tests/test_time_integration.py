@@ -168,7 +168,7 @@ def test_a_term_of_the_velocity_makes_a_dry_body_creep_exactly():
         return eta * ufl.inner(ufl.sym(points.grad(velocity)), ufl.sym(points.grad(v))) * points.dx
 
     for options in ({"fluid": False}, {"material": replace(SOFT, conductivity=0.0)}):
-        with pytest.raises(ValueError, match=r"velocities have no error estimate, must be left out"):
+        with pytest.raises(ValueError, match=r"must be left out: without flow of fluid, velocities have no error"):
             loaded(load, cells=2, terms=[damper], **options).run(20.0, rtol=1e-2)
 
     def error(steps):
@@ -331,7 +331,7 @@ BAD = {
     "no step": ({}, r"dt = None, must be given, or rtol"),
     "rtol too large": ({"rtol": 1.0}, r"rtol = 1\.0, must be in \[1e-07, 1\)"),
     "rtol below the solver's": ({"rtol": 1e-9}, r"rtol = 1e-09, must be in \[1e-07, 1\)"),
-    "both output rules": ({"dt": 1.0, "rtol": 1e-3, "t_eval": [1.0]}, r"dt = 1\.0: .* must be left out"),
+    "both output rules": ({"dt": 1.0, "rtol": 1e-3, "t_eval": [1.0]}, r"dt = 1\.0, must be left out with rtol and"),
     "times that fall": ({"rtol": 1e-3, "t_eval": [2.0, 1.0]}, r"t_eval = .*must be increasing times in \(0, 4\] s"),
     "times after the end": ({"dt": 1.0, "t_eval": [2.0, 9.0]}, r"t_eval = .*must be increasing times in \(0, 4\] s"),
     "times of words": ({"dt": 1.0, "t_eval": ["a"]}, r"t_eval = "),

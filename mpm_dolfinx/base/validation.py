@@ -111,7 +111,7 @@ def chosen(name: str, values, among: Sequence[int], what: str) -> None:
     for i, value in enumerate(values):
         if not isinstance(value, (int, np.integer)) or value not in among or value in values[:i]:
             options = ", ".join(map(str, among)) or "there is none"
-            raise ValueError(f"{name}: body {line(value)}, must be one of the {what}, each once: {options}")
+            raise ValueError(f"{name}: body {line(value)}, must be one of the {what} ({options}), and listed once")
 
 
 def all_of(name: str, values, kind: type | tuple[type, ...], least: int = 0) -> None:
@@ -201,7 +201,7 @@ def takes(function: Callable) -> tuple[str, ...] | None:
 
 
 def _names(function: Callable, parameters: list[Parameter] | None) -> tuple[str, ...] | None:
-    """Return which arguments a function with these parameters takes, see `takes`."""
+    """Return the result of `takes` for a function with known parameters."""
     if parameters is None or (len(parameters) == 1 and parameters[0].name not in PLACES):
         return ("t",)
     names = tuple([p.name for p in parameters])

@@ -19,11 +19,11 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Body:
-    """A seeded body: the reference geometry of all its particle domains, the same on every process.
+    """A seeded body: the reference geometry of all its particle domains.  Every process has an equal object.
 
     Each domain is the image of a box under `map`.  Subclasses define the edge lengths `spacing` of the boxes, in m.
-    Their shape is (n, d), or (d,) if all boxes are equal.  A `RowsBody` has the smallest edge lengths (d,).  Large
-    bodies are processed in chunks, so no array over all domains is stored.
+    Their shape is (n, d), or (d,) if all boxes are equal.  In a `RowsBody`, `spacing` (d,) contains the smallest edge
+    lengths.  Large bodies are processed in chunks, so no array over all domains is stored.
     """
 
     material: int = 0  # index in the scene's list of materials

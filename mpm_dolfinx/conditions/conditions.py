@@ -244,8 +244,8 @@ class Drained(Condition):
     Raises
     ------
     ValueError
-        The pressure is not finite.  The scene raises the error without fluid, without a point on the side, or with
-        another `Drained` or `Inflow` on the same part of a face.
+        The pressure is not finite.  The scene raises the error without fluid, or without a point on the side.  Another
+        `Drained` or `Inflow` is on the same part of a face.
     """
 
     side: str

@@ -101,7 +101,7 @@ class ContactLaw:
         self.pairs = pairs
         key, self.of = np.unique(pairs.number * self.grid.num_local + pairs.cell, return_inverse=True)
         self.key = key
-        """Key of each condition (k,): the index of the contact times the number of local cells, plus the local cell."""
+        """Key (k,) of each condition: `i * num_local + c`, from the indices i of the contact and c of the cell."""
         self.cell = key % self.grid.num_local
         self.area = sum_by(self.of, pairs.area, len(key))
         strength = np.array([(contact.friction, contact.adhesion) for contact in contacts], dtype=float)

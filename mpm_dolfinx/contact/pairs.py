@@ -62,7 +62,7 @@ class Pairs:
 
     @property
     def largest_coordinate(self) -> NDArray[np.float64] | float:
-        """Largest coordinates, in m, from which the gaps are computed, for the rounding errors of the gaps."""
+        """Largest coordinates, in m, from which gaps are computed.  They determine the rounding errors of the gaps."""
         return self.grid.reach
 
     def other_side(self) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:

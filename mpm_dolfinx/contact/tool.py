@@ -67,8 +67,8 @@ class Tool:
     displacement : (d,) or callable t (s) -> (d,), m
         Displacement from the initial position, also in later stages.  In axisymmetry, it must be along the axis.
     rotation_rad : float or callable t (s) -> float, rad
-        Counterclockwise rotation about `centre`, which precedes the displacement.  Tools can rotate only in 2D, and not
-        in axisymmetry.
+        Counterclockwise rotation about `centre`.  The tool is rotated first, and then displaced.  Tools can rotate only
+        in 2D, and not in axisymmetry.
     centre : (d,), m
         Centre of rotation and reference of moments.  In a free tool, it is also the centre of mass.  The centre moves
         with the tool.  The default is the centroid of a free disc or polygon, and the origin for other tools.
@@ -84,16 +84,16 @@ class Tool:
     direction : (d,)
         Direction of the load, of any length.  In axisymmetry, it must be along the axis.
     mass
-        Mass of a free tool, kg (kg/m in plane strain), > 0, for bodies with inertia.  The tool starts from its position
-        after `displacement`.  Weight, load and contact forces move the tool along `direction`, by default in any
-        direction.  The tool keeps its position while an initial stress is balanced.  Results are the displacement
+        Mass of a free tool, kg (kg/m in plane strain), > 0, for bodies with inertia.  The tool starts at its initial
+        position plus `displacement`.  Weight, load and contact forces move the tool along `direction`, by default in
+        any direction.  The tool keeps its position while an initial stress is balanced.  Results are the displacement
         `tool_travel` (d,), in m, and the velocity `outcome("tool_velocity")` (d,), in m/s.
     velocity : (d,), m/s
         Initial velocity of a free tool.
     moment
         Moment of inertia of a free tool about `centre`, kg m^2 (kg m in plane strain), > 0; only in 2D.  The default is
-        that of a uniform disc or polygon.  Other shapes, and tools with `direction`, rotate only if `moment` is
-        specified.  Results are `outcome("tool_rotation")`, in rad, and `outcome("tool_spin")`, in rad/s.
+        the moment of inertia of a uniform disc or polygon.  Other shapes, and tools with `direction`, rotate only if
+        `moment` is specified.  Results are `outcome("tool_rotation")`, in rad, and `outcome("tool_spin")`, in rad/s.
     spin
         Initial angular velocity of a free tool, rad/s, counterclockwise.
     name

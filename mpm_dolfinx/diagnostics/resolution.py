@@ -23,13 +23,11 @@ from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
 from mpm_dolfinx.points.material_points import body_of
 
 FULL = 1.2
-"""Largest volume fraction in a cell without a warning.  Intact domains reach 1.08 when a footing sinks by half its
-width.
-"""
+"""Volume fraction above which a cell causes a warning.  Intact domains reach 1.08 under a footing half a width deep."""
 
 
 def warn_overlaps(cut: CutDomains, bodies: Sequence[Body]) -> Callable[..., Any] | None:
-    """Warn about the fullest cell if domains overlap.  Return the next check, or None after a warning."""
+    """Warn about the fullest cell if domains overlap.  Return a function for the next check, or None if warned."""
     grid, points = cut.grid, cut.points
     volume = cut.to_cells(points.volume0 * points.J) * cut.pieces_to_cells(cut.pieces.fraction)
     fill = sum_by(cut.cells, cut.plane(volume)[0], grid.num_owned)[cut.cells] / grid.volumes(cut.cells)
@@ -59,11 +57,11 @@ def bodies_in(cut: CutDomains, bodies: Sequence[Body], cell: int) -> tuple[list[
 
 
 LOSS = 0.03
-"""Fraction of its deformation that a soft material may lose in cells with a stiffer material without a warning."""
+"""A warning is issued if a soft material loses this fraction of its deformation in cells with stiffer materials."""
 AGAIN = 2.0
 """Factor by which the lost fraction must grow before the next warning.  Moving interfaces change the lost fraction."""
 FINE = 0.1
-"""Smallest lost fraction of a cell's deformation that counts.  Cells with stiffness ratios below 2.1 lose less."""
+"""Fraction of a cell's deformation below which a loss is ignored.  The loss is less with stiffness ratios below 2.1."""
 
 
 def warn_mixed(
@@ -125,21 +123,21 @@ def _losses(cut: CutDomains, volume: NDArray[np.float64], modulus: NDArray[np.fl
     return np.where(loss > FINE * total, loss, 0.0), contrast, softest
 
 
-COARSE = 0.7  # fraction of a cell: in larger domains, constant stress costs more stiffness than Q1 bending adds
+COARSE = 0.7  # domain size in cells, above which constant stress lowers the stiffness more than Q1 bending raises it
 FEW = 3  # points over the thickness at which bending is an eighth too large.  Source: exact, 1 / (n^2 - 1)
 SLENDER = 4  # length divided by thickness from which on a body counts as a beam
-LOST_WET = 2.5  # lost fraction of a wet beam's stiffness, times n^2: 1.8, 2.3, 3.2 for n = 4, 8, 16 in sealed beams
+LOST_WET = 2.5  # lost fraction of a wet beam's stiffness, times n^2; undrained: 1.8 (n = 4), 2.3 (n = 8), 3.2 (n = 16)
 FEW_WET = int((100 * LOST_WET) ** 0.5)  # points over the thickness at which the loss is 1 %.  Source: exact
 SLENDER_WET = 2  # length divided by thickness from which on a wet body counts as a beam
 
 
 def warn_thin(grid: Grid, bodies: Sequence[Body], walls: Mapping[str, str], wet: bool) -> None:
-    """Warn about each slender body that can bend, with one point per cell and too few points over its thickness.
+    """Warn about each slender body that can bend, and has one point per cell and too few points over its thickness.
 
     The increment of stress is constant in a cut domain.  In a single step, n points over the thickness therefore give
-    `1 - 1/n^2` of the bending stiffness, and more in several steps (`domain_slopes`).  A body with one point over its
-    thickness carries no moment.  It creeps from step to step, because only the stress increment of a step resists
-    bending. Measurements show that saturated bodies (`wet`) lose more stiffness, and continue to creep.
+    `1 - 1/n^2` of the bending stiffness.  In several steps the fraction is larger (`domain_slopes`).  A body with one
+    point over its thickness carries no moment.  It creeps from step to step, because only the stress increment of a
+    step resists bending.  Measurements show that saturated bodies (`wet`) lose more stiffness, and continue to creep.
     """
     few, slender = (FEW_WET, SLENDER_WET) if wet else (FEW, SLENDER)
     for i, body in enumerate(bodies):

@@ -25,10 +25,10 @@ def check_held(
 
     `active`: cells of this process that contain pieces of domains.
     `free` (nodes, d): whether no wall fixes a displacement component.
-    `holds`: constraints by prescribed displacements, tools and contact. Each is a tuple of the constrained cells (n,),
-    the cells (n,) of the part in contact or None, positions (n, d) in m, and directions (n, d). The cells of the part
-    in contact are lexicographic indices. Of two parts in contact, a constrained part constrains the other part.
-    `each`: whether to check each connected part, not only all parts together.
+    `holds`: constraints by prescribed displacements, tools and contact. Each is a tuple of four arrays: constrained
+    cells (n,), opposite cells (n,) in a contact, positions (n, d) in m, and directions (n, d). Opposite cells are
+    lexicographic indices, or None without a contact between parts. A fixed part fixes the part in contact with it.
+    `each`: whether to check each connected part alone. Otherwise all parts are checked together.
 
     Raises
     ------

@@ -25,7 +25,7 @@ from mpm_dolfinx.points.material_points import MaterialPoints, middle
 STILL = 3e-4
 """Largest motion of corners, divided by the cell size, for which a cut remains valid.
 
-With a new cut in every step, pressures in a consolidating column of ten cells change by 7e-5 of the load, and the
+A column of ten cells consolidates.  With a new cut in every step, pressures change by 7e-5 of the load, and the
 settlement changes by 3e-5 of its value.  Both changes are proportional to STILL.
 """
 

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Parts of seeded domains after division and merging: their intervals, identifiers, corners and faces.
 
-A part is the image of a box [a, b] under the bilinear or trilinear map of its domain, both in the reference
-configuration and in the deformed one.  A whole domain is the interval [0, 1] along each axis.  A division bisects an
-interval, and two parts merge if they are the halves of one interval.  On the lattice of a box, whole domains merge as
-well, to [0, 2], [0, 4], and so on.
+A part is the image of a box [a, b] under the bilinear or trilinear map of its domain.  This holds in the reference and
+in the deformed configuration.  A whole domain is the interval [0, 1] along each axis.  A division bisects an interval,
+and two parts merge if they are the halves of one interval.  On the lattice of a box, whole domains merge as well, to
+[0, 2], [0, 4], and so on.
 """
 
 from __future__ import annotations

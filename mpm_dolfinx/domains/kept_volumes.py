@@ -8,12 +8,12 @@ After a step the corners of yielded domains therefore move by the vectors d that
 
     sum_p V_p e_p^2 + SOFT^2 sum_p V_p (mean |d / h|^2 + sum_a mean |D_a / h|^2),  V_p e_p = V_p - V - dV/dx d.
 
-The sums are over the points p.  V_p is the volume of a point, V is the volume of its domain, and dV/dx is the
-derivative of V with respect to the corners.  The relative volume error after the motion is e_p.  D_a is the change of d
-along an edge of axis a.  Without D_a, more narrow domains would become inverted, and corners of renewed domains would
-leave the edges on which they lie.  The means are over the domain's corners and edges, and h are the edges of cells.
-Shared corners move together.  Corners of elastic domains and held corners do not move.  Kugelstadt et al. (2019)
-correct densities of cells in this way.
+The sums are over the points p.  V_p is the volume of a point, and V is the volume of its domain.  The derivative of V
+with respect to the corners is dV/dx.  The relative volume error after the motion is e_p.  D_a is the change of d along
+an edge of axis a.  Without D_a, more narrow domains would become inverted, and corners of renewed domains would leave
+the edges on which they lie.  The means are over the domain's corners and edges, and h contains the edge lengths of the
+domain's cell.  Shared corners move together.  Fixed corners, and corners of elastic domains, do not move.  Kugelstadt
+et al. (2019) correct cell densities in this way.
 """
 
 from __future__ import annotations

@@ -97,13 +97,13 @@ class Feeds:
         return {}
 
     def passing(self, at: Any, fluid: Fluid) -> Mapping[str, NDArray[np.float64]]:
-        """Return the rates of a substep that determine `volumes`.  All processes must call this."""
+        """Return the rates in a substep, from which `volumes` computes volumes.  All processes must call this."""
         return {}
 
     def volumes(
         self, rates: Sequence[Mapping[str, NDArray[np.float64]]], seconds: Sequence[float]
     ) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return the volumes since the conditions began, in m^d, by quantity and condition.
+        """Return the volumes, in m^d, since the start of the conditions, by quantity and name of the condition.
 
         `rates`: results of `passing` in the substeps of the last step.  `seconds`, s: time weights of these substeps.
         """

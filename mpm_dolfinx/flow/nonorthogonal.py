@@ -2,7 +2,7 @@
 """Non-orthogonal correction of fluxes between cells and through open sides.
 
 The two-point flux takes the difference of two cell pressures as the pressure difference across the face.  In bodies
-inclined to the grid, however, the two centroids are also offset along the face, by a vector t of up to half a cell
+inclined to the grid, the two centroids are also offset along the face.  The offset is a vector t of up to half a cell
 size.  This offset causes an error that does not decrease with the cell size.  Let G be the pressure gradient in a cell
 minus the unit weight of the fluid.  The corrected flux is (see `storage` for other symbols)
 
@@ -109,7 +109,7 @@ class Gradients:
 
     @cached_property
     def _units(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the gradients for a unit pressure difference to a neighbour, and to an open side."""
+        """Return two arrays of gradients: for a unit pressure difference to a neighbour, and to an open side."""
         known, d = self._known, self._separation.shape[2]
         at, no_flow = self._at[known], self._no_flow(self._contents, self._sides)[self.rows]
         size = np.linalg.norm(self._sides.area, axis=1)[self._faces[known]]

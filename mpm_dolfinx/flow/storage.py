@@ -30,9 +30,9 @@ term `max(0, tau d - dt kappa / d) A [p - p_n]`.  Here tau (1/Pa) is the strengt
 term raises the coefficient `dt kappa A / d` of a face to at least `tau d A`.  The term conserves fluid, and it is zero
 in steady states.
 
-For elastic soil, tau is a quarter of Silvester and Kechkar's patch value (Camargo, White and Borja 2021).  Soil in
-plastic flow needs a tau up to a hundred times larger.  The increase of tau acts on second differences only
-(`second_differences`), because damping of jumps would smear steep pressures.
+For elastic soil, tau is a quarter of the value that Silvester and Kechkar give for patches of elements (Camargo, White
+and Borja 2021).  Soil in plastic flow needs a tau up to a hundred times larger.  The increase of tau acts on second
+differences only (`second_differences`), because damping of jumps would smear steep pressures.
 """
 
 from __future__ import annotations
@@ -437,7 +437,7 @@ class StorageProblem:
         return {name: values for one, at in both for name, values in one.run_off(at, fluid).items()}
 
     def passing(self) -> list[Mapping[str, NDArray[np.float64]]]:
-        """Return the rates of a converged substep that determine `volumes`."""
+        """Return the rates in a converged substep, from which `volumes` computes volumes."""
         fluid, both = self._fluid, zip(self._feeds, self._flow(False).at, strict=True)
         return [one.passing(at, fluid) for one, at in both]
 

@@ -9,7 +9,7 @@ multilinear function v on a box of dimension d equals the first d + 1 terms of i
 with the offset xi = x_p - x_mid of the point p from the midpoint x_mid.  The right side is evaluated at the midpoint.
 It is plain UFL, integrated by the one-point rule.
 
-The list of cells of the integral contains each cell once for each point in the cell, so that the assembler calls the
+The list of cells of the integral contains each cell once for each point in the cell.  The assembler therefore calls the
 kernel once for each point.  The offset xi and all other data of the points are DG0 coefficients, with one row for each
 entry of the list.  The integral of f w / |cell| over the list is sum_p w_p f(x_p), with the weights w_p of the points
 and the cell volume |cell|.
@@ -207,7 +207,7 @@ class Places(Keyed):
 
     @cached_property
     def dofs(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Dofs of Q1 vectors in all cells with points, and indices of each cell's dofs in this array."""
+        """Two arrays: dofs of Q1 vectors in cells with points, and indices of each cell's dofs in the first array."""
         d = self.grid.dim
         nodes, at = np.unique(self.grid.cell_nodes[self.filled], return_inverse=True)
         return tuple((rows.reshape(-1, 1) * d + np.arange(d)).astype(np.intp).ravel() for rows in (nodes, at))
@@ -218,7 +218,7 @@ class Places(Keyed):
         return Places(self.grid, self.cells[rows], self.x[rows], mixed, hoop)
 
     def shape_gradients(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the gradients of the shape functions at points, or their means over pieces, in 1/m."""
+        """Return the gradients, in 1/m, of the shape functions at points, or the means of the gradients over pieces."""
         mixed = None if self.mixed is None else self.mixed[chosen]
         return self.grid.shape_gradients(self.cells[chosen], self.x[chosen], mixed)
 

@@ -2,8 +2,8 @@
 """The unknowns of a step: their numbering, vectors and matrices.
 
 Functions are defined on the whole grid.  Vectors, matrices and factorisations contain only the free degrees of freedom
-of active nodes or cells.  All other degrees of freedom have the index -1 in the local-to-global map, which PETSc
-ignores, so that dolfinx can assemble directly into the vectors and matrices.
+of active nodes or cells.  All other degrees of freedom have the index -1 in the local-to-global map.  PETSc ignores
+this index, so dolfinx can assemble directly into the vectors and matrices.
 """
 
 from __future__ import annotations

@@ -322,7 +322,7 @@ class Grid:
         lines along all axes give a grid of equal cells.
     follow : Tool, or callable -> (n,) along each axis, m
         Object that the lines follow, at each reset of the grid.  With a tool, the smallest cells of `lines` move like
-        the centre of the tool's ball, the tip of its cone, or the mean of its corners.  If the tool's shape is a
+        one point: the centre of a ball, the tip of a cone, or the mean of the corners.  If the tool's shape is a
         function, they move like its `centre`.  The other cells widen or narrow.  The tool must be a condition of the
         first stage.  Lines do not move in stages without this tool.  A function depends on time t (s), the positions x
         (n, d) of all points, or both.  The function returns all lines.  Along each axis, their number, first and last
@@ -568,12 +568,12 @@ class Grid:
         return self._cells
 
     def share(self, load: NDArray[np.float64]) -> None:
-        """Create the mesh, unless it exists, with cells distributed among processes by their loads (cells,)."""
+        """Create the mesh if it does not exist.  Divide the loads (cells,) of cells evenly among processes."""
         if self._cells is None:
             self._cells = self._made(boxes(load.reshape(self.shape), self.comm.size))
 
     def shared(self, load: NDArray[np.float64], keep: bool) -> Grid:
-        """Return a grid whose cells are distributed by their loads: this grid, or an equal grid with another mesh.
+        """Return this grid, or an equal grid with another mesh, whose loads are evenly distributed among processes.
 
         `load` (cells,): load >= 0 of each cell, such as its number of points
         `keep`: whether to return this grid in any case, because other objects were created on its mesh
@@ -690,7 +690,7 @@ class Grid:
         return TURN * x[:, 0] if self.axisymmetric else 1.0
 
     def number(self, index: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the lexicographic indices (n,) of cells of the first copy with indices (n, d) along the axes."""
+        """Convert indices (n, d) of cells along axes to lexicographic indices (n,) in the first copy of the grid."""
         return np.ravel_multi_index(tuple(index.T), tuple(self.shape))
 
     def index(self, x: NDArray[np.float64]) -> NDArray[np.int64]:

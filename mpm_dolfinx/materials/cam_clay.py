@@ -12,9 +12,9 @@ with associated flow.  P_0 is the pressure at F = I, G is the shear modulus, M i
 P_c is the size of the yield surface, and e_v^p is the plastic volume strain.  The logarithm of the specific volume is
 linear in ln P (bilogarithmic law), with the slope lambda in first loading and the slope kappa in unloading.
 
-The stress at the end of a step is computed from the trial stresses P_t and Q_t, and from the size P_c,n of the yield
-surface at the start of the step.  The number a is the plastic compaction divided by kappa.  The number h is defined by
-6G dgamma / M^2 = exp(h) - 1, with the plastic multiplier dgamma.  With w = (Q_t / (M P_t))^2,
+The stress at the end of a step is computed from the trial stresses P_t and Q_t, and from P_c,n.  P_c,n is the size of
+the yield surface at the start of the step.  The number a is the plastic compaction divided by kappa.  The number h is
+defined by 6G dgamma / M^2 = exp(h) - 1, with the plastic multiplier dgamma.  With w = (Q_t / (M P_t))^2,
 
     P = P_t exp(-a),   Q = Q_t exp(-h),   P_c = P_c,n exp(rho a),   rho = kappa / (lambda - kappa),
     (6G kappa / M^2) a = (exp(h) - 1) (2P - P_c).

@@ -192,7 +192,7 @@ def knows_space(grid: Grid, m: Skeleton) -> bool:
 def by_scene(
     grid: Grid, cell_size: float | None = None, law: type[Skeleton] | None = None, points: FormPoints | None = None
 ) -> dict[str, Any]:
-    """Return the time and the cell size as UFL, the arguments `BY_SCENE` of laws.
+    """Return the arguments `BY_SCENE` of laws as UFL: the time since the start of the step, and the cell size.
 
     points: integration points of the law.  If cells have several sizes, each point stores the size of its cell.
     """

@@ -285,7 +285,7 @@ class SceneMaterials:
     def saturation(
         self, points: MaterialPoints, p: NDArray[np.float64], of: NDArray[np.int64] | slice = slice(None)
     ) -> tuple[NDArray[np.float64], ...]:
-        """Return saturation, dS/dp, chi and relative permeability at pressures p, in Pa, of the points `of`."""
+        """Return saturation S, dS/dp, chi and relative permeability at pressures p, in Pa.  `of`: indices of points."""
         return self.saturations(self.retention_rows(points)[of], p)
 
     @cached_property

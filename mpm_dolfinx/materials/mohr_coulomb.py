@@ -13,8 +13,8 @@ principal directions e_i.
 The return mapping keeps the order of the principal stresses.  The final stress lies on one of ten faces, edges and
 vertices.  On each of these the final stress is linear in the trial stress (de Souza Neto, Peric and Owen 2008, 8.2,
 without the cut-off).  A final stress is valid if it is admissible, the order is kept, and all plastic multipliers are
->= 0.  Of the ten possible final stresses, the return mapping uses the stress with the smallest violation, which is a
-rounding error.  Derivatives are computed in numpy, and are exact even for equal eigenvalues.
+>= 0.  Of the ten possible final stresses, the return mapping uses the stress that violates these conditions least.  Its
+violation is a rounding error.  Derivatives are computed in numpy, and are exact even for equal eigenvalues.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 """Drucker and Prager's law with a viscosity, and with a cohesion that decreases with slip.
 
 Softening localises in shear bands one cell wide.  If the cohesion depended on strain, the dissipated work would
-decrease with the cell size.  The cohesion c therefore depends on the slip gamma h of a band, with the plastic shear
-strain gamma and the cell size h (crack band: Bazant and Oh 1983; Pietruszczak and Mroz 1981),
+decrease with the cell size.  The cohesion c therefore depends on the slip gamma h of a band.  Here gamma is the plastic
+shear strain, and h is the cell size (crack band: Bazant and Oh 1983; Pietruszczak and Mroz 1981),
 
     c = c_0 - (c_0 - c_r) min(1, gamma h / s).
 

@@ -11,7 +11,7 @@ points
     (3, 3), with f_r / r.  `points.F` is the deformation gradient at the start of the step, in the shape of grad u, with
     the volume ratio as determinant.  `points.position` is the position at the start of the step.
     `points.displacement` is the displacement since the start of the run, or since a stage that set it to zero.  Other
-    attributes are parameters that are functions of position, and the laws' state variables.
+    attributes are the laws' state variables, and parameters that are functions of position.
 t
     Time at which the balances hold, s, as a UFL constant: the end of the step or of its first substep.
 
@@ -73,8 +73,8 @@ def call(function: Callable, kind: str = "UFL", /, **available):
 def expression(function: Callable, shapes: Sequence[tuple[int, ...]], of: str = "", **available):
     """Return the result of a user-defined function as a UFL expression with one of the given shapes.
 
-    ValueError is raised if the function fails, or if its result is not UFL, has a wrong shape, or does not depend on
-    the argument `of`.
+    ValueError is raised if the function fails.  It is also raised if the result is not UFL, has a wrong shape, or does
+    not depend on `of`.
     """
     value = call(function, **available)
     allowed = f"UFL of shape {' or '.join(map(str, shapes))}{f' that depends on {of}' if of else ''}"

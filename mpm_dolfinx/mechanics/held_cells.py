@@ -166,10 +166,10 @@ class HeldCells:
     def rows(self, axis: int, given: NDArray[np.bool_], free: NDArray[np.bool_]) -> tuple:
         """Return the penalties on one component, with their stiffness, gap and distribution of the force to nodes.
 
-        Where a side ends at a wall, its penalties omit nodes that the wall fixes, because the free nodes of the cell
-        would otherwise oscillate along the side.  The prescribed displacement is also extrapolated to the wall.  A
-        penalty is omitted if the extrapolated value exceeds half of the cell's mean, at the start or the end of the
-        step, and if other penalties of the condition hold a free node of the cell.
+        Where a side ends at a wall, its penalties omit nodes that the wall fixes.  The free nodes of the cell would
+        otherwise oscillate along the side.  The prescribed displacement is also extrapolated to the wall.  A penalty is
+        omitted if the extrapolated value exceeds half of the cell's mean, at the start or the end of the step, and if
+        other penalties of the condition hold a free node of the cell.
 
         given (conditions,): whether each condition prescribes component `axis`.
         free (nodes,): whether no wall fixes the node.

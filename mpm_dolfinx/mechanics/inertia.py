@@ -166,19 +166,19 @@ class InertiaForms:
         self._ghost = kinks(grid, V, GHOST_MASS * ufl.avg(self.density), 3)
 
     def set_substep(self, inertia: Inertia | None, midpoint: bool) -> None:
-        """Set the acceleration in the forms, zero without inertia, and whether the substep uses a midpoint rule."""
+        """Set the acceleration in the forms (zero without inertia), and whether the substep uses a midpoint rule."""
         self.midpoint.value = float(midpoint and inertia is not None)
         self._rate.value = 0.0 if inertia is None else inertia.rate
         if inertia is not None:
             self._flight.x.array[:] = inertia.flight
 
     def at(self, cells: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return accelerations, in m/s^2, at one place in each cell from the shape functions there."""
+        """Return accelerations, in m/s^2, at places in cells.  `values` are the shape functions at these places."""
         nodal = self._rate.value * (self._u.x.array - self._flight.x.array).reshape(-1, self.grid.dim)
         return np.einsum("nk,nkd->nd", values, nodal[self.grid.cell_nodes[cells]])
 
     def _seen(self, chords: Latest[tuple[NDArray, NDArray]], which: int, data: PointData) -> NDArray[np.float64]:
-        """Return the gradients for laws, or the rotations of their stresses, see `chord`.
+        """Return the gradients for laws, or the rotations of the laws' stresses, see `chord`.
 
         chords: the last result, shared by all forms at the same u.
         """

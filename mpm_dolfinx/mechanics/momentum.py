@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: MIT
-"""Balance of momentum: Q1 displacements on the grid, integrated over the pieces of particle domains in cells.
+"""Balance of momentum for Q1 displacements on the grid.  Integrals are sums over pieces of particle domains.
 
 The displacement increment u of the step defines Delta = I + grad u, F = Delta F_n, J_n = det F_n and
 J_Delta = det Delta.  The residual is the derivative of
 
     int [psi(F) / J_n - alpha p J_Delta] dV_n  -  work of the loads,
 
-with the energy psi of the skeleton, Biot's coefficient alpha and the pore pressure p.  That is
+with the energy psi of the skeleton, Biot's coefficient alpha and the pore pressure p.  The residual is thus
 `int (P' - alpha p J_Delta Delta^-T) : grad v dV_n = int rho g . v dV_n + tractions`, with the density rho, the
 acceleration of gravity g and the test function v.  P' is the first Piola-Kirchhoff effective stress relative to the
 start of the step.  A law may define the stress instead of psi.
@@ -532,7 +532,7 @@ class MomentumProblem:
 
         For the first result, the rounding error at each node is subtracted from the residual.  With `first` it is not
         subtracted, so that even a load below the error causes a solve.  For the second result, the force scale at an
-        unknown is at least `of_whole` divided by the tolerance, so that a residual within rounding has converged.
+        unknown is at least `of_whole` divided by the tolerance.  A residual within rounding has thus converged.
 
         r, scales (parts,), in N: residuals and force scales.
         """

@@ -55,7 +55,7 @@ def corner_share(material: Skeleton, wet: bool) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class QuadratureData:
-    """Integration points of a step, with their fields."""
+    """Integration points of a step, with their fields.  A part has the points of one law (`SceneMaterials.parts`)."""
 
     pieces: PointData  # all integration points
     parts: tuple[PointData, ...]  # integration points of each part

@@ -190,15 +190,15 @@ def cut(grid: Grid, corners: NDArray[np.float64], second: bool = False, faces: b
 def on_planes(
     grid: Grid, true: NDArray[np.float64], x: NDArray[np.float64], axes: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return positions in units of cells, and positions for slicing, both snapped to grid planes nearer than
-    `Grid.snap`.
+    """Return positions in units of cells, and positions for slicing.  Positions closer to a grid plane than `Grid.snap`
+    are moved onto this plane.
 
     If all cells are equal, positions for slicing are in units of cells.  Otherwise they are in m, because domain edges
     are straight in m.
 
     `true`: positions from the grid's lower corner, in units of cells.
-    `x`, in m: these positions from the grid's base.
-    `axes`: array axis of the position's components.
+    `x`, in m: the same positions, measured from the grid's base.
+    `axes`: axis of both arrays along which the d components of a position are stored.
     """
     shape = [1] * true.ndim
     shape[axes] = grid.dim

@@ -242,7 +242,7 @@ class Times:
             raise ValueError("dt = None, must be given, or rtol for adaptive steps")
         if given is not None and interval is not None and rtol is not None:
             raise ValueError(
-                f"dt = {line(interval)}: with rtol and t_eval there is no output interval, must be left out"
+                f"dt = {line(interval)}, must be left out with rtol and t_eval, because t_eval are the output times"
             )
         self.interval, self.each = 0.0, given is None and interval is None
         """Output interval, in s, or 0 without equal intervals; and whether every step is an output."""
@@ -314,7 +314,7 @@ def step_rule(times: Times, rtol: float | Adaptive | None, scene: Scene, points:
     inertia = scene.momentum.inertia is not None
     if (scene.momentum.own.rates or timed) and not scene.flows and not inertia:
         why = "without flow of fluid, velocities have no error estimate"
-        raise ValueError(f"rtol = {line(rtol)}: {why}, must be left out")
+        raise ValueError(f"rtol = {line(rtol)}, must be left out: {why}")
     first = times.after(times.start)[0] - times.start
     if len(scene.substeps) > 1:  # a scene without time derivatives has no such error
         # for a load that grows from zero the relative error is ERROR dt c_v / h^2

@@ -81,14 +81,14 @@ def run(
         interval. With `rtol`, but without `dt` and `t_eval`, every step is an output.
     rtol
         Tolerance of adaptive steps, or `Adaptive`: the tolerance with limits of the steps. The estimated error of the
-        pore pressures stays below about `rtol` times the larger of two changes: the largest since the start of the run,
-        and the undrained change of the step. `rtol` is at least ten times `tolerance`, and < 1. If no fluid flows, the
-        steps are the output intervals. A term or law that depends on velocity then raises ValueError, because its error
-        cannot be estimated. With inertia the error of the motion is limited too, relative to the largest motion since
-        the start, see `motion_error`. In unsaturated soil the error of the water content is limited too, relative to
-        its largest change in a step so far. The estimate is a fraction of a first-order step's error, see
-        `solve.newton.ERROR`. The largest true error of a run was 0.7 to 5 times the largest estimate, and 5 times
-        directly after a jump of the load.
+        pore pressures stays below about `rtol` times the larger of two pressure changes: the largest change since the
+        start of the run, and the undrained change in the step. `rtol` is at least ten times `tolerance`, and < 1. If no
+        fluid flows, the steps are the output intervals. A term or law that depends on velocity then raises ValueError,
+        because its error cannot be estimated. With inertia the error of the motion is limited too, relative to the
+        largest motion since the start, see `motion_error`. In unsaturated soil the error of the water content is
+        limited too. Its limit is relative to the largest change of the water content in a step so far. The estimate is
+        a fraction of a first-order step's error, see `solve.newton.ERROR`. The largest true error of a run was 0.7 to 5
+        times the largest estimate. The factor was 5 directly after a jump of the load.
     t_eval : (n,), s
         Output times, increasing, in (t, t_end]; t_end is always an output time. Steps end at output times.
     until

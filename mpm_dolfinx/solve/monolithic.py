@@ -51,7 +51,7 @@ of 2e-5.
 """
 
 IDLE = object()
-"""Replaces a context of PETSc after each solve.  Otherwise PETSc would keep all objects of the last solve."""
+"""Takes the operator's place in PETSc after each solve.  Otherwise PETSc would keep all objects of the last solve."""
 Scale = NDArray[np.float64] | float
 Inverses = tuple[PETSc.PC, PETSc.PC]
 """Preconditioners that approximate K^-1 and P^-1."""

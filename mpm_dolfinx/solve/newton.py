@@ -400,8 +400,8 @@ class Newton:
         """Assemble both residuals, add their relative norms to the history, and return the norms.
 
         The scales contain the forces at the start of the step, but no forces at earlier iterates: after a diverging
-        iterate every residual would seem small. Residuals within round-off are returned as 0. The history has their
-        true norms, divided by scales of at least `round_off / tolerance`.
+        iterate every residual would seem small. Residuals within round-off are returned as 0. The history has the
+        true norms of all residuals, divided by scales of at least `round_off / tolerance`.
         """
         first = not self.report.history
         with _compat.Timer("residual"):

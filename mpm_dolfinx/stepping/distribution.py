@@ -26,9 +26,10 @@ class Distributed(Protocol):
 
 
 def distribute(simulation: Distributed) -> None:
-    """Distribute the cells anew before a step that resets the grid, if the numbers of points then become more even.
+    """Distribute the cells anew if this makes the numbers of points of the processes more equal.
 
-    Otherwise points move to the owners of their cells.  On a grid with `follow`, lines and points move later.
+    The function acts only before a step that resets the grid.  If the cells keep their owners, the points move to the
+    owners of their cells.  On a grid with `follow`, lines and points move later.
     """
     grid = simulation.scene.grid
     if grid.comm.size == 1 or (state := simulation.state).stays:

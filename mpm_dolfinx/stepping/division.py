@@ -132,9 +132,9 @@ class Division:
         return wants
 
     def _intervals(self, points: MaterialPoints, axis: int) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Return keys of the points, and whether each point is an upper half.
+        """Return a key of each domain, and whether the domain is an upper half.
 
-        Two halves of a domain have equal keys. A domain that has no other half has a key with nan.
+        The two halves of a divided domain have equal keys. The key of a domain that has no other half contains nan.
         """
         root, part = roots(points)
         place, size = self._domains.places(root), np.ptp(part, axis=2)
@@ -182,10 +182,10 @@ class Division:
 
 
 def _divides(now: NDArray[np.float64], seeded: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return whether a half of each domain extends over as many cells as the domain at seeding."""
+    """Return along which axes each domain is at least twice as long, in cells, as its seeded domain was at seeding."""
     return now >= 2 * seeded * (1 - SAME)
 
 
 def _merges(now: NDArray[np.float64], seeded: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return whether a pair of domains extends over no more cells than one domain at seeding."""
+    """Return along which axes each domain is at most half as long, in cells, as its seeded domain was at seeding."""
     return 2 * now <= seeded * (1 + SAME)

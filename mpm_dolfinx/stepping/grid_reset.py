@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Reset of the grid: domains cut by the cells, active cells, and matrices that are reused while the pieces are valid.
+"""Reset of the grid: domains are cut into pieces, active cells are found, and matrices are created.
 
-A step begins with a reset (`Scene.on_grid`), unless no corner has moved by more than a small fraction of a cell since
-the last reset. At the end of a step only the points move (`advance`), and their pieces store the pressures.
+Pieces and matrices are reused until the next reset. A step begins with a reset (`Scene.on_grid`), unless no corner has
+moved by more than a small fraction of a cell since the last reset. At the end of a step only the points move
+(`advance`), and their pieces store the pressures.
 """
 
 from __future__ import annotations

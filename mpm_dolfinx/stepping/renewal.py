@@ -10,11 +10,11 @@ of a domain longer than `LONGEST` are filled anew:
 edges replace the surface in the cell. Ends, sharp corners and area (in axisymmetry volume) do not change.
 
 Remainders of old domains outside these cells become domains. Masses, volumes and the mass of the fluid are exact in
-each cell, as are mass-weighted sums of other point data, such as the logarithm of the elastic left Cauchy-Green tensor.
-Point data of a new domain are means over its overlaps with old domains. The means are shifted to the new centroid by
-fitted slopes, within the range of the old values. With inertia, the centre of mass, the momentum and the angular
-momentum of each cell are exact too. Cells are unchanged if they contain elastic soil, several bodies, several crossings
-of the surface, or domains on a side whose displacement a condition needs.
+each cell. Mass-weighted sums of other point data are also exact, such as the logarithm of the elastic left Cauchy-Green
+tensor. Point data of a new domain are means over its overlaps with old domains. The means are shifted to the new
+centroid by fitted slopes, within the range of the old values. With inertia, the centre of mass, the momentum and the
+angular momentum of each cell are exact too. Cells are unchanged if they contain elastic soil, several bodies, several
+crossings of the surface, or domains on a side whose displacement a condition needs.
 """
 
 from __future__ import annotations

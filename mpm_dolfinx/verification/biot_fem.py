@@ -558,9 +558,9 @@ class BiotFEM:
     def _restrained(self, x: PETSc.Vec) -> tuple[list[float], int]:
         """Solve by Newton steps with limited pressure changes, see `retention.restrained`.  Return as `_free` does.
 
-        The first tangent omits the derivative of k_r (Celia, Bouloutas and Zarba 1990), and so do tangents after a
-        limited step or after an increase of the residual.  In dry soil under gravity, this derivative can reverse the
-        Newton step.
+        The first tangent omits the derivative of k_r (Celia, Bouloutas and Zarba 1990).  Tangents after a limited step
+        or an increase of the residual omit it too.  In dry soil under gravity, this derivative can reverse the Newton
+        step.
         """
         snes, of_p = self._snes, self._space.p_dofs
         of_p = of_p[of_p < x.getLocalSize()]

@@ -39,8 +39,8 @@ ITERATIONS, CUTS, CLOSE = 30, 12, 1e-11  # limits: Newton iterations, halvings o
 class ElementTest:
     """Results of an element test, as arrays with rows for the start and each step.
 
-    F, stress : (n, 3, 3), -, Pa
-        Deformation gradient, and effective Cauchy stress, tension positive.
+    F, stress : (n, 3, 3)
+        Deformation gradient F, and effective Cauchy stress in Pa, tension positive.
     strain : (n,)
         Prescribed quantity.  In shear it is F_xy, and in wetting it is the suction, Pa.  In other tests it is the
         logarithmic axial strain, compression positive.

@@ -335,9 +335,9 @@ def shear_flexible_rod(
     Parameters
     ----------
     length : m, > 0
-    EA : N (per depth N/m), > 0, may be inf
-    GA : N (per depth N/m), > 0, may be inf; includes the shear correction factor
-    EI : N m² (per depth N m), > 0
+    EA : N (N/m in plane strain), > 0, may be inf
+    GA : N (N/m in plane strain), > 0, may be inf; includes the shear correction factor
+    EI : N m² (N m in plane strain), > 0
     end_load : N; force at the end
     line_load : N/m; force per reference length
     points : number of equidistant points from end to end, >= 2, or reference arclengths (n,), m, in [0, length]
