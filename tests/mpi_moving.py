@@ -15,6 +15,8 @@ from mpm_dolfinx.grid import grid as grids
 
 T_END, DT = 0.375, 0.125
 TIGHT = mpm.Numerics(tolerance=1e-11, method="backward-euler")
+CONTENT = 0.2
+"""Fluid content, m^2, of the block of `carried`.  An outflow is a difference of contents, with their rounding error."""
 
 
 def carried():
@@ -81,7 +83,8 @@ if __name__ == "__main__":
     left = state(still)
     if not comm.rank:
         same = all(np.array_equal(whole[name], resumed[name], equal_nan=True) for name in whole)
-        off = {n: np.abs(whole[n] - left[n]).max() / max(np.abs(left[n]).max(), 1e-300) for n in whole}
+        least = {n: CONTENT if n.startswith("outflows") else 1e-300 for n in whole}
+        off = {n: np.abs(whole[n] - left[n]).max() / max(np.abs(left[n]).max(), least[n]) for n in whole}
         print(result.imbalance, fixed.imbalance, same, off)
         ratios = [one.imbalance.get("points", 1.0) for one in (result, fixed)]
         np.savez(out, **whole, same=same, off=max(off.values()), imbalance=ratios[0], fixed=ratios[1])
