@@ -610,7 +610,7 @@ class Grid:
         return other
 
     def _again(self) -> Grid:
-        return Grid(**self.given, comm=self.comm, axisymmetric=self.axisymmetric)
+        return Grid(**self.given)
 
     def _made(self, boxes: NDArray[np.int64]) -> Cells:
         """Create the mesh, and return its cells."""
@@ -670,10 +670,12 @@ class Grid:
 
     @property
     def given(self) -> dict[str, Any]:
-        """Arguments with which an equal grid can be created: corners and numbers of cells, or lines."""
+        """Arguments with which an equal grid can be created: corners and numbers of cells, or lines, and the rest."""
+        rest = {"axisymmetric": self.axisymmetric, "comm": self.comm}
         if self.even:
-            return {"lower": self.lower, "upper": self.upper, "cells": self.shape}
-        return {"lines": [x + start for x, start in zip(self.seeded, self.base, strict=True)], "follow": self.follow}
+            return {"lower": self.lower, "upper": self.upper, "cells": self.shape, **rest}
+        lines = [x + start for x, start in zip(self.seeded, self.base, strict=True)]
+        return {"lines": lines, "follow": self.follow, **rest}
 
     @property
     def reach(self) -> float:
@@ -862,7 +864,7 @@ class GridOfGroups(Grid):
     """
 
     def __init__(self, grid: Grid, group: NDArray[np.int64], starts: NDArray[np.int64]):
-        super().__init__(**grid.given, comm=grid.comm, axisymmetric=grid.axisymmetric)
+        super().__init__(**grid.given)
         self._group, self._starts = group, starts
         self._copies = int(group.max()) + 1
         if self.dim * self.copies * self.nodes > MOST:

@@ -74,8 +74,6 @@ def one_file(folder: str | os.PathLike) -> Path:
 
 def joined(pieces: Sequence[meshio.Mesh]) -> meshio.Mesh:
     """Return the particle domains of all processes as one mesh, ordered by id."""
-    import meshio
-
     if len(pieces) == 1:
         return pieces[0]
     order = np.argsort(np.concatenate([piece.cell_data["id"][0] for piece in pieces]))
@@ -83,7 +81,7 @@ def joined(pieces: Sequence[meshio.Mesh]) -> meshio.Mesh:
     names = pieces[0].cell_data
     data = {name: [np.concatenate([piece.cell_data[name][0] for piece in pieces])[order]] for name in names}
     cells = np.arange(corners[..., 0].size).reshape(corners.shape[:2])
-    return meshio.Mesh(corners.reshape(-1, 3), [(pieces[0].cells[0].type, cells)], cell_data=data)
+    return type(pieces[0])(corners.reshape(-1, 3), [(pieces[0].cells[0].type, cells)], cell_data=data)
 
 
 def _add(writer: meshio.xdmf.TimeSeriesWriter, number: int, t: float, mesh: meshio.Mesh) -> None:
