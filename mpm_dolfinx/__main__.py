@@ -56,7 +56,7 @@ def number(name: str, text: str) -> float | list[float]:
 
 
 def law_of(name: str) -> type[mpm_dolfinx.Skeleton]:
-    """Return the law of the package with this name, or a user-defined law for a name file.py:name."""
+    """Return the package's law with this name, or for `file.py:name` the law `name` of the user's file."""
     file, _, own = name.rpartition(":")
     if not file:
         found = getattr(mpm_dolfinx, name, None)
@@ -76,7 +76,7 @@ def _is_law(value: object) -> bool:
 
 
 def constants_of(law: type[mpm_dolfinx.Skeleton], texts: Sequence[str]) -> dict[str, float | list[float]]:
-    """Return the constants of a law from texts `name=value`.  Each name must be a constant, and occur only once."""
+    """Return the constants of a law from texts `name=value`.  Each text must name a different constant."""
     out, known = {}, [f.name for f in fields(law) if f.init]
     for text in texts:
         name, equals, value = text.partition("=")

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Wrappers of every function of dolfinx that differs between the supported releases (0.5.2 and 0.9 to 0.11).
 
-No other module of the package asks for the version.  Branches marked OLD are for release 0.5, and can be removed when
-no supported release needs them.
+No other module of the package depends on the release.  Branches marked OLD serve release 0.5 only.
 """
 
 from __future__ import annotations
@@ -45,11 +44,11 @@ def box_mesh(
     Parameters
     ----------
     cells : (n, 2^d)
-        Global node indices of the cells that this process contributes.  Within a cell, the first axis varies fastest.
+        Global indices of the nodes of this process's cells.  Along the nodes of a cell, the first axis varies fastest.
     x : (m, d), m
         Positions of the nodes that this process contributes.  Nodes are numbered globally in the order of the ranks.
     ranks, offsets
-        Ranks that hold each cell.  Cell i has `ranks[offsets[i] : offsets[i + 1]]`, the owner first.
+        The ranks that hold cell i are `ranks[offsets[i] : offsets[i + 1]]`, with the owner first.
     """
     kind = {4: "quadrilateral", 8: "hexahedron"}[cells.shape[1]]
     where = (ranks, offsets)

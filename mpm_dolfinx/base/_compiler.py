@@ -44,7 +44,7 @@ logger = logging.getLogger("mpm_dolfinx")
 _settings = jit.get_options if hasattr(jit, "get_options") else jit.get_parameters  # OLD
 _ffcx_settings = ffcx.get_options if hasattr(ffcx, "get_options") else ffcx.get_parameters  # OLD
 _replacements: dict[Path, Path] = {}
-"""Temporary folders of this run, by the cache folder that each replaces.  The cache folders are not writable."""
+"""Temporary folders of this run.  The key of each is the cache folder that it replaces, which is not writable."""
 _warnings: dict[Path, str] = {}
 """Pending warnings by temporary folder.  The first compilation in a folder issues its warning."""
 
@@ -167,7 +167,7 @@ def _library(place: Path, name: str) -> Path | None:
 def _is_complete(place: Path, name: str) -> bool:
     """Return whether the cache holds a complete library, and its files `.c` and `.c.cached`.
 
-    Python's loader does not notice a truncated library.  The run would end with a bus error.
+    Python's loader does not detect a truncated library.  A run that uses this library would end with a bus error.
     """
     library = _library(place, name)
     if library is None or not all((place / f"{name}{end}").exists() for end in (".c", ".c.cached")):

@@ -58,7 +58,7 @@ class Latest(Generic[T]):
 
 
 class Keyed:
-    """Base class of objects for which a token stands in cache keys.  Caches then do not keep the objects alive."""
+    """Base class of objects with a token for cache keys, so that caches do not keep the objects alive."""
 
     @cached_property
     def key(self) -> object:

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Fluid content of the pores: the quantity stored in the fluid balance.
 
-Let alpha be Biot's coefficient, J the volume ratio, and p the pore pressure.  Per reference volume, the content zeta
-changes by (d zeta = alpha dJ + S J dp).  The storage coefficient S = n / K_w + (alpha - n) / K_s contains the bulk
-moduli K_w of water and K_s of grains.  The porosity is n = 1 - (1 - n0) / J, where n0 is the porosity at J = 1.
-Therefore S J = a J + b is linear in J, with a = S(n = 1), and
+Let alpha be Biot's coefficient, J the volume ratio, and p the pore pressure.  The content zeta per reference volume
+changes by d zeta = alpha dJ + S J dp.  The storage coefficient S = n / K_w + (alpha - n) / K_s contains the bulk moduli
+K_w of water and K_s of grains.  The porosity is n = 1 - (1 - n0) / J, where n0 is the porosity at J = 1.  Therefore S J
+is a linear function a J + b of J, where a is the value of S at n = 1, and
 
     d zeta = (alpha / rho) d[(J + b / a) rho],    rho = exp(a p / alpha).
 
@@ -12,9 +12,9 @@ The bracket is the mass of a fluid of density rho that fills the volume J + b / 
 computed as alpha times the change of this mass, divided by rho at the mean pressure of the step.  This formula is
 second-order accurate for any path.  If no fluid flows, the change is exactly zero in a step of any size.
 
-Fluxes between cells conserve mass.  A fluid of density rho_w exp(p / K_w) has the mass flux -rho_w kappa grad pi, with
-the mobility kappa (conductivity divided by unit weight) and the mass potential pi = K_w (exp(p / K_w) - 1) (Kirchhoff's
-transformation).  The density between the pressures p- and p+ is rho_w times the logarithmic mean (pi+ - pi-) / (p+ -
+Fluxes between cells conserve mass.  The density of the fluid is rho_w exp(p / K_w).  Its mass flux is -rho_w kappa grad
+pi.  The mobility kappa is the conductivity divided by the unit weight.  Kirchhoff's transformation gives the mass
+potential pi = K_w (exp(p / K_w) - 1).  The mean density between the pressures p- and p+ is rho_w (pi+ - pi-) / (p+ -
 p-).
 """
 
@@ -27,15 +27,14 @@ from numpy.typing import NDArray
 from mpm_dolfinx.base.tolerances import EPSILON
 
 SERIES = (120 * EPSILON) ** 0.25
-"""Argument z below which (sinh(z) / z) is computed as (1 + z^2 / 6).  Source: z^4 / 120 = epsilon, the next term."""
+"""Argument z below which (sinh(z) / z) is computed as (1 + z^2 / 6).  Source: the next term z^4 / 120 is epsilon."""
 
 
 def change_of_content(alpha, a, storage, J, dp):
     """Return the change of the fluid content in a step per volume at the start of the step, as UFL.
 
     `alpha`: Biot coefficient.
-    `a`, `storage`: storage coefficients, in 1/Pa.  `a` refers to a porosity of one (see the module), `storage` to the
-    start of the step.
+    `a`, `storage`: storage coefficients S, in 1/Pa, at the porosity 1 and at the start of the step.
     `J`: volume ratio of the step.
     `dp`: change of the pore pressure, Pa.
     """
@@ -81,7 +80,7 @@ def density_between(p0, p1, compliance):
 
 
 def mean_density(p0, p1, bulk: float) -> NDArray[np.float64]:
-    """Return the relative densities (n,) of `density_between` for pressures (n,), in Pa.  `bulk` is K_w, in Pa."""
+    """Return the mean densities (n,) between pressures (n,), Pa, divided by that at p = 0.  `bulk` is K_w, in Pa."""
     z = (p0 - p1) / (2 * bulk)
     small = np.abs(z) < SERIES
     away = np.where(small, 1.0, z)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Histories of a run: quantities at each output time.  All results of a run share the growing arrays."""
+"""Histories of a run: quantities at each output time.  All results of a run share the same arrays."""
 
 from __future__ import annotations
 
@@ -58,12 +58,12 @@ class Rows(Sequence[Row]):
     """Immutable sequence of one `Row` for each output time of a run.
 
     The result of `more` shares its arrays with this object.  The time to append a row therefore does not grow with the
-    run.  If a quantity has different shapes in two rows, the smaller array is padded with nan.
+    number of rows.  If a quantity has different shapes in two rows, the smaller array is padded with nan.
 
     Attributes
     ----------
     run
-        Token shared by all histories that were extended from the same object.
+        Token shared by all histories that `more` derived from the same object.
     """
 
     def __init__(self, rows: Iterable[Row] = ()):
@@ -76,7 +76,7 @@ class Rows(Sequence[Row]):
 
     @classmethod
     def of_columns(cls, columns: dict[str, NDArray[np.float64]], outcomes: Sequence[Any]) -> Rows:
-        """Return rows from values (n, ...) by name, and from n outcomes.  Raise ValueError if their numbers differ."""
+        """Return n rows from the values (n, ...) of each quantity, and n outcomes.  Other lengths raise ValueError."""
         if columns.keys() != set(COLUMNS):
             raise ValueError(f"the columns are {', '.join(columns)}, must be {', '.join(COLUMNS)}")
         if {len(values) for values in columns.values()} != {len(outcomes)}:

@@ -18,9 +18,7 @@ Outcome = Mapping[str, Mapping[str, NDArray[np.float64]]]
 
 
 class Histories(Protocol):
-    """Results at the probes at one output time, or at all output times.  With all times, the first axis of arrays is
-    time.
-    """
+    """Results at the probes at one output time, or at all output times.  Time is then the first axis of arrays."""
 
     t: Any
     displacement: NDArray[np.float64]

@@ -1,18 +1,18 @@
 # SPDX-License-Identifier: MIT
-"""Time integration: the substeps (stages) of a time step.  The finite element reference solution also uses them.
+"""Time integration: the substeps (stages) of a time step.  The finite element reference uses the same substeps.
 
 Without inertia the momentum balance has no time derivative.  The fluid content zeta of a cell satisfies zeta' + Q(u, p)
-= 0 with the displacement u, the pressure p, and the net outflow Q.  The subscript n denotes the start of a step, the
-numbers 1 and 2 the ends of its substeps, and dt its length.  The two methods are
+= 0 with the displacement u, the pressure p, and the net outflow Q.  The subscript n denotes the start of a step, and
+the numbers 1 and 2 the ends of its substeps.  The step length is dt.  The two methods are
 
     backward-euler   zeta(u, p) - zeta_n + dt Q(u, p) = 0,
     sdirk2           zeta(u1, p1) - zeta_n + gamma dt Q(u1, p1) = 0                               loads at t + gamma dt,
                      zeta(u2, p2) - zeta_n + gamma dt Q(u2, p2) + (1 - gamma) dt Q(u1, p1) = 0    loads at t + dt.
 
-With gamma = 1 - 1 / sqrt(2), `sdirk2` is Alexander's method (1977).  It is second-order and L-stable.  The rate at the
-start of the step is not used, because a transfer between grids makes this rate noisy.  After a jump of the loads, one
-long step overshoots by a fifth of the change, but two half steps do not, see `step_size`.  The error of a step is
-estimated from the rates of the two substeps: see `solve.newton.note_pressures`.
+With gamma = 1 - 1 / sqrt(2), `sdirk2` is Alexander's method (1977).  It is second-order and L-stable.  The method does
+not use the rate at the start of the step, because grid resets make this rate noisy.  After a jump of the loads, one
+long step overshoots by a fifth of the change.  Two half steps do not overshoot, see `step_size`.  The error of a step
+is estimated from the rates of the two substeps: see `solve.newton.note_pressures`.
 """
 
 from __future__ import annotations
@@ -45,9 +45,9 @@ def in_step(
 ) -> NDArray[np.float64]:
     """Return the displacement to prescribe at the end of the first substep.
 
-    The method divides the displacement in the substep by its length (`share` dt), and so obtains the velocity v.  With
-    the exact displacement, v is first-order accurate, and accelerations do not converge.  Therefore v is the slope of
-    the parabola through three displacements, and the result is (`start` + `share` dt v).
+    The velocity v is the displacement in the substep, divided by the length `share` dt of the substep.  If the exact
+    displacement were prescribed, v would be first-order accurate, and accelerations would not converge.  The result is
+    therefore (`start` + `share` dt v), where v is the slope of the parabola through three displacements.
 
     `share`: end of the substep as a fraction of the step.
     `start`, `now`, `end`: displacements at the start of the step, at the end of the substep, and at the end of the

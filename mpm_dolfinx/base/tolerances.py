@@ -8,7 +8,7 @@ EPSILON = float(np.finfo(float).eps)
 ROUND_OFF = 64 * EPSILON
 """Largest relative error of a sum of 64 terms.  Source: gamma_n = n epsilon, n = 64 (Higham 2002, eq. 3.1)."""
 SAME = EPSILON**0.5
-"""Relative difference below which two numbers are considered equal.  It corresponds to half of the digits.
+"""Relative difference below which two numbers are considered equal: half of their digits agree.
 
 `SAME` is also the increment of one-sided differences.  Newton's method squares the error, so only rounding errors
 remain after a Newton step of relative size `SAME`.  Source: Dennis and Schnabel (1983), sections 5.4 and 2.4.
@@ -18,7 +18,7 @@ CENTRAL = EPSILON ** (1 / 3)
 SECOND = EPSILON**0.25
 """Increment of second differences, relative to the variable.  Source: Dennis and Schnabel (1983), 5.6."""
 NEAR = 8 * float(np.finfo(np.float32).eps)
-"""Relative distance, 1e-6, below which positions coincide.  Mesh files have seven digits, and maps add errors.
+"""Relative distance, 1e-6, below which positions coincide.  Mesh files have seven digits, and maps add rounding errors.
 
 Source: epsilon of single precision (IEEE 754), times 8 for a few operations.
 """

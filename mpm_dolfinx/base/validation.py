@@ -6,15 +6,16 @@ An error message has one line.  It names the object, the value, and the allowed 
 The parameter names of a function decide its arguments:
 
 t
-    Time, s, at the ends of the substeps, see `time_integration`.
+    Time, s, at the end of a substep, see `time_integration`.
 X : (n, d), m
     Reference positions of n places.
 x : (n, d), m
     Positions of the n places at the start of the step, for example to prescribe a water level.
 
-If a function has a single parameter with another name, this parameter receives the time.  With several parameters,
-other names raise an error.  Parameters with a default receive no argument, unless all parameters have one.  Material
-constants may be functions of X.  Initial pressures and stresses may be functions of x, the seeded positions.
+If a function has a single parameter with another name, this parameter receives the time.  In functions of several
+parameters, other names raise an error.  If all parameters have defaults, all receive arguments.  Otherwise, parameters
+with a default receive no argument.  Material constants may be functions of X.  Initial pressures and stresses may be
+functions of x, the seeded positions.
 
 A function of position returns a number or an array (n,).  Where vectors are allowed, the function may also return a
 vector (d,) or an array (n, d).  Places are repeated until n exceeds d, so that the array's shape is unambiguous.
@@ -151,7 +152,7 @@ def path(name: str, value) -> Path:
 
 @contextmanager
 def on_disk(name: str, allowed: str) -> Iterator[None]:
-    """Context that adds the object and the remedy to an OSError, for example for a missing folder."""
+    """Context that adds an object's name and the remedy to the message of an OSError."""
     try:
         yield
     except OSError as error:
@@ -266,8 +267,8 @@ def given(
 ) -> NDArray[np.float64]:
     """Return a value at time t.
 
-    For m places, the shape is () or (m,).  If `dim` > 0, it may also be (d,) or (m, d).  If a function of position
-    returns one vector, the result (m, d) repeats this vector for each place.
+    The result has the shape () or, for m places, (m,).  If `dim` > 0, the shapes (d,) and (m, d) are also possible.  If
+    a function of position returns one vector, the result (m, d) repeats this vector for each place.
 
     Parameters
     ----------
