@@ -21,7 +21,7 @@ from mpm_dolfinx.bodies.mesh_cells import Block
 PLANE = re.compile(r"(?:(?:C|DC|DCC|EC)?(?:PE|PS|PEG|AX|GAX|2D)|AC(?:2D|AX)|S|STRI|DS|M3D|SFM3D|R3D)(3|4|6|8|9)(?!\d)")
 SOLID = re.compile(r"(?:(?:C|DC|DCC|EC|AC|Q)3D|SC)(4|5|6|8|10|13|15|20|27)(?![\dV])")
 LINE = re.compile(r"(?:T2D|T3D|R2D|RAX|DC1D|AC1D)(2|3)|(?:B|PIPE|SAX)[23]?([123])")
-"""Pattern of line elements.  The first group is the number of nodes.  The second group is the order of a beam."""
+"""Pattern of the names of line elements.  Group 1 is the number of nodes, group 2 the order of a beam element."""
 NO_CELL = ("SPRING", "DASHPOT", "MASS", "ROTARY", "CONN", "GAP", "JOINT", "HEATCAP", "DCOUP", "ITS", "DIST", "FRAME")
 """Name prefixes of elements without volume or area."""
 KINDS = {
@@ -80,7 +80,7 @@ class _Placed:
     rotation: tuple[float, ...] = ()
 
     def places(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return positions after placement: first a translation, then a rotation."""
+        """Return the positions of an instance: the part's positions are translated, then rotated."""
         x = x + self.shift
         if not self.rotation:
             return x
@@ -138,7 +138,7 @@ def _keyword(file: Path, line: str, rows: list[str]) -> Iterator[tuple[str, dict
 
 
 def _placed(file: Path) -> list[_Placed]:
-    """Return the definitions outside of parts, and all instances (or all parts without instances)."""
+    """Return the definitions outside parts, and all instances.  Without instances, return all parts."""
     whole = _Scope()
     scope = whole
     parts = {}

@@ -21,9 +21,9 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 class Body:
     """A seeded body: the reference geometry of all its particle domains.  Every process has an equal object.
 
-    Each domain is the image of a box under `map`.  Subclasses define the edge lengths `spacing` of the boxes, in m.
-    Their shape is (n, d), or (d,) if all boxes are equal.  In a `RowsBody`, `spacing` (d,) contains the smallest edge
-    lengths.  Large bodies are processed in chunks, so no array over all domains is stored.
+    Each domain is the image of a box under `map`.  Subclasses define `spacing`, the edge lengths (n, d) of the boxes in
+    m, or (d,) for equal boxes.  In a `RowsBody`, `spacing` (d,) contains the smallest edge lengths.  Large bodies are
+    processed in chunks, so no array over all domains is stored.
     """
 
     material: int = 0  # index in the scene's list of materials
@@ -91,8 +91,7 @@ class Body:
     def facing(self, axis: int, end: int, least: float = 0.0) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return the surface faces at the lower (0) or upper (1) end of an axis, as domains (n,) and face indices (n,).
 
-        In unstructured bodies, the unit normals of these faces have their largest component, above `least`, towards
-        this end.
+        In bodies from meshes, the largest component of a face's unit normal points to this end, and exceeds `least`.
         """
         row = self._with_face(axis, end)
         return row, np.full(len(row), 2 * axis + end)
@@ -130,7 +129,7 @@ class Body:
         return images.reshape(X.shape)
 
     def bend(self, chosen: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return how far the straight edges of chosen domains are from the curved images of their box edges, in m."""
+        """Return the distances, in m, of straight edges of chosen domains from the curved images of box edges."""
         out = np.zeros(len(chosen))
         if self.map is None:
             return out

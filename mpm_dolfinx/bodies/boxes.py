@@ -110,7 +110,7 @@ class LatticeBody(Body):
         return self._index(rows) - self._ends[0]
 
     def nodes(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the node indices (n, 2^d) of the corners of domains.  A shared corner has one index."""
+        """Return the node indices (n, 2^d) of the corners of domains.  Domains share the index of a common corner."""
         corners = self.places(rows)[:, None] + corner_bits(self.dim)
         return np.ravel_multi_index(tuple(np.moveaxis(corners, 2, 0)), tuple(np.add(self.lattice, 1)))
 
@@ -183,8 +183,8 @@ def box(grid: Grid, lower: ArrayLike, upper: ArrayLike, per_cell: int = 2, mater
         Corners of the box, inside the grid.  They need not lie on grid lines.
     per_cell
         Points per cell and direction, >= 1, rounded to fit the box.  In grids of unequal cells, domains end at grid
-        lines.  With 1 point, bodies deflect too much and creep.  A warning names slender bodies.  In 3D, scenes
-        refuse bodies that end at grid lines and have one domain in each cell.
+        lines.  With 1 point, bodies deflect too much and creep; a warning names slender bodies.  In 3D, a body that
+        ends at grid lines needs more than one domain in each cell.
     material
         Index of the material in the scene's list, >= 0.
 
@@ -215,14 +215,14 @@ def shape(
     """Seed a body from a lattice over the whole grid, and return it.
 
     The body consists of all domains of the lattice with centres inside a shape.  Its surface has steps of the size of a
-    domain.  `mapped` gives smooth sides.
+    domain.  `mapped` gives bodies with smooth sides.
 
     Parameters
     ----------
     grid
         Background grid.
     inside
-        Function from positions (n, d), in m, to booleans (n,).
+        Function from positions (n, d), in m, to booleans (n,), True inside the shape.
     per_cell
         Points per cell and direction, >= 1.
     material

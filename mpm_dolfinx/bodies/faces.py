@@ -126,7 +126,7 @@ Region = tuple[ArrayLike, ArrayLike]
 def limits(region: Region | None, dim: int) -> NDArray[np.float64]:
     """Return the lower and upper corners (2, d) of a region, in m, or infinite corners without a region.
 
-    Equal regions give equal bytes (`tobytes`), which serve as a key.
+    Equal regions give equal bytes (`tobytes`), so that the bytes can serve as a cache key.
     """
     if region is None:
         return np.repeat([[-np.inf], [np.inf]], dim, axis=1)
@@ -140,7 +140,7 @@ def surface(
 ) -> Surface:
     """Return the faces on a side of the active bodies, without the parts that touch other bodies.
 
-    The seeded shapes after the maps determine which bodies touch.  Touching bodies stick permanently.
+    The seeded shapes after the maps determine the parts in contact, because bodies in contact stick permanently.
 
     Parameters
     ----------
@@ -256,7 +256,7 @@ def _interval(X: NDArray[np.float64], region: NDArray[np.float64]) -> tuple[NDAr
 def _clipped(
     X: NDArray[np.float64], t: NDArray[np.float64], region: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Clip parts of faces to a region, and return the triangles that are left."""
+    """Clip parts of faces to a region, and return the remaining triangles."""
     places = np.einsum("npk,nkd->npd", weights(t.reshape(-1, 2)).reshape(*t.shape[:2], 4), X)
     three = (t[:, 2] == t[:, 3]).all(axis=1)[:, None]  # in triangles, the middle is a corner
     middle = np.where(three, places[:, 2], places.mean(axis=1))
@@ -297,7 +297,7 @@ def interpolate(corners: NDArray[np.float64], xi: NDArray[np.float64]) -> NDArra
 def on_face(
     corners: NDArray[np.float64], face: NDArray[np.int64], x: NDArray[np.float64], xi: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return xi (n, 3) with the tangential components of positions x (n, 3), in m, projected onto faces."""
+    """Return local coordinates xi (n, 3) with tangential components from positions x (n, 3), in m, on faces."""
     quads = np.take_along_axis(corners, FACES[3][face][:, :, None], axis=1)
     normal = face_vectors(corners, face)
     t, _ = local(quads, x[:, None], normal)

@@ -47,7 +47,7 @@ class Contact:
         return self.own.row[face][:, None], self.own.index[face]
 
     def given(self) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
-        """Return which corners of the fill's faces touch the body, and the displacements of the body there."""
+        """Return which corners of the fill's faces touch the body, and the body's displacements at these corners."""
         face, by = self.cover.face, self.cover.by
         s, _ = local(self.other.corners[by], self.own.corners[face], self.other.outward[by])
         on = np.abs(s - 0.5).max(axis=2) <= 0.5 + np.maximum(self.cover.slack, SAME)[:, None]
@@ -73,8 +73,8 @@ def put(
     """Return the material points of a fill, placed onto the active bodies.
 
     Sides of the fill that touched a neighbour when seeded follow the neighbour's displacement.  The side opposite to
-    the largest contact stays where it was seeded.  Displacements between these sides are interpolated.  The fill has no
-    velocity.  The initial volumes of its domains belong to the displaced shape.
+    the largest contact keeps its seeded position.  Displacements between these sides are interpolated.  The fill has no
+    velocity.  The initial volumes of its domains are those of the displaced shape.
 
     Parameters
     ----------
@@ -177,7 +177,7 @@ def _springs(body: Body, node: NDArray[np.int64], count: int) -> csr_array:
 
 
 def _between(K: csr_array, fixed: NDArray[np.bool_], u: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the displacements along an axis of springs with prescribed displacements at some nodes."""
+    """Return the displacements of a network of springs along an axis, with u prescribed at `fixed` nodes."""
     out, free = u.copy(), np.flatnonzero(~fixed)
     if len(free):
         held = np.flatnonzero(fixed)
@@ -221,7 +221,7 @@ def _check_shape(grid: Grid, fill: int, corners: NDArray, u: NDArray) -> None:
 def _penetration(
     grid: Grid, bodies: Sequence[Body], other: int, corners: NDArray, points: MaterialPoints, misfit: float
 ) -> tuple[float, float, NDArray[np.float64]]:
-    """Return the depth of a body in the fill, in m, the gap between both in cells, and the position."""
+    """Return the depth of a body in the fill, in m, their gap, in cells, and the position of either."""
     start = _start(bodies, other)
     rows = np.flatnonzero((points.id >= start) & (points.id < start + len(bodies[other])))
     both = [(c, INSIDE / 2 * np.ptp(c, axis=1).min(axis=1) + misfit) for c in (points.corners[rows], corners)]

@@ -50,9 +50,9 @@ def from_mesh(
 
     Sides have the names of groups of facets in the mesh.  Groups of facets are Abaqus surfaces, facet tags, or gmsh's
     physical groups of lines (in 2D) or surfaces (in 3D).  Bodies from two parts of a mesh share the faces between the
-    parts.  Shared faces are no surface while both bodies are active.  Vertices of the mesh are reference positions.
-    The points form no lattice, so the filter of short waves does not act.  On several processes, the first process
-    reads the mesh, and each machine has a copy of the domains in a temporary file.
+    parts.  While both bodies are active, shared faces are not part of the surface.  Vertices of the mesh are reference
+    positions.  The points form no lattice, so the filter of short waves does not act on them.  On several processes,
+    the first process reads the mesh, and each machine has a copy of the domains in a temporary file.
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ def from_mesh(
         The file is missing or unreadable, the kind of mesh is not supported, or the part is unknown.  Cells are flat,
         inverted, non-convex, repeated or overlapping.  Vertices are outside the grid.  Nodes are hanging or duplicate.
     OSError
-        A temporary file cannot be written.  Only runs on several processes write one.
+        A temporary file cannot be written.  Only runs on several processes write temporary files.
     """
     import meshio
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Mesh files are read by meshio.  Data that meshio loses or misplaces are corrected, or cause an error."""
+"""Reader of mesh files with meshio.  Data that meshio loses or misplaces are corrected, or raise an error."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mpm_dolfinx.bodies import abaqus_files, gmsh_files
 
 
 def read(file: Path) -> meshio.Mesh:
-    """Return the mesh of a file.  Known errors of meshio are corrected, or cause ValueError."""
+    """Return the mesh of a file.  Known errors of meshio are corrected, or raise ValueError."""
     if abaqus_files.is_abaqus(file):
         return abaqus_files.read(file)
     version = gmsh_files.version(file) if file.suffix.lower() == ".msh" else ""
@@ -28,7 +28,7 @@ def read(file: Path) -> meshio.Mesh:
 
 
 def _bulk(file: Path) -> meshio.Mesh:
-    """Return the mesh of a Nastran file, also of a file without the header that meshio needs."""
+    """Return the mesh of a Nastran file.  The file may lack the header that meshio needs."""
     text = file.read_text(errors="replace")
     if re.search(r"^BEGIN\s+BULK", text, re.MULTILINE | re.IGNORECASE):
         return meshio.read(file, "nastran")

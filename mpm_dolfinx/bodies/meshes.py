@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Bodies from meshes: each mesh cell becomes one or more particle domains.
 
-`mesh_cells` divides cells into domains.  Domains that are too large for the grid are divided further, evenly in their
-local coordinates.  The first process reads and divides a mesh, and each machine has one file with all domains.  The
-processes of a machine map the file into memory, and load only the domains that they need.
+`mesh_cells` divides cells into domains.  Domains that are too large for the grid are divided again, evenly in local
+coordinates.  The first process reads and divides a mesh, and each machine has one file with all domains.  The processes
+of a machine map the file into memory, and load only the domains that they need.
 """
 
 from __future__ import annotations
@@ -132,12 +132,12 @@ class MeshBody(Body):
         return self.vertices[chosen]
 
     def nodes(self, rows: slice | NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return node indices (n, 2^d) of the corners of domains.  Shared corners have one index."""
+        """Return node indices (n, 2^d) of the corners of domains.  Domains share the index of a common corner."""
         return self.numbers[rows]
 
 
 def _numbered(vertices: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return the node indices of the corners of domains."""
+    """Return the node indices of the corners of domains.  Equal corners have equal indices."""
     x = vertices.reshape(-1, vertices.shape[2])
     pairs = cKDTree(x).query_pairs(NEAR * np.ptp(vertices, axis=1).min(), output_type="ndarray")
     graph = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(x), len(x)))
@@ -210,7 +210,7 @@ def _divided(grid: Grid, mesh: Mesh, part: str | None, per_cell: int, name: str)
 def _domains(mesh: Mesh, cells: Mapping[str, NDArray[np.int64]]) -> list[tuple[NDArray, NDArray, NDArray]]:
     """Return the corners of the particle domains, the mesh facet of each face, and the cell of each domain.
 
-    A facet is given by its nodes, with -1 before the nodes of a triangle.  A face inside a cell has only -1.
+    The row of a facet contains its nodes, and starts with -1 for a triangle.  The row of a face inside a cell is -1.
     """
     d = mesh.x.shape[1]
     start = 0
@@ -247,7 +247,7 @@ def _check_sides(
     shared: NDArray[np.bool_],
     name: str,
 ) -> None:
-    """Raise an error if both cells of a `shared` facet lie on one side of this facet."""
+    """Raise an error if both cells of a `shared` facet lie on the same side of this facet."""
     d, size = domains.shape[2], len(facets)
     outward = np.stack([face_vectors(domains, face) for face in range(2 * d)], axis=1).reshape(-1, d)
     of = facet.ravel()

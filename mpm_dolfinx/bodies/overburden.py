@@ -22,8 +22,8 @@ def overburden(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the overburden stress (k,), in Pa, at positions x, and the level (k,), in m, of the ground above them.
 
-    Domains may meet exactly above a position.  Both results are therefore means over vertical lines on all sides of the
-    position, very close to it.
+    Two domains may meet exactly above a position.  Both results are therefore means over vertical lines on all sides of
+    the position, very close to it.
 
     `corners` (n, 2^d, d), in m: corners of the particle domains of all bodies; the last axis is vertical.
     `unit_weight` (n,), in N/m^3: unit weights of the domains.
@@ -38,7 +38,7 @@ def overburden(
 
 
 def _along(corners: NDArray, unit_weight: NDArray, x: NDArray, places: NDArray) -> tuple[NDArray, NDArray]:
-    """Return overburden stresses and ground levels for positions x, on vertical lines at `places`."""
+    """Return the overburden stress at the height of each position x, and the ground level, along lines at `places`."""
     low, high = corners[..., :-1].min(axis=1), corners[..., :-1].max(axis=1)
     half = (high - low).max(initial=0.0) / 2
     across, line = np.unique(places, axis=0, return_inverse=True)
@@ -68,7 +68,7 @@ def _along(corners: NDArray, unit_weight: NDArray, x: NDArray, places: NDArray) 
 
 
 def _hits(corners: NDArray, at: NDArray) -> Iterator[tuple[NDArray, NDArray, NDArray]]:
-    """Yield the crossings of vertical lines with the faces of domains, each line with its own domain.
+    """Yield the crossings of vertical lines with faces.  Line i is tested against domain i only.
 
     Each face yields the lines that cross the face, the heights of the crossings, in m, and signs.  The sign is 1 where
     a rising line leaves the domain, and -1 where the line enters.

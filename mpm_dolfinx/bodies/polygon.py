@@ -39,7 +39,7 @@ def polygon(
     grid
         Background grid, in 2D.
     corners : (n, 2), m
-        Consecutive corners, in either direction.
+        Corners in sequence, clockwise or counterclockwise.
     sides
         Name of the edge from each corner to the next, or "" for no name.  A single name applies to all edges.
     holes : name -> (k, 2), m

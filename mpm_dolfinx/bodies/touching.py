@@ -265,7 +265,7 @@ def uncovered(
     `count`: number of faces.
     `face` (n,): index of the face that each box covers in part.
     `low`, `high` (n, 2): corners of the boxes, in face coordinates from 0 to 1.
-    `slack` (n,): largest difference between ends of boxes that count as equal.
+    `slack` (n,): largest difference between two ends of boxes that count as equal.
     """
     touched, row = np.unique(face, return_inverse=True)
     whole = np.setdiff1d(np.arange(count), touched)
@@ -325,7 +325,7 @@ def uncovered(
 def separation(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the gaps (n,), in m, between convex domains a and b (n, 2^d, d).  Overlapping domains have negative gaps.
 
-    Domains overlap unless a plane separates them.  It is sufficient to try planes parallel to a face of either domain.
+    Two domains overlap if no plane separates them.  It is sufficient to try planes parallel to a face of either domain.
     In 3D, planes parallel to one edge of each domain must also be tried.
     """
     d = a.shape[2]
@@ -340,7 +340,7 @@ def separation(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.flo
 
 
 def _between_planes(a: NDArray, b: NDArray, normals: Iterable[NDArray]) -> NDArray[np.float64]:
-    """Return the largest distance, in m, between two parallel planes with one of `normals` that separate a and b."""
+    """Return the largest distance, in m, between parallel planes that separate a and b, over all given normals."""
     out, size = np.full(len(a), -np.inf), np.ptp(a, axis=1).max(axis=1)
     for n in normals:
         length = np.linalg.norm(n, axis=1)
@@ -369,7 +369,7 @@ def solids(body: Body) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 def allowance(edge: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the tolerances (n,), in m, of gaps and overlaps of touching domains with edge lengths (n,), in m."""
+    """Return the tolerances (n,), in m, for gaps and overlaps of domains with edge lengths (n,), in m."""
     return NEAR / 2 * edge
 
 
@@ -378,7 +378,7 @@ def meeting(
     b: tuple[NDArray[np.float64], NDArray[np.float64]],
     in_cells: Callable[[NDArray[np.float64]], NDArray[np.float64]],
 ) -> tuple[float, float, NDArray[np.float64]]:
-    """Return the largest overlap of two bodies, in m, the smallest gap, in cells, and the position of either, in m.
+    """Return the largest overlap of two bodies, in m, their smallest gap, in cells, and the position of either, in m.
 
     Touching bodies have overlap 0 and gap 0.  The gap of distant bodies is inf.  `a` and `b` are the domains of the
     bodies with their tolerances, see `solids`.  `in_cells` divides positions by the cell size.
