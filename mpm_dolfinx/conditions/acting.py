@@ -53,7 +53,7 @@ class FormsOf:
         self._made: dict[Callable, Any] = {}
 
     def __call__(self, make: Callable[..., T], *more) -> T:
-        """Return the forms `make(grid, u, *more)` of a class `make`, which are compiled once."""
+        """Return the forms `make(grid, u, *more)`.  Only the first call with a class `make` compiles them."""
         if make not in self._made:
             self._made[make] = make(self.grid, self.u, *more)
         return self._made[make]
@@ -142,16 +142,16 @@ class Loads:
     stiff: bool = False
     """Whether the condition adds a `penalty`."""
     holding: bool = False
-    """Whether the condition may constrain bodies by constraints that `touching` does not return."""
+    """Whether the condition may constrain bodies by other constraints than `touching` returns."""
     couples: bool = False
     """Whether the tangent couples nodes of different cells."""
     touches: bool = False
     """Whether the condition is a contact, which may open."""
     key: Any = None
-    """Key of all data on which the penalty and the pattern depend, except for the positions of faces."""
+    """Cache key of the penalty and the pattern, from all data on which they depend except the positions of faces."""
 
     def joined(self, substeps: Sequence[Any]) -> Loads:
-        """Return the loads with a pattern for all substeps of the step."""
+        """Return the loads with a sparsity pattern that is valid in all substeps of the step."""
         return self
 
     def begun(self, shares: Shares, earlier: Any) -> Loads:
@@ -167,7 +167,7 @@ class Loads:
     def rubbing(self, at: At, v: NDArray[np.float64]) -> tuple[float, float]:
         """Return the dissipation by slip, and a correction of the external power, both in W, at u on this process.
 
-        Without the correction, the external power is that of the forces in `push` at the nodal velocities v, in m/s.
+        The correction is added to the power of the forces in `push` at the nodal velocities v, in m/s.
         """
         return 0.0, 0.0
 
@@ -175,7 +175,7 @@ class Loads:
         """Add forces that are constant during the substep."""
 
     def pulls(self, b: NDArray[np.float64]) -> None:
-        """Add the constant part of the penalty forces, which the scale of residuals leaves out."""
+        """Add the constant part of the penalty forces.  The force scale of relative residuals omits this part."""
 
     def loads(self, b: NDArray[np.float64]) -> None:
         """Add forces that depend on u."""
@@ -184,10 +184,10 @@ class Loads:
         """Add resisting forces at u, with the sign of the internal forces."""
 
     def takes_up(self, b: NDArray[np.float64]) -> None:
-        """Add forces at u that count as internal forces, also in the scale of residuals."""
+        """Add forces at u that count as internal forces, also in the force scale of relative residuals."""
 
     def penalty(self, A: PETSc.Mat, walls: bool) -> None:
-        """Add the matrix of forces that are linear in u.  `walls`: whether to add rows of components that walls fix."""
+        """Add the matrix of forces that are linear in u.  `walls`: whether to add rows of dofs that walls fix."""
 
     def pulling(self, at: At, v: NDArray[np.float64]) -> float:
         """Return the power, in W, of `pulls` and `penalty` at u and the nodal velocities v on this process."""
@@ -197,7 +197,7 @@ class Loads:
         """Add the derivative of `resists` minus `loads` at u, without final assembly."""
 
     def push(self, at: At, residual: PETSc.Vec, on: Unknowns) -> None:
-        """Subtract forces at u from the residual, but not from its scale."""
+        """Subtract forces at u from the residual.  The force scale of relative residuals omits these forces."""
 
     def inertia(self, at: At) -> PETSc.Vec | None:
         """Return the inertia forces at u, in N, or None without inertia."""
@@ -228,18 +228,18 @@ class Loads:
         return self
 
     def counted(self, at: At) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return local dofs (n,) on walls, and loads (n,), in N, at these dofs that wall reactions leave out."""
+        """Return local dofs (n,) on walls, and the loads (n,), in N, that wall reactions omit at these dofs."""
         return np.empty(0, dtype=np.int64), np.empty(0)
 
     def within_reach(self) -> NDArray[np.int64]:
-        """Return the pairs (n, 2) of lexicographic cells on this process that the condition may couple in the step."""
+        """Return the pairs (n, 2) of cells, by lexicographic index, that the condition may couple in the step."""
         return np.empty((0, 2), dtype=np.int64)
 
     def touching(self) -> tuple | None:
         """Return the initial constraints of this condition.
 
         Each constraint has cells (n,), opposite cells (n,), positions (n, d) and directions (n, d).
-        Opposite cells belong to another body in contact.  They are None without a second deforming body.
+        Opposite cells belong to another deforming body in contact, and are None without such a body.
         """
 
     @property
@@ -253,7 +253,7 @@ class Loads:
 
     @property
     def rounding_beside(self) -> float:
-        """Rounding errors of the forces, in N, in the cells of other bodies in contact."""
+        """Return the rounding error of contact forces, in N, in the cells of the other bodies."""
         return 0.0
 
     def outcome(self, at: At) -> dict[str, dict[str, NDArray[np.float64]]]:
@@ -275,7 +275,7 @@ class Loads:
     def outside(
         self, corners: NDArray[np.float64], free: NDArray[np.bool_], everywhere: bool = False
     ) -> NDArray[np.float64]:
-        """Return the corners (n, 2^d, d), in m, after they are moved out of forbidden regions.
+        """Return the corners (n, 2^d, d), in m.  Corners in forbidden regions, such as tools, are moved out.
 
         `free` (n, 2^d, d): whether no other condition prescribes a component.
         `everywhere`: whether to correct penetrations of any depth, not only small ones.
@@ -285,14 +285,15 @@ class Loads:
     def under_held(
         self, ids: NDArray[np.int64], tracked: NDArray[np.float64], volume: NDArray[np.float64], corners: NDArray
     ) -> NDArray[np.float64]:
-        """Return the corners (n, 2^d, d), in m, of re-initialised domains, with tracked corners on prescribed sides.
+        """Return the corners (n, 2^d, d), in m, of re-initialised domains.  Those on prescribed sides are `tracked`
+        ones.
 
         A domain with a face on a prescribed side becomes a prism of equal volume.
 
         `ids` (n,): identifiers of the points.
-        `tracked`: tracked corners.
+        `tracked`: corners that moved with the displacement field.
         `volume` (n,), in m^d: volumes of the domains.
-        `corners`: corners that are initialised from F.
+        `corners`: corners computed from F.
         """
         return corners
 

@@ -2,9 +2,9 @@
 """Conditions on sides of bodies: tractions, pressures, displacements, plates, drained sides, prescribed flux, rain.
 
 Sides of seeded bodies are named "left", "right", "bottom" and "top", in 3D also "front" (lower y) and "back" (upper y).
-A name refers to the position of the side before any map.  Meshes name their own sides (`from_mesh`).  A side moves with
-its body, and excludes faces that touched another body at seeding.  Regions and X are reference positions before all
-maps (`mapped`).  Reference areas are areas of the seeded shape, after the maps.
+A name refers to the position of the side before any map.  The sides of a mesh have the names in the mesh (`from_mesh`).
+A side moves with its body, and excludes faces that touched another body at seeding.  Regions and X are reference
+positions before all maps (`mapped`).  Reference areas are areas of the seeded shape, after the maps.
 
 A new kind of condition is a class in a separate file.  Its method `acting` adds terms to the momentum balance
 (`conditions/acting.py`).  Its method `feeding` adds terms to the fluid balance (`flow/feeding.py`).
@@ -95,7 +95,7 @@ class Traction(Condition):
 class Pressure(Condition):
     """Pressure on a side of the bodies, always normal to the moving surface, per current area.
 
-    The pressure is added to tractions.  Skeleton and pore fluid carry it together.  For water that also enters the
+    The pressure is added to tractions.  The pressure acts on skeleton and pore fluid together.  If the water enters the
     pores, a `Drained` must also prescribe the pore pressure.  A uniform pressure has a potential if the loaded surface
     is closed, or ends at walls that fix the edges of this surface.  Without a potential the tangent is unsymmetric.
     The solver is then LU or FGMRES, and the stability of dry equilibria is not checked.
@@ -226,7 +226,7 @@ class Through(NamedTuple):
 class Drained(Condition):
     """Side of the bodies with a prescribed pore pressure.
 
-    The side moves with the bodies.  `outflows` of the simulation are the flow through the side.
+    The side moves with the bodies.  `outflows` of the simulation contain the flow through the side.
 
     Parameters
     ----------
@@ -237,9 +237,8 @@ class Drained(Condition):
     region : ((d,), (d,)), m
         Box of reference positions.  The parts of faces inside the box are drained.
     seepage
-        Whether the side is a seepage face.  Where the outside pressure is <= 0, as above a water level, water can then
-        leave but not enter.  The pore pressure there is at most the outside pressure.  It is lower only where no water
-        leaves.
+        Whether the side is a seepage face.  Then, where the outside pressure is <= 0 (above a water level), water can
+        leave but not enter.  The pore pressure equals the outside pressure where water leaves, and is lower elsewhere.
 
     Raises
     ------
@@ -319,7 +318,7 @@ class Inflow(Flux):
 class Rain(Flux):
     """Side of the bodies with rain or evaporation, limited by the soil's capacity to take up or release water.
 
-    Rain infiltrates until the pressure at the side reaches `ponding`.  The excess runs off.  Water evaporates at the
+    Rain infiltrates until the pressure at the side reaches `ponding`.  Further rain runs off.  Water evaporates at the
     prescribed rate until the pressure at the side falls to `driest`.  Water can also seep out of the side.  `outflows`
     of the simulation are the flow through the side.  `simulation.outcome("runoff")` is the run-off, in m^3/s (m^2/s in
     plane strain).  Three further outcomes are volumes since the condition began, in m^3 (m^2 in plane strain).
@@ -337,7 +336,7 @@ class Rain(Flux):
         Largest pressure >= 0 of ponded water, in Pa: depth times unit weight.  The pond has one depth for the whole
         side.  Water runs off once the pond is full.  Ponded water infiltrates or evaporates later.
     driest
-        Lowest pressure at the side, in Pa, < 0 and finite.  It is the pore pressure in equilibrium with the air.  By
+        Lowest pressure at the side, in Pa, < 0 and finite: the pore pressure in equilibrium with the air.  By
         Kelvin's equation, -1e7 Pa corresponds to air of 93 % humidity at 20 °C.
     region : ((d,), (d,)), m
         Box of reference positions.  Rain falls on the parts of faces inside the box.
@@ -394,7 +393,7 @@ RIGIDITY = 1e4
 HOLD = 3e2
 """Penalty stiffness for prescribed displacements, times cell size, divided by the `holding` modulus.
 
-The penalty acts on means over cells.  The displacement error is the change of traction in the step (without its
+The penalty acts on means over cells.  The displacement error is the change of traction in the step (except by
 rotation), divided by the stiffness.  The error does not accumulate, because each step measures it from the prescribed
 position.  If a body is much stiffer than the penalty, multipliers remove the error, see `HoldLoads.augment`.  Plateau
 (scene "soil" of tests/plateaus.py): half this value changes the result by 5.9e-05, twice this value by 2.0e-05, and
@@ -417,9 +416,9 @@ def holding(material: Skeleton) -> NDArray[np.float64]:
     """Return the reference modulus, in Pa, of the penalty for prescribed displacements.
 
     A Q1 field with constant volumetric strain in each cell cannot follow a curved side.  The penalty converts the
-    difference between field and side into pressure, so it must not be stiff compared with the shear stiffness.  In an
-    undrained cavity, a penalty of 300 (lambda + 2G) gives up to 1.9 times the exact pressure.  A penalty of 30 (4G)
-    gives 1.01 times the exact pressure.
+    difference between this field and the side into pressure, so it must not be stiff compared with the shear stiffness.
+    In an undrained cavity, a penalty of 300 (lambda + 2G) gives up to 1.9 times the exact pressure.  A penalty of 30
+    (4G) gives 1.01 times the exact pressure.
     """
     return (YIELDING if material.state else 1.0) * resistance(material)
 
@@ -435,8 +434,9 @@ class Displacement(Condition):
     side
         Side of the bodies, as for `Traction`.
     value : (d,) or callable (t, X) -> (d,) or (m, d), m
-        Displacement since the start, or since a stage set it to zero, at reference positions X (m, d).  In a mapped
-        body, the map converts X to seeded positions.  The value has all d components, even if some are not prescribed.
+        Displacement at reference positions X (m, d), since the start or the last stage that set displacements to zero.
+        In a mapped body, the map converts X to seeded positions.  The value has all d components, even if some are not
+        prescribed.
     components
         Prescribed components, such as "y".  By default all d components are prescribed.
     region : ((d,), (d,)), m

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Names of conditions, by which the results of the conditions are found."""
+"""Results of conditions by the names of the conditions."""
 
 from __future__ import annotations
 

@@ -26,7 +26,8 @@ class Record:
     record : file, or (n, 2)
         Two columns: times (in s) and values.  Blanks or commas separate the columns of a file, and # starts a comment.
     direction : (d,)
-        Direction of the motion.  Its length multiplies the values.  For a record in units of g, use (9.81, 0).
+        Direction of the motion.  The vector's length multiplies the values.  For a record in units of g, use
+        (9.81, 0).
     quantity
         Recorded quantity: "acceleration" (m/s^2) or "velocity" (m/s).
     at_rest

@@ -31,7 +31,7 @@ class Sides:
         self._found: dict[tuple[str, bytes], Surface] = {}
 
     def of(self, condition) -> Surface:
-        """Return the faces of a condition's side in its region, or raise ValueError without faces."""
+        """Return the faces of a condition's side in its region, or raise ValueError if there are none."""
         found = self._of(condition.side, condition.region)
         if not len(found):
             where = " in the region" if condition.region is not None else ""
@@ -52,12 +52,12 @@ class Sides:
         return self._found[key]
 
     def held(self, condition: Displacement, others: Sequence[Displacement]) -> Surface:
-        """Return the faces of a prescribed displacement, without cells that its region covers by at most one half.
+        """Return the faces of a prescribed displacement, except in cells that its region covers by at most one half.
 
-        The last prescribed node also moves half a cell of the side beyond it.  If the region covers at most half of the
-        cell in which it ends, the faces therefore end where the region enters this cell.  On a side inclined to the
-        grid, the faces end half a cell before the end of the region.  Both rules apply only if the side continues
-        outside the region, and none of the conditions `others` with a common component applies there.
+        The last prescribed node also moves half a cell of the side beyond this node.  If the region covers at most half
+        of the cell in which it ends, the faces therefore end where the region enters this cell.  On a side inclined to
+        the grid, the faces end half a cell before the end of the region.  Both rules apply only if the side continues
+        outside the region, without another condition with a common component (`others`).
         """
         faces, d = self.of(condition), self.grid.dim
         box, X = faces.region.copy(), faces.X

@@ -34,7 +34,7 @@ def under(fluid: Fluid | None, gravity: Gravity) -> Fluid | None:
 
 
 def weighed(value, fluid: Fluid | None):
-    """Return a water pressure, with the unit weight of the pore fluid if it has none."""
+    """Return a water pressure.  A water pressure without a unit weight receives that of the pore fluid."""
     by_fluid = isinstance(value, OfWater) and value.given is None and fluid is not None
     return replace(value, given=fluid.unit_weight) if by_fluid else value
 
@@ -93,9 +93,9 @@ def warn_levels(comm: MPI.Intracomm, fluid: Fluid | None, gravity: Gravity, leve
 
 
 def other_gravity(fluid: Fluid, gravity: Sequence[NDArray[np.float64]]) -> float | None:
-    """Return the last value of `gravity`, in m/s^2, or None if conductivities are converted with this gravity.
+    """Return the last magnitude of `gravity`, in m/s^2, or None if conductivities refer to this gravity.
 
-    A varying gravity is returned only if its last value is above 9.81 m/s^2.
+    A gravity that varies in the step is returned only if its last magnitude is above 9.81 m/s^2.
 
     `gravity`: vectors, in m/s^2, at the start of a step and at times in the step.
     """

@@ -52,9 +52,10 @@ def fixed_corners(grid: Grid, walls: Mapping[str, str], corners: NDArray[np.floa
 def stopped(
     grid: Grid, walls: Mapping[str, str], corners: NDArray[np.float64], before: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return corners (n, 2^d, d), in m, after some corners outside the grid are moved to its sides.
+    """Return corners (n, 2^d, d), in m.  Some corners outside the grid are moved to its sides.
 
-    Corners move to a side if its wall fixes the normal component, or if their old position `before` was in the grid.
+    A corner moves to a side if the wall at this side fixes the normal component, or if its old position `before` was in
+    the grid.
     """
     shut = np.zeros((2, grid.dim), dtype=bool)
     for name, axes in walls.items():
@@ -72,7 +73,7 @@ def wall_forces(
     If several walls fix a component of a node, the wall normal to this component carries the force.  If none of these
     walls is normal to the component, they share the force equally.  The axis of revolution has no radial force.
 
-    `dofs` (n,): flat local degrees of freedom, possibly repeated; free ones are ignored.
+    `dofs` (n,): flat local degrees of freedom, possibly repeated; free degrees of freedom are ignored.
     `forces` (n,), in N: forces on these degrees of freedom.
     """
     d, sides = grid.dim, SIDES[grid.dim]

@@ -23,11 +23,11 @@ from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
 from mpm_dolfinx.points.material_points import body_of
 
 FULL = 1.2
-"""Volume fraction above which a cell causes a warning.  Intact domains reach 1.08 under a footing half a width deep."""
+"""Volume fraction above which a cell causes a warning.  Under a deep footing, intact domains fill cells to 1.08."""
 
 
 def warn_overlaps(cut: CutDomains, bodies: Sequence[Body]) -> Callable[..., Any] | None:
-    """Warn about the fullest cell if domains overlap.  Return a function for the next check, or None if warned."""
+    """Warn about the fullest cell if domains overlap.  Return a function for the next check; after a warning, None."""
     grid, points = cut.grid, cut.points
     volume = cut.to_cells(points.volume0 * points.J) * cut.pieces_to_cells(cut.pieces.fraction)
     fill = sum_by(cut.cells, cut.plane(volume)[0], grid.num_owned)[cut.cells] / grid.volumes(cut.cells)
@@ -61,7 +61,7 @@ LOSS = 0.03
 AGAIN = 2.0
 """Factor by which the lost fraction must grow before the next warning.  Moving interfaces change the lost fraction."""
 FINE = 0.1
-"""Fraction of a cell's deformation below which a loss is ignored.  The loss is less with stiffness ratios below 2.1."""
+"""Fraction of a cell's deformation below which a loss is ignored.  Stiffness ratios below 2.1 cause smaller losses."""
 
 
 def warn_mixed(
@@ -157,9 +157,9 @@ def warn_thin(grid: Grid, bodies: Sequence[Body], walls: Mapping[str, str], wet:
 def check_stiff(grid: Grid, bodies: Sequence[Body]) -> None:
     """Raise ValueError for 3D bodies with one domain in each cell, if domains end at grid lines along two axes.
 
-    Displacements that alternate from node to node along both axes then have no mean gradient in any piece.  They have
-    no stiffness for any variation along the third axis.  In 2D each component has a single field of this kind, and
-    walls prevent this field.
+    Displacements that alternate from node to node along both axes then have no mean gradient in any piece.  Such
+    displacements have no stiffness, however they vary along the third axis.  In 2D each component has a single field of
+    this kind, and walls prevent this field.
     """
     for i, body in enumerate(bodies if grid.dim == 3 else ()):
         low, between = np.array([[np.inf], [-np.inf]]) * np.ones(grid.dim)  # of domains; the highest end inside a cell

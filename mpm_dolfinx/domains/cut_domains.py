@@ -143,7 +143,7 @@ class CutDomains(Keyed):
         """Pieces of this process's points, without areas and mean products."""
 
     def faces(self) -> NDArray[np.float64]:
-        """Return areas (m, d, 2), in m^(d-1), of pieces on cell faces, and delete them here."""
+        """Return areas (m, d, 2), in m^(d-1), of pieces on cell faces.  This object does not keep the areas."""
         faces, self._faces = self._faces, None
         return faces
 
@@ -249,12 +249,12 @@ class CutDomains(Keyed):
 
     @property
     def _tracked(self) -> NDArray[np.float64]:
-        """Positions of all corners, or of the points without `domains`, in m."""
+        """Positions of all corners, in m.  Without `domains`, positions of the points."""
         return self.points.corners.reshape(-1, self.grid.dim) if self.domains else self.points.x
 
     @cached_property
     def _followed(self) -> tuple[Exchange, NDArray[np.int32]]:
-        """Exchange that sends `_tracked` positions to the owners of their cells, and these cells."""
+        """Exchange that sends `_tracked` positions to the owners of their cells, and the cells of these positions."""
         grid, at = self.grid, np.arange(len(self.points))
         cell = self.cells_at(at.repeat(2**grid.dim) if self.domains else at, self._tracked)
         exchange = Exchange(grid.comm, grid.owner(cell))

@@ -30,8 +30,8 @@ PLACES = "corners", "reference", "origin"
 class SeededDomains:
     """Seeded domains of the bodies, and identifiers of their parts.
 
-    The identifier of a part follows from its domain and its interval.  It is a number for `material_points.body_of`
-    with an odd index in the body.  Renewed points have even indices.
+    The identifier of a part follows from its domain and its interval.  Among identifiers of the same body
+    (`material_points.body_of`), parts have odd indices, and renewed points have even indices.
     """
 
     def __init__(self, bodies: Sequence[Body]):
@@ -79,7 +79,7 @@ class SeededDomains:
     def places(self, root: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return the body and lattice index (n, 1 + d) of seeded domains.
 
-        For a domain without a lattice, the body is -1 - id.
+        For a domain without a lattice, the entry of the body is -1 - id.
         """
         out = np.zeros((len(root), 1 + self._dim), dtype=np.int64)
         body = body_of(root, self.starts)
@@ -173,7 +173,7 @@ def beyond_corners(points: MaterialPoints, axisymmetric: bool) -> NDArray[np.flo
 def halved(points: MaterialPoints, axis: int, domains: SeededDomains, axisymmetric: bool) -> MaterialPoints:
     """Return the halves (2n,) of n points: first all lower halves, then all upper halves.
 
-    The volumes of both halves add up to the volume of the point, both at rest and deformed.
+    The volumes of both halves add up to the volume of the point, in the reference and in the deformed configuration.
     """
     root, part = roots(points)
     at, n = domains.middle(root, part, axis), len(points)
@@ -193,7 +193,7 @@ def joined(
 ) -> MaterialPoints:
     """Return the points (n,) merged from their halves.
 
-    F follows from the corners and the reference corners.  Data are means, weighted by the volumes at rest.
+    F follows from the corners and the reference corners.  Data are means, weighted by reference volumes.
     """
     places = {name: merged(getattr(lower, name), getattr(upper, name), axis) for name in PLACES}
     root, part = roots(lower)

@@ -94,13 +94,13 @@ def cell_ratios(
     With F-bar, the volume ratio of a cell is the current volume of its domains, computed from the corners, divided by
     their reference volume.  Differences between the volume ratios of domains in a cell do no work.  If the ratio of a
     cell were updated by increments only, it could drift from the volume of the domains without any opposing force.
-    Pieces have the ratio of their point without F-bar, and in cells with yielded soil, where corner volumes are
-    meaningless.
+    Without F-bar, pieces have the ratio of their point.  The same applies in cells with yielded soil, where volumes
+    from corners are meaningless.
 
     `cut`: cut particle domains.
     `points`: points at the start of the step.
-    `share` (n,): weight, from 0 to 1, of the ratio from corners in its geometric mean with the point's ratio.  It is 0
-    without F-bar.
+    `share` (n,): weight, from 0 to 1, of the ratio from corners in the geometric mean with the point's ratio; 0 without
+    F-bar.
     `flows` (n,): whether points have yielded.
     """
     cells, size = cut.cells, cut.grid.num_local

@@ -2,8 +2,8 @@
 """Deformation gradients that vary linearly within the particle domains of elastic soil.
 
 The gradient F of a point is the mean over its domain.  In bending the gradient varies across the domain.  With one
-value for each domain, and n domains over the thickness, the bending stiffness is too small by the fraction `1/n^2`.  At
-a piece with the local coordinates xi in its domain, the gradient is therefore
+gradient for each domain, and n domains over the thickness, the bending stiffness is too small by the fraction `1/n^2`.
+At a piece with the local coordinates xi in its domain, the gradient is therefore
 
     F(xi) = F (1 + e),   F e = sum_a D_a (xi_a - mean of xi_a over the reference volume).
 
@@ -56,8 +56,7 @@ class Neighbours:
         self._partner = partner.reshape(-1, 2 * dim).T.copy()  # index of the opposite face; -1 if there is none
 
     def at_neighbours(self, own: NDArray[np.float64], faces: Sequence[NDArray[np.float64]]) -> Callable[[int], tuple]:
-        """Return a function of a face index, which returns data and face centres of neighbours, and which neighbours
-        exist.
+        """Return a function from a face index to data and face centres of neighbours, and whether neighbours exist.
 
         `own` (c, k): c data columns of the points.
         `faces`: centres (d, k), in m, of the points' faces, for each face index.
@@ -95,7 +94,7 @@ class LinearGradients:
 
 
 def _seeded_faces(bodies: Sequence[Body], ids: NDArray[np.int64], seeded: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Return a key for each face of seeded domains, which is equal in both domains at the face."""
+    """Return a key for each face of seeded domains.  Both domains at a face have the same key."""
     dim, starts = bodies[0].dim, np.cumsum([0, *map(len, bodies)])
     of, key = np.where(seeded, body_of(ids, starts), -1), np.zeros((len(ids), 2 * dim), dtype=np.int64)
     for i, body in enumerate(bodies):
@@ -113,8 +112,8 @@ def _faces_of_parts(
 ) -> NDArray[np.int64]:
     """Return a key for each face of domains and of parts of domains.
 
-    On a lattice, the key consists of the lower corner, the normal and the size of the face.  Other whole domains keep
-    the keys `seeded`.  Other parts have neighbours only in their domain.
+    On a lattice, the key consists of the lower corner, the normal and the size of the face.  Without a lattice, whole
+    domains keep the keys `seeded`, and parts have neighbours only in their seeded domain.
     """
     dim, part = bodies[0].dim, is_part(points)
     root, ends = roots(points)

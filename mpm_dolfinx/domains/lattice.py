@@ -15,7 +15,7 @@ filtered.  The result is the mean over all orders of the axes.
 
 Quadratic fields remain unchanged, even at the surface.  A wave with a length of two domains is reduced by the fraction
 s, and a wave with a length of eight domains by 0.003 s.  The filter leaves out domains that have separated from their
-neighbours, and yielded soil, whose kinks are physical.  It does not move corners held by a wall, a prescribed
+neighbours, and yielded soil, whose kinks are physical.  The filter does not move corners held by a wall, a prescribed
 displacement, a plate or another body.
 """
 
@@ -40,8 +40,7 @@ from mpm_dolfinx.parallel.exchange import Exchange
 from mpm_dolfinx.points.material_points import MaterialPoints
 
 FAST = 10
-"""Fraction of a wave with a length of two domains that the filter removes for each crossed cell, at most the whole
-wave.
+"""Fraction of a wave with a length of two domains that the filter removes for each crossed cell (at most 1 in total).
 
 Plateau (scene "cycles" of tests/plateaus.py): half this value changes the result by 1.5e-04, twice this value by
 3.4e-04, and finer cells by 6.2e-03.
@@ -160,7 +159,7 @@ def _at_sites(
     """Return values at the sites of a lattice, which is distributed over the processes in slabs of layers.
 
     The function also returns the range of layers of this process, and a function that converts values at sites to rows.
-    Sites have nan where their rows of values differ by more than `tolerance`.
+    A site has nan if its rows of `values` differ by more than `tolerance`.
     """
     across, starts = int(np.prod(shape[1:])), np.arange(comm.size + 1) * shape[0] // comm.size
     layer = number // across

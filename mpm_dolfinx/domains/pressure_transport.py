@@ -34,7 +34,7 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 
 @dataclass(frozen=True, eq=False)
 class PiecePressures:
-    """Pore pressure of a scene between two steps.  Arrays have a row for each of m pieces, by point and cell.
+    """Pore pressure of a scene between two steps.  Arrays have a row for each of m pieces, sorted by point and cell.
 
     Pieces to be moved to the next grid have pressures at their centroids.  Pieces that stay have pressures of cells.
     """
@@ -161,9 +161,9 @@ class Reconstruction:
     ) -> NDArray[np.float64]:
         """Return pressures (m,), in Pa, at positions in owned cells, with second-order accuracy even at the surface.
 
-        In a cell at a no-flow side, the slope is the smaller of two slopes: that in the next cell inside, and the
-        linear extrapolation of the slopes inside.  Pressures stay between the extremes of cell, neighbours and drained
-        sides, and of the reconstructed value at the surface.
+        In a cell at a no-flow side, the slope is the smaller of two: the slope in the next cell inside, and the linear
+        extrapolation of the slopes inside.  Pressures stay between the extremes of the cell, its neighbours, drained
+        sides, and the reconstructed value at the surface.
 
         `x` (m, d), in m: positions relative to the midpoints of their cells.
         `slot` (m,): index of the cell of each position in `pressures.cells`.
@@ -202,7 +202,7 @@ def van_leer(one_sided: NDArray[np.float64]) -> NDArray[np.float64]:
 def share_within(
     increment: NDArray[np.float64], low: NDArray[np.float64], high: NDArray[np.float64], slot: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Return the largest factor (n,) <= 1 of each cell that keeps increments in the cell within [`low`, `high`]."""
+    """Return for each cell the largest factor (n,) <= 1 by which increments stay within [`low`, `high`]."""
     bound, share = np.where(increment > 0, high[slot], low[slot]), np.ones(len(low))
     excessive = (np.abs(increment) > np.abs(bound)).nonzero()[0]
     np.minimum.at(share, slot[excessive], bound[excessive] / increment[excessive])
@@ -210,7 +210,7 @@ def share_within(
 
 
 def _bounds_of(jump: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the smallest and largest difference to neighbours, at most 0 and at least 0."""
+    """Return the smallest difference to neighbours, or 0 if it is positive, and the largest, or 0 if it is negative."""
     return np.minimum(jump.min(axis=(1, 2)), 0), np.maximum(jump.max(axis=(1, 2)), 0)
 
 
@@ -263,7 +263,7 @@ def halved_pieces(
     storage: tuple[NDArray[np.float64], NDArray[np.float64]],
     bulk: float,
 ) -> PiecePressures:
-    """Return one piece for each new point.  The pressure of the piece follows from the mean slope in its old point.
+    """Return one piece for each new point.  Its pressure follows from the mean slope in the domain of the old point.
 
     `pieces`: pieces of the n old points.
     `points`: old points, and m new points.
@@ -327,7 +327,7 @@ def joined_pieces(
 def _missing(
     held: NDArray[np.float64], store: NDArray[np.float64], potential: NDArray[np.float64], of: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Return the change of potentials, in Pa, for which each point contains the fluid `held`."""
+    """Return the change of potentials, in Pa, by which each point comes to contain the fluid `held`."""
     (total, now), n = sum_by(of, np.array([store, store * potential]), len(held)), len(held)
     return np.divide(held - now, total, out=np.zeros(n), where=total > 0)
 

@@ -47,7 +47,7 @@ COVERED = 0.25
 Source: definition, the area of a new domain in a full cell, which is divided into four.
 """
 SIDE = np.array([2, 1, 3, 0])
-"""Index of the face at each edge of the ring of a domain's corners."""
+"""Index of the domain's face at each edge, in the sequence of corners around the domain."""
 START, END = np.array([2, 1, 0, 3]), np.array([0, 3, 1, 2])
 """Corner at which each face starts, and corner at which it ends, anticlockwise."""
 
@@ -304,7 +304,7 @@ class RefilledCells:
         lower: NDArray[np.float64],
         upper: NDArray[np.float64],
     ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return the keys of edges in cells, and the reference positions of their ends, from the nearest surface."""
+        """Return the keys of new edges, and the reference positions of their ends, from the nearest old surface."""
         first = np.searchsorted(parts.cell[order], cells, side="left")
         stop = np.searchsorted(parts.cell[order], cells, side="right")
         edge, at = ranges(first, stop - first)
@@ -328,7 +328,7 @@ class RefilledCells:
 
     @cached_property
     def _face_areas(self) -> NDArray[np.float64]:
-        """Seeded areas of faces, increased so that the remaining parts represent the whole face."""
+        """Seeded areas of faces, increased so that the parts that are not removed represent the whole face."""
         parts, left = self.parts, self._left
         of, share = self.faces.point[parts.row], self._share(parts.row, parts.t)
         remains = np.isin(of * self.cells + parts.cell, self.pieces.point[left] * self.cells + self.cell[left])

@@ -175,7 +175,7 @@ class SeededFaces:
         return out
 
     def signatures(self, surfaces: Sequence[Surface]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the keys of outer faces, and the index of each face's set of conditions, or -1 if it must stay."""
+        """Return the keys of outer faces, and the index of each face's set of conditions, or -1 for faces to keep."""
         key = self.seeded.key
         kind = np.zeros((len(key), len(surfaces)), dtype=np.int8)
         barred = np.zeros(len(key), dtype=bool)

@@ -76,7 +76,7 @@ def balancing_tractions(
 def _rigid(arm: NDArray[np.float64], free: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Return the rigid-body fields (k, n, d) for the lever arms of n points.
 
-    If any axis is fixed, there are no rotations.
+    If any axis is fixed, the fields contain no rotations.
     """
     n, d = arm.shape
     fields = [np.broadcast_to(e, (n, d)) for e in np.eye(d)[free]]

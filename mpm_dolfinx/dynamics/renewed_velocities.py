@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Masses and velocities of renewed particle domains, which keep centres of mass and momenta."""
+"""Masses and velocities of renewed particle domains.  Renewal conserves centres of mass and momenta."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def velocities(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the velocities and the velocity gradients of new domains.
 
-    They are means of the affine velocity fields of the old domains over the overlap.  A rigid motion of each group of
+    Both are means over the overlap with old domains, whose velocity fields are affine.  A rigid motion of each group of
     domains then restores the momentum and the angular momentum of the group.
 
     corners (n, 4, 2), in m: corners of each new domain.
