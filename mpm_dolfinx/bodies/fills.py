@@ -74,7 +74,7 @@ def put(
 
     Sides of the fill that touched a neighbour when seeded follow the neighbour's displacement.  The side opposite to
     the largest contact keeps its seeded position.  Displacements between these sides are interpolated.  The fill has no
-    velocity.  The initial volumes of its domains are those of the displaced shape.
+    velocity.  The displaced shape determines the initial volumes of its domains.
 
     Parameters
     ----------

@@ -285,8 +285,7 @@ class Loads:
     def under_held(
         self, ids: NDArray[np.int64], tracked: NDArray[np.float64], volume: NDArray[np.float64], corners: NDArray
     ) -> NDArray[np.float64]:
-        """Return the corners (n, 2^d, d), in m, of re-initialised domains.  Those on prescribed sides are `tracked`
-        ones.
+        """Return the corners (n, 2^d, d), in m, of re-initialised domains.  On prescribed sides, corners are `tracked`.
 
         A domain with a face on a prescribed side becomes a prism of equal volume.
 
