@@ -44,7 +44,7 @@ logger = logging.getLogger("mpm_dolfinx")
 _settings = jit.get_options if hasattr(jit, "get_options") else jit.get_parameters  # OLD
 _ffcx_settings = ffcx.get_options if hasattr(ffcx, "get_options") else ffcx.get_parameters  # OLD
 _replacements: dict[Path, Path] = {}
-"""Temporary folders of this run.  The key of each is the cache folder that it replaces, which is not writable."""
+"""Temporary folder of this run in place of each cache folder that is not writable."""
 _warnings: dict[Path, str] = {}
 """Pending warnings by temporary folder.  The first compilation in a folder issues its warning."""
 

@@ -44,7 +44,7 @@ class _Columns:
         return len(self.outcomes)
 
     def reshaped(self, count: int, capacity: int, shapes: dict[str, tuple[int, ...]]) -> _Columns:
-        """Copy the first rows into new arrays with more room, filled up with nan."""
+        """Copy the first rows into new, larger arrays, which are filled up with nan."""
         out = {}
         for name, shape in shapes.items():
             out[name] = np.full((capacity, *shape), np.nan)

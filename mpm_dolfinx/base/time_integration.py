@@ -27,7 +27,7 @@ GAMMA = 1 - 1 / np.sqrt(2)  # Source: Alexander (1977), the L-stable method of t
 
 @dataclass(frozen=True)
 class Substep:
-    """A stage of a diagonally implicit Runge-Kutta method.  Its numbers are fractions of the step."""
+    """A stage of a diagonally implicit Runge-Kutta method.  All numbers are fractions of the step."""
 
     end: float  # c_i: time at which the stage is in equilibrium
     own: float  # a_ii: weight of the rate of this stage
@@ -60,7 +60,7 @@ EULER = METHODS["backward-euler"]
 
 
 def substeps(method: str, evolves: bool) -> tuple[Substep, ...]:
-    """Return the substeps of a method.  A scene without time derivatives (`evolves` is False) needs only one."""
+    """Return the substeps of a method.  Without time derivatives (`evolves` is False), one substep suffices."""
     if not isinstance(method, str) or method not in METHODS:
         raise ValueError(f"method {method!r}: must be one of {', '.join(METHODS)}")
     return METHODS[method if evolves else "backward-euler"]

@@ -27,5 +27,5 @@ TINY = float(np.finfo(float).tiny) / EPSILON
 Source: IEEE 754.
 """
 FOREVER = 1 / EPSILON**2
-"""Time step, in s, so long that rates vanish: changes of (1 / epsilon) have the rate epsilon.  Source: epsilon squared.
+"""Time step, in s, so long that rates vanish: a change of (1 / epsilon) has the rate epsilon.  Source: epsilon squared.
 """

@@ -2,9 +2,9 @@
 """Cell types of meshes: their facets, and their division into particle domains.
 
 A triangle is divided into three quadrilaterals.  A tetrahedron is divided into four hexahedra with plane faces.  Each
-vertex of such a cell thus has one domain, whose corners are means of vertices.  A wedge is divided like its triangle.
-A pyramid is divided like two tetrahedra.  Hexahedra are not divided.  Neighbouring cells divide a common facet in the
-same way; only hexahedra do not divide their facets.
+vertex of such a cell thus has one domain, whose corners are means of vertices.  A wedge is divided like its triangular
+facets.  A pyramid is divided like two tetrahedra.  Hexahedra are not divided.  Neighbouring cells divide a common facet
+in the same way; only hexahedra do not divide their facets.
 """
 
 from __future__ import annotations

@@ -259,7 +259,7 @@ def split(s: NDArray, owner: NDArray, axis: int, plane) -> tuple[NDArray, NDArra
 def uncovered(
     count: int, face: NDArray[np.int64], low: NDArray[np.float64], high: NDArray[np.float64], slack: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    """Divide the uncovered parts of faces into rectangles, and return faces, lower and upper corners of these.
+    """Divide the uncovered parts of faces into rectangles, and return their faces and corners.
 
     `count`: number of faces.
     `face` (n,): index of the face that each box covers in part.

@@ -297,7 +297,7 @@ class Loads:
         return corners
 
     def check_end(self, points: MaterialPoints, before: MaterialPoints) -> None:
-        """Raise an error if points lie in forbidden regions after a step.
+        """Raise an error if points lie in forbidden regions, such as tools, after a step.
 
         `before`: points at the start of the step.
         """

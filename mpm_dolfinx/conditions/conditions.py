@@ -393,11 +393,11 @@ RIGIDITY = 1e4
 HOLD = 3e2
 """Penalty stiffness for prescribed displacements, times cell size, divided by the `holding` modulus.
 
-The penalty acts on means over cells.  The displacement error is the change of traction in the step (except by
-rotation), divided by the stiffness.  The error does not accumulate, because each step measures it from the prescribed
-position.  If a body is much stiffer than the penalty, multipliers remove the error, see `HoldLoads.augment`.  Plateau
-(scene "soil" of tests/plateaus.py): half this value changes the result by 5.9e-05, twice this value by 2.0e-05, and
-finer cells by 3.0e-02.
+The penalty acts on means over cells.  The displacement error is the change of traction in the step, divided by the
+stiffness; rotations of the traction cause no error.  The error does not accumulate, because each step measures it from
+the prescribed position.  If a body is much stiffer than the penalty, multipliers remove the error, see
+`HoldLoads.augment`.  Plateau (scene "soil" of tests/plateaus.py): half this value changes the result by 5.9e-05, twice
+this value by 2.0e-05, and finer cells by 3.0e-02.
 """
 YIELDING = 0.1
 """Factor on the elastic modulus in the penalty of laws with state variables.

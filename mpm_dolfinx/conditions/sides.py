@@ -57,7 +57,7 @@ class Sides:
         The last prescribed node also moves half a cell of the side beyond this node.  If the region covers at most half
         of the cell in which it ends, the faces therefore end where the region enters this cell.  On a side inclined to
         the grid, the faces end half a cell before the end of the region.  Both rules apply only if the side continues
-        outside the region, without another condition with a common component (`others`).
+        outside the region, and no other prescribed displacement (`others`) acts there.
         """
         faces, d = self.of(condition), self.grid.dim
         box, X = faces.region.copy(), faces.X

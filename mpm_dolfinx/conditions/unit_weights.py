@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Unit weight of the fluid, from the gravity of the scene, which converts hydraulic conductivity to mobility."""
+"""Unit weight of the fluid under the scene's gravity.  It converts hydraulic conductivity to mobility."""
 
 from __future__ import annotations
 
