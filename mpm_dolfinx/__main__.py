@@ -56,7 +56,7 @@ def number(name: str, text: str) -> float | list[float]:
 
 
 def law_of(name: str) -> type[mpm_dolfinx.Skeleton]:
-    """Return the package's law with this name, or for `file.py:name` the law `name` of the user's file."""
+    """Return the package's law with this name.  For `file.py:name`, return the law `name` of the user's file."""
     file, _, own = name.rpartition(":")
     if not file:
         found = getattr(mpm_dolfinx, name, None)

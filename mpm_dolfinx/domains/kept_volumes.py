@@ -6,7 +6,7 @@ the cell.  In elastic soil, F and the volume ratios of cells are computed from t
 updated by increments.  The volumes of domains and of points would therefore drift apart, and domains would overlap.
 After a step the corners of yielded domains therefore move by the vectors d that minimise
 
-    sum_p V_p e_p^2 + SOFT^2 sum_p V_p (mean |d / h|^2 + sum_a mean |D_a / h|^2),  V_p e_p = V_p - V - dV/dx d.
+    sum_p V_p e_p^2 + SOFT^2 sum_p V_p (mean (d / h)^2 + sum_a mean (D_a / h)^2),  V_p e_p = V_p - V - dV/dx d.
 
 The sums are over the points p.  V_p is the volume of a point, and V is the volume of its domain.  The derivative of V
 with respect to the corners is dV/dx.  The relative volume error after the motion is e_p.  D_a is the change of d along

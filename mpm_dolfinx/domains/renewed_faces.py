@@ -99,7 +99,7 @@ def faces_of_parts(
 
 
 def on_parts(faces: Surface, points: MaterialPoints) -> tuple[Surface, NDArray[np.int64]]:
-    """Return a surface together with its faces on parts of domains, and the given face of each row.
+    """Return a surface that includes its faces on parts of domains, and for each row the index in the given surface.
 
     Polygons of the surface on seeded domains are clipped to the parts.  These polygons must be rectangles in local
     coordinates.
