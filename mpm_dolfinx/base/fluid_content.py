@@ -31,7 +31,7 @@ SERIES = (120 * EPSILON) ** 0.25
 
 
 def change_of_content(alpha, a, storage, J, dp):
-    """Return the change of the fluid content in a step per volume at the start of the step, as UFL.
+    """Return as UFL the change of the fluid content in a step, divided by the volume at the start of the step.
 
     `alpha`: Biot coefficient.
     `a`, `storage`: storage coefficients S, in 1/Pa, at the porosity 1 and at the start of the step.

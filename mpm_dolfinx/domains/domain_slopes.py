@@ -88,8 +88,7 @@ class LinearGradients:
     def at_pieces(
         self, cut: CutDomains, F: NDArray[np.float64], elastic: NDArray[np.bool_], soils: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return `linear_gradients`, which vary only in the domains of `elastic` points.  All processes must call
-        it."""
+        """Return `linear_gradients`, varying only in domains of `elastic` points.  All processes must call it."""
         make = partial(Neighbours, self._comm, self._bodies, cut.points, elastic)
         return linear_gradients(self._neighbours((cut.points.id, elastic), make, self._comm), cut, F, soils)
 

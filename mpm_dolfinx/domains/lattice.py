@@ -193,7 +193,7 @@ def _filtered(
     thirds: Sequence[NDArray[np.float64]] | None,
     axes: Sequence[int] | None = None,
 ) -> NDArray[np.float64]:
-    """Return the values on a box of sites, filtered along some axes, by default along all."""
+    """Return the values at the sites of a lattice, filtered along some axes, by default along all."""
     if axes is None:
         axes = tuple(axis for axis, count in enumerate(d.shape[:-1]) if count >= len(THIRD))
     if not axes:
@@ -214,7 +214,7 @@ def _divided(x: NDArray[np.float64]) -> NDArray[np.float64]:
 def _along(
     d: NDArray[np.float64], crossed: NDArray[np.float64], axis: int, weights: NDArray[np.float64] | None = None
 ) -> NDArray[np.float64]:
-    """Return the values on a box of sites, filtered along one axis."""
+    """Return the values at the sites of a lattice, filtered along one axis."""
     out, count = d.copy(), d.shape[axis]
     along, cells = out.swapaxes(axis, 0), crossed.swapaxes(axis, 0)
     share = np.minimum(1.0, FAST * (cells[1 : count - 2] + cells[2 : count - 1]) / 2)
