@@ -42,7 +42,7 @@ LOOPS = {
 
 
 class Block(NamedTuple):
-    """Cells of one type.  meshio's class `CellBlock` lacks some second-order types."""
+    """Cells of one type.  meshio's own class for cells lacks some second-order types."""
 
     type: str
     data: NDArray[np.int64]
