@@ -38,7 +38,7 @@ def overburden(
 
 
 def _along(corners: NDArray, unit_weight: NDArray, x: NDArray, places: NDArray) -> tuple[NDArray, NDArray]:
-    """Return the overburden stress at the height of each position x, and the ground level, along lines at `places`."""
+    """Return overburden stresses at the heights of positions x, and ground levels, for vertical lines at `places`."""
     low, high = corners[..., :-1].min(axis=1), corners[..., :-1].max(axis=1)
     half = (high - low).max(initial=0.0) / 2
     across, line = np.unique(places, axis=0, return_inverse=True)

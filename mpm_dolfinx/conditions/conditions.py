@@ -320,8 +320,8 @@ class Rain(Flux):
 
     Rain infiltrates until the pressure at the side reaches `ponding`.  Further rain runs off.  Water evaporates at the
     prescribed rate until the pressure at the side falls to `driest`.  Water can also seep out of the side.  `outflows`
-    of the simulation are the flow through the side.  `simulation.outcome("runoff")` is the run-off, in m^3/s (m^2/s in
-    plane strain).  Three further outcomes are volumes since the condition began, in m^3 (m^2 in plane strain).
+    of the simulation contain the flow through the side.  `simulation.outcome("runoff")` is the run-off, in m^3/s (m^2/s
+    in plane strain).  Three further outcomes are volumes since the condition began, in m^3 (m^2 in plane strain).
     `outcome("flowed")` is the outflow through each open side.  `outcome("ran_off")` is the run-off and seepage.
     `outcome("ponded")` is the ponded water.
 

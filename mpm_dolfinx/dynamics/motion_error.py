@@ -21,9 +21,9 @@ def motion_error(
 
     The substeps end with the velocities v1, v2 and accelerations a1, a2.  A first-order step would give a velocity that
     differs by `seconds * (a2 - a1)`, and a displacement that differs by `seconds * (v2 - v1)`.  The estimate is `ERROR`
-    times this difference.  The error of a resolved mode is 0.081 omega dt times this difference, with the angular
-    frequency omega and the step dt.  A solve with the matrix of the substep bounds the estimate for unresolved modes
-    (Hosea and Shampine 1996).
+    times the difference of the two steps.  For a resolved mode of angular frequency omega, the true error is 0.081
+    omega dt times this difference, with the step dt.  A solve with the matrix of the substep bounds the estimate for
+    unresolved modes (Hosea and Shampine 1996).
 
     K, mass: momentum tangent and mass of the last substep.
     flights: states of motion after the two substeps.
