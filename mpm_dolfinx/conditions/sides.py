@@ -89,7 +89,7 @@ class Sides:
         return shorter if len(shorter) else faces  # the region is narrower than a cell
 
     def _beyond_nodes(self, side: Surface, at_end: NDArray[np.bool_], axis: int, x: float, sign: int) -> float:
-        """Return the length, in m, by which to shorten a region that ends at x along a reference axis."""
+        """Return the length, in m, by which to shorten a region at its end x along a reference axis."""
         faces = np.flatnonzero(at_end)
         X, places = side.corners[faces][:, :, axis], side.places()[faces]
         way, moved = X - X.mean(axis=1, keepdims=True), places - places.mean(axis=1, keepdims=True)

@@ -3,8 +3,8 @@
 
 A part is the image of a box [a, b] under the bilinear or trilinear map of its domain.  This holds in the reference and
 in the deformed configuration.  A whole domain is the interval [0, 1] along each axis.  A division bisects an interval,
-and two parts merge if they are the halves of one interval.  On the lattice of a box, whole domains merge as well, to
-[0, 2], [0, 4], and so on.
+and two parts merge if they are the halves of one interval.  On the lattice of a box, whole domains also merge, into the
+intervals [0, 2], [0, 4], and so on.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ PLACES = "corners", "reference", "origin"
 class SeededDomains:
     """Seeded domains of the bodies, and identifiers of their parts.
 
-    The identifier of a part follows from its domain and its interval.  Among identifiers of the same body
-    (`material_points.body_of`), parts have odd indices, and renewed points have even indices.
+    The identifier of a part follows from its domain and its interval.  `material_points.body_of` finds the body of an
+    identifier.  Within the body, parts have odd indices, and renewed points have even indices.
     """
 
     def __init__(self, bodies: Sequence[Body]):
