@@ -48,7 +48,7 @@ class Borders:
         known = np.zeros((grid.num_local, 2 + soils.shape[1]))
         known[cells, 1:] = np.column_stack([law, soils])
         self.mixed = np.full(grid.num_local, -1)
-        """Index of each local cell among the owned mixed cells, or -1."""
+        """Index of each local cell among the owned mixed cells, -1 for all other cells."""
         if mixed is not None:
             self.mixed[mixed.cells] = np.arange(len(mixed.cells))
             known[mixed.cells, 0] = 1.0
@@ -76,7 +76,7 @@ class Borders:
         `laws`: relative conductivities as functions of pressure, see `Laws`.
         `contents`: material in the cells.
         `flow`: conductivities of the filled owned cells.
-        `places` (c, d), m: vectors from the midpoints of local cells to the pressure positions of these cells.
+        `places` (c, d), m: vectors from the midpoints of local cells to their pressure positions (see `layers`).
         `moved` (c, d), m: displacements of the cells in the step.
         """
         grid, d = self.grid, self.grid.dim
@@ -145,7 +145,7 @@ class Borders:
         yield rows, *np.divide(found, across, out=np.zeros_like(found), where=across > 0)
 
     def _from_others(self, paths: Paths) -> Paths:
-        """Return the flow paths in all cells at these faces, ghost cells included."""
+        """Return the flow paths with the values of ghost cells, which other processes compute."""
         if self.grid.comm.size == 1:
             return paths
         columns = [values.reshape(len(self._cells), np.prod(values.shape[1:])) for values in paths]
@@ -203,9 +203,7 @@ class BorderFlows:
             np.add.at(out, cells, sign * self.flux)
 
     def add_slopes(self, A: PETSc.Mat, unknowns: Unknowns) -> None:
-        """Add the derivatives of the outflows with respect to the pressures to a matrix. The matrix is not yet
-        assembled.
-        """
+        """Add the derivatives of the outflows with respect to the pressures to an unassembled matrix."""
         if not len(self.flux):
             return
         number = unknowns.map.indices[self.pair]

@@ -8,12 +8,12 @@ face.  The mobility is the conductivity divided by the unit weight of the fluid.
 fluid divided by the density at zero pressure.
 
 At a seepage face, fluid can only leave.  A primal-dual active-set method (Hintermueller, Ito and Kunisch 2002) opens
-faces with outflow and closes all other faces.  The method is applied at the start of the substep and after each
-solution (`SideFeeds.settle`).
+faces with outflow and closes all other faces.  The set of open faces is updated at the start of the substep
+(`SideFeeds.begin`), and after each solution (`SideFeeds.settle`).
 
-Infiltration is the rain, but at most the inflow at the pressure of the pond.  Evaporation is at most the outflow at the
-driest pressure.  A pond of volume V supplies the additional inflow `V / dt` in a step of length dt, uniformly over its
-side.  Infiltration, ponding and run-off add up to the rain within rounding.
+Infiltration equals the rain, but is at most the inflow under the pressure of ponded water.  Evaporation is at most the
+outflow at the pressure `Rain.driest`.  A pond of volume V supplies the additional inflow `V / dt` in a step of length
+dt, uniformly over its side.  Infiltration, ponding and run-off add up to the rain within rounding.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ THICK = np.sqrt(2)
 """Area of the largest plane section of a cube, divided by the area of a face.  Source: exact bound (Ball 1986).
 
 Let a convex body of volume V in a cell of edge length h lie on one side of a plane.  The distance from the body's
-centroid to the plane is at least `V / ((d + 1) THICK h^(d-1))`.  A face that is closer to the centroid of the cell's
-material, or behind the centroid, bounds only a part of the material.  Such a face must not drain the whole cell.
+centroid to the plane is at least `V / ((d + 1) THICK h^(d-1))`.  A face at a smaller distance from the centroid of the
+cell's material bounds only a part of this material.  Such a face must not drain the whole cell.
 """
 
 
@@ -143,7 +143,7 @@ class OpenFaces:
     offset: NDArray[np.float64]  # vector from the centroid of the cell's material to the face (m, d), m
 
     def outflow(self, fluid: Fluid) -> NDArray[np.float64]:
-        """Return the outflow (m,) through each face, in m^d/s.  All faces are treated as open in both directions."""
+        """Return the outflow (m,) through each face, in m^d/s.  Seepage faces count as open."""
         return self.conductance * fluid.pi[self.at] - self.inflow
 
     def open_by(self, fluid: Fluid) -> NDArray[np.float64]:
@@ -179,7 +179,7 @@ class UnsaturatedFaces(OpenFaces):
     drop: NDArray[np.float64]  # hydrostatic pressure drop from the centroid to the face (m,), Pa
 
     def outflow(self, fluid: Fluid) -> NDArray[np.float64]:
-        """Return the outflow (m,) through each face, in m^d/s.  All faces are treated as open in both directions."""
+        """Return the outflow (m,) through each face, in m^d/s.  Seepage faces count as open."""
         return self.open_by(fluid) * (fluid.pi[self.at] - self.outer) - self.inflow
 
     def nonorthogonal(
@@ -187,8 +187,8 @@ class UnsaturatedFaces(OpenFaces):
     ) -> tuple[NDArray[np.float64] | float, NDArray[np.float64] | float]:
         """Return the two terms of the non-orthogonal correction: zero flow, and a fraction of the two-point flux.
 
-        The correction is proportional to the flux, because conductivities change by orders of magnitude in a step.  The
-        fraction is limited to [-1, 1], so that the correction does not empty the soil.
+        The correction is proportional to the flux, so it remains small if the conductivity decreases by orders of
+        magnitude. The fraction is limited to [-1, 1], so the correction does not reverse the flux.
         """
         difference = fluid.pi[self.at] - self.outer
         share = np.divide(correction, difference, out=np.zeros_like(correction), where=difference != 0).clip(-1, 1)
@@ -209,11 +209,11 @@ class UnsaturatedFaces(OpenFaces):
 
 @dataclass(frozen=True)
 class RainedFaces(OpenFaces):
-    """Faces on open sides, at least one of which has rain.
+    """Faces on open sides with rain, and faces of the other open sides.
 
     Through a face with rain, the outflow is minus the rain.  The outflow is limited from below by the outflow at the
-    pond's pressure, and from above by the outflow at the driest pressure.  The lower limit already accounts for
-    seepage, so faces with rain need no active set, and `seeps` is False.
+    pressure of the pond, and from above by the outflow at the pressure `Rain.driest`.  The lower limit also allows
+    seepage.  Faces with rain therefore need no active set, and their `seeps` is False.
     """
 
     rain: NDArray[np.float64]  # rain (m,), m^d/s; nan for faces without rain
@@ -230,13 +230,13 @@ class RainedFaces(OpenFaces):
     def nonorthogonal(
         self, fluid: Fluid, difference: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64] | float, NDArray[np.float64] | float]:
-        """Return the non-orthogonal correction.  Faces with rain have none."""
+        """Return the non-orthogonal correction.  Faces with rain have no correction."""
         return tuple(
             np.where(np.isnan(self.rain), values, 0.0) for values in self.pond.nonorthogonal(fluid, difference)
         )
 
     def driven(self, fluid: Fluid) -> NDArray[np.float64]:
-        """Return the outflow (m,) through each face due to inertia forces, in m^d/s.  Faces with rain have none."""
+        """Return the outflow (m,) through each face due to inertia forces, in m^d/s: 0 for faces with rain."""
         return np.where(np.isnan(self.rain), super().driven(fluid), 0.0)
 
     def open_by(self, fluid: Fluid) -> NDArray[np.float64]:
@@ -274,7 +274,7 @@ class SideFeeds(Feeds):
     def _pond(
         self, sides: OpenSides, ponds: tuple[float | None, ...], dt: float
     ) -> tuple[OpenSides, NDArray[np.float64]]:
-        """Return the open sides with the inflow from ponds as additional rain, and the volumes of the ponds."""
+        """Return the open sides with the inflow from ponds as additional rain, and the largest volumes of the ponds."""
         depth, number = np.array([depth or 0.0 for depth in ponds]), sides.number
         size = np.linalg.norm(sides.area, axis=1)
         area = over_all(self._comm, sum_by(number, size, len(self._names)))
@@ -301,7 +301,7 @@ class SideFeeds(Feeds):
         return RainedFaces(*same, self.sides.rain, faces, dry)
 
     def _faces(self, sides: OpenSides, flow: Conduction) -> OpenFaces:
-        """Return the faces with the outside pressures of `sides`."""
+        """Return the faces, with conductances for the outside pressures of `sides`."""
         at = self._at
         (conductance, inflow), offset = sides.driven(at, flow), flow.deformed(at, sides.offset)
         if flow.relative is None:
@@ -311,7 +311,7 @@ class SideFeeds(Feeds):
         return UnsaturatedFaces(at, conductance, sides.given, self._seeps, offset, *rest)
 
     def begin(self, at: OpenFaces, fluid: Fluid, difference: NDArray[np.float64]) -> None:
-        """Open all seepage faces whose two-point flux is not an inflow, see `Feeds`."""
+        """Open each seepage face if its two-point flux is zero or an outflow, see `Feeds`."""
         self._flows = at.outflow(fluid) >= 0
         self._nonorthogonal, self._share = at.nonorthogonal(fluid, difference)
 

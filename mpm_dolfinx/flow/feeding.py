@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Interface of the conditions on the pore fluid: drained sides, inflows, rain, sources.
 
-The method `feeding(setting)` of a condition returns a `Feeding`, which is created once in a stage.  `Feeding.placed`
-returns the `Feeds` of a substep.  At each assembly of the residual, the `Feeds` add their flow rates to the outflow of
-the cells.  `conditions/acting.py` has the corresponding interface for the momentum balance.
+The method `feeding(setting)` of a condition creates its `Feeding` once in a stage.  `Feeding.placed` returns the
+`Feeds` of a substep.  At each assembly of the residual, the `Feeds` add their flow rates to the outflow of the cells.
+`conditions/acting.py` has the corresponding interface for the momentum balance.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class Leaving(NamedTuple):
 
 
 class Feeds:
-    """Flow rates of the conditions of one kind in a substep.  Methods other than `leaving` add nothing by default.
+    """Flow rates of the conditions of one kind in a substep.  Subclasses define `leaving`.
 
     Arrays have one entry for each of the n active owned cells.  The argument `at` is the result of `conducting` for the
     current displacements.
@@ -103,7 +103,7 @@ class Feeds:
     def volumes(
         self, rates: Sequence[Mapping[str, NDArray[np.float64]]], seconds: Sequence[float]
     ) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return the volumes, in m^d, since the start of the conditions, by quantity and name of the condition.
+        """Return the volumes (m^d) since the conditions began, for each quantity and each name of a condition.
 
         `rates`: results of `passing` in the substeps of the last step.  `seconds`, s: time weights of these substeps.
         """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Two-point fluxes of the pore fluid through the covered parts of cell faces, and damping of pressure jumps.
+"""Two-point fluxes of the pore fluid through the parts of cell faces that material covers; damping of pressure jumps.
 
 The coefficients of the forms describe the material in the cells, and are set at each grid reset.  In a moving body, the
 fluxes through the deformed cells are pulled back to the start of the step.  Let kappa be the mobility of a cell
@@ -137,8 +137,7 @@ class OpenSides:
         return self.area / np.sqrt(np.add.reduce(self.area**2, axis=1, keepdims=True))
 
     def driven(self, at: NDArray[np.int64], flow: Conduction) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the outflow per unit of the cell's mass potential, in m^d/(Pa s), and the inflow, in m^d/s, of each
-        face.
+        """Return two arrays (m,): outflow per unit of the cell's mass potential, in m^d/(Pa s), and inflow, in m^d/s.
 
         The inflow is prescribed, or caused by the outside pressure and gravity.
 
@@ -151,7 +150,7 @@ class OpenSides:
         return conductance, self.given + conductance * self.outer(at, flow)
 
     def outer(self, at: NDArray[np.int64], flow: Conduction) -> NDArray[np.float64]:
-        """Return the mass potentials (m,) at outside pressures minus hydrostatic drops from centroids, in Pa."""
+        """Return the mass potentials (m,), Pa, at outside pressures minus hydrostatic drops from centroids to faces."""
         outer = self.pressure if flow.weight is None else self.pressure - flow.deformed(at, self.offset) @ flow.weight
         return mass_potential(outer, flow.bulk)
 
@@ -159,7 +158,7 @@ class OpenSides:
         """Return pressure differences (Pa) and slopes (Pa/m) from cells to drained sides.
 
         The result is an array (n, d, 2, 2).  Its indices are: cell, axis, end of the cell along this axis, and 0 for
-        the difference or 1 for the slope.  Ends without a drained side have nan for both.
+        the difference or 1 for the slope.  Ends without a drained side have nan for difference and slope.
 
         `at` (m,): index of the cell of each face among the filled cells.
         `p` (n,), Pa: pressures of the filled cells.
@@ -221,7 +220,7 @@ class CellContents(Keyed):
         rows = [self.weight, self.area, self.weight * pieces.fixed_stress], (self.area[:, None] * pieces.x).T
         sums = self.total(np.concatenate([*rows, pieces.faces.reshape(len(self.area), 2 * d).T]))
         self.volume, area, self.fixed_stress = sums[:3]
-        """Volumes (n,) of the material in filled cells, in m^d.  `fixed_stress` has mean coefficients times volumes."""
+        """Volumes (n,) of the material in filled cells, in m^d.  `fixed_stress`: integrals (n,) of beta, m^d/Pa."""
         self.fill = np.minimum(area / grid.volumes(filled), 1.0)
         """Volume fractions (n,) of material in the filled cells."""
         shapes = (forms.centroid, forms.lower_face, forms.upper_face)
@@ -240,7 +239,8 @@ class CellContents(Keyed):
         self.centroid, self.open = forms.active.centroid, forms.active.opening
         self.centroid[active] = centroid[active]
         self.open[active, :, 0], self.open[active, :, 1] = lower[active], upper[active]
-        """Vectors (c, d), in m, from cell midpoints to centroids.  `open`: open fractions (c, d, 2) of faces."""
+        """`centroid` (c, d), m: vectors from cell midpoints to centroids.  `open` (c, d, 2): open fractions of
+        faces."""
 
     def total(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the sums (..., n) of values (..., m) over the pieces of each filled cell."""
@@ -274,7 +274,7 @@ class CellContents(Keyed):
         return u[self._nodes].transpose(0, 2, 1)
 
     def motion(self, nodal: NDArray[np.float64], rests: NDArray[np.int64] | None = None) -> CellMotion:
-        """Return the motion of filled cells at centroids.
+        """Return the motion of filled cells, at the centroids of their material.
 
         `nodal`: displacements, in m.
         `rests`: cells that do not move.
@@ -336,7 +336,7 @@ class FluxForms:
         h0, h1, across = across_faces(grid, n0)
 
         def opening(side, sign):
-            """Open fraction of the face in direction `sign * n0`, in axisymmetry multiplied by `Grid.around`."""
+            """Return the open fraction of the face with normal `sign * n0`, in axisymmetry times `Grid.around`."""
             lower, upper = self.lower_face(side), self.upper_face(side)
             return sum(
                 ufl.conditional(ufl.gt(sign * n0[a], 0.5), upper[a], 0.0)
@@ -398,7 +398,7 @@ class FluxForms:
             if relative is not None:
 
                 def by_k(k):
-                    """Return `dT / dk_r` of a law without squares of conductivities, which would underflow."""
+                    """Return `dT / dk_r` for one k_r, without squares of conductivities, because squares underflow."""
                     return share * (
                         d0 * (k1 / resistance) ** 2 * ufl.diff(k0, k) + d1 * (k0 / resistance) ** 2 * ufl.diff(k1, k)
                     )
@@ -419,7 +419,7 @@ class FluxForms:
         active: NDArray[np.int64],
         density: NDArray[np.float64],
     ) -> NDArray[np.float64]:
-        """Return the outflow of the local cells through `facets` due to slopes in `cells`, in m^d/s.
+        """Return the outflow of local cells through `facets`, in m^d/s, due to the gradients `slope` in `cells`.
 
         `slope` (n, d), Pa/m: see `Gradients`.  `active` (c,): active local cells.
         `density` (c,): density of the fluid in the active local cells, divided by the density at zero pressure.

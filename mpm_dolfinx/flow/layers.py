@@ -4,17 +4,17 @@
 Soils along a line are in series, and lines are in parallel.  The mobility of a line is the harmonic mean of the
 mobilities along it.  The mobility of a cell along an axis is the arithmetic mean over the lines along this axis
 (Cardwell and Parsons 1945).  This mobility is exact for flow along and across any number of layers parallel to the
-grid.  Inclined layers must be at least a cell thick.  Otherwise a seam of low conductivity leaves gaps, and no line
-lies completely in a drain.
+grid.  Inclined layers must be at least a cell thick.  Otherwise a thin barrier has leaks, and a thin drain conducts too
+little.
 
 The pressure of a cell refers to one position in the cell, the pressure position.  In steady flow along a line, the
 pressure at this position equals the mean pressure of the line.  Let R be the resistance of the line, and let s increase
 from 0 to 1 along the line.  The resistance from the pressure position to the lower end is `int (1 - s) dR`, and to the
-upper end `int s dR`.  The sum of these resistances is exact for a line through several cells.
+upper end `int s dR`.  For a line through several cells, the sum of these resistances is exact.
 
 If layers are inclined by more than `INCLINED`, the pressure position moves to the more conductive end of the cell.
-Without this shift a drain would be interrupted between rows of cells.  The shape of a piece is approximated by the
-bounding box of its domain in the cell.  `graded` treats conductivities that vary gradually with deformation.
+Without this shift, an inclined drain would be interrupted between rows of cells.  The shape of a piece is approximated
+by the bounding box of its domain in the cell.  `graded` treats conductivities that vary gradually with deformation.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ more conductive end.  Plateau (scene "slope" of tests/plateaus.py): half this va
 this value by 5.0e-05, and finer cells by 3.4e-03.
 """
 PAIRS = 2**16
-"""Number of pairs of pieces that are processed together."""
+"""Number of pairs of pieces in a batch."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ class MixedCells:
             self._lines.append(Lines(line, piece, length, before, total))
 
     def _crossed(self, rows: slice, first, count, low, high) -> list[tuple[NDArray, NDArray, NDArray]]:
-        """Return pairs of a line and a crossed piece for each axis, with weights.
+        """Return, for each axis, all pairs of a line and a piece that it crosses, with weights.
 
         The lines run through the centroids of the pieces `rows`.  A weight is below one if the line runs along the
         border of the piece.
@@ -141,7 +141,7 @@ class MixedCells:
     def _along(self, kappa: NDArray[np.float64], mean: float = 1.0) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the mobilities along the axes, and the shifts of the pressure position divided by the cell size.
 
-        With `mean` 0 only inclined layers cause shifts.  With 1 the shifts lead to the position of mean pressure.
+        With `mean` 0, only inclined layers cause shifts.  With `mean` 1, shifts lead to the position of mean pressure.
         """
         n, d = len(self._filled), self._x.shape[1]
         mobility = np.zeros((n, d))
@@ -220,7 +220,7 @@ class MixedCells:
         return out._replace(parallel=parallel)
 
     def _sharper(self, kappa: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the contribution of inclined layers to the factor of the shift in each cell."""
+        """Return a factor of the shift in each cell: 0 without inclined layers, >= 1 for slopes above `INCLINED`."""
         n = len(self._filled)
 
         def total(values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -243,7 +243,7 @@ def graded(
 
     Pieces conduct in series along the gradient of the mobility, and in parallel across this gradient.  For a gradient
     in any direction, the difference between arithmetic and harmonic mean is distributed over the axes.  The share of an
-    axis is proportional to the variance that a linear variation along this axis explains.
+    axis is proportional to the variance of the mobility that a linear variation along this axis explains.
 
     `offset` (m, d), m: positions of the pieces relative to the midpoints of cells.
     `kappa` (m,), m^2/(Pa s): mobilities of the pieces.

@@ -8,13 +8,13 @@ minus the unit weight of the fluid.  The corrected flux is (see `storage` for ot
 
     Q = T [p+ - p- + rho_w g . (x- - x+) - (G+ + G-)/2 . t].
 
-At an open side, `p - p_out` is replaced by `p - p_out + G . t`.  Here t is the vector along the side, from the foot of
-the perpendicular through the centroid to the centre of the face.
+At an open side, `p - p_out` is replaced by `p - p_out + G . t`.  Here t is the vector along the side, from the
+projection of the centroid onto the side to the centre of the face.
 
 The gradients are fitted by least squares to the pressures of neighbouring cells and drained sides, and to zero flow
-across no-flow sides.  The area vector of a no-flow side closes the surface of the material in the cell.  The fit is
-exact for linear pressures.  Gradients are limited so that the corrected pressures at faces stay between the pressures
-of the neighbours.
+across no-flow sides.  The area vector of a no-flow side follows from the closed surface of the material in the cell.
+The fit is exact for linear pressures.  Gradients are limited so that the corrected pressures at faces stay between the
+pressures of the neighbours.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from mpm_dolfinx.forms.point_forms import FacetSum
 from mpm_dolfinx.grid.grid import Grid, sum_by
 
 ALONG = 1e-4
-"""Largest offset of two centroids along a face, divided by the cell size, for which fluxes need no correction."""
+"""Fluxes are corrected if the offset of two centroids along the face exceeds this fraction of the cell size."""
 NEAREST = 0.1
 """Lower bound of distances in the weights of the least-squares fit, divided by the cell size.  Plateau (scene "slope"
 of tests/plateaus.py): half this value changes the result by 3.0e-08, twice this value by 1.2e-06, and finer cells by
@@ -193,7 +193,7 @@ class NonorthogonalFlow(NamedTuple):
 
 
 def off_middle(sides: OpenSides, grid: Grid) -> NDArray[np.bool_]:
-    """Return a mask (m,) of faces that are offset along the side.
+    """Return a mask (m,) of faces whose centres are offset, along the side, from the centroids of their cells.
 
     Offsets are averaged over the faces of one condition in one cell.
     """
@@ -204,5 +204,5 @@ def off_middle(sides: OpenSides, grid: Grid) -> NDArray[np.bool_]:
 
 
 def _along(sides: OpenSides) -> NDArray[np.float64]:
-    """Return the vectors along faces from the foot of the perpendicular through the centroid to the centre."""
+    """Return the vectors along faces, from the projections of the centroids to the centres of the faces."""
     return sides.offset - np.add.reduce(sides.offset * sides.normal, axis=1, keepdims=True) * sides.normal

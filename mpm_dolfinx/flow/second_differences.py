@@ -32,14 +32,14 @@ def second_differences(
     centroid: NDArray[np.float64],
     opening: NDArray[np.float64],
 ) -> PETSc.Mat:
-    """Return the matrix H.  The pattern of H depends on the active cells only.
+    """Return the matrix H.  The sparsity pattern of H depends on the active cells only.
 
     `unknowns`: pressure unknowns of the active cells.
-    `strength` (n, d), m^d/Pa: coefficient, >= 0, of each owned active cell and axis.  Alternating pressures are damped
-    as by a damping of pressure jumps with the same coefficient.
+    `strength` (n, d), m^d/Pa: coefficient, >= 0, of each owned active cell and axis.  For alternating pressures, H
+    equals a damping of pressure jumps with this coefficient.
     `centroid` (c, d), m: centroids of the material in the local cells, relative to the midpoints of the cells.
-    `opening` (c, d, 2): open fractions of the lower and upper faces of the local cells.  In axisymmetry they are
-    multiplied by `Grid.around`.
+    `opening` (c, d, 2): open fractions of the lower and upper faces of the local cells.  In axisymmetry the fractions
+    are multiplied by `Grid.around`.
     """
     own = unknowns.owned
     number = unknowns.map.indices

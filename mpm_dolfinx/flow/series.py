@@ -3,9 +3,9 @@
 
 The pressure of a cell refers to one position in the cell, the pressure position (see `layers`).  Several soils may lie
 between the pressure positions of two cells.  The pressures at the interfaces of these soils are local unknowns of each
-face.  Newton's method finds these pressures from the continuity of the flux, and condensation eliminates them.  The
-flux law within a soil is the law between two cells of this soil (`fitted`).  Steady flow through layers with
-exponential relative conductivity is therefore exact for any position of the layers.
+face.  Newton's method finds these pressures from the continuity of the flux, and static condensation eliminates the
+unknowns.  The flux law within a soil is the law between two cells of this soil (`fitted`).  Steady flow through layers
+with exponential relative conductivity is therefore exact for any position of the layers.
 
 Lines through a cell (see `layers`) conduct in parallel if they cross a single soil up to the face.  All lines that
 cross several soils are replaced by one line.  This line crosses the same soils in the same sequence.  Its length in
@@ -31,9 +31,9 @@ MOST = 2200  # largest number of iterations.  Source: exact bound, twice the hal
 class Paths(NamedTuple):
     """Flow paths from the pressure positions of n cells to their faces.
 
-    The arrays (n, d, 2, ...) have the indices cell, axis and end of the cell.  `parallel` contains the lines that cross
-    a single soil.  Its entry 0 is for soil without a retention curve, and each curve has one further entry.  All other
-    lines are replaced by one line with s soils in series.
+    The first three indices of the arrays (n, d, 2, ...) are the cell, the axis, and the end of the cell.  `parallel`
+    contains the lines that cross a single soil.  Its entry 0 is for soil without a retention curve, and each curve has
+    one further entry.  All other lines are replaced by one line with s soils in series.
     """
 
     parallel: NDArray[np.float64]  # mobility of single-soil lines, times their fraction of all lines (l,), m^2/(Pa s)

@@ -9,9 +9,9 @@ The fluid balance of an active cell, with J_Delta = det(I + grad u), is
 With div u instead of J_Delta, rotations would cause volume changes.  `fluid_content` defines the change of the fluid
 content zeta, and `time_integration` the integral over a substep.  A is the exact area of the body on the face, and k is
 the conductivity.  The points x+ and x- are the centroids of the material in both cells, and d+ and d- are their
-distances from the face.  Distances from centroids are exact for partly filled cells.  `layers` defines kappa and d of
-mixed cells.  `nonorthogonal` corrects the fluxes if the two centroids are offset along the face.  `drained_sides`
-treats open sides.
+distances from the face.  The centroids, in place of cell midpoints, account for partly filled cells.  `layers` defines
+kappa and d of mixed cells.  `nonorthogonal` corrects the fluxes if the two centroids are offset along the face.
+`drained_sides` treats open sides.
 
 The factor `r = exp(p / K_w)` is the fluid density divided by the density rho_w at zero pressure.  In the storage term,
 r is taken at the pressure `(p_n + p) / 2`.  On a face, r is the logarithmic mean over both cells.  With this mean,
@@ -19,16 +19,16 @@ r is taken at the pressure `(p_n + p) / 2`.  On a face, r is the logarithmic mea
 The residual is the left side of the balance, divided by the r of the storage term.  The tangent neglects the difference
 between the r of a face and the r of the storage term.
 
-The volumes of domains drift from their fluid content, for three reasons: corners do not follow u alone, points move to
-other cells, and pressure jumps are damped (see below).  Each point stores the difference as a volume defect (`owed`).
-The next steps correct fractions of this defect (`defect`), at a constant rate over the step.
+The volume of a particle domain drifts away from the volume that its fluid content implies, for three reasons: corners
+do not follow u alone, points move to other cells, and pressure jumps are damped (see below).  Each point stores the
+difference of the volumes as its volume defect (`owed`).  Each step corrects a part (`defect`), at a constant rate.
 
 If no fluid flows within a step, Q1 displacements with DG0 pressures violate the inf-sup condition: pressures that
-alternate from cell to cell have no effect.  Therefore jumps of the pressure increment of the step are stabilised by the
-term `max(0, tau d - dt kappa / d) A [p - p_n]`.  Here tau (1/Pa) is the strength of the stabilisation, and
-`d = d+ + d-`.  In this term, dt is the length of the step times the coefficient of Q(u, p) in `time_integration`.  The
-term raises the coefficient `dt kappa A / d` of a face to at least `tau d A`.  The term conserves fluid, and it is zero
-in steady states.
+alternate from cell to cell do not affect the displacements.  The term `max(0, tau d - dt kappa / d) A [p - p_n]`
+therefore stabilises jumps of the pressure increment.  Here tau (1/Pa) is the strength of the stabilisation, and `d = d+
++ d-`.  In this term, dt is the length of the step times the coefficient of Q(u, p) in `time_integration`.  The term
+raises the coefficient `dt kappa A / d` of a face to at least `tau d A`.  The term conserves fluid, and it is zero in
+steady states.
 
 For elastic soil, tau is a quarter of the value that Silvester and Kechkar give for patches of elements (Camargo, White
 and Borja 2021).  Soil in plastic flow needs a tau up to a hundred times larger.  The increase of tau acts on second
@@ -89,8 +89,8 @@ class StorageForms:
     """Compiled forms of the fluid balance of a scene.
 
     `pieces`: quadrature points with the fields `biot`, `storage` (1/Pa) and `storage_at_one` (1/Pa), see
-    `change_of_content`.  With a specific yield they also have the field `drainage`: specific yield and suction (Pa),
-    see `skeleton.unsaturated`.
+    `change_of_content`.  With a specific yield, the points also have the field `drainage`: specific yield and suction
+    (Pa), see `skeleton.unsaturated`.
     `displacement`: increment of the displacement since the start of the step.
     `pressure`: pore pressure of the cells, positive in compression.
     `materials`: materials and fluid of the scene.  With retention curves, pieces have the fields `retention`, `lever`,
@@ -168,14 +168,14 @@ class StorageForms:
 
         The derivative with respect to p is an array (filled cells,), in m^d/Pa.  The derivatives with respect to u are
         one or two arrays (filled cells, n), in m^(d-1).  The first array is for the momentum balance, and
-        differentiates `alpha dJ_Delta`.  The second array differentiates the content.  It exists only if `symmetric` is
-        False.
+        differentiates `alpha dJ_Delta`.  The second array differentiates the content.  The second array exists only if
+        `symmetric` is False.
         """
         sums, count = self._derivatives(data), self.grid.dim * 2**self.grid.dim
         return [sums[:, 0], *[sums[:, start : start + count] for start in range(1, sums.shape[1], count)]]
 
     def drained(self, data: PointData) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the storage of cells due to saturation (m^d/Pa), and the integral `int S d(chi p)/dp dV` (m^d)."""
+        """Return the storage due to changes of saturation S (m^d/Pa), and the integral `int S d(chi p)/dp dV` (m^d)."""
         capacity, coupled = self._capacity(data).T
         return capacity, coupled
 
@@ -268,12 +268,12 @@ class StorageSystem:
         return tuple(form and form.on(facets) for form in (fluxes.flux, fluxes.gravity))
 
     def places(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the grid positions of this process's unknowns, and an empty array for prescribed pressures."""
+        """Return the grid positions of this process's unknowns, and an empty array: no pressure is prescribed."""
         places = self._forms.grid.cell_places(self.unknowns.owned)
         return places, places[:0]
 
     def change_by(self, u: PETSc.Vec, out: PETSc.Vec, *slopes: FluxSlope) -> None:
-        """Set `out` to the change (m^d) of the residual due to u.  With `slopes`, the change includes the fluxes."""
+        """Set `out` to the change (m^d) of the residual due to an increment u.  `slopes` add the changes of fluxes."""
         self.B.mult(u, out)
         for slope in slopes:
             out.array_w[:] += slope(u)
@@ -457,17 +457,15 @@ class StorageProblem:
 
     @property
     def fill(self) -> NDArray[np.float64]:
-        """Volume fraction of material in each cell.  It is the weight of the cell's pressure error."""
+        """Volume fraction of material in each cell, the weight of the cell's pressure error."""
         return self._contents.fill
 
     def undrained(self, volumes: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the pressure rises (Pa) of cells at fixed stress, if the outflows `volumes` (m^d) do not leave the
-        cells.
-        """
+        """Return the pressure increases (Pa) of cells at fixed total stress, if `volumes` (m^d) of fluid are added."""
         return volumes / (self.forms.derivatives(self.data)[0] + self._contents.fixed_stress)
 
     def filling(self, error: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the errors of the water content for pressure errors (Pa), and the changes of the water content."""
+        """Return the errors of the water content due to pressure errors (Pa), and the change of the content."""
         capacity, _ = self.forms.drained(self.data)
         change = self.forms.change(self.data)[self.system.unknowns.owned]
         share = self.fill / self._contents.volume
@@ -494,7 +492,7 @@ class StorageProblem:
 
     @property
     def accuracy(self) -> float:
-        """Largest relative tolerance of linear solvers.  Dry cells need small errors: they store little fluid."""
+        """Largest relative tolerance of linear solvers.  Dry cells store little fluid, and need small errors."""
         return SAME if self.forms.retains else 1.0
 
     def restrained(
@@ -524,7 +522,7 @@ class StorageProblem:
         """Return a function that maps a change of displacements to the changes (n,) of outflow volumes, in m^d.
 
         The function computes a matrix-free finite difference (Knoll and Keyes 2004) of the conductivity laws and of the
-        geometry of the fluxes.  Its caller must then reset the fluxes with `set_fluxes`.
+        geometry of the fluxes.  After its last call, `set_fluxes` must assemble the fluxes again.
 
         `dofs`: active dofs of u.
         """
@@ -644,8 +642,8 @@ class StorageProblem:
         share
             Weight of the filter L, in [0, 1].  The weight 0 gives the fixed-stress operator.  With the stiffness K, `B
             K^-1 B^T` equals `beta V` for a smooth pressure, and zero for a checkerboard.  For a pressure that
-            alternates along one axis, it equals `beta V / 2` at nu = 0.  The matrix `beta V - L` gives these three
-            values.  L is the sum of `min(beta V+, beta V-) / (4 d) [p][q]` over the faces.
+            alternates along one axis, this matrix equals `beta V / 2` at nu = 0.  The matrix `beta V - L` gives these
+            three values.  L is the sum of `min(beta V+, beta V-) / (4 d) [p][q]` over the faces.
         """
         system = self.system
         system.C.copy(system.P, structure=PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
