@@ -14,7 +14,7 @@ def block(T):
 def planar(F) -> bool:
     """Return whether the third axis of a UFL deformation gradient is principal.
 
-    This is so for a tensor (2, 2), and for a result of `block`.
+    The result is True for a tensor (2, 2), and for a result of `block`.
     """
     if isinstance(F, ufl.classes.Variable):
         F = F.ufl_operands[0]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Nodal forces and element matrices of Q1 vectors, summed over the points of each cell before insertion."""
+"""Nodal forces and element matrices of Q1 vectors.  The sum over the points of a cell is inserted once."""
 
 from __future__ import annotations
 
@@ -98,13 +98,13 @@ class ElementForces:
         self._sums = CellSums(along_shapes(stress, points), points)
 
     def assemble_vector(self, b: NDArray[np.float64], data: PointData, given: Given = NONE) -> None:
-        """Add the vector to the local array `b`, with contributions to ghosts in the ghost entries."""
+        """Add the assembled vector to the local array `b`, ghost entries included."""
         dofs, at = data.places.dofs
         b[dofs] += sum_by(at, self._sums(data, given).ravel(), len(dofs))
 
 
 class Beside(NamedTuple):
-    """Further integrals over each cell, which share terms with an element matrix and are computed with it."""
+    """Further integrals over each cell, computed together with an element matrix, because both share terms."""
 
     # UFL tensors T[i, k] (d, d), multiplied by grad v (or by grad v F) for each dof of v
     along: Sequence[ufl.core.expr.Expr] = ()
@@ -128,7 +128,7 @@ class ElementMatrices:
     points
         Points of the forms.
     symmetric
-        Whether A[i, k, j, l] = A[j, l, i, k].  If so, only half of the entries are computed.
+        Whether A[i, k, j, l] = A[j, l, i, k].  If True, only half of the entries are computed.
     beside
         Further integrals.
     """

@@ -6,8 +6,8 @@ multilinear function v on a box of dimension d equals the first d + 1 terms of i
 
     v(x_p) = v + grad v . xi + 1/2 xi . grad grad v . xi + ...,
 
-with the offset xi = x_p - x_mid of the point p from the midpoint x_mid.  The right side is evaluated at the midpoint.
-It is plain UFL, integrated by the one-point rule.
+with the offset xi = x_p - x_mid of the point p from the midpoint x_mid.  The right side, evaluated at the midpoint, is
+plain UFL, and the one-point rule integrates it.
 
 The list of cells of the integral contains each cell once for each point in the cell.  The assembler therefore calls the
 kernel once for each point.  The offset xi and all other data of the points are DG0 coefficients, with one row for each
@@ -37,9 +37,8 @@ from mpm_dolfinx.forms.axes import block
 from mpm_dolfinx.grid.grid import Grid, in_chunks
 
 BATCH, MANY = 2**10, 2**12
-"""Number of points in a batch of element matrices, and in one call of an expression.
-
-A batch fits into the cache.  An expression evaluates lists of `MANY` cells, and for its last points `BATCH` cells.
+"""`BATCH`: number of points in a batch of element matrices, which fits into the cache.  `MANY`: number of points in one
+evaluation of an expression.  The last points of an expression are evaluated in batches of `BATCH`.
 """
 
 
@@ -70,7 +69,7 @@ class FormPoints:
         self.live: dict[str, Callable[[PointData], NDArray[np.float64]] | None] = {}
         """Functions that return the values (n, size) of fields that change between assemblies.
 
-        A field has None if the caller passes its values to each assembly.
+        The entry of a field is None if the caller passes its values to each assembly.
         """
         self.dx = PointMeasure(grid.mesh, self.functions["weight"])
         self.sizes = {name: int(np.prod(shape, dtype=int)) for name, shape in fields.items()}
@@ -83,7 +82,7 @@ class FormPoints:
         raise AttributeError(f"the points have {', '.join(functions)}, not {name!r}")
 
     def at(self, cells: NDArray[np.int32], x: NDArray[np.float64], weight: NDArray[np.float64], **fields) -> PointData:
-        """Return points with these positions, in m, weights, in m^d, and fields; see `PointData`."""
+        """Return points with given positions x (m), weights (m^d) and fields, see `PointData`."""
         return PointData(self, Places(self.grid, cells, x), weight, fields)
 
     def value(self, f):
@@ -101,7 +100,7 @@ class FormPoints:
         return ufl.as_matrix([[plane[0, 0], plane[0, 1], 0], [plane[1, 0], plane[1, 1], 0], [0, 0, self.hoop(f)]])
 
     def plane_grad(self, f):
-        """Return the gradient at the points without the circumferential component in axisymmetry."""
+        """Return the gradient at the points, in axisymmetry without the circumferential component."""
         return self._taylor(ufl.grad(f), self.grid.dim - 1)
 
     def hoop(self, f):
@@ -114,7 +113,8 @@ class FormPoints:
         """Return grad u at the points as a coefficient that numpy evaluates.
 
         All forms with the same u share the values.  UFL would otherwise expand u as a Taylor polynomial, with many
-        terms in 3D.  With the coefficient, a kernel of Hencky's law runs in half of the time, and compiles in a fifth.
+        terms in 3D.  The coefficient halves the run time of a kernel for Hencky's law, and divides its compile time by
+        five.
         """
         if "gradient" not in self.live:
             values = u.x.array
@@ -124,7 +124,7 @@ class FormPoints:
     def follow(
         self, name: str, shape: tuple[int, ...], values: Callable[[PointData], NDArray] | None = None
     ) -> fem.Function:
-        """Return a new field as a coefficient, with a function of its values as in `live`."""
+        """Create a field that changes between assemblies, and return its coefficient.  See `live` for `values`."""
         self.functions[name] = self.grid.coefficient(shape)
         self.live[name] = values
         return self.functions[name]
@@ -138,7 +138,7 @@ class FormPoints:
         return ufl.Identity(self.grid.stretches) + (self.grad(u) if self.grid.axisymmetric else self.gradient(u))
 
     def moved_by(self, u: fem.Function):
-        """Return u at the points as UFL.  In unequal cells it is a coefficient, so that kernels fit all cells."""
+        """Return u at the points as UFL.  For unequal cells, u is a coefficient, so one kernel fits all cells."""
         if self.grid.even:
             return self.value(u)
         d = self.grid.dim
@@ -174,10 +174,10 @@ class Places(Keyed):
     x : (n, d), m
         Positions of the points.
     mixed : (n, d), m^2
-        In 3D: mean products of the offsets from the centroid of each piece, see `Pieces`.  For points without extent it
-        is None, and the products are zero.
+        In 3D: mean products of the offsets from the centroid of each piece, see `Pieces`.  None for points without
+        extent.
     hoop : (n, 4)
-        In axisymmetry: moments of the pieces in the plane, see `Pieces`.  For points without extent it is None.
+        In axisymmetry: moments of the pieces in the plane, see `Pieces`.  None for points without extent.
     """
 
     def __init__(
@@ -227,7 +227,7 @@ class Places(Keyed):
         """For each axis, pairs of `bits` and `product`.
 
         The number `bits` selects some of the other axes, see `Grid.monomials`.  The array `product` (n,) is the product
-        of the offsets from the midpoint of the cell along these axes.  For pieces it is the mean of this product.
+        of the offsets from the midpoint of the cell along these axes.  For pieces, `product` is a mean over the piece.
         """
         along = []
         for axis in range(self.grid.dim):
@@ -332,7 +332,7 @@ Given = Mapping[str, NDArray[np.float64]]
 NONE: Given = MappingProxyType({})
 
 Packed = tuple[NDArray[np.float64], list[tuple[slice, NDArray[np.float64], NDArray[np.intp]]]]
-"""Coefficients with one row per point; and for each grid function its columns, its values, and the dofs of each row."""
+"""Coefficients, one row for each point; for each grid function, its columns, its values, and the dofs of each row."""
 
 
 class Rows:
@@ -365,7 +365,7 @@ class Rows:
         return out
 
     def room(self, size: int) -> NDArray[np.float64]:
-        """Return a buffer for at least `size` rows.  It is kept between steps, because allocation is slow."""
+        """Return a buffer for at least `size` rows.  The buffer is kept, because allocation is slow."""
         buffer = self._room.value
         if buffer is None or size > len(buffer):
             buffer = self._room(size, lambda: np.zeros((size, self._width)))
@@ -400,8 +400,8 @@ class PointForm:
     """A form with the measure `points.dx`, compiled once and assembled for any positions of the points.
 
     form: linear or bilinear UFL form, with integrals over `points.dx` only.
-    dense: whether the values of a DG0 test function are numbered over the cells with points, not over all cells.
-    Kernels are then called for other cells, as in `PointExpression`, and all cells must be equal.
+    dense: whether the values of a DG0 test function are numbered over the cells with points, not over all cells. If
+    True, kernels are called for arbitrary cells, as in `PointExpression`, so all cells must be equal.
     """
 
     def __init__(self, form: ufl.Form, points: FormPoints, dense: bool = False):
@@ -414,7 +414,7 @@ class PointForm:
         return self._bound(cells, lambda: [(rows, bind(cells[rows])) for rows in in_chunks(len(cells))])
 
     def assemble_vector(self, b: NDArray[np.float64], data: PointData, given: Given = NONE) -> None:
-        """Add the vector to the local array `b`, with contributions to ghosts in the ghost entries."""
+        """Add the assembled vector to the local array `b`, ghost entries included."""
         live = self._rows.live(data, given)
         for part, form in self._parts(data):
             self.compiled.assemble_vector(b, self._rows(data, part, live), form)
@@ -474,7 +474,7 @@ class FacetSum:
             self._of.compiled.assemble_matrix(A, None, self._bound)
 
     def assemble_vector(self, b: NDArray[np.float64]) -> None:
-        """Add the vector to the local array `b`, with contributions to ghosts in the ghost entries."""
+        """Add the assembled vector to the local array `b`, ghost entries included."""
         if self._bound is not None:
             self._of.compiled.assemble_vector(b, None, self._bound)
 

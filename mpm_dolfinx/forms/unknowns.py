@@ -23,9 +23,9 @@ class Unknowns:
 
     function: any function of the space, with ghosts.
     dofs: unrolled local degrees of freedom that are unknowns, ghosts included.
-    at: positions (entities, d), in m, of the nodes or cells of this process, and whether their rows of matrices may
-    have entries in columns of other processes.  Without `at`, the space computes the positions at each request, and all
-    rows may have such entries.
+    at: positions (entities, d), in m, of the nodes or cells of this process, and a mask of entities.  Only the matrix
+    rows of masked entities may have entries in columns of other processes.  Without `at`, all rows may have such
+    entries, and the space computes the positions.
     """
 
     def __init__(self, function: fem.Function, dofs: NDArray[np.int64], at: tuple[NDArray, NDArray] | None = None):
@@ -117,7 +117,8 @@ def collect_garbage(comm: MPI.Intracomm) -> None:
     """Free the PETSc objects that Python has released on all processes.  All processes must call this function.
 
     PETSc keeps released objects, because the order of release may differ between processes.  Versions of PETSc before
-    about 3.20 also keep them on a single process.  Without this function, a run keeps the matrices of all its steps.
+    about 3.20 also keep released objects on a single process.  Without this function, a run keeps the matrices of all
+    its steps.
     """
     PETSc.garbage_cleanup(comm)
     PETSc.garbage_cleanup(PETSc.COMM_SELF)
@@ -131,7 +132,7 @@ def sum_ghosts(function: fem.Function) -> NDArray[np.float64]:
 
 
 def with_ghosts(space, rows: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return values at local dofs after an update of the ghosts from their owners.
+    """Return `rows` with the entries of ghosts replaced by the values of their owners.
 
     rows (n, k): values at the n local dofs.
     """

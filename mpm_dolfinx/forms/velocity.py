@@ -33,6 +33,6 @@ class Velocity:
         return self._past in form.coefficients()
 
     def set(self, own: float, past: float, dofs: NDArray[np.int64]) -> None:
-        """Set `own`, in s, and set the field `past` to a multiple of the present u."""
+        """Set `own`, in s, and set the field `past` to the argument `past` times the present u."""
         self._own.value = own
         self._past.x.array[dofs] = past * self._u.x.array[dofs]

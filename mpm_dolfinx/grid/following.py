@@ -60,9 +60,9 @@ def lines_at(
 def carried(lines: Sequence[NDArray[np.float64]], shift: NDArray[np.float64]) -> list[NDArray[np.float64]]:
     """Return the lines (m) along each axis after the smallest cells have moved by `shift` (d,), in m.
 
-    The smallest cells move by a whole number of cells, rounded towards zero.  A tool therefore moves through them as
-    through fixed cells.  On each side of the smallest cells, the edge of the k-th cell (k = 1, 2, ...) is multiplied by
-    the k-th power of a common factor.  Cells still grow towards the sides, but faster or slower.
+    The smallest cells move by a whole number of cells, rounded towards zero.  A tool therefore moves through the
+    smallest cells as through fixed cells.  On each side of the smallest cells, the size of the k-th cell (k = 1, 2,
+    ...) is multiplied by the k-th power of a common factor.  Cells still grow towards the sides, but faster or slower.
 
     Raises
     ------
@@ -91,7 +91,7 @@ def _filled(width: NDArray[np.float64], length: float, more: float, least: float
     """Return the new edge lengths of the cells between the smallest cells and a side.
 
     `width` (n,), m: old edge lengths.
-    `length`, m: old distance between the smallest cells and the side.  It grows by `more`.
+    `length`, m: old distance between the smallest cells and the side.  The new distance is `length + more`.
     """
     what = f"grid: follow: the tool has moved by {abs(more):.3g} m along {letter}"
     if not len(width):

@@ -2,7 +2,7 @@
 """Background grid: a box of quadrilaterals or hexahedra between lines along the axes.
 
 Grids of equal cells locate points by arithmetic.  All other grids search along each axis.  Methods such as `sizes` and
-`volumes` return a value for each cell.  In grids of equal cells they return a single row (`h`) or a single number.
+`volumes` return a value for each cell.  For equal cells these methods return a single row (`h`) or a single number.
 
 The mesh is created at its first use.  Before that, a simulation distributes the cells to processes by numbers of
 points.
@@ -39,9 +39,9 @@ REACH = 1e-4  # distance, in cell sizes, by which bodies may lie outside the gri
 TURN = 2 * np.pi
 """Angle of a whole revolution.  Axisymmetric volumes, forces and outflows refer to this angle.  Source: definition."""
 CHUNK = 2**14
-"""Number of rows of an array that are processed together.  It limits the size of temporary arrays."""
+"""Number of rows of an array that are processed together, a limit for the size of temporary arrays."""
 SNAP = 1e-10
-"""Distance, in cell sizes, below which vertices count as on a grid plane.  `Grid.snap` adds rounding."""
+"""A vertex nearer than so many cell sizes to a grid plane counts as on this plane.  `Grid.snap` adds rounding."""
 ORDER = "the order is Grid(lower, upper, cells)"
 MANY = "grid: h is undefined for unequal cells, must be replaced by sizes"
 
@@ -69,7 +69,7 @@ FACE_SIGNS = (-1, 1, 1, -1, -1, 1)
 apply.
 """
 ABOUT_MIDDLE = ((0, 1, 4), (1, 3, 4), (3, 2, 4), (2, 0, 4))
-"""Triangles of a face in 3D.  Each has two corners and the middle of the face, so no diagonal is preferred."""
+"""Triangles of a face in 3D.  Each triangle has two corners and the middle of the face, so no diagonal is preferred."""
 
 
 def side(name: str, dim: int) -> tuple[int, int]:
@@ -117,7 +117,7 @@ def polynomial(
 
 
 def ranges(first: NDArray[np.int64], count: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the index (n,) of the range of each integer in these ranges, and the integers (n,)."""
+    """Return two arrays (n,) for all integers in the ranges: the index of the range, and the integer."""
     of = np.arange(len(count)).repeat(count)
     return of, np.arange(len(of)) + np.repeat(first - (np.cumsum(count) - count), count)
 
@@ -159,7 +159,7 @@ class CellPlaces(NamedTuple):
 
 
 class Spacing(NamedTuple):
-    """The lines of a grid, and quantities that depend on the lines.  The attributes of `Grid` explain them."""
+    """The lines of a grid, and quantities that depend on the lines.  `Grid` documents the attributes."""
 
     lines: tuple[NDArray[np.float64], ...]
     widths: tuple[NDArray[np.float64], ...]
@@ -170,7 +170,7 @@ class Spacing(NamedTuple):
 
 
 class LocalCells:
-    """The local index of each cell by its lexicographic index: `[number]`.  Cells of other processes have -1.
+    """Local indices of cells by lexicographic indices: `self[number]`.  Cells of other processes have the index -1.
 
     `number` (cells,): lexicographic indices of the local cells.  The table covers the box around these cells only.
     """
@@ -212,7 +212,7 @@ class Cells:
     cell_facets : (cells, 2d)
         Facets of each cell.
     facet_cells : (facets, 2)
-        The two cells at each facet.  At the boundary the second is -1.
+        The two cells at each facet.  At the boundary the second cell is -1.
     """
 
     def __init__(self, grid: Grid, mesh: Any, partition: Partition):
@@ -259,7 +259,7 @@ class Cells:
 
     @cached_property
     def near_others(self) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Masks of local nodes at most two cells from shared nodes, and of local cells with shared nodes."""
+        """Two masks: local nodes at most two cells away from shared nodes, and local cells with shared nodes."""
         holders = fem.Function(self._nodes)
         holders.x.array[:] = 1.0
         _compat.scatter_reverse_add(holders)
@@ -306,8 +306,8 @@ def of_spacing(name: str) -> property:
 class Grid:
     """Background grid over the box [lower, upper], with equal cells or with cells between given lines.
 
-    Bodies must stay inside the grid.  Empty cells cost next to nothing.  The sides of the grid are the walls of a
-    scene: "left", "right" (x), "bottom", "top" (y in 2D, z in 3D), and in 3D "front", "back" (y).
+    Bodies must stay inside the grid.  Empty cells need little time and memory.  The sides of the grid are the walls of
+    a scene: "left", "right" (x), "bottom", "top" (y in 2D, z in 3D), and in 3D "front", "back" (y).
 
     Parameters
     ----------
@@ -323,10 +323,10 @@ class Grid:
     follow : Tool, or callable -> (n,) along each axis, m
         Object that the lines follow, at each reset of the grid.  With a tool, the smallest cells of `lines` move like
         one point: the centre of a ball, the tip of a cone, or the mean of the corners.  If the tool's shape is a
-        function, they move like its `centre`.  The other cells widen or narrow.  The tool must be a condition of the
-        first stage.  Lines do not move in stages without this tool.  A function depends on time t (s), the positions x
-        (n, d) of all points, or both.  The function returns all lines.  Along each axis, their number, first and last
-        coordinate must be as in `lines`.
+        function, the smallest cells move like `Tool.centre`.  The other cells widen or narrow.  The tool must be a
+        condition of the first stage.  Lines do not move in stages without this tool.  A function depends on time t (s),
+        the positions x (n, d) of all points, or both.  The function returns all lines.  Along each axis, the number of
+        lines and the first and last coordinate must be as in `lines`.
     axisymmetric
         Whether the first axis is the radius r >= 0, and the second axis is the axis of revolution.  There is no
         torsion.  Volumes (m^3), forces (N) and outflows (m^3/s) refer to the whole revolution.  If the grid begins at r
@@ -359,12 +359,12 @@ class Grid:
     snap
         Distances (d,) along the axes, in cell sizes.  Vertices that are nearer to a grid plane count as on the plane.
     base : (d,), m
-        Origin of all internal positions.  It is the lower corner of the grid; in axisymmetry its radius is 0.  With
-        this origin, positions far from the true origin keep their digits.
+        Origin of all internal positions: the lower corner of the grid, in axisymmetry at the radius 0.  With this
+        origin, positions far from the true origin keep their digits.
     low, high : (d,), m
         Lower and upper corner relative to `base`.
     stretches
-        Dimension of deformation gradients: d.  In axisymmetry it is 3, for the circumferential stretch.
+        Dimension of deformation gradients: d, or 3 in axisymmetry, because of the circumferential stretch.
     mesh
         The dolfinx mesh, created at its first use.  Its coordinates are relative to `base`.  On several processes, a
         second scene with another distribution of points has a separate mesh and grid, `Simulation.grid`.  A scene that
@@ -415,7 +415,7 @@ class Grid:
         self.low, self.high = self.lower - self.base, self.upper - self.base
         self._h = (self.upper - self.lower) / self.shape if self.even else None
         self.seeded: tuple[NDArray[np.float64], ...] | None = None if self.even else self.from_base(lines)
-        """Lines (n,), in m, along each axis as given, but relative to the base.  Bodies are seeded on these lines."""
+        """Given lines (n,) along each axis, in m, relative to the base.  Bodies are seeded on these lines."""
         self._spacing = self._spaced(self.seeded)
         self.comm = comm
         self._cells: Cells | None = None
@@ -436,7 +436,7 @@ class Grid:
         return Spacing(lines, widths, finest, float(finest.min()), float(most.max()), snap)
 
     def move(self, lines: Mapping[str, NDArray[np.float64]] | None) -> None:
-        """Move the lines of a grid with `follow` to coordinates (n,) by axis "x", "y", "z", in m from the base.
+        """Move the lines of a grid with `follow` to coordinates (n,) under the keys "x", "y", "z", in m from the base.
 
         With None, the lines return to their initial coordinates.  Afterwards all coordinates of nodes, cells and mesh
         are exactly as in a new grid with these lines.
@@ -459,7 +459,7 @@ class Grid:
 
     @cached_property
     def cell_volume(self) -> float:
-        """Volume of equal cells, m^d.  In axisymmetry it is the area of a cell in the plane."""
+        """Volume of equal cells, m^d.  In axisymmetry: area of a cell in the plane."""
         return float(np.prod(self.h))
 
     def sizes(self, cells: Any) -> NDArray[np.float64]:
@@ -467,7 +467,7 @@ class Grid:
         return self._h if self.even else self._of_process.at.sizes[cells]
 
     def along(self, cells: Any, axis: Any) -> NDArray[np.float64]:
-        """Return the edge lengths (n,) of local cells along an axis, in m.  Each cell may have another axis."""
+        """Return the edge lengths (n,) of local cells along an axis, in m.  `axis` may differ between cells."""
         return self.h[axis] if self.even else self._of_process.at.sizes[cells, axis]
 
     def between(self, cells: Any, others: Any, axis: Any) -> NDArray[np.float64]:
@@ -539,7 +539,7 @@ class Grid:
         return np.stack([w[i] for w, i in zip(self.widths, index.T, strict=True)], axis=-1)
 
     def next_plane(self, axis: int, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the next line (n,) above coordinates x (n,) along an axis of unequal cells, in m, or inf."""
+        """Return the next line (n,) above coordinates x (n,) along an axis of unequal cells, in m; inf if none."""
         return np.append(self.lines[axis], np.inf)[self.lines[axis].searchsorted(x, side="right")]
 
     def cells_along(self, axis: int, x: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -568,7 +568,7 @@ class Grid:
         return self._cells
 
     def share(self, load: NDArray[np.float64]) -> None:
-        """Create the mesh if it does not exist.  Divide the loads (cells,) of cells evenly among processes."""
+        """Create the mesh if it does not exist, with the loads (cells,) evenly divided among processes."""
         if self._cells is None:
             self._cells = self._made(boxes(load.reshape(self.shape), self.comm.size))
 
@@ -657,7 +657,7 @@ class Grid:
         return int(np.prod(self.shape + 1))
 
     def copy(self, ids: NDArray[np.int64]) -> NDArray[np.int64] | int:
-        """Return the index of the first cell in the copy of the box to which material points `ids` (n,) belong."""
+        """Return, for material points `ids` (n,), the index of the first cell in their copy of the box."""
         return 0
 
     def cellwise(self, shape: tuple[int, ...] = ()):
@@ -670,7 +670,7 @@ class Grid:
 
     @property
     def given(self) -> dict[str, Any]:
-        """Arguments with which an equal grid can be created: corners and numbers of cells, or lines, and the rest."""
+        """Arguments of an equal grid: corners and numbers of cells, or lines; then all other arguments."""
         rest = {"axisymmetric": self.axisymmetric, "comm": self.comm}
         if self.even:
             return {"lower": self.lower, "upper": self.upper, "cells": self.shape, **rest}
@@ -780,8 +780,8 @@ class Grid:
     ) -> NDArray[np.float64]:
         """Return the gradients (n, 2^d, d) of the Q1 shape functions of local cells at points x, in 1/m.
 
-        With `mixed`, used in 3D, gradients are means over subdomains about the points.  `mixed` (n, 3), m^2, are the
-        means of the products of two offsets from the point, over each subdomain.
+        In 3D with `mixed`, gradients are means over subdomains about the points. `mixed` (n, 3), m^2: means, over each
+        subdomain, of the products of two offsets from the point.
         """
         hats, h = self._hats(cells, x), self.sizes(cells).T[..., None] if not self.even else self.h
         dN = np.empty((*hats[0].shape, self.dim))
@@ -796,7 +796,7 @@ class Grid:
 
     @cached_property
     def monomials(self) -> NDArray[np.float64]:
-        """Coefficients (2^d, 2^d) of the Q1 shape functions about the midpoint of a cell.  Columns are functions.
+        """Coefficients (2^d, 2^d) of the Q1 shape functions about the midpoint of a cell, one in each column.
 
         Row s has the factors of the monomial s, the product of the offsets along all axes whose bit is set in s.  For
         unequal cells, the offsets are divided by the edge lengths, see `over_edges`.
@@ -805,7 +805,8 @@ class Grid:
         return np.where(bits, self.signs / (self.h if self.even else 1.0), 0.5).prod(axis=2)
 
     def over_edges(self, coefficients: NDArray[np.float64], cells: NDArray[np.int32]) -> NDArray[np.float64]:
-        """Convert coefficients (d, 2^d, cells) of `monomials` for offsets in m.  Equal cells need no change."""
+        """Divide coefficients (d, 2^d, cells) of `monomials` by cell edges, for offsets in m.  Equal cells need no
+        change."""
         if self.even:
             return coefficients
         bits = corner_bits(self.dim)[:, None]
@@ -824,14 +825,14 @@ class Grid:
         return out
 
     def _hats(self, cells: NDArray[np.int32], x: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-        """Return for each axis a factor of the shape functions, which is linear along the axis."""
+        """Return the factors of the shape functions, one for each axis.  Each factor is linear along its axis."""
         y = (x - self.midpoints[cells]) / self.sizes(cells)
         return [0.5 + y[:, a, None] * self.signs[:, a] for a in range(self.dim)]
 
     def interior_facets(self, active: NDArray[np.bool_], cells: NDArray[np.int32]) -> NDArray[np.int32]:
         """Return the owned facets between two active cells.
 
-        `cells`: indices of the mask `active`.
+        `cells`: indices of the active cells, where the mask `active` is True.
         """
         facets = np.unique(self.cell_facets[cells])
         facets = facets[facets < self.facets_owned]
@@ -839,15 +840,15 @@ class Grid:
         return facets[(both[:, 1] >= 0) & active[both[:, 0]] & active[both[:, 1]]]
 
     def wall_nodes(self, name: str) -> NDArray[np.bool_]:
-        """Return which nodes lie on the side `name` of the box."""
+        """Return a mask of the nodes on the side `name` of the box."""
         axis, end = side(name, self.dim)
         plane = (self.low, self.high)[end][axis]
         return np.abs(self.node_x[:, axis] - plane) < NEAR * self.finest[axis]
 
 
 def begin_with(name: str, grid: Any) -> None:
-    """Move lines that follow to their initial coordinates, for new bodies and scenes.  Raise ValueError for other
-    objects.
+    """Move the lines of a grid with `follow` back to their initial coordinates, for new bodies and scenes. Raise
+    ValueError if `grid` is not a Grid.
     """
     instance(name, grid, Grid)
     grid.move(None)
@@ -880,5 +881,5 @@ class GridOfGroups(Grid):
         return GridOfGroups(self, self._group, self._starts)
 
     def copy(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the index of the first cell in the copy of the box to which material points `ids` (n,) belong."""
+        """Return, for material points `ids` (n,), the index of the first cell in their copy of the box."""
         return self._group[self._starts.searchsorted(ids, side="right") - 1] * np.int64(self.cells)

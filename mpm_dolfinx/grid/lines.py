@@ -17,7 +17,7 @@ MOST = 2**31 - 1
 
 
 def rounding(x: NDArray[np.float64]) -> float:
-    """Return the largest rounding error, in m, of coordinates as large as x, in m."""
+    """Return the largest rounding error, in m, of coordinates up to the largest absolute value in x, in m."""
     return 8 * EPSILON * float(np.abs(x).max(initial=0.0))
 
 
@@ -51,7 +51,7 @@ def graded(
     ratio: float = 1.1,
     largest: float = np.inf,
 ) -> list[NDArray[np.float64]]:
-    """Return grid lines with small cells in fine boxes.  Cells outside the boxes grow with the distance from them.
+    """Return grid lines with small cells in fine boxes.  Cells outside grow with the distance from the boxes.
 
     Lines cross the whole grid, so cells in the rows and columns of a fine box are as narrow as the cells in the box.
 

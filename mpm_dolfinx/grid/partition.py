@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Partition of the grid's cells among processes: recursive coordinate bisection, weighted by loads.
 
-dolfinx's partitioners distribute the whole background grid.  Most of its cells are empty, so one process might hold the
-whole body.  Here the box of the grid is bisected recursively into halves of equal load (Berger and Bokhari 1987).  Each
-plane lies between cells, normal to the longest extent of the filled cells.
+dolfinx's partitioners distribute the whole background grid.  Most cells are empty, so one process might hold the whole
+body.  Here the box of the grid is bisected recursively into halves of equal load (Berger and Bokhari 1987).  Each plane
+of bisection lies between cells, normal to the longest extent of the filled cells.
 """
 
 from __future__ import annotations
@@ -89,14 +89,14 @@ def better(load: NDArray[np.float64], of: NDArray[np.int64]) -> NDArray[np.int64
     """Return the boxes (ranks, 2, d) of a new bisection, or None if they are hardly better than the boxes `of`.
 
     New boxes are returned if their imbalance is below `IMBALANCE`, or below the imbalance of the boxes `of` divided by
-    `IMBALANCE`.  Otherwise each reset of the grid might distribute a few cells anew.
+    `IMBALANCE`.  Without this factor, each reset of the grid might distribute a few cells anew.
     """
     new = boxes(load, len(of))
     return new if imbalance(load, new) < max(IMBALANCE, imbalance(load, of) / IMBALANCE) else None
 
 
 def imbalance(load: NDArray[np.float64], of: NDArray[np.int64]) -> float:
-    """Return the largest load of the boxes `of`, divided by the mean load.  It is 1 without loads."""
+    """Return the largest load of the boxes `of`, divided by the mean load, or 1 without loads."""
     each = np.array([load[tuple(map(slice, *box))].sum() for box in of])
     return float(each.max() / each.mean()) if each.any() else 1.0
 
@@ -134,7 +134,7 @@ def _extent(filled: NDArray[np.bool_], axis: int) -> int:
 
 
 def destinations(partition: Partition, cells: NDArray[np.int64]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Return the ranks that hold each cell, the owner first, in one list, and the start of each cell in this list.
+    """Return one list with the ranks that hold each cell, the owner first, and the start of each cell in the list.
 
     `cells` (n,): lexicographic indices.  Processes that own a neighbour across a face hold the cell as a ghost.
     """
