@@ -131,7 +131,7 @@ def resume(simulation: Simulation, file: str | os.PathLike) -> Result:
     Raises
     ------
     ValueError
-        The file is not a complete checkpoint, or belongs to another scene.  The simulation does not change.
+        The file is not a complete checkpoint, or belongs to another scene.  The error leaves the simulation unchanged.
     OSError
         The file does not exist (FileNotFoundError), or cannot be read.
     """
@@ -288,7 +288,7 @@ def _nested(arrays: dict[str, NDArray]) -> dict[str, Any]:
 
 
 def _points(arrays: dict[str, NDArray], like: MaterialPoints) -> MaterialPoints:
-    """Return material points from stored arrays; raise ValueError if the arrays differ in kind from those of `like`."""
+    """Return material points from stored arrays; raise ValueError if names, types or shapes differ from `like`."""
     data = _part(arrays, "data/")
     like = with_faces(like) if PARENT in data else like
     like = with_parts(like) if ROOT in data else like
@@ -424,7 +424,7 @@ def _ranges(comm: MPI.Intracomm, file: Path, of: dict[str, Member]) -> dict[str,
 
 
 def _before(file: Path, of: dict[str, Member], row: int) -> int:
-    """Return the number of pieces of the points in all rows before `row`."""
+    """Return the number of pieces of all points stored before the row `row`."""
     points, pieces = of[POINTS], of[PIECES]
     if row == points.shape[0]:
         return pieces.shape[0]

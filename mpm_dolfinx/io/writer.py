@@ -78,7 +78,7 @@ class Writer:
         An argument has the wrong type.  Files in the folder were not written by a writer, or have other columns.  The
         writer is closed, or was made for another simulation or for another time.
     OSError
-        The folder is not writable, or the disk is full.  `run(..., after=simulation.result)` continues such a run.
+        The folder is not writable, or the disk is full.  `run(..., after=simulation.result)` continues the run.
     """
 
     def __init__(self, simulation: Simulation, folder: str | os.PathLike, *, every: int = 1, grid: bool = False):
@@ -117,7 +117,7 @@ class Writer:
         self._lock = Lock.of(folder)
 
     def __call__(self, simulation: Simulation) -> None:
-        """Write a row of the histories, and after each `every` output intervals also the current state."""
+        """Write a row of the histories; after every `every` output intervals, also write points and grid."""
         if self.closed:
             raise ValueError(f"writer: {self._points.file.parent} is closed, must be open during a run")
         if simulation is not self._simulation:
@@ -138,7 +138,7 @@ class Writer:
         self._write_indices()
 
     def _start(self, result: Result) -> None:
-        """Remove the output of later times from the index and the table."""
+        """Remove output later than the start of the run from the index and the table."""
         if (start := result.rows[-2][0]) != self._t:
             what = f"writer: made at t = {self._t:g} s, but the run starts at t = {start:g} s"
             raise ValueError(f"{what}; must be made just before the run")
@@ -230,7 +230,7 @@ class Lock:
 
 
 def _row(result: Result) -> dict[str, float]:
-    """Return the row of the table for the last output time."""
+    """Return the row of `history.csv` for the last output time."""
     row = result.rows[-1]
     out = {"t": row.t, **{name: getattr(result, name) for name in COUNTS}}
     return out | {name: float(value) for name, (value, _) in columns(row, row.outcome).items()}
@@ -314,7 +314,7 @@ def _ends(file: Path) -> bool:
 
 @contextmanager
 def replacing(file: Path) -> Iterator[Path]:
-    """Give a temporary path for a new file, which replaces `file` at the end of the context."""
+    """Give a temporary path for a new file.  At the end of the context, the new file replaces `file`."""
     part = file.with_name(file.name + ".part")
     yield part
     with open(part, "rb") as f:

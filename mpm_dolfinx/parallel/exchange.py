@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Transfer of array rows to other processes, and of the answers back.
+"""Transfer of array rows to other processes, and of answers back to the senders.
 
-A row is the data of one piece of a particle domain, of one corner or of one loaded point.  The row is sent to the
-process that owns its cell and assembles the integrals of the cell.
+A row is the data of one piece of a particle domain, of one corner or of one loaded point.  Each row is sent to the
+process that owns the cell of the row, and assembles the integrals of this cell.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ traffic = Traffic()
 
 @cache
 def _lasting(handle: int) -> PETSc.Vec:
-    """Return an object that keeps PETSc's duplicate of a communicator."""
+    """Return a PETSc object.  PETSc keeps its duplicate of the communicator while the object exists."""
     return PETSc.Vec().create(MPI.Comm.f2py(handle))
 
 
 class Exchange:
-    """A fixed assignment of array rows to processes, which can be used for several transfers.
+    """A fixed assignment of array rows to processes, for any number of transfers.
 
     `comm`: processes of the exchange.
     `destination` (n,): rank of the process that receives each row.
@@ -107,7 +107,7 @@ def to_root(comm: MPI.Intracomm, rows: int) -> Exchange:
 
 
 def evenly(comm: MPI.Intracomm, numbers: NDArray[np.int64]) -> NDArray[np.int32]:
-    """Return ranks (n,) for ascending numbers (n,) >= 0.  All numbers of all processes differ.
+    """Return ranks (n,) for ascending numbers (n,) >= 0.  No number occurs twice, not even on two processes.
 
     Each rank gets an equal share of all numbers.  The smallest numbers go to rank 0, the next to rank 1, and so on.
     """
@@ -150,7 +150,7 @@ def at_root(comm: MPI.Intracomm, action: Callable[[], T]) -> T:
 def by_user(comm: MPI.Intracomm, name: str, action: Callable[[], T]) -> T:
     """Return the result of a user's function `name`; an error on one process, or Ctrl-C, is raised on all processes.
 
-    Other processes raise a RuntimeError, because errors of user types may not be sent.
+    Only the process with the error raises the original error; all other processes raise a RuntimeError.
     """
     value = raised = None
     try:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Arrays with one copy on each machine, in a temporary file that all processes of the machine map into memory.
 
-A process loads only the pages of the file that it reads.  The operating system may drop these pages again.  The file
-loses its name once all processes have opened it.  Its space becomes free when the last array is deleted.
+A process loads only the pages of the file that it reads.  The operating system may drop these pages again.  Once all
+processes have opened the file, it is unlinked.  Its space is freed when the last array is deleted.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ ALIGNED = np.dtype(np.float64).itemsize
 
 
 def once_a_machine(comm: MPI.Intracomm, make: Callable[[], dict[Hashable, NDArray]]) -> dict[Hashable, NDArray]:
-    """Return on every process the arrays that `make` returns on rank 0.  On several processes they are read-only.
+    """Return on every process the arrays that `make` returns on rank 0.  On several processes the arrays are read-only.
 
     If `make` raises, all processes raise its error.  No array may be empty.
     """

@@ -32,7 +32,7 @@ class ConditionWarning(ResultWarning):
 def set_log_level(level: int | str) -> None:
     """Show log lines at or above a level.  The level "INFO", for example, shows reduced steps and checkpoints.
 
-    Lines go to stderr, unless `logging` already has handlers.
+    If `logging` has no handlers, the lines go to stderr.
 
     Parameters
     ----------

@@ -30,7 +30,7 @@ ONE = 1 << 31  # Source: definition of the same order of the powers
 
 
 class Member(NamedTuple):
-    """An array in an archive: where its entries start in the file, and data that identify the entries."""
+    """An array in an archive: position of its entries in the file, their checksums, type and shape."""
 
     dtype: np.dtype
     shape: tuple[int, ...]
@@ -129,7 +129,7 @@ def some_rows(file: Path, member: Member, first: int, last: int) -> NDArray:
 def read(
     comm: MPI.Intracomm, file: Path, of: Mapping[str, Member], ranges: Mapping[str, tuple[int, int]]
 ) -> dict[str, NDArray]:
-    """Return the rows of arrays in an archive that this process reads.
+    """Return this process's rows of arrays in an archive.
 
     Raise ValueError on all processes if the bytes of an array differ from its checksum.
 
@@ -162,7 +162,7 @@ def _row_bytes(dtype: np.dtype, shape: tuple[int, ...]) -> int:
 
 
 def _joined(crc: int, parts: Iterable[tuple[int, int]]) -> int:
-    """Return the checksum of bytes with checksum `crc` and further parts."""
+    """Return the checksum of bytes with checksum `crc`, followed by parts with given checksums and lengths."""
     for more, length in parts:
         for k in range(length.bit_length()):
             crc = _product(_power(k), crc) if length >> k & 1 else crc

@@ -2,7 +2,7 @@
 """Pressures of cells from the water content of their pieces, in unsaturated soil.
 
 A piece is the part of a particle domain in one cell.  The piece has the storage s, in m^d/Pa, and the pore volume n, in
-m^d.  Its fluid content at the pressure p, minus that at zero pressure, is `c(p) = s pi(p) + n (S(p) - 1) rho(p)`.  Here
+m^d.  Minus its value at p = 0, the fluid content at the pressure p is `c(p) = s pi(p) + n (S(p) - 1) rho(p)`.  Here
 `pi = K_w (exp(p / K_w) - 1)` and `rho = exp(p / K_w)`, with the bulk modulus K_w of the fluid, and S is the saturation
 of the soil of the piece.  The pressure of a piece differs from the pressure of its cell by an offset.
 """
@@ -45,7 +45,7 @@ class PoreWater:
         return self.sums(mass_potential(p, self.bulk), self.emptied(p)[0])
 
     def sums(self, pi: NDArray[np.float64], empty: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the fluid contents of the cells, in m^d, from values of their pieces."""
+        """Return the fluid contents of the cells, in m^d, from pi and `(S - 1) rho` of their pieces."""
         return sum_by(self.slot, self.store * pi + self.pores * empty, len(self.scale))
 
     def level(
@@ -56,8 +56,8 @@ class PoreWater:
         Newton's method solves for the logarithm of the suction, within a bracket.
 
         content (n,), in m^d: prescribed fluid contents.
-        p (n,), in Pa: initial pressures, returned unchanged where they already give the fluid contents.
-        offset (k,), in Pa: pressure of each piece minus the pressure of its cell.
+        p (n,), in Pa: initial pressures.  Pressures that already give the fluid contents are returned unchanged. offset
+        (k,), in Pa: pressure of each piece minus the pressure of its cell.
         """
         count, scale = len(p), self.scale
         rounding = 4 * EPSILON * sum_by(self.slot, self.pores, count)

@@ -212,7 +212,7 @@ def sampled(law) -> list[float]:
 
 
 def _value(function: Callable, p: float) -> float:
-    """Return the number that a function with UFL results has at a pressure."""
+    """Return the value of a UFL function of the pressure at p, in Pa, as a number."""
     return float(apply_algebra_lowering(ufl.as_ufl(function(ufl.as_ufl(float(p)))))(()))
 
 
@@ -232,8 +232,8 @@ def _empty(function: Callable, suction: float) -> bool:
 def scale_of(law) -> float:
     """Return the characteristic suction of a law, in Pa.
 
-    Without an attribute `scale` of the law, this is approximately the suction at which S = 0.5.  If S is always above
-    0.5, it is the suction at which k_r = 0.5.
+    If the law has no attribute `scale`, the result is approximately the suction at which S = 0.5.  If S is always above
+    0.5, the result is the suction at which k_r = 0.5.
     """
     if (scale := getattr(law, "scale", None)) is not None:
         return float(numbers(f"{line(law)}: scale", scale, test=lambda v: v > 0, allowed="> 0"))
@@ -380,7 +380,7 @@ def anywhere(points: FormPoints, **fields: NDArray[np.float64]) -> PointData:
 class Conductance:
     """Integral of the relative permeability with respect to pressure, the potential of flow (Kirchhoff 1894).
 
-    A table holds the integral at suctions with equal steps of the logarithm.  Cubic Hermite polynomials interpolate it.
+    A table holds the integral at suctions with equal steps of the logarithm.  Cubic Hermite polynomials interpolate.
     """
 
     def __init__(self, grid: Grid, law):
@@ -422,7 +422,7 @@ class Conductance:
 
 
 REACH = (1e-8, 1e8)
-"""Range of tabulated suctions, divided by the law's scale.  Source: outside, the integral is exact to 1e-8."""
+"""Range of tabulated suctions, divided by the law's scale.  Source: k_r is constant to 1e-8 outside."""
 ROWS = 4000
 """Number of tabulated suctions.  Plateau (scene "dry" of tests/plateaus.py): half this value changes the result by
 2.1e-08, twice this value by 2.6e-09, and finer cells by 6.6e-03.
@@ -434,7 +434,7 @@ changes the result by 8.2e-10, twice this value by 1.5e-09, and finer cells by 6
 
 
 def logarithm(p: NDArray[np.float64], scale: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return scaled pressures, which are logarithmic for suctions above `scale`, in Pa."""
+    """Return the dimensionless pressures `p / scale`, with a logarithmic scale for suctions: `arcsinh(p / scale)`."""
     return np.where(p < 0, np.arcsinh(p / scale), p / scale)
 
 
@@ -447,7 +447,7 @@ FARTHEST = np.log(10)
 """Largest change of the natural logarithm of the suction in a Newton step.
 
 Without this limit, fronts in dry soil do not converge.  With the limit 2, Celia's column takes 310 Newton steps with 25
-cells, and 500 with 100 cells.  With the limit 4, it takes 330 Newton steps with 25 cells, and 920 with 100 cells.
+cells, and 500 with 100 cells.  The limit 4 gives 330 Newton steps with 25 cells, and 920 with 100 cells.
 
 Plateau (scene "dry" of tests/plateaus.py): half this value changes the result by 7.6e-10, twice this value by 9.8e-10,
 and finer cells by 6.6e-03.
@@ -460,7 +460,7 @@ def restrained(
     scale: NDArray[np.float64] | float,
     previous: NDArray[np.float64] | float = 0.0,
 ) -> NDArray[np.float64]:
-    """Return the pressure decreases (n,), in Pa, of a Newton step after limitation.
+    """Limit the pressure decreases (n,) of a Newton step, and return the limited decreases, in Pa.
 
     A step across the characteristic suction ends at this suction.  On each side of the characteristic suction the
     saturation is convex or concave, so that Newton's method converges (Wang and Tchelepi 2013).  The logarithm of the

@@ -2,10 +2,10 @@
 """Pore pressure and stress at probes, which lie at any position in the bodies.
 
 The pressure at a probe is a weighted polynomial fit (`local_fit`) to the pressures of cells.  The fit uses cells of the
-same soil, at most three cells away, that open faces connect to the cell of the probe.  The fit also uses pressures on
-faces to excluded cells and on drained sides.  Heads are fitted instead of pressures, so hydrostatic states are exact.
-The result is limited to the range of heads in the cell of the probe, in neighbouring cells and on drained sides.
-Towards an undrained side, this range is extended with the gradient of the head.
+same soil, at most three cells away.  Open faces must connect these cells to the cell of the probe.  The fit also uses
+pressures on faces to excluded cells and on drained sides.  Heads are fitted instead of pressures, so hydrostatic states
+are exact.  The result is limited to the range of heads in the cell of the probe, in neighbouring cells and on drained
+sides.  Towards an undrained side, this range is extended with the gradient of the head.
 
 The stress at a probe is a fit to the stresses of material points.
 """
@@ -207,7 +207,7 @@ class _Around:
         return low, high
 
     def _outside_faces(self, head: NDArray[np.float64]) -> list[tuple[NDArray, ...]]:
-        """Return the probe, position, head and weight of each face to an excluded cell."""
+        """Return the index of the probe, the position, the head and the weight of each face to an excluded cell."""
         out = []
         for (axis, end), pair in self._lattice.neighbours.items():
             own_cells, other_cells = pair
@@ -228,7 +228,8 @@ class _Around:
         return out
 
     def _drained(self, weight: NDArray[np.float64]) -> tuple[NDArray, ...]:
-        """Return the probe, position, head and weight of drained sides, and whether they are in the probe's cell.
+        """Return for drained sides: index of the probe, position, head, weight, and whether the probe's cell has the
+        side.
 
         The head is a mean over all drained faces on one side of a cell.  Heads of single faces give false gradients.
         """
