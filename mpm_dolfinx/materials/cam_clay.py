@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Modified Cam Clay at finite strain (Borja and Tamagnini 1998), and the Barcelona Basic Model for suction.
 
-The law is for clay whose yield surface grows with plastic compaction.  Plasticity is multiplicative, in principal
-logarithmic strains.  tau is the Kirchhoff stress, e_v is the elastic volume strain, and e is the elastic
-deviatoric strain (tension positive).  With P = -tr(tau)/3 and Q = sqrt(3/2) |dev tau|, the law is
+The law describes clay whose yield surface grows with plastic compaction.  Plasticity is multiplicative, in principal
+logarithmic strains.  tau is the Kirchhoff stress, e_v is the elastic volume strain, and e is the elastic deviatoric
+strain (tension positive).  With P = -tr(tau)/3 and Q = sqrt(3/2) |dev tau|, the law is
 
     P = P_0 exp(-e_v / kappa),   dev tau = 2G e,
     f = Q^2 / M^2 + P (P - P_c) <= 0,   dP_c / P_c = -de_v^p / (lambda - kappa),
@@ -19,9 +19,9 @@ defined by 6G dgamma / M^2 = exp(h) - 1, with the plastic multiplier dgamma.  Wi
     P = P_t exp(-a),   Q = Q_t exp(-h),   P_c = P_c,n exp(rho a),   rho = kappa / (lambda - kappa),
     (6G kappa / M^2) a = (exp(h) - 1) (2P - P_c).
 
-The local unknown is d = 2 (h - a).  It determines the stress ratio at the end of the step,
-Q / (M P) = sqrt(w) exp(-d/2).  On the yield surface a = (ln(P_t / P_c,n) + ln(1 + w exp(-d))) / (1 + rho).  The
-equation for d is smooth and monotone, even at isotropic stresses and at the critical state (a = 0).
+The local unknown d = 2 (h - a) determines the stress ratio at the end of the step, Q / (M P) = sqrt(w) exp(-d/2).  On
+the yield surface a = (ln(P_t / P_c,n) + ln(1 + w exp(-d))) / (1 + rho).  The equation for d is smooth and monotone,
+even at isotropic stresses and at the critical state (a = 0).
 
 If M^2 P_c > 6G (lambda - kappa), soil on the dry side of the critical state softens faster than it unloads elastically.
 The stress then jumps, or the equation for d has no solution.  Without a solution, the time step is reduced.
@@ -85,8 +85,8 @@ class ModifiedCamClay(Skeleton):
         loading, kappa to unloading.  P is a Kirchhoff stress.  If v has the slope C against the logarithm of the Cauchy
         stress, the slope of ln v against ln P is C / (v - C).
     initial_stress : (3,), Pa
-        Normal effective stresses at F = I, tension positive.  Their mean must be < 0.  The last stress is out of plane
-        in 2D, and circumferential in axisymmetry.  These stresses must be in equilibrium with the loads.
+        Normal effective stresses at F = I, tension positive, with a mean < 0.  The last stress is out of plane in 2D,
+        and circumferential in axisymmetry.  These stresses must be in equilibrium with the loads.
     OCR
         Overconsolidation ratio, -, >= 1: initial P_c, divided by P_c of the yield surface through the initial stress.
     shear

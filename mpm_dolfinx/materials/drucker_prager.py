@@ -8,8 +8,8 @@ tau = K tr(eps) I + 2G dev eps.  The stress returns to the yield surface
     f = sqrt(J_2) + eta p - xi c <= 0,   p = tr(tau)/3 (tension positive),  c = c_0 + H kappa,
 
 with J_2 = dev tau : dev tau / 2, the cohesion c, the accumulated plastic strain kappa, and eta and xi from `MATCHES`.
-The return has the closed form of small-strain plasticity, on the cone and at its apex (de Souza Neto, Peric and Owen
-2008, 8.3 and 14.6).  The consistent tangent is UFL's derivative of the stress.
+The return mapping has the closed form of small-strain plasticity, on the cone and at its apex (de Souza Neto, Peric and
+Owen 2008, 8.3 and 14.6).  The consistent tangent is UFL's derivative of the stress.
 """
 
 from __future__ import annotations
@@ -48,18 +48,17 @@ class DruckerPrager(Frictional):
     friction
         Friction angle phi, degrees, in [0, 90).
     dilation
-        Dilation angle psi, degrees, in [0, friction].  If it equals `friction`, flow is associated and the tangent
-        symmetric.
+        Dilation angle psi, degrees, in [0, friction].  If psi = phi, flow is associated and the tangent is symmetric.
     cohesion
-        Cohesion c_0, Pa, >= 0.  If it is zero, points without mean pressure have no stiffness.
+        Cohesion c_0, Pa, >= 0.  If c_0 is zero, points without mean pressure have no stiffness.
     hardening
         Linear hardening modulus H, Pa, >= 0: c = c_0 + H kappa, with the accumulated plastic strain kappa.  In
         associated flow, kappa is work conjugate to c.
     match
-        Stress states in which the cone coincides with Mohr and Coulomb's yield surface.  "plane strain" gives the same
-        collapse load in plane strain, exactly for associated flow.  "compression" is the outer cone of triaxial
-        compression, and "extension" is the inner cone of triaxial extension.  In axisymmetry no cone coincides in all
-        stress states: a circular footing bears 10 % less on von Mises's soil than on Tresca's.
+        Stress states in which the cone coincides with Mohr and Coulomb's yield surface.  "plane strain" gives the
+        collapse load of Mohr and Coulomb's law in plane strain, exactly for associated flow.  "compression" is the
+        outer cone of triaxial compression, and "extension" is the inner cone of triaxial extension.  In axisymmetry no
+        cone coincides in all stress states: a circular footing bears 10 % less on von Mises's soil than on Tresca's.
 
     Other parameters: see `Skeleton`.  All parameters are passed by name.  The state variable `plastic` in `points.data`
     is the inverse plastic metric C_p^-1 (3, 3), and `hardened` is kappa.  Source: de Souza Neto, Peric and Owen (2008),

@@ -204,7 +204,7 @@ def by_scene(
 
 
 def mean_size(grid: Grid) -> float:
-    """Return the edge length, in m, of the square or cube as large as the largest cell."""
+    """Return the edge length, in m, of the square or cube with the volume of the largest cell."""
     h = grid.h if grid.even else [w.max() for w in grid.widths]
     return float(np.prod(h) ** (1 / grid.dim))
 
@@ -220,9 +220,9 @@ and finer cells by 3.0e-02.
 class SoftnessAtPoints:
     """Softness of yielding points: elastic shear modulus divided by tangent shear modulus.
 
-    In plastic flow, volume strains that alternate from cell to cell grow at constant stress.  They cause alternating
-    pressures, equal to the volume strains divided by the damping coefficient tau.  tau must therefore grow with the
-    softness, or the alternating pressures reach the strength of the soil.
+    In plastic flow, volume strains that alternate from cell to cell grow at constant stress.  These volume strains
+    cause alternating pressures, equal to the volume strains divided by the damping coefficient tau. tau must therefore
+    grow with the softness.  Otherwise the alternating pressures reach the strength of the soil.
 
     The strain of a step is e = dev sym dF F^-1, with the change dF of F.  With the Kirchhoff stress T(s) at
     F - (1 - s) dF, the tangent shear modulus is G_t = (dT/ds) : e / (2 e : e) at s = 1.  At rest the direction of e is
@@ -280,7 +280,7 @@ class ConductivityAtPieces:
     laws
         Distinct conductivity laws of the materials.
     pieces
-        Integration points of the pieces.  With `laws` they have the fields F, position, conductivity and porosity0.
+        Integration points of the pieces.  `laws` need the fields F, position, conductivity and porosity0.
     displacement
         Increment of the displacement since the start of the step.
     pressure

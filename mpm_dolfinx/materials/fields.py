@@ -64,7 +64,7 @@ class SceneMaterials:
     bodies
         All bodies.
     points
-        Material points of this process, as seeded.  Fields are evaluated at their reference positions.
+        Material points of this process, as seeded.  Fields are evaluated at the reference positions of the points.
     fluid
         Pore fluid, if there is one.
     prestressed
@@ -132,7 +132,7 @@ class SceneMaterials:
             for i, m in zip(self._used, used, strict=True)
             if m.conductivity_law
         }
-        """Checksums of fields, and sampled values of laws of flow, which show whether a checkpoint fits the scene."""
+        """Checksums of fields, and values of laws of flow, for comparison of a checkpoint with the scene."""
         for i, m in zip(self._used, used, strict=True):
             if m.retention is not None:
                 self.checksums[f"retention of material {i}"] = drained(m.retention)
@@ -320,8 +320,8 @@ class SceneMaterials:
     def table(self, points: MaterialPoints, value: Callable[..., float], *columns: NDArray) -> NDArray[np.float64]:
         """Return the values (n, ...) of a function of the material at the points.
 
-        The function is called as `value(material, *columns)` and returns values (n, ...) or one number.  Without
-        `columns`, for a uniform material, it may also return one value (...) for all points.
+        The function is called as `value(material, *columns)` and returns values (n, ...) or one number.  For a uniform
+        material without `columns`, the function may also return one value (...) for all points.
 
         columns (n,): further point data.
         """
@@ -378,7 +378,7 @@ class SceneMaterials:
 
     @property
     def constants(self) -> dict[str, Skeleton]:
-        """Names of material constants, each with a material that has it."""
+        """Names of material constants, each with a material that has this constant."""
         return {name: self.materials[i] for i in self._used for name in constants_of(self.materials[i])}
 
     @cached_property
@@ -464,11 +464,11 @@ class SceneMaterials:
 
     @property
     def some_elastic(self) -> bool:
-        """Whether any law is elastic, which means that it has no state variables."""
+        """Whether any law is elastic, that is, has no state variables."""
         return any(not law.state for law in self.laws)
 
     def elastic(self, points: MaterialPoints) -> NDArray[np.bool_]:
-        """Return for each point whether its law is elastic, which means that it has no state variables."""
+        """Return for each point whether its law is elastic, that is, has no state variables."""
         return np.array([not m.state for m in self.materials])[points.material]
 
     def soil_rows(self, points: MaterialPoints) -> NDArray[np.float64]:
@@ -523,7 +523,7 @@ class SceneMaterials:
         return out
 
     def total_stress(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the total Cauchy stress, in Pa, in the shape of `effective_stress`.  All processes must call it."""
+        """Return the total Cauchy stress, in Pa, shaped like `effective_stress`.  All processes must call this."""
         return self.effective_stress(points) - self.pore_stress(points)[:, None, None] * np.eye(self.grid.stretches)
 
     def updated_state(

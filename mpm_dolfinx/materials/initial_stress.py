@@ -35,10 +35,10 @@ class K0:
 
     The vertical effective stress is the overburden of soil and fluid plus the surcharge, minus the pore stress
     alpha chi p.  alpha is Biot's coefficient, chi is Bishop's coefficient, and p is the pore pressure.  The horizontal
-    effective stresses are K0 times the vertical effective stress.  In axisymmetry they are the radial and the
-    circumferential stress.  The stresses are exact for level ground with level layers.  In other ground the stresses
-    are balanced, without motion of the points.  A warning is given if balancing changes a stress by more than 5 % of
-    the largest initial stress, as on slopes.
+    effective stresses are K0 times the vertical effective stress.  In axisymmetry, the horizontal stresses are radial
+    and circumferential.  The stresses are exact for level ground with level layers.  In other ground, the stresses are
+    changed until they balance the weight, without motion of the points.  A warning is given if balancing changes a
+    stress by more than 5 % of the largest initial stress, as on slopes.
 
     Parameters
     ----------
@@ -80,8 +80,8 @@ def hydrostatic(level: float, unit_weight: float | None = None) -> Callable[[NDA
     level
         Height, m, along the last axis.
     unit_weight
-        Unit weight of the fluid, N/m^3, > 0; by default that of the scene's fluid, or 9810 outside a scene.  A warning
-        is given if the value differs from the unit weight of the scene's fluid.
+        Unit weight of the fluid, N/m^3, > 0; by default the unit weight of the scene's fluid, or 9810 outside a scene.
+        A warning is given if the value differs from the unit weight of the scene's fluid.
     """
     numbers("hydrostatic: level", level)
     if unit_weight is not None:
@@ -113,7 +113,7 @@ class Hydrostatic(OfWater):
 
 
 def by_body(given, bodies: Sequence[Body], later: Sequence[int]) -> dict[int, InitialStress]:
-    """Return the initial stress of each body.  One initial stress applies to all bodies present at the start."""
+    """Return the initial stress of each body.  A single initial stress applies to all bodies present at the start."""
     allowed = "a K0, a function of x, or a dict of these, {index of a body: ...}"
     if given is None:
         return {}
@@ -225,7 +225,7 @@ def _in_columns(
 def stressed(
     materials: SceneMaterials, points: MaterialPoints, chosen: NDArray[np.bool_], target: NDArray[np.float64]
 ) -> MaterialPoints:
-    """Return the points with target stresses (n, 3, 3), in Pa, at the chosen points.  All processes must call it.
+    """Return the points with target stresses (n, 3, 3), in Pa, at the chosen points.  All processes must call this.
 
     In Modified Cam Clay the initial stress is a parameter.  In other laws it is due to elastic strains.  ValueError is
     raised if a target stress is outside the yield surface.
@@ -276,7 +276,7 @@ class _ElasticStrains:
         return out
 
     def of(self, tensor: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the components of tensors (n, 3, 3), with zeros where the strain component is not unknown."""
+        """Return the components of tensors (n, 3, 3), with zeros for known strain components."""
         i, j = np.array(self.components).T
         return np.where(self.free, tensor[:, i, j], 0.0)
 
@@ -344,7 +344,7 @@ class _ElasticStrains:
 
 
 def strained(materials: SceneMaterials, points: MaterialPoints, moved: MaterialPoints) -> MaterialPoints:
-    """Return points with the elastic strains that they have in `moved`, after deformation."""
+    """Return `points` with the elastic strains of `moved`, the same points after deformation."""
     law = materials.law_of(points)
     own = {name: points.data[name] for name in MaterialPoints.INTERNAL if name in points.data}
     data = {**moved.data, **own}

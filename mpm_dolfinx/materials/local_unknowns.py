@@ -62,7 +62,7 @@ class LocalUnknowns:
     Attributes
     ----------
     values
-        The unknowns by name, as UFL that depends on F, and `trial`.
+        The unknowns by name, as UFL that depends on F; also `trial`.
     known
         Like `values`, but independent of F, for expressions that are not differentiated with respect to F.  The kernels
         of such expressions need no trial values.  For laws with an energy, `known` equals `values`.
@@ -99,10 +99,8 @@ class LocalUnknowns:
     def solve(self, data: PointData, derive: bool = True, motion: tuple = ()) -> Given:
         """Solve for the local unknowns at the present F, and return values for the forms.  All processes must call it.
 
-        derive: whether to differentiate with respect to the trial values, which `values` needs.
-        motion: key for `Latest`, which changes whenever trial values of the same `data` change, except with time.
-
-        derive: whether to differentiate with respect to the trial values, which `values` needs.
+        derive: whether to compute the derivatives with respect to the trial values.  `values` contains them.
+        motion: key of the present displacement.  Results are reused while `data`, `motion` and dt are the same.
         """
         key = data.key, motion, float(self._dt.value)
         solved = self._solved(key, lambda: self._equations.solve(data, self._trial.evaluate(data)), self._comm)
@@ -156,7 +154,7 @@ class _Equations:
             self._bends = PointExpression(ufl.as_vector([_along(by_y, by_z, Y, m, (i, j), l) for i, j, l in each]), own)
 
     def _with_trial(self, values: dict) -> dict:
-        """Return the trial values by the names of the arguments of the law's equations."""
+        """Return the trial values as arguments of the law's equations, by name."""
         return {"trial": values} if self._law.trial is not None else values
 
     def solve(self, data: PointData, trial: NDArray[np.float64]) -> Solved:
@@ -265,7 +263,7 @@ class _Equations:
 
 
 def _along(by_y, by_z, Y, m: int, i: tuple[int, ...], j: int):
-    """Return the derivative of component i with respect to component j of z as UFL."""
+    """Return the derivative of component i of f(y* + Y (z - z*), z) with respect to component j of z, as UFL."""
     return by_z[(*i, j)] + sum(by_y[(*i, a)] * Y[a, j] for a in range(m))
 
 
@@ -317,7 +315,7 @@ def _newton(system, y: NDArray[np.float64]) -> NDArray[np.int64]:
 
 
 def _solve(A: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return A^-1 b for matrices A, not finite if A is singular."""
+    """Return A^-1 b for matrices A.  The result is not finite if A is singular."""
     with np.errstate(all="ignore"):
         if A.shape[1] == 1:
             return b / A

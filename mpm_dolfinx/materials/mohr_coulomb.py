@@ -2,7 +2,7 @@
 """Mohr and Coulomb's elastoplasticity at finite strain, with edges, apex and a tension cut-off.
 
 Plasticity is multiplicative, in principal logarithmic strains, with Hencky's elasticity.  The principal Kirchhoff
-stresses are t_1 >= t_2 >= t_3, tension positive.  They satisfy
+stresses are t_1 >= t_2 >= t_3, tension positive.  These stresses satisfy
 
     f_ij = (1 + sin phi) t_i - (1 - sin phi) t_j - 2 c cos phi <= 0  for all i, j,    t_i <= T,
 
@@ -11,10 +11,10 @@ with the friction angle phi, the cohesion c and the tensile strength T.  The dir
 principal directions e_i.
 
 The return mapping keeps the order of the principal stresses.  The final stress lies on one of ten faces, edges and
-vertices.  On each of these the final stress is linear in the trial stress (de Souza Neto, Peric and Owen 2008, 8.2,
-without the cut-off).  A final stress is valid if it is admissible, the order is kept, and all plastic multipliers are
->= 0.  Of the ten possible final stresses, the return mapping uses the stress that violates these conditions least.  Its
-violation is a rounding error.  Derivatives are computed in numpy, and are exact even for equal eigenvalues.
+vertices.  On each face, edge and vertex, the final stress is linear in the trial stress (de Souza Neto, Peric and Owen
+2008, 8.2, without the cut-off).  A final stress is valid if it is admissible, the order is kept, and all plastic
+multipliers are >= 0.  The return mapping uses the possible final stress with the least violation, which is a rounding
+error.  Derivatives are computed in numpy, and are exact even for equal eigenvalues.
 """
 
 from __future__ import annotations
@@ -46,10 +46,10 @@ class MohrCoulomb(Frictional):
     friction
         Friction angle phi, degrees, in [0, 90).  At 0 the law is Tresca's law with the undrained strength `cohesion`.
     dilation
-        Dilation angle psi, degrees, in [0, friction].  If it equals `friction`, flow is associated and the tangent is
-        symmetric.  Soil in tension at the apex dilates for any psi.
+        Dilation angle psi, degrees, in [0, friction].  If psi = phi, flow is associated and the tangent is symmetric.
+        Soil in tension at the apex dilates for any psi.
     cohesion
-        Cohesion c, Pa, >= 0.  If it is zero, points without mean pressure have no stiffness.
+        Cohesion c, Pa, >= 0.  If c is zero, points without mean pressure have no stiffness.
     tension
         Tensile strength T, Pa, >= 0: upper limit of the principal stresses, by default the apex stress c cot phi.
 
@@ -239,11 +239,11 @@ class _Return:
         return [total, self._q * total + difference * x[:, 2], self._q * total + difference * (x[:, 1] + x[:, 2])]
 
     def _in_triaxial(self, x: NDArray) -> list[NDArray]:
-        """Like `_in_apex`, for the vertex with t_2 = t_3 at the cut-off of t_1."""
+        """Like `_in_apex`, for the vertex where t_1 is at the cut-off, and t_2 = t_3."""
         return [-x[:, 1], -x[:, 2], x[:, 0] + self._p / self._q * (x[:, 1] + x[:, 2])]
 
     def _in_extension(self, x: NDArray) -> list[NDArray]:
-        """Like `_in_apex`, for the vertex with t_1 = t_2 at their cut-offs."""
+        """Like `_in_apex`, for the vertex where t_1 = t_2 are at the cut-off."""
         return [x[:, 0], x[:, 1], -x[:, 2], x[:, 0] + x[:, 1] + self._p / self._q * x[:, 2]]
 
 

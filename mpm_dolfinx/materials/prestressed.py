@@ -21,7 +21,7 @@ from mpm_dolfinx.forms.axes import block, embedded, planar
 from mpm_dolfinx.materials.skeleton import Field, Skeleton
 
 AT_REST = " at rest"
-"""Suffix of the names of state variables at seeding, which show whether a point has yielded."""
+"""Suffix of the names of state variables at seeding.  At yielded points, the present state variables differ."""
 
 
 def stressed(m: Skeleton, knows_space: bool) -> Skeleton:
@@ -54,7 +54,7 @@ def prestressed(law: type[Skeleton], knows_space: bool) -> type[Skeleton]:
 
 
 def _from_seeded(function: Callable, name: str, knows_space: bool) -> Callable:
-    """Return a function of a law that is evaluated at F F_i."""
+    """Return a function of a law, with F replaced by F F_i."""
     names = Skeleton.arguments_of(function)
 
     def of(**given):

@@ -25,7 +25,7 @@ from mpm_dolfinx.pores.retention import check_retention
 Field = float | Sequence[float] | Callable[[NDArray[np.float64]], ArrayLike]
 """A constant (number or vector), or a function of the reference positions X (n, d), in m, that returns values (n, ...).
 
-X are the points of one process.  On several processes, a function whose values depend on other points, like a mean,
+X are the points of one process.  On several processes, a function whose values depend on other points, such as a mean,
 raises ValueError.
 """
 
@@ -94,13 +94,13 @@ class Skeleton:
     computes new values at the points after every converged step.  If a new value is not finite, the time step is
     reduced.
 
-    A law whose stress has no closed formula has local unknowns.  `unknowns` contains the initial values of the unknowns
-    in their iteration, by name.  Unknowns are arguments of `kirchhoff` and `update`.  Unknowns and residuals should be
-    scaled to values of about one.
+    A law whose stress has no closed formula has local unknowns.  `unknowns` contains the values at which Newton's
+    method starts, by name of the unknown.  Unknowns are arguments of `kirchhoff` and `update`.  Unknowns and residuals
+    should be scaled to values of about one.
 
     residual
-        Function of the law's fields, state, unknowns and `trial`.  It returns a dict with UFL of the shape of the
-        unknown for each unknown.  Newton's method solves residual = 0 at each point.
+        Function of the law's fields, state, unknowns and `trial`.  It returns a dict with UFL for each unknown, of the
+        shape of the unknown.  Newton's method solves residual = 0 at each point.
     solution
         Alternative to `residual` in numpy, for return mappings with many cases, and for existing codes.  It is a
         function of arrays (n, ...) of the law's fields, state and `trial`.  It returns a dict with a pair for each
@@ -110,14 +110,14 @@ class Skeleton:
         stationary in the unknowns.
     trial
         Function (F, ...) -> {name: UFL}.  Residuals depend on F through these trial values only.  In a law without
-        `trial`, residuals have F itself as argument.  `kirchhoff` and `update` also receive values other than UFL.
+        `trial`, residuals have F itself as argument.  Only `kirchhoff` and `update` also receive values other than UFL.
 
     All these functions may have the argument `dt`, the time since the start of the step, s, for rate-dependent laws.
     With the new state and dt = 0, a law must return the stress at the end of the step.  The argument `cell_size`, the
     mean edge length of a cell, m, can make softening independent of the grid.
 
     A law that depends on suction has the state variable `suction`, and optionally `suction_at_start`, both initially
-    0.0.  The scene sets `suction` to max(-p, 0), Pa, at the end of each substep, and `suction_at_start` to this value
+    0.0.  The scene sets `suction` to max(-p, 0), Pa, at the end of each substep, and `suction_at_start` to the suction
     at seeding.  Laws with local unknowns use `suction` in `trial`.
 
     For every law, bulk and shear also scale the ghost penalty, the fixed-stress coefficient and the pressure damping.
@@ -255,7 +255,7 @@ class Skeleton:
 
     @classmethod
     def _kirchhoff(cls, F, values: Mapping[str, object], shape: tuple[int, int]):
-        """Return the Kirchhoff stress, in Pa, as UFL of the right shape."""
+        """Return the Kirchhoff stress, in Pa, as UFL of this shape."""
         return expression(cls.kirchhoff, [shape, (3, 3)], "" if cls.unknowns else "F", F=F, **values)
 
     @classmethod
@@ -301,8 +301,8 @@ class Skeleton:
 
         The value for macroelements of 2 x 2 cells is 3 alpha^2 / (8 (lambda + 3G)) (Silvester and Kechkar 1990;
         Camargo, White and Borja 2021).  tau is half of this value for laws with a state, and a quarter for other laws.
-        A quarter gives better conditioning and less smearing.  The value for 2 x 2 x 2 cells is too small to damp
-        pressures that alternate along two axes only.  Oscillations due to first yield remain.
+        A quarter gives better conditioning and less smearing than a half.  The value for 2 x 2 x 2 cells is too small
+        to damp pressures that alternate along two axes only.  Oscillations due to first yield remain.
         """
         lam = self.bulk - 2 * self.shear / 3
         return (0.5 if self.state else 0.25) * self.biot**2 * 3 / (8 * (lam + 3 * self.shear))
@@ -343,7 +343,7 @@ class Hencky(Skeleton):
     """Hencky's law: psi = lambda/2 (ln J)^2 + G sum_i (ln lambda_i)^2, with the principal stretches lambda_i.
 
     2D means plane strain.  Source: Hencky (1928).  The deviatoric part contains a small constant under a square root,
-    which keeps the derivatives finite at equal eigenvalues.  The stress at F = I is exactly zero.  Parameters as for
+    which keeps the derivatives finite at equal eigenvalues.  The stress at F = I is exactly zero.  Parameters: see
     `Skeleton`.
     """
 
@@ -372,7 +372,7 @@ def _deviatoric(F):
 def _stretch_difference(C):
     """Return the difference of the logarithmic principal stretches of a symmetric 2x2 tensor, as UFL.
 
-    With a single quotient, `ratio`, the second derivatives are half as long as with two.
+    With a single quotient, `ratio`, the second derivatives are half as long as with two quotients.
     """
     ratio = ((C[0, 0] - C[1, 1]) ** 2 + 4 * C[0, 1] ** 2) / (C[0, 0] + C[1, 1]) ** 2
     radius = ufl.sqrt(ratio + SEPARATION**2 / 4)
@@ -380,7 +380,7 @@ def _stretch_difference(C):
 
 
 def _eigenvalues(C, separation: float = SEPARATION):
-    """Return separated eigenvalues of a symmetric 2x2 or 3x3 tensor as UFL."""
+    """Return eigenvalues of a symmetric 2x2 or 3x3 tensor as UFL, slightly separated if they are equal."""
     if C.ufl_shape[0] == 2:
         mean = (C[0, 0] + C[1, 1]) / 2
         radius = ufl.sqrt((C[0, 0] - C[1, 1]) ** 2 + 4 * C[0, 1] ** 2 + separation**2) / 2
@@ -396,7 +396,7 @@ def _eigenvalues(C, separation: float = SEPARATION):
 class NeoHookean(Skeleton):
     """Compressible neo-Hookean law: psi = G/2 (F:F - d - 2 ln J) + lambda/2 (ln J)^2.
 
-    2D means plane strain.  Source: Simo and Pister (1984).  Parameters as for `Skeleton`.
+    2D means plane strain.  Source: Simo and Pister (1984).  Parameters: see `Skeleton`.
     """
 
     @staticmethod
@@ -411,7 +411,7 @@ class NeoHookean(Skeleton):
 class LinearElastic(Skeleton):
     """Linear elasticity of small strain: psi = lambda/2 (tr eps)^2 + G eps:eps with eps = sym F - I.
 
-    The law is not objective, so rotations must be small.  Parameters as for `Skeleton`.
+    The law is not objective, so rotations must be small.  Parameters: see `Skeleton`.
     """
 
     linear: ClassVar[bool] = True
@@ -439,7 +439,7 @@ def kozeny_carman(conductivity, porosity, porosity0):
 
 
 def filled(p, suction):
-    """Return the saturation of drainable pores, a cubic from 0 at -`suction` to 1 at `suction`."""
+    """Return the saturation of drainable pores: a cubic function of p from 0 at -`suction` to 1 at `suction`."""
     x = ufl.max_value(0.0, ufl.min_value(1.0, (1 + p / suction) / 2))
     return x**2 * (3 - 2 * x)
 
@@ -491,9 +491,9 @@ class Fluid:
         Density rho_w at zero pressure, kg/m^3, > 0.  Weights are computed with rho_w.  Flowing fluid has the density
         rho_w exp(p / K_w).
     gravity
-        Acceleration g that defines hydraulic conductivities, m/s^2, > 0.  By default it is the scene's gravity if this
-        is a constant vector other than zero, and 9.81 otherwise.  With units other than m and s, it is required in
-        scenes without gravity, or with gravity as a function of time.
+        Acceleration g that defines hydraulic conductivities, m/s^2, > 0.  The default is the scene's gravity if it is a
+        constant vector other than zero, and 9.81 otherwise. With units other than m and s, scenes without gravity, or
+        with gravity as a function of time, require this argument.
 
     Raises
     ------

@@ -9,7 +9,7 @@ shear strain, and h is the cell size (crack band: Bazant and Oh 1983; Pietruszcz
 
 c_0 is the initial cohesion, c_r is the residual cohesion, and s is the slip at which c = c_r.  Softening along a band
 dissipates the work (c_0 - c_r) s / 2 per area, on any grid.  Perzyna's viscosity is f = eta dgamma/dt, with the yield
-function f and the viscosity eta.  It is integrated implicitly, and has no effect in slow loading.
+function f and the viscosity eta.  The viscosity is integrated implicitly, and has no effect in slow loading.
 """
 
 from __future__ import annotations

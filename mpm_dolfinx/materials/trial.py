@@ -2,9 +2,9 @@
 """Trial elastic strain of multiplicative plasticity, and isotropic functions, in UFL and in numpy.
 
 In UFL, isotropic functions of a tensor are Newton's interpolation polynomials at its eigenvalues.  The polynomials are
-exact for smooth functions of each eigenvalue.  They remain smooth at equal eigenvalues, because `_eigenvalues`
-separates equal eigenvalues.  For principal values that have kinks and depend on all three eigenvalues, `Coaxial` gives
-exact derivatives in numpy.
+exact for smooth functions of each eigenvalue.  The polynomials remain smooth at equal eigenvalues, because
+`_eigenvalues` separates equal eigenvalues.  For principal values that have kinks and depend on all three eigenvalues,
+`Coaxial` gives exact derivatives in numpy.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class Trial:
 
 
 def components(b, plane: bool):
-    """Return the components of a symmetric UFL tensor (3, 3), six or the four in `PLANE`."""
+    """Return the components of a symmetric UFL tensor (3, 3): six, or the four in `PLANE`."""
     return ufl.as_vector([b[i] for i in (PLANE if plane else SPACE)])
 
 
@@ -131,7 +131,7 @@ class Coaxial:
         """Return the derivatives of `values` with respect to the components of the other tensors.
 
         In principal axes, dy_ij = (y_i - y_j) / (x_i - x_j) dx_ij for i != j.  The limit for x_i = x_j is
-        (dy_i/dx_i - dy_i/dx_j) dx_ij, because an isotropic function has y_i = y_j there.
+        (dy_i/dx_i - dy_i/dx_j) dx_ij, because then an isotropic function also has y_i = y_j.
 
         slopes (n, 3, 3): dy/dx.
         """

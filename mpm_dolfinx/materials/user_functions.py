@@ -6,12 +6,12 @@ see `skeleton.Skeleton`.  `Simulation` takes terms of the balances, integrated o
 the step.  Their arguments are:
 
 points
-    Quadrature points.  `points.dx` is their measure, which adds up to the volumes of the material points.
-    `points.value(f)` and `points.grad(f)` are the value and gradient of f = u or v.  In axisymmetry the gradient is
-    (3, 3), with f_r / r.  `points.F` is the deformation gradient at the start of the step, in the shape of grad u, with
-    the volume ratio as determinant.  `points.position` is the position at the start of the step.
-    `points.displacement` is the displacement since the start of the run, or since a stage that set it to zero.  Other
-    attributes are the laws' state variables, and parameters that are functions of position.
+    Quadrature points.  The integral of 1 over the measure `points.dx` is the volume of the material points.
+    `points.value(f)` and `points.grad(f)` are the value and gradient of f = u or v.  In axisymmetry the gradient is (3,
+    3), with f_r / r.  `points.F` is the deformation gradient at the start of the step, in the shape of grad u, with the
+    volume ratio as determinant.  `points.position` is the position at the start of the step.  `points.displacement` is
+    the displacement since the start of the run, or since a stage that reset it to zero.  Other attributes are the laws'
+    state variables, and parameters that are functions of position.
 t
     Time at which the balances hold, s, as a UFL constant: the end of the step or of its first substep.
 
