@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Derivatives of nodal forces with respect to the pressures of cells, for laws that depend on suction.
 
-The stress of such a law depends on the pressure through the law, and through the term chi p of Bishop's stress.  In
-cells with F-bar, the mean stress pi also depends on the pressure.
+The total stress depends on the pressure through such a law, and through the term chi p of Bishop's stress.  In cells
+with F-bar, the mean stress pi also depends on the pressure.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
 
 
 def suction_sums(points: FormPoints, F, slopes: Sequence, locks: bool) -> CellSums | None:
-    """Return the sums over pieces in each cell that `OfSuction` needs, or None.
+    """Return the sums over pieces in each cell that `OfSuction` needs, or None for laws without suction.
 
     F: deformation gradient (d, d), a UFL variable.
-    slopes: UFL derivatives with respect to the pressure, empty for laws without suction.  The first derivative is that
-    of the first Piola-Kirchhoff stress (d, d).  With F-bar, the second is that of the mean stress pi.
+    slopes: UFL derivatives with respect to the pressure: of the first Piola-Kirchhoff stress (d, d), and with F-bar
+    also of the mean stress pi.  Empty for laws without suction.
     locks: whether the law of the pieces uses F-bar.
     """
     share = 1 / ufl.det(points.F)

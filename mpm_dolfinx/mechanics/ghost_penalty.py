@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Ghost penalty: nearly empty cells follow the deformation of fuller neighbours (Burman 2010, Coombs 2023).
 
-Nearly empty cells would spoil the conditioning and the accuracy of a step.  The ghost penalty adds the term
+Without a penalty, nearly empty cells would spoil conditioning and accuracy.  The ghost penalty adds the term
 `gamma s 2G h/3 int [d_n u].[d_n v] dS` over faces, with the displacement increment u of the step and the test function
 v.  gamma is `GHOST`, s is the strength of the face, G is the shear modulus, h is the cell size, and [d_n u] is the jump
 of the normal derivative.  The penalty resists motion like a viscosity, so it must not act on load-bearing cells:
@@ -39,13 +39,13 @@ GHOST = 0.05
 YIELDING = 0.02
 """Smallest reduction factor of the penalty for nearly incompressible laws with a state."""
 RATIO = 0.3
-"""A face has the penalty if the filling of the emptier cell, divided by that of the fuller cell, is below this value.
+"""A face has the penalty if the filling of its emptier cell is below this fraction of the filling of its fuller cell.
 
 Plateau (scene "soil" of tests/plateaus.py): half this value changes the result by 1.3e-03, twice this value by 5.9e-04,
 and finer cells by 3.0e-02.
 """
 SPARSE, FULL = 0.2, 0.9
-"""Two numbers for integration at points: strength of the penalty, and largest volume fraction of a cell with it."""
+"""Two numbers for integration at points: strength of the penalty, and largest volume fraction of a penalised cell."""
 
 
 def stiffness(material: Skeleton) -> NDArray[np.float64]:

@@ -95,7 +95,7 @@ class GivenDisplacements(Acting):
     def check_start(self, place: Place) -> None:
         """Warn once for each condition whose side must jump at the start of a stage with inertia.
 
-        A gap is a jump if it strains the cell by more than the stress of the cell divided by its modulus.
+        A gap counts as a jump if its strain in the cell exceeds the cell's stress divided by the modulus.
         """
         if not (place.inertia and place.dt):
             return
@@ -137,7 +137,7 @@ class GivenDisplacements(Acting):
         return HoldLoads(self, forms, data, held, row, own, place)
 
     def _held_points(self, place: Place, ends: Sequence[float]) -> HeldPoints:
-        """Return the integration points on sides, on the processes of their constraints, see `inner_cells`.
+        """Return the integration points on sides, on the processes that own the constraints, see `inner_cells`.
 
         ends: start and end of the step, in s; empty if the displacement is zero.
         """
@@ -233,11 +233,11 @@ class GivenDisplacements(Acting):
     def under_held(
         self, ids: NDArray[np.int64], tracked: NDArray[np.float64], volume: NDArray[np.float64], corners: NDArray
     ) -> NDArray[np.float64]:
-        """Return corners of particle domains, in m, with prisms in place of domains at a held side.
+        """Return corners of re-initialised domains, in m, with prisms in place of domains at prescribed sides.
 
         A prism has the volume of its domain, and keeps the tracked corners on the held face.
 
-        tracked, corners (n, 2^d, d), in m: tracked corners, and corners, of the domains `ids`.
+        tracked, corners (n, 2^d, d), in m: tracked and re-initialised corners of the domains `ids`.
         volume (n,): volumes of the domains, in axisymmetry areas of their sections.
         """
         index = np.arange(2**self._grid.dim)
@@ -291,8 +291,8 @@ class HoldLoads(Loads):
     def augment(self, at: At) -> bool:
         """Add the penalty forces on sides that lag behind to the multipliers.
 
-        This is needed if a whole body, such as undrained soil, resists a side more stiffly than one cell.  The updates
-        end when the mean gap of a side over a connected part of the bodies no longer falls by half.
+        Multipliers are needed if a whole body, such as undrained soil, resists a side more stiffly than one cell.  The
+        updates end when the mean gap of a side over a connected part of the bodies no longer falls by half.
         """
         if not self._place.dt:
             return False

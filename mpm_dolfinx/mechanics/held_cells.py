@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Prescribed displacements of sides in cells: a stiff penalty on the mean, a weak penalty on deviations from it.
+"""Prescribed displacements of sides in cells: a stiff penalty on the mean, a weak penalty on deviations.
 
 A Q1 field has too few nodal displacements in a cell to satisfy constraints at many points of a side.  A stiff penalty
 at each point would lock sides that are curved or inclined to the grid.  A stiff penalty therefore acts on the mean
@@ -167,9 +167,9 @@ class HeldCells:
         """Return the penalties on one component, with their stiffness, gap and distribution of the force to nodes.
 
         Where a side ends at a wall, its penalties omit nodes that the wall fixes.  The free nodes of the cell would
-        otherwise oscillate along the side.  The prescribed displacement is also extrapolated to the wall.  A penalty is
-        omitted if the extrapolated value exceeds half of the cell's mean, at the start or the end of the step, and if
-        other penalties of the condition hold a free node of the cell.
+        otherwise oscillate along the side.  The prescribed displacement is also extrapolated to the wall.  Where other
+        penalties of the condition hold a free node of the cell, a check follows.  A penalty is omitted if the
+        extrapolated value exceeds half of the cell's mean, at the start or the end of the step.
 
         given (conditions,): whether each condition prescribes component `axis`.
         free (nodes,): whether no wall fixes the node.
@@ -229,8 +229,8 @@ class HeldCells:
         """Return the conditions with too large forces, and the position of the largest force of each.
 
         A Q1 field cannot always have the prescribed means in two neighbouring cells, as at a side on a grid line.  The
-        forces of their penalties then oppose each other.  A force therefore counts as too large only if the sums of the
-        forces at its nodes also exceed their limits.
+        forces of the penalties in the two cells then oppose each other.  A force therefore counts as too large only if
+        the sums of the forces at its nodes also exceed their limits.
 
         row (k,): index of the penalty of each of k prescribed components.
         axis (k,): axis of each component.

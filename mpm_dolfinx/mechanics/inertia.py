@@ -56,7 +56,7 @@ from mpm_dolfinx.points.material_points import MaterialPoints, middle
 GHOST_MASS = 0.02
 """Strength c of the ghost mass.  A rotating block has the same energies with 0.002 and 0.2 (tests/test_inertia.py)."""
 RELAXES = 2.0
-"""Relaxation rate of point velocities towards grid velocities, for domain corners that move by one cell size.
+"""Relaxation rate of point velocities towards grid velocities, per motion of domain corners by one cell size.
 
 Relaxation removes velocity modes of the points that the nodes cannot represent.  In a test, a vibrating bar of 20 cells
 moves across 50 cells, with 40 steps a period.  After 25 periods the velocity error is 1.7 % at the rate 0, and 1.2 % at
@@ -83,7 +83,7 @@ def moving(
     velocity: vector (d,), in m/s, or function of positions x (n, d) with values (n, d).  Each domain stores the affine
     field nearest to the values at its corners.
     base (d,), in m: origin of the points' coordinates.
-    rings: whether the domains are rings, whose centroids then determine the velocities (axisymmetry).
+    rings: whether the domains are rings (axisymmetry).  The centroids of rings determine their velocities.
     """
     n, corners, d = points.corners.shape
     places = (points.corners + base).reshape(-1, d)
@@ -118,10 +118,10 @@ def product(A: NDArray[np.float64], B: NDArray[np.float64]) -> NDArray[np.float6
 
 
 def chord(G: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the increment F~ - 1 at which a midpoint rule evaluates laws, and the rotation of the laws' stress.
+    """Return F~ - 1, with the gradient F~ at which a midpoint rule evaluates laws, and the rotation of their stress.
 
     The rule moves F from F_n to F_n + 2 D, with the midpoint F = F_n + D.  The mean of C = F^T F over both ends of the
-    step is F^T F + D^T D, with the midpoint's F on the right side.  Laws are evaluated at F~, and give the stress P:
+    step is F^T F + D^T D, with F of the midpoint.  Laws are evaluated at F~, and give the stress P:
 
         F~ = F + F^-T D^T D / 2,     F~^T F~ = F^T F + D^T D + O(D^4),     P = F F~^-1 P(F~).
 
@@ -303,7 +303,7 @@ class Mass:
 
 
 def velocity_gradients(points: MaterialPoints) -> NDArray[np.float64]:
-    """Return the velocity gradients (n, d, d) of the points, in 1/s, in axisymmetry for the plane."""
+    """Return the velocity gradients (n, d, d) of the points, in 1/s, without a circumferential component."""
     d = points.x.shape[1]
     return product(points.data[RATE], inverses(points.F[:, :d, :d]))
 

@@ -184,7 +184,7 @@ class MeanDilatation:
     def at(self, data: QuadratureData, motion: tuple, solve: Callable[[], Sequence[Given]]) -> list[Given]:
         """Set theta and pi, and return values for the forms of each part.  All processes must call this method.
 
-        motion: key for `Latest`, which changes whenever stresses at the points `data` change, except with time.
+        motion: key of the present displacement, see `LocalUnknowns.solve`.
         solve: function that returns these values without stresses, see `LocalUnknowns`.
         """
 
@@ -201,7 +201,7 @@ class MeanDilatation:
         return self._stresses((self._key(data), motion, float(self._dt.value)), given_stresses, self._grid.comm)
 
     def _set_ratios(self, data: QuadratureData, motion: tuple) -> None:
-        """Set theta, with the key `motion` of the method `at`."""
+        """Set theta.  `motion`: see `at`."""
 
         def ratios() -> None:
             sums = [of.ratio(part) for of, part in zip(self._sums, self._parts(data), strict=True)]

@@ -61,7 +61,7 @@ class FormsOfPart(NamedTuple):
 class MomentumForms:
     """Compiled forms of the balance of momentum of a scene.
 
-    pieces: all integration points.  With gravity they have `density`, in kg/m^3.
+    pieces: all integration points.  With gravity, the points have the field `density`, in kg/m^3.
     laws: class, integration points, and whether it uses F-bar (`MeanDilatation`), of each law.  The points have F, the
     law's parameters and state, and with fluid `biot`.  With retention curves they have `retention`, `lever`, `pores`.
     pressure: DG0 pore pressure, or None without fluid.
@@ -134,7 +134,7 @@ class MomentumForms:
         symmetric: bool,
         dt: fem.Constant,
     ) -> FormsOfPart:
-        """Return the compiled forms of a law; `dried` tells whether any law depends on suction."""
+        """Return the compiled forms of a law.  `dried`: whether any law depends on suction."""
         F = points.deformation(self.u)
         values = {name: getattr(points, name) for name in (*law.parameters, *law.state)}
         values |= by_scene(self.grid, None, law, points) | {"dt": dt}
@@ -226,7 +226,7 @@ class MomentumForms:
 
     @property
     def _motion(self) -> tuple:
-        """Key for `Latest`, which changes whenever stresses at the same points change, except with time."""
+        """Key of the present displacement and suction, see `LocalUnknowns.solve`."""
         p = None if self._suction is None else self._suction.x.array.copy()
         return self.u.x.array[self.active.now.dofs], self.inertia and float(self.inertia.midpoint.value), p
 
@@ -319,7 +319,8 @@ class MomentumSystem:
         self.rounding = self.unknowns.vector()
         """Rounding error of the residual at each unknown, in N."""
         self.of_whole = self.unknowns.vector()
-        """Norm, in N, of a vector with the rounding error of an unknown at all unknowns of the same connected part."""
+        """Rounding error of each unknown, in N, times the square root of the number of unknowns in its connected
+        part."""
         self.K = matrix(self.unknowns, self.unknowns, 3**d * d)
         self.residual, self.step = self.unknowns.vector(), self.unknowns.vector()
         held = active[~among(active, dofs)]
@@ -397,7 +398,7 @@ class MomentumProblem:
     data: integration points.
     tolerance: tolerance of the residual, relative to the forces.
     goes_on (unknowns,), in m: displacements extrapolated from the last step, or None.
-    held (unknowns,), in N: forces that balance initial stresses where loads do not, or None.
+    held (unknowns,), in N: initial residual forces that loads do not balance, or None.
     yielded: whether any soil has yielded before this step.
     """
 
@@ -530,9 +531,9 @@ class MomentumProblem:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return two relative residuals of each connected part.
 
-        For the first result, the rounding error at each node is subtracted from the residual.  With `first` it is not
-        subtracted, so that even a load below the error causes a solve.  For the second result, the force scale at an
-        unknown is at least `of_whole` divided by the tolerance.  A residual within rounding has thus converged.
+        For the first result, the rounding error at each node is subtracted from the residual.  With `first`, the error
+        is not subtracted, so that even a load below the error causes a solve.  For the second result, the force scale
+        at an unknown is at least `of_whole` divided by the tolerance.  A residual within rounding has thus converged.
 
         r, scales (parts,), in N: residuals and force scales.
         """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Rigid plates, which exert a uniform traction and a penalty on the slope of a side, see `RigidPlate`."""
+"""Rigid plates: a uniform traction on a side, and a penalty on the slope of this side, see `RigidPlate`."""
 
 from __future__ import annotations
 
@@ -124,7 +124,7 @@ class PlateLoads(Loads):
 
 
 def _check_flat(plate: RigidPlate, faces: Surface) -> None:
-    """Raise ValueError unless the faces under a plate are one flat, connected side."""
+    """Raise ValueError if the faces under a plate are not one flat, connected side."""
     corners, axis = faces.places(), facing(faces)[0]
     tangential = np.arange(corners.shape[2]) != axis
     low = corners.min(axis=1)[:, tangential]

@@ -31,8 +31,8 @@ weight of 1, the stress change at a reset of the grid would exceed the stresses 
 STIFF_WET = 8
 """Value of (lambda + 2G) / G above which the volume ratio from the corners loses weight in wet bodies.
 
-The weight is 1 at nu = 0.43, and 0 at nu = 0.47.  With a weight of 1, the difference between the ratio from the
-corners and the Q1 field expels water in every step, however short.  The extreme pressures of a beam with eight cells
+The weight is 1 at nu = 0.43, and 0 at nu = 0.47.  With a weight of 1, the difference between the volume ratios of the
+corners and of the Q1 field expels water in every step, however short.  The extreme pressures of a beam with eight cells
 across its depth then have errors of 43 % at nu = 0.49.  At nu = 0.499 the pressures are six to thirty times too large.
 """
 SHARE = 0.5
@@ -40,8 +40,8 @@ SHARE = 0.5
 
 Dilatant flow has a volume strain rate of sin psi times its shear rate.  This condition at four points over-constrains a
 Q1 cell, even with F-bar.  With the full deviation, the load of a footing (phi = psi = 20 degrees) is 4.4 % too large
-with 9 cells, 3.4 % too large with 17 cells, and still rises.  With one point per cell, the load is constant, but 6.6 %
-too small with 9 cells, and 3.2 % too small with 17 cells.
+with 9 cells, 3.4 % too large with 17 cells, and does not reach a limit.  With one point per cell, the load is constant,
+but 6.6 % too small with 9 cells, and 3.2 % too small with 17 cells.
 """
 
 
@@ -63,7 +63,7 @@ class QuadratureData:
     of_points: PointData  # like `pieces`, but volumes and F are not scaled for F-bar; for user-defined terms
 
     def increments(self, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return I + grad u at the positions where laws use it."""
+        """Return I + grad u at the positions where laws use grad u."""
         n, d = self.pieces.x.shape
         out, nodes = np.empty((n, d, d)), self.pieces.points.grid.cell_nodes
         for rows, part in zip(self.rows, self.parts, strict=True):
@@ -259,7 +259,7 @@ class QuadraturePoints:
     def fixed_stress(self, cut: CutDomains, points: MaterialPoints, of_fluid: bool) -> NDArray[np.float64]:
         """Return the coefficient beta of the fixed-stress operator at the integration points, in 1/Pa.
 
-        of_fluid: whether to return 1/K_w in place of beta, with which the iteration converges for stiff skeletons only.
+        of_fluid: whether to return 1/K_w in place of beta; then the iteration converges for stiff skeletons only.
         """
         if of_fluid:
             return np.full(len(cut.cells), 1 / self._fluid.bulk)

@@ -46,7 +46,7 @@ class OwnTerms:
         self.symmetric = True
         self.holding = False
         self.rates = False
-        """Whether all tangents are `symmetric`, and whether a term depends on u (`holding`) or velocity (`rates`)."""
+        """`symmetric`: all tangents are symmetric.  `holding`, `rates`: a term depends on u, or on velocity."""
         u = forms.u
         more = {"t": t, "dt": dt, "velocity": forms.velocity.value}
         v, du = ufl.TestFunction(u.function_space), ufl.TrialFunction(u.function_space)
