@@ -42,7 +42,7 @@ class ActiveSet:
 
     @cached_property
     def parts_of_cells(self) -> tuple[NDArray[np.int64], int]:
-        """Connected part (cells,) of each local cell, counted from 1, and the number of parts.  Empty cells have 0."""
+        """Connected part (cells,) of each local cell, counted from 1 (0 for empty cells), and the number of parts."""
         return parts_of_cells(self.grid, self.contains)
 
 
@@ -56,12 +56,12 @@ class Active:
     wet
         Whether cells may contain fluid.
     cells, dofs
-        Arrays over the local cells, and over the unrolled local degrees of freedom.  `clear` resets them to zero.
+        Arrays over the local cells, and over the unrolled local degrees of freedom.  `clear` sets the arrays to 0.
 
     Attributes
     ----------
     now
-        The active set.  It remains one object as long as the cells do not change.
+        The active set, the same object as long as the cells do not change.
     slot : (cells,)
         Index of each cell among the owned active cells.
     centroid : (cells, d), m

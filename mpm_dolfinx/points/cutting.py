@@ -2,8 +2,8 @@
 """Particle domains cut by the grid into pieces.  A piece is the part of a domain in one cell.
 
 A material point has a quadrilateral or hexahedral domain with tracked corners.  The pieces of the domain have exact
-volumes and centroids.  In 3D they also have exact mean products of coordinates.  Gradients of Q1 functions are linear
-within a cell, in 3D bilinear.  One quadrature point in each piece therefore integrates these gradients exactly,
+volumes and centroids.  In 3D, pieces also have exact mean products of coordinates.  Gradients of Q1 functions are
+linear within a cell, in 3D bilinear.  One quadrature point in each piece therefore integrates these gradients exactly,
 wherever the domain lies on the grid.
 
 The surface of a domain has 4 edges, or in 3D 4 triangles about the middle of each face.  The triangles of neighbouring
@@ -32,7 +32,7 @@ from mpm_dolfinx.base.tolerances import NEAR
 from mpm_dolfinx.grid.grid import ABOUT_MIDDLE, FACE_SIGNS, FACES, TURN, Grid, corner_bits, in_chunks, sum_by
 
 SLIVER = NEAR**2
-"""Smallest volume fraction of a piece.  Pieces thinner than `Grid.snap` have an open face.  Source: epsilon."""
+"""Smallest volume fraction of a piece.  The surface of thinner pieces may have gaps (`Grid.snap`).  Source: epsilon."""
 CHUNK = 2**15  # simplices cut in one call, so that they fit into the processor's cache
 TANGLED = 0.2  # smallest volume between corners / volume of domain; below it corners are re-initialised from F
 
@@ -148,7 +148,7 @@ def _centroids(corners: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def tangled(corners: NDArray[np.float64], volume: NDArray[np.float64], axisymmetric: bool = False) -> NDArray[np.bool_]:
-    """Return which domains (n,) are inverted, with a volume far from the prescribed `volume` (n,), in m^d."""
+    """Return a mask (n,) of inverted domains, whose volumes are far from the prescribed `volume` (n,), in m^d."""
     ratio = domain_volumes(corners, axisymmetric) / volume
     return (ratio < TANGLED) | (ratio > 1 / TANGLED)
 
@@ -254,7 +254,7 @@ def _area_vectors(s: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 class _Slots:
-    """Cells in the bounding boxes of domains.  Each domain and cell has a slot."""
+    """Cells in the bounding boxes of domains.  Each pair of a domain and a cell has a slot."""
 
     def __init__(self, grid: Grid, y: NDArray[np.float64]):
         top = (grid.shape - 1)[:, None]
@@ -436,7 +436,7 @@ def _products(
     total: Callable[[NDArray[np.float64]], NDArray[np.float64]],
     slots: _Slots,
 ) -> list[NDArray[np.float64]]:
-    """Return integrals over the pieces of products of two coordinates, from the lower corners of the cells."""
+    """Return integrals over pieces of products of two coordinates, measured from the lower corners of the cells."""
     d = len(x)
 
     def mean(*factors: int) -> NDArray[np.float64]:
@@ -465,8 +465,8 @@ def cut_faces(
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Cut faces of domains by the grid, and return integration points, which are exact for products of Q1 functions.
 
-    If a face crosses a grid line, its part on each side must load the nodes of that side.  With one point for each
-    face, the error would move nodes of partly filled cells in every step without limit.
+    If a face crosses a grid line, the part of the face in each cell must load the nodes of this cell.  With one point
+    for each face, nodes of partly filled cells would move further in every step, without limit.
 
     `corners` (faces, 2^(d-1), d), in m: corners of the faces; triangles repeat their last corner.
     `local` (faces, 2^(d-1), e): coordinates of the corners, to be interpolated.

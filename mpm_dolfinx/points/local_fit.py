@@ -6,9 +6,9 @@ For each position, the polynomial P minimises
     sum_i w(o_i) (P(o_i) - v_i)^2 + small terms of P's coefficients,
 
 where v_i are the data, o_i are the offsets of the data from the position, and w is a weight.  The value at the position
-is the constant term of P (Lancaster and Salkauskas 1981).  Polynomials up to the degree of P are exact.  The weights
-decrease smoothly to zero, so values are continuous when data enter or leave the fit.  If data do not determine all
-coefficients, the small terms set coefficients to zero, higher degrees first.
+is the constant term of P (Lancaster and Salkauskas 1981).  If the data are values of a polynomial of at most the degree
+of P, the fit is exact.  The weights decrease smoothly to zero, so values are continuous when data enter or leave the
+fit.  If data do not determine all coefficients, the small terms set coefficients to zero, higher degrees first.
 """
 
 from __future__ import annotations
@@ -49,8 +49,7 @@ def fitted(
     values: NDArray[np.float64],
     weight: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Return the fitted values (count, width) at `count` positions, on every process.  Positions without data have
-    zero.
+    """Return the fitted values (count, width) at `count` positions, on every process: zero if a position has no data.
 
     `degree`: degree of the polynomials, 1 or 2.
     `at` (r,): index of the position to which each row of this process's data belongs, counted from 0.

@@ -65,7 +65,7 @@ def in_space(F: NDArray[np.float64], across: NDArray[np.float64]) -> NDArray[np.
 
 
 def unstretched(F: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return F (n, 3, 3), without out-of-plane stretch if F is (n, 2, 2)."""
+    """Return F (n, 3, 3), with an out-of-plane stretch of 1 if F is (n, 2, 2)."""
     out = np.tile(np.eye(3), (len(F), 1, 1))
     out[:, : F.shape[1], : F.shape[1]] = F
     return out
@@ -98,7 +98,7 @@ class MaterialPoints:
     corners : (n, 2^d, d), m
         Tracked corners of the particle domain, in the order of `grid.corner_bits`.
     F : (n, d, d)
-        Deformation gradient.  In plane strain with an out-of-plane stretch, F is the in-plane part, scaled to det F.
+        Deformation gradient.  With an out-of-plane stretch in plane strain: in-plane part, scaled to det F.
     volume0 : (n,), m^d
         Reference volume.
     material : (n,)
@@ -191,7 +191,7 @@ class MaterialPoints:
         return self.x - centroids(self.origin)
 
     def map(self, function: Callable[[NDArray], NDArray], shared: bool = True) -> MaterialPoints:
-        """Return the points with a function applied to each array, which selects, copies or transfers entries.
+        """Return the points after a function has selected, copied or transferred the entries of each array.
 
         `shared`: whether fields that share an array also share the new array.
         """

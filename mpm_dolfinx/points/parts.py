@@ -101,7 +101,8 @@ def relative(
 def parts_of_cells(grid: Grid, active: NDArray[np.bool_]) -> tuple[NDArray[np.int64], int]:
     """Return the connected part (cells,) of each active local cell, counted from 1, and the number of parts.
 
-    Cells with common nodes belong to one part.  Inactive cells have index 0.  The number of processes has no influence.
+    Cells with common nodes belong to one part.  Inactive cells have index 0.  The number of processes does not affect
+    the result.
     """
     cells, out = active.nonzero()[0], np.zeros(len(active), dtype=np.int64)
     own, count = _touching(grid.cell_places(cells))
@@ -121,7 +122,7 @@ def parts_of_cells(grid: Grid, active: NDArray[np.bool_]) -> tuple[NDArray[np.in
 def parts_of_domains(grid: Grid, corners: NDArray[np.float64], copy: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the connected part (n,) of each domain, counted from 0.
 
-    `copy` (n,): first cell of the domain's grid copy.
+    `copy` (n,): first cell of the domain's copy of the grid, see `Grid.copy`.
     """
     cell = grid.number(grid.index(corners.reshape(-1, grid.dim))).reshape(corners.shape[:2]) + copy.reshape(-1, 1)
     cell, at = np.unique(cell, return_inverse=True)
@@ -135,7 +136,7 @@ def parts_of_domains(grid: Grid, corners: NDArray[np.float64], copy: NDArray[np.
 def joined_parts(
     grid: Grid, part: NDArray[np.int64], count: int, pairs: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], int]:
-    """Join the parts of some pairs of cells, and return the new results of `parts_of_cells`.
+    """Join the connected parts of the two cells in each pair, and return the new results of `parts_of_cells`.
 
     `pairs` (m, 2): lexicographic indices of active cells.  Processes may have different pairs.
 

@@ -43,7 +43,7 @@ class Polygons:
 
     @property
     def centroid(self) -> NDArray[np.float64]:
-        """Centroids (n, 2) of the polygons, in m.  A polygon without area has the first vertex."""
+        """Centroids (n, 2) of the polygons, in m.  For a polygon without area, the result is its first vertex."""
         area, moment = self._moments
         some = area > 0
         return self.x[:, 0] + np.divide(moment, area[:, None], out=np.zeros_like(moment), where=some[:, None])

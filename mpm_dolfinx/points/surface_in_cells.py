@@ -69,7 +69,7 @@ class Region:
         self.simple = (angles.min(axis=1) > 0) & (self.area > NEAR)
 
     def area_of(self, count: int) -> NDArray[np.float64]:
-        """Return the filled area fraction of each of `count` cells, which is 1 for cells that are not in `cells`."""
+        """Return the filled area fraction of each of `count` cells: 1 for cells that are not in `cells`."""
         out = np.ones(count)
         out[self.cells] = self.area
         return out
