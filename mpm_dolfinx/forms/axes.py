@@ -29,7 +29,7 @@ def planar(F) -> bool:
 def embedded(F, across=1):
     """Return a deformation gradient as a UFL tensor (3, 3).
 
-    across: in plane strain, the out-of-plane stretch.
+    `across`: in plane strain, the out-of-plane stretch.
     """
     if F.ufl_shape == (3, 3):
         return F

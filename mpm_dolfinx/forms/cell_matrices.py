@@ -91,7 +91,7 @@ def _entries(count: int, symmetric: bool) -> tuple[NDArray, NDArray, NDArray]:
 class ElementForces:
     """The linear form T : grad v of Q1 vectors, integrated over the points.
 
-    stress: UFL tensor T (d, d) at the points.
+    `stress`: UFL tensor T (d, d) at the points.
     """
 
     def __init__(self, stress: ufl.core.expr.Expr, points: FormPoints):
@@ -160,7 +160,7 @@ class ElementMatrices:
 def _circumferential(tangent, gradients: list, over_radius: list, row: tuple[int, int], column: tuple[int, int]):
     """Return the contribution of circumferential strains to one entry of an element matrix, as UFL.
 
-    row, column: node and axis of v, and node and axis of u.
+    `row`, `column`: node and axis of v, and node and axis of u.
     """
     (v, i) = row
     (u, j) = column
@@ -237,9 +237,9 @@ def batches(places: Places) -> list[tuple[NDArray[np.int64], NDArray[np.int64], 
 
     Returns for each batch
     ----------------------
-    cells (c,): indices in `Places.filled`.
-    points (c, most): indices in `Places.cells` of the points in each cell.
-    padding (c, most): True after the last point of a cell.
+    `cells` (c,): indices in `Places.filled`.
+    `points` (c, most): indices in `Places.cells` of the points in each cell.
+    `padding` (c, most): True after the last point of a cell.
     """
     cells = places.cells
     filled = places.filled

@@ -56,8 +56,8 @@ class PointMeasure(ufl.Measure):
 class FormPoints:
     """The points in forms, as UFL coefficients.  The values of these coefficients are in `PointData`.
 
-    grid: background grid.
-    fields: shape of each quantity at the points, by name.  The coefficient is an attribute with this name.
+    `grid`: background grid.
+    `fields`: shape of each quantity at the points, by name.  The coefficient is an attribute with this name.
     """
 
     def __init__(self, grid: Grid, **fields: tuple[int, ...]):
@@ -399,8 +399,8 @@ class Rows:
 class PointForm:
     """A form with the measure `points.dx`, compiled once and assembled for any positions of the points.
 
-    form: linear or bilinear UFL form, with integrals over `points.dx` only.
-    dense: whether the values of a DG0 test function are numbered over the cells with points, not over all cells. If
+    `form`: linear or bilinear UFL form, with integrals over `points.dx` only.
+    `dense`: whether the values of a DG0 test function are numbered over the cells with points, not over all cells. If
     True, kernels are called for arbitrary cells, as in `PointExpression`, so all cells must be equal.
     """
 
@@ -455,7 +455,7 @@ class FacetForm:
 class FacetSum:
     """A form over `facets` of this process.
 
-    some: whether any process has such facets.
+    `some`: whether any process has such facets.
     """
 
     def __init__(self, form: FacetForm, facets: NDArray[np.int32], some: bool):
@@ -486,7 +486,7 @@ class PointExpression:
     each point.  The result is divided by the volume of the cell.  Gradients of grid functions are allowed only if all
     cells are equal.
 
-    expression: UFL expression of any shape in the fields of `points`.
+    `expression`: UFL expression of any shape in the fields of `points`.
     """
 
     def __init__(self, expression: ufl.core.expr.Expr, points: FormPoints):
@@ -510,7 +510,7 @@ class PointExpression:
     ) -> NDArray[np.float64]:
         """Return the values (n, *shape) at the chosen points, by default at all points.
 
-        live: result of the method `live`.
+        `live`: result of the method `live`.
         """
         live = self.live(data) if live is None else live
         count = len(data.cells if chosen is None else chosen)

@@ -21,9 +21,9 @@ from mpm_dolfinx.base import _compat
 class Unknowns:
     """Numbering of a subset of the degrees of freedom of a function's space.
 
-    function: any function of the space, with ghosts.
-    dofs: unrolled local degrees of freedom that are unknowns, ghosts included.
-    at: positions (entities, d), in m, of the nodes or cells of this process, and a mask of entities.  Only the matrix
+    `function`: any function of the space, with ghosts.
+    `dofs`: unrolled local degrees of freedom that are unknowns, ghosts included.
+    `at`: positions (entities, d), in m, of the nodes or cells of this process, and a mask of entities.  Only the matrix
     rows of masked entities may have entries in columns of other processes.  Without `at`, all rows may have such
     entries, and the space computes the positions.
     """
@@ -134,7 +134,7 @@ def sum_ghosts(function: fem.Function) -> NDArray[np.float64]:
 def with_ghosts(space, rows: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return `rows` with the entries of ghosts replaced by the values of their owners.
 
-    rows (n, k): values at the n local dofs.
+    `rows` (n, k): values at the n local dofs.
     """
     if space.mesh.comm.size == 1:
         return rows

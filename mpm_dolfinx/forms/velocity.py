@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 class Velocity:
     """Velocity `(u - past) / own` at the end of a substep.
 
-    u, in m: displacement increment of the step.
-    own, in s: time weight of the rate in the substep; in backward Euler, the length of the step.
-    past, in m: part of u that is due to the rate of the previous substep; in backward Euler, zero.
+    `u`, in m: displacement increment of the step.
+    `own`, in s: time weight of the rate in the substep; in backward Euler, the length of the step.
+    `past`, in m: part of u that is due to the rate of the previous substep; in backward Euler, zero.
     """
 
     def __init__(self, u: fem.Function):

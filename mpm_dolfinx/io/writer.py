@@ -340,8 +340,8 @@ def kept(entries: Sequence[tuple[float, Any]], t: float) -> list[tuple[float, An
 class Series:
     """A time series for ParaView: an index (.pvd), and files in a folder with the same name.
 
-    entries: output times so far, with their files.
-    next: path of the next file, without suffix.
+    `entries`: output times so far, with their files.
+    `next`: path of the next file, without suffix.
     """
 
     def __init__(self, comm: MPI.Intracomm, file: Path, t: float):

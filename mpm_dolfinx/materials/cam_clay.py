@@ -309,12 +309,12 @@ class BarcelonaBasic(ModifiedCamClay):
 class _Return:
     """Return to the yield surface for a value of the unknown d.
 
-    compaction: a.
-    flow: h.
-    steepness: w exp(-d), the square of Q / (M P) at the end of the step.
-    trial_pressure: P_t, in Pa.
-    rho: ln(P_c / P_c,n) / a.
-    yields: whether the trial stress is outside the yield surface.
+    `compaction`: a.
+    `flow`: h.
+    `steepness`: w exp(-d), the square of Q / (M P) at the end of the step.
+    `trial_pressure`: P_t, in Pa.
+    `rho`: ln(P_c / P_c,n) / a.
+    `yields`: whether the trial stress is outside the yield surface.
     """
 
     def __init__(self, trial, shear, M, lambda_, kappa, pressure, yield_pressure, consolidated, steeper):

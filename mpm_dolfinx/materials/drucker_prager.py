@@ -133,15 +133,15 @@ def metric(trial: Trial, to: dict, bulk, plastic):
 def returned(trial: Trial, bulk, shear, eta, xi, eta_flow, cohesion, hardening, hardened, drag=0.0) -> dict:
     """Return the stress and the hardening after the return to the yield surface.
 
-    drag: viscosity divided by the time step, in Pa.
+    `drag`: viscosity divided by the time step, in Pa.
 
     Returns
     -------
-    p: mean stress, in Pa, tension positive.
-    ratio: final deviatoric stress divided by the trial deviatoric stress.
-    hardened: increment of the accumulated plastic strain.
-    yields: whether the trial stress is outside the yield surface.
-    apex: 1 if the stress returns to the apex, and 0 otherwise.
+    `p`: mean stress, in Pa, tension positive.
+    `ratio`: final deviatoric stress divided by the trial deviatoric stress.
+    `hardened`: increment of the accumulated plastic strain.
+    `yields`: whether the trial stress is outside the yield surface.
+    `apex`: 1 if the stress returns to the apex, and 0 otherwise.
     """
     p = bulk * trial.volumetric
     q = shear * ufl.sqrt(2 * ufl.inner(trial.deviatoric, trial.deviatoric) + LEAST)  # sqrt(J_2)

@@ -96,7 +96,7 @@ class LawAtPoints:
     ) -> PointData:
         """Return form data at the points `rows`.
 
-        values: F, parameters and state (n, ...) of all points, by name.
+        `values`: F, parameters and state (n, ...) of all points, by name.
         """
         x = points.x[rows]
         cells = self.grid.locals[self.grid.number(self.grid.index_from_base(x))]
@@ -112,7 +112,7 @@ class LawAtPoints:
     def stress(self, data: PointData, dt: float = 0.0) -> NDArray[np.float64]:
         """Return the effective Cauchy stress (n, d, d), in Pa.
 
-        dt: time since the last update of the state, in s.
+        `dt`: time since the last update of the state, in s.
         """
         return self._evaluate(self._stress, data, dt)
 
@@ -167,7 +167,7 @@ def knows_space(grid: Grid, m: Skeleton) -> bool:
 
     Some user-defined laws accept F (2, 2) only.  The result is True for laws with local unknowns.
 
-    m: material with constants as arrays for one point.
+    `m`: material with constants as arrays for one point.
     """
     law = type(m)
     function, shape = (law.energy, ()) if law.kirchhoff is None else (law.kirchhoff, (3, 3))
@@ -194,7 +194,7 @@ def by_scene(
 ) -> dict[str, Any]:
     """Return the arguments `BY_SCENE` of laws as UFL: the time since the start of the step, and the cell size.
 
-    points: integration points of the law.  If cells have several sizes, each point stores the size of its cell.
+    `points`: integration points of the law.  If cells have several sizes, each point stores the size of its cell.
     """
     if points is not None and not grid.even and cell_size is None and "cell_size" in law.by_scene:
         sizes = points.follow("cell_size", (), lambda data: grid.volumes(data.cells)[:, None] ** (1 / grid.dim))
@@ -230,7 +230,7 @@ class SoftnessAtPoints:
     with the weight `NEAR`^4.  The forms use the softness of the previous step, because Newton's method may not converge
     with the softness of the current iterate.
 
-    grid, law, shapes, stretches: see `LawAtPoints`.
+    `grid`, `law`, `shapes`, `stretches`: see `LawAtPoints`.
     """
 
     def __init__(self, grid: Grid, law: type[Skeleton], shapes: dict[str, tuple[int, ...]], stretches: int):
@@ -255,10 +255,10 @@ class SoftnessAtPoints:
     def __call__(self, at: PointData, dF: NDArray, shear: NDArray, dt: float, before: NDArray) -> NDArray[np.float64]:
         """Return the softness of points, in [1, `MOST`].
 
-        at: data with F, parameters and state of n points.
-        dF (n, d, d): change of F in a step of dt, in s.
-        shear (n,), in Pa: elastic shear modulus.
-        before (n,): softness before the step.
+        `at`: data with F, parameters and state of n points.
+        `dF` (n, d, d): change of F in a step of dt, in s.
+        `shear` (n,), in Pa: elastic shear modulus.
+        `before` (n,): softness before the step.
         """
         self._by_scene["dt"].value = dt
         fields = {name: at[name] for name in ("F", *self._shapes)}
@@ -321,7 +321,7 @@ class ConductivityAtPieces:
     def evaluate(self, data: PointData, material: NDArray[np.int32], begins: bool) -> NDArray[np.float64]:
         """Return the conductivities of pieces, in m/s, at the present displacement.
 
-        material (n,): index of the material of each piece.
+        `material` (n,): index of the material of each piece.
 
         Raises
         ------

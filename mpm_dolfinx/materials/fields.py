@@ -323,7 +323,7 @@ class SceneMaterials:
         The function is called as `value(material, *columns)` and returns values (n, ...) or one number.  For a uniform
         material without `columns`, the function may also return one value (...) for all points.
 
-        columns (n,): further point data.
+        `columns` (n,): further point data.
         """
         each, shapes = [], set()
         for i in self._used:
@@ -531,8 +531,8 @@ class SceneMaterials:
     ) -> dict[str, NDArray[np.float64]]:
         """Return the point data after a step of length dt, in s.
 
-        points: points with the new F and the old state.
-        before: points with the old F.
+        `points`: points with the new F and the old state.
+        `before`: points with the old F.
 
         Raises
         ------
@@ -604,8 +604,8 @@ def _by_place(m: Skeleton) -> list[str]:
 def _evaluated(grid: Grid, m: Skeleton, X: NDArray[np.float64], ids: NDArray[np.int64]) -> tuple[Skeleton, Skeleton]:
     """Return a material twice: at this process's points, and at the point with the lowest id on all processes.
 
-    X (n, d), in m: reference positions of this process's points with the material.
-    ids (n,): ids of these points.
+    `X` (n, d), in m: reference positions of this process's points with the material.
+    `ids` (n,): ids of these points.
     """
     names = _by_place(m)
 

@@ -128,8 +128,8 @@ def by_body(given, bodies: Sequence[Body], later: Sequence[int]) -> dict[int, In
 class InitialStresses:
     """Initial stresses of the bodies of a scene.
 
-    given: result of `by_body`.
-    pressure: initial pore pressure, in Pa, as a number or a function of x.
+    `given`: result of `by_body`.
+    `pressure`: initial pore pressure, in Pa, as a number or a function of x.
     """
 
     def __init__(self, bodies: Sequence[Body], given: Mapping[int, InitialStress], pressure: float | Callable):
@@ -141,8 +141,8 @@ class InitialStresses:
     def of(self, materials: SceneMaterials, points: MaterialPoints, present: Sequence[bool], gravity) -> MaterialPoints:
         """Return the points with the elastic strains of their initial stress.  All processes must call this method.
 
-        present: whether each body is present, so that its weight acts on the soil below.
-        gravity (d,), in m/s^2: acceleration of gravity, or None.
+        `present`: whether each body is present, so that its weight acts on the soil below.
+        `gravity` (d,), in m/s^2: acceleration of gravity, or None.
         """
         if not self.given:
             return points
@@ -210,8 +210,8 @@ def _in_columns(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return corners and unit weights of all domains above and below this process's domains.
 
-    ids (n,), corners (n, 2^d, d), in m, unit_weight (n,), in N/m^3: this process's domains in the scene.
-    above (k, 2^d, d), in m: corners of the domains whose columns are needed.
+    `ids` (n,), `corners` (n, 2^d, d), in m, `unit_weight` (n,), in N/m^3: this process's domains in the scene.
+    `above` (k, 2^d, d), in m: corners of the domains whose columns are needed.
     """
     ends = [above[..., :-1].min(axis=(0, 1), initial=np.inf), above[..., :-1].max(axis=(0, 1), initial=-np.inf)]
     low, high = corners[..., :-1].min(axis=1), corners[..., :-1].max(axis=1)

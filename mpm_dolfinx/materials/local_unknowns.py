@@ -55,9 +55,9 @@ class Derived(NamedTuple):
 class LocalUnknowns:
     """The local unknowns of a law at some points, as coefficients of forms.
 
-    law: class of the law.
-    points: the points, with the law's parameters and state.
-    F: deformation gradient (d, d) of the law, as UFL.
+    `law`: class of the law.
+    `points`: the points, with the law's parameters and state.
+    `F`: deformation gradient (d, d) of the law, as UFL.
 
     Attributes
     ----------
@@ -99,8 +99,8 @@ class LocalUnknowns:
     def solve(self, data: PointData, derive: bool = True, motion: tuple = ()) -> Given:
         """Solve for the local unknowns at the present F, and return values for the forms.  All processes must call it.
 
-        derive: whether to compute the derivatives with respect to the trial values.  `values` contains them.
-        motion: key of the present displacement.  Results are reused while `data`, `motion` and dt are the same.
+        `derive`: whether to compute the derivatives with respect to the trial values.  `values` contains them.
+        `motion`: key of the present displacement.  Results are reused while `data`, `motion` and dt are the same.
         """
         key = data.key, motion, float(self._dt.value)
         solved = self._solved(key, lambda: self._equations.solve(data, self._trial.evaluate(data)), self._comm)
@@ -253,7 +253,7 @@ class _Equations:
     def _slopes_of(self, of: str, given: Mapping[str, object], n: int) -> NDArray[np.float64]:
         """Return the derivatives (n, m, k) of one unknown with respect to all trial values.
 
-        given: derivatives by name of the trial value.  Missing derivatives are zero.
+        `given`: derivatives by name of the trial value.  Missing derivatives are zero.
         """
         m, parts = _size(self._unknowns[of]), []
         for by, shape in self._trial.items():
@@ -283,8 +283,8 @@ def _real(name: str, value, shape: tuple[int, ...]) -> NDArray[np.float64]:
 def _newton(system, y: NDArray[np.float64]) -> NDArray[np.int64]:
     """Solve f(y) = 0 in place, and return the indices of points without a solution.
 
-    system: function of r point indices and of the y (r, m) of these points.  It stores y, and returns f, df/dy and the
-    norms of f.
+    `system`: function of r point indices and of the y (r, m) of these points.  It stores y, and returns f, df/dy and
+    the norms of f.
     """
     rows, failed = np.arange(len(y)), np.zeros(len(y), dtype=bool)
     f, slope, norm = system(rows, y)

@@ -134,7 +134,7 @@ class MohrCoulomb(Frictional):
 def _returned(e: NDArray, bulk: NDArray, shear: NDArray, sine: NDArray, sine_flow: NDArray, *limits: NDArray) -> tuple:
     """Return principal stresses, their derivatives with respect to e, and flags of plastic flow.
 
-    e (n, 3): principal trial strains, in descending order.
+    `e` (n, 3): principal trial strains, in descending order.
     """
     elastic = (bulk - 2 * shear / 3)[:, None, None] * np.ones((3, 3)) + 2 * shear[:, None, None] * np.eye(3)
     t, slopes = np.einsum("nij,nj->ni", elastic, e), elastic
@@ -196,7 +196,7 @@ class _Return:
     def end(self, few: slice) -> tuple[NDArray, NDArray, NDArray]:
         """Return the final stresses, their derivatives with respect to the trial stresses, and their violation.
 
-        few: slice of `_faces` with possible faces and edges of the final stress.  `ALL` also includes the vertices.
+        `few`: slice of `_faces` with possible faces and edges of the final stress.  `ALL` also includes the vertices.
         """
         with np.errstate(all="ignore"):  # vertices at infinity
             ends = [self._on(faces) for faces in self._faces[few]]

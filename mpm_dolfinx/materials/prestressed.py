@@ -27,7 +27,7 @@ AT_REST = " at rest"
 def stressed(m: Skeleton, knows_space: bool) -> Skeleton:
     """Return a material with a point field for its initial stress or initial strain.
 
-    knows_space: whether the material's law accepts F (3, 3).
+    `knows_space`: whether the material's law accepts F (3, 3).
     """
     if "initial_stress" in (names := [f.name for f in fields(m)]):
         own = m.initial_stress if callable(m.initial_stress) else _everywhere(m.initial_stress)

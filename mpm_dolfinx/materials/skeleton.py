@@ -239,8 +239,8 @@ class Skeleton:
     def first_piola(cls, F, values: Mapping[str, object]):
         """Return the first Piola-Kirchhoff effective stress (d, d), in Pa, as UFL.
 
-        F: deformation gradient (d, d), a UFL variable.
-        values: UFL values of the parameters and of the state.
+        `F`: deformation gradient (d, d), a UFL variable.
+        `values`: UFL values of the parameters and of the state.
         """
         if cls.kirchhoff is None:
             return ufl.diff(expression(cls.energy, [()], "F", F=F, **values), F)
@@ -262,8 +262,8 @@ class Skeleton:
     def out_of_plane(cls, F, values: Mapping[str, object]):
         """Return the out-of-plane effective Cauchy stress in plane strain, in Pa, as UFL, or None if undefined.
 
-        F: deformation gradient (2, 2), a UFL variable.
-        values: UFL values of the parameters and of the state.
+        `F`: deformation gradient (2, 2), a UFL variable.
+        `values`: UFL values of the parameters and of the state.
         """
         if cls.kirchhoff is not None:
             tau = cls._kirchhoff(F, values, (2, 2))

@@ -50,9 +50,9 @@ class Isotropic:
 class Trial:
     """Trial elastic strain for a deformation gradient, in UFL.
 
-    F: deformation gradient (d, d).
-    plastic: C_p^-1 (3, 3).
-    prestretch: principal elastic stretches (3,) at F = I, or None if all are 1.
+    `F`: deformation gradient (d, d).
+    `plastic`: C_p^-1 (3, 3).
+    `prestretch`: principal elastic stretches (3,) at F = I, or None if all are 1.
     """
 
     def __init__(self, F, plastic, prestretch=None):
@@ -103,9 +103,9 @@ def eigen(b: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float
 class Coaxial:
     """Tensors that are coaxial with n other tensors.
 
-    x (n, 3), axes (n, 3, 3): eigenvalues and axes of the other tensors, see `eigen`.
-    y (n, 3): principal values of the coaxial tensors.
-    plane: whether the other tensors have the components in `PLANE`.
+    `x` (n, 3), `axes` (n, 3, 3): eigenvalues and axes of the other tensors, see `eigen`.
+    `y` (n, 3): principal values of the coaxial tensors.
+    `plane`: whether the other tensors have the components in `PLANE`.
     """
 
     def __init__(self, x: NDArray[np.float64], axes: NDArray[np.float64], y: NDArray[np.float64], plane: bool):
@@ -133,7 +133,7 @@ class Coaxial:
         In principal axes, dy_ij = (y_i - y_j) / (x_i - x_j) dx_ij for i != j.  The limit for x_i = x_j is
         (dy_i/dx_i - dy_i/dx_j) dx_ij, because then an isotropic function also has y_i = y_j.
 
-        slopes (n, 3, 3): dy/dx.
+        `slopes` (n, 3, 3): dy/dx.
         """
         x = self._x
         y = self._y

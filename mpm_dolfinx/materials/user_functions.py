@@ -60,7 +60,7 @@ def call(function: Callable, kind: str = "UFL", /, **available):
 
     ValueError is raised if the function has an unknown argument or fails.
 
-    kind: type of the result, for messages.
+    `kind`: type of the result, for messages.
     """
     names = list(signature(function).parameters)
     for name in names:
@@ -108,7 +108,7 @@ def _check_parts(what: str, out: ufl.core.expr.Expr) -> None:
 def named(what: str, given, shapes: Mapping[str, tuple[int, ...]], some: bool = False) -> dict:
     """Return the dict from a user-defined function as UFL with the given shapes, or raise ValueError.
 
-    some: whether names may be missing.
+    `some`: whether names may be missing.
     """
     instance(f"{what}: its result", given, dict)
     allowed, out = f"{'some of ' if some else ''}the names and shapes {dict(shapes)}", {}

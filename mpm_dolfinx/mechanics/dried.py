@@ -22,10 +22,10 @@ from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
 def suction_sums(points: FormPoints, F, slopes: Sequence, locks: bool) -> CellSums | None:
     """Return the sums over pieces in each cell that `OfSuction` needs, or None for laws without suction.
 
-    F: deformation gradient (d, d), a UFL variable.
-    slopes: UFL derivatives with respect to the pressure: of the first Piola-Kirchhoff stress (d, d), and with F-bar
+    `F`: deformation gradient (d, d), a UFL variable.
+    `slopes`: UFL derivatives with respect to the pressure: of the first Piola-Kirchhoff stress (d, d), and with F-bar
     also of the mean stress pi.  Empty for laws without suction.
-    locks: whether the law of the pieces uses F-bar.
+    `locks`: whether the law of the pieces uses F-bar.
     """
     share = 1 / ufl.det(points.F)
     tensors = [share * ufl.diff(ufl.det(F), F)] if locks else []
@@ -37,8 +37,8 @@ def suction_sums(points: FormPoints, F, slopes: Sequence, locks: bool) -> CellSu
 class OfSuction:
     """Derivatives of nodal forces with respect to the pressures of cells, for laws that depend on suction.
 
-    dilatation: volume ratios of cells for F-bar, or None if no cell would lock.
-    sums: results of `suction_sums` for each part of the points.
+    `dilatation`: volume ratios of cells for F-bar, or None if no cell would lock.
+    `sums`: results of `suction_sums` for each part of the points.
     """
 
     def __init__(self, dim: int, dilatation: MeanDilatation | None, sums: Sequence[CellSums | None]):
@@ -50,7 +50,7 @@ class OfSuction:
     def rows(self, data: QuadratureData, given: Sequence[Given]) -> list[tuple[NDArray[np.int32], NDArray[np.float64]]]:
         """Return cells, and the derivatives of their nodal forces with respect to their pressures.
 
-        given: values that are passed to the forms of each part.
+        `given`: values that are passed to the forms of each part.
         """
         parts = data.parts
         out = [(parts[k].places.filled, of(parts[k], given[k])) for k, of in self._free.items()]

@@ -70,8 +70,8 @@ def kinks(grid: Grid, V: fem.FunctionSpace, strength: ufl.core.expr.Expr, power:
 class GhostPenalty:
     """Form of the ghost penalty, with modulus and volume fraction of the cells as coefficients.
 
-    V: space of the displacement.
-    at_points: whether bodies are integrated at their material points.
+    `V`: space of the displacement.
+    `at_points`: whether bodies are integrated at their material points.
 
     Attributes
     ----------
@@ -115,9 +115,9 @@ class GhostPenalty:
 
         `fill` must be zero before the call.
 
-        own (n,): owned cells that contain material.
-        volume (n,), in m^d: volume of the material in each cell.
-        moduli: two arrays (n,), `modulus` times volume and `shear` times volume.
+        `own` (n,): owned cells that contain material.
+        `volume` (n,), in m^d: volume of the material in each cell.
+        `moduli`: two arrays (n,), `modulus` times volume and `shear` times volume.
         """
         grid, fill = self.grid, self.fill.x.array
         fill[own] = volume / grid.volumes(own)

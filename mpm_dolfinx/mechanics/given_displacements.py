@@ -139,7 +139,7 @@ class GivenDisplacements(Acting):
     def _held_points(self, place: Place, ends: Sequence[float]) -> HeldPoints:
         """Return the integration points on sides, on the processes that own the constraints, see `inner_cells`.
 
-        ends: start and end of the step, in s; empty if the displacement is zero.
+        `ends`: start and end of the step, in s; empty if the displacement is zero.
         """
         cut, points = place.cut, place.points
         d, t = self._grid.dim, place.t
@@ -237,8 +237,8 @@ class GivenDisplacements(Acting):
 
         A prism has the volume of its domain, and keeps the tracked corners on the held face.
 
-        tracked, corners (n, 2^d, d), in m: tracked and re-initialised corners of the domains `ids`.
-        volume (n,): volumes of the domains, in axisymmetry areas of their sections.
+        `tracked`, `corners` (n, 2^d, d), in m: tracked and re-initialised corners of the domains `ids`.
+        `volume` (n,): volumes of the domains, in axisymmetry areas of their sections.
         """
         index = np.arange(2**self._grid.dim)
         for _, faces, _ in self._holds:
@@ -256,11 +256,11 @@ class GivenDisplacements(Acting):
 class HoldLoads(Loads):
     """Prescribed displacements in a substep, as penalties on k components.
 
-    data: points of the forms, one for each component, with stiffness, direction and gap.
-    held: geometry and stiffness of all penalties.
-    row (k,): index in `held` of each component.
-    share (k, 2^d): fraction of each component's force on each node, without the fraction that walls of the grid bear.
-    place: time and cut domains of the substep.
+    `data`: points of the forms, one for each component, with stiffness, direction and gap.
+    `held`: geometry and stiffness of all penalties.
+    `row` (k,): index in `held` of each component.
+    `share` (k, 2^d): fraction of each component's force on each node, without the fraction that walls of the grid bear.
+    `place`: time and cut domains of the substep.
     """
 
     stiff = True

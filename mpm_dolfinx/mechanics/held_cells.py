@@ -74,11 +74,11 @@ def inner_cells(
     Constraints in these cells would contradict the constraints of inner cells.  The constraints of the inner cells
     therefore contain these points too (aggregation; Badia, Verdugo and Martin 2018).
 
-    fill (cells,): volume fractions.
-    sides: for each condition, the prescribed components, and the extent (d,), in m, of the prescribed positions.
-    number (n,): index of each point's condition.
-    cell (n,): owned cell of each point.
-    normal (n, d): outward area vector of each point.
+    `fill` (cells,): volume fractions.
+    `sides`: for each condition, the prescribed components, and the extent (d,), in m, of the prescribed positions.
+    `number` (n,): index of each point's condition.
+    `cell` (n,): owned cell of each point.
+    `normal` (n, d): outward area vector of each point.
     """
     inner = cell.astype(np.int64)
     for k, (axes, extent) in enumerate(sides):
@@ -171,16 +171,16 @@ class HeldCells:
         penalties of the condition hold a free node of the cell, a check follows.  A penalty is omitted if the
         extrapolated value exceeds half of the cell's mean, at the start or the end of the step.
 
-        given (conditions,): whether each condition prescribes component `axis`.
-        free (nodes,): whether no wall fixes the node.
+        `given` (conditions,): whether each condition prescribes component `axis`.
+        `free` (nodes,): whether no wall fixes the node.
 
         Returns
         -------
-        index (k,): indices of the penalties.
-        stiffness (k,), in N/m: stiffness of these penalties.
-        gap (k,), in m: gaps of these penalties.
-        share (k, 2^d): fractions of the force on each node, without the fraction of the wall.
-        stuck: index of a penalty that must move but has fixed nodes only, or -1.
+        `index` (k,): indices of the penalties.
+        `stiffness` (k,), in N/m: stiffness of these penalties.
+        `gap` (k,), in m: gaps of these penalties.
+        `share` (k, 2^d): fractions of the force on each node, without the fraction of the wall.
+        `stuck`: index of a penalty that must move but has fixed nodes only, or -1.
         """
         grid, chosen = self.grid, np.flatnonzero(given[self.number])
         nodes, x, gap, N = (v[chosen] for v in (grid.cell_nodes[self.cell], self.x, self._gap[:, axis], self.shape))
@@ -208,8 +208,8 @@ class HeldCells:
     ) -> NDArray[np.bool_]:
         """Return which penalties at a wall have a node that other penalties of the condition hold.
 
-        N (k, 2^d): values of the shape functions of the nodes.
-        stuck (k, 2^d): whether each node is at a wall.
+        `N` (k, 2^d): values of the shape functions of the nodes.
+        `stuck` (k, 2^d): whether each node is at a wall.
         """
         grid = self.grid
         at_wall = stuck.any(axis=1)
@@ -232,11 +232,11 @@ class HeldCells:
         forces of the penalties in the two cells then oppose each other.  A force therefore counts as too large only if
         the sums of the forces at its nodes also exceed their limits.
 
-        row (k,): index of the penalty of each of k prescribed components.
-        axis (k,): axis of each component.
-        force (k,), in N: force of each component.
-        reached (k,): whether each component is at its prescribed position.
-        reported: indices of conditions that have been reported already; they are excluded.
+        `row` (k,): index of the penalty of each of k prescribed components.
+        `axis` (k,): axis of each component.
+        `force` (k,), in N: force of each component.
+        `reached` (k,): whether each component is at its prescribed position.
+        `reported`: indices of conditions that have been reported already; they are excluded.
         """
         grid = self.grid
         comm = grid.comm

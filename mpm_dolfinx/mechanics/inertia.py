@@ -80,10 +80,10 @@ def moving(
 ) -> dict[str, NDArray[np.float64]]:
     """Return the point data `VELOCITY` and `RATE` of a velocity field.
 
-    velocity: vector (d,), in m/s, or function of positions x (n, d) with values (n, d).  Each domain stores the affine
-    field nearest to the values at its corners.
-    base (d,), in m: origin of the points' coordinates.
-    rings: whether the domains are rings (axisymmetry).  The centroids of rings determine their velocities.
+    `velocity`: vector (d,), in m/s, or function of positions x (n, d) with values (n, d).  Each domain stores the
+    affine field nearest to the values at its corners.
+    `base` (d,), in m: origin of the points' coordinates.
+    `rings`: whether the domains are rings (axisymmetry).  The centroids of rings determine their velocities.
     """
     n, corners, d = points.corners.shape
     places = (points.corners + base).reshape(-1, d)
@@ -127,7 +127,7 @@ def chord(G: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float
 
     A rigid rotation then causes no strain in any body.  P F^T is symmetric, so moments balance.
 
-    G (n, d, d): gradient of the displacement since the start of the step.
+    `G` (n, d, d): gradient of the displacement since the start of the step.
     """
     one, G = np.eye(G.shape[1]), np.ascontiguousarray(G.transpose(1, 2, 0)).transpose(2, 0, 1)
     delta = one + G
@@ -138,7 +138,7 @@ def chord(G: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float
 class InertiaForms:
     """Compiled forms of mass and momentum, with the coefficients of the midpoint rule.
 
-    points, of_laws: all integration points, and the integration points of each law.
+    `points`, `of_laws`: all integration points, and the integration points of each law.
     """
 
     def __init__(self, points: FormPoints, of_laws: Sequence[FormPoints], u: fem.Function):
@@ -180,7 +180,7 @@ class InertiaForms:
     def _seen(self, chords: Latest[tuple[NDArray, NDArray]], which: int, data: PointData) -> NDArray[np.float64]:
         """Return the gradients for laws, or the rotations of the laws' stresses, see `chord`.
 
-        chords: the last result, shared by all forms at the same u.
+        `chords`: the last result, shared by all forms at the same u.
         """
         G, d = data.gradients(self._u.x.array), self.grid.dim
         if self.midpoint.value:
@@ -198,10 +198,10 @@ class InertiaForms:
     ) -> Mass:
         """Return the mass of the bodies on the grid.
 
-        mass (n,), in kg: masses of the points.
-        fill (cells,): volume fractions of the local cells.
-        facets: faces between two active cells, at least one of them not full.
-        unknowns, held: unknown displacements, and displacements that grid boundary conditions fix.
+        `mass` (n,), in kg: masses of the points.
+        `fill` (cells,): volume fractions of the local cells.
+        `facets`: faces between two active cells, at least one of them not full.
+        `unknowns`, `held`: unknown displacements, and displacements that grid boundary conditions fix.
         """
         grid = self.grid
         rows = cut.pieces_to_cells(cut.pieces.fraction * mass[cut.pieces.point])
@@ -225,9 +225,9 @@ class InertiaForms:
 class Mass:
     """Mass of the bodies on the grid, constant until the next reset of the grid.
 
-    pieces: integration points of the pieces, with masses, in kg, as weights.
-    M: mass matrix, in kg, with the rows of the unknowns.
-    held: mass matrix, in kg, with the rows of displacements that walls of the grid fix.
+    `pieces`: integration points of the pieces, with masses, in kg, as weights.
+    `M`: mass matrix, in kg, with the rows of the unknowns.
+    `held`: mass matrix, in kg, with the rows of displacements that walls of the grid fix.
     """
 
     def __init__(
@@ -259,9 +259,9 @@ class Mass:
     ) -> dict[str, NDArray[np.float64]]:
         """Return the point data `VELOCITY` and `RATE` after a step.
 
-        points: material points at the start of the step.
-        velocities: velocities of the unknowns, in m/s, at the start and at the end of the step.
-        moved (n,): largest displacement of a corner, in cell sizes, in the connected part of the point, or 0 if the
+        `points`: material points at the start of the step.
+        `velocities`: velocities of the unknowns, in m/s, at the start and at the end of the step.
+        `moved` (n,): largest displacement of a corner, in cell sizes, in the connected part of the point, or 0 if the
         point keeps its pieces.
         """
         start, end = velocities
@@ -311,8 +311,8 @@ def velocity_gradients(points: MaterialPoints) -> NDArray[np.float64]:
 class Inertia(Loads):
     """Inertia forces in a substep.
 
-    flight, in m: inertial predictor, the displacement without forces.
-    rate, in 1/s^2: acceleration divided by (displacement - flight).
+    `flight`, in m: inertial predictor, the displacement without forces.
+    `rate`, in 1/s^2: acceleration divided by (displacement - flight).
     """
 
     holding = True

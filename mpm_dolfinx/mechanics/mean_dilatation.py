@@ -56,7 +56,7 @@ class SumsOfPart(NamedTuple):
 class FBar:
     """F-bar modification of laws, with theta and pi of each cell as fields.
 
-    symmetric: whether the tangents of all laws are symmetric.
+    `symmetric`: whether the tangents of all laws are symmetric.
     """
 
     def __init__(self, grid: Grid, symmetric: bool):
@@ -88,12 +88,12 @@ class FBar:
     ) -> tuple:
         """Return the stress and the cell sums of points with a law that uses F-bar.
 
-        points: integration points with the law, with the field F at the start of the step.
-        F: deformation gradient (d, d), a UFL variable.
-        Fbar: result of `of`.
-        ratio: det Delta, with Delta F_n = F.
-        values: UFL values of the law's parameters, state and local unknowns.
-        known: the same values for expressions that are not differentiated, see `LocalUnknowns`.
+        `points`: integration points with the law, with the field F at the start of the step.
+        `F`: deformation gradient (d, d), a UFL variable.
+        `Fbar`: result of `of`.
+        `ratio`: det Delta, with Delta F_n = F.
+        `values`: UFL values of the law's parameters, state and local unknowns.
+        `known`: the same values for expressions that are not differentiated, see `LocalUnknowns`.
 
         Returns
         -------
@@ -160,8 +160,8 @@ class FBar:
 class MeanDilatation:
     """The volume ratio theta and the mean stress pi of each cell, for F-bar.
 
-    parts: sums over each part in which cells would lock, by index of the part, see `QuadratureData`.
-    dt: time since the start of the step, s.
+    `parts`: sums over each part in which cells would lock, by index of the part, see `QuadratureData`.
+    `dt`: time since the start of the step, s.
     """
 
     def __init__(self, fbar: FBar, parts: Mapping[int, SumsOfPart], dt: fem.Constant):
@@ -184,8 +184,8 @@ class MeanDilatation:
     def at(self, data: QuadratureData, motion: tuple, solve: Callable[[], Sequence[Given]]) -> list[Given]:
         """Set theta and pi, and return values for the forms of each part.  All processes must call this method.
 
-        motion: key of the present displacement, see `LocalUnknowns.solve`.
-        solve: function that returns these values without stresses, see `LocalUnknowns`.
+        `motion`: key of the present displacement, see `LocalUnknowns.solve`.
+        `solve`: function that returns these values without stresses, see `LocalUnknowns`.
         """
 
         def given_stresses() -> list[Given]:
@@ -212,14 +212,14 @@ class MeanDilatation:
     def _set_mean(self, f: fem.Function, sums: Sequence[NDArray[np.float64]], data: QuadratureData) -> None:
         """Set f in each cell to a mean over the pieces with F-bar.
 
-        sums: for each part of the points, the sums (cells, 1) of the quantity times the volume.
+        `sums`: for each part of the points, the sums (cells, 1) of the quantity times the volume.
         """
         f.x.array[self._cells(data).filled] = self._cells(data).total(sums)[:, 0] / self._volume_of(data)[:, 0]
 
     def assemble_matrix(self, A: PETSc.Mat, data: QuadratureData, sums: Sequence[NDArray[np.float64]]) -> None:
         """Add the contribution of theta and pi to the tangent, without final assembly.
 
-        sums: for each part, the integrals (cells, quantities) of `Beside` from `FBar.forms` over each cell.
+        `sums`: for each part, the integrals (cells, quantities) of `Beside` from `FBar.forms` over each cell.
         """
         count, volume = 2**self._grid.dim * self._grid.dim, self._volume_of(data)
         b, c, *other, e = np.split(

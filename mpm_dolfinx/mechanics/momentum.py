@@ -61,16 +61,16 @@ class FormsOfPart(NamedTuple):
 class MomentumForms:
     """Compiled forms of the balance of momentum of a scene.
 
-    pieces: all integration points.  With gravity, the points have the field `density`, in kg/m^3.
-    laws: class, integration points, and whether it uses F-bar (`MeanDilatation`), of each law.  The points have F, the
-    law's parameters and state, and with fluid `biot`.  With retention curves they have `retention`, `lever`, `pores`.
-    pressure: DG0 pore pressure, or None without fluid.
-    gravity (d,), in m/s^2: acceleration as a UFL constant, or None.
-    materials: materials of the scene, and its fluid.
-    at_points: whether bodies are integrated at their material points.
-    terms: user-defined terms, see `user_functions`.
-    t, dt, in s: time at the end of the substep, and time since the start of the step, as UFL constants.
-    inertia: whether bodies may have inertia.
+    `pieces`: all integration points.  With gravity, the points have the field `density`, in kg/m^3.
+    `laws`: for each law, its class, its integration points, and whether it uses F-bar.  The points have F, the law's
+    parameters and state, and with fluid `biot`.  With retention curves they have `retention`, `lever`, `pores`.
+    `pressure`: DG0 pore pressure, or None without fluid.
+    `gravity` (d,), in m/s^2: acceleration as a UFL constant, or None.
+    `materials`: materials of the scene, and its fluid.
+    `at_points`: whether bodies are integrated at their material points.
+    `terms`: user-defined terms, see `user_functions`.
+    `t`, `dt`, in s: time at the end of the substep, and time since the start of the step, as UFL constants.
+    `inertia`: whether bodies may have inertia.
     """
 
     def __init__(
@@ -287,11 +287,11 @@ class MomentumForms:
 class MomentumSystem:
     """Vectors and matrices of the balance of momentum for one set of active cells.
 
-    dofs: unrolled local degrees of freedom that are unknowns, ghosts included.
-    cells: active cells of this process.
-    facets: faces of this process with a ghost penalty.
-    stiff: whether plates or prescribed displacements have a penalty.
-    parts: connected parts of the bodies.
+    `dofs`: unrolled local degrees of freedom that are unknowns, ghosts included.
+    `cells`: active cells of this process.
+    `facets`: faces of this process with a ghost penalty.
+    `stiff`: whether plates or prescribed displacements have a penalty.
+    `parts`: connected parts of the bodies.
     """
 
     def __init__(
@@ -395,11 +395,11 @@ class MomentumSystem:
 class MomentumProblem:
     """Balance of momentum of one step.
 
-    data: integration points.
-    tolerance: tolerance of the residual, relative to the forces.
-    goes_on (unknowns,), in m: displacements extrapolated from the last step, or None.
-    held (unknowns,), in N: initial residual forces that loads do not balance, or None.
-    yielded: whether any soil has yielded before this step.
+    `data`: integration points.
+    `tolerance`: tolerance of the residual, relative to the forces.
+    `goes_on` (unknowns,), in m: displacements extrapolated from the last step, or None.
+    `held` (unknowns,), in N: initial residual forces that loads do not balance, or None.
+    `yielded`: whether any soil has yielded before this step.
     """
 
     def __init__(
@@ -535,7 +535,7 @@ class MomentumProblem:
         is not subtracted, so that even a load below the error causes a solve.  For the second result, the force scale
         at an unknown is at least `of_whole` divided by the tolerance.  A residual within rounding has thus converged.
 
-        r, scales (parts,), in N: residuals and force scales.
+        `r`, `scales` (parts,), in N: residuals and force scales.
         """
         system, parts = self.system, self.system.of_parts
         both = np.zeros((2, system.unknowns.size))
@@ -576,8 +576,8 @@ class MomentumProblem:
     ) -> PETSc.Mat:
         """Return the tangent at u, regularised by a fraction of the elastic shear stiffness.
 
-        data: integration points, by default the points of the problem.
-        shift: this fraction, as one number or as one number for each connected part.
+        `data`: integration points, by default the points of the problem.
+        `shift`: this fraction, as one number or as one number for each connected part.
         """
         K = self.system.K
         # the first sum gives K its full sparsity pattern, because PETSc does not always notice a later change

@@ -86,8 +86,8 @@ class PiecePlaces:
 class QuadraturePoints:
     """Pieces of particle domains as integration points, with the fields of the scene's forms.
 
-    weighs: whether the scene has gravity.
-    extended: whether user-defined functions may use any data of the material points.
+    `weighs`: whether the scene has gravity.
+    `extended`: whether user-defined functions may use any data of the material points.
 
     Attributes
     ----------
@@ -259,7 +259,7 @@ class QuadraturePoints:
     def fixed_stress(self, cut: CutDomains, points: MaterialPoints, of_fluid: bool) -> NDArray[np.float64]:
         """Return the coefficient beta of the fixed-stress operator at the integration points, in 1/Pa.
 
-        of_fluid: whether to return 1/K_w in place of beta; then the iteration converges for stiff skeletons only.
+        `of_fluid`: whether to return 1/K_w in place of beta; then the iteration converges for stiff skeletons only.
         """
         if of_fluid:
             return np.full(len(cut.cells), 1 / self._fluid.bulk)

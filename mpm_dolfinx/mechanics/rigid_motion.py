@@ -32,8 +32,8 @@ def rigid_motion(
     The result is None for a pure translation, or if a translation fits nearly as well.  All processes must call this
     function.
 
-    holds: penalties of prescribed displacements, with direction, gap, in m, and stiffness, the weight in the fit.
-    counts (k,): whether each penalty is used.
+    `holds`: penalties of prescribed displacements, with direction, gap, in m, and stiffness, the weight in the fit.
+    `counts` (k,): whether each penalty is used.
     """
     d = x.shape[1]
     e = holds["direction"]

@@ -177,7 +177,7 @@ def closed(grid: Grid, free: NDArray[np.bool_], pressures: Sequence[tuple[Pressu
 
     The corners of faces must not lie on the edges of other faces.
 
-    free (nodes, d): whether walls leave each displacement component free.
+    `free` (nodes, d): whether walls leave each displacement component free.
     """
     if not pressures:
         return True

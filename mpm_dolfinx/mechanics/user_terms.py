@@ -34,10 +34,10 @@ class OwnTerm(NamedTuple):
 class OwnTerms:
     """User-defined terms of a scene, for all of its stages.
 
-    terms: functions for bodies, or `OnSide` with functions for sides.
-    pieces: all integration points.
-    forms: forms of the scene's conditions, with u and the velocity of the bodies.
-    t, dt, in s: time at the end of the substep, and time since the start of the step, as UFL constants.
+    `terms`: functions for bodies, or `OnSide` with functions for sides.
+    `pieces`: all integration points.
+    `forms`: forms of the scene's conditions, with u and the velocity of the bodies.
+    `t`, `dt`, in s: time at the end of the substep, and time since the start of the step, as UFL constants.
     """
 
     def __init__(

@@ -16,11 +16,11 @@ from mpm_dolfinx.mechanics.tractions import DeadLoads
 class Weight(Acting):
     """Weight in a scene.
 
-    pieces: all integration points, with `density`, in kg/m^3, at the start of the step.
-    u: displacement increment of the step.
-    gravity (d,), in m/s^2: acceleration as a UFL constant.
-    fluid_density, in kg/m^3: density of the pore fluid, or None without fluid.
-    saturation: degree of saturation as UFL, or None for saturated soil.
+    `pieces`: all integration points, with `density`, in kg/m^3, at the start of the step.
+    `u`: displacement increment of the step.
+    `gravity` (d,), in m/s^2: acceleration as a UFL constant.
+    `fluid_density`, in kg/m^3: density of the pore fluid, or None without fluid.
+    `saturation`: degree of saturation as UFL, or None for saturated soil.
     """
 
     def __init__(

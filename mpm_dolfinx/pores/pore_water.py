@@ -55,9 +55,9 @@ class PoreWater:
 
         Newton's method solves for the logarithm of the suction, within a bracket.
 
-        content (n,), in m^d: prescribed fluid contents.
-        p (n,), in Pa: initial pressures.  Pressures that already give the fluid contents are returned unchanged. offset
-        (k,), in Pa: pressure of each piece minus the pressure of its cell.
+        `content` (n,), in m^d: prescribed fluid contents.
+        `p` (n,), in Pa: initial pressures.  Pressures that already give the fluid contents remain unchanged.
+        `offset` (k,), in Pa: pressure of each piece minus the pressure of its cell.
         """
         count, scale = len(p), self.scale
         rounding = 4 * EPSILON * sum_by(self.slot, self.pores, count)
@@ -91,8 +91,8 @@ def emptied(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return (S - 1) rho at pressures p, in Pa, and its derivative with respect to p.
 
-    bulk, in Pa: bulk modulus of the fluid.
-    slope (k,), in 1/Pa: derivative dS/dp.
+    `bulk`, in Pa: bulk modulus of the fluid.
+    `slope` (k,), in 1/Pa: derivative dS/dp.
     """
     density = np.exp(p / bulk)
     return (S - 1) * density, (slope + (S - 1) / bulk) * density

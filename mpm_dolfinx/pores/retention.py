@@ -257,8 +257,8 @@ class Retentions:
     centroid of the material in their cell to the piece.  The pressure of a piece is the pressure of its cell plus the
     hydrostatic difference along `lever`.
 
-    laws: distinct retention curves of the scene's materials.
-    everywhere: whether every material has a retention curve.
+    `laws`: distinct retention curves of the scene's materials.
+    `everywhere`: whether every material has a retention curve.
     """
 
     def __init__(self, laws: Sequence, everywhere: bool, grid: Grid):
@@ -363,7 +363,7 @@ class SaturationAt:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Return S, dS/dp, chi and k_r at pressures p (n,), in Pa.
 
-        rows (n, width): field `retention` of the points.
+        `rows` (n, width): field `retention` of the points.
         """
         data = anywhere(self._points, p=p, retention=rows)
         S, slope, chi, k = self._values.evaluate(data).T
@@ -466,10 +466,10 @@ def restrained(
     saturation is convex or concave, so that Newton's method converges (Wang and Tchelepi 2013).  The logarithm of the
     suction changes by at most `FARTHEST`.  A change that reverses its direction is at most half of the previous change.
 
-    p (n,), in Pa: pressures.
-    dp (n,), in Pa: decreases of the pressures in Newton's method.
-    scale (n,), in Pa: characteristic suctions.
-    previous (n,): changes of `logarithm` in the previous Newton step.
+    `p` (n,), in Pa: pressures.
+    `dp` (n,), in Pa: decreases of the pressures in Newton's method.
+    `scale` (n,), in Pa: characteristic suctions.
+    `previous` (n,): changes of `logarithm` in the previous Newton step.
     """
     new, limit = p - dp, -scale
     new = np.where((p - limit) * (new - limit) < 0, limit, new)

@@ -46,10 +46,10 @@ def probe_pressures(scene: Scene, state: State, probes: Probes) -> NDArray[np.fl
 class _Lattice:
     """Blocks of cells around the cells of n probes.
 
-    number (n, cells): lexicographic indices of the cells in the grid, -1 outside the grid.
-    middle: index of the probe's cell in its block.
-    stride (d,): increment of the index in the block along each axis.
-    neighbours: indices of cells and of their neighbours in the block, by axis and end.
+    `number` (n, cells): lexicographic indices of the cells in the grid, -1 outside the grid.
+    `middle`: index of the probe's cell in its block.
+    `stride` (d,): increment of the index in the block along each axis.
+    `neighbours`: indices of cells and of their neighbours in the block, by axis and end.
     """
 
     def __init__(self, grid: Grid, cell: NDArray[np.int64]):
@@ -106,7 +106,7 @@ class _Around:
         """Return the local indices of the cells in the blocks, and a table of the data of these cells.
 
         The index of an empty cell, or of a cell of another process, is -1.
-        soils (k, 3): conductivity, index of the conductivity law, and material of each piece.
+        `soils` (k, 3): conductivity, index of the conductivity law, and material of each piece.
         """
         grid = self._grid
         contents = self._contents
@@ -136,7 +136,7 @@ class _Around:
         The fit uses cells with only the soil of the probe.  Without such cells, the fit uses cells with only the
         material of the probe, or else all filled cells.
 
-        same (n, cells, 3): whether all soil in a cell has the conductivity, conductivity law and material at the probe.
+        `same` (n, cells, 3): whether all soil in a cell has the probe's conductivity, conductivity law and material.
         """
         same = same & self._filled[:, :, None]
         levels = [same.all(axis=2), same[:, :, 2], self._filled]
