@@ -237,9 +237,9 @@ def batches(places: Places) -> list[tuple[NDArray[np.int64], NDArray[np.int64], 
 
     Returns for each batch
     ----------------------
-    `cells` (c,): indices in `Places.filled`.
-    `points` (c, most): indices in `Places.cells` of the points in each cell.
-    `padding` (c, most): True after the last point of a cell.
+    Indices (c,) of the cells in `Places.filled`.
+    Indices (c, most) in `Places.cells` of the points in each cell.
+    Mask (c, most) of entries after the last point of a cell.
     """
     cells = places.cells
     filled = places.filled
