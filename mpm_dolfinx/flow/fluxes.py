@@ -157,7 +157,7 @@ class OpenSides:
     def ahead(self, at: NDArray[np.int64], p: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return pressure differences (Pa) and slopes (Pa/m) from cells to drained sides.
 
-        The result is an array (n, d, 2, 2).  Its indices are: cell, axis, end of the cell along this axis, and 0 for
+        The result is an array (n, d, 2, 2).  The indices are: cell, axis, end of the cell along this axis, and 0 for
         the difference or 1 for the slope.  Ends without a drained side have nan for difference and slope.
 
         `at` (m,): index of the cell of each face among the filled cells.
@@ -304,7 +304,7 @@ class FluxForms:
     """Compiled forms over the faces between active cells, and their coefficients.
 
     `weight` (d,), N/m^3: unit weight rho_w g of the pore fluid, as UFL, or None without gravity.
-    `flows`: whether any material is permeable.  Otherwise there are no fluxes.
+    `flows`: whether any material is permeable.  If False, no fluxes are computed.
     `pressure`: pore pressure of the cells (DG0), Pa.
     `bulk`: bulk modulus of the fluid, Pa.
     `inertial` (d,), N/m^3: inertia force on the pore fluid, as UFL, or None without inertia.

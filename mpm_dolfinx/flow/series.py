@@ -8,8 +8,8 @@ unknowns.  The flux law within a soil is the law between two cells of this soil 
 with exponential relative conductivity is therefore exact for any position of the layers.
 
 Lines through a cell (see `layers`) conduct in parallel if they cross a single soil up to the face.  All lines that
-cross several soils are replaced by one line.  This line crosses the same soils in the same sequence.  Its length in
-each soil is the mean over the replaced lines.
+cross several soils are replaced by one line.  The new line crosses the same soils in the same sequence, and has the
+mean length in each soil.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ class Paths(NamedTuple):
     """Flow paths from the pressure positions of n cells to their faces.
 
     The first three indices of the arrays (n, d, 2, ...) are the cell, the axis, and the end of the cell.  `parallel`
-    contains the lines that cross a single soil.  Its entry 0 is for soil without a retention curve, and each curve has
-    one further entry.  All other lines are replaced by one line with s soils in series.
+    contains the lines that cross a single soil.  Entry 0 of `parallel` is for soil without a retention curve, and each
+    curve has one further entry.  All other lines are replaced by one line with s soils in series.
     """
 
     parallel: NDArray[np.float64]  # mobility of single-soil lines, times their fraction of all lines (l,), m^2/(Pa s)

@@ -346,10 +346,10 @@ class StorageProblem:
     """The fluid balance in one substep.  The pressure at the start of the step is `forms.p_n`.
 
     `system`: vectors and matrices, with the assembled fluxes.
-    `flow`: function that assembles the outflow at (u, p).  Its argument states whether a substep starts.
+    `flow`: function that assembles the outflow at (u, p).  Argument: whether a substep starts.
     `dt`: time weight, s, of the rate at (u, p).
     `before`: outflow volumes from the rate of the previous substep.
-    `softness` (m,): softness of the pieces, see `SoftnessAtPoints`.  It is 1 if no law can yield.
+    `softness` (m,): softness of the pieces (1 if no law can yield), see `SoftnessAtPoints`.
     `defect` (n,), m^d: part of the volume defect in the active owned cells that is corrected by the end of the substep.
     `inertial`: function that returns the inertia forces (n, d), in N/m^3, on the fluid in the active owned cells, or
     None.

@@ -224,7 +224,7 @@ class Places(Keyed):
 
     @cached_property
     def products(self) -> list[list[tuple[int, NDArray[np.float64] | float]]]:
-        """For each axis, pairs of `bits` and `product`.
+        """List of pairs of `bits` and `product` for each axis.
 
         The number `bits` selects some of the other axes, see `Grid.monomials`.  The array `product` (n,) is the product
         of the offsets from the midpoint of the cell along these axes.  For pieces, `product` is a mean over the piece.

@@ -108,7 +108,7 @@ def matrix(rows: Unknowns, columns: Unknowns, row_length: int | NDArray[np.int64
 
 
 def zero(A: PETSc.Mat) -> None:
-    """Set a matrix to zero before assembly, even if it has never been assembled."""
+    """Set a matrix to zero before assembly.  The matrix may never have been assembled."""
     if A.assembled:
         A.zeroEntries()
 

@@ -67,7 +67,7 @@ def carried(lines: Sequence[NDArray[np.float64]], shift: NDArray[np.float64]) ->
     Raises
     ------
     ValueError
-        The smallest cells touch a side and move along its normal, or another cell would become smaller than them.
+        The smallest cells touch a side and move along its normal, or would no longer be the smallest cells.
     """
     out = []
     for letter, x, step in zip("xyz", lines, shift.tolist(), strict=False):

@@ -330,7 +330,7 @@ class Grid:
     axisymmetric
         Whether the first axis is the radius r >= 0, and the second axis is the axis of revolution.  There is no
         torsion.  Volumes (m^3), forces (N) and outflows (m^3/s) refer to the whole revolution.  If the grid begins at r
-        = 0, its side "left" is the axis, where radial displacements are zero.
+        = 0, the side "left" is the axis, where radial displacements are zero.
 
     Raises
     ------
@@ -366,10 +366,10 @@ class Grid:
     stretches
         Dimension of deformation gradients: d, or 3 in axisymmetry, because of the circumferential stretch.
     mesh
-        The dolfinx mesh, created at its first use.  Its coordinates are relative to `base`.  On several processes, a
-        second scene with another distribution of points has a separate mesh and grid, `Simulation.grid`.  A scene that
-        distributes its cells anew also has a separate mesh and grid.  Scenes with terms or sources always keep this
-        mesh, because terms may be defined on it.
+        The dolfinx mesh, created at its first use.  The coordinates of the mesh are relative to `base`.  On several
+        processes, a second scene with another distribution of points has a separate mesh and grid, `Simulation.grid`.
+        A scene that distributes its cells anew also has a separate mesh and grid.  Scenes with terms or sources always
+        keep this mesh, because terms may be defined on it.
     """
 
     def __init__(
@@ -568,7 +568,7 @@ class Grid:
         return self._cells
 
     def share(self, load: NDArray[np.float64]) -> None:
-        """Create the mesh if it does not exist, with the loads (cells,) evenly divided among processes."""
+        """Create the mesh, if it does not exist, with an even distribution of the loads (cells,) among processes."""
         if self._cells is None:
             self._cells = self._made(boxes(load.reshape(self.shape), self.comm.size))
 

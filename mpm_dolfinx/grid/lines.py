@@ -22,7 +22,7 @@ def rounding(x: NDArray[np.float64]) -> float:
 
 
 def checked(lines: Sequence[ArrayLike], what: str = "grid") -> list[NDArray[np.float64]]:
-    """Return the grid lines (n,), in m, along each of two or three axes.  Raise ValueError if they are invalid."""
+    """Return the grid lines (n,), in m, along each of two or three axes.  Raise ValueError for invalid lines."""
     if not isinstance(lines, Sequence | np.ndarray) or len(lines) not in (2, 3):
         raise ValueError(f"{what}: lines = {line(lines)}, must be 2 or 3 lists of coordinates, one for each axis")
     out = []

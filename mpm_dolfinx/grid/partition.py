@@ -86,7 +86,7 @@ def boxes(load: NDArray[np.float64], processes: int) -> NDArray[np.int64]:
 
 
 def better(load: NDArray[np.float64], of: NDArray[np.int64]) -> NDArray[np.int64] | None:
-    """Return the boxes (ranks, 2, d) of a new bisection, or None if they are hardly better than the boxes `of`.
+    """Return the boxes (ranks, 2, d) of a new bisection, or None if the boxes `of` are almost as good.
 
     New boxes are returned if their imbalance is below `IMBALANCE`, or below the imbalance of the boxes `of` divided by
     `IMBALANCE`.  Without this factor, each reset of the grid might distribute a few cells anew.

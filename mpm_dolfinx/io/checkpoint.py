@@ -122,7 +122,7 @@ def resume(simulation: Simulation, file: str | os.PathLike) -> Result:
     Parameters
     ----------
     simulation
-        The scene of the checkpoint.  Grid, bodies, fluid and materials must be those of the checkpoint.  Loads,
+        The scene of the checkpoint.  Grid, bodies, fluid and materials must be the same as in the checkpoint.  Loads,
         conditions, terms, sources and the number of processes may differ.  If the run had several stages, first call
         `stage` to bring the scene to the stage of the checkpoint.  A checkpoint contains no data of observers.
     file

@@ -227,8 +227,8 @@ def stressed(
 ) -> MaterialPoints:
     """Return the points with target stresses (n, 3, 3), in Pa, at the chosen points.  All processes must call this.
 
-    In Modified Cam Clay the initial stress is a parameter.  In other laws it is due to elastic strains.  ValueError is
-    raised if a target stress is outside the yield surface.
+    In Modified Cam Clay the initial stress is a parameter.  In other laws, elastic strains cause the initial stress.
+    ValueError is raised if a target stress is outside the yield surface.
     """
     comm = materials.grid.comm
     rows = np.flatnonzero(chosen)

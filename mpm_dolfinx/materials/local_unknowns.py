@@ -97,7 +97,7 @@ class LocalUnknowns:
         self.known = self.values if self._of_energy else given | _named(shapes, at["unknowns"])
 
     def solve(self, data: PointData, derive: bool = True, motion: tuple = ()) -> Given:
-        """Solve for the local unknowns at the present F, and return values for the forms.  All processes must call it.
+        """Solve for the unknowns at the present F, and return values for the forms.  All processes must call this.
 
         `derive`: whether to compute the derivatives with respect to the trial values.  `values` contains them.
         `motion`: key of the present displacement.  Results are reused while `data`, `motion` and dt are the same.
@@ -283,8 +283,8 @@ def _real(name: str, value, shape: tuple[int, ...]) -> NDArray[np.float64]:
 def _newton(system, y: NDArray[np.float64]) -> NDArray[np.int64]:
     """Solve f(y) = 0 in place, and return the indices of points without a solution.
 
-    `system`: function of r point indices and of the y (r, m) of these points.  It stores y, and returns f, df/dy and
-    the norms of f.
+    `system`: function of r point indices and of the y (r, m) of these points.  The function stores y, and returns f,
+    df/dy and the norms of f.
     """
     rows, failed = np.arange(len(y)), np.zeros(len(y), dtype=bool)
     f, slope, norm = system(rows, y)

@@ -77,7 +77,7 @@ class Skeleton:
         of the substep, Pa).
     retention
         Retention curve and relative permeability: `VanGenuchten`, `Gardner`, `BrooksCorey` or a user-defined object,
-        see `retention`.  It is passed by name.  With None the pores stay saturated.
+        see `retention`.  Passed by name.  With None the pores stay saturated.
 
     A law adds its parameters as fields of the dataclass and defines one of the static methods below.  Arguments of a
     method may be F, and the law's fields, properties and state variables.  F is (d, d) in general.  In axisymmetry F is
@@ -288,7 +288,7 @@ class Skeleton:
 
     @property
     def nearly_incompressible(self) -> bool:
-        """Whether Q1 cells would lock.  Such cells use F-bar, see `mean_dilatation`."""
+        """Whether Q1 cells would lock without F-bar, see `mean_dilatation`."""
         return self.poisson > LOCKING
 
     @property
@@ -491,9 +491,9 @@ class Fluid:
         Density rho_w at zero pressure, kg/m^3, > 0.  Weights are computed with rho_w.  Flowing fluid has the density
         rho_w exp(p / K_w).
     gravity
-        Acceleration g that defines hydraulic conductivities, m/s^2, > 0.  The default is the scene's gravity if it is a
-        constant vector other than zero, and 9.81 otherwise. With units other than m and s, scenes without gravity, or
-        with gravity as a function of time, require this argument.
+        Acceleration g that defines hydraulic conductivities, m/s^2, > 0.  The default is the scene's gravity if this
+        gravity is a constant vector other than zero, and 9.81 otherwise. With units other than m and s, scenes without
+        gravity, or with gravity as a function of time, require this argument.
 
     Raises
     ------

@@ -36,7 +36,7 @@ class SofteningDruckerPrager(DruckerPrager):
     Parameters
     ----------
     residual
-        Residual cohesion c_r, Pa, in [0, cohesion]; if it equals the cohesion, there is no softening.
+        Residual cohesion c_r, Pa, in [0, cohesion]; c_r = c_0 means no softening.
     slip
         Slip s along a shear band, m, > 0, at which the cohesion has fallen to c_r.  The scene raises ValueError if
         cells are so large that the soil would soften faster than it unloads.

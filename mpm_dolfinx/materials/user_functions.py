@@ -15,8 +15,8 @@ points
 t
     Time at which the balances hold, s, as a UFL constant: the end of the step or of its first substep.
 
-A function in `terms` is added to the balance of momentum, `int P : grad v dV - loads + term = 0`.  It may also have
-these arguments:
+A function in `terms` is added to the balance of momentum, `int P : grad v dV - loads + term = 0`.  Further possible
+arguments of this function are:
 
 u
     Increment of the displacement in the step, m; Q1.
@@ -30,8 +30,8 @@ dt
 
 The tangent of a term with v is assumed to be unsymmetric.
 
-The function of a `Source` returns the inflow as a volume rate of fluid at zero pressure, m^d/s.  It may also have
-these arguments:
+The function of a `Source` returns the inflow as a volume rate of fluid at zero pressure, m^d/s.  Further possible
+arguments of this function are:
 
 q
     Test function, constant in the cells.  The source is `s * q * points.dx` with s in 1/s.
@@ -73,8 +73,8 @@ def call(function: Callable, kind: str = "UFL", /, **available):
 def expression(function: Callable, shapes: Sequence[tuple[int, ...]], of: str = "", **available):
     """Return the result of a user-defined function as a UFL expression with one of the given shapes.
 
-    ValueError is raised if the function fails.  It is also raised if the result is not UFL, has a wrong shape, or does
-    not depend on `of`.
+    ValueError is raised if the function fails, or if the result is not UFL.  ValueError is also raised if the result
+    has a wrong shape, or does not depend on `of`.
     """
     value = call(function, **available)
     allowed = f"UFL of shape {' or '.join(map(str, shapes))}{f' that depends on {of}' if of else ''}"

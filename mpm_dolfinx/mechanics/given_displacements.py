@@ -2,8 +2,8 @@
 """Prescribed displacements of sides, by penalties on cell means and weaker penalties at points; see `held_cells`.
 
 A side may lag behind its prescribed displacement.  Each component in each cell then gets a multiplier, by the method of
-multipliers (Hestenes 1969).  With the multipliers, the cell means reach the prescribed displacements, unless the cells
-cannot follow the side.
+multipliers (Hestenes 1969).  With the multipliers, the cell means reach the prescribed displacements if the cells can
+follow the side.
 """
 
 from __future__ import annotations
@@ -233,11 +233,11 @@ class GivenDisplacements(Acting):
     def under_held(
         self, ids: NDArray[np.int64], tracked: NDArray[np.float64], volume: NDArray[np.float64], corners: NDArray
     ) -> NDArray[np.float64]:
-        """Return corners of re-initialised domains, in m, with prisms in place of domains at prescribed sides.
+        """Return corners, in m, of re-initialised domains.  Domains at prescribed sides become prisms.
 
-        A prism has the volume of its domain, and keeps the tracked corners on the held face.
+        Each prism has the volume of its domain, and keeps the old corners on the side.
 
-        `tracked`, `corners` (n, 2^d, d), in m: tracked and re-initialised corners of the domains `ids`.
+        `tracked`, `corners` (n, 2^d, d), in m: corners of the domains `ids` before and after re-initialisation.
         `volume` (n,): volumes of the domains, in axisymmetry areas of their sections.
         """
         index = np.arange(2**self._grid.dim)

@@ -236,7 +236,7 @@ class HeldCells:
         `axis` (k,): axis of each component.
         `force` (k,), in N: force of each component.
         `reached` (k,): whether each component is at its prescribed position.
-        `reported`: indices of conditions that have been reported already; they are excluded.
+        `reported`: indices of conditions to exclude, because they have been reported already.
         """
         grid = self.grid
         comm = grid.comm

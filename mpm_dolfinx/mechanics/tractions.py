@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Loads on sides of the bodies in their present position: dead tractions, and pressures that follow the surface.
 
-A traction t is a force per reference area.  Its virtual work is `int t . v dA` on the reference faces, with the test
-function v.  The virtual work of a pressure p is `-int p n . v da` on the present area with the normal n.  The tangent
-of the pressure's work is symmetric, except for a contribution `p/2 (v x du) . dx` of the edges dx of the surface, with
-the displacement increment du.  This contribution vanishes where two surfaces of equal pressure meet.  It also vanishes
+A traction t is a force per reference area.  The virtual work of t is `int t . v dA` on the reference faces, with the
+test function v.  The virtual work of a pressure p is `-int p n . v da` on the present area with the normal n.  The
+tangent of the pressure's work is symmetric, except for a contribution `p/2 (v x du) . dx` of the edges dx of the
+surface, with the displacement increment du.  This contribution vanishes where two surfaces of equal pressure meet, and
 on a wall that fixes the normal component of v and du.
 """
 

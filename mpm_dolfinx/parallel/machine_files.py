@@ -2,7 +2,7 @@
 """Arrays with one copy on each machine, in a temporary file that all processes of the machine map into memory.
 
 A process loads only the pages of the file that it reads.  The operating system may drop these pages again.  Once all
-processes have opened the file, it is unlinked.  Its space is freed when the last array is deleted.
+processes have opened the file, its name is removed.  The space of the file is freed when the last array is deleted.
 """
 
 from __future__ import annotations

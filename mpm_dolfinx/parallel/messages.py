@@ -63,8 +63,8 @@ def log(comm: MPI.Intracomm, message: str, *values, level: int = logging.INFO) -
 def warn(comm: MPI.Intracomm, category: type[ResultWarning], message: str, *values) -> None:
     """Give a warning on the first process, at the line of the script that caused it.  All processes must call this.
 
-    If a filter turns the warning into an error, all processes raise the error.  A caller must therefore warn before it
-    changes any data.
+    If a filter turns the warning into an error, all processes raise the error.  Callers must therefore warn before they
+    change any data.
     """
     raised = None
     if comm.rank == 0:

@@ -40,7 +40,7 @@ class Member(NamedTuple):
 
 
 def write(comm: MPI.Intracomm, file: Path, arrays: Mapping[str, NDArray], rows: Mapping[str, NDArray]) -> int:
-    """Write an archive, and return its size in bytes.  The archive replaces `file` once it is complete on the disk.
+    """Write an archive, and return its size in bytes.  The complete archive then replaces `file`.
 
     If a process cannot write, all processes raise its error.
 

@@ -6,11 +6,11 @@ volumes and centroids.  In 3D, pieces also have exact mean products of coordinat
 linear within a cell, in 3D bilinear.  One quadrature point in each piece therefore integrates these gradients exactly,
 wherever the domain lies on the grid.
 
-The surface of a domain has 4 edges, or in 3D 4 triangles about the middle of each face.  The triangles of neighbouring
-domains match, and do not favour a diagonal of the face.  The grid planes of one axis after another slice this surface.
-Gauss's theorem gives the volumes and first moments between a slice and the lower face of its cell, and in the column of
-cells below.  The interior of a domain is never cut.  Inverted parts of a domain have negative volume, and cancel its
-overlap with neighbours.  Pieces with negative volume are left out.
+The surface of a domain consists of four edges, or in 3D of four triangles about the middle of each face.  The triangles
+of neighbouring domains match, and do not favour a diagonal of the face.  The grid planes of one axis after another
+slice this surface.  Gauss's theorem gives the volumes and first moments between a slice and the lower face of its cell,
+and in the column of cells below.  The interior of a domain is never cut.  Inverted parts of a domain have negative
+volume, and cancel its overlap with neighbours.  Pieces with negative volume are left out.
 
 In axisymmetry pieces are rings.  The volume of a ring is `2 pi r_c` times the area of its section, where r_c is the
 radius of the section's centroid (Pappus).  Gradients are evaluated at the centroid of the volume,
@@ -193,8 +193,8 @@ def on_planes(
     """Return positions in units of cells, and positions for slicing.  Positions closer to a grid plane than `Grid.snap`
     are moved onto this plane.
 
-    If all cells are equal, positions for slicing are in units of cells.  Otherwise they are in m, because domain edges
-    are straight in m.
+    If all cells are equal, positions for slicing are in units of cells.  In other grids these positions are in m,
+    because domain edges are straight in m.
 
     `true`: positions from the grid's lower corner, in units of cells.
     `x`, in m: the same positions, measured from the grid's base.

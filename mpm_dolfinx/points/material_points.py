@@ -104,8 +104,8 @@ class MaterialPoints:
     material : (n,)
         Index of the point's material in the scene's list.
     pressure : (n,), Pa
-        Pore pressure, positive in compression.  It is a second-order accurate mean over the domain.  Balances use cell
-        pressures instead.
+        Pore pressure, positive in compression.  The value is a second-order accurate mean over the domain.  Balances
+        use cell pressures instead.
     x : (n, d), m
         Centroid of the domain, or in axisymmetry of its section.  For linear fields, F and pressure are exact at x.
     origin : (n, 2^d, d), m
@@ -187,7 +187,7 @@ class MaterialPoints:
 
     @property
     def displacement(self) -> NDArray[np.float64]:
-        """Displacement (n, d), in m, of the centroids since the start, or since a stage set it to zero."""
+        """Displacement (n, d), in m, of the centroids since the start, or since a reset to zero by a stage."""
         return self.x - centroids(self.origin)
 
     def map(self, function: Callable[[NDArray], NDArray], shared: bool = True) -> MaterialPoints:

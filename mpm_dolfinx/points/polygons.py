@@ -59,7 +59,7 @@ class Polygons:
     def cut(self, normal: NDArray[np.float64], level: NDArray[np.float64]) -> Polygons:
         """Return the part of each polygon where `normal . x <= level`, with normal (n, 2) and level (n,).
 
-        The algorithm is that of Sutherland and Hodgman (1974). New edges have no identifier.
+        Source: Sutherland and Hodgman (1974). New edges have no identifier.
         """
         n, k = self.edge.shape
         used = np.arange(k) < self.count[:, None]

@@ -252,10 +252,10 @@ def scale_of(law) -> float:
 class Retentions:
     """Retention curves of the materials, as UFL expressions of data at the integration points.
 
-    The points have the field `retention`.  Its first entry is the number of the law (1, 2, ...), or 0 if the pores stay
-    saturated.  Its other entries are the constants of the law.  Pieces also have the field `lever`: the vector from the
-    centroid of the material in their cell to the piece.  The pressure of a piece is the pressure of its cell plus the
-    hydrostatic difference along `lever`.
+    The points have the field `retention`.  The first entry of this field is the number of the law (1, 2, ...), or 0 if
+    the pores stay saturated.  The other entries are the constants of the law.  Pieces also have the field `lever`: the
+    vector from the centroid of the material in their cell to the piece.  The pressure of a piece is the pressure of its
+    cell plus the hydrostatic difference along `lever`.
 
     `laws`: distinct retention curves of the scene's materials.
     `everywhere`: whether every material has a retention curve.
@@ -422,7 +422,7 @@ class Conductance:
 
 
 REACH = (1e-8, 1e8)
-"""Range of tabulated suctions, divided by the law's scale.  Source: k_r is constant to 1e-8 outside."""
+"""Range of tabulated suctions, divided by the law's scale.  Source: k_r outside is constant, exact to 1e-8."""
 ROWS = 4000
 """Number of tabulated suctions.  Plateau (scene "dry" of tests/plateaus.py): half this value changes the result by
 2.1e-08, twice this value by 2.6e-09, and finer cells by 6.6e-03.
