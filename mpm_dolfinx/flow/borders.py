@@ -58,7 +58,7 @@ class Borders:
         first, other = grid.facet_cells[facets].T
         differ = (known[first] != known[other]).any(axis=1) | (known[first, 0] > 0)
         self.facets, self.uniform = facets[differ], facets[~differ]
-        """Facets of this process between cells of different soil, and all other facets."""
+        """`facets`: facets of this process between cells of different soil.  `uniform`: all other facets."""
         offset = grid.midpoints[grid.facet_cells[self.facets]]
         offset = offset[:, 1] - offset[:, 0]
         self._axis = np.abs(offset).argmax(axis=1)

@@ -301,7 +301,7 @@ class SideFeeds(Feeds):
         return RainedFaces(*same, self.sides.rain, faces, dry)
 
     def _faces(self, sides: OpenSides, flow: Conduction) -> OpenFaces:
-        """Return the faces, with conductances for the outside pressures of `sides`."""
+        """Return the faces with their conductances for the outside pressures in `sides`."""
         at = self._at
         (conductance, inflow), offset = sides.driven(at, flow), flow.deformed(at, sides.offset)
         if flow.relative is None:

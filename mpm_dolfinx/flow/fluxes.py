@@ -91,7 +91,7 @@ class Conduction:
         return across if hoop is None else across * hoop[at]
 
     def distance_ratio(self, at: NDArray[np.int64], normal: NDArray, offset: NDArray) -> NDArray[np.float64]:
-        """Return the distance of the centroid from each face, divided by the distance of the pressure position (m,).
+        """Return ratios (m,): distance from face to centroid, divided by distance from face to pressure position.
 
         See `layers` for pressure positions.
         `normal` (m, d): normals of the faces.

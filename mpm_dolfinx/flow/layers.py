@@ -243,7 +243,7 @@ def graded(
 
     Pieces conduct in series along the gradient of the mobility, and in parallel across this gradient.  For a gradient
     in any direction, the difference between arithmetic and harmonic mean is distributed over the axes.  The share of an
-    axis is proportional to the variance of the mobility that a linear variation along this axis explains.
+    axis is proportional to the variance of a linear fit to the mobility along this axis.
 
     `offset` (m, d), m: positions of the pieces relative to the midpoints of cells.
     `kappa` (m,), m^2/(Pa s): mobilities of the pieces.

@@ -21,7 +21,7 @@ between the r of a face and the r of the storage term.
 
 The volume of a particle domain drifts away from the volume that its fluid content implies, for three reasons: corners
 do not follow u alone, points move to other cells, and pressure jumps are damped (see below).  Each point stores the
-difference of the volumes as its volume defect (`owed`).  Each step corrects a part (`defect`), at a constant rate.
+difference of the volumes as its volume defect (`owed`).  Each step corrects a part of this defect at a constant rate.
 
 If no fluid flows within a step, Q1 displacements with DG0 pressures violate the inf-sup condition: pressures that
 alternate from cell to cell do not affect the displacements.  The term `max(0, tau d - dt kappa / d) A [p - p_n]`
@@ -522,7 +522,7 @@ class StorageProblem:
         """Return a function that maps a change of displacements to the changes (n,) of outflow volumes, in m^d.
 
         The function computes a matrix-free finite difference (Knoll and Keyes 2004) of the conductivity laws and of the
-        geometry of the fluxes.  After its last call, `set_fluxes` must assemble the fluxes again.
+        geometry of the fluxes.  After the last call of the function, `set_fluxes` must assemble the fluxes again.
 
         `dofs`: active dofs of u.
         """

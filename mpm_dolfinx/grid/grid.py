@@ -33,7 +33,7 @@ SIDES = {
     2: {"left": (0, 0), "right": (0, 1), "bottom": (1, 0), "top": (1, 1)},
     3: {"left": (0, 0), "right": (0, 1), "front": (1, 0), "back": (1, 1), "bottom": (2, 0), "top": (2, 1)},
 }
-"""Axis and end of each side of a box.  The end is 0 at the lower coordinate, and 1 at the upper."""
+"""Axis and end of each side of a box.  The end is 0 at the lower coordinate, and 1 at the upper coordinate."""
 REACH = 1e-4  # distance, in cell sizes, by which bodies may lie outside the grid: walls act by penalties, inexactly
 
 TURN = 2 * np.pi
@@ -41,7 +41,7 @@ TURN = 2 * np.pi
 CHUNK = 2**14
 """Number of rows of an array that are processed together, a limit for the size of temporary arrays."""
 SNAP = 1e-10
-"""A vertex nearer than so many cell sizes to a grid plane counts as on this plane.  `Grid.snap` adds rounding."""
+"""A vertex closer to a grid plane than this distance, in cell sizes, counts as on the plane; see `Grid.snap`."""
 ORDER = "the order is Grid(lower, upper, cells)"
 MANY = "grid: h is undefined for unequal cells, must be replaced by sizes"
 
@@ -805,8 +805,7 @@ class Grid:
         return np.where(bits, self.signs / (self.h if self.even else 1.0), 0.5).prod(axis=2)
 
     def over_edges(self, coefficients: NDArray[np.float64], cells: NDArray[np.int32]) -> NDArray[np.float64]:
-        """Divide coefficients (d, 2^d, cells) of `monomials` by cell edges, for offsets in m.  Equal cells need no
-        change."""
+        """Divide coefficients (d, 2^d, cells) of `monomials` by edge lengths if cells are unequal, for offsets in m."""
         if self.even:
             return coefficients
         bits = corner_bits(self.dim)[:, None]

@@ -63,7 +63,7 @@ class Partition:
         return self.numbered(np.full(self.count[rank].prod(), rank), np.arange(self.count[rank].prod()))
 
     def numbered(self, rank: NDArray[np.int64], k: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the lexicographic indices (n,) of the `k`-th cells (n,), from 0, of processes `rank` (n,)."""
+        """Return the lexicographic index (n,) of cell number `k` (n,), counted from 0, of process `rank` (n,)."""
         out, stride = np.zeros_like(k), 1
         for axis in reversed(range(len(self.shape))):
             k, place = np.divmod(k, self.count[rank, axis])

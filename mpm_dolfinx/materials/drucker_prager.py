@@ -33,7 +33,7 @@ MATCHES = {
 }
 """Parameters (eta, xi) of the cone, from tan phi, sin phi and cos phi, for each match to Mohr and Coulomb's law."""
 LEAST = 1e-20
-"""Constant added to the squared deviatoric strain under the square root, so that its derivative is finite at zero.
+"""Constant added to the squared deviatoric strain under a square root, so that the root is differentiable at zero.
 Plateau (scene "soil" of tests/plateaus.py): half this value changes the result by 2.3e-11, twice this value by 1.0e-11,
 and finer cells by 3.0e-02.
 """

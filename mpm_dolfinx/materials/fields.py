@@ -88,7 +88,7 @@ class SceneMaterials:
         places = {i: _places(bodies, i, points.id[own]) for i, own in rows.items()}
 
         def at_points() -> list[tuple[Skeleton, Skeleton]]:
-            """Return each material at its points on this process, and at its first point on all processes."""
+            """Return each material twice: at the points of this process, and at its first point on all processes."""
             return [_evaluated(grid, materials[i], places[i], points.id[rows[i]]) for i in self._used]
 
         evaluated, at_first = zip(*at_points(), strict=True)

@@ -21,7 +21,7 @@ from mpm_dolfinx.forms.axes import block, embedded, planar
 from mpm_dolfinx.materials.skeleton import Field, Skeleton
 
 AT_REST = " at rest"
-"""Suffix of the names of state variables at seeding.  At yielded points, the present state variables differ."""
+"""Suffix of the names of state variables at seeding.  At yielded points, present values differ from seeded values."""
 
 
 def stressed(m: Skeleton, knows_space: bool) -> Skeleton:

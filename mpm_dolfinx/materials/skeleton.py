@@ -77,7 +77,7 @@ class Skeleton:
         of the substep, Pa).
     retention
         Retention curve and relative permeability: `VanGenuchten`, `Gardner`, `BrooksCorey` or a user-defined object,
-        see `retention`.  Passed by name.  With None the pores stay saturated.
+        see `retention`.  The argument is passed by name.  With None the pores stay saturated.
 
     A law adds its parameters as fields of the dataclass and defines one of the static methods below.  Arguments of a
     method may be F, and the law's fields, properties and state variables.  F is (d, d) in general.  In axisymmetry F is
@@ -110,7 +110,7 @@ class Skeleton:
         stationary in the unknowns.
     trial
         Function (F, ...) -> {name: UFL}.  Residuals depend on F through these trial values only.  In a law without
-        `trial`, residuals have F itself as argument.  Only `kirchhoff` and `update` also receive values other than UFL.
+        `trial`, residuals have F itself as argument.  Values other than UFL are for `kirchhoff` and `update` only.
 
     All these functions may have the argument `dt`, the time since the start of the step, s, for rate-dependent laws.
     With the new state and dt = 0, a law must return the stress at the end of the step.  The argument `cell_size`, the
@@ -160,7 +160,7 @@ class Skeleton:
     dilates: ClassVar[bool] = False
     """Whether the law has an angle of `dilation`."""
     elastic_hencky: ClassVar[bool] = False
-    """Whether elastic strains determine the stresses by Hencky's law, so that stresses determine the elastic energy."""
+    """Whether elastic strains determine the stresses by Hencky's law.  Stresses then determine the elastic energy."""
     linear: ClassVar[bool] = False
     """Whether the stress is linear in F, so that a factorisation is reused until active cells or step size change."""
     state: ClassVar[Mapping[str, ArrayLike]] = {}

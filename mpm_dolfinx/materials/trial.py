@@ -66,7 +66,7 @@ class Trial:
 
 
 def components(b, plane: bool):
-    """Return the components of a symmetric UFL tensor (3, 3): six, or the four in `PLANE`."""
+    """Return the components of a symmetric UFL tensor (3, 3), in the order of `PLANE` or `SPACE`."""
     return ufl.as_vector([b[i] for i in (PLANE if plane else SPACE)])
 
 

@@ -289,7 +289,7 @@ class HoldLoads(Loads):
         self._lacked = np.full(1, np.inf)  # for each side of a part: last sum of gaps in `augment`, at first infinite
 
     def augment(self, at: At) -> bool:
-        """Add the penalty forces on sides that lag behind to the multipliers.
+        """Increase the multipliers of sides that lag behind by their penalty forces.
 
         Multipliers are needed if a whole body, such as undrained soil, resists a side more stiffly than one cell.  The
         updates end when the mean gap of a side over a connected part of the bodies no longer falls by half.
@@ -311,7 +311,7 @@ class HoldLoads(Loads):
         return bool(more.any())
 
     def reached(self, at: At) -> NDArray[np.bool_]:
-        """Return whether each component lags at u by at most `1 / sqrt(HOLD)` of its prescribed increment."""
+        """Return whether the lag of each component at u is at most `1 / sqrt(HOLD)` of its prescribed increment."""
         return np.abs(self._asked - self._along(at.nodal)) * np.sqrt(HOLD) <= np.abs(self._asked)
 
     def pulls(self, b: NDArray[np.float64]) -> None:

@@ -167,9 +167,9 @@ class HeldCells:
         """Return the penalties on one component, with their stiffness, gap and distribution of the force to nodes.
 
         Where a side ends at a wall, its penalties omit nodes that the wall fixes.  The free nodes of the cell would
-        otherwise oscillate along the side.  The prescribed displacement is also extrapolated to the wall.  Where other
-        penalties of the condition hold a free node of the cell, a check follows.  A penalty is omitted if the
-        extrapolated value exceeds half of the cell's mean, at the start or the end of the step.
+        otherwise oscillate along the side.  The prescribed displacement is also extrapolated to the wall.  A penalty
+        can be omitted if other penalties of its condition hold a free node of the cell.  Such a penalty is omitted if
+        the extrapolated value exceeds half of the cell's mean, at the start or the end of the step.
 
         `given` (conditions,): whether each condition prescribes component `axis`.
         `free` (nodes,): whether no wall fixes the node.
@@ -226,7 +226,7 @@ class HeldCells:
     def beyond(
         self, row: NDArray, axis: NDArray, force: NDArray, reached: NDArray[np.bool_], reported: Collection[int]
     ) -> list[tuple[int, NDArray[np.float64]]]:
-        """Return the conditions with too large forces, and the position of the largest force of each.
+        """Return the conditions with too large forces, and for each condition the position of its largest force.
 
         A Q1 field cannot always have the prescribed means in two neighbouring cells, as at a side on a grid line.  The
         forces of the penalties in the two cells then oppose each other.  A force therefore counts as too large only if

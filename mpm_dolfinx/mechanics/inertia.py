@@ -118,7 +118,7 @@ def product(A: NDArray[np.float64], B: NDArray[np.float64]) -> NDArray[np.float6
 
 
 def chord(G: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return F~ - 1, with the gradient F~ at which a midpoint rule evaluates laws, and the rotation of their stress.
+    """Return two tensors for a midpoint rule: F~ - 1, where laws are evaluated at F~, and the rotation of their stress.
 
     The rule moves F from F_n to F_n + 2 D, with the midpoint F = F_n + D.  The mean of C = F^T F over both ends of the
     step is F^T F + D^T D, with F of the midpoint.  Laws are evaluated at F~, and give the stress P:

@@ -319,8 +319,7 @@ class MomentumSystem:
         self.rounding = self.unknowns.vector()
         """Rounding error of the residual at each unknown, in N."""
         self.of_whole = self.unknowns.vector()
-        """Rounding error of each unknown, in N, times the square root of the number of unknowns in its connected
-        part."""
+        """Rounding error of each unknown, in N, times the square root of the size of its connected part."""
         self.K = matrix(self.unknowns, self.unknowns, 3**d * d)
         self.residual, self.step = self.unknowns.vector(), self.unknowns.vector()
         held = active[~among(active, dofs)]
@@ -432,7 +431,7 @@ class MomentumProblem:
 
     @property
     def smooth(self) -> bool:
-        """Whether the tangent of one substep may be reused in the next."""
+        """Whether the tangent of one substep may be reused in the next substep."""
         return self.forms.elastic and all(one.smooth for one in self.loads)
 
     @cached_property

@@ -38,10 +38,10 @@ across its depth then have errors of 43 % at nu = 0.49.  At nu = 0.499 the press
 SHARE = 0.5
 """Fraction of the gradient's deviation from its cell mean that laws use in cells of flowing, dilatant soil.
 
-Dilatant flow has a volume strain rate of sin psi times its shear rate.  The condition at four points over-constrains a
-Q1 cell, even with F-bar.  With the full deviation, the load of a footing (phi = psi = 20 degrees) is 4.4 % too large
-with 9 cells, 3.4 % too large with 17 cells, and does not reach a limit.  With one point per cell, the load is constant,
-but 6.6 % too small with 9 cells, and 3.2 % too small with 17 cells.
+Dilatant flow has a volume strain rate of sin psi times its shear rate.  This condition, imposed at four points,
+over-constrains a Q1 cell, even with F-bar.  With the full deviation, the load of a footing (phi = psi = 20 degrees) is
+4.4 % too large with 9 cells, 3.4 % too large with 17 cells, and does not reach a limit.  With one point per cell, the
+load is constant, but 6.6 % too small with 9 cells, and 3.2 % too small with 17 cells.
 """
 
 

@@ -7,8 +7,8 @@ linear within a cell, in 3D bilinear.  One quadrature point in each piece theref
 wherever the domain lies on the grid.
 
 The surface of a domain consists of four edges, or in 3D of four triangles about the middle of each face.  The triangles
-of neighbouring domains match, and do not favour a diagonal of the face.  The grid planes of one axis after another
-slice this surface.  Gauss's theorem gives the volumes and first moments between a slice and the lower face of its cell,
+of neighbouring domains match, and do not favour a diagonal of the face.  The grid planes slice this surface, one axis
+after the other.  Gauss's theorem gives the volumes and first moments between a slice and the lower face of its cell,
 and in the column of cells below.  The interior of a domain is never cut.  Inverted parts of a domain have negative
 volume, and cancel its overlap with neighbours.  Pieces with negative volume are left out.
 
@@ -469,7 +469,7 @@ def cut_faces(
     for each face, nodes of partly filled cells would move further in every step, without limit.
 
     `corners` (faces, 2^(d-1), d), in m: corners of the faces; triangles repeat their last corner.
-    `local` (faces, 2^(d-1), e): coordinates of the corners, to be interpolated.
+    `local` (faces, 2^(d-1), e): coordinates at the corners, which are interpolated to the integration points.
 
     Returns
     -------

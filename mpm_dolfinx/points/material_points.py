@@ -206,7 +206,8 @@ class MaterialPoints:
         return type(self)(**arrays, data={name: once(values) for name, values in self.data.items()})
 
     def where(self, rows: NDArray[np.bool_], other: MaterialPoints) -> MaterialPoints:
-        """Return these points where `rows` (n,) is true, and elsewhere `other`, the same points in another state."""
+        """Return `other`, another state of the points, with the entries `rows` (n,) replaced by the entries of this
+        state."""
 
         def chosen(a: NDArray, b: NDArray) -> NDArray:
             return a if a is b else np.where(rows.reshape(-1, *[1] * (a.ndim - 1)), a, b)

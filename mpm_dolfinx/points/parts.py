@@ -42,7 +42,7 @@ class OfParts:
 
     @cached_property
     def _sorted(self) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-        """Order of the entries by part, the first entry of each part in this order, and the parts with entries."""
+        """Three arrays: order of the entries by part, first entry of each part in this order, parts with entries."""
         sizes = np.bincount(self.of, minlength=self.count)
         present = sizes.nonzero()[0]
         return self.of.argsort(kind="stable"), (sizes.cumsum() - sizes)[present], present
@@ -101,8 +101,7 @@ def relative(
 def parts_of_cells(grid: Grid, active: NDArray[np.bool_]) -> tuple[NDArray[np.int64], int]:
     """Return the connected part (cells,) of each active local cell, counted from 1, and the number of parts.
 
-    Cells with common nodes belong to one part.  Inactive cells have index 0.  The number of processes does not affect
-    the result.
+    Cells with common nodes belong to one part.  Inactive cells have index 0.  All processes get equal indices.
     """
     cells, out = active.nonzero()[0], np.zeros(len(active), dtype=np.int64)
     own, count = _touching(grid.cell_places(cells))
