@@ -208,7 +208,7 @@ class Cells:
     partition
         The box of cells of each process.
     locals
-        Local index of each cell of the grid, one copy after the other.  Cells of other processes have -1.
+        Local index of each cell in all copies of the box (`Grid.copies`).  Cells of other processes have -1.
     cell_facets : (cells, 2d)
         Facets of each cell.
     facet_cells : (facets, 2)
@@ -575,8 +575,8 @@ class Grid:
     def shared(self, load: NDArray[np.float64], keep: bool) -> Grid:
         """Return this grid, or an equal grid with another mesh, whose loads are evenly distributed among processes.
 
-        `load` (cells,): load >= 0 of each cell, such as its number of points
-        `keep`: whether to return this grid in any case, because other objects were created on its mesh
+        `load` (cells,): load >= 0 of each cell, such as its number of points.
+        `keep`: whether to return this grid in any case, because other objects were created on its mesh.
         """
         new = boxes(load.reshape(self.shape), self.comm.size)
         if self._cells is None:
@@ -739,7 +739,7 @@ class Grid:
         return self.from_rows(other.node_numbers()[some], rows[some])
 
     def from_rows(self, nodes: NDArray[np.int64], rows: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return nodal values (unknowns,) from rows (n, d) of nodes, which may be on any process.
+        """Return nodal values (unknowns,) from rows (n, d) of values.  The nodes of a row may be on any process.
 
         `nodes` (n,): lexicographic indices.  The values of all other nodes are zero.
         """
@@ -858,9 +858,9 @@ class GridOfGroups(Grid):
 
     The copies coincide in space.  Cells at the same place in all copies belong to the same process.
 
-    `grid`: grid of the bodies
-    `group` (bodies,): index, from 0, of the group of each body
-    `starts` (bodies,): id of the first material point of each body
+    `grid`: grid of the bodies.
+    `group` (bodies,): index, from 0, of the group of each body.
+    `starts` (bodies,): id of the first material point of each body.
     """
 
     def __init__(self, grid: Grid, group: NDArray[np.int64], starts: NDArray[np.int64]):

@@ -75,8 +75,8 @@ class Partition:
 def boxes(load: NDArray[np.float64], processes: int) -> NDArray[np.int64]:
     """Return the boxes of cells (ranks, 2, d) of all ranks, see `Partition`.
 
-    `load` (cells along each axis): load >= 0 of each cell, such as its number of points
-    `processes`: number of ranks, >= 1
+    `load` (cells along each axis): load >= 0 of each cell, such as its number of points.
+    `processes`: number of ranks, >= 1.
     """
     filled = load > 0
     weight = load + (EMPTY * load[filled].mean() if filled.any() else 1.0)

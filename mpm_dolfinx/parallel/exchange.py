@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Transfer of array rows to other processes, and of answers back to the senders.
 
-A row is the data of one piece of a particle domain, of one corner or of one loaded point.  Each row is sent to the
-process that owns the cell of the row, and assembles the integrals of this cell.
+A row is the data of one piece of a particle domain, of one corner or of one loaded point.  The process that owns the
+cell of a row receives this row, and assembles the integrals of the cell.
 """
 
 from __future__ import annotations

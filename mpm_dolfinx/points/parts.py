@@ -101,7 +101,8 @@ def relative(
 def parts_of_cells(grid: Grid, active: NDArray[np.bool_]) -> tuple[NDArray[np.int64], int]:
     """Return the connected part (cells,) of each active local cell, counted from 1, and the number of parts.
 
-    Cells with common nodes belong to one part.  Inactive cells have index 0.  All processes get equal indices.
+    Cells with common nodes belong to one part.  Inactive cells have index 0.  The indices do not depend on the number
+    of processes.
     """
     cells, out = active.nonzero()[0], np.zeros(len(active), dtype=np.int64)
     own, count = _touching(grid.cell_places(cells))
