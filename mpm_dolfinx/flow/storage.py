@@ -416,7 +416,7 @@ class StorageProblem:
 
     @property
     def _fluid(self) -> Fluid:
-        """The fluid in the active owned cells at p."""
+        """The fluid in the active owned cells at the pressures p."""
         p = self._p[0][self.system.unknowns.owned]
         return Fluid(p, mass_potential(p, self.forms.bulk), np.exp(p / self.forms.bulk))
 

@@ -226,9 +226,9 @@ class SoftnessAtPoints:
 
     The strain of a step is e = dev sym dF F^-1, with the change dF of F.  With the Kirchhoff stress T(s) at
     F - (1 - s) dF, the tangent shear modulus is G_t = (dT/ds) : e / (2 e : e) at s = 1.  At rest the direction of e is
-    random.  G_t is therefore a weighted mean of the modulus of the step, with the weight e : e, and of the old modulus,
-    with the weight `NEAR`^4.  The forms use the softness of the previous step, because Newton's method may not converge
-    with the softness of the current iterate.
+    random.  G_t is therefore a weighted mean of two moduli: the modulus of the step has the weight e : e, and the old
+    modulus has the weight `NEAR`^4.  The forms use the softness of the previous step, because Newton's method may not
+    converge with the softness of the current iterate.
 
     `grid`, `law`, `shapes`, `stretches`: see `LawAtPoints`.
     """

@@ -261,8 +261,8 @@ class Mass:
 
         `points`: material points at the start of the step.
         `velocities`: velocities of the unknowns, in m/s, at the start and at the end of the step.
-        `moved` (n,): largest displacement of a corner, in cell sizes, in the connected part of the point, or 0 if the
-        point keeps its pieces.
+        `moved` (n,): largest displacement of a corner in the connected part of the point, in cell sizes.  It is 0 for
+        points that keep their pieces.
         """
         start, end = velocities
         out = {name: points.data[name] + more for name, more in self._at_points(points, end - start).items()}

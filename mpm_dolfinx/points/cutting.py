@@ -436,7 +436,8 @@ def _products(
     total: Callable[[NDArray[np.float64]], NDArray[np.float64]],
     slots: _Slots,
 ) -> list[NDArray[np.float64]]:
-    """Return integrals over pieces of products of two coordinates, measured from the lower corners of the cells."""
+    """Return the integrals of products of two coordinates over the pieces.  Coordinates begin at the cells' lower
+    corners."""
     d = len(x)
 
     def mean(*factors: int) -> NDArray[np.float64]:
