@@ -239,8 +239,7 @@ class CellContents(Keyed):
         self.centroid, self.open = forms.active.centroid, forms.active.opening
         self.centroid[active] = centroid[active]
         self.open[active, :, 0], self.open[active, :, 1] = lower[active], upper[active]
-        """`centroid` (c, d), m: vectors from cell midpoints to centroids.  `open` (c, d, 2): open fractions of
-        faces."""
+        """`centroid` (c, d), m: offsets from cell midpoints to centroids.  `open` (c, d, 2): open face fractions."""
 
     def total(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the sums (..., n) of values (..., m) over the pieces of each filled cell."""

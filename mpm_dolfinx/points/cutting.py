@@ -436,8 +436,7 @@ def _products(
     total: Callable[[NDArray[np.float64]], NDArray[np.float64]],
     slots: _Slots,
 ) -> list[NDArray[np.float64]]:
-    """Return the integrals of products of two coordinates over the pieces.  Coordinates begin at the cells' lower
-    corners."""
+    """Return integrals of products of two coordinates over pieces.  Coordinates begin at the cells' lower corners."""
     d = len(x)
 
     def mean(*factors: int) -> NDArray[np.float64]:

@@ -206,8 +206,7 @@ class MaterialPoints:
         return type(self)(**arrays, data={name: once(values) for name, values in self.data.items()})
 
     def where(self, rows: NDArray[np.bool_], other: MaterialPoints) -> MaterialPoints:
-        """Return `other`, another state of the points, with the entries `rows` (n,) replaced by the entries of this
-        state."""
+        """Return the points of another state `other`, with the entries `rows` (n,) replaced by these points."""
 
         def chosen(a: NDArray, b: NDArray) -> NDArray:
             return a if a is b else np.where(rows.reshape(-1, *[1] * (a.ndim - 1)), a, b)

@@ -89,8 +89,8 @@ class Polygons:
         return out
 
     def simplified(self, near: float) -> Polygons:
-        """Return the polygons after removal of vertices inside straight edges, or within `near`, in m, of the next
-        vertex."""
+        """Return the polygons without vertices inside straight edges, and without vertices within `near` (m) of the
+        next."""
         used = np.arange(self.edge.shape[1]) < self.count[:, None]
         out = _packed(self.x, self.edge, used & (np.abs(self.after - self.x).max(axis=2) > near))
         k, last = np.arange(out.edge.shape[1]), np.maximum(out.count - 1, 0)[:, None]
