@@ -332,7 +332,7 @@ class StorageSystem:
 
 @dataclass(frozen=True)
 class StorageResidual:
-    """Residual of the fluid balance of each cell, and sums (parts,) over each connected part, all in m^d."""
+    """Residuals of the fluid balance in the cells, and sums (parts,) over the connected parts, in m^d."""
 
     vector: PETSc.Vec
     exchanged: NDArray[np.float64]  # sum of absolute changes of content and of sources
