@@ -89,7 +89,7 @@ class Polygons:
         return out
 
     def simplified(self, near: float) -> Polygons:
-        """Return the polygons without vertices inside straight edges, and without vertices within `near` (m) of the
+        """Return the polygons without vertices on straight edges, and without vertices within `near`, in m, of the
         next."""
         used = np.arange(self.edge.shape[1]) < self.count[:, None]
         out = _packed(self.x, self.edge, used & (np.abs(self.after - self.x).max(axis=2) > near))
