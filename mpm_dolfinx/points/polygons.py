@@ -89,8 +89,7 @@ class Polygons:
         return out
 
     def simplified(self, near: float) -> Polygons:
-        """Return the polygons without vertices on straight edges, and without vertices within `near`, in m, of the
-        next."""
+        """Return the polygons without vertices on straight edges, or within `near`, in m, of the next vertex."""
         used = np.arange(self.edge.shape[1]) < self.count[:, None]
         out = _packed(self.x, self.edge, used & (np.abs(self.after - self.x).max(axis=2) > near))
         k, last = np.arange(out.edge.shape[1]), np.maximum(out.count - 1, 0)[:, None]
