@@ -289,5 +289,5 @@ def test_one_line_says_what_is_wrong():
     with pytest.raises(ValueError, match="the reference has no state"):
         BiotFEM(mpm.Grid([0, 0], [1, 1], (2, 2)), SOIL, walls={})
     half = type("Half", (Stiffening,), {"residual": None})
-    with pytest.raises(ValueError, match="Half: has unknowns and 0 of residual and solution; with unknowns it must"):
+    with pytest.raises(ValueError, match="Half: has unknowns, and 0 of residual and solution; must define one of"):
         column(fluid=False, material=half(bulk=1e6, shear=1e6))

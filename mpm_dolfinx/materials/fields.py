@@ -194,8 +194,9 @@ class SceneMaterials:
             raise ValueError(f"{law.__name__}: defines {which} of energy and kirchhoff, must define one of them")
         given = (law.residual is not None) + (law.solution is not None)
         if given != bool(law.unknowns):
-            has = f"{'' if law.unknowns else 'no '}unknowns and {given} of residual and solution"
-            raise ValueError(f"{law.__name__}: has {has}; with unknowns it must have one of the two, else none")
+            has = f"{'' if law.unknowns else 'no '}unknowns, and {given} of residual and solution"
+            allowed = "one of residual and solution if it has unknowns, else neither"
+            raise ValueError(f"{law.__name__}: has {has}; must define {allowed}")
         own, others = (*constants_of(m), *law.state), {*constants_of(m), *law.state, *BY_SCENE, "F", "trial"}
         if clashes := [name for name in own if name in BY_SCENE] + [name for name in law.unknowns if name in others]:
             raise ValueError(f"{law.__name__}: the name {clashes[0]!r} is taken; {WHAT_IS_NAMED} must have others")
