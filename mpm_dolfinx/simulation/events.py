@@ -43,13 +43,13 @@ class Step(NamedTuple):
 
     start: State  # state at the start
     dt: float  # length of the step, s
-    how: tuple  # substeps; empty for the substeps of the scene
+    how: tuple  # substeps; empty if the step has the substeps of the scene
 
 
 class Found(NamedTuple):
     """An event within a step."""
 
-    number: int  # index of its function
+    number: int  # index of the function in `until`
     dt: float  # time from the start of the step, s
     new: State  # state at the event
     report: Report  # report of the step to the event
@@ -82,9 +82,9 @@ class Events:
     def within(self, step: Step, new: State) -> Found | None:
         """Return the first event within a step that ends in the state `new`, or None if there is no event.
 
-        Trial steps locate the event, by Brent's method for numbers and by bisection for booleans.  The state that is
-        returned follows the event by at most the fraction `LOCATED` of the step.  The simulation is then in the state
-        at the start of the step.
+        Trial steps locate the event, by Brent's method for numbers and by bisection for booleans.  The returned state
+        follows the event by at most `LOCATED` times the length of the step.  After the search, the simulation has the
+        state at the start of the step.
         """
         if not self._until:
             return None
@@ -108,7 +108,7 @@ class Events:
             warn(self._simulation.scene.grid.comm, ResolutionWarning, what, step.dt, failed)
         end = min(dt for dt, values in tried.items() if _crossed(before, values).any())
         self._simulation.state = step.start
-        new, report = self._simulation.advanced(end, *step.how)  # repeated: the scene keeps data of its last step
+        new, report = self._simulation.advanced(end, *step.how)  # again, because the scene keeps data of its last step
         return Found(int(_crossed(before, tried[end]).argmax()), end, new, report)
 
     def _at(self, step: Step, dt: float, tried: dict[float, list[float]]) -> list[float]:
@@ -121,7 +121,7 @@ class Events:
         return tried[dt]
 
     def _values(self) -> list[float]:
-        """Return the values of the functions, and raise an error of one process on all processes."""
+        """Return the values of the functions.  An error on one process is raised on all processes."""
         s, comm = self._simulation, self._simulation.scene.grid.comm
         out = by_user(comm, "until: a function", lambda: [_number(k, of(s)) for k, of in enumerate(self._until)])
         check_alike(comm, {f"until: function {k}": value for k, value in enumerate(out)})

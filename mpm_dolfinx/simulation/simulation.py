@@ -58,24 +58,24 @@ class Simulation:
     fluid
         Pore fluid; None for a dry scene.
     gravity : (d,) or callable t -> (d,), m/s^2
-        Acceleration of gravity. In axisymmetry it is along the axis.
+        Acceleration of gravity. In axisymmetry gravity acts along the axis.
     pressure
-        Initial pore pressure, Pa: a number, or a function of positions x (n, d) such as `hydrostatic`. It requires a
-        fluid.
+        Initial pore pressure, Pa: a number, or a function of positions x (n, d) such as `hydrostatic`. A nonzero
+        pressure requires a fluid.
     initial_stress
         Initial effective stress, tension positive: `K0`, or a function of positions x (n, d). The function returns
         normal stresses (n, 3) or tensors (n, 3, 3), Pa. A dictionary {index: ...} gives initial stresses to some bodies
-        only. Bodies that a stage adds start without stress unless the dictionary lists them. At the start the stress is
-        balanced with the loads and the initial pore pressures. Under constant loads the first step then causes no
-        displacement.
+        only. A body that a stage adds has initial stress only if the dictionary lists it. Iterations at the start bring
+        the stress into equilibrium with loads and initial pore pressures. Under constant loads the first step then
+        causes no displacement.
     terms
         User-defined terms in UFL. Functions are terms of the momentum balance, see `user_functions`; `OnSide` applies
         such a function to a side. A `Source` is a term of the fluid balance.
     numerics
         Quadrature, coupling, tolerance and time integration, see `Numerics`.
     inertia
-        True: bodies have inertia, and need no walls. `Moving`: they also have an initial velocity. False: quasi-static;
-        a later stage may switch inertia on. None: quasi-static in all stages. Inertia excludes `quadrature="point"`.
+        True: bodies have inertia, and need no walls. `Moving`: bodies also have an initial velocity. False: only later
+        stages may have inertia. None: all stages are quasi-static. Inertia requires `quadrature="domain"`.
 
     Attributes
     ----------
@@ -140,7 +140,7 @@ class Simulation:
         """Wall time for compiling or loading the forms, in s."""
 
     def __str__(self) -> str:
-        """Return a table of terms and solvers: whether the scene uses each of them, and why."""
+        """Return a table of terms and solvers, with the reason why the scene uses, or does not use, each of them."""
         return summary.table(self.scene, self.state)
 
     # ---- results --------------------------------------------------------------------------------
@@ -219,7 +219,7 @@ class Simulation:
     def tool_forces(self) -> ByName[NDArray[np.float64]]:
         """Force, in N, and moment, in N m, of each `Tool` and `Contact` on the bodies, by name.
 
-        An array with three components in 2D, and with six components in 3D, contains the force and the moment.
+        Each array contains the components of the force, and then the moment: three values in 2D, and six in 3D.
         """
         return self.outcome("tool_forces")
 
@@ -287,15 +287,15 @@ class Simulation:
         walls, gravity
             New walls and new gravity, as for `Simulation`.  A scene without gravity cannot get gravity later.
         inertia
-            Whether bodies have inertia from now on, if the scene allows it.  Bodies that get inertia start without
-            velocity.
+            Whether bodies have inertia from now on; a scene created with `inertia=None` cannot have inertia.  Bodies
+            that get inertia start without velocity.
         conditions
             All conditions from now on; by default the present conditions.  Pass `[*simulation.conditions, more]` to
             add the condition `more`.  Every `Contact` remains in force, even if it is not listed.
         add
-            Indices of bodies that are `Later`, for example a fill.  Added bodies have no velocity, and no stress unless
-            `initial_stress` lists them.  A fill is placed on the present surface of the bodies that it touched at
-            seeding.  The free side of the fill remains where it was seeded.
+            Indices of bodies that are `Later`, for example a fill.  Added bodies have no velocity.  Added bodies have
+            an initial stress only if `initial_stress` lists them.  A fill is placed on the present surface of the
+            bodies that it touched at seeding.  The free side of the fill remains where it was seeded.
         remove
             Indices of bodies to be removed, for example by an excavation.
         reset_displacement
@@ -336,7 +336,7 @@ class Simulation:
             return step(self.scene, self._state, dt, *how)
         except StepFailed:
             raise
-        except BaseException as error:  # the step may have been interrupted anywhere
+        except BaseException as error:  # an interrupt may have come at any line of the step
             self.scene.forget()
             raise_interrupt(error)
             raise

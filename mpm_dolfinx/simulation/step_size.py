@@ -41,16 +41,16 @@ between 1 and `KEEPS`, the step keeps its length.  Source: Hairer, Norsett and W
 Hairer and Wanner (1996), IV.8.
 """
 RINGS = 5e-3
-"""Largest sudden pressure change for which a step is not halved, divided by the largest pressure change so far.
+"""Sudden pressure change above which a step is halved, divided by the largest pressure change so far.
 
 SDIRK2 overshoots a jump by at most 0.21 times the jump.
 """
 AGAIN = 2.0
 """A pressure change is sudden if its rate is more than `AGAIN` times the rate at the start of the last step."""
 MOST = SAME / EPSILON
-"""Largest number of output intervals.  Source: exact; `SAME` times a shorter interval would be below rounding."""
+"""Largest number of output intervals.  Source: exact; in more intervals `SAME` times an interval is below rounding."""
 RESOLVED = 10
-"""Smallest `rtol`, divided by the tolerance of the solver.  Errors of the solver would hide smaller errors in time."""
+"""Smallest `rtol`, divided by the solver's tolerance.  Solver errors would hide time integration errors below it."""
 FIRST = 1e-3
 """Smallest default length of the first adaptive step, divided by the first output interval."""
 
@@ -119,13 +119,13 @@ class StepSize:
         return max(MIN_CUT_BY_ERROR * size, FINEST * abs(t)) if self.by_error else MIN_CUT * size
 
     def preferred(self, size: float) -> float:
-        """Return the nominal step, for the first trial step `size`."""
+        """Return the nominal step length of a step whose first trial has the length `size`."""
         return size if self.by_error else self.longest
 
     def fitted(self, left: float, small: float) -> float:
         """Return the step length `small`, adjusted to an output time that is `left` seconds away."""
-        if self.by_error:  # avoids a tiny step before an output
-            small = min(small, self.longest)  # `small` may be longer if an earlier run had other steps
+        if self.by_error:  # prevents a tiny step before an output
+            small = min(small, self.longest)  # `small` is longer than `longest` if an earlier run had longer steps
             return left if left <= min(1.05 * small, (1 + SAME) * self.longest) else min(small, left / 2)
         # steps that fit up to rounding have equal lengths
         return left if not left > (1 - SAME) * small else small
@@ -144,9 +144,9 @@ class StepSize:
             return max(control.small, min(2 * size, self.longest)) if grows else control.small
         factor = self._factor(report, control, 0.5)
         if factor >= 1:
-            # a step as long as a failed one mostly fails again: 78 reductions in place of 1 in yielding soil
+            # a step as long as a failed step mostly fails again: in yielding soil 78 reductions, in place of 1
             factor = 1.0 if factor < KEEPS or failed or not report.easy else factor
-            return min(max(size * factor, control.small), self.longest)  # an output may have shortened the step
+            return min(max(size * factor, control.small), self.longest)  # an output time may have shortened the step
         return size * factor
 
     def cut(self, size: float, control: StepControl) -> StepControl:
@@ -166,9 +166,9 @@ class StepSize:
         if self.by_error:
             return replace(control, small=small)
         waits = control.waits // 2 if whole and control.kept == 0 else control.waits
-        if small > (1 + SAME) * control.small and control.kept > waits:  # by more than rounding
+        if small > (1 + SAME) * control.small and control.kept > waits:  # larger by more than rounding
             return replace(control, small=small, waits=waits, kept=0)
-        # a step shortened for an output is no evidence about longer steps
+        # a step shortened to an output time does not show whether longer steps converge
         return replace(control, waits=waits, kept=control.kept + whole)
 
     def _rings(self, size: float, report: Report, control: StepControl) -> bool:
@@ -316,7 +316,7 @@ def step_rule(times: Times, rtol: float | Adaptive | None, scene: Scene, points:
         why = "without flow of fluid, velocities have no error estimate"
         raise ValueError(f"rtol = {line(rtol)}, must be left out: {why}")
     first = times.after(times.start)[0] - times.start
-    if len(scene.substeps) > 1:  # a scene without time derivatives has no such error
+    if len(scene.substeps) > 1:  # a scene without time derivatives has no pressure error in time
         # for a load that grows from zero the relative error is ERROR dt c_v / h^2
         first = min(first, max(FIRST * first, SAFETY * rtol / ERROR * diffusion_time(scene, points)))
     if inertia:  # bodies may be released or loaded suddenly

@@ -2,14 +2,14 @@
 """Factor of safety: the largest number by which the strength of the soil can be divided before the bodies fail.
 
 Trials with different factors bracket this number.  A factor divides cohesion, tensile strength and the tangents of the
-angles of friction and dilation (Griffiths and Lane 1999).  If Newton's method fails, the soil need not be too weak, so
-this failure is no criterion.  A trial adds a viscous stress to the soil instead, and follows the motion in time.  The
-criterion is the overload, the ratio of the viscous stress to the shear stress.  If the soil is strong enough, the
+angles of friction and dilation (Griffiths and Lane 1999).  Newton's method may also fail in soil that is strong enough,
+so its failure is no criterion.  Instead, a trial adds a viscous stress to the soil, and computes the motion in time.
+The criterion is the overload, the ratio of the viscous stress to the shear stress.  If the soil is strong enough, the
 bodies come to rest, and the overload vanishes.  In a slide the overload remains, and equals the missing strength for
 any viscosity and cell size.
 
 All trials start after one step with soil that cannot yield.  In this step, bodies in equilibrium keep their stresses.
-Bodies that cannot stand, and were not run before, get elastic stresses.
+Bodies that cannot stand get elastic stresses in this step, if no run precedes it.
 """
 
 from __future__ import annotations
@@ -87,9 +87,9 @@ def factor_of_safety(
 ) -> Safety:
     """Return the factor of safety: the largest number by which the strength can be divided before the bodies fail.
 
-    The simulation does not change.  A scene that cannot stand need not be run before.  Suction contributes to the
-    strength through the effective stress.  The friction of tools is not divided.  If a thin weak layer slides on the
-    surface, the factor depends on `rtol`.  All processes must call this function.
+    The simulation does not change.  If the bodies cannot stand, no earlier run is necessary.  Suction contributes to
+    the strength through the effective stress.  The friction of tools is not divided.  If a thin weak layer slides on
+    the surface, the factor depends on `rtol`.  All processes must call this function.
 
     Parameters
     ----------
@@ -150,7 +150,7 @@ class _Bar:
     def __init__(self, shown: bool):
         self._bar = tqdm(bar_format="{desc}, {n_fmt} steps, {elapsed}{postfix}", disable=None if shown else True)
         self._bar.set_description("factor of safety")
-        self._logs = nullcontext() if self._bar.disable else logging_redirect_tqdm()  # log lines above the bar
+        self._logs = nullcontext() if self._bar.disable else logging_redirect_tqdm()  # the log appears above the bar
         self._known = {"rests": "", "slides": ""}
 
     def __enter__(self) -> _Bar:
@@ -187,8 +187,8 @@ def _bracket(rests: Callable[[float], bool]) -> tuple[float, float]:
 def _ends(overloads: Sequence[float], steps: int, least: float) -> bool:
     """Return whether the overloads of the first steps determine the result of a trial.
 
-    The overload decreases ever more slowly.  The bodies slide if its present rate of decrease is too small for the
-    remaining steps.
+    The overload decreases ever more slowly.  If the overload would not vanish in the remaining steps at its present
+    rate of decrease, the bodies slide.
     """
     *before, last = overloads
     rate = min(1.0, last / before[-1]) if before else 0.0
@@ -226,7 +226,7 @@ class _Weakened:
             raise ValueError("factor_of_safety: no material has a strength; one must have friction and cohesion")
         if scene.grid.copies > 1:
             raise ValueError("factor_of_safety: the scene has contacts, must have none")
-        initial = begin_stage(scene, simulation.state, {}, [], [], False, {})  # has no data of the old grid
+        initial = begin_stage(scene, simulation.state, {}, [], [], False, {})  # without data of the old grid
         self._viscosity = viscosity = fem.Constant(scene.grid.mesh, 0.0)  # Pa s
 
         def resistance(points, u, dt):

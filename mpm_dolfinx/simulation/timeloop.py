@@ -83,21 +83,21 @@ def run(
         Tolerance of adaptive steps, or `Adaptive`: the tolerance with limits of the steps. The estimated error of the
         pore pressures stays below about `rtol` times the larger of two pressure changes: the largest change since the
         start of the run, and the undrained change in the step. `rtol` is at least ten times `tolerance`, and < 1. If no
-        fluid flows, the steps are the output intervals. A term or law that depends on velocity then raises ValueError,
-        because its error cannot be estimated. With inertia the error of the motion is limited too, relative to the
-        largest motion since the start, see `motion_error`. In unsaturated soil the error of the water content is
-        limited too. Its limit is relative to the largest change of the water content in a step so far. The estimate is
-        a fraction of a first-order step's error, see `solve.newton.ERROR`. The largest true error of a run was 0.7 to 5
-        times the largest estimate. The factor was 5 directly after a jump of the load.
+        fluid flows, each step is one output interval. A term or law that depends on velocity then raises ValueError,
+        because the error of such a term or law cannot be estimated. With inertia the error of the motion is limited
+        too, relative to the largest motion since the start, see `motion_error`. In unsaturated soil the error of the
+        water content is limited too, relative to its largest change in a step so far. The estimated error of a pressure
+        is a fraction of a first-order step's error, see `solve.newton.ERROR`. In tests, the largest true error of a run
+        was 0.7 to 5 times the largest estimate. The ratio was 5 directly after a jump of the load.
     t_eval : (n,), s
         Output times, increasing, in (t, t_end]; t_end is always an output time. Steps end at output times.
     until
         One function of the simulation, or several, that end the run before t_end. An event occurs within a step when a
         returned number changes its sign, or a returned boolean changes. A number that is zero at the start is no event.
         Example of a number: `lambda s: -s.points.displacement[:, 1].min() - 0.1`. Trial steps locate the event.
-        The run ends at the first state found after the event, at most a thousandth of the step later. This state is an
-        output; `Result.event` has the function's index and the time. The functions must return equal values on all
-        processes. An event completes the histories, as t_end does; a later run without `until` continues them.
+        The run ends after the event, by at most a thousandth of the step. The state at the end is an output;
+        `Result.event` has the function's index and the time. The functions must return equal values on all processes.
+        An event completes the histories, as t_end does. A later run without `until` may continue these histories.
     probes
         Material particles at which results are recorded.
     observe
@@ -166,7 +166,7 @@ def run(
                 _note(simulation, stopwatch.read(simulation.state.result))
                 checkpoint(simulation)
 
-    # messages are printed above the bar
+    # messages appear above the bar
     with bar, nullcontext() if bar.disable else logging_redirect_tqdm([logger] if logger.handlers else None):
         for target in targets:
             while not rule.ended(simulation.state.t, target, simulation.state.control):
@@ -309,7 +309,7 @@ def _advance(simulation: Simulated, rule: StepSize, target: float, verbose: bool
         try:
             new, report = simulation.advanced(size)
         except StepFailed as failed:
-            cause = cause if isinstance(cause, CannotFollow) else failed  # shorter steps may fail with less to say
+            cause = cause if isinstance(cause, CannotFollow) else failed  # this cause is clearer than later ones
             cut, counted = rule.cut(size, control), replace(result, cuts=result.cuts + 1)
             left = _has_left(failed, rule, size, state)
             if not left and cut.small >= rule.least(preferred, state.t):
@@ -356,7 +356,7 @@ def _by_euler(simulation: Simulated, dt: float, failed: StepFailed) -> tuple[Sta
 
 
 def _has_left(failed: StepFailed, rule: StepSize, size: float, state: State) -> bool:
-    """Return whether points leave the grid in a step that is short enough."""
+    """Return whether points leave the grid in a step that meets the tolerances."""
     if not isinstance(failed, LeftGrid) or failed.report is None:
         return False
     return rule.refused(size, failed.report, measured(state.control, failed.report)) == 1
