@@ -2,15 +2,15 @@
 """Direct linear solvers, used where they are faster than multigrid (`multigrid`): see `plan`.
 
 On one process, PETSc factorises displacement matrices with a block for each node.  `dissection` orders the nodes along
-grid lines.  `bash demos/run.sh calibrate` prints the times of this solver and of others.  In 2D with 33000 unknowns and
-a symmetric matrix, the first factorisation, the next one, and a solve take the following times, in ms:
+grid lines.  `bash demos/run.sh calibrate` prints the times of several solvers.  With 33000 unknowns in 2D and a
+symmetric matrix, the first factorisation, the second factorisation, and a solve take these times, in ms:
 
     blocks of nodes 214, 108, 6        scalar entries, minimum degree 888, 450, 12
     CHOLMOD 185, 150, 9                UMFPACK 286, 200, 17                MUMPS 722, 524, 175
 
-On several processes, one process holds the factors of displacements, because many solves use them.  Another process
-computes and holds the factors of pressures at the same time.  In large scenes all processes share the factors, and
-MUMPS computes them (`Thresholds.mumps`).
+On several processes, one process holds the factors of displacements, because this is faster for many solves.  At the
+same time, another process computes the factors of pressures.  In large scenes all processes share the factors of MUMPS
+(`Thresholds.mumps`).
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ from mpm_dolfinx.solve.petsc_options import set_defaults
 from mpm_dolfinx.solve.solver_choice import MUMPS, NODAL
 
 MOST = 500
-"""Largest number of iterations of a linear solve. The Krylov space has the same size, so there is no restart.
+"""Largest number of iterations of a linear solve. The Krylov space has this dimension, so GMRES never restarts.
 
-With PETSc's restarts after 30 iterations, FGMRES stagnates if the tangent of a footing is nearly singular. Solves then
-end after 500 iterations. Without a restart, they take 50 iterations. Vectors are allocated on demand.
+With PETSc's default, a restart every 30 iterations, FGMRES stagnates on the nearly singular tangent of a footing, and
+ends after 500 iterations. Without restarts, FGMRES takes 50 iterations. PETSc allocates the vectors on demand.
 """
 TOLERABLE = (-3, -8, -10)  # PETSc's reasons: too many iterations, indefinite preconditioner, indefinite matrix
 
@@ -54,13 +54,13 @@ def direct_solver(
     else:
         ksp.pc.setType(PETSc.PC.Type.CHOLESKY if symmetric else PETSc.PC.Type.LU)
         if A.comm.size > 1:
-            PETSc.Options(ksp.getOptionsPrefix()).setValue("mat_mumps_icntl_13", 1)  # counts negative pivots
+            PETSc.Options(ksp.getOptionsPrefix()).setValue("mat_mumps_icntl_13", 1)  # makes MUMPS count negative pivots
             package = "mumps"
         if package is not None:
             ksp.pc.setFactorSolverType(package)
         else:
             ksp.pc.setFactorOrdering("nd" if gathered else "amd")
-            ksp.pc.setFactorPivot(0.0)  # no smallest pivot: PETSc's, 2e-14, rejects rows of nearly empty cells
+            ksp.pc.setFactorPivot(0.0)  # PETSc's smallest pivot, 2e-14, would reject nearly empty cells
     ksp.setOperators(A)
     ksp.setFromOptions()
     return ksp
@@ -76,7 +76,7 @@ def _preonly(A: PETSc.Mat, name: str) -> PETSc.KSP:
 def renew(A: PETSc.Mat) -> None:
     """Rebuild the sparsity pattern of a matrix in PETSc after sums with other matrices.
 
-    Before the sums, PETSc has grouped rows with equal patterns. LU factors with these old groups would be wrong.
+    PETSc has grouped rows with equal patterns before the sums. LU factors with these groups would be wrong.
     """
     A.setPreallocationCSR([part.copy() for part in A.getValuesCSR()])
 
@@ -84,7 +84,7 @@ def renew(A: PETSc.Mat) -> None:
 def solved(ksp: PETSc.KSP, name: str) -> int:
     """Return the number of iterations of a solver's last solve. Raise NotConverged if this solve failed.
 
-    With an indefinite tangent, or after the largest number of iterations, the line search judges the result.
+    An indefinite tangent, or the largest number of iterations, is no failure: the line search tests the result.
     """
     count, reason = ksp.getIterationNumber(), ksp.getConvergedReason()
     if reason < 0 and reason not in TOLERABLE:
@@ -109,7 +109,7 @@ def displacement_solver(A: PETSc.Mat, name: str, unknowns: Unknowns, how: str, s
 
 
 def _set_gathered(ksp: PETSc.KSP, A: PETSc.Mat, factors: NodalFactors | SingleFactors, rank: int) -> None:
-    """Make a solver use factors on one process."""
+    """Replace the preconditioner of a solver by factors on one process."""
     ksp.pc.setType(PETSc.PC.Type.PYTHON)
     ksp.pc.setPythonContext(Gathered(A.createVecRight(), factors, rank))
 
@@ -130,8 +130,8 @@ class Gathered:
     `factors`: factors of the whole matrix.
     `rank`: process that holds the factors.
 
-    `setUp` gathers a matrix. The factors are computed at the next solve, or by the function `factorise`, which lets the
-    processes compute their factors at the same time.
+    `setUp` gathers a matrix. The next solve computes its factors. The function `factorise` computes the factors of
+    several matrices at the same time.
     """
 
     def __init__(self, x: PETSc.Vec, factors: NodalFactors | SingleFactors, rank: int):
@@ -189,7 +189,7 @@ class SingleFactors:
 
     def factorise(self) -> None:
         """Factorise the matrix if it has changed."""
-        self._solver.value[0].pc.setUp()  # PETSc's KSPSetUp does nothing when only entries have changed
+        self._solver.value[0].pc.setUp()  # PETSc's KSPSetUp ignores a change of entries alone
 
     def _of(self, rows: NDArray[np.int32], columns: NDArray[np.int32]) -> tuple[PETSc.KSP, PETSc.Vec, PETSc.Vec]:
         """Return a solver for matrices with this sparsity pattern, and vectors for solution and right-hand side."""
@@ -223,7 +223,7 @@ class NodalFactors:
 
     def take(self, rows: NDArray[np.int32], columns: NDArray[np.int32], values: NDArray[np.float64]) -> None:
         """Set the matrix, in compressed rows."""
-        if len(rows) > 1:  # else walls fix all nodes, and PETSc cannot factorise an empty matrix
+        if len(rows) > 1:  # otherwise walls fix all nodes, and the matrix is empty, which PETSc rejects
             make = (rows, columns, *self._nodes, self._dim, self._symmetric)
             self._factors((rows, columns), lambda: BlockFactors(*make)).take(values)
 
@@ -256,7 +256,7 @@ def dissection(x: NDArray[np.float64]) -> NDArray[np.int64]:
 
 
 def _lines(x: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return the index of the grid line of each coordinate, among the lines with nodes."""
+    """Return the index of each coordinate's grid line. Only lines with nodes are counted."""
     values, at = np.unique(x, return_inverse=True)
     return np.cumsum(np.diff(values, prepend=values[:1]) > SAME * (values[-1:] - values[:1]))[at]
 
@@ -282,7 +282,7 @@ class BlockFactors:
             kept = np.flatnonzero(np.repeat(node, lengths) <= node[columns])
         place = self._place.astype(np.int32)
         i, j = np.repeat(place, lengths)[kept], place[columns[kept]]
-        # 1 on the diagonal for components that walls fix
+        # components that walls fix have 1 on the diagonal
         missing = np.setdiff1d(np.arange(count * dim, dtype=np.int32), place)
         number = np.concatenate([kept, np.full(len(missing), len(columns))]) + 1
         where, n = (np.concatenate([i, missing]), np.concatenate([j, missing])), count * dim

@@ -1,24 +1,24 @@
 # SPDX-License-Identifier: MIT
 """Line search: length of a Newton step, see `Newton._line_search`.
 
-Without yield the step is full, even if the residual grows, because linearised rotations of a bending body cause a
-spurious stretch. The step is halved until all laws can be evaluated at its end, and the residual does not grow
-enormously.
+Without yield, the search accepts a full step even if the residual grows, because linearised rotations of a bending body
+cause a spurious stretch. The step is halved only if a law cannot be evaluated at its end, or if the residual grows by
+more than `EXPLODES`.
 
-In yielding soil, the criterion is the work of the residual forces along the step. The step is full if the work at its
-end is less than half of the initial work. The step is also full if the residual falls, and the work does not exceed the
-initial work. Otherwise bracketed secants look for the step length at which the work is zero. The secants end at less
-than half of the initial work (Matthies and Strang 1979). Nearer to zero work, soil might unload, and would be elastic
-in the next tangent. The work of the fluid's residual is added, because forces do nearly no work if only the fluid is
-out of balance. Soil that has lost its strength needs several secants: with one secant, a slumping bank takes twice the
-Newton steps.
+In yielding soil, the criterion is the work of the residual forces along the step. The search accepts a full step if the
+work at its end is less than half of the initial work. The search also accepts a full step if the residual decreases,
+and the work does not exceed the initial work. Otherwise bracketed secants seek the step length at which the work is
+zero. The secants end when the work is less than half of the initial work (Matthies and Strang 1979). Steps closer to
+zero work might unload soil, which would be elastic in the next tangent. The work of the fluid's residual is added,
+because forces do nearly no work if only the fluid is out of balance. Soil that has lost its strength needs several
+secants: with one secant, a slumping bank takes twice the Newton steps.
 
 Flowing soil has almost no stiffness along its mechanisms, and negative stiffness with non-associated flow, so full
 steps overshoot far. The tangent is therefore regularised by a fraction of the elastic shear stiffness, proportional to
-the relative residual of the forces (Levenberg 1944, Marquardt 1963). The residual of the fluid is not used: it grows
-with the step length for any soil. Soil that has not yielded is regularised too, because full steps overshoot just as
-far when this soil first yields. Before any soil yields, there is no regularisation while the tangents converge. With
-regularisation, wet elastic soil would take 1.6 times the Newton steps.
+the relative residual of the forces (Levenberg 1944, Marquardt 1963). The residual of the fluid is not used, because it
+grows with the step length even if no soil yields. Elastic soil is regularised too, because full steps overshoot just as
+far when this soil first yields. Before any soil yields, the tangent is regularised only if the iterations do not
+converge. Regularisation from the start would take 1.6 times the Newton steps in wet elastic soil.
 
 A few flowing points may give the tangent a negative stiffness. A Newton step then unloads these points, the next step
 loads them again, and the iterations cycle. The work of the residuals along such a step is negative, and the step is
@@ -35,11 +35,10 @@ import numpy as np
 EXPLODES, SHORTEST = 1e4, 1e-3
 """Largest growth of the residual in a step without yield, and smallest fraction of the full step.
 
-Scenes take equal steps with 1e3 and 1e5 as largest growth, because the growth is below 1e3, or the residual is not
-finite.
+With 1e3 or 1e5 as largest growth, scenes take the same steps: the growth is below 1e3, or the residual is not finite.
 """
 WORK = 0.5
-"""Largest ratio of the work at the end of a step to the work at its start (Matthies and Strang 1979)."""
+"""Largest ratio of the work at the end of an accepted step to the work at its start (Matthies and Strang 1979)."""
 SHIFT = 0.1
 """Fraction (<= 1) of the elastic shear stiffness in the tangent of yielding soil, divided by the relative residual.
 
@@ -73,7 +72,7 @@ class Search:
     """Search for a step length in yielding soil, by the work of the residuals."""
 
     step: float = 1.0  # next trial, as a fraction of the full step
-    low: float = 0.0  # from `low` to `high` the work changes its sign
+    low: float = 0.0  # the work changes its sign between `low` and `high`
     at_low: float = 1.0  # work at `low`, divided by the initial work
     high: float = np.inf
     at_high: float = np.nan  # work at `high` / initial work
@@ -85,7 +84,7 @@ class Search:
         """Return the next trial, or None if the search ends.
 
         A full step that does not increase the residual ends the search if `abs(work) <= 1`. A secant gives the next
-        trial. Bisection replaces the secant if one bound stays in place twice.
+        trial. Bisection replaces the secant if one bound does not change in two trials.
         `work`: work in the last trial divided by the initial work, or nan.
         `growth`: growth factor of the residual in the last trial.
         """

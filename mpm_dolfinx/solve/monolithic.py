@@ -6,25 +6,25 @@
 
 K is the stiffness, C the storage and B the coupling of the balances (`newton`).  The solver is GMRES, preconditioned
 from the right with the upper block triangle.  In this triangle the fixed-stress operator `P = C + beta V` replaces the
-Schur complement `C + B K^-1 B^T`.  Here beta is the fixed-stress coefficient, and V are the cell volumes.  One
-multigrid cycle approximates K^-1, and another cycle P^-1.  The bodies that need this solver are larger in 2D than in 3D
+Schur complement `C + B K^-1 B^T`.  Here beta is the fixed-stress coefficient, and V contains the cell volumes.  One
+multigrid cycle approximates K^-1, and another cycle P^-1.  In 2D, a body must be larger than in 3D to need this solver
 (see `plan`).
 
-In 3D, GMRES takes 7 to 12 iterations to the tolerance 1e-3, each with one cycle on K.  In 2D, GMRES takes 8 iterations
-to the tolerance 1e-5.  Other methods were tested in 3D with algebraic multigrid and Jacobi smoothing, with which GMRES
-takes 10 to 15 iterations.  Conjugate gradients on the Schur complement took 35 to 60 cycles in their inner solves.
-Flexible GMRES with inner solves to tolerances of 0.1 or 0.01 took 12 to 24 cycles.  MINRES with the diagonal blocks
-took 17 to 23 cycles, and left a residual five times as large.
+In 3D, GMRES takes 7 to 12 iterations to the tolerance 1e-3, each with one cycle on K. In 2D, GMRES takes 8 iterations
+to the tolerance 1e-5.  Other methods were tested in 3D with algebraic multigrid and Jacobi smoothing.  In this test,
+GMRES takes 10 to 15 iterations.  Conjugate gradients on the Schur complement take 35 to 60 cycles in their inner
+solves.  Flexible GMRES with inner solves to tolerances of 0.1 or 0.01 takes 12 to 24 cycles.  MINRES with the diagonal
+blocks takes 17 to 23 cycles, and its residual is five times the residual of GMRES.
 
-At nu = 0.499 the cycle is inaccurate, and GMRES takes more than 100 iterations with 14^3 cells.  If a solve takes too
-many iterations (see `plan`), or is predicted to take too many, factors of K replace the cycle.  These factors are kept
-until a solve with them takes too many iterations.  With factors of an earlier tangent, a solve takes about 10
-iterations.  With new factors, a solve takes 4 to 6 iterations.  A step takes 6.2 s with kept factors, and 8.5 s with
-new factors for each tangent.
+At nu = 0.499 the cycle is inaccurate, and GMRES takes more than 100 iterations with 14^3 cells.  If a solve takes, or
+is predicted to take, too many iterations (see `plan`), factors of K replace the cycle.  The solver keeps these factors
+until a solve takes too many iterations again.  With factors of an earlier tangent, a solve takes about 10 iterations.
+With new factors, a solve takes 4 to 6 iterations.  A step takes 6.2 s with kept factors, and 8.5 s with new factors for
+each tangent.
 
-In 2D yielding soil would take 20 to 500 iterations (footing, 41 cells, any smoother).  Shear bands are one cell wide,
-so coarse grids cannot represent these bands.  With a viscosity of 0.05, GMRES takes 28 iterations.  The time of GMRES
-is then 0.9 times the time of a direct solver on 41 cells, but 1.7 times on 81 cells.
+In 2D, GMRES would take 20 to 500 iterations in yielding soil (footing, 41 cells, any smoother).  Shear bands are one
+cell wide, so coarse grids cannot represent these bands.  With a viscosity of 0.05, GMRES takes 28 iterations.  The time
+of GMRES is then 0.9 times the time of a direct solver on 41 cells, but 1.7 times on 81 cells.
 """
 
 from __future__ import annotations
@@ -46,12 +46,12 @@ from mpm_dolfinx.solve.solver_choice import MUMPS, SolverPlan
 LEAST = 1e-4
 """Smallest scale of the fluid residual, divided by the fluid volume that residual forces displace in a drained body.
 
-Undrained bodies exchange nearly no fluid.  If the displaced volume is 5e5 times the scale, rounding leaves a residual
-of 2e-5.
+Undrained bodies exchange nearly no fluid.  If the displaced volume is 5e5 times the scale, rounding errors cause a
+residual of 2e-5.
 """
 
 IDLE = object()
-"""Takes the operator's place in PETSc after each solve.  Otherwise PETSc would keep all objects of the last solve."""
+"""Replaces the operator in PETSc after each solve.  Otherwise PETSc would hold all objects of the last solve."""
 Scale = NDArray[np.float64] | float
 Inverses = tuple[PETSc.PC, PETSc.PC]
 """Preconditioners that approximate K^-1 and P^-1."""
@@ -173,7 +173,7 @@ class BlockSolver:
         residuals = self._momentum.residual, self._storage.residual
         scale_u, scale_p = scales
         scale_p = np.maximum(scale_p, LEAST * scale_u * operator.displaced())
-        if on_u.count > 1:  # parts are uncoupled, so their residuals are scaled to equal size
+        if on_u.count > 1:  # the residuals of the uncoupled parts are scaled to equal size
             sizes = [of.norms(r.array_r) for of, r in zip((on_u, on_p), residuals, strict=True)]
             size = np.hypot(sizes[0] / scale_u, sizes[1] / scale_p)
             scale_u, scale_p = (scale * np.where(size > 0, size, 1.0) for scale in (scale_u, scale_p))

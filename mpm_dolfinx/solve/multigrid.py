@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: MIT
-"""Geometric multigrid on the background grid: coarse grids of twice the spacing, with interpolated matrices.
+"""Geometric multigrid on the background grid: each coarse grid has twice the cell size of the finer grid.
 
 A coarse unknown belongs to a node, or a cell, of a grid with half as many cells along each axis. Displacements are
 interpolated linearly along each axis between nodes, and pressures between cell centres. Coarse matrices are Q^T A Q
 (Galerkin) with the fine matrix A and the interpolation Q. Cut cells, penalties and laws thus need no special treatment.
 
 With 504000 displacements and 251000 pressures in 2D (10^6 points), both hierarchies of grids take 0.33 s. The coarse
-matrices of a tangent take 0.1 s, and a cycle takes 0.06 s. A step takes 2.6 s, but 7.6 s with factors (including
-ordering). A wet cube of 20^3 cells in shear takes 2.0 s for 16 Newton steps. With smoothed aggregation (GAMG) it takes
-11.6 s, with equally many iterations.
+matrices of a tangent take 0.1 s, and a cycle takes 0.06 s. A step takes 2.6 s with multigrid, and 7.6 s with a direct
+solver (including ordering). A wet cube of 20^3 cells in shear takes 2.0 s for 16 Newton steps. With smoothed
+aggregation (GAMG) the cube takes 11.6 s, and equally many iterations.
 """
 
 from __future__ import annotations
@@ -59,10 +59,10 @@ def multigrid_solver(
 
     `A`: matrix, which may still be empty.
     `name`: prefix of the solver's PETSc options.
-    `places` (n, d + 1): unknowns of this process: indices along the grid axes, and index of the component, all >= 0.
-    Each component is interpolated separately.
-    `held` (m, d + 1): fixed degrees of freedom in cells of bodies, described like `places`. Interpolated displacements
-    vanish there.
+    `places` (n, d + 1): index along each grid axis, and index of the component, of the unknowns of this process, all >=
+    0. Each component is interpolated separately.
+    `held` (m, d + 1): fixed degrees of freedom in cells of bodies, as indices like `places`. Interpolated displacements
+    vanish at these degrees of freedom.
     `nodal`: whether the unknowns belong to nodes.
     `coarsest`: largest number of unknowns of the coarsest grid, which has a direct solver.
     `firmly`: whether to use the stronger smoother `FIRMLY`.
@@ -99,9 +99,9 @@ def interpolations(
     """
     steps: list[PETSc.Mat] = []
     size = before = over_all(comm, len(places))
-    while not steps or coarsest < size < 0.7 * before:  # many bodies of a few cells cannot be coarsened
+    while not steps or coarsest < size < 0.7 * before:  # bodies of few cells have no coarser grid
         Q, places, held = interpolation(comm, places, held, nodal, lines)
-        if lines is not None:  # half as many cells, of which the last one may extend beyond the grid
+        if lines is not None:  # half as many cells; the last cell may extend beyond the grid
             lines = [x[::2] if len(x) % 2 else np.append(x[::2], 2 * x[-1] - x[-2]) for x in lines]
         size, before = over_all(comm, len(places)), size
         steps.append(Q)
@@ -172,10 +172,10 @@ def _hats(
 def _shared(
     comm: MPI.Intracomm, keys: NDArray[np.int64], count: int, stated: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Return the index of the unknown of each candidate, and whether this process owns it.
+    """Return the index of the unknown of each candidate, and whether this process owns the unknown.
 
-    The process of lowest rank with a candidate owns the unknown. Keys are distributed over processes to find owners. A
-    candidate has the largest status (`MAYBE`, `NOT` or `IS`) of all processes.
+    The process of lowest rank with a candidate owns the unknown. Each key is sent to one process, which determines the
+    owner. The status of a candidate (`MAYBE`, `NOT` or `IS`) is the largest status on all processes.
     """
     ask = Exchange(comm, (keys * comm.size // count).astype(np.int32))
     distinct, who = np.unique(ask.send(keys), return_inverse=True)

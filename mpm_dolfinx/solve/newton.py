@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: MIT
 """Equations of a substep: balance of momentum and storage of fluid, coupled by u and p.
 
-Unconnected parts of the bodies are in equilibrium independently of each other. In each part, the momentum residual is
-divided by the forces, and the fluid residual by the exchanged fluid volume. A line search sets the step length of each
-part separately.
+Each connected part of the bodies is in equilibrium on its own. In each part, the momentum residual is divided by the
+forces, and the fluid residual by the exchanged fluid volume. A line search sets the step length of each part
+separately.
 
-A Newton step of the two problems reads
+A Newton step of the two balances is
 
     [ K  -B^T ] [du]     [R_u]
     [ B   C   ] [dp] = - [R_p].
@@ -45,36 +45,37 @@ from mpm_dolfinx.solve.factors import negative_pivots
 from mpm_dolfinx.solve.line_search import SHIFT, Halving, Search
 from mpm_dolfinx.solve.schur import Kept, LinearSolvers
 
-INNER = 1e-3  # momentum tolerance / storage error; it is small because unconverged rotations change volumes
+INNER = 1e-3  # momentum tolerance / storage error; small, because errors of rotations change volumes
 MOMENTUM_STEPS = 10
-REBALANCED = 6  # largest number of iterations if contacts change, divided by the number if they do not
+REBALANCED = 6  # largest number of iterations with changing contacts, divided by the number without
 LOOSEST = 1e-2
 """Largest ratio of the residual after a linear solve to the residual before this solve. Plateau (scene "soil" of
 tests/plateaus.py): half this value changes the result by 2.2e-11, twice this value by 6.0e-12, and finer cells by
 3.0e-02.
 """
 SOLVED = 0.05
-"""Residual after the last linear solve, divided by the tolerance.  Plateau (scene "soil" of tests/plateaus.py): half
-this value changes the result by 4.0e-12, twice this value by 3.1e-11, and finer cells by 3.0e-02.
+"""Residual that the last linear solve aims at, divided by the tolerance of Newton's method.  Plateau (scene "soil" of
+tests/plateaus.py): half this value changes the result by 4.0e-12, twice this value by 3.1e-11, and finer cells by
+3.0e-02.
 """
-SETTLED = 1e-2  # residual below which slip of contacts may end; above it the contact area still changes
+SETTLED = 1e-2  # residual below which slip of contacts may end; at larger residuals the contact area changes
 ERROR = 1 / 20
 """Assumed pressure error of a run, divided by the estimated error e of a first-order step (`note_pressures`).
 
 For a mode with decay rate l, the stability function of sdirk2 gives an error of `0.081 dt abs(l) e` in a step, at most
 0.28 e. A pressure that follows a varying load has an error of at most 0.14 e. With little decay, the errors of all
-steps add up to 0.081 e. Errors were measured against steps an eighth as long. They are 0.05 to 0.08 e if loads rise or
-oscillate, or if the prescribed pressure on a drained side oscillates. They are 0.01 to 0.04 e with an oscillating
-source, and 0.01 to 0.05 e late in a consolidation. The error is 0.17 e in a first step from zero load, and 0.26 e after
-a jump. In a run it is at most 5 e / 20.
+steps add up to 0.081 e. Errors were measured by comparison with steps an eighth as long. They are 0.05 to 0.08 e if
+loads rise or oscillate, or if the prescribed pressure on a drained side oscillates. Errors are 0.01 to 0.04 e with an
+oscillating source, and 0.01 to 0.05 e late in a consolidation. The error is 0.17 e in a first step from zero load, and
+0.26 e after a jump. The error of a run is at most 5 e / 20.
 """
 SUDDEN = np.sqrt(2)
-"""Limit of the ratio of pressure changes in the second and the first substep, below which sdirk2 overshoots.
+"""Pressure change in the second substep, divided by the change in the first substep, below which sdirk2 overshoots.
 
 With `z = -(decay rate) dt`, the stability function `(1 + (1 - 2 gamma) z) / (1 - gamma z)^2` changes its sign at `z =
 -1 - sqrt(2)`. At this z, a pressure changes by `-gamma z / (1 - gamma z) = sqrt(2) - 1` in the first substep, and by `2
 - sqrt(2)` in the second substep. If pressures follow loads, the ratio of the two changes is `(1 - gamma) / gamma`.
-Source: exact, this ratio.
+Source: exact.
 """
 
 
@@ -126,7 +127,7 @@ def solve_substep(
     Raises
     ------
     NotConverged
-        If Newton's method did not converge. The exception has the residual history.
+        Newton's method does not converge. The exception has the history of the residuals.
     """
     newton = Newton(solvers, momentum, storage, kept)
     in_turn = solvers.scheme.richardson and storage is not None
@@ -163,9 +164,9 @@ def note_pressures(
     """Store the pressure changes and the estimated pressure error of a step in the report.
 
     The fluid volumes after the step and after a first-order step differ by `seconds` times the change of rates between
-    substeps. The fixed-stress operator converts this difference into a pressure that is bounded for stiff modes, as in
-    Hosea and Shampine (1996). The error of the step is assumed to be `ERROR` times this pressure. Errors and changes in
-    a cell are weighted by the volume fraction of material in the cell.
+    substeps. The inverse of the fixed-stress operator converts this difference into a pressure. This pressure is
+    bounded for stiff modes, as in Hosea and Shampine (1996). The error of the step is assumed to be `ERROR` times this
+    pressure. Weights of cells are their volume fractions of material.
 
     `seconds`, s: time weight of the rates of the first substep.
     `dt`, s: length of the step.
@@ -213,7 +214,7 @@ class Newton:
     def newton(self, as_reset: AsReset, key: Hashable, reusable: bool, ahead: Callable | None) -> Errors:
         """Solve the balances by Newton's method.
 
-        A tangent is reused while the iterations converge, and with linear laws over many steps.
+        A tangent is reused while the iterations converge. With linear laws, a tangent is reused over many steps.
 
         `reusable`: whether the tangent of the previous substep may be reused.
         `ahead`: see `solve_substep`.
@@ -241,7 +242,7 @@ class Newton:
         log_change: NDArray[np.float64] | float = 0.0
         eases = np.full(len(errors.u), elastic or not self._momentum.yielded)
         while (found := self._augmented(errors)).worst > tolerance:
-            if found is not errors:  # converged, but contact forces or multipliers have changed
+            if found is not errors:  # the iterations converged, but contact forces or multipliers have changed
                 errors = found
                 count = 0
                 fresh |= any(one.touches for one in self._momentum.loads)
@@ -255,7 +256,7 @@ class Newton:
             if self._storage is not None:
                 log_change = self._solvers.restrain(self._storage, log_change)
             before, errors = errors, self._line_search(errors, elastic)
-            # the first residual is infinite without exchanged fluid; with yield it shows prescribed displacements alone
+            # without exchanged fluid the first residual is infinite; with yield only prescribed displacements cause it
             count, known = count + 1, np.minimum(1.0, before.each) * (elastic | (before.each <= 1))
             lags = (errors.each > keep * known) & (errors.each > tolerance)
             slow = fresh and bool((lags & (errors.p > errors.u)).any())
@@ -268,7 +269,7 @@ class Newton:
     def _augmented(self, errors: Errors) -> Errors:
         """Update contacts until no contact changes or a residual exceeds the tolerance, and return the errors.
 
-        The largest number of updates is the largest number of Newton iterations.
+        The limit of Newton iterations is also the limit of these updates.
         """
         momentum = self._momentum
         count = 0
@@ -280,8 +281,8 @@ class Newton:
     def _begin(self, ahead: Callable | None) -> tuple[Errors, list[NDArray[np.float64]] | None]:
         """Choose the start of Newton's method. Return the errors at the start, and the previous (u, p) or None.
 
-        The start is `ahead` if the square of its residual is small. Otherwise each part starts at its guess of least
-        residual. The result is None instead of the previous (u, p) if the start is the previous (u, p).
+        The start is `ahead` if the square of its residual is small. Otherwise each part starts at the guess with the
+        smallest residual. If the start is the previous (u, p), None is returned in place of the previous (u, p).
         """
         start = self._iterate()
         if ahead is not None:
@@ -289,7 +290,7 @@ class Newton:
             self._go_to([self._momentum.freely(u), *p])
             errors, _ = self._tried(None)
             worst = np.inf if errors is None else errors.worst
-            if errors is not None and errors.fluid is not None:  # without flow, wrong volumes look like exchanged fluid
+            if errors is not None and errors.fluid is not None:  # without flow, volume errors resemble exchanged fluid
                 flows = np.abs(self._storage.net_inflow(errors.fluid.rates)).sum()
                 worst = max(worst, errors.fluid.off.sum() / over_all(self._solvers.du.comm.tompi4py(), flows))
             if worst**2 <= self._solvers.plan.keep:
@@ -307,7 +308,7 @@ class Newton:
                 found = self._errors(errors.start)
             except NotConverged:
                 continue
-            better = found.u < least  # p is the same; its residual is meaningless before any fluid has been exchanged
+            better = found.u < least  # p is equal; its residual has no meaning before fluid is exchanged
             if better.any():
                 at = guess if better.all() else np.where(better[self._parts], guess, at)
                 least, last = np.minimum(found.u, least), at if better.all() else None
@@ -345,7 +346,7 @@ class Newton:
             return found
         if not negative_pivots(self._solvers.solve_u):
             return found
-        self._linearise()  # the last tangent may belong to another state
+        self._linearise()  # the last tangent may be that of another state
         if not (count := negative_pivots(self._solvers.solve_u)):
             return found
         self._solvers.solve_momentum()
@@ -399,9 +400,9 @@ class Newton:
     def _errors(self, start: NDArray[np.float64] | None = None) -> Errors:
         """Assemble both residuals, add their relative norms to the history, and return the norms.
 
-        The scales contain the forces at the start of the step, but no forces at earlier iterates: after a diverging
-        iterate every residual would seem small. Residuals within round-off are returned as 0. The history has the
-        true norms of all residuals, divided by scales of at least `round_off / tolerance`.
+        The scales contain the forces at the start of the step, but no forces at earlier iterates. With the large forces
+        of a diverging iterate, every later residual would seem small. Residuals within round-off are returned as 0. The
+        history has the true norms of all residuals, divided by scales of at least `round_off / tolerance`.
         """
         first = not self.report.history
         with _compat.Timer("residual"):
@@ -438,20 +439,20 @@ class Newton:
     def _direction(self, errors: Errors, slow: bool) -> int:
         """Solve the linearised problem, and return the number of coupling iterations.
 
-        `slow`: whether a new tangent has hardly reduced the residual of the storage, and this residual is the larger
-        one. The tangent then also contains the derivative of fluxes with respect to displacements.
+        `slow`: whether a new tangent has hardly reduced the storage residual, and this residual exceeds the momentum
+        residual. The tangent then also contains the derivative of fluxes with respect to displacements.
         """
-        # the next residual needs no more accuracy
+        # the linear solve need not be more accurate than the next residual
         iterative, least = self._solvers.plan.iterative, self._solvers.plan.forcing
         if self._momentum.linear and not (iterative and self._momentum.forms.grid.dim == 3):
             least = 0.0
         rtol = min(LOOSEST, max(least, SOLVED * self._scheme.tolerance / min(1.0, errors.worst)))
-        if iterative:  # the penalty of prescribed displacements dominates the first residual and hides other terms
+        if iterative:  # in the first residual, the penalty of prescribed displacements hides all other terms
             rtol = max(SOLVED * self._scheme.tolerance, rtol / max(1.0, errors.worst))
         if self._storage is not None:
             rtol = min(rtol, self._storage.accuracy)
         done = errors.each <= self._scheme.tolerance
-        if done.any():  # converged parts do not move
+        if done.any():  # converged parts are not changed
             self._momentum.system.residual.array_w[done[self._momentum.system.of_parts.of]] = 0.0
             if self._storage is not None:
                 errors.fluid.vector.array_w[done[self._storage.system.of_parts.of]] = 0.0
@@ -475,7 +476,7 @@ class Newton:
         of = self._momentum.system.of_parts
         moved = np.zeros(of.count)
         steps = moved + 1.0
-        first = np.empty(0) if elastic else self._work()  # without yield it is not used
+        first = np.empty(0) if elastic else self._work()  # without yield the work is not used
         if not elastic and (first < 0).any():
             self._solvers.turn_round(first < 0)
             first = np.abs(first)

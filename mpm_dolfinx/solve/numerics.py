@@ -22,7 +22,7 @@ class Numerics:
     ----------
     quadrature
         "domain" integrates exactly over cut particle domains. "point" integrates at material points, as in standard
-        MPM. It supports boxes only, and no axisymmetry.
+        MPM; it supports only boxes, without axisymmetry.
     coupling
         Coupling scheme of the balances of momentum and fluid, one of `COUPLINGS`.
     tolerance
@@ -32,19 +32,20 @@ class Numerics:
         Time integration: "sdirk2" (second order) or "backward-euler".
     renewal
         Whether to replace particle domains of yielded soil that are longer than a cell, see `stepping/renewal.py`.
-        Renewal requires quadrature "domain", yielding dry or saturated soil in 2D, no `Contact`, and in axisymmetry no
-        inertia. On a grid with `follow`, elastic domains are also divided and merged, see `stepping/division.py`.
-        Division and merging require quadrature "domain", dry or saturated soil, no `Contact` and no inertia.
+        Renewal requires quadrature "domain", and yielding dry or saturated soil in 2D. A `Contact`, and in axisymmetry
+        inertia, exclude renewal. On a grid with `follow`, elastic domains are also divided and merged, see
+        `stepping/division.py`. Division and merging require quadrature "domain" and dry or saturated soil, and allow no
+        `Contact` or inertia.
     keep_volumes
-        Whether yielded domains keep the volumes of their points, see `domains/kept_volumes.py`. With "point" it has no
-        effect.
+        Whether yielded domains keep the volumes of their points, see `domains/kept_volumes.py`. With quadrature "point"
+        this option has no effect.
     petsc_options
         PETSc options for the solvers, see `Scheme`.
 
     Raises
     ------
     ValueError
-        If an option is invalid. The message names the option and its allowed values.
+        An option is invalid. The message names the option and its allowed values.
     """
 
     quadrature: str = "domain"

@@ -42,7 +42,7 @@ def using(options: Mapping[str, Any], unread: set[str] | None = None) -> Iterato
     for name, value in options.items():
         full = f"mpm_{name}"
         before[full] = given.getString(full) if given.hasName(full) else None
-        given.delValue(full)  # the query above has marked the option as read
+        given.delValue(full)  # the query above has marked this option as read
         given.setValue(full, value)
     try:
         yield

@@ -34,7 +34,7 @@ class Scheme:
         Tolerance, in (0, 1), of the momentum residual relative to the forces, and of the fluid residual relative to the
         exchanged fluid volume.
     most_newton, most_coupling
-        Largest numbers of Newton steps and of coupling iterations (with `fixed-stress`) in a step.
+        Largest numbers of Newton steps, and of coupling iterations with "fixed-stress", in a step.
     petsc_options
         PETSc options for the solvers, such as {"momentum_pc_factor_mat_ordering_type": "nd"}. Names begin with one of
         `petsc_options.PREFIXES`. A warning lists options that no solver of the scene reads.
@@ -42,7 +42,7 @@ class Scheme:
     Raises
     ------
     ValueError
-        If a value is out of its range. The message names the value.
+        A value is outside its range. The message names the value.
     """
 
     coupling: str
@@ -69,5 +69,5 @@ class Scheme:
 
     @property
     def beta(self) -> float:
-        """Factor f in the fixed-stress coefficient, see `COUPLINGS`. It is 1 in the scheme with `beta = 1 / K_w`."""
+        """Factor f in the fixed-stress coefficient, see `COUPLINGS`. In the scheme with `beta = 1 / K_w`, f is 1."""
         return COUPLINGS[self.coupling] or 1.0

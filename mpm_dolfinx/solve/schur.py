@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Solvers of the linearised problem, created once for the matrices of a set of active cells.
+"""Solvers of the linearised problem. One set of solvers serves while the active cells do not change.
 
     [ K  -B^T ] [du]     [R_u]
     [ B   C   ] [dp] = - [R_p]
@@ -9,8 +9,7 @@ solved by conjugate gradients (or FGMRES), with the fixed-stress operator as pre
 solves for both unknowns (`monolithic`).
 
 PETSc's PCFIELDSPLIT (full Schur factorisation) takes 0.8 to 1 times the time of these solves, and equally many
-iterations. But PCFIELDSPLIT needs a copy of -B^T for each tangent, and fixed-stress iterations would still need
-separate blocks.
+iterations. PCFIELDSPLIT also needs a copy of -B^T for each tangent. Fixed-stress iterations need separate blocks.
 """
 
 from __future__ import annotations
@@ -128,7 +127,7 @@ class LinearSolvers:
                 return
             work = momentum.unknowns.vector(), momentum.unknowns.vector()
             n, self._context = (storage.unknowns.size, None), SchurComplement(storage, self.solve_u, *work)
-            finalize(self, vars(self._context).clear)  # PETSc keeps contexts of matrices and their references
+            finalize(self, vars(self._context).clear)  # PETSc never frees the contexts of matrices, nor objects in them
             self._schur = PETSc.Mat().createPython((n, n), self._context, storage.unknowns.comm)
             self._schur.setUp()
             mumps = how.pressures == MUMPS
@@ -156,7 +155,7 @@ class LinearSolvers:
 
     @property
     def schur(self) -> tuple[PETSc.Mat, PETSc.KSP]:
-        """The Schur complement and its preconditioned solver. Raise ValueError for monolithic multigrid."""
+        """The Schur complement and its solver. Raise ValueError if multigrid solves for both unknowns."""
         if self._schur is None:
             raise ValueError("solvers: monolithic multigrid has no Schur complement; direct solvers must be used")
         return self._schur, self._solve_s
@@ -197,7 +196,7 @@ class LinearSolvers:
                     P = storage.assemble_preconditioner(self.scheme.beta, share)
                     self._solve_s.setOperators(self._schur, P)
                 factorise(self.solve_u.pc, self._solve_s.pc)
-                # reused within a step only, because a resumed run lacks factors of earlier steps
+                # reused within a step only, because a resumed run has no factors of earlier steps
                 kept.operator = not self.scheme.richardson and data is None
         if first:
             self._tell_unread()
@@ -234,7 +233,7 @@ class LinearSolvers:
             count = solved(self.solve_u, "momentum")
             return count if self.plan.iterative else 0
         if self._block is not None:
-            r = self._storage.residual  # scaled so that Euclidean norms equal the errors
+            r = self._storage.residual  # scaled so that its Euclidean norm equals the error
             of = self._storage.of_parts
             size, total = of.norms(r.array_r), of.sums(np.abs(r.array_r))
             share = np.divide(size, total, out=np.ones(of.count), where=total > 0)

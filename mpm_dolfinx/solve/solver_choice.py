@@ -21,24 +21,24 @@ class Thresholds:
     """Thresholds between methods. `bash demos/run.sh calibrate` measures times on both sides of each threshold.
 
     multigrid_3d
-        Number of unknown displacements in 3D from which multigrid is used. Two steps of a block take, with a direct
-        solver and with multigrid: 0.66 and 0.59 s with 1656 unknowns, 5.6 and 1.8 s with 5460, 32 and 4.0 s with 12784.
+        Number of unknown displacements in 3D from which multigrid is used. Two steps of a block take 0.66 s with a
+        direct solver and 0.59 s with multigrid (1656 unknowns), 5.6 and 1.8 s (5460), 32 and 4.0 s (12784).
     multigrid_2d
         The same limit in wet 2D scenes without yield. From 8000 to 74000 unknowns, the times of both solvers are equal
-        within 15 %. Beyond, the work of factors grows faster, with the number of unknowns to the power 1.5.
+        within 15 %. For larger numbers n the work of factors is larger, because it is proportional to n^1.5.
     mumps
-        Number of unknown displacements from which MUMPS computes the factors in wet scenes. With unsymmetric K this
-        holds on any number of processes, with symmetric K on several processes. The processes then share the factors.
-        Below this number, one process holds the factors of K. On one process, two steps of a yielding block take with
-        blocks of nodes and with MUMPS: 1.4 and 3.1 s with 8192 unknowns, 6.6 and 8.3 s with 32768, 18 and 36 s with
-        73728. With 100000 unknowns, the factors of K have 1.5e7 entries (0.12 GB).
+        Number of unknown displacements from which MUMPS computes the factors in wet scenes. With a symmetric K, MUMPS
+        is used on several processes only. The processes then share the factors. Below this number, one process holds
+        the factors of K. On one process, two steps of a yielding block take 1.4 s with blocks of nodes and 3.1 s with
+        MUMPS (8192 unknowns), 6.6 and 8.3 s (32768), 18 and 36 s (73728). With 100000 unknowns, the factors of K have
+        1.5e7 entries (0.12 GB).
     fallback_3d
-        Largest number of unknown displacements in 3D for which a direct solver may replace multigrid. Beyond, factors
-        need too much memory and time.
+        Largest number of unknown displacements in 3D for which a direct solver may replace multigrid. In larger scenes,
+        factors need too much memory and time.
     many
-        If a solve takes more iterations than this, a direct solver replaces multigrid, or the next tangent renews the
-        factors of the fixed-stress operator. Limits of 12, 25, 50 and 500 give equally many Newton steps (footing, 9
-        cells).
+        Largest number of iterations of a solve before a direct solver replaces multigrid, or before the next tangent
+        renews the factors of the fixed-stress operator. Limits of 12, 25, 50 and 500 give equally many Newton steps
+        (footing, 9 cells).
     coarsest
         Largest number of unknowns of multigrid's coarsest grid, which has a direct solver.
     """
@@ -83,7 +83,7 @@ class SolverPlan:
     fallback
         Direct solver that replaces the multigrid cycle on K after many iterations, or "" without such a solver.
     firmly
-        Whether multigrid uses a stronger smoother, as for nearly incompressible bodies without a fallback.
+        Whether multigrid uses a stronger smoother, for nearly incompressible bodies without a fallback.
     symmetric
         Whether K is symmetric.
     many, coarsest
@@ -137,13 +137,13 @@ def plan(
     """Return the solution method for a problem.
 
     The tangent is reused while a Newton step reduces the residual to less than 0.05 of its value, or 0.01 in wet 2D
-    scenes without yield. In 26 adaptive steps, the drained beam takes 205 Newton steps and 79 tangents with 0.05. It
-    takes 179 Newton steps and 83 tangents with 0.01, and 174 Newton steps and 94 tangents with 0.002. In 3D tangents
-    cost more, and a beam takes up to a fifth longer with 0.01.
+    scenes without yield. In 26 adaptive steps, the drained beam takes 205 Newton steps and 79 tangents with 0.05. The
+    beam takes 179 Newton steps and 83 tangents with 0.01, and 174 Newton steps and 94 tangents with 0.002. In 3D
+    tangents cost more. A beam in 3D takes up to 1.2 times the time with 0.01.
 
-    The relative tolerance of linear solves is at least 1e-5 with nonlinear laws, and 1e-3 with multigrid in 3D. With a
-    factorised stiffness, iterations are cheap, and a looser tolerance costs Newton steps. A footing on 21 cells
-    (backward Euler) takes 299 Newton steps with 1e-5, and 370 with 1e-3.
+    The relative tolerance of linear solves is at least 1e-5 with nonlinear laws, and 1e-3 with multigrid in 3D. With
+    factors of K, iterations are cheap, and a larger tolerance takes more Newton steps. A footing on 21 cells (backward
+    Euler) takes 299 Newton steps with 1e-5, and 370 with 1e-3.
 
     Parameters
     ----------
