@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""End of a step: particle domains move with the grid, their corners determine F, and their pieces store pressures.
+"""End of a step: particle domains move with the grid, F follows from their corners, and their pieces store pressures.
 
 The grid is reset at the start of the next step, see `grid_reset`.
 """
@@ -48,14 +48,14 @@ from mpm_dolfinx.stepping.stage import Stage
 from mpm_dolfinx.stepping.state import State, Stay, Trend
 
 TAKES_IN = 0.1
-"""Rate of correction of the volume defect `owed` of the points, for a motion of their connected part by a cell size.
+"""Rate at which the volume defects `owed` of points are corrected, for a motion by one cell size.
 
-In an undrained part without sources, the mean defect is corrected at once, so that the part keeps its volume. In
-drained parts the mean defect is not corrected. If it were, a column under varying gravity would have order 1.2 in the
-time step. Twenty undrained cycles of a beam of 5 cells leave spurious stresses of 7.7 % with a rate of 0, 3.8 % with
-0.1, 3.7 % with 0.2, and 3.6 % with 0.4. The corrected share of the defect grows with the number of cells. Observed
-orders of pressures in space are therefore below 2, and below 1.75 at rates of 0.2 and above. The order in time is
-unaffected.
+In an undrained connected part without sources, the mean defect is corrected at once, so that the part keeps its volume.
+In drained parts the mean defect is not corrected. With this correction, a column under varying gravity would converge
+with order 1.2 in the time step. After twenty undrained cycles of a beam of 5 cells, spurious stresses are 7.7 % with a
+rate of 0, 3.8 % with 0.1, 3.7 % with 0.2, and 3.6 % with 0.4. On finer grids a larger share of the defect is corrected.
+The order of pressures in the cell size is therefore below 2, and with rates of 0.2 or more below 1.75. The order in the
+time step does not change.
 
 Plateau (scene "beam" of tests/plateaus.py): half this value changes the result by 1.7e-03, twice this value by 2.8e-03,
 and finer cells by 1.5e-02.
@@ -102,24 +102,24 @@ class Motion:
         `state`: state at the start of the step.
         `on_grid`, `data`: the bodies on the grid, and their integration points at the start of the step.
         `loads`: loads at the end of the step.
-        `net_inflow` (n,), m^d: net inflow of fluid into the filled owned cells in the step. Without it the volume
-        defect stays unchanged.
+        `net_inflow` (n,), m^d: net inflow of fluid into the filled owned cells in the step. Without a net inflow the
+        volume defects do not change.
         `report`: report of the step, for the exception if a point leaves the grid.
         `stays`: whether points that hardly move may keep their pieces.
         `carried`: function that returns new velocities, see `Mass.carried`. Its argument (n,) is the motion of the
-        points in cell sizes, which is 0 for points that keep their pieces.
+        points in cell sizes; 0 for points that keep their pieces.
 
         Raises
         ------
         NotConverged
-            If a point is inverted, or its pores are closed.
+            A point is inverted, or its pores are closed.
         LeftGrid
-            If a point has left the grid.
+            A point has left the grid.
         """
         with _compat.Timer("move points"):
             cut, pieces = on_grid.cut, data.pieces
             for one in (pieces, *data.parts):
-                one.forget()  # memory is at its peak below
+                one.forget()  # the memory is largest below
             grid, d = cut.grid, cut.grid.dim
             nodal = self._momentum.u.x.array.reshape(-1, d)
             deformed = cache(partial(self._deformed, cut, data, nodal))
@@ -186,10 +186,10 @@ class Motion:
         """Return the expected displacements (m) of active dofs, and with fluid also the expected pressures (Pa) of
         active cells.
 
-        Both are extrapolated from the trend over `seconds` (s), see `Trend.over`. If `first` > 0, the change in a first
-        substep of this length (s), times `seconds / first`, is added. Domains move affinely. The value of a cell is the
-        volume mean of its pieces, and the value of a node is the volume mean of its cells. Ten load steps of a drained
-        beam take 50 Newton steps from rest, and 29 Newton steps from this guess.
+        Displacements and pressures are extrapolated from the trend over `seconds` (s), see `Trend.over`. If `first` >
+        0, the change in a first substep of this length (s), times `seconds / first`, is added. Domains move affinely.
+        The value of a cell is the volume mean of its pieces, and the value of a node is the volume mean of its cells.
+        Ten load steps of a drained beam take 50 Newton steps from rest, and 29 Newton steps from these values.
         """
         cut, points = on_grid.cut, state.points
         grid, pieces = cut.grid, on_grid.data.pieces
@@ -217,7 +217,7 @@ class Motion:
     def _at_rest(self, stage: Stage, t: float, nodal: NDArray[np.float64] | None) -> AtPlaces | None:
         """Return a function for the hydrostatic pressures up to a constant, or None without gravity."""
         gravity, grid = stage.gravity_at(t), self._momentum.grid
-        if gravity is None:  # even if nothing conducts: a distant body that conducts must not change pressures
+        if gravity is None:  # also without conductivity: conductivity of a distant body must not change pressures
             return None
         weight = self._materials.fluid.density * gravity
         return lambda cells, x: (x - grid.low + (0.0 if nodal is None else grid.at(cells, x, nodal))) @ weight
@@ -276,7 +276,7 @@ class Motion:
             delta[:, 2, 2] = pieces.places.stretch(nodal) if grid.axisymmetric else 1.0
         self._momentum.average(delta, data)
         columns = np.empty((len(F), d * d + 1))
-        for part in in_chunks(len(F)):  # products of all pieces at once would take as much memory as a step
+        for part in in_chunks(len(F)):  # products of all pieces would take the memory of a step
             product = delta[part] @ F[part]
             columns[part, :-1], columns[part, -1] = product.reshape(-1, d * d), determinant(product)
         mean = cut.mean(cut.to_pieces(columns))
@@ -298,8 +298,8 @@ class Motion:
         """Return the points with new F and corners, a mask of points that keep their pieces, and the number of inverted
         domains.
 
-        If Q1 cells would lock, F is scaled so that det F equals that of `deformed`. In yielded soil F is `deformed`,
-        because the corners of domains in permanent kinks of the motion would give a wrong F.
+        If Q1 cells would lock, F is scaled so that det F equals the determinant of `deformed`. In yielded soil F is
+        `deformed`, because corners of domains that contain a permanent kink of the motion would give a wrong F.
         """
         cut, stage = on_grid.cut, state.stage
         grid, folded = cut.grid, 0
@@ -342,7 +342,7 @@ class Motion:
     def _corrected(
         self, points: MaterialPoints, state: State, loads: Sequence[Loads], keeps: NDArray[np.bool_]
     ) -> MaterialPoints:
-        """Return the points after `with_volumes` has corrected the yielded domains that do not keep their pieces."""
+        """Return the points after `with_volumes` has corrected the yielded domains whose pieces are not reused."""
         grid, stage = self._momentum.grid, state.stage
         yielded = self._materials.evolved(points) & ~keeps
         if not over_all(grid.comm, int(yielded.sum())):
@@ -357,7 +357,7 @@ class Motion:
         corners[yielded] = stopped(grid, stage.conditions["walls"], corners[yielded], points.corners[yielded])
         for one in loads:
             corners = one.outside(corners, own)
-        if flat := over_all(grid.comm, int((volumes(corners) == 0).sum())):  # these cannot be cut into pieces
+        if flat := over_all(grid.comm, int((volumes(corners) == 0).sum())):  # flat domains cannot be cut into pieces
             raise NotConverged(f"the step flattens domains, {flat} in all")
         return replace(points, corners=corners, x=centroids(corners))
 
@@ -372,9 +372,9 @@ class Motion:
     ) -> dict[str, NDArray[np.float64]]:
         """Return the volume defects of the points after a step, per reference volume, and their corrections.
 
-        The step adds `(c - q) / alpha` to the defect. Here c is the increase of the fluid content, which follows from
-        volumes and cell pressures, and q is the net inflow. Both c and q are fluid masses divided by the density at
-        zero pressure. Soil with a free surface has no defect, because its fluid content excludes drained water.
+        The step adds `(c - q) / alpha` to the defect. Here c is the increase of the fluid content, computed from
+        volumes and cell pressures, and q is the net inflow. Both are fluid masses divided by the density at zero
+        pressure. Soil with a free surface has no defect, because its fluid content excludes drained water.
         """
         before = state.points
         cut = on_grid.cut
@@ -433,7 +433,7 @@ class Motion:
         return size * (points.volume0 / size.prod(axis=1))[:, None] ** (1 / size.shape[1])
 
     def _check_volumes(self, points: MaterialPoints, cut: CutDomains) -> None:
-        """Raise NotConverged for inverted points, and for pores without volume."""
+        """Raise NotConverged for inverted points and for closed pores."""
         wet, J = self._storage is not None, points.J
         least = 1 - self._materials.table(points, lambda m: m.porosity) if wet else np.zeros(len(J))
         bad = (~(J > least)).nonzero()[0]
@@ -443,7 +443,7 @@ class Motion:
             raise NotConverged(f"{what}, J <= {least.max(initial=0):.3g}: {', '.join(shown) or 'elsewhere'}")
 
     def left_grid(self, state: State, on_grid: OnGrid) -> State:
-        """Return a state in which points store the pressures of their pieces, for a reset of the grid."""
+        """Return a state for a reset of the grid, in which points store the pressures of their pieces."""
         pieces = state.pieces and self._left(state.pieces, state.points, state.stage, state.t, on_grid, False)
         return replace(state, pieces=pieces, stay=None)
 

@@ -67,8 +67,8 @@ class Start(NamedTuple):
         return partial(self.matrices.mass.carried, self.state.points, (flight.start, flight.velocity))
 
     def moves(self, flights: Sequence[Flight | None], substep: Substep) -> tuple[float, float]:
-        """Return the error and the size of the motion in the step, see `motion_error`.  They are zero if a run does not
-        need them.
+        """Return the error and the size of the motion in the step, see `motion_error`.  Both are zero if the run does
+        not need them.
 
         `flights`: velocities after each substep.
         """
@@ -120,14 +120,14 @@ class Balances(NamedTuple):
 
 
 def joined(loads: list[list[Loads]]) -> list[list[Loads]]:
-    """Return the loads of each substep.  The matrix pattern of their contacts covers the contacts of all substeps."""
+    """Return the loads of each substep.  The matrix pattern of contacts includes the contacts of all substeps."""
     if not any(map(attrgetter("couples"), chain.from_iterable(loads))):
         return loads
     return [[one.joined(of) for one, of in zip(now, zip(*loads, strict=True), strict=True)] for now in loads]
 
 
 def at_rest(scene: Scene, state: State, loads: list[list[Loads]]) -> list[list[Loads]]:
-    """Return the loads of each substep.  With `State.rest`, supports also react to the initial stress."""
+    """Return the loads of each substep.  If the state has `rest`, reactions of supports include the initial stress."""
     if state.rest is None:
         return loads
     scene.momentum.u.x.array[:] = state.rest
@@ -135,7 +135,7 @@ def at_rest(scene: Scene, state: State, loads: list[list[Loads]]) -> list[list[L
 
 
 def left(loads: Sequence[Loads], at: At, before: MaterialPoints, after: MaterialPoints) -> MaterialPoints:
-    """Return the points after a step, with data that loads store.  Raise an error if a load forbids their positions."""
+    """Return the points after a step, with the data of the loads.  Raise an error if a load forbids new positions."""
     for one in loads:
         one.check_end(after, before)
     for one in loads:
@@ -153,7 +153,7 @@ def flight_of(start: Start) -> Flight | None:
 
 
 def leads(scene: Scene, loads: Sequence[Loads]) -> bool:
-    """Return whether Newton's method may start from extrapolated motion.  It may with yield or quasi-static contact."""
+    """Return whether Newton's method may start from extrapolated motion: with yield, or with quasi-static contact."""
     momentum = scene.momentum
     return not momentum.elastic or (momentum.inertia is None and any([one.touches for one in loads]))
 
@@ -161,7 +161,7 @@ def leads(scene: Scene, loads: Sequence[Loads]) -> bool:
 def going_on(scene: Scene, start: Start, acting: Acting) -> NDArray[np.float64] | None:
     """Return the displacements (m) extrapolated from the previous substep or step, as a local array.
 
-    The result is None without previous motion, or if previous motion is a bad guess, see `leads`.
+    The result is None without previous motion, or if `leads` rejects extrapolated motion.
     """
     substep = acting.substep
     if substep.before > 0.0 and leads(scene, acting.loads):
@@ -198,7 +198,7 @@ def balances(
         own = float(substep.own * dt)
         inertia = Inertia(matrices.mass, flight.free(own, float(substep.before * dt)), 1 / own**2)
         loads = [*loads, inertia]
-        u = inertia.flight  # other initial displacements cause inertia forces that hide the imbalance
+        u = inertia.flight  # other starts cause large inertia forces that hide the imbalance
     if scene.momentum.inertia is not None:
         scene.momentum.inertia.set_substep(inertia, substep.end < 1)
     momentum = scene.balance(when, matrices.momentum, start.data, loads, u, **options)

@@ -39,11 +39,11 @@ def distribute(simulation: Distributed) -> None:
     if boxes is not None and distribute_by(simulation, boxes):
         log(grid.comm, "t = %g s: cells distributed anew among %d processes", state.t, grid.comm.size)
     elif grid.follow is None:
-        simulation.state = state.at_owners(grid)  # the step would keep a second state, with points where they were
+        simulation.state = state.at_owners(grid)  # otherwise the step would hold a second state, with the old points
 
 
 def distribute_by(simulation: Distributed, boxes: NDArray[np.int64]) -> bool:
-    """Distribute the cells by boxes (ranks, 2, d) (see `Partition`).  Return whether the scene allows this."""
+    """Distribute the cells by boxes (ranks, 2, d) (see `Partition`).  Return whether the scene allows it."""
     new = simulation.scene.distributed(boxes)
     if new is not None:
         simulation.scene, simulation.state = new, new.adopted(simulation.state)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Division and merging of elastic particle domains where grid cells become finer or coarser.
 
-A domain is bisected along a local axis if each half then extends over as many cells as the whole domain at seeding. A
-domain that stretches extends over more cells, and may therefore be divided too. Two halves merge if the merged domain
-extends over as many cells as one domain at seeding. Whole domains on the lattice of a box merge too, except at the
+A domain is bisected along a local axis if each half is at least as long, in cells, as the whole domain was at seeding.
+A stretched domain is longer in cells, and may therefore be divided too. Two halves merge if the merged domain is at
+most as long, in cells, as one domain at seeding. Whole domains on the lattice of a box merge too, except at the
 surface. Domains are not replaced if they yield, contain probes, or have a side whose displacement a condition needs.
 
 The corners of elastic domains determine F, so a division adds no error: both halves have the mapping of the whole
@@ -122,7 +122,7 @@ class Division:
     # ---- merging --------------------------------------------------------------------------------
 
     def _merging(self, state: State, axis: int) -> NDArray[np.bool_]:
-        """Return a mask of domains that are short enough along a local axis to merge with their other half."""
+        """Return a mask of halves that are short enough along a local axis to merge."""
         now, seeded = self._domains.sizes(self._grid, state.points)
         wants = _merges(now, seeded)[:, axis]
         if self._grid.comm.allreduce(int(wants.any())):
@@ -134,7 +134,7 @@ class Division:
     def _intervals(self, points: MaterialPoints, axis: int) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """Return a key of each domain, and whether the domain is an upper half.
 
-        The two halves of a divided domain have equal keys. The key of a domain that has no other half contains nan.
+        The two halves of a divided domain have equal keys. The key of a domain without a second half contains nan.
         """
         root, part = roots(points)
         place, size = self._domains.places(root), np.ptp(part, axis=2)
@@ -182,10 +182,10 @@ class Division:
 
 
 def _divides(now: NDArray[np.float64], seeded: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return along which axes each domain is at least twice as long, in cells, as its seeded domain was at seeding."""
+    """Return for each domain and axis whether its length in cells is at least twice the length of its seeded domain."""
     return now >= 2 * seeded * (1 - SAME)
 
 
 def _merges(now: NDArray[np.float64], seeded: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return along which axes each domain is at most half as long, in cells, as its seeded domain was at seeding."""
+    """Return for each domain and axis whether its length in cells is at most half the length of its seeded domain."""
     return 2 * now <= seeded * (1 + SAME)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Reset of the grid: domains are cut into pieces, active cells are found, and matrices are created.
 
-Pieces and matrices are reused until the next reset. A step begins with a reset (`Scene.on_grid`), unless no corner has
-moved by more than a small fraction of a cell since the last reset. At the end of a step only the points move
-(`advance`), and their pieces store the pressures.
+Pieces and matrices are reused until the next reset. A step begins with a reset (`Scene.on_grid`) if any corner has
+moved by more than a small fraction of a cell since the last reset. At the end of a step the points move (`advance`),
+and their pieces store the pressures.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class OnGrid(Keyed):
     """The bodies on the grid since its last reset.
 
     `quadrature`: integration points of the scene.
-    `momentum`, `storage`: forms, whose coefficients are set from the material in the cells. `storage` is None without
+    `momentum`, `storage`: forms; their coefficients are set from the material in the cells. `storage` is None without
     fluid.
     `cut`: the cut particle domains.
     `of_fluid`: whether the fixed-stress coefficient beta is 1/K_w, see `Scheme`.
@@ -125,12 +125,12 @@ class OnGrid(Keyed):
 
     @property
     def mixes(self) -> bool:
-        """Whether any cell contains several soils whose conductivities have a ratio that depends on the pressure."""
+        """Whether a cell contains several soils, and the ratio of their conductivities depends on the pressure."""
         return self._mixed is not None and self._storage.fluxes.relative is not None
 
     @cached_property
     def not_full(self) -> NDArray[np.int32]:
-        """Faces with a ghost mass: between two active cells, at least one of which is not full."""
+        """Faces with a ghost mass: faces between a partly filled cell and another active cell."""
         return self.facets[self.fill[self.cut.grid.facet_cells[self.facets]].min(axis=1) < FULL]
 
     @property
@@ -161,7 +161,7 @@ class OnGrid(Keyed):
             bulk = self._storage.bulk
             retentions, new = self._quadrature.materials.retentions, self.cut.pieces
             old, rest = state.pieces.potentials(bulk), None if retentions is None else retentions.weight.value
-            # without hydrostatic pressures, because the storage of unsaturated soil is not linear
+            # hydrostatic pressures are excluded, because the storage of unsaturated soil is not linear
             carried = transport(old if rest is None else old.less(rest), self.cut.points, new)
             carried = carried if rest is None else carried + new.x @ rest
             if state.stay:
@@ -174,10 +174,10 @@ class OnGrid(Keyed):
         return p[self.contents.filled]
 
     def _carried(self, state: State, pi: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the pressures of the pieces for which the pieces contain the pore water of the points.
+        """Return the pressures at which the pieces contain the pore water of their points.
 
-        The mass potentials pi (Pa) preserve linear fields (`fluid_content`). A constant is then added to the pressures
-        of the pieces of each point, which preserves the water of the point.
+        The transferred mass potentials pi (Pa) reproduce linear fields (`fluid_content`). A constant is then added to
+        the pressures of the pieces of each point, so that the water of the point does not change.
         """
         materials = self._quadrature.materials
         points = self.cut.points
@@ -201,14 +201,12 @@ class OnGrid(Keyed):
         return self.cut.pieces_to_cells(there + more[pieces.point])
 
     def of_pieces(self, state: State, name: str, fresh: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the data `name` (m, ...) of the pieces. Pieces that points do not keep have the values `fresh`."""
+        """Return the data `name` (m, ...) of the pieces. New pieces have the values `fresh`."""
         return state.of_pieces(name, fresh, self.cut.pieces.point)
 
     @contextmanager
     def as_reset(self, state: State) -> Iterator[QuadratureData]:
-        """Yield the integration points at the last reset. Within this context u is 0, and p is the pressure at the
-        reset.
-        """
+        """Yield the integration points at the last reset. In this context u is 0, and p is the pressure at the reset."""
         at = [(self._u.x.array, self._momentum.active.now.dofs)]
         if self._storage is not None:
             at += [(f.x.array, self.cells) for f in (self._storage.p, self._storage.p_n)]
@@ -260,8 +258,8 @@ class OnGrid(Keyed):
         """Return pressures (m,), slopes (m, d) and bounds (m, 2) in the pieces, from the pressures of the cells.
 
         In each cell, the mean of the mass potentials of the pieces is the potential of the cell. Means are weighted by
-        storage, or by volume in cells without storage. With `water`, the sum of pore water in a cell is conserved. With
-        gravity the reconstruction then acts on differences from the hydrostatic pressures `at_rest`.
+        storage, or by volume in cells without storage. With `water`, the pore water of a cell is conserved instead.
+        With water and gravity, the reconstruction acts on differences from the hydrostatic pressures `at_rest`.
 
         `store` (m,), m^d/Pa: storage of the pieces.
         `t`, s: time of the pressures on open sides.
@@ -280,7 +278,7 @@ class OnGrid(Keyed):
         seen = self._cell_pressures(p_n, stage, t, bulk, at_rest)
         slope, bounds = reconstruction(seen, origin)
         rise, here = np.add.reduce(slope[at] * (offset - origin[at]), axis=1), seen.p[contents.filled]
-        share = share_within(rise, *(bounds.T - here), at)  # drained sides may be inclined to their cells
+        share = share_within(rise, *(bounds.T - here), at)  # drained sides may be inclined to the grid
         pi = here[at] + share[at] * rise
         slope, bounds = (slope * share[:, None])[at], bounds[at]
         if at_rest is not None:
@@ -315,8 +313,7 @@ class OnGrid(Keyed):
         """Return the pressures (m,) at the centroids of the pieces, in Pa.
 
         The volume mean of the pressures in a cell is the pressure of the cell. The reconstruction acts on differences
-        from hydrostatic pressures, which cause no flow through no-flow sides. In axisymmetry centroids and means refer
-        to the sections.
+        from hydrostatic pressures. In axisymmetry centroids and means refer to the meridional section.
 
         `t`, s: time of the pressures on drained sides.
         `at_rest`: hydrostatic pressures, or None without gravity.
@@ -332,7 +329,7 @@ class OnGrid(Keyed):
     def _cell_pressures(
         self, p: NDArray[np.float64], stage: Stage, t: float, bulk: float = np.inf, at_rest: AtPlaces | None = None
     ) -> CellPressures:
-        """Return the cell pressures as mass potentials, with the data from which slopes are computed."""
+        """Return the cell pressures as mass potentials, with the data for their slopes."""
         contents = self.contents
         wet = Wet(self.cut, self.cut.points, contents, t)
         place = lambda: open_sides([one.placed(wet) for one in stage.feeding], self.cut.grid.dim)  # noqa: E731
@@ -420,12 +417,12 @@ class OnGrid(Keyed):
         return (self.contents.total(moves) == 0).nonzero()[0]
 
     def valid(self, points: MaterialPoints, loads: Sequence[Loads]) -> NDArray[np.bool_]:
-        """Return a mask (n,) of points whose connected part, and parts in contact with it, hardly move."""
+        """Return a mask (n,) of points in connected parts that hardly move, and touch no part that moves."""
         part, count = self.parts if self.cut.grid.copies == 1 else self._of_points(*self.parts_of_cells(loads))
         return self.cut.valid(points, part, count)[part]
 
     def parts_of_cells(self, loads: Sequence[Loads]) -> tuple[NDArray[np.int64], int]:
-        """Return the parts of cells, see `ActiveSet.parts_of_cells`. Parts that may touch count as one part."""
+        """Return the parts of cells, see `ActiveSet.parts_of_cells`. Parts that may touch form one part."""
         if self.cut.grid.copies == 1:
             return self.active.parts_of_cells
         pairs = np.concatenate([one.within_reach() for one in loads])
@@ -491,7 +488,8 @@ class System:
         return LinearSolvers(self.plan, self._scheme, self.momentum, self.storage)
 
     def end_step(self) -> None:
-        """Delete multigrid's coarse grids if no tangent is kept. This frees memory before the points move."""
+        """Delete multigrid's coarse grids, unless a tangent is reused. This frees memory for the motion of the
+        points."""
         if "solvers" in vars(self) and self.plan.iterative and self.solvers.tangent.value is None:
             del self.solvers
             collect_garbage(self.momentum.unknowns.comm)
@@ -564,7 +562,8 @@ class Assembled(Keyed):
     def flow(
         self, state: State, weight: NDArray[np.float64] | None, data: QuadratureData, t: float, dt: float
     ) -> tuple[list[Feeds], Callable[[bool], Outflow]]:
-        """Return the fluid conditions, and a function `outflow(begins)` for the fluxes at u (begins: see `mobility`).
+        """Return the fluid conditions, and a function `outflow(begins)` that returns the fluxes at u. `begins`: see
+        `mobility`.
 
         Without a conductivity law, cells whose points all keep their pieces have the flux geometry of the last reset.
 
@@ -579,7 +578,7 @@ class Assembled(Keyed):
         grid = self._on_grid.cut.grid
         u = self._nodal
         varies = (t,) if any([one.varies for one in self._stage.feeding]) else ()
-        at = state.points if weight is not None or varies else on_grid.cut.points  # gravity may depend on time
+        at = state.points if weight is not None or varies else on_grid.cut.points  # because gravity may depend on time
         wet = Wet(on_grid.cut, at, contents, t, data.of_points, on_grid.scale is not None, dt, state.outcome)
         feeds = [one.placed(wet) for one in self._stage.feeding]
         sides = open_sides(feeds, grid.dim)
@@ -587,7 +586,7 @@ class Assembled(Keyed):
         def mobility(begins: bool) -> Mobility:
             if self._varies:
                 return on_grid.mobility(data, begins)
-            together = [grid.comm] if mixture else []  # without pressures the key is equal on all processes
+            together = [grid.comm] if mixture else []  # a key without pressures is equal on all processes
             return self._mobility(mixture, lambda: on_grid.mobility(data, True), *together)
 
         def fit() -> Gradients | None:
@@ -641,7 +640,7 @@ def assembled(
     Raises
     ------
     ValueError
-        If a body has a free rigid-body mode. At the start of a stage, also if a connected part of a body has one.
+        A body has a free rigid-body mode. At the start of a stage, this also holds for connected parts of bodies.
     """
     grid, free = on_grid.cut.grid, stage.free
     dofs = momentum.active.now.dofs[free[momentum.active.now.nodes].ravel()]
@@ -652,7 +651,7 @@ def assembled(
             check_held(on_grid.active, free, [held for one in loads if (held := one.touching())], begins)
         return System(momentum, storage, scheme, on_grid, dofs, stiff, symmetric, loads)
 
-    # a cell may become active between active nodes, so equal dofs do not mean equal cells
+    # a cell between active nodes may become active, so active cells may differ for equal dofs
     with _compat.Timer("integration data"):
         others = pairs, on_grid.not_full if stage.inertia else None, () if grid.follow is None else grid.lines
         system = systems((stage, on_grid.cells, dofs, on_grid.penalised, *others), make, grid.comm)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """State at the start of each stage: the initial state, and the state after changes of bodies, conditions or point data.
 
-Initial stresses and errors of the discretisation leave out-of-balance forces. Steps of the momentum balance at constant
-pressures remove these forces. The steps add to the elastic strain of the points, and do not change their positions.
+Initial stresses, and discretisation errors, cause out-of-balance forces. Steps of the momentum balance at constant
+pressures remove these forces. These steps change the elastic strains of the points, but not their positions.
 """
 
 from __future__ import annotations
@@ -52,11 +52,11 @@ from mpm_dolfinx.stepping.state import State, Stay
 from mpm_dolfinx.stepping.step import set_up
 
 DEPTH, PATIENCE, LESS = 40, 16, 0.7
-"""Anderson mixing of `DEPTH` iterations ends when `PATIENCE` successive residuals exceed `LESS` times the best one.
+"""Anderson mixing of `DEPTH` iterations ends if `PATIENCE` successive residuals exceed `LESS` times the least residual.
 
-The tests are a wet bank, elastic or frictional, and blocks on a rough base, one of which is half supported. Depth 40
-with patience 16 takes as many iterations as depth 80 with patience 24. Both leave relative forces of 4e-5 to 3e-9.
-Depth 40 with patience 8 leaves relative forces of 6e-3.
+The tests are a wet bank, elastic or frictional, and blocks on a rough base; one block is half supported. Depth 40 with
+patience 16 takes as many iterations as depth 80 with patience 24. The relative out-of-balance forces are then 4e-5 to
+3e-9. Depth 40 with patience 8 ends at 6e-3.
 """
 REMARKABLE = 0.05
 """Largest change of stress by balancing without a warning, divided by the largest initial stress.
@@ -133,7 +133,7 @@ def begin_stage(
     state, tractions = _released(scene, state, after, new_quiet) if new_quiet else (state, {})
     scene.rests_at(before, state.t)
     state = scene.followed(state)
-    if state.stays:  # points have the pressures of their cells, not of their pieces
+    if state.stays:  # points have the pressures of cells, not of pieces
         state = scene.motion.left_grid(state, scene.on_grid(state.stay.points))
     rests = after.inertia and not before.inertia and (not state.begins or state.held is not None)
     state, supported = replace(state, stay=None), _holds_as(after, before)
@@ -178,8 +178,8 @@ def _released(
 ) -> tuple[State, dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]]:
     """Return the state on the grid of the next step, and the tractions on quiet sides.
 
-    The tractions are a dict by name of point data, with ids and tractions of points on a side. The stresses are in
-    equilibrium with these tractions, the loads of the previous stage, and the remaining supports.
+    The tractions are a dict: name of the point data, then ids of points on a side and their tractions. The stresses are
+    in equilibrium with these tractions, the loads of the previous stage, and the remaining supports.
     """
     start = set_up(scene, state, 0.0)
     state, momentum = start.state, scene.momentum
@@ -213,8 +213,8 @@ def _released(
 def _kept_at_rest(scene: Scene, state: State) -> State:
     """Return the state on the grid of the next step, with forces that keep its bodies at rest.
 
-    Bodies are in equilibrium under the loads of the present stage. A reset of the grid leaves a small imbalance, which
-    the forces balance. With contact the state has no such forces, because contact removes penetrations of the last
+    Bodies are in equilibrium under the loads of the present stage. A reset of the grid causes small out-of-balance
+    forces, which these forces cancel. With contact they are omitted, because contact removes penetrations of the last
     step.
     """
     start, forms = set_up(scene, state, 0.0), scene.momentum
@@ -251,7 +251,7 @@ def _without_data(points: MaterialPoints, names: Collection[str]) -> MaterialPoi
 
 
 def _holds_as(after: Stage, before: Stage) -> bool:
-    """Return whether the same conditions support the same faces."""
+    """Return whether the conditions that support faces, and these faces, are the same in two stages."""
     return len(after.held) == len(before.held) and all(
         hold is was and np.array_equal(faces.id, then.id) and np.array_equal(faces.xi, then.xi)
         for (hold, faces, _), (was, then, _) in zip(after.held, before.held, strict=True)
@@ -259,7 +259,7 @@ def _holds_as(after: Stage, before: Stage) -> bool:
 
 
 def _check_weight(after: Stage, before: Stage | None, t: float) -> None:
-    """Raise ValueError if a stage with quiet sides changes the weight, which their tractions cannot balance."""
+    """Raise ValueError if a stage with quiet sides changes the weight: their tractions would not balance it."""
     quiet = after.of(Quiet)
     now = after.gravity_at(t) if quiet else None
     was = None if before is None else before.gravity_at(t)
@@ -279,7 +279,7 @@ def _with_contacts(before: Stage, conditions: Sequence[Condition]) -> list[Condi
 
 
 def _warn_moved_on(scene: Scene, before: Stage, after: Stage) -> None:
-    """Warn of each unchanged condition that also acts on faces exposed by an excavation."""
+    """Warn of each unchanged condition that now also acts on faces exposed by an excavation."""
     stop = np.cumsum([len(body) for body in scene.bodies])
     for name, condition in after.given.items():
         if not hasattr(condition, "side") or before.given.get(name) is not condition:
@@ -361,7 +361,7 @@ def pieces_at_start(scene: Scene, points: MaterialPoints) -> PiecePressures:
     bulk = scene.fluid.bulk
     pi = mass_potential(
         cut.pieces_to_cells(pressure_at(pressure, cut.pieces.x + grid.base)), bulk
-    )  # potentials are additive in a cell
+    )  # potentials in a cell may be added
     store = on_grid.weight * on_grid.data.pieces["storage"][:, 0]
     held = contents.total(store)
     weight = np.where(held[contents.slot(cut.cells)] > 0, store, on_grid.weight)
@@ -381,16 +381,16 @@ def pieces_at_start(scene: Scene, points: MaterialPoints) -> PiecePressures:
 def balanced(scene: Scene, state: State) -> State:
     """Return a state with stresses in equilibrium with the loads at its time and with its pore pressures.
 
-    For points with the strain of a displacement w, a step of the momentum balance gives a further displacement u(w).
-    Points store only mean strains of their domains, so `w + u(w)` is not in equilibrium yet. The fixed-point iteration
-    `w <- w + u(w)` follows, with Anderson mixing (Walker and Ni 2011). Mean strains cannot balance all nodes. The nodal
-    forces `State.held` balance the remainder. Support forces are evaluated at the displacement w (`State.rest`). Sides
-    therefore stay at their seeded positions for any displacement prescribed at the start.
+    If points have the strain of a displacement w, a step of the momentum balance gives a further displacement u(w).
+    Points store only mean strains of their domains, so `w + u(w)` is not in equilibrium yet. Therefore the fixed-point
+    iteration `w <- w + u(w)` follows, with Anderson mixing (Walker and Ni 2011). Mean strains cannot balance all nodal
+    forces. The forces `State.held` balance the remainder. Support forces are evaluated at the displacement w
+    (`State.rest`). Sides therefore stay at their seeded positions for any displacement prescribed at the start.
 
     Raises
     ------
     ValueError
-        If there is no equilibrium with these laws.
+        No equilibrium exists with these laws.
     """
     forms, materials = scene.momentum, scene.materials
     try:
@@ -439,9 +439,9 @@ def balanced(scene: Scene, state: State) -> State:
 
 
 def _report(scene: Scene, seeded: State, points: MaterialPoints, count: int, left: float, touches: bool) -> None:
-    """Log the changes by balancing, and raise ValueError for a large relative residual.
+    """Log the changes of the stresses, and raise ValueError for a large relative residual.
 
-    Contact is detected only in the first step. With contact, a large residual therefore causes only a warning.
+    With contact, a large residual causes only a warning, because contact is detected in the first step.
     """
     materials, comm = scene.materials, scene.grid.comm
     if left > REMARKABLE and not touches:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Grid lines that move with a body or tool.  Each reset computes the lines from the state, even in a resumed run."""
+"""Grid lines that move with a body or tool.  A reset of the grid computes the lines from the state."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def with_lines(grid: Grid, state: State, left: Callable[[State], State]) -> Stat
 
     All domains are cut anew if any line moves by more than `STILL` cells.
 
-    `left`: function that adds pressures of pieces to a state with kept pieces. It is called before the grid moves.
+    `left`: function that adds pressures of pieces to a state, and is called before the grid moves.
     """
     grid.move(state.lines)
     before = grid.lines

@@ -1,18 +1,19 @@
 # SPDX-License-Identifier: MIT
 """Renewal: replacement of distorted particle domains of flowing soil by new ones, at a reset of the grid.
 
-F of yielded soil is updated by increments, so its domains are used for integration only. They may be replaced if the
-new domains fill the region of the old domains, and keep the surface and the contents of the region. Cells with a piece
-of a domain longer than `LONGEST` are filled anew:
+F of yielded soil is updated by increments, so domains serve for integration only. New domains may replace these domains
+if they fill the same region, and keep its surface and contents. Cells with a piece of a domain longer than `LONGEST`
+are filled anew:
 
 * A full cell is divided into four equal domains.
 * A cell that the surface crosses once is filled with quadrilaterals about the centroid of the filled part. `EDGES`
-edges replace the surface in the cell. Ends, sharp corners and area (in axisymmetry volume) do not change.
+edges replace the surface in the cell. Ends and sharp corners of the surface, and the filled area (in axisymmetry
+volume), do not change.
 
 Remainders of old domains outside these cells become domains. Masses, volumes and the mass of the fluid are exact in
-each cell. Mass-weighted sums of other point data are also exact, such as the logarithm of the elastic left Cauchy-Green
-tensor. Point data of a new domain are means over its overlaps with old domains. The means are shifted to the new
-centroid by fitted slopes, within the range of the old values. With inertia, the centre of mass, the momentum and the
+each cell. Mass-weighted sums of other point data, such as the logarithm of the elastic left Cauchy-Green tensor, are
+exact too. Point data of a new domain are means over its overlaps with old domains. Fitted slopes extrapolate these
+means to the new centroid, within the range of the old values. With inertia, the centre of mass, the momentum and the
 angular momentum of each cell are exact too. Cells are unchanged if they contain elastic soil, several bodies, several
 crossings of the surface, or domains on a side whose displacement a condition needs.
 """
@@ -42,7 +43,7 @@ from mpm_dolfinx.points.material_points import ACROSS, MaterialPoints, body_of, 
 from mpm_dolfinx.stepping.state import State, Stay
 
 LONGEST = 1.0
-"""Largest length of a domain, in cell sizes. Edges of longer domains would have to bend. Source: definition."""
+"""Largest length of a domain, in cell sizes. Longer domains would need curved edges. Source: definition."""
 
 
 class Renewal:
@@ -65,7 +66,7 @@ class Renewal:
         return misshapen(self._grid, points.corners, LONGEST)
 
     def flowed(self, points: MaterialPoints) -> NDArray[np.bool_]:
-        """Return a mask (n,) of yielded or renewed points. It is False for laws without the state `plastic`."""
+        """Return a mask (n,) of yielded or renewed points. Laws without the state `plastic` have False."""
         if "plastic" not in points.data:
             return np.zeros(len(points), dtype=bool)
         known = np.array(["plastic" in law.state for law in self._materials.laws])[self._materials.law_of(points)]
@@ -139,7 +140,7 @@ class Renewal:
     ) -> NDArray[np.float64]:
         """Return the pressures of new domains, so that their cells contain the fluid of the old domains.
 
-        Domains of a group have the mean of the old pressures, weighted by storage, or by volume without storage.
+        All domains of a group have one pressure: the mean of the old pressures, weighted by storage, or else by volume.
         """
         materials, pieces = self._materials, work.pieces
         bulk = materials.fluid.bulk
@@ -195,7 +196,7 @@ class Renewal:
         volume0, volume = (size / one / sum_by(group, size / one, count)[group] for one in (like, 1.0))
         if work.pieces.second.size:
             volume0, volume = (centred(work, group, x, *of) for of in ((volume0, mass), (volume, mass * J)))
-        volume0, volume = M[group] * volume0, V[group] * volume  # mass and volume are both exact
+        volume0, volume = M[group] * volume0, V[group] * volume  # both mass and volume are exact
         ratio = volume / volume0
 
         def kept(values: NDArray) -> NDArray:
@@ -219,7 +220,7 @@ class Renewal:
         d = points.F.shape[1]
         stretch = ratio[:, None, None] ** (1 / d)
         F = stretch * np.eye(d)
-        fixed = x * [not self._grid.axisymmetric, True]  # radii too are stretched
+        fixed = x * [not self._grid.axisymmetric, True]  # radii are stretched too
         data = {}
         logs = np.zeros((len(points), 3, 3))
         logs[work.affected] = _of_tensors(np.log, self._elastic(points, np.flatnonzero(work.affected)))

@@ -17,7 +17,7 @@ from mpm_dolfinx.conditions.acting import MOTIONS, QUANTITIES
 from mpm_dolfinx.conditions.names import ByName
 
 OUTCOMES = (*QUANTITIES, *MOTIONS, "energy", "runoff", "flowed", "ran_off", "ponded")
-"""Quantities of the package's conditions. User-defined conditions may have others."""
+"""Quantities of the package's conditions. User-defined conditions may have other quantities."""
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class Result:
     """Histories of a run, with one row for each output time, including the start.
 
     Histories are read-only arrays (n, ...) for n output times. Quantities that were not recorded have an axis of length
-    0, such as (n, 0, d) without probes.
+    0: without probes, displacements have the shape (n, 0, d).
 
     Parameters
     ----------
@@ -49,15 +49,15 @@ class Result:
     wall, profile
         Wall times, s: of the whole run, and of each part of the run on this process.
     converged
-        Whether the run has reached its end.
+        Whether the run has reached `t_end`, or an event has ended it.
     event
-        Index in `until` (from 0) of the function that ended the run, and time (s) of this event. None without an event.
+        Index in `until` (from 0) of the function that ended the run, and the time (s). None without an event.
     points
         Number of material points at the end of the run.
     memory
         Peak memory (MB) of all processes, including libraries.
     imbalance
-        Largest number of points, pieces and cells on a process, each divided by its mean, see `summary.imbalance`.
+        Largest number of points, of pieces and of cells on a process, divided by the mean, see `summary.imbalance`.
     """
 
     rows: Rows = field(default_factory=Rows, repr=False)
@@ -148,9 +148,9 @@ class Result:
         `kinetic` and `elastic` are energies of bodies and free tools. `elastic` is 0 for laws of unknown elastic
         energy. Works are summed from the start of the run. `external` is the work of all loads. `viscous` is the work
         of quiet sides and of the user's terms. `friction` is the work of slip at tools and between groups. `internal`
-        is the work of the stresses. `dissipated` is `internal` minus `elastic`, in wet bodies with the work of flow and
-        storage of water. With `Numerics(renewal=True)`, `renewal` is the kinetic and elastic energy that renewed
-        domains have lost. The sum `kinetic` + `elastic` + `dissipated` + `viscous` + `friction` + `renewal` -
+        is the work of the stresses. `dissipated` is `internal` minus `elastic`; in wet bodies it includes the work of
+        flow and storage of water. With `Numerics(renewal=True)`, `renewal` is the kinetic and elastic energy that
+        renewed domains have lost. The sum `kinetic` + `elastic` + `dissipated` + `viscous` + `friction` + `renewal` -
         `external` is constant, up to numerical dissipation.
         """
         return self.outcome("energy")
@@ -175,8 +175,8 @@ class Result:
         """Return the histories as an xarray data set, with units as attributes of its variables.
 
         Dimensions are time, probe and axis. Stresses at probes have the dimensions row and column instead of axis.
-        Variables of conditions have the conditions' names. The data set's attributes are the counts of the run. Raise
-        ImportError if xarray is not installed.
+        Variables of conditions have the conditions' names. Attributes of the data set are the numbers of steps and
+        iterations. Raise ImportError if xarray is not installed.
         """
         counts = {name: getattr(self, name) for name in ("steps", "newton", "cuts", "balance", "residual", "wall")}
         return data_set(self, {name: self.outcome(name) for name in OUTCOMES}, counts)
@@ -200,7 +200,7 @@ class Result:
         )
 
     def shares(self) -> str:
-        """Return a table with the time (s) and the share of each part of the run, the memory, and the imbalance."""
+        """Return a table: time (s) and share of each part of the run, memory, and imbalance."""
         rows = [*self.profile.items(), ("rest", self.wall - sum(self.profile.values()))]
         lines = [f"{name:18} {s:8.2f} s {100 * s / max(self.wall, 1e-9):5.1f} %" for name, s in rows]
         if self.points:  # measured at the end of a run
@@ -223,7 +223,7 @@ class GaveUp(RuntimeError):
     result
         Histories up to the last good output time.
     history
-        Relative residuals (momentum, storage) of the failed step's iterations, if any.
+        Relative residuals (momentum, storage) in the iterations of the failed step, if any.
     """
 
     def __init__(self, message: str, result: Result, history: Sequence[tuple[float, float]] = ()):

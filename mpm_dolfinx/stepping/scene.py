@@ -68,7 +68,7 @@ class Scene:
     `pressure`: initial pore pressure, Pa, or a function of position.
     `extensions`: user-defined terms in the balance of momentum, and in the storage of fluid.
     `initial`: initial stresses of bodies, see `initial_stress.by_body`.
-    `velocity`: initial velocity, m/s, if bodies may have inertia, see `Simulation`.  Otherwise None.
+    `velocity`: initial velocity, m/s, see `Simulation`; None if bodies cannot have inertia.
     """
 
     def __init__(
@@ -123,7 +123,7 @@ class Scene:
             self.storage = StorageForms(pieces, self.momentum.u, p, self.momentum.active, *of_fluid)
         keeps_volumes = numerics.keep_volumes and numerics.quadrature == "domain" and scene.evolves
         self.motion = Motion(scene, bodies, self.momentum, self.storage, keeps_volumes)
-        # checks that remain to be made; they affect only the log
+        # checks still to be made, which only write to the log
         self._looks = (warn_overlaps, *[partial(warn_mixed, materials=scene)] * scene.varied)
         self._assembled: Latest[Assembled] = Latest()
         self._on_grid: Latest[OnGrid] = Latest(self._assembled)
@@ -187,7 +187,7 @@ class Scene:
 
     @cached_property
     def _warned(self) -> set[str]:
-        """Subjects of earlier warnings.  They affect only the log."""
+        """Subjects of earlier warnings, which are not repeated."""
         return set()
 
     def look_at(self, gravity: Sequence[NDArray[np.float64] | None]) -> None:
@@ -201,7 +201,7 @@ class Scene:
             self._warned.add("gravity")
 
     def rests_at(self, stage: Stage, t: float) -> None:
-        """Set the unit weight of the fluid, from which `Retentions` computes the pressure variation in unsaturated
+        """Set the unit weight of the fluid, with which `Retentions` computes hydrostatic pressures in unsaturated
         cells.
 
         If gravity varies, each step resets the grid.  `t`, s: start of a step, at which the gravity of `stage` is
@@ -214,9 +214,8 @@ class Scene:
     def distributed(self, boxes: NDArray[np.int64]) -> Scene | None:
         """Return an equal scene on a grid distributed by boxes (ranks, 2, d), see `Partition`, or None.
 
-        Scenes with user-defined terms give None, because the terms may be defined on the present mesh.  Scenes with a
-        function of position that does not return the same values when called again, such as a random field, give None
-        too.
+        The result is None for user-defined terms, because these may be defined on the present mesh.  The result is also
+        None if a second call of a function of position returns other values, as for a random field.
         """
         if self.extended:
             return None
@@ -267,7 +266,7 @@ class Scene:
         return self._on_grid((points.arrays, lines), make, grid.comm)
 
     def check_followed(self, first: Stage) -> None:
-        """Raise ValueError if grid lines follow a tool that is absent from the first stage, and never move."""
+        """Raise ValueError if grid lines follow a tool that is absent from the first stage: they would never move."""
         follow = self.grid.follow
         if hasattr(follow, "pose") and first.followed(self.grid) is None:
             raise ValueError(f"grid: follow = {line(follow)}, not in the first stage, must be one of its conditions")
@@ -312,7 +311,8 @@ class Scene:
     def for_reset(self, state: State, renew: bool) -> tuple[State, int]:
         """Return a state for a reset of the grid, and the number of renewed domains.
 
-        Points are on the owners of their cells.  A state in which all points keep their pieces is unchanged.
+        In the returned state, points are on the owners of their cells.  If all points keep their pieces, the state is
+        unchanged.
 
         `renew`: whether renewal is allowed.
         """

@@ -77,7 +77,7 @@ def contacts_of(conditions: Sequence[Any]) -> list[Contact]:
 
 
 def named(conditions: Sequence[Any]) -> dict[str, Any]:
-    """Return the conditions by name.  A default name consists of kind and side, and a number if necessary.
+    """Return the conditions by name.  Default names consist of kind and side, and of a number if necessary.
 
     Raises
     ------
@@ -113,7 +113,7 @@ class Stage:
     """The conditions of a stage."""
 
     given: Mapping[str, Condition]  # conditions by name, as given
-    named: Mapping[str, Condition]  # the same; water pressures have the unit weight of the pore fluid
+    named: Mapping[str, Condition]  # as `given`, but water pressures have the unit weight of the pore fluid
     conditions: Mapping[str, Any]  # walls (in axisymmetry also the axis), and gravity
     present: tuple[bool, ...]  # whether each body is present
     later: tuple[int, ...]  # indices of bodies to be added
@@ -197,7 +197,7 @@ class Stage:
 
     @property
     def lasting(self) -> list[Surface]:
-        """Faces for which conditions need displacements from seeded positions.  Domains there must not be replaced."""
+        """Faces whose displacements from seeding a condition needs.  Domains with these faces must not be replaced."""
         return [*(faces for _, faces, _ in self.held), *(faces for one in self.acting for faces in one.seeded)]
 
     @property
@@ -261,7 +261,7 @@ def stage(
     """Return a stage.
 
     `bodies`, `materials`: all bodies and materials of the scene.
-    `momentum`, `fed`: forms, with the loads of all stages, and terms that act in the balance of fluid in all stages.
+    `momentum`, `fed`: forms of the balance of momentum, and terms that act in the balance of fluid in all stages.
     `conditions`: walls, conditions, gravity and inertia: see `Simulation`.
     `present`: whether each body is present.
     `later`: indices of bodies still to be added.
@@ -269,7 +269,7 @@ def stage(
     Raises
     ------
     ValueError
-        If a condition is invalid.  The message has its name, its value and the allowed values.
+        A condition is invalid.  The message has the name, the value and the allowed values of the condition.
     """
     grid, fluid = materials.grid, materials.fluid
     given_by_name = named(checked(conditions["conditions"]))

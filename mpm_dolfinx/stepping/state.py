@@ -37,7 +37,7 @@ class StepControl:
     Parameters
     ----------
     interval : s
-        Output interval of the run, 0 without an interval.
+        Output interval of the run; 0 for output times without equal intervals.
     small : s
         Next trial step.
     waits, kept
@@ -49,7 +49,7 @@ class StepControl:
     start : (2, bodies), Pa
         Smallest and largest cell pressures of each body at the start of the run, or None before the first step.
     motion : J^(1/2)
-        Largest motion since the start of the run, see `motion_error`. None if it is not used.
+        Largest motion since the start of the run, see `motion_error`; None if the run does not limit errors of motion.
     filled
         Largest change of the water content in a step since the start of the run.
     """
@@ -67,12 +67,12 @@ class StepControl:
 
 @dataclass(frozen=True, eq=False)
 class Stay:
-    """Reused pieces: points that have hardly moved since the last reset of the grid keep the pieces of their domains.
+    """Points that have hardly moved since the last reset of the grid, and therefore keep the pieces of their domains.
 
     points
         The material points at the reset of the grid.
     keeps : (n,)
-        Whether each point keeps its pieces, or None if all points keep them.
+        Whether each point keeps its pieces; None if all points keep their pieces.
     """
 
     points: MaterialPoints
@@ -101,7 +101,7 @@ class Trend:
     def over(self, seconds: float, implicit: bool = False, first: float = 0.0) -> NDArray[np.float64]:
         """Return the changes (n, ...) in a time `seconds` (s), from the polynomial through the last states.
 
-        `implicit`: whether the rate at the end of this time replaces the mean rate.
+        `implicit`: whether the rate at the end of the time replaces the mean rate.
         `first`, s: length of a first substep. If it is positive, the implicit change in this substep, times
         `seconds / first`, is subtracted.
         """
@@ -122,13 +122,13 @@ NODAL = ("velocity", "held", "rest")
 class State:
     """All data of a scene that one step passes to the next. States are immutable: each step returns a new state.
 
-    A checkpoint stores all of these data except two: the stage, which the script defines, and the watched points.
+    A checkpoint stores all of these data, except the stage, which the script defines, and the points `watched`.
 
     t
         Time, s.
     points
-        Material points of this process, with positions relative to the grid's `base`. A state does not accept
-        `Simulation.points`, which have true positions; `PlacedPoints.from_base` converts them.
+        Material points of this process, with positions relative to the grid's `base`. `Simulation.points` have true
+        positions, and are not accepted; `PlacedPoints.from_base` converts them.
     pieces
         Pressures of the pieces of the particle domains, for the transfer to the next grid. None without fluid.
     stay
@@ -136,11 +136,11 @@ class State:
     resets
         Number of resets of the grid.
     lines
-        Coordinates (n,), m, of moving grid lines at the last reset of the grid, by axis "x", "y", "z". They are
-        relative to the `base` of the grid. None before a reset, and for grids whose lines do not move.
+        Coordinates (n,), m, of moving grid lines at the last reset of the grid, by axis "x", "y", "z". These
+        coordinates are relative to the `base` of the grid. None before a reset, and for grids with fixed lines.
     outcome
-        Results of conditions at the end of the last step, by quantity and name. They are nan for new conditions before
-        the first step of a stage. `reactions` (d,), N: forces of prescribed displacements on the bodies.
+        Results of conditions at the end of the last step, by quantity and name. Results of new conditions are nan
+        before the first step of a stage. `reactions` (d,), N: forces of prescribed displacements on the bodies.
         `wall_reactions` (d,), N: forces of the grid's walls on the bodies. `outflows`, m^3/s (m^2/s in plane strain):
         flow through open sides, as volumes at zero pressure. `tool_forces` (d + 1,), in 3D (6,): forces (N) and moments
         (N m) of tools and contacts on the bodies. `tool_travel`, m: displacement of a load-controlled tool in addition
@@ -156,8 +156,8 @@ class State:
         Motion in the last steps, for the initial guess in elastic bodies. None in other scenes, and after bodies were
         added.
     held : (unknowns,), N
-        Nodal forces on this process, with ghosts. They balance an initial stress where loads do not, or keep a body at
-        rest when inertia begins. None without such forces, in other stages, and after a reset of the grid.
+        Nodal forces on this process, with ghosts. These forces balance an initial stress where loads do not, or keep a
+        body at rest when inertia begins. None without such forces, in other stages, and after a reset of the grid.
     rest : (unknowns,), m
         Nodal displacement on this process, with ghosts, for which prescribed displacements and plates balance an
         initial stress. None after a stage that changes these conditions, and after a reset of the grid.
@@ -196,13 +196,13 @@ class State:
 
     @property
     def as_cut(self) -> MaterialPoints:
-        """Points at the positions of their cut. Points that do not keep their pieces are at their present positions."""
+        """Points at the positions where their domains were cut, or at present positions without kept pieces."""
         if self.stay is None:
             return self.points
         return self.stay.points if self.stay.keeps is None else self.stay.points.where(self.stay.keeps, self.points)
 
     def of_pieces(self, name: str, fresh: NDArray[np.float64], point: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the data `name` (m, ...) of the pieces. Pieces that points do not keep have the values `fresh`.
+        """Return the data `name` (m, ...) of the pieces. New pieces have the values `fresh`.
 
         `point` (m,): index of the point of each piece.
         """
