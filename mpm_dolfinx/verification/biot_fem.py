@@ -124,8 +124,8 @@ class BiotFEM:
         `Traction`, `Pressure`, `RigidPlate` and `Drained` on sides.  With "taylor-hood", `Drained` acts on facets that
         lie wholly in its region.  All other sides are free of loads, and undrained.
     pressure : Pa
-        Initial pore pressure, or a function of positions x (n, d), in m.  The initial effective stress is zero, so that
-        loads or strains must balance the initial pressure.
+        Initial pore pressure, or a function of positions x (n, d), in m.  The initial effective stress is zero.  Loads
+        or strains must therefore balance the initial pressure.
     gravity : callable t -> (d,), m/s^2
         Acceleration of gravity as a function of time.
     terms
@@ -185,7 +185,7 @@ class BiotFEM:
         self.tolerance, self._t = numerics.tolerance, fem.Constant(self.grid.mesh, 0.0)
         self._substeps = substeps(numerics.method, fluid is not None or bool(terms))  # terms may depend on the velocity
         self.scale = float(np.max(material.at(self.grid.midpoints + self.grid.base).oedometric))
-        """Unit of the unknown pressure, in Pa.  Both equations are divided by it."""
+        """Unit of the unknown pressure, in Pa.  Both equations are divided by this unit."""
         self._pores = Pores(self.grid.mesh, material.retention if fluid else None, self.scale)
         self._whole = fem.Constant(self.grid.mesh, 1.0)
         """Factor, 0 or 1, of the derivative of k_r in the tangent."""
@@ -286,7 +286,7 @@ class BiotFEM:
         return area * float(np.squeeze(self.grid.around(middle[None])))
 
     def _on(self, condition: Traction | Pressure | Drained | RigidPlate, integrand):
-        """Return the integral over the area on which a condition acts, as UFL."""
+        """Return the integral of `integrand` over the area on which a condition acts, as UFL."""
         low, high = map(self._constant, self._box(condition.side, condition.region))
         for a, x in enumerate(ufl.SpatialCoordinate(self.grid.mesh)):
             integrand = ufl.conditional(ufl.And(ufl.ge(x, low[a]), ufl.le(x, high[a])), integrand, 0.0)
@@ -477,7 +477,7 @@ class BiotFEM:
         self._take(x)
         b = self._assemble(self._space.b, self._forms.residual)
         b.axpy(-1.0, _compat.petsc_vec(self._space.f))
-        # no lifting: every iterate satisfies the prescribed values
+        # no lifting, because every iterate satisfies the prescribed values
         petsc.set_bc(b, self._bcs, _compat.petsc_vec(self._space.w), -1.0)
         b.copy(out)
 
@@ -558,9 +558,9 @@ class BiotFEM:
     def _restrained(self, x: PETSc.Vec) -> tuple[list[float], int]:
         """Solve by Newton steps with limited pressure changes, see `retention.restrained`.  Return as `_free` does.
 
-        The first tangent omits the derivative of k_r (Celia, Bouloutas and Zarba 1990).  Tangents after a limited step
-        or an increase of the residual omit it too.  In dry soil under gravity, this derivative can reverse the Newton
-        step.
+        The first tangent omits the derivative of k_r (Celia, Bouloutas and Zarba 1990).  Tangents after a limited step,
+        or after an increase of the residual, omit this derivative too.  In dry soil under gravity, the derivative may
+        reverse the Newton step.
         """
         snes, of_p = self._snes, self._space.p_dofs
         of_p = of_p[of_p < x.getLocalSize()]

@@ -135,7 +135,7 @@ def element_test(
     ValueError
         An argument is invalid.
     NotConverged
-        The law does not reach the prescribed stress, even in short steps.
+        No strain gives the prescribed stress, even in short steps.
     """
     instance("material", material, Skeleton)
     if test not in KINDS:

@@ -2,10 +2,10 @@
 """Exact solutions for comparison: consolidation, columns, beams and rods.  The module needs no dolfinx.
 
 Stress is positive in tension, pore pressure in compression, as in the rest of the package.  The dimensionless time of
-consolidation is T = c_v t / length².  The series of exponentials converges slowly for small T.  For T < `SWITCH` the
-Laplace transform of the solution is inverted in closed form, with tanh X and coth X replaced by 1, where X = sqrt(s).
-The errors of the series and of the closed form are at most of the order of erfc(1/sqrt(`SWITCH`)) < 2e-23.  Both are
-therefore exact to round-off.
+consolidation is T = c_v t / length².  The series of exponentials converges slowly for small T. For T < `SWITCH` a
+closed form replaces the series: the inverse Laplace transform of the solution, with 1 in place of tanh sqrt(s) and coth
+sqrt(s).  The errors of the series and of the closed form are at most of the order of erfc(1/sqrt(`SWITCH`)) < 2e-23.
+Both are therefore exact to round-off.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from scipy.special import ellipe, ellipeinc, ellipkinc, ellipkm1, erf, erfc, erf
 from mpm_dolfinx.base.tolerances import EPSILON, ROUND_OFF, SAME, TINY
 
 SWITCH = 0.02  # dimensionless time below which the closed form is used.  Source: both forms are exact
-TERMS = 20  # number of exponentials.  Source: exact bound, the last is below exp(-70)
+TERMS = 20  # number of exponentials.  Source: exact bound, the last term is below exp(-70)
 Array = NDArray[np.float64]
 
 
@@ -214,7 +214,7 @@ def cryer_pressure(t: ArrayLike, radius: float, cv: float, nu: float, p0: float 
     ----------
     t : (...), s, > 0; time
     radius : m, > 0; radius of the sphere
-    cv : m²/s, > 0; coefficient of consolidation kappa (K + 4G/3), because fluid and grains are incompressible
+    cv : m²/s, > 0; coefficient of consolidation kappa (K + 4G/3) with incompressible fluid and grains
     nu : in (-1, 0.5); drained Poisson ratio
     p0 : Pa; uniform pressure on the surface, equal to the pore pressure at t = 0+
 
@@ -247,8 +247,8 @@ def _cryer_long(mu: float, T: Array) -> Array:
 class SelfWeightColumn:
     """Column of Hencky's material without lateral strain, standing at Y = 0 under its own weight.
 
-    The Cauchy stress and the first Piola-Kirchhoff stress along the column are both tau / stretch, because there is no
-    lateral stretch.  This stress balances the weight above Y.  For nu = 0, K + 4G/3 is Young's modulus.
+    Without lateral stretch, the Cauchy stress and the first Piola-Kirchhoff stress along the column are both tau /
+    stretch.  This stress balances the weight above Y.  For nu = 0, K + 4G/3 is Young's modulus.
 
     Parameters
     ----------
@@ -302,7 +302,7 @@ class SelfWeightColumn:
 def elastica_tip(load_parameter: float) -> tuple[float, float]:
     """Return the tip displacement of an inextensible cantilever under a dead transverse load at its tip.
 
-    load_parameter, in [0, 1e5]: P L²/(E I)
+    load_parameter, in [0, 1e5]: P L²/(E I), with the load P, the length L and the bending stiffness E I
 
     Returns (shortening u/L, deflection v/L), with absolute errors of 1e-12.
 

@@ -37,8 +37,8 @@ class Pores:
     def between(self, p0, p1):
         """Return the mean of k_r between the pressures p0 and p1 as a UFL expression.
 
-        The mean is a Gauss quadrature over `retention.logarithm`.  With a quadrature over the pressure, all points
-        between a wet cell and a very dry cell would be dry.
+        The mean is computed by Gauss quadrature over `retention.logarithm`.  With a quadrature over the pressure, all
+        points between a wet cell and a very dry cell would be dry.
         """
         if self.law is None:
             return 1.0
