@@ -2,13 +2,13 @@
 """Cost of each feature of a scene, measured with a pair of scenes: one with the feature, and one without.
 
 The scene is a square block of 1 m between smooth walls. The load is so small that the active cells do not change. The
-feature has almost no effect. Examples are a gravity of zero, a conductivity of 1e-30 m/s, and a plastic law far from
-yield. `settlement` is the relative difference between the final settlements of the two scenes. In the pair "mean
+feature hardly changes the results. Examples are a gravity of zero, a conductivity of 1e-30 m/s, and a plastic law far
+from yield. `settlement` is the relative difference between the final settlements of the two scenes. In the pair "mean
 dilatation" (F-bar), the two scenes have different Poisson ratios and therefore different settlements.
 
 The two scenes of a pair take one step each in turn, --repeat times. The shortest step of each scene is used, because
-other work on the machine only increases times. All times are processor times. The compile time is the extra time for
-the first step if the cache of compiled forms is empty. The memory is the peak memory if this cache is full.
+other work on the machine only increases times. All times are processor times. The compile time is the additional time
+of the first step with an empty cache of compiled forms. The memory is the peak memory with a full cache.
 """
 
 from __future__ import annotations
@@ -318,7 +318,7 @@ def compiled(make: Make, cells: int) -> tuple[float, float]:
     """Return the compilation time of a scene, in s, and its peak memory, in MB.
 
     The compilation time is the difference between two processes: one with an empty cache of compiled forms, and one
-    with a full cache. The memory is that of the process with the full cache.
+    with a full cache. The memory is the peak memory of the second process.
     """
     command = [sys.executable, __file__, "--cells", str(cells), "--one", str(MAKES.index(make))]
     with TemporaryDirectory() as folder:

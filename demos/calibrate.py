@@ -2,8 +2,8 @@
 """Thresholds between linear solvers: run times of both solvers below and above each threshold.
 
 Each row of the table is a scene with a given number of displacement unknowns. The demo changes the threshold, so that
-both solvers are measured. A time is the processor time of two steps, and the shortest of --repeat runs. On several
-processes, the time is the largest time of all processes, including waiting. The thresholds are in
+both solvers are measured. A time is the processor time of two steps in the shortest of --repeat runs. On several
+processes, the time is the largest of all processes, including waiting. The thresholds are in
 `mpm_dolfinx/solve/solver_choice.py`.
 
 On one process a second table follows. For each direct solver, it lists the times of a first factorisation of the

@@ -120,7 +120,7 @@ def pressure(s: mpm.Simulation, radius: float) -> float:
 
 
 def drained(name: str, cells: int) -> dict[float, tuple[float, float]]:
-    """Return the computed cavity pressure and that of the radial solution for each radius, divided by p_0."""
+    """Return the cavity pressures of the scene and of the radial solution for each radius, divided by p_0."""
     case = DRAINED[name]
     widest = max(case.known)
     reference, radii, out, p = cavity(case.soil, case.reach, 150, state=case.state), [1.0], [0.0], {}

@@ -42,7 +42,7 @@ class Parser(argparse.ArgumentParser):
         self.add_argument("--json", action="store_true", help="print the results as one line of JSON at the end")
 
     def parse_args(self, args: Sequence[str] | None = None, namespace=None) -> argparse.Namespace:
-        """Return the options, with the run time of the demo as text in `takes`.
+        """Return the options; the option `takes` is the run time of the demo, as text.
 
         The run time comes from the table Gallery of README.md, or is None if the table has no row with these options.
         """
@@ -73,7 +73,7 @@ def results(o: argparse.Namespace) -> Iterator[dict]:
     """
     out, start = {}, time.perf_counter()
     if first() and o.takes:
-        print(f"It takes about {o.takes}, and longer the first time, when its forms are compiled.", flush=True)
+        print(f"The demo takes about {o.takes}, and longer in its first run, which compiles the forms.", flush=True)
     try:
         yield out
         out.setdefault("converged", True)

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: MIT
 """A cone penetrometer is pushed from the surface into weightless clay, and the pore pressures then dissipate.
 
-The cone has a tip angle of 60 degrees and an adhesion of 0.3 s_u, where s_u is the strength of the clay. The shaft
-behind the cone is a second tool, which is smooth, so the force on the cone is known separately. The scene is
-axisymmetric. The clay is undrained and follows Tresca's law, or with --mises von Mises's law with the strength s_u in
-pure shear. The shear modulus of the clay is G = 100 s_u. The resistance is F / (pi R^2 s_u), with the force F on the
-cone and the radius R of the shaft. The resistance is compared with a formula for a deep cone in Tresca clay with equal
-initial stresses in all directions (Lu, Randolph, Hu and Bugarski 2004, Geotechnique 54):
+The cone has a tip angle of 60 degrees and an adhesion of 0.3 s_u, where s_u is the strength of the clay. The smooth
+shaft behind the cone is a second tool, so that the force on the cone is known separately. The scene is axisymmetric.
+The clay is undrained and follows Tresca's law, or with --mises von Mises's law with the strength s_u in pure shear. The
+shear modulus of the clay is G = 100 s_u. The resistance is F / (pi R^2 s_u), with the force F on the cone and the
+radius R of the shaft. The resistance is compared with a formula for a deep cone in Tresca clay with equal initial
+stresses in all directions (Lu, Randolph, Hu and Bugarski 2004, Geotechnique 54):
 
     N_c = 3.4 + 1.6 ln(G / s_u) + 1.3 alpha,
 
@@ -18,8 +18,8 @@ The cone is also pushed into saturated ("wet") clay, so fast that the clay is un
 excess pressure at the edge between cone and shaft dissipates. The fraction of the excess pressure that remains is
 compared with the curve of Teh and Houlsby (1991, Geotechnique 41) for a deep cone. The time factor of this curve is
 `T* = c_v t / (R^2 sqrt(G / s_u))`, with the coefficient of consolidation c_v and the time t. Near the surface pressures
-dissipate faster. Half of the pressure has dissipated at T* = 0.03 if the tip is three radii deep, and at T* = 0.08 if
-the tip is five radii deep.
+dissipate faster than around a deep cone. Half of the pressure has dissipated at T* = 0.03 if the tip is three radii
+deep, and at T* = 0.08 if the tip is five radii deep.
 
 With --follow, the cone is pushed once more into undrained clay, on grid lines that follow the cone.
 """
@@ -196,7 +196,7 @@ def main(argv: list[str] | None = None) -> dict:
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=2, help="whole cells over the radius, which has half a cell more")
     parser.add_argument("--depth", type=float, default=10.0, help="depth of the tip, divided by R")
-    parser.add_argument("--wet-depth", type=float, default=5.0, help="the same in saturated clay; 0: none")
+    parser.add_argument("--wet-depth", type=float, default=5.0, help="the same depth in saturated clay; 0: no run")
     parser.add_argument("--mises", action="store_true", help="von Mises's law in place of Tresca's, in undrained clay")
     parser.add_argument("--follow", action="store_true", help="push the cone again, on grid lines that follow")
     o = parser.parse_args(argv)

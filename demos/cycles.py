@@ -2,8 +2,8 @@
 """Residual stress of an elastic body after load cycles and after a rotation by 360 degrees.
 
 The drained beam of `poroelastic_beam.py` is loaded and unloaded repeatedly. The beam is elastic, so its stress must
-vanish after unloading. Grid displacements have kinks at grid lines. Particle domains must not follow these kinks. If
-they did, stress would accumulate at every grid line that a domain crosses, as at the points of standard MPM.
+vanish after unloading. Grid displacements have kinks at grid lines. Particle domains must not follow these kinks.
+Otherwise stress would accumulate at every grid line that a domain crosses, as in standard MPM.
 
 A block is stretched between two fixed sides and then rotated by 360 degrees. The stresses after and before the rotation
 must be equal.
@@ -48,7 +48,7 @@ def conditions(o: Namespace) -> dict:
 
 
 def rms(simulation: mpm.Simulation, away: float = 0.0) -> float:
-    """Return the rms stress of the points, in Pa, if the stress within `away`, in m, of the wall counts as zero."""
+    """Return the rms stress of the points, in Pa, with zero stress at distances below `away`, in m, from the wall."""
     stress, volume = simulation.effective_stress(), simulation.points.volume0
     counts = simulation.points.reference.mean(axis=1)[:, 0] > away
     squares = (volume * counts * (stress**2).sum(axis=(1, 2))).sum()

@@ -14,8 +14,8 @@ Checks:
   `k (H1^2 - H2^2) / (2 L)` (Dupuit, Charny), with the conductivity k. With suction, Kirchhoff's potential replaces the
   head. The potential is the integral of the relative permeability over the head.
 * `steady`: inflow of the dam divided by its outflow, before the reservoir falls.
-* `drained`: outflow of a column, divided by the outflow by finite elements on cells of a quarter of the size. The free
-  surface in the column falls from 8 m towards 2 m.
+* `drained`: outflow of a column, divided by the outflow of finite elements, whose cells have a quarter of the size. The
+  free surface in the column falls from 8 m towards 2 m.
 """
 
 from __future__ import annotations

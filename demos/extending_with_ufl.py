@@ -10,9 +10,9 @@ arguments.
 
 The error is the largest difference from the exact solution, divided by the largest exact value. With 20 cells the error
 is 8e-4 for the energy, 6e-4 for the fibres, 3e-3 for each of the two conductivities, 6e-4 for the foundation, and 5e-4
-for the source. The errors named so far decrease with the cell size. The error of the stress with damage is 1e-5,
-because the penalty of the prescribed displacement lets the top move a little. The error of plastic flow is 1e-11. The
-errors of the implicit stress and of the return mapping are 1e-15.
+for the source. These errors decrease with the cell size. The error of the stress with damage is 1e-5, because the
+penalty of the prescribed displacement lets the top move a little. The error of plastic flow is 1e-11. The errors of the
+implicit stress and of the return mapping are 1e-15.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def stretch(stress: Callable[[float], float]) -> float:
 
 
 def settlement(s: mpm.Simulation, stretches: np.ndarray) -> tuple:
-    """Return labels and values of an `Example` of displacements, for exact stretches of four layers from below."""
+    """Return labels and values of an `Example` of displacements, from the exact stretches of four layers."""
     Y, u = displacements(s)
     exact = np.interp(Y, np.linspace(0, 1, 5), np.concatenate([[0], np.cumsum(stretches - 1) / 4]))
     return "height at the start (m)", "displacement (m)", Y, u, exact

@@ -12,8 +12,8 @@ of these outcomes:
 * warned: the error is above the bound, and the package has issued a warning.
 * wrong, nan or hung: a defect, which the exit status reports. An unexpected exception counts as wrong.
 
-An error is divided by the largest exact value, unless the docstring of its family defines another error. The condition
-number is that of the last tangent of the momentum balance, scaled to a unit diagonal. The demo runs on one process.
+An error is divided by the largest exact value, if the docstring of its family defines no other error. The condition
+number belongs to the last tangent of the momentum balance, scaled to a unit diagonal. The demo runs on one process.
 """
 
 from __future__ import annotations

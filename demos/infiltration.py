@@ -99,7 +99,7 @@ def front(cells: int, dt: float) -> tuple[list, list[float], list[float], bool]:
 
 
 def by_elements(cells: int, dt: float) -> tuple[list[float], list[float]]:
-    """Return the errors of front, in m, and of water, relative, for `cells` finite elements."""
+    """Return the errors of the front, in m, and the relative errors of the water, for `cells` finite elements."""
     walls, pull = {"left": "x", "right": "x", "bottom": "y"}, lambda t: (0, -9.81)
     scene = {"conditions": DRY["sides"], "pressure": DRY["pressure"], "walls": walls, "gravity": pull}
     size = [0, 0], [1 / cells, 1], [1, cells]

@@ -3,11 +3,12 @@
 
 A slope of 2:1, H = 10 m high, stands on a layer of 5 m. Slope and layer are Mohr-Coulomb soil, with the friction angle
 phi = 20 degrees and the cohesion c = 0.05 gamma H (unit weight gamma). The slope settles under its weight without
-inertia. The factor of safety of the slope is 1.4. Then its strength is suddenly divided by 1.6.
+inertia. The factor of safety of the slope is 1.4. Then the strength of the soil is suddenly divided by 1.6.
 
 With inertia the slope accelerates until its shape is stable, and then moves on until friction stops it. Without
 inertia, as in the demo `slope`, a viscous stress controls the motion. The slope then stops at the first stable shape,
-so its run-out is shorter. Friction dissipates the work of gravity, except for the part that is stored elastically.
+so the run-out is shorter than with inertia. Friction dissipates the work of gravity, except for the part that is stored
+elastically.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 """A T-bar, which is a rigid cylinder, is pushed through clay, normal to its axis and deep below the surface.
 
 The clay is undrained, and follows von Mises's law with the plane-strain strength s_u. F is the force per length of the
-bar, and D is its diameter. The bar starts inside the clay and is pushed until the clay flows all around it. Then the
-resistance N of the bar is that of Randolph and Houlsby (1984) for an adhesion alpha s_u on its surface,
+bar, and D is its diameter. The bar starts inside the clay and is pushed until the clay flows all around it. The
+resistance N of a bar with the adhesion alpha s_u on its surface is then (Randolph and Houlsby 1984)
 
     N = F / (s_u D) = pi + 2 asin(alpha) + 4 cos(pi/4 - asin(alpha)/2) (sqrt(2) + sin(pi/4 - asin(alpha)/2)).
 
@@ -18,9 +18,8 @@ is lower for one or two steps. Errors refer to the mean of N in the last steps o
 N in these steps, divided by their mean.
 
 A smooth bar is also pushed through saturated ("wet") clay by one diameter, at three rates `V = v D / c_v`, with the
-velocity v and the coefficient of consolidation c_v. The pressure on the top is that of water, so the clay starts
-without effective stress. Wet clay is seeded only once. Domains longer than a cell are replaced by new domains
-(renewal).
+velocity v and the coefficient of consolidation c_v. Water exerts the pressure on the top, so the clay starts without
+effective stress. Wet clay is seeded only once. Domains longer than a cell are replaced by new domains (renewal).
 
 With --follow the bar is pushed once more, on grid lines that follow the bar. The number of cells does not change.
 """
@@ -210,7 +209,7 @@ def main(argv: list[str] | None = None) -> dict:
     parser.add_argument("--rough", nargs="*", type=float, default=list(ROUGH), help="roughnesses alpha of the bar")
     parser.add_argument("--depth", type=float, default=1.0, help="depth of each push, divided by the diameter")
     parser.add_argument("--wet-cells", type=int, default=4, help="cells over the diameter in saturated clay")
-    parser.add_argument("--wet-depth", type=float, default=1.0, help="the same in wet clay")
+    parser.add_argument("--wet-depth", type=float, default=1.0, help="depth in saturated clay, divided by the diameter")
     parser.add_argument("--follow", action="store_true", help="push the last bar again, on grid lines that follow")
     o = parser.parse_args(argv)
     if not 4 <= o.cells <= 32 or not 0 < o.depth <= 4 or any(not 0 <= alpha <= 1 for alpha in o.rough):

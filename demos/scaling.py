@@ -13,7 +13,7 @@ far.
 The exponent of a part is the slope of log(time) against log(points), fitted by least squares to the larger half of the
 sizes. `kB a point` is the slope of the memory against the number of points, fitted to all sizes by least squares of
 relative errors. Runs on several processes also print the load balance and the messages of a step. The load balance
-(`imbalance`) is the largest number of pieces of a process divided by the mean. Messages are those of the process with
+(`imbalance`) is the largest number of pieces of a process divided by the mean. Messages are counted on the process with
 the most messages. `exchange` are the messages of the package (pieces, corners, points). `solvers` are the messages that
 PETSc counts in set-up and solution of its Krylov solvers. Messages of MUMPS and of dolfinx are not counted.
 

@@ -3,9 +3,9 @@
 
 Shear waves have a velocity of 100 m/s in a layer of 10 m, and of 300 m/s in the ground below the layer. The computed
 ground ends at an absorbing base, 5 m below the layer. A shear pulse enters through this base, and reflections from
-layer and surface leave through it. The sides have no vertical displacement, as in an infinite layer. The reference
-motion is that of the ground's free surface without a layer, which is twice the incoming wave. The spectrum of the
-surface motion, divided by the spectrum of the reference motion, is
+layer and surface leave through it. The sides have no vertical displacement, as in an infinite layer. The reference is
+the motion of the ground's free surface without a layer, which is twice the incoming wave. The spectrum of the surface
+motion, divided by the spectrum of the reference motion, is
 
     1 / |cos(w H / c) + i a sin(w H / c)|,        a = rho c / (rho_g c_g),
 

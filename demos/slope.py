@@ -5,8 +5,8 @@ A slope of 2:1, H = 10 m high, stands on a layer of 5 m. Slope and layer are Moh
 the friction angle phi = 20 degrees and the cohesion c = 0.05 gamma H (unit weight gamma).
 
 1. The factor of safety is the largest divisor of c and tan(phi) for which the slope is stable. `mpm.factor_of_safety`
-   reduces the strength of the slope at rest, and checks whether the viscous stress decays. The best log-spiral
-   mechanism gives 1.368, and finite elements give 1.4 (Griffiths and Lane 1999).
+   reduces the strength of the slope at rest, adds a viscous stress, and checks whether this stress decays. The best
+   log-spiral mechanism gives 1.368, and finite elements give 1.4 (Griffiths and Lane 1999).
 2. For the run-out, the strength of viscous soil is suddenly divided by 1.6. The slope slides until its new shape is
    just stable. The factor of safety of the new shape differs from one by less than 0.1.
 """

@@ -9,11 +9,11 @@ runs on one process.
 
 1. Critical strength. The soil has no friction and does not drain. The strength c of the soil is reduced by 1 % in each
    step. A vertical side of height H is stable while gamma' H / c < 3.78. Limit analysis gives 3.76 to 3.79 (Pastor,
-   Thai and Francescato 2000), and the critical slip circle 3.83 (Fellenius 1927). The bank has failed when its crest
-   settles 20 times as much in a step as in the first steps. With a factor of 10 or 40 instead of 20, the result changes
-   by 1 %. With 10 cells over the height the bank fails at gamma' H / c = 3.94, which is 4.2 % too large. With 20 cells
-   it fails at 3.86, which is 2.0 % too large. The error is of first order in the cell size, and the extrapolated value
-   is 3.78.
+   Thai and Francescato 2000), and the critical slip circle 3.83 (Fellenius 1927). The bank has failed when the crest
+   settles 20 times as much in a step as in each of the first steps. With a factor of 10 or 40 instead of 20, the result
+   changes by 1 %. With 10 cells over the height the bank fails at gamma' H / c = 3.94, which is 4.2 % too large. With
+   20 cells it fails at 3.86, which is 2.0 % too large. The error is of first order in the cell size, and the
+   extrapolated value is 3.78.
 2. Run-out. The consolidated bank, with friction, loses its cohesion within T = 10 minutes, far faster than it drains.
    The bank slumps. In front of the initial toe, the water carries more than half of the soil's weight. At rest the bank
    is twice as long as before. Then the excess pressure drains. The final inclination of the slope is 23.5 degrees, and
@@ -24,8 +24,8 @@ runs on one process.
 
 The points carry the cohesion (`points.data["cohesion"]`), because it is a function of position. A function in `observe`
 reduces the cohesion after each step. A viscous stress of 2 eta times the strain rate, also a term in UFL, limits the
-velocity of the bank in part 2. A step that does not converge is cut, and converges because of this viscous stress. The
-ratio eta / T is a hundredth of gamma' H.
+velocity of the bank in part 2. Steps that do not converge are repeated with half the length. With the viscous stress
+these short steps converge. The ratio eta / T is a hundredth of gamma' H.
 """
 
 from __future__ import annotations

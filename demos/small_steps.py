@@ -9,18 +9,18 @@ have an exact solution in time. Three columns are computed:
 
 * column at rest on the grid.
 * moving column: during consolidation the base moves down by half the height, through half of all cells.
-* moving column with soft water: the water stores as much as the skeleton, so its storage coefficient is 1/M with the
-  oedometric modulus M. The pressure of soft water is remapped from grid to grid. The pressure of stiff water follows
-  from the strain of the points.
+* moving column with soft water: the storage coefficient of the water is 1/M, with the oedometric modulus M of the
+  skeleton. The pressure of soft water is remapped from grid to grid. The pressure of stiff water follows from the
+  strain of the points.
 
 Motion adds an error, because all points of a cell have equal strain increments in a step. The error due to motion is
 largest at the drained top, in cells that contain little of the column. The error of the remap is smaller than the
 spatial error, and of second order in the cell size.
 
-The overshoot, the largest p / p0 - 1 in all steps, is zero for the column at rest, with steps of any length. In more
-dimensions, small steps cause checkerboard modes of the pressure, unless the jumps of the pressure are damped
-(`storage.py`). The demo shows these modes in the first step after a strip load on a layer, with and without damping.
-The demo runs on one process.
+The overshoot, the largest p / p0 - 1 in all steps, is zero for the column at rest, with steps of any length. In 2D and
+3D, small steps cause checkerboard modes of the pressure; damping of the pressure jumps (`storage.py`) removes these
+modes. The demo shows the first step after a strip load on a layer, with and without damping. The demo runs on one
+process.
 """
 
 from __future__ import annotations

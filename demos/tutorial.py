@@ -25,7 +25,7 @@ from mpm_dolfinx.verification.exact import terzaghi_pressure
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
 parser.add_argument("--out", type=Path, default=Path("out/tutorial"), help="folder for the picture")
-out = parser.parse_known_args()[0].out  # a notebook has options of its own
+out = parser.parse_known_args()[0].out  # a notebook has other options
 
 # 1. A domain, cut by the grid.
 #
@@ -42,10 +42,10 @@ assert abs(pieces.fraction.sum() - 1) < 1e-14
 # 2. A form over this domain.
 #
 # Each piece is integrated at its centroid.  A Q1 function equals its Taylor polynomial about the midpoint of its cell.
-# Its value at the centroid is therefore an expression in UFL, with the offset from the midpoint as a DG0 coefficient.
-# The list of integration entities contains a cell once for each of its pieces, and each piece has its own coefficients.
-# `points.value`, `points.grad` and `points.dx` hide these details.  Linear functions are integrated exactly for any
-# cut.
+# The value of the function at the centroid is therefore an expression in UFL, with the offset from the midpoint as a
+# DG0 coefficient.  The list of integration entities contains a cell once for each of its pieces, and each piece has its
+# own coefficients.  `points.value`, `points.grad` and `points.dx` hide these details.  Linear functions are integrated
+# exactly for any cut.
 
 points = FormPoints(grid)
 cells = grid.locals[grid.number(grid.index(pieces.x))]
@@ -128,8 +128,8 @@ assert apart < 1e-3
 
 # 5. The same column, computed by the package.
 #
-# The package also moves corners by second differences of u, and computes F from the corners.  It treats nearly empty
-# cells, locking, surfaces, water, time integration and several processes.
+# The package also moves corners by second differences of u, and computes F from the corners.  The package also treats
+# nearly empty cells, locking, surfaces, water, time integration and several processes.
 
 soil = mpm.NeoHookean(bulk=BULK, shear=SHEAR, porosity=0.5, grain_density=WEIGHT / 9.81 / 0.5)  # dry
 column = mpm.box(grid, [0, 0], [0.4, 0.95], per_cell=2)

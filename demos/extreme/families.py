@@ -274,7 +274,7 @@ def thin():
 
 
 def beside_q1(beam: Beam, cells: tuple[int, int]) -> Scene:
-    """Return the scene of the beam; its error is divided by that of Q1 elements on `cells` cells."""
+    """Return the scene of the beam, with the error divided by the error of Q1 elements on `cells` cells."""
     scene = beam()
     bound = off(beam.elements("q1-dg0", cells), beam.elements())
     return replace(scene, error=lambda s, r: off(tip(r), beam.elements()) / bound)
@@ -425,8 +425,8 @@ def layered_rain():
 def rained_layers(ratio: float, steep: float, other: float, grid: str = "plane") -> Scene:
     """Return a column of two layers under rain, with `steep` = alpha h of the lower layer.
 
-    ratio: conductivity of the upper layer, divided by that of the lower layer.
-    other: alpha of the upper layer, divided by that of the lower layer.
+    ratio: conductivity of the upper layer, divided by the conductivity of the lower layer.
+    other: alpha of the upper layer, divided by alpha of the lower layer.
     """
     k, alpha, edge = [1e-6, 1e-6 * ratio], [10 * steep, 10 * steep * other], 0.53
     rain = min(k) / 2

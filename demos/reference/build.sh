@@ -1,12 +1,11 @@
 #!/usr/bin/env bash
 # bash demos/run.sh reference | notebooks
-#
-# reference: the pages of the project and a reference from its docstrings, in out/reference/site. A link that leads
-# nowhere is an error, and so is a page that needs the network to be read. `python3 -m http.server -d
-# out/reference/site` serves them with their search; without a server, "All names" lists what there is.
+# reference: the pages of the project and a reference from its docstrings, in out/reference/site. A broken link is an
+# error. A page that loads files from the network is an error too. `python3 -m http.server -d out/reference/site` serves
+# the pages with their search. Without a server, the page "All names" lists all public names.
 # notebooks: the tutorial and three short examples in out/notebooks.
 #
-# A Python environment of its own, out/reference/venv, has the tools; they need no dolfinx.
+# The tools are installed in a separate Python environment, out/reference/venv, without dolfinx.
 set -euo pipefail
 root=$(cd "$(dirname "${BASH_SOURCE[0]}")/../.." && pwd)
 out=$root/out/reference

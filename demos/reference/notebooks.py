@@ -11,7 +11,7 @@ SCRIPTS = ("tutorial", "short/consolidation", "short/footing", "short/own_law")
 
 
 def notebook(path: Path):
-    """Return a script as a notebook; the docstring, and comments on lines of their own, become text."""
+    """Return a script as a notebook. The docstring, and comments that fill a line, become text."""
     text, code = parts(path)
     words = "\n".join(
         f"# {line}".rstrip() for line in [f"# {path.stem.replace('_', ' ').capitalize()}", "", *text.split("\n")]

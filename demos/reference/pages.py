@@ -51,7 +51,7 @@ def documented(folder: Path) -> dict[str, str]:
 
 
 def names(folder: Path) -> str:
-    """Return a page with links to all public names, which needs no server."""
+    """Return a page with links to all public names, for reading without a server."""
     found = documented(folder)
     rows = [f"* [`{name}`]({found[name]}.md#mpm_dolfinx.{name})" for name in sorted(found, key=str.lower)]
     return "# All names\n\n" + "\n".join(rows) + "\n"
