@@ -13,7 +13,7 @@ settlement grows with the logarithm of the thickness of the layer, without bound
 
 Limit loads are computed with very stiff soil, which flows before the geometry changes. Without friction the bearing
 capacity is `q = (2 + pi) s_u` (Prandtl 1921), with the undrained strength s_u. With the friction angle phi and
-associated flow the bearing capacity is `q = c N_c`, with `N_c = (exp(pi tan(phi)) tan^2(45 deg + phi/2) - 1) / tan(phi)`.
+associated flow the capacity is `q = c N_c`, with `N_c = (exp(pi tan(phi)) tan^2(45 deg + phi/2) - 1) / tan(phi)`.
 The footing has --cells cells over its width, and about twice as many in a second run.
 
 In the deep push the soil does not dilate. The undrained strength is s_u = xi c, with the coefficient xi of the cohesion

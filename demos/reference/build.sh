@@ -1,5 +1,6 @@
 #!/usr/bin/env bash
 # bash demos/run.sh reference | notebooks
+#
 # reference: the pages of the project and a reference from its docstrings, in out/reference/site. A broken link is an
 # error. A page that loads files from the network is an error too. `python3 -m http.server -d out/reference/site` serves
 # the pages with their search. Without a server, the page "All names" lists all public names.
