@@ -6,8 +6,8 @@ both solvers are measured. A time is the processor time of two steps in the shor
 processes, the time is the largest of all processes, including waiting. The thresholds are in
 `mpm_dolfinx/solve/solver_choice.py`.
 
-On one process a second table follows. For each direct solver, it lists the times of a first factorisation of the
-stiffness, of a repeated factorisation, and of a solve.
+On one process a second table follows. For each direct solver, this table lists the times of a first factorisation of
+the stiffness, of a repeated factorisation, and of a solve.
 """
 
 from __future__ import annotations

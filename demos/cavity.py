@@ -45,7 +45,7 @@ SAND = mpm.MohrCoulomb(bulk=G * 2.6 / 1.2, shear=G, friction=30.0, dilation=0.0,
 def well() -> mpm.ModifiedCamClay:
     """Return the clay of Chen and Abousleiman.
 
-    lambda and kappa are converted to ln(specific volume) and Kirchhoff stress.
+    The law uses ln(specific volume) and Kirchhoff stress, so lambda and kappa are converted.
     """
     lambda_, kappa = (index / 2.064 / (1 - index / 2.064) for index in (0.15, 0.03))
     stress = (-P0, -P0, -1.6 * P0)

@@ -2,16 +2,17 @@
 """Columns of dry sand collapse: run-out and height against published experiments, and energies.
 
 A column of width L and height a L stands on a rough floor against a smooth wall, with a = 0.5, 1, 4 and 8. The right
-side of the column is released suddenly. In the experiments of Lube et al. (2005) with sand, sugar and rice, the front
-moves by 1.2 a L for a < 1.8, and by 1.9 a^(2/3) L for a > 2.8. The angles of repose are near 31 degrees.
+side of the column is released suddenly. In the experiments of Lube, Huppert, Sparks and Freundt (2005) with sand, sugar
+and rice, the front moves by 1.2 a L for a < 1.8, and by 1.9 a^(2/3) L for a > 2.8. The angles of repose are near 31
+degrees.
 
 The sand follows the Mohr-Coulomb law without dilation. In simple shear its strength is sin(phi) times the normal stress
 (Davis 1968), so sin(phi) = tan(31 degrees). In fast flow the friction coefficient increases by 0.93 I, with the
 inertial number I (Jop, Forterre and Pouliquen 2006). This increase is equivalent to a viscosity of
 `0.93 d sqrt(p rho_s)`, with the grain size d = L/100, the pressure p and the grain density rho_s. In the demo the
 viscosity is constant, and p is the pressure in the middle of a heap half as high as the column. With a constant
-viscosity, run-outs are as accurate as with a local viscosity (Ionescu et al. 2015). Without viscosity, shear localises
-in single cells. The front is the point at which the depth of the sand is one grain.
+viscosity, run-outs are as accurate as with a local viscosity (Ionescu, Mangeney, Bouchut and Roche 2015). Without
+viscosity, shear localises in single cells. The front is the point at which the depth of the sand is one grain.
 
 Sources: Lube, Huppert, Sparks and Freundt (2005), Phys. Rev. E 72, 041301, as in Lagree, Staron and Popinet (2011), J.
 Fluid Mech. 686, 378.

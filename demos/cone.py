@@ -55,7 +55,7 @@ TEH = np.array([0.038, 0.078, 0.142, 0.245, 0.439, 0.804, 1.60])
 
 
 def published() -> float:
-    """Return the resistance N_c of a deep cone by Lu et al. (2004)."""
+    """Return the resistance N_c of a deep cone by Lu, Randolph, Hu and Bugarski (2004)."""
     return 3.4 + 1.6 * np.log(INDEX) + 1.3 * ROUGH
 
 

@@ -208,7 +208,7 @@ def cells(s: mpm.Simulation) -> NDArray[np.float64]:
 
 
 def roughness(p: NDArray[np.float64]) -> float:
-    """Return the roughness of cell pressures (nx, ny): rms(p - mean of the four neighbours) / max |p|."""
+    """Return the rms difference of cell pressures (nx, ny) from the mean of four neighbours, over the largest."""
     deviation = p[1:-1, 1:-1] - (p[:-2, 1:-1] + p[2:, 1:-1] + p[1:-1, :-2] + p[1:-1, 2:]) / 4
     return float(np.sqrt(np.nanmean(deviation**2)) / np.nanmax(np.abs(p)))
 

@@ -71,7 +71,7 @@ def cycle(
 
     h: cell size, in m.
     load: largest load, in Pa.
-    steps: number of steps in a cycle. The number is even.
+    steps: number of steps in a cycle, even.
     quadrature: quadrature rule, see `mpm.Numerics`.
     seed: function that returns the body, such as `mpm.box`.
     fluid: pore fluid of an undrained beam, or None.

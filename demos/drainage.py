@@ -3,12 +3,12 @@
 
 The pressure in a column of 1 m is initially zero, as in uniform downward flow. Then no more water enters at the top,
 and the column drains at its foot. The retention curve is user-defined. The effective stress is the total stress plus
-the product of saturation and pore pressure. The scene is that of Liakopoulos (1965), with the constants of Lewis and
+the product of saturation and pore pressure. The scene follows Liakopoulos (1965), with the constants of Lewis and
 Schrefler (1998). The reference is a converged small-strain solution with 400 finite volumes.
 
 Three errors are given after 5, 10, 30 and 120 minutes. The first is the largest error of the pressure at five heights,
-divided by the suction at the highest of the five. The second and the third are the relative errors of the settlement
-and of the outflow at the foot. The demo runs on one process.
+divided by the suction at the highest of these heights. The second and the third are the relative errors of the
+settlement and of the outflow at the foot. The demo runs on one process.
 """
 
 from __future__ import annotations

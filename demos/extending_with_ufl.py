@@ -118,7 +118,7 @@ def energy(cells: int) -> Example:
 
 @dataclass(frozen=True)
 class Fibrous(mpm.NeoHookean):
-    """Neo-Hookean matrix with fibres of direction a, which add the energy `c/4 (I_4 - 1)^2` with `I_4 = |F a|^2`."""
+    """Neo-Hookean matrix with fibres of direction a, which add the energy `c/4 (I_4 - 1)^2` with `I_4 = (F a)^2`."""
 
     fibre: float = 0.0  # c, Pa
     direction: mpm.Field = (1.0, 0.0)
@@ -228,7 +228,7 @@ def well(cells: int) -> Example:
 class Damaged(mpm.NeoHookean):
     """Neo-Hookean law with the energy `(1 - D) psi`.
 
-    The damage is `D = 1 - exp(-m / 0.5)`, where m is the largest |ln J| so far.
+    The damage is `D = 1 - exp(-m / 0.5)`, where m is the largest `abs(ln(J))` so far.
     """
 
     state: ClassVar = {"damage": 0.0}

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Stiff and extreme scenes: each converges, recovers or is refused, and none is silently wrong.
 
-Every scene is tiny and has one extreme property. Scenes with equal extreme property form a family. Each scene has one
-of these outcomes:
+Every scene is tiny and has one extreme property. Scenes with the same extreme property form a family. Each scene has
+one of these outcomes:
 
 * converged: the error is below the bound of the family. The reference is an exact solution, a solution with finite
   elements, or the same scene with a moderate setting. The residuals of momentum and fluid, and the error of the fluid

@@ -18,8 +18,8 @@ The footing has --cells cells over its width, and about twice as many in a secon
 
 In the deep push the soil does not dilate. The undrained strength is s_u = xi c, with the coefficient xi of the cohesion
 in the yield function. A footing at depth D carries (1 + 0.27 sqrt(D/B)) times the undrained load of a footing at the
-surface (fit to bounds of limit analysis, Salgado et al. 2004). The drained capacity at the surface lies between the
-capacity for the reduced friction of Davis (1968) and c N_c.
+surface (fit to bounds of limit analysis, Salgado, Lyamin, Sloan and Yu 2004). The drained capacity at the surface lies
+between the capacity for the reduced friction of Davis (1968) and c N_c.
 
 The undrained limit load converges from below, with order 1.5: its error is -5.9 % with 5 cells, -2.4 % with 9 cells and
 -0.85 % with 17 cells. The outermost node of the footing also carries the half cell outside this node. With an odd
@@ -41,17 +41,17 @@ cells than a box of 4 B x 2.5 B with equal cells.
 With --square, square and circular footings, rough and smooth, are pushed into Tresca's soil, on graded cells. The
 footings are tools, because below a smooth prescribed displacement the faces of the soil would move outward and enlarge
 the footing. A quarter of the square is computed in 3D, also on several processes. N_c is the limit load, divided by
-area and c. The bounds of N_c are 5.52 and 6.22 for a rough square (Salgado et al. 2004), and 2 + pi and 5.71 for a
-smooth square (Shield and Drucker 1955). Circles are computed in axisymmetry, with about twice as many cells over the
-width. The exact N_c is 6.05 for a rough circle (Cox, Eason and Hopkins 1961), and 5.69 for a smooth circle (Shield
-1955).
+area and c. The bounds of N_c are 5.52 and 6.22 for a rough square (Salgado, Lyamin, Sloan and Yu 2004), and 2 + pi and
+5.71 for a smooth square (Shield and Drucker 1955). Circles are computed in axisymmetry, with about twice as many cells
+over the width. The exact N_c is 6.05 for a rough circle (Cox, Eason and Hopkins 1961), and 5.69 for a smooth circle
+(Shield 1955).
 
 With non-associated flow the solution is not unique. Shear bands are one cell wide and change their position between
 steps, more often on finer cells (Rudnicki and Rice 1975). On fine grids many steps are therefore cut. The option
 --viscosity adds a viscous stress, small compared with the cohesion, which makes the solution unique (Needleman 1988).
-With --explicit-friction, the strength by friction is computed from the mean stress at the start of each step
-(Krabbenhoft et al. 2012), so flow is associated within a step. With 9 cells over the width, this option changes the
-load by 0.8 % in a run of 4 steps, and by 0.3 % in a run of 16 steps.
+With --explicit-friction, the strength by friction is computed from the mean stress at the start of each step. Flow is
+then associated within a step (Krabbenhoft, Karim, Lyamin and Sloan 2012). With 9 cells over the width, this option
+changes the load by 0.8 % in a run of 4 steps, and by 0.3 % in a run of 16 steps.
 """
 
 from __future__ import annotations

@@ -7,11 +7,11 @@ initial value p0 = force / (2a). By symmetry a quarter of the slab is computed, 
 strain. Poisson's ratio is 0.2, and water and grains are incompressible. The mean strain is 1e-5, so small-strain theory
 is accurate. Displacements are linear in y, so few cells over the height suffice. The reduced time is `T = c t / a²`,
 with `c = kappa (K + 4G/3)`. Here t is the time, kappa the mobility, K the bulk modulus and G the shear modulus. Source:
-Mandel (1953); Abousleiman et al. (1996), Géotechnique 46. The demo runs on one process.
+Mandel (1953); Abousleiman, Cheng, Cui, Detournay and Roegiers (1996), Géotechnique 46. The demo runs on one process.
 
 Errors:
 
-* `p_0.01` to `p_1`: largest value of |p - exact| a / force at the centroids of all cells, at T = 0.01, 0.1, 0.5 and 1.
+* `p_0.01` to `p_1`: largest error of the pressure at the centroids of all cells, times a / force, at T = 0.01 to 1.
 * `p_max`: relative error of the highest pressure in the innermost cell, which occurs at T = 0.07.
 * `p_rise`: relative error of the difference between the highest pressure and p0.
 * `settlement`: largest relative error of the plate's settlement at T = 0.01, 0.1, 0.5 and 1.

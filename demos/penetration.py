@@ -13,9 +13,9 @@ wide, N of a rough bar is 10.9 with 8 cells over the diameter, and 10.8 with 16 
 
 Clay ahead of the bar flows around the bar and stretches exponentially, by a factor of about e^4 for each diameter of
 depth. After each quarter of a diameter, new points are therefore seeded around the bar, with the present stresses
-(remeshing and interpolation: Hu and Randolph 1998, Int. J. Numer. Anal. Meth. Geomech. 22). After each new seeding, N
-is lower for one or two steps. Errors refer to the mean of N in the last steps of each quarter. `spread` is the range of
-N in these steps, divided by their mean.
+(remeshing and interpolation, Hu and Randolph 1998). After each new seeding, N is lower for one or two steps. Errors
+refer to the mean of N in the last steps of each quarter. `spread` is the range of N in these steps, divided by their
+mean.
 
 A smooth bar is also pushed through saturated ("wet") clay by one diameter, at three rates `V = v D / c_v`, with the
 velocity v and the coefficient of consolidation c_v. Water exerts the pressure on the top, so the clay starts without
@@ -243,7 +243,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def following(o: Namespace, alpha: float, equal: Push) -> dict[str, float]:
-    """Push a bar on grid lines that follow it, and compare resistance and number of cells with those on equal cells."""
+    """Push a bar on grid lines that follow it, and compare resistance and number of cells with a run on equal cells."""
     run = push(alpha, o.cells, o.depth, follow=True)
     N, beside = (np.array(each.N)[each.steady].mean() for each in (run, equal))
     count, whole = (np.prod([len(x) - 1 for x in each.lines]) for each in (run, equal))

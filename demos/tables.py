@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Write the numbers in README.md and demos/README.md from the output of the demos.
 
-A comment follows each number.  It contains the command of the demo, the entries of its JSON output, and a format:
+A comment follows each number.  The comment contains the command of the demo, the entries of its JSON output, and a
+format:
 
     | Terzaghi's column, pressure at T_v = 0.5 | 0.004 % <!-- terzaghi --cells 50; errors/p_0.5; % --> |
 

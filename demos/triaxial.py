@@ -69,7 +69,7 @@ def block(soil: mpm.Skeleton, cells: int) -> mpm.Simulation:
 
 
 def costs(cells: int, steps: int = 30) -> dict[str, float]:
-    """Return the processor time of a step of each law, divided by that of Drucker and Prager's law.
+    """Return the processor time of a step of each law, divided by the time with Drucker and Prager's law.
 
     The laws are timed in turn, so that a varying load of the machine affects all laws alike. Sands have associated
     flow, because otherwise shear bands form in the block.

@@ -2,9 +2,9 @@
 """Water tables in unsaturated soil: in a slab under rain (Vauclin), and in a levee during a flood.
 
 A slab of sand, 6 m wide and 2 m high, stands on an impervious base between ditches. By symmetry half of the slab is
-computed. Rain falls on its middle metre for eight hours. Above the water table, water spreads through unsaturated soil.
-Scene and soil laws follow Vauclin, Khanji and Vachaud (1979). The reference is a converged solution of finite volumes,
-with cells of 1.25 cm. The side above the level of the ditch is a seepage face.
+computed. Rain falls on the middle metre of the slab for eight hours. Above the water table, water spreads through
+unsaturated soil. Scene and soil laws follow Vauclin, Khanji and Vachaud (1979). The reference is a converged solution
+of finite volumes, with cells of 1.25 cm. The side above the level of the ditch is a seepage face.
 
 The second scene is a levee of 3 m with slopes of 1:2 on an impervious base. The water level rises by 2.5 m in two days,
 is constant for two days, and falls again in two days. The soil of the levee retains water under suction, so water that

@@ -81,7 +81,7 @@ def time_step():
 def terzaghi(h: float, s: mpm.Simulation, r: mpm.Result) -> float:
     """Return the error of the pressures or the error of the settlement, whichever is larger.
 
-    The error of the pressures is the mean of |p - exact| over the points, divided by the load. The error of the
+    The error of the pressures is the mean absolute error over the points, divided by the load. The error of the
     settlement is divided by the final settlement.
     """
     m = (np.arange(20000) + 0.5) * np.pi

@@ -37,7 +37,7 @@ SAFETY, SHRINKS, GROWS, KEEPS = 0.9, 0.2, 5.0, 1.2
 """Constants for the ratio of an adaptive step to the step before.
 
 The ratio is `SAFETY` times a power of (tolerance / error), but at least `SHRINKS` and at most `GROWS`.  If the ratio is
-between 1 and `KEEPS`, the step keeps its length.  Source: Hairer, Norsett and Wanner (1993), eq. 4.13; for `KEEPS`
+between 1 and `KEEPS`, the step keeps its length.  Source: Hairer, Norsett and Wanner (1993), equation 4.13; for `KEEPS`
 Hairer and Wanner (1996), IV.8.
 """
 RINGS = 5e-3
@@ -50,7 +50,7 @@ AGAIN = 2.0
 MOST = SAME / EPSILON
 """Largest number of output intervals.  Source: exact; in more intervals `SAME` times an interval is below rounding."""
 RESOLVED = 10
-"""Smallest `rtol`, divided by the solver's tolerance.  Solver errors would hide time integration errors below it."""
+"""Smallest `rtol`, divided by the solver's tolerance.  With a smaller `rtol`, solver errors dominate."""
 FIRST = 1e-3
 """Smallest default length of the first adaptive step, divided by the first output interval."""
 
@@ -245,7 +245,7 @@ class Times:
                 f"dt = {line(interval)}, must be left out with rtol and t_eval, because t_eval are the output times"
             )
         self.interval, self.each = 0.0, given is None and interval is None
-        """Output interval, in s, or 0 without equal intervals; and whether every step is an output."""
+        """Output interval, in s (0 without equal intervals), and whether every step is an output."""
         if interval is not None:
             allowed = f"> 0, and not below {(self.end - now) / MOST:g} s"
             test = lambda v: (v > 0) & (v * MOST >= self.end - now)  # noqa: E731

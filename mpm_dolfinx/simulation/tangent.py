@@ -31,7 +31,7 @@ class Tangent:
     stiffness : (n, n)
         Derivative of forces with respect to displacements.  The matrix includes the ghost penalty, the penalties of
         prescribed displacements and contacts, and the inertia of free tools, but not the inertia of bodies.  Fixed
-        components are excluded.
+        displacement components are excluded.
     nodes, components : (n,)
         Grid node and axis of each displacement.
     x : (n, d)

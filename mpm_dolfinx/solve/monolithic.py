@@ -44,10 +44,10 @@ from mpm_dolfinx.solve.factors import MOST, direct_solver, displacement_solver, 
 from mpm_dolfinx.solve.solver_choice import MUMPS, SolverPlan
 
 LEAST = 1e-4
-"""Smallest scale of the fluid residual, divided by the fluid volume that residual forces displace in a drained body.
+"""Smallest scale of the fluid residual. Its unit is the fluid volume that residual forces displace in a drained body.
 
-Undrained bodies exchange nearly no fluid.  If the displaced volume is 5e5 times the scale, rounding errors cause a
-residual of 2e-5.
+Undrained bodies exchange nearly no fluid.  If this volume is 5e5 times the scale, rounding errors cause a residual of
+2e-5.
 """
 
 IDLE = object()

@@ -59,8 +59,8 @@ def multigrid_solver(
 
     `A`: matrix, which may still be empty.
     `name`: prefix of the solver's PETSc options.
-    `places` (n, d + 1): index along each grid axis, and index of the component, of the unknowns of this process, all >=
-    0. Each component is interpolated separately.
+    `places` (n, d + 1), >= 0: indices of this process's unknowns along the grid axes, and of their components. Each
+    component is interpolated separately.
     `held` (m, d + 1): fixed degrees of freedom in cells of bodies, as indices like `places`. Interpolated displacements
     vanish at these degrees of freedom.
     `nodal`: whether the unknowns belong to nodes.
@@ -148,7 +148,7 @@ def interpolation(
 def _hats(
     places: NDArray[np.int64], nodal: bool, lines: Sequence[NDArray[np.float64]] | None = None
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-    """Return the fine unknown, the coarse place, and the weight of each entry of an interpolation."""
+    """Return the fine unknown, the indices of the coarse unknown, and the weight of each entry of an interpolation."""
     half, odd = np.divmod(places[:, :-1], 2)
     if nodal:
         share = 0.5

@@ -64,17 +64,17 @@ ERROR = 1 / 20
 
 For a mode with decay rate l, the stability function of sdirk2 gives an error of `0.081 dt abs(l) e` in a step, at most
 0.28 e. A pressure that follows a varying load has an error of at most 0.14 e. With little decay, the errors of all
-steps add up to 0.081 e. Errors were measured by comparison with steps an eighth as long. They are 0.05 to 0.08 e if
-loads rise or oscillate, or if the prescribed pressure on a drained side oscillates. Errors are 0.01 to 0.04 e with an
-oscillating source, and 0.01 to 0.05 e late in a consolidation. The error is 0.17 e in a first step from zero load, and
-0.26 e after a jump. The error of a run is at most 5 e / 20.
+steps add up to 0.081 e. Errors were measured by comparison with steps an eighth as long. The errors are 0.05 to 0.08 e
+if loads rise or oscillate, or if the prescribed pressure on a drained side oscillates. Errors are 0.01 to 0.04 e with
+an oscillating source, and 0.01 to 0.05 e late in a consolidation. The error is 0.17 e in a first step from zero load,
+and 0.26 e after a jump. The error of a run is at most 5 e / 20.
 """
 SUDDEN = np.sqrt(2)
 """Pressure change in the second substep, divided by the change in the first substep, below which sdirk2 overshoots.
 
-With `z = -(decay rate) dt`, the stability function `(1 + (1 - 2 gamma) z) / (1 - gamma z)^2` changes its sign at `z =
--1 - sqrt(2)`. At this z, a pressure changes by `-gamma z / (1 - gamma z) = sqrt(2) - 1` in the first substep, and by `2
-- sqrt(2)` in the second substep. If pressures follow loads, the ratio of the two changes is `(1 - gamma) / gamma`.
+For a mode with `z = -(decay rate) dt`, the stability function `(1 + (1 - 2 gamma) z) / (1 - gamma z)^2` is zero at
+`z = -1 - sqrt(2)`. At this z, a pressure changes by `-gamma z / (1 - gamma z) = sqrt(2) - 1` in the first substep, and
+by `2 - sqrt(2)` in the second. If pressures follow loads, the ratio of the two changes is `(1 - gamma) / gamma`.
 Source: exact.
 """
 
@@ -166,7 +166,7 @@ def note_pressures(
     The fluid volumes after the step and after a first-order step differ by `seconds` times the change of rates between
     substeps. The inverse of the fixed-stress operator converts this difference into a pressure. This pressure is
     bounded for stiff modes, as in Hosea and Shampine (1996). The error of the step is assumed to be `ERROR` times this
-    pressure. Weights of cells are their volume fractions of material.
+    pressure. Errors and changes of a cell are weighted by its fill.
 
     `seconds`, s: time weight of the rates of the first substep.
     `dt`, s: length of the step.
@@ -337,9 +337,9 @@ class Newton:
         """Return the errors. Raise NotConverged if the equilibrium is unstable.
 
         The tangent of an unstable equilibrium has negative eigenvalues. Smaller steps find the path that leaves this
-        equilibrium. Only dry bodies with symmetric, factorised tangents are checked, because water delays buckling. A
-        tangent kept for a step shows an instability only in the next step. If only soft springs resist a motion, a
-        stable solution may seem unstable. One more Newton step decides such cases.
+        equilibrium. Only dry bodies with symmetric, factorised tangents are checked, because water delays buckling. If
+        the tangent of the last step is reused, an instability is found one step late. If only soft springs resist a
+        motion, a stable solution may seem unstable. One more Newton step decides such cases.
         """
         plan = self._solvers.plan
         if not self.report.newton or self._storage is not None or not plan.symmetric or plan.iterative:

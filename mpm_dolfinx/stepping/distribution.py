@@ -3,7 +3,7 @@
 
 The scene is created again on a grid with other owners, but its forms are not compiled again.  The state is transferred
 as from a checkpoint.  Points and pieces move to the owners of their cells, and nodal data move to the nodes of each
-process.  The conditions of the stage find their faces again.
+process.  The faces of all conditions are determined again.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ class Distributed(Protocol):
 
 
 def distribute(simulation: Distributed) -> None:
-    """Distribute the cells anew if this makes the numbers of points of the processes more equal.
+    """Distribute the cells anew if the processes then have more equal numbers of points.
 
-    The function acts only before a step that resets the grid.  If the cells keep their owners, the points move to the
-    owners of their cells.  On a grid with `follow`, lines and points move later.
+    The function acts only before a step that resets the grid.  If no cell changes its owner, points are still sent to
+    the owners of their cells.  On a grid with `follow`, this happens after the lines have moved.
     """
     grid = simulation.scene.grid
     if grid.comm.size == 1 or (state := simulation.state).stays:
@@ -43,7 +43,7 @@ def distribute(simulation: Distributed) -> None:
 
 
 def distribute_by(simulation: Distributed, boxes: NDArray[np.int64]) -> bool:
-    """Distribute the cells by boxes (ranks, 2, d) (see `Partition`).  Return whether the scene allows it."""
+    """Distribute the cells by boxes (ranks, 2, d) (see `Partition`).  Return whether this is possible."""
     new = simulation.scene.distributed(boxes)
     if new is not None:
         simulation.scene, simulation.state = new, new.adopted(simulation.state)

@@ -7,8 +7,7 @@ most as long, in cells, as one domain at seeding. Whole domains on the lattice o
 surface. Domains are not replaced if they yield, contain probes, or have a side whose displacement a condition needs.
 
 The corners of elastic domains determine F, so a division adds no error: both halves have the mapping of the whole
-domain. After merging, F follows from the outer corners. Mass, fluid, and the volume that the fluid has to fill are
-exact.
+domain. After merging, F follows from the outer corners. Masses, and the volume implied by the fluid, do not change.
 """
 
 from __future__ import annotations

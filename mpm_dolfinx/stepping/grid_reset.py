@@ -45,7 +45,7 @@ from mpm_dolfinx.stepping.stage import Stage
 from mpm_dolfinx.stepping.state import State
 
 AtPlaces = Callable[[NDArray[np.integer], NDArray[np.float64]], NDArray[np.float64]]
-"""Function of local cells (n,) and of positions (n, d), in m, in these cells. It returns values (n,)."""
+"""Function of local cells (n,) and of positions (n, d), in m, in these cells, which returns values (n,)."""
 
 
 class OnGrid(Keyed):
@@ -206,7 +206,7 @@ class OnGrid(Keyed):
 
     @contextmanager
     def as_reset(self, state: State) -> Iterator[QuadratureData]:
-        """Yield the integration points at the last reset. Within, u is 0, and p is the pressure at the reset."""
+        """Yield the integration points at the last reset. In this context u is 0 and p is the pressure at the reset."""
         at = [(self._u.x.array, self._momentum.active.now.dofs)]
         if self._storage is not None:
             at += [(f.x.array, self.cells) for f in (self._storage.p, self._storage.p_n)]
@@ -640,7 +640,7 @@ def assembled(
     Raises
     ------
     ValueError
-        A body has a free rigid-body mode. At the start of a stage, this also holds for connected parts of bodies.
+        A body, or at the start of a stage a connected part of a body, has a free rigid-body mode.
     """
     grid, free = on_grid.cut.grid, stage.free
     dofs = momentum.active.now.dofs[free[momentum.active.now.nodes].ravel()]

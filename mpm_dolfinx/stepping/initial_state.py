@@ -59,7 +59,7 @@ patience 16 takes as many iterations as depth 80 with patience 24. The relative 
 3e-9. Depth 40 with patience 8 ends at 6e-3.
 """
 REMARKABLE = 0.05
-"""Largest change of stress by balancing without a warning, divided by the largest initial stress.
+"""Change of an initial stress above which a warning is issued, divided by the largest initial stress.
 
 This value is also the largest allowed relative residual of the forces.
 """
@@ -178,8 +178,8 @@ def _released(
 ) -> tuple[State, dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]]:
     """Return the state on the grid of the next step, and the tractions on quiet sides.
 
-    The tractions are a dict: name of the point data, then ids of points on a side and their tractions. The stresses are
-    in equilibrium with these tractions, the loads of the previous stage, and the remaining supports.
+    The tractions are a dict by name of point data. Each value has the ids of points on a side, and their tractions. The
+    stresses are in equilibrium with these tractions, the loads of the previous stage, and the remaining supports.
     """
     start = set_up(scene, state, 0.0)
     state, momentum = start.state, scene.momentum
@@ -214,8 +214,8 @@ def _kept_at_rest(scene: Scene, state: State) -> State:
     """Return the state on the grid of the next step, with forces that keep its bodies at rest.
 
     Bodies are in equilibrium under the loads of the present stage. A reset of the grid causes small out-of-balance
-    forces, which these forces cancel. With contact they are omitted, because contact removes penetrations of the last
-    step.
+    forces. Forces stored in the state cancel them. With contact, no forces are stored, because contact removes
+    penetrations of the last step.
     """
     start, forms = set_up(scene, state, 0.0), scene.momentum
     state, system = start.state, start.matrices.momentum

@@ -10,7 +10,7 @@ are filled anew:
 edges replace the surface in the cell. Ends and sharp corners of the surface, and the filled area (in axisymmetry
 volume), do not change.
 
-Remainders of old domains outside these cells become domains. Masses, volumes and the mass of the fluid are exact in
+Remainders of old domains outside these cells become new domains. Masses, volumes and the mass of the fluid are exact in
 each cell. Mass-weighted sums of other point data, such as the logarithm of the elastic left Cauchy-Green tensor, are
 exact too. Point data of a new domain are means over its overlaps with old domains. Fitted slopes extrapolate these
 means to the new centroid, within the range of the old values. With inertia, the centre of mass, the momentum and the
@@ -66,7 +66,7 @@ class Renewal:
         return misshapen(self._grid, points.corners, LONGEST)
 
     def flowed(self, points: MaterialPoints) -> NDArray[np.bool_]:
-        """Return a mask (n,) of yielded or renewed points. Laws without the state `plastic` have False."""
+        """Return a mask (n,) of yielded or renewed points: False for laws without the state `plastic`."""
         if "plastic" not in points.data:
             return np.zeros(len(points), dtype=bool)
         known = np.array(["plastic" in law.state for law in self._materials.laws])[self._materials.law_of(points)]

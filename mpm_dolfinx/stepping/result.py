@@ -47,7 +47,7 @@ class Result:
     residual
         Largest relative residual of the momentum and fluid equations so far.
     wall, profile
-        Wall times, s: of the whole run, and of each part of the run on this process.
+        Wall times, s, of the whole run, and of each part of the run on this process.
     converged
         Whether the run has reached `t_end`, or an event has ended it.
     event
@@ -156,7 +156,8 @@ class Result:
         return self.outcome("energy")
 
     def outcome(self, quantity: str) -> ByName[NDArray[np.float64]]:
-        """Return the results (n, ...) of conditions at the output times, by name. Times without the condition have nan.
+        """Return the results (n, ...) of conditions at the output times, by name. Results are nan at times without the
+        condition.
 
         `quantity`: name of the results, such as "reactions".
         """

@@ -212,7 +212,7 @@ class Scene:
             self.materials.retentions.weight.value = 0.0 if gravity is None else self.fluid.density * gravity
 
     def distributed(self, boxes: NDArray[np.int64]) -> Scene | None:
-        """Return an equal scene on a grid distributed by boxes (ranks, 2, d), see `Partition`, or None.
+        """Return an equal scene, or None.  The boxes (ranks, 2, d) distribute its grid, see `Partition`.
 
         The result is None for user-defined terms, because these may be defined on the present mesh.  The result is also
         None if a second call of a function of position returns other values, as for a random field.

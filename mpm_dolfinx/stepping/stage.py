@@ -197,7 +197,7 @@ class Stage:
 
     @property
     def lasting(self) -> list[Surface]:
-        """Faces whose displacements from seeding a condition needs.  Domains with these faces must not be replaced."""
+        """Faces at which a condition needs displacements since seeding.  Their domains must not be replaced."""
         return [*(faces for _, faces, _ in self.held), *(faces for one in self.acting for faces in one.seeded)]
 
     @property

@@ -196,7 +196,7 @@ class State:
 
     @property
     def as_cut(self) -> MaterialPoints:
-        """Points at the positions where their domains were cut, or at present positions without kept pieces."""
+        """Points at the positions where their domains were cut. Points without kept pieces are at present positions."""
         if self.stay is None:
             return self.points
         return self.stay.points if self.stay.keeps is None else self.stay.points.where(self.stay.keeps, self.points)

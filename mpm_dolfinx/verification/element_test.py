@@ -65,7 +65,7 @@ class ElementTest:
 
     @property
     def q(self) -> NDArray[np.float64]:
-        """Deviatoric stress q = sqrt(3/2) |dev stress| (n,), in Pa."""
+        """Deviatoric stress q (n,), sqrt(3/2) times the norm of the stress deviator, in Pa."""
         s = self.stress + self.p[:, None, None] * np.eye(3)
         return np.sqrt(1.5 * (s * s).sum(axis=(1, 2)))
 

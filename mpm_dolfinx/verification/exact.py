@@ -164,8 +164,8 @@ class Mandel:
     def pressure(self, x: ArrayLike, t: ArrayLike) -> Array:
         """Return the pore pressure, which is independent of y.
 
-        x (...), m, in [0, a]: distances from the middle; x and t are broadcast
-        t (...), s, > 0: times
+        x : (...), m, in [0, a]; distances from the middle; x and t are broadcast
+        t : (...), s, > 0; times
 
         Returns (...), Pa; at t = 0+ the pressure is B (1 + nu_u) force / (3 a). Source: see the class.
         """
@@ -174,9 +174,9 @@ class Mandel:
     def displacement(self, x: ArrayLike, y: ArrayLike, t: ArrayLike) -> tuple[Array, Array]:
         """Return the displacement relative to the state without force.
 
-        x (...), m, in [0, a]: positions; x and t are broadcast
-        y (...), m, in [0, b]: positions; y and t are broadcast
-        t (...), s, > 0: times
+        x : (...), m, in [0, a]; positions; x and t are broadcast
+        y : (...), m, in [0, b]; positions; y and t are broadcast
+        t : (...), s, > 0; times
 
         Returns (u_x, u_y), m; u_x is independent of y, and u_y is independent of x. Source: computed from the pressure
         and the force on the plate, with zero total stress at the lateral side; agrees with the papers cited above.
@@ -302,7 +302,7 @@ class SelfWeightColumn:
 def elastica_tip(load_parameter: float) -> tuple[float, float]:
     """Return the tip displacement of an inextensible cantilever under a dead transverse load at its tip.
 
-    load_parameter, in [0, 1e5]: P L²/(E I), with the load P, the length L and the bending stiffness E I
+    load_parameter : in [0, 1e5]; P L²/(E I), with the load P, the length L and the bending stiffness E I
 
     Returns (shortening u/L, deflection v/L), with absolute errors of 1e-12.
 
@@ -380,11 +380,11 @@ def euler_bernoulli(x: ArrayLike, load: float, length: float, modulus: float, se
 
     The deflection is w x^2 (6 L^2 - 4 L x + x^2) / (24 E I).
 
-    x (n,), m: distances from the clamp
-    load, N/m: w, of any sign
-    length, m, > 0: L
-    modulus, Pa, > 0: Young's modulus E
-    second_moment, m^4, > 0: second moment of area I
+    x : (n,), m; distances from the clamp
+    load : N/m; load w, of any sign
+    length : m, > 0; length L
+    modulus : Pa, > 0; Young's modulus E
+    second_moment : m^4, > 0; second moment of area I
     """
     x = np.asarray(x, dtype=float)
     return load * x**2 * (6 * length**2 - 4 * length * x + x**2) / (24 * modulus * second_moment)  # Source: exact
