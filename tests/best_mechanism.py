@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Largest active thrust of Q1 velocities on a wall that slides away above a rough floor.
 
-A linear program finds these velocities (kinematic theorem of limit analysis).  At the quadrature points sand with the
-friction angle phi dilates by at least sin(phi) times its shear rate.  The pressures on the wall, one for each cell, are
-multipliers of the program.  The sand does not slip on the floor.  The program has no steps and no elasticity: the error
-of the thrust is that of the velocities alone.
+A linear program finds these velocities (kinematic theorem of limit analysis). At the quadrature points, sand with the
+friction angle phi dilates by at least sin(phi) times its shear rate. The pressures on the wall, one for each cell, are
+multipliers of the program. The sand does not slip on the floor. The program has no steps and no elasticity, so the
+error of the thrust is due to the velocities alone.
 
     python -m tests.best_mechanism --cells 10 20
 """
@@ -21,24 +21,24 @@ LENGTH = 1.5  # of the sand / height of the wall
 
 
 def shapes(x, nodes):
-    """Return linear shape functions (m, nodes) at positions x (m,), and their derivatives; nodes lie 1 apart."""
+    """Return linear shape functions (m, nodes) at positions x (m,), and their derivatives. Nodes are 1 apart."""
     off = x[:, None] - nodes
     inside = np.abs(off) < 1
     return inside * (1 - np.abs(off)), inside * -np.sign(off)
 
 
 def means(x):
-    """Return the matrix (cells, m) of the means over positions x (m,) in each cell.  Cells end at odd halves."""
+    """Return the matrix (cells, m) of the means over positions x (m,) in each cell. Cells end at half-integers."""
     cell = np.floor(x + 0.5).astype(int)
     out = (cell == np.unique(cell)[:, None]).astype(float)
     return out / out.sum(axis=1, keepdims=True)
 
 
 def thrust(cells, share, free=0):
-    """Return the error of the thrust on a wall, with this number of cells over its height.
+    """Return the error of the thrust on a wall, with `cells` cells over the height of the wall.
 
-    Walls and floor lie in the middle of cells.  Laws use this share of the gradient's deviation from its cell mean.
-    The floor is smooth in its first `free` cells.
+    Wall and floor lie in the middle of cells. Laws use the fraction `share` of the gradient's deviation from the cell
+    mean. The floor is smooth in the first `free` cells.
     """
     at = [np.arange(0.25, cells * length, 0.5) for length in (LENGTH, 1)]
     nodes = [np.arange(-0.5, cells * length + 1) for length in (LENGTH, 1)]

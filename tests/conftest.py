@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Tests import the demos' scenes."""
+"""The tests import scenes of the demos."""
 
 import sys
 from pathlib import Path
@@ -11,7 +11,7 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "demos"))
 
 @pytest.fixture
 def warned(recwarn):
-    """Return a function that gives the messages of the package's warnings since it was called last."""
+    """Return a function that returns the messages of the package's warnings since its last call."""
     import mpm_dolfinx as mpm  # not above: xdist would hand its workers MPI's variables, with which mpirun ends
 
     def messages():

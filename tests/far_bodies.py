@@ -12,7 +12,11 @@ THERE = ((2.0, -np.inf), (np.inf, np.inf))
 def beside(
     kind: str | None, stiffer: float = 1.0, wet: bool = False, law=None, plate=False, **options
 ) -> mpm.Simulation:
-    """Return the scene; stiffer: the other body's modulus over that of the beam; law: of the beam; plate: on it."""
+    """Return the beam, with a second body of some kind, or alone.
+
+    stiffer: modulus of the second body, divided by the modulus of the beam. law: law of the beam. plate: whether a
+    rigid plate loads the beam.
+    """
     grid = mpm.Grid([0, 0], [3.6, 1.2], [30, 10])
     soft, hard = (mpm.Hencky(bulk=f * E / 1.8, shear=f * E / 2.6, conductivity=1e-4) for f in (1, stiffer))
     bodies, materials = [mpm.box(grid, [0, 0.42], [1, 0.75])], [law or soft]

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Start time of the README's first scene: `python -m tests.first_run` prints it.
 
-The first run has an empty cache of compiled forms, the second one that of the first.  Processor times hardly depend on
-other programs; wall times do.  Compiled Python files are kept, as they are by default.
+The first run has an empty cache of compiled forms, and the second run has the cache of the first run. Other programs
+affect wall times, but hardly processor times. Compiled Python files are kept, as by default.
 """
 
 import os

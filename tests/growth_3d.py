@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Bend a beam in 3D in 25 steps; print a list of the memory that the process has after each of them, MB."""
+"""Bend a beam in 3D in 25 steps, and print the memory of the process after each step, in MB."""
 
 import json
 from pathlib import Path

@@ -20,7 +20,7 @@ SOFT = mpm.Hencky(bulk=1e7 / 3, shear=5e6, porosity=0.4, conductivity=1e-4)
 
 
 def rates(errors):
-    """Return the orders between errors at sizes that are halved each time."""
+    """Return the orders of convergence between errors, if each size is half of the size before."""
     return np.log2(np.array(errors[:-1]) / np.array(errors[1:]))
 
 
@@ -44,7 +44,7 @@ def beam(*, fluid=True, ramp=0.06, load=54e3, offset=0.5, h=0.03, material=SOFT,
 
 
 def pressed(finer: int = 1, conductivity=1e-5, bulk=6.7e6, shear=3.1e6, cells=(36, 30)) -> mpm.Simulation:
-    """Return a saturated beam, clamped and pressed down more and more."""
+    """Return a saturated beam, clamped at one end, under a load that increases."""
     grid = mpm.Grid(lower=[0, -0.6], upper=[1.2, 0.4], cells=[finer * n for n in cells])
     law = mpm.Hencky(bulk=bulk, shear=shear, porosity=0.4, conductivity=conductivity)
     load = mpm.Traction("top", lambda t: (0, -1e5 * t))
@@ -54,23 +54,23 @@ def pressed(finer: int = 1, conductivity=1e-5, bulk=6.7e6, shear=3.1e6, cells=(3
 
 
 def joined(*given):
-    """Return arguments of scenes as one, with the conditions of all."""
+    """Merge the arguments of several scenes into one dictionary, with the conditions of all scenes."""
     conditions = [one for options in given for one in options.get("conditions", [])]
     return {name: value for options in given for name, value in options.items()} | {"conditions": conditions}
 
 
 def without(simulation, *kinds):
-    """Return the active conditions, except for the given kinds."""
+    """Return the conditions of a simulation, except for some kinds."""
     return [one for one in simulation.conditions if not isinstance(one, kinds)]
 
 
 def thresholds(monkeypatch, **values):
-    """Let the choice of solvers follow other thresholds."""
+    """Replace thresholds in the choice of solvers."""
     monkeypatch.setattr(plan, "THRESHOLDS", replace(plan.THRESHOLDS, **values))
 
 
 def noting(counts, solve):
-    """Return `BlockSolver.solve` that notes its iterations."""
+    """Return `BlockSolver.solve` with a record of its numbers of iterations in `counts`."""
 
     def noted(*how):
         found = solve(*how)
@@ -81,14 +81,14 @@ def noting(counts, solve):
 
 
 def limit(simulation, newton):
-    """Let a simulation take so many Newton steps before a step is cut; before its first step."""
+    """Set the largest number of Newton steps before a step is cut. Call this function before the first step."""
     simulation.scene.scheme = replace(simulation.scene.scheme, most_newton=newton)
     simulation.scene.forget()
     return simulation
 
 
 class SetUp(NamedTuple):
-    """The balances at the end of a step's last substep, taken as the only one, and the start of the step."""
+    """Start of a step, and the balances at its end, for one substep of backward Euler."""
 
     start: Start
     momentum: MomentumProblem
@@ -100,7 +100,7 @@ class SetUp(NamedTuple):
 
 
 def set_up(simulation, dt):
-    """Return the balances of a simulation's next step by backward Euler, set up and not solved."""
+    """Return the balances of a simulation's next step by backward Euler before they are solved."""
     start = step.set_up(simulation.scene, simulation.state, dt)
     whole = start.acting[-1]._replace(substep=METHODS["backward-euler"][0])
     both = balances(simulation.scene, start, whole)
@@ -108,12 +108,12 @@ def set_up(simulation, dt):
 
 
 def top_load(load=54e3, ramp=0.06):
-    """Return the beam's load."""
+    """Return the load of the beam."""
     return mpm.Traction("top", lambda t: (0, -load * min(1, t / ramp)), region=((0.05, -np.inf), (1.0, np.inf)))
 
 
 def column(*, cells=10, offset=0.0, width=1, fluid=True, height=1.0, bottom=0.0, **options):
-    """Return a laterally held column on the floor, its top `offset` cells above a grid line."""
+    """Return a column between smooth walls on the floor, with the top `offset` cells above a grid line."""
     h = height / cells
     grid = mpm.Grid([0, 0], [width * h, (cells + 4) * h], [width, cells + 4])
     body = mpm.box(grid, [0, bottom], [width * h, height + offset * h])
@@ -125,7 +125,7 @@ def column(*, cells=10, offset=0.0, width=1, fluid=True, height=1.0, bottom=0.0,
 
 
 def refused_in_one_line(make, name, value, folder, longest):
-    """Assert that a ValueError is one line with object, value and allowed values, shorter than `longest`."""
+    """Assert that `make` raises a ValueError in one line: object, value and allowed values, shorter than `longest`."""
     with pytest.raises(ValueError) as caught:
         make(folder) if make.__code__.co_argcount else make()
     line = str(caught.value)
@@ -134,7 +134,7 @@ def refused_in_one_line(make, name, value, folder, longest):
 
 
 def left_after_a_way_and_back(grid):
-    """Return the mean residual stress and largest pressure of a wet beam bent while its support moves and returns."""
+    """Return mean residual stress and largest pressure of a wet beam whose support moves and returns."""
     hold = mpm.Displacement("left", lambda t: (np.sin(np.pi * t), 0.0))
     load = mpm.Traction("right", lambda t: (0, -600 * np.sin(np.pi * t)))
     body, soil = mpm.box(grid, [0.1, 0.5], [0.9, 0.8]), mpm.Hencky(1e6 / 3, 2e5, porosity=0.4, conductivity=1e-4)
@@ -145,10 +145,10 @@ def left_after_a_way_and_back(grid):
 
 
 def imbalance(s, before, soil, gravity):
-    """Return the resultant of all forces on wet soil after a step, over the largest force.
+    """Return the resultant of all forces on wet soil after a step, divided by the largest force.
 
-    The weight counts the fluid as the balance of momentum does: without the step's change of the volume defect, and
-    without the correction of the defect.  `before` are the points at the start of the step.
+    The weight contains the fluid as in the balance of momentum: without the change of the volume defect in the step,
+    and without its correction. `before` are the points at the start of the step.
     """
     p, n = s.points, soil.porosity
     fluid = p.volume0 @ (p.J - 1 + n - p.data["owed"]) + before.volume0 @ (before.data["owed"] - before.data["due"])
@@ -159,7 +159,9 @@ def imbalance(s, before, soil, gravity):
 
 
 def gathered(simulation):
-    """Return positions, pressures, stresses and F of all points by number, and their counts a process; {} but on 0."""
+    """Return positions, pressures, stresses and F of all points by id, and the numbers of points of the processes (on
+    process 0).
+    """
     points = simulation.points
     columns = (points.id, points.x, points.pressure, simulation.effective_stress(), points.F)
     parts = simulation.grid.comm.gather(columns)

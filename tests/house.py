@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: MIT
-"""Measures of the package's house, counted over its syntax trees: `python -m tests.house` prints them.
+"""Measures of the quality of the package's code: `python -m tests.house` prints them.
 
-A number is *structure* where it cannot be another one: see `structure` below. It is *sourced* if a comment on its line,
-or the string below it, names one of two things:
+A number is *structure* if no other value is possible: see `structure` below. A number is *sourced* if a comment on its
+line, or the string below it, has one of two forms:
 
     Source: an equation, a paper (with its year), a definition, a format, or an exact bound, see `SOURCE`;
     Plateau (scene "name" of tests/plateaus.py): half this value changes the result by a, twice this value by b, and
     finer cells by c.
 
-The changes are relative. One of a and b is not zero, so the number affects the scene. Both are below c. `python
-tests/plateaus.py` measures them again. All other numbers are *ad hoc*.
+The changes are relative. a or b is not zero, so the number affects the scene. Both are below c.
+`python tests/plateaus.py` measures these changes again. All other numbers are *ad hoc*.
 """
 
 import ast
@@ -46,7 +46,7 @@ CONDITIONS = (
 
 
 class Module:
-    """One file: its name, its lines and its tree."""
+    """A file of the package, with its name, its lines and its syntax tree."""
 
     def __init__(self, path: Path):
         self.path, self.text = path, path.read_text()
@@ -66,7 +66,7 @@ class Module:
         }
 
     def beside(self, node: ast.stmt) -> str:
-        """Return the comments of a statement: on its lines and above it, and the string below it."""
+        """Return the comments on the lines of a statement and above it, and the string below the statement."""
         first, last = node.lineno - 1, node.end_lineno
         said = [line.partition("#")[2] for line in self.lines[first:last]]
         while first > 0 and self.lines[first - 1].lstrip().startswith("#"):
@@ -85,12 +85,12 @@ def modules() -> tuple[Module, ...]:
 
 
 def literals(node: ast.AST):
-    """Yield the numbers written in an expression, no truth values among them."""
+    """Yield the numbers in an expression, except truth values."""
     return (m for m in ast.walk(node) if isinstance(m, ast.Constant) and type(m.value) in (int, float))
 
 
 def power_of_two(node: ast.AST) -> bool:
-    """Return whether an expression is 2**k or 1 << k, maybe less one: sizes of chunks and of numbers' formats."""
+    """Return whether an expression is 2**k or 1 << k, or one less, as for sizes of chunks and of number formats."""
     if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Sub):
         return power_of_two(node.left)
     return isinstance(node, ast.BinOp) and isinstance(node.op, ast.Pow | ast.LShift) and integers(node)
@@ -101,7 +101,7 @@ def integers(node: ast.AST) -> bool:
 
 
 def table(node: ast.AST) -> bool:
-    """Return whether an expression is a table of indices or of names: a nest of integers, of more than one level."""
+    """Return whether an expression is a table of indices or names: nested lists of integers with several levels."""
     inner = [m for m in ast.walk(node) if m is not node and isinstance(m, ast.Tuple | ast.List | ast.Dict | ast.Set)]
     rows = isinstance(node, ast.Tuple | ast.List) and len(node.elts) > 1
     names = any(isinstance(m, ast.Constant) and isinstance(m.value, str) for m in ast.walk(node))
@@ -109,7 +109,7 @@ def table(node: ast.AST) -> bool:
 
 
 def pairs(node: ast.Assign):
-    """Yield (name, value) of an assignment to names, also of several at once."""
+    """Yield (name, value) of an assignment to one or several names."""
     for target in node.targets:
         if isinstance(target, ast.Tuple) and isinstance(node.value, ast.Tuple):
             yield from ((a.id, b) for a, b in zip(target.elts, node.value.elts, strict=True) if isinstance(a, ast.Name))
@@ -128,7 +128,7 @@ def structure(value: ast.AST) -> bool:
 
 
 def named():
-    """Yield (where, name, comments) of all numbers in capitals that are not structure."""
+    """Yield (place, name, comments) of all numbers with names in capitals that are not structure."""
     for module in modules():
         for node in module.tree.body:
             if isinstance(node, ast.AnnAssign) and node.value is not None:
@@ -141,13 +141,13 @@ def named():
 
 
 def plateau(said: str):
-    """Return (scene, halved, doubled, cells) from the comments of a number, None without a plateau."""
+    """Return (scene, change with half, change with twice, change with finer cells) from a comment, or None."""
     found = PLATEAU.search(said)
     return found and (found[1], *map(float, found.groups()[1:]))
 
 
 def sourced(said: str) -> bool:
-    """Return whether the comments of a number have a source, or a plateau: an effect, but smaller than the cells'."""
+    """Return whether the comments of a number have a source, or a plateau with an effect below that of finer cells."""
     flat = plateau(said)
     return bool(SOURCE.search(said)) or bool(flat and 0 < max(flat[1:3]) < flat[3])
 
@@ -157,7 +157,7 @@ def ad_hoc() -> list[str]:
 
 
 def inline() -> list[str]:
-    """Return the numbers in functions that are rules: no small fractions, no units, no defaults that callers choose."""
+    """Return the rules among the numbers in functions: no small fractions, no units, no defaults of parameters."""
     out = []
     for module in modules():
         within = [n for n in module.nodes if isinstance(n, ast.FunctionDef | ast.Lambda)]
@@ -205,7 +205,7 @@ def folders() -> dict[str, set[str]]:
 
 
 def cycles(graph: dict[str, set[str]]) -> list[str]:
-    """Return the nodes of a circle, none where there is no circle."""
+    """Return the nodes of a circle in a graph, or an empty list."""
     try:
         tuple(TopologicalSorter(graph).static_order())
     except CycleError as error:
@@ -214,7 +214,7 @@ def cycles(graph: dict[str, set[str]]) -> list[str]:
 
 
 def parameters() -> list[tuple[int, str]]:
-    """Return (number of parameters, function), the most first, of all functions and of fields of data classes."""
+    """Return (number of parameters, name) of all functions and data classes, in descending order."""
     out = []
     for module in modules():
         for node in module.nodes:
@@ -226,7 +226,7 @@ def parameters() -> list[tuple[int, str]]:
 
 
 def packed() -> list[str]:
-    """Return the assignments of three and more values to as many names in one statement."""
+    """Return the assignments of three or more values to as many names in one statement."""
     found = []
     for module in modules():
         for node in module.nodes:
@@ -237,17 +237,18 @@ def packed() -> list[str]:
 
 
 def _slot(index: ast.AST) -> bool:
-    """Return whether a subscript is [0], [()] or [:], by which a container stands for an attribute."""
+    """Return whether a subscript is [0], [()] or [:], so that a container replaces an attribute."""
     whole = isinstance(index, ast.Slice) and index.lower is index.upper is index.step is None
     empty = isinstance(index, ast.Tuple) and not index.elts
     return whole or empty or (isinstance(index, ast.Constant) and index.value == 0)
 
 
 def hidden() -> list[str]:
-    """Return where a method changes the contents of its object without setting an attribute, or a function a global.
+    """Return the places where a method changes contents of its object without setting an attribute, or a function
+    changes a global.
 
-    These are: `self.x[0] += 1`, `self.x[:] = y`, `self.x[()] = y`; `self._x.append`, clear, update, pop and add
-    outside of `__init__`; `global`; attributes of functions; entries set in a module's own lists and dictionaries.
+    Such changes are: `self.x[0] += 1`, `self.x[:] = y`, `self.x[()] = y`; `self._x.append`, clear, update, pop and add
+    outside of `__init__`; `global`; attributes of functions; entries set in the lists and dictionaries of a module.
     """
     out = []
     for module in modules():
@@ -278,7 +279,7 @@ def _changes(node: ast.AST, functions: set[str]) -> bool:
 
 
 def guards() -> list[str]:
-    """Return asserts and RuntimeErrors, which guard an order of calls if users and solvers are not their cause."""
+    """Return asserts and RuntimeErrors that guard the order of calls, and are not caused by users or solvers."""
     found = []
     for module in modules():
         for node in module.nodes:
@@ -297,7 +298,7 @@ def lines() -> int:
 
 
 def measures() -> dict[str, float]:
-    """Return all measures by their names."""
+    """Return all measures by name."""
     size: dict[Path, int] = {}
     for module in modules():
         size[module.path.parent] = size.get(module.path.parent, 0) + 1
@@ -319,7 +320,7 @@ def measures() -> dict[str, float]:
 
 
 def main(arguments: list[str]) -> None:
-    """Print the measures, and with --list the counted places."""
+    """Print the measures. With --list, also print the counted places."""
     for name, value in measures().items():
         print(f"{value:9g}  {name}")
     if "--list" in arguments:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Ctrl-C at any line of the package, the same line in every run."""
+"""Ctrl-C at a chosen line of the package, which is the same line in every run."""
 
 import sys
 from contextlib import contextmanager, suppress
@@ -12,9 +12,9 @@ PACKAGE = str(Path(mpm_dolfinx.__file__).parent)
 
 @contextmanager
 def interrupted(after: int):
-    """Raise KeyboardInterrupt once so many lines of the package have been run, and go on behind the block.
+    """Raise KeyboardInterrupt once, after `after` lines of the package, and continue after the block.
 
-    Gives a function that returns how many lines have been run.
+    The context is a function that returns the number of executed lines.
     """
     left = after
 

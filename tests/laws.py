@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Laws at points, where any deformation gradient can be tried; not collected by pytest."""
+"""Laws at points with arbitrary deformation gradients. pytest does not collect this file."""
 
 from functools import cached_property
 
@@ -13,7 +13,7 @@ from mpm_dolfinx.materials.local_unknowns import LocalUnknowns
 
 
 class LawAtPoints:
-    """A law at points with one state, or an array (n, ...) of each of its variables."""
+    """A law at points with one state, or with an array (n, ...) for each state variable."""
 
     def __init__(self, material, dim):
         self.material, self.law, self.dim = material, type(material), dim
@@ -29,7 +29,9 @@ class LawAtPoints:
         self.stress = PointExpression(self.P, self.points)
 
     def evaluate(self, expression, F, state=None):
-        """Return an expression at points with given F (n, d, d); state: name -> (n, ...), by default that at rest."""
+        """Return an expression at points with given F (n, d, d). `state`: name -> (n, ...), by default the state at
+        rest.
+        """
         n, state = len(F), {**self.law.state, **(state or {})}
         fields = {name: np.asarray(getattr(self.material, name), dtype=float) for name in self.law.parameters}
         fields = {name: np.broadcast_to(v, (n, *v.shape)) for name, v in fields.items()}
@@ -67,7 +69,7 @@ class LawAtPoints:
         return out
 
     def tangent(self, F, state=None, h=1e-6):
-        """Return dP/dF (n, d, d, d, d) of the law and by central differences."""
+        """Return dP/dF (n, d, d, d, d), from the law and by central differences."""
         d = self.dim
         A = ufl.diff(self.P, self.F)
         A = PointExpression(ufl.as_vector([A[i] for i in np.ndindex(d, d, d, d)]), self.points)
@@ -79,7 +81,7 @@ class LawAtPoints:
 
 
 def turned(F, seed=0):
-    """Return a rotation (d, d) at random."""
+    """Return a random rotation (d, d)."""
     d = F.shape[-1]
     R = np.linalg.qr(np.random.default_rng(seed).normal(size=(d, d)))[0]
     R[0] *= np.linalg.det(R)

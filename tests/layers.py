@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Exact contact of elastic layers with a parabola: Hertz's, with the layers' finite thickness and width.
+"""Exact contact of elastic layers with a parabola: Hertz's theory for layers of finite thickness and width.
 
-Layers between smooth walls, in plane strain: pressures cos(k x), k a multiple of pi / width, move their surface by
-multiples of themselves (Johnson 1985, Contact Mechanics, 5.8).  The contact is where pressures are positive.
+The layers are in plane strain between smooth walls. Pressures cos(k x), with k a multiple of pi / width, cause
+proportional displacements of the surface (Johnson 1985, Contact Mechanics, 5.8). The contact is the region of positive
+pressures.
 """
 
 import numpy as np
@@ -12,7 +13,7 @@ TERMS = 1024
 
 
 def compliance(width, height, young, poisson, rough):
-    """Return the displacements under pressures 1 cos(k x) on a layer with a rough, held base, or a smooth one."""
+    """Return the displacements under pressures cos(k x) on a layer with a rough, fixed base or with a smooth base."""
     wave = np.arange(1, TERMS) * np.pi / width
     a, kappa = np.minimum(wave * height, 300.0), 3 - 4 * poisson
     over = (2 * kappa * np.sinh(2 * a) - 4 * a, 2 * kappa * np.cosh(2 * a) + 4 * a**2 + 1 + kappa**2)
@@ -22,7 +23,7 @@ def compliance(width, height, young, poisson, rough):
 
 
 def pressures(width, radius, compliances, force):
-    """Return places and pressures on half of the contact that bears a force, N/m on both halves."""
+    """Return positions and pressures on half of the contact under a force, in N/m on both halves."""
     x = (np.arange(TERMS // 2) + 0.5) * width / TERMS
     waves = np.cos(np.outer(x, np.arange(TERMS) * np.pi / width))
     matrix = waves * (np.append(1.0, np.full(TERMS - 1, 2.0)) / TERMS * sum(compliances)) @ waves.T
@@ -41,9 +42,9 @@ def pressures(width, radius, compliances, force):
 
 
 def errors(places, found, width, radius, compliances, force):
-    """Return the largest error of pressures at places over the inner 0.8 of the contact, and that of its half-width.
+    """Return the largest error of the pressures over the inner 0.8 of the contact, and the error of the half-width.
 
-    The half-width is that of the ellipse that fits there.
+    The half-width is the half-width of an ellipse that is fitted to these pressures.
     """
     x, p = pressures(width, radius, compliances, force)
     edge = 0.8 * x[p > 0].max()

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""A large-strain solution (u, p) that is chosen, with the body force and the source that it needs, in UFL.
+"""A manufactured solution (u, p) at large strain, with its body force and source in UFL.
 
-A block of one metre with soft water and a conductivity that depends on its volume stands between smooth walls.  Its
-top, which is drained, sinks by a third; inside it bulges and turns.  Everything is a function of X and t.
+A block of one metre stands between smooth walls. Its water is soft, and its conductivity depends on its volume. The
+drained top sinks by a third of the height, and the inside bulges and rotates. All fields are functions of X and t.
 """
 
 import numpy as np
@@ -24,14 +24,14 @@ WALLS = {"left": "x", "right": "x", "bottom": "y"}
 
 
 def sunk(t, sin):
-    """Return the share of SINK by which the top has sunk."""
+    """Return the displacement of the top, divided by SINK."""
     return sin(np.pi / 2 * t / TIME) ** 2
 
 
 def solution(X, t, sin=np.sin, cos=np.cos):
-    """Return (u, p) at reference positions (x, y), m, at time t, s, of numbers or UFL.
+    """Return (u, p) at reference positions (x, y), in m, and time t, in s, as numbers or UFL.
 
-    The walls are free of shear and flow, and so is the floor; at the top p = 0, and the traction is even.
+    Walls and floor are free of shear and flow. At the top p = 0, and the traction is uniform.
     """
     (x, y), part = X, sunk(t, sin)
     across = BULGE * part * sin(np.pi * x) * (1 - y) ** 2 * (1 + 2 * y)
@@ -40,21 +40,21 @@ def solution(X, t, sin=np.sin, cos=np.cos):
 
 
 def traction(t):
-    """Return the traction of the top, Pa."""
+    """Return the traction on the top, in Pa."""
     stretch = 1 - SINK * sunk(t, np.sin)
     lam = SOIL.bulk - 2 * SOIL.shear / 3
     return 0, SOIL.shear * (stretch - 1 / stretch) + lam * np.log(stretch) / stretch
 
 
 def _at(points, t):
-    """Return X and t as UFL variables, F and p."""
+    """Return X and t as UFL variables, and F and p."""
     X, t = ufl.variable(points.position - points.displacement), ufl.variable(t)
     u, p = solution(X, t, ufl.sin, ufl.cos)
     return X, t, ufl.variable(ufl.Identity(2) + ufl.diff(ufl.as_vector(u), X)), p
 
 
 def _divergence(f, X):
-    """Return the divergence by X of a vector or tensor."""
+    """Return the divergence of a vector or tensor with respect to X."""
     slope = ufl.diff(f, X)
     if len(f.ufl_shape) == 1:
         return slope[0, 0] + slope[1, 1]
@@ -62,14 +62,14 @@ def _divergence(f, X):
 
 
 def body_force(points, v, t):
-    """Return the work of -Div P of effective stress and pore pressure, a term."""
+    """Return the term of the body force: the work of -Div P, with effective stress and pore pressure."""
     X, _, F, p = _at(points, t)
     P = ufl.diff(SOIL.energy(F, SOIL.bulk, SOIL.shear), F) - p * ufl.det(F) * ufl.inv(F).T
     return ufl.inner(_divergence(P, X), points.value(v)) / ufl.det(points.F) * points.dx
 
 
 def source(points, q, t):
-    """Return the rate of the mass of the water and the divergence of its flow, over the density at zero pressure."""
+    """Return the source: rate of the water mass plus divergence of its flow, over the density at zero pressure."""
     X, t, F, p = _at(points, t)
     J = ufl.det(F)
     density = ufl.exp(p / WATER.bulk)
@@ -88,13 +88,13 @@ PHYSICS = {
 
 
 def scene(cells):
-    """Return the block on a grid of that many cells a metre."""
+    """Return the block on a grid of `cells` cells per metre."""
     grid = mpm.Grid([0, 0], [1.0, 1 + 2 / cells], [cells, cells + 2])
     return mpm.Simulation(grid, [mpm.box(grid, [0, 0], [1, 1])], [SOIL], **PHYSICS)
 
 
 def reference(cells):
-    """Return the block by Taylor-Hood elements."""
+    """Return the block with Taylor-Hood elements."""
     return BiotFEM(mpm.Grid([0, 0], [1, 1], (cells, cells)), SOIL, **PHYSICS)
 
 
@@ -103,9 +103,8 @@ def rms(values):
 
 
 def errors(s):
-    """Return the errors of displacement and pressure, at points or in cells' centres, over the largest exact ones.
-
-    In the rms.
+    """Return the rms errors of displacement and pressure, at points or cell centres, divided by the largest exact
+    values.
     """
     fem = isinstance(s, BiotFEM)
     X = s.grid.midpoints[: s.grid.num_owned] if fem else s.bodies[0].centre
@@ -118,7 +117,7 @@ def errors(s):
 
 
 def stress(X, t):
-    """Return the exact effective Cauchy stress (n, 2, 2), Pa, at reference positions (n, 2), by differences of u."""
+    """Return the exact effective Cauchy stress (n, 2, 2), in Pa, at reference positions (n, 2), by differences of u."""
     step, slopes = 1e-6, []
     for e in np.eye(2):
         ahead, behind = (np.stack(solution((X + way * step * e).T, t)[0], axis=1) for way in (1, -1))
@@ -129,7 +128,7 @@ def stress(X, t):
 
 
 def errors_of_cells(s):
-    """Return the errors of the cells' displacement, pressure and both stresses where they are, as `errors` does."""
+    """Return the errors of displacement, pressure and both stresses of the cells, defined as in `errors`."""
     cells = s.cells()
     X = cells.x - cells.displacement
     u, p = solution(X.T, s.t)

@@ -13,7 +13,7 @@ IN_ORDER = {4: [0, 1, 3, 2], 8: [0, 1, 3, 2, 4, 5, 7, 6]}
 
 
 def box_mesh(kind, cells, lower, upper, parts=None, place=None):
-    """Return a box of cells along each axis as a mesh of a kind; parts: functions of the cells' centres, by name."""
+    """Return a box as a mesh of one kind of cells. `parts`: functions of the cell centres, by name."""
     dim = len(cells)
     axes = [np.linspace(a, b, n + 1) for a, b, n in zip(lower, upper, cells, strict=True)]
     x = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, dim)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Run a saturated block in 3D, solved by iterations, on however many processes there are; write its state."""
+"""Run a saturated block in 3D with iterative solvers, on any number of processes, and write its state."""
 
 import sys
 from dataclasses import replace

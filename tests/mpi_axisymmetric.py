@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Push a rough disc into a ring of two soils on top of each other, on any number of processes; write the state."""
+"""Push a rough disc into a ring of two layers of soil, on any number of processes, and write the state."""
 
 import sys
 

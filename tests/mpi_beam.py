@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Run the coarse beam on however many processes there are and write its state, ordered by point."""
+"""Run the coarse beam on any number of processes, and write its state, ordered by point."""
 
 import sys
 

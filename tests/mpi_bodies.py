@@ -22,7 +22,7 @@ tempfile.tempdir = str(folder)
 
 
 def same(words, make):
-    """Check that all processes raise the same error, with these words."""
+    """Check that all processes raise the same error with these words."""
     try:
         make()
         message = "accepted"
@@ -33,7 +33,7 @@ def same(words, make):
 
 
 def rows(body):
-    """Return the domains and their surface faces in the order of their centres."""
+    """Return the domains and their surface faces, ordered by centres."""
     order = np.lexsort(body.centre.round(9).T)
     return body.vertices[order].mean(axis=1), body.surface[order].sum(axis=(1, 2))
 
@@ -63,7 +63,7 @@ with warnings.catch_warnings():
 
 
 def full(**options):
-    """Return a file on a full disk."""
+    """Return a file that behaves as on a full disk."""
 
     def write(rows):
         raise OSError("the disk is full")

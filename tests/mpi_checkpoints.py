@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Checkpoints of scenes; arguments: a folder, whether checkpoints are written half way, "write" or "read", the scenes.
+"""Checkpoints of scenes. Arguments: a folder, whether a checkpoint is written in the middle of a run, "write" or
+"read", and scenes.
 
-Resume every checkpoint in the folder and save the state again: the same bits, whatever number of processes wrote it.
-Then refuse altered checkpoints, a full disk of one process and a missing file, on all processes.
+Every checkpoint in the folder is resumed, and the state is saved again, with equal bits for any number of processes.
+Then altered checkpoints, a full disk of one process and a missing file are refused on all processes.
 """
 
 import resource
@@ -35,7 +36,7 @@ def rained():
 
 
 def few():
-    """Return a block of two cells in 3D: not every process has points."""
+    """Return a block of two cells in 3D, so that some processes have no points."""
     grid = mpm.Grid([0, 0, 0], [1, 1, 3], [1, 1, 3])
     soil, top = mpm.Hencky(bulk=1e8, shear=6e7, conductivity=1e-4), mpm.Drained("top")
     walls = {"left": "x", "right": "x", "front": "y", "back": "y", "bottom": "xyz"}
@@ -63,7 +64,7 @@ def contents(file):
 
 
 def refused(simulation, action, kind, words):
-    """Assert that all processes raise the same error, of one line, and that the state remains."""
+    """Assert that all processes raise the same error, in one line, and that the state does not change."""
     before = simulation.state
     try:
         action()
@@ -75,7 +76,7 @@ def refused(simulation, action, kind, words):
 
 
 def check(simulation, file):
-    """Refuse what is no whole checkpoint, and write none on a full disk."""
+    """Check that incomplete checkpoints are refused, and that a full disk leaves no checkpoint."""
     comm = simulation.grid.comm
     kept, part = file.read_bytes(), file.with_name("altered")
     comm.barrier()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Press a block aslant, which slips, on another one; then a tool on both and on a fill of the block's group."""
+"""Press a rotated block, which slips, onto another block, then a tool onto both and onto a fill of the first group."""
 
 import sys
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Load, unload and load a beam of two bodies, one of clay in plane strain, and one in 3D, on however many processes."""
+"""Load, unload and reload a beam of two bodies, of clay in plane strain and in 3D, on any number of processes."""
 
 import sys
 
@@ -12,7 +12,7 @@ CLAY = mpm.Hencky(bulk=1.7e8, shear=3.4e6)  # nu = 0.49
 
 
 def cycled(dim):
-    """Return a simulation after a load cycle and a half."""
+    """Return a simulation after one and a half load cycles."""
     grid = mpm.Grid([0] * dim, [1.3, *[0.4] * (dim - 2), 1.0], [13, *[4] * (dim - 2), 10])
     lower, upper = [0.0, *[0.13] * (dim - 2), 0.43], [1.0, *[0.33] * (dim - 2), 0.63]
     bodies = [mpm.box(grid, lower, [0.55, *upper[1:]]), mpm.box(grid, [0.55, *lower[1:]], upper, material=3 - dim)]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Press wet soil by a disc and a load while the finest cells travel, on any number of processes; write the state."""
+"""Press wet soil with a disc and a load while the finest cells move, on any number of processes; write the state."""
 
 import sys
 
@@ -13,7 +13,7 @@ GRAVITY = (2.0, -9.81)
 
 
 def fine_about(low, high, count, middle, width=0.15, times=6):
-    """Return lines from low to high; cells at `middle` are `times` + 1 times finer than far from it."""
+    """Return lines from low to high, with cells at `middle` that are `times` + 1 times finer than cells far away."""
     x = np.linspace(low, high, 1601)
     density = 1 + times * np.exp(-(((x - middle) / width) ** 2))
     share = np.append(0.0, np.cumsum((density[1:] + density[:-1]) / 2))
@@ -24,7 +24,7 @@ DISC = mpm.Tool(mpm.Ball((1.0, 1.25), 0.25), lambda t: (0.001 * t, -0.002 * t), 
 
 
 def pressed(loaded=True, soil=SOIL, disc=DISC, axisymmetric=False):
-    """Return a block under a disc that sinks, and under a load, in cells that travel to the right and back."""
+    """Return a block under a sinking disc and under a load, with fine cells that move to the right and back."""
     y = fine_about(0, 1.2, 9, 0.9, 0.2, 2)
     lines = lambda t: [fine_about(0, 2, 18, 0.4 + 1.2 * np.sin(2 * t) ** 2), y]  # noqa: E731
     grid = mpm.Grid(lines=lines(0), follow=lines, axisymmetric=axisymmetric)
@@ -37,7 +37,7 @@ def pressed(loaded=True, soil=SOIL, disc=DISC, axisymmetric=False):
 
 
 def pressed_in_3d():
-    """Return a block under a rough ball that sinks, in cells that travel to the right and back."""
+    """Return a block under a sinking rough ball, with fine cells that move to the right and back."""
     others = np.linspace(0, 0.9, 4), fine_about(0, 1.1, 5, 0.8, 0.2, 2)
     lines = lambda t: [fine_about(0, 2, 8, 0.4 + 1.2 * np.sin(2 * t) ** 2, 0.2), *others]  # noqa: E731
     grid = mpm.Grid(lines=lines(0), follow=lines)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Rows of any kind and width travel to other processes and come back, and are counted; so do whole points."""
+"""Rows of any type and width, and whole points, are sent to other processes and back; messages are counted."""
 
 from dataclasses import replace
 

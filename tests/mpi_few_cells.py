@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Run blocks on grids of few cells, with processes without cells or faces; write the final positions."""
+"""Run blocks on grids with so few cells that some processes have no cells or faces, and write the final positions."""
 
 import sys
 

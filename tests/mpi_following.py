@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Push a disc into wet soil through lines that follow it, on any number of processes; write the state."""
+"""Push a disc into wet soil on grid lines that follow it, on any number of processes, and write the state."""
 
 import sys
 
@@ -12,7 +12,7 @@ SOIL = mpm.Hencky(2e5, 1e5, porosity=0.4, conductivity=1e-4)
 
 
 def pushed(load=None):
-    """Return a wet block under a disc that follows a path, or sinks under a load, and lines that follow the disc."""
+    """Return a wet block with lines that follow a disc, on a path or under a load."""
     lines = mpm.graded([0, 0], [2, 2], [[[0.65, 0.88], [0.98, 1.24]]], 0.03, 1.25)
     path = {"displacement": lambda t: (0.42 * t, -0.1 * t)} if load is None else {"load": load, "direction": (0.3, -1)}
     disc = mpm.Tool(mpm.Ball((0.8, 1.1), 0.1), friction=0.2, **path)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Push a ball into wet soil in 3D through lines that follow it, on any number of processes; write the state."""
+"""Push a ball into wet soil in 3D on grid lines that follow it, on any number of processes, and write the state."""
 
 import sys
 
@@ -14,12 +14,12 @@ LINES = mpm.graded([0, 0, 0], [2.1, 0.9, 0.9], [[[0.9, 0.3, 0.45], [1.2, 0.6, 0.
 
 
 def leading(t, x):
-    """Return lines whose smallest cells move along x with time, as far as the soil reaches."""
+    """Return lines whose smallest cells move along x with time, within the soil."""
     return carried(LINES, np.array([min(2 * t, x[:, 0].max() - 1.5), 0.0, 0.0]))
 
 
 def pushed(follows=True):
-    """Return a wet block under a smooth ball and lines that follow the ball, or `leading`."""
+    """Return a wet block under a smooth ball, on lines that follow the ball, or on the lines `leading`."""
     ball = mpm.Tool(mpm.Ball((1.05, 0.45, 0.75), 0.15), lambda t: (2 * t, 0, -0.2 * t))
     grid = mpm.Grid(lines=LINES, follow=ball if follows else leading)
     walls = {"left": "x", "right": "x", "front": "y", "back": "y", "bottom": "xyz"}

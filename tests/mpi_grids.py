@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""As `mpi_beam.py`, on a finer grid, by multigrid on the background grid."""
+"""Run the beam of `mpi_beam.py` on a finer grid, with multigrid on the background grid."""
 
 import sys
 from dataclasses import replace

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Move two wet soils, boxes or meshes, with fields of materials, on any number of processes; write the memory held.
+"""Move two wet soils, boxes or meshes, with fields of materials, on any number of processes, and write the memory.
 
-Also write a checkpoint, read the one that a single process has written in the same folder, and weigh both.
+The script also writes a checkpoint, reads the checkpoint of a single process in the same folder, and measures both.
 """
 
 import sys
@@ -25,7 +25,7 @@ def stiffness(X):
 
 
 def peak(action):
-    """Return the largest memory that Python and numpy take during an action on this process, bytes."""
+    """Return the largest memory of Python and numpy in an action on this process, in bytes."""
     tracemalloc.start()
     action()
     found = tracemalloc.get_traced_memory()[1]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Excavate half of a body on any number of processes; write load balance and amounts of communication."""
+"""Excavate half of a body on any number of processes, and write the load balance and the amount of communication."""
 
 import sys
 
@@ -17,7 +17,7 @@ simulation = mpm.Simulation(
 
 
 def measured(t_end):
-    """Return the reported imbalance and memory of a run, and on rank 0 the values of all processes."""
+    """Return the reported imbalance and memory of a run, and on process 0 the values of all processes."""
     result = simulation.run(t_end, 0.5, progress=False)
     pieces = simulation.scene.last[0].data.pieces
     mine = (len(simulation.points), len(pieces.cells), len(pieces.places.filled))

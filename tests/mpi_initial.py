@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Put a bank in water at rest, and load it, on however many processes there are; write the state."""
+"""Put a bank in still water, load it, and write the state, on any number of processes."""
 
 import sys
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Run four laws, three with state, with fields and terms of the user's, on any number of processes; write the state."""
+"""Run four laws, three of them with state, with fields and user-defined terms, on any number of processes."""
 
 import sys
 
@@ -10,7 +10,7 @@ import mpm_dolfinx as mpm
 
 
 def push(points, u, v, t):
-    """Return a force that turns with the material."""
+    """Return a force that rotates with the material."""
     F = (ufl.Identity(2) + points.grad(u)) * points.F
     return -ufl.inner(F * ufl.as_vector([2e4 * t, 0]), points.value(v)) / ufl.det(points.F) * points.dx
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Run a seam off the grid lines, of a law of its own, which not every process has a part of; write the state."""
+"""Run a seam with its own law, off the grid lines; some processes have no part of the seam. Write the state."""
 
 import sys
 

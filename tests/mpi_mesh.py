@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Run a slope of triangles on a layer of quadrilaterals on however many processes there are; write the state."""
+"""Run a slope of triangles on a layer of quadrilaterals on any number of processes, and write the state."""
 
 import sys
 

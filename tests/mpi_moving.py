@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Bodies that leave the cells of their processes: the state with and without a new distribution, and after restarts.
+"""Bodies move away from the cells of their processes: the state with and without a new distribution, and after
+restarts.
 
-Arguments: file of the results, and a checkpoint, written by the first run and resumed by a run on fewer processes.
+Arguments: file of the results, and a checkpoint, which the first run writes and a run on fewer processes resumes.
 """
 
 import sys
@@ -20,7 +21,7 @@ CONTENT = 0.2
 
 
 def carried():
-    """Return a wet block with friction under a disc; its bottom and the disc are carried along."""
+    """Return a wet block with friction under a disc; its bottom and the disc move."""
     grid = mpm.Grid([0, 0], [2, 1], [10, 5])
     law = mpm.DruckerPrager(2e5, 1e5, friction=25, dilation=5, cohesion=3e3, porosity=0.4, conductivity=1e-4)
     hold = mpm.Displacement("bottom", lambda t: (1.3 * t, 0.0))
@@ -31,7 +32,7 @@ def carried():
 
 
 def dug():
-    """Return a block on a longer one, with inertia and friction between them, after an excavation at one end."""
+    """Return a block on a longer block, with inertia and friction, after an excavation at one end."""
     grid = mpm.Grid([0, 0], [2, 1], [10, 5])
     bodies = [mpm.box(grid, [x, 0], [x + 0.8, 0.2]) for x in (0.2, 1.0)] + [mpm.box(grid, [0.3, 0.2], [0.7, 0.6])]
     push = mpm.Traction("left", lambda t: (2e3 * t, 0), region=((0.25, 0.25), (0.35, 0.6)))
@@ -45,12 +46,12 @@ def dug():
 
 
 def run(simulation, t_end, **options):
-    """Run to a time; return the result."""
+    """Run to a time, and return the result."""
     return simulation.run(t_end, DT, progress=False, **options)
 
 
 def state(simulation):
-    """Return the state on rank 0, and results of conditions."""
+    """Return the state on process 0, and the results of conditions."""
     found = gathered(simulation)
     found.pop("counts", None)
     for quantity, of in simulation.state.outcome.items():

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Run a sheared block with output files on any number of processes; argument: a folder."""
+"""Run a sheared block with output files on any number of processes. The argument is a folder."""
 
 import sys
 
@@ -7,7 +7,7 @@ import mpm_dolfinx as mpm
 
 
 def sheared(folder):
-    """Return a block whose foot is held while its top is sheared and pressed, and its writer."""
+    """Return a block with fixed base and sheared, pressed top, and its writer."""
     grid = mpm.Grid([0, 0], [1.4, 1.0], [14, 10])
     body = mpm.box(grid, [0.2, 0.15], [0.9, 0.75])
     sides = [mpm.Displacement("bottom", (0, 0)), mpm.Displacement("top", lambda t, X: (0.2 * t, -0.05 * t))]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Run a soft wet beam next to a stiff body on any number of processes; write the state of both."""
+"""Run a soft wet beam next to a stiff body on any number of processes, and write the state of both."""
 
 import sys
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Let rain fall on sand next to loam, which is carried along as it gets wet, and write the state."""
+"""Let rain fall on sand next to loam, while both soils move, and write the state."""
 
 import sys
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""All processes raise the same error, even if only one of them can see its cause."""
+"""All processes raise the same error, even if only one process can detect the cause."""
 
 import warnings
 from dataclasses import replace

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Push a disc through clay whose domains are renewed, on however many processes there are; write its state."""
+"""Push a disc through clay with renewal of domains, on any number of processes, and write its state."""
 
 import sys
 from pathlib import Path
@@ -15,7 +15,7 @@ CLAY = mpm.DruckerPrager(5e6, 1e5, friction=0.0, dilation=0.0, cohesion=1e3, con
 def pushed(cells=8, renewal=True, wet=False, rings=False, **more):
     """Return a simulation of a disc, or with `rings` a ball, that is pushed into a block next to a pressure.
 
-    cells: number of cells across the block.
+    cells: number of cells over the width of the block.
     """
     grid = mpm.Grid([0, 0], [1.0, 1.2], [cells, 5 * cells // 4], axisymmetric=rings)
     block = mpm.box(grid, [0, 0], [1.0, 0.83])

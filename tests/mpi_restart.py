@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Checkpoints on several processes; arguments: one of a single process, one to write, the state to write.
+"""Checkpoints on several processes. Arguments: a checkpoint of one process, a checkpoint to write, and the state to
+write.
 
-Resumes the first one and runs to the end; writes the second one half way, with output files; runs and resumes on as
-many processes.
+The script resumes the first checkpoint and runs to the end. Another run writes the second checkpoint in the middle,
+with output files; its resumed run uses as many processes.
 """
 
 import sys
@@ -19,7 +20,7 @@ T_END, DT = 0.12, 0.02
 
 
 def state(simulation):
-    """Return all points on rank 0, and the histories."""
+    """Return all points on process 0, and the histories."""
     points = simulation.points.migrated(to_root(simulation.grid.comm, len(simulation.points)))
     return {**{name: a for name, a in vars(points).items() if name != "data"}, "tip": simulation.result.displacement}
 
@@ -31,9 +32,9 @@ def to_the_end(simulation, probe, file):
 
 
 def same_bits(file):
-    """Return whether run and resumed run end with the same bits, on solvers and a grid that are reproducible.
+    """Return whether run and resumed run end with equal bits, with reproducible solvers and a reproducible grid.
 
-    MUMPS adds up messages in the order in which they come in, and PT-Scotch's partition differs from grid to grid.
+    MUMPS adds contributions in the order of messages, and PT-Scotch's partition is not reproducible.
     """
     options = PETSc.Options()
     for name in ("momentum", "storage"):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Scenes on one grid, whose bodies lie at its two ends, or are mapped there: each is as even as it would be alone."""
+"""Several scenes use one grid, at opposite ends or with mapped bodies: each is as balanced as it would be alone."""
 
 import sys
 
@@ -12,12 +12,12 @@ assert grid.mesh is not None, "a mesh that was looked at before"
 
 
 def faint(points, v):
-    """Return a force of next to nothing."""
+    """Return a very small force."""
     return 1e-30 * points.value(v)[0] * points.dx
 
 
 def uneven(simulation):
-    """Return the most points of a process over the mean."""
+    """Return the largest number of points of a process, divided by the mean."""
     counts = grid.comm.allgather(len(simulation.points))
     return max(counts) / np.mean(counts)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Press wet soil that yields, with factors that processes share; write the state."""
+"""Press yielding wet soil, with factors that the processes share, and write the state."""
 
 import sys
 from dataclasses import replace

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Push a side of two soils into cells of many sizes, on any number of processes; write the state."""
+"""Push a side of two soils into cells of many sizes, on any number of processes, and write the state."""
 
 import sys
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Run a slab with a plate, gravity, inflow and next to no flow on however many processes there are; write its state."""
+"""Run a slab with a plate, gravity, inflow and almost no flow on any number of processes, and write its state."""
 
 import sys
 

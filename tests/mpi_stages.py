@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Run stages with an excavation, a fill and a moving side on however many processes there are; write the state."""
+"""Run stages with an excavation, a fill and a moving side on any number of processes, and write the state."""
 
 import sys
 

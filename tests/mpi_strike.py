@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Let a rough spinning disc strike a block that slides on another one, on any number of processes."""
+"""Let a rough rotating disc strike a block that slides on another block, on any number of processes."""
 
 import sys
 

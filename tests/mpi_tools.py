@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Press a disc that slips into a block on however many processes there are; write its state."""
+"""Press a disc that slips into a block on any number of processes, and write its state."""
 
 import sys
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Let a saturated block at rest go onto quiet sides, with a wave that comes in, and write the state."""
+"""Put quiet sides on a saturated block at rest, send a wave into it, and write the state."""
 
 import sys
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Load ground that its suction holds and let it get wet, on any number of processes; write the state."""
+"""Load unsaturated ground, wet it, and write the state, on any number of processes."""
 
 import sys
 

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Changes of the answers of a small scene with half and twice a number: `python tests/plateaus.py` measures all.
+"""Changes of the results of a small scene with half and twice a number: `python tests/plateaus.py` measures all.
 
-Arguments are numbers and scenes, as domains/lattice.py:FAST@cycles; without arguments all numbers with a plateau are
-measured, see `house`. The change is the largest relative change of a scene's answers, followed by that of finer cells.
+Arguments are numbers and scenes, such as domains/lattice.py:FAST@cycles. Without arguments, all numbers with a plateau
+are measured, see `house`. The printed changes are the largest relative change of a result, and the change with finer
+cells.
 """
 
 import importlib
@@ -25,7 +26,7 @@ import mpi_renewal
 
 
 def bent(h: float, nu: float = 0.0) -> dict[str, float]:
-    """A saturated beam under a load on its top: at its tip, and the pressures in it."""
+    """Return tip displacement and pressures of a saturated beam under a load on its top."""
     material = mpm.Hencky(bulk=1e7 / (3 * (1 - 2 * nu)), shear=1e7 / (2 * (1 + nu)), porosity=0.4, conductivity=1e-4)
     s, probe = helpers.beam(h=h, material=material)
     run = s.run(0.12, 0.02, probes=probe)
@@ -34,25 +35,27 @@ def bent(h: float, nu: float = 0.0) -> dict[str, float]:
 
 
 def cycled(h: float) -> dict[str, float]:
-    """A dry beam, loaded and unloaded twice: its tip, and its residual stress over the first peak."""
+    """Return the tip displacement of a dry beam after two load cycles, and its residual stress divided by the first
+    peak.
+    """
     run = cycles.cycle(h, 54e3, 2, 10)
     return {"tip": run["tips"][5], "left": 1 + run["left"][-1]}
 
 
 def pushed(cells: int) -> dict[str, float]:
-    """A footing on wet soil that yields: its load."""
+    """Return the load of a footing on yielding wet soil."""
     return {"load": footing.effort(cells, 0.06, 4, 2.0, "sdirk2")["load"]}
 
 
 def strip(cells: int) -> dict[str, float]:
-    """A rough strip on soil without friction: its load."""
+    """Return the load of a rough strip on soil without friction."""
     from test_footing import rough_strip
 
     return {"load": rough_strip(cells, "displacement")}
 
 
 def flowing(cells: int) -> dict[str, float]:
-    """A disc that goes into clay whose domains are renewed: its load."""
+    """Return the load of a disc that is pushed into clay with renewal of domains."""
     from mpm_dolfinx.stepping import renewal
 
     before, renewal.LONGEST = renewal.LONGEST, 0.6
@@ -63,7 +66,7 @@ def flowing(cells: int) -> dict[str, float]:
 
 
 def slope(cells: int) -> dict[str, float]:
-    """Wet layers aslant on the grid under a load: settlement, pressures."""
+    """Return settlement and pressures of loaded wet layers, which are inclined to the grid."""
     grid = mpm.Grid([0, 0], [1.5, 1.5], [3 * cells, 3 * cells])
     soils = [
         mpm.Hencky(bulk=1e7 / 3, shear=5e6, porosity=0.4, conductivity=conductivity) for conductivity in (1e-4, 1e-6)
@@ -82,7 +85,7 @@ def slope(cells: int) -> dict[str, float]:
 
 
 def wetted(cells: int) -> dict[str, float]:
-    """A front that runs into dry soil, after Celia: its depth and the water that the soil takes up."""
+    """Return depth and absorbed water of a wetting front in dry soil (Celia)."""
     _, places, waters, _ = infiltration.front(cells, 3600.0)
     *_, (depth, _) = infiltration.FRONT.values()
     return {"front": depth + places[-1], "water": 1 + waters[-1]}
@@ -102,7 +105,7 @@ SCENES = {
 
 
 def holders(where: str, name: str) -> list:
-    """Return the modules that have a number under its name, first the one that defines it."""
+    """Return the modules that hold a number under its name, beginning with the module that defines it."""
     own = importlib.import_module(".".join([house.ROOT.name, *Path(where).with_suffix("").parts]))
     every = [importlib.import_module(m.name) for m in house.modules() if m.path.name != "__main__.py"]
     return [own, *(m for m in every if m is not own and getattr(m, name, None) is getattr(own, name))]
@@ -110,7 +113,7 @@ def holders(where: str, name: str) -> list:
 
 @cache
 def answer(scene: str, finer: bool = False) -> dict[str, float]:
-    """Return the answers of a scene with the numbers as they are."""
+    """Return the results of a scene with the present numbers."""
     run, *cells = SCENES[scene]
     return run(cells[finer])
 
@@ -120,7 +123,7 @@ def change(a: dict[str, float], b: dict[str, float]) -> float:
 
 
 def moved(where: str, name: str, scene: str) -> tuple[float, float, float]:
-    """Return the changes of a scene's answers with half and twice a number, and with finer cells."""
+    """Return the changes of a scene's results with half and twice a number, and with finer cells."""
     run, cells, _ = SCENES[scene]
     plain, modules, out = answer(scene), holders(where, name), []
     value = getattr(modules[0], name)

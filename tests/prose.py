@@ -4,9 +4,9 @@
     python -m tests.prose --show PART               # the long and the vague sentences of a part
     python -m tests.prose --draw 300 --seed 1       # sentences drawn at random, with their places, for a reader
 
-The text comes from docstrings, and from pages without code, tables' rules, comments and formulas.  Code in a sentence
-counts as one word.  The noun of a *vague* word is missing or far away.  A sentence ends at a full stop or a colon, and
-with its paragraph, item or cell of a table.
+The text comes from docstrings, and from pages without code, rules of tables, comments and formulas. Code in a sentence
+counts as one word. The noun of a *vague* word is missing or far away. A sentence ends at a full stop or colon, and at
+the end of a paragraph, an item or a cell of a table.
 """
 
 import ast
@@ -64,7 +64,7 @@ def docstrings(paths: list[Path]) -> list[str]:
 
 
 def messages(tree: ast.AST) -> list[tuple[int, str]]:
-    """Return the lines and the texts of messages: of errors and of warnings, a value in them is `code`."""
+    """Return the lines and the texts of errors and warnings. A value in a message becomes `code`."""
     out = []
     for node in ast.walk(tree):
         warns = isinstance(node, ast.Call) and re.search(r"(warn\w*|refuse\w*)$", ast.unparse(node.func))
@@ -99,7 +99,7 @@ def page_paragraphs(text: str) -> list[str]:
 
 
 def paragraphs(text: str) -> list[str]:
-    """Return the paragraphs of a text: items, headings and cells of tables are some of their own; code is not."""
+    """Return the paragraphs of a text. Items, headings and cells of tables are paragraphs; code is excluded."""
     lines = [re.sub(r"^\s*(\* |- |\d+\. |#+ )", "\n", line) for line in text.split("\n")]
     lines = ["\n" if re.match(r"\s*[-=|: ]*$", line) else re.sub(r"(?<!\|)\|(?!\|)", "\n\n", line) for line in lines]
     return [" ".join(each.split()) for each in re.split(r"\n\s*\n", "\n".join(lines)) if each.strip()]
@@ -114,7 +114,7 @@ def sentences(paragraph: str) -> list[list[str]]:
 
 
 def measures(texts: list[str]) -> dict[str, float]:
-    """Return vague words in 1000 words, the share of long sentences, and the median length, words."""
+    """Return the number of vague words per 1000 words, the share of long sentences, and the median length, in words."""
     found = [words for text in texts for words in sentences(text)]
     lengths = [len(words) for words in found if len(words) > 2]
     words = sum(map(len, found))
@@ -150,9 +150,9 @@ def private_names(trees: Iterable[ast.AST]) -> Counter[str]:
 
 
 def whole_sentences(paragraph: str) -> list[str]:
-    """Return the sentences of a paragraph as they stand, of at least `SHORTEST` words without code.
+    """Return the sentences of a paragraph with at least `SHORTEST` words without code.
 
-    Here, a colon does not end a sentence.
+    In this function, a colon does not end a sentence.
     """
     code = iter(re.findall(r"``?[^`]+``?", paragraph))
     parts = re.split(r"(?<=[.!?])\s+(?![a-z])", re.sub(r"``?[^`]+``?", "\0", paragraph))
@@ -162,7 +162,7 @@ def whole_sentences(paragraph: str) -> list[str]:
 
 
 def entry(found: re.Match) -> str:
-    """Return the beginning of a parameter as that of a paragraph."""
+    """Return the name of a parameter as the beginning of a paragraph."""
     return f"\n{found[1]}{found[2]}: " if found[2] else f"\n{found[3]}"
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Run the coarse beam with checkpoints and files, from its checkpoint if there is one; argument: a folder."""
+"""Run the coarse beam with checkpoints and files, or resume it from its checkpoint. The argument is a folder."""
 
 import sys
 from pathlib import Path
@@ -12,7 +12,7 @@ T_END, DT = 0.4, 0.02
 
 
 def run(folder):
-    """Run, or go on with, the beam in a folder."""
+    """Run the beam in a folder, or resume it."""
     simulation, probe = beam(h=0.06)
     file = folder / "run.ckpt"
     after = mpm.resume(simulation, file) if file.exists() else None

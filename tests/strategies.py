@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Random input of property tests, and their number of examples, which are always the same."""
+"""Random input of property tests, and numbers of examples, which are reproducible."""
 
 from functools import cache
 
@@ -22,12 +22,12 @@ def numbers(draw, low, high, *shape):
 
 
 def orders(draw, low, high, *shape):
-    """Return numbers from 10^low to 10^high."""
+    """Return powers of ten from 10^low to 10^high."""
     return 10.0 ** numbers(draw, low, high, *shape)
 
 
 def turned(draw, y):
-    """Return y (k, d) turned somehow, or not at all."""
+    """Return y (k, d), rotated at random or not rotated."""
     if draw(st.booleans()):
         return y
     q, _ = np.linalg.qr(numbers(draw, -1, 1, y.shape[1], y.shape[1]) + 1e-3 * np.eye(y.shape[1]))

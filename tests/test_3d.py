@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""3D: plane strain is recovered, iterations and factors agree, and a bent body takes the prescribed shape."""
+"""3D: plane strain is recovered, iterative and direct solvers agree, and a bent body has the prescribed shape."""
 
 import json
 import os
@@ -23,7 +23,9 @@ SOIL = mpm.Hencky(bulk=1e7 / 3, shear=5e6, conductivity=1e-6)
 
 
 def block(*, fill=0.4, n=4, fluid=False, aslant=1e4, **options):
-    """A block on rough ground, n cells high, pressed and pushed aslant; cells of its sides are filled so far."""
+    """Return a block on a rough floor, n cells high, under an inclined load; the cells at its sides have the filling
+    `fill`.
+    """
     h = 1 / n
     grid = mpm.Grid([0] * 3, [1 + 3 * h] * 3, [n + 3] * 3)
     body = mpm.box(grid, [h, h, 0], [1 + h + fill * h, 1 + h + fill * h, 1 + fill * h])
@@ -83,14 +85,16 @@ def test_a_tangent_that_is_not_symmetric_is_solved_by_iterations(monkeypatch):
 @pytest.mark.parametrize("fluid, most", [(False, 6), (True, 13)], ids=["dry", "saturated"])
 @pytest.mark.parametrize("fill", [0.5, 1e-2, 1e-4, 1e-6])
 def test_iterations_do_not_grow_where_cells_are_nearly_empty(monkeypatch, fluid, most, fill):
-    """The ghost penalty keeps the condition number; without it the linear solver needs more than twice as many."""
+    """The ghost penalty limits the condition number. Without it, the linear solver takes more than twice as many
+    iterations.
+    """
     thresholds(monkeypatch, multigrid_3d=0)
     result = block(fill=fill, fluid=fluid).run(1.0, 0.5, progress=False)
     assert result.coupling <= most * result.newton and result.newton <= 20
 
 
 def test_memory_does_not_grow_with_the_steps():
-    """petsc4py keeps objects that Python has dropped until it is told to free them: 4 MB a step here."""
+    """petsc4py keeps objects that Python has deleted until it is told to free them: 4 MB a step in this scene."""
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     done = subprocess.run([sys.executable, growth_3d.__file__], env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-2000:]
@@ -175,7 +179,7 @@ def test_cryers_sphere_peaks_within_two_percent():
 
 @pytest.mark.slow
 def test_the_number_of_steps_hardly_moves_a_cantilever_and_less_with_smaller_cells():
-    """Over 10 to 160 steps as much again: the difference is of first order in the step, of second in the cell."""
+    """The difference over 10 to 160 steps is of first order in the step, and of second order in the cell size."""
     drift = []
     for cells in (4, 8):
         tips = [cantilever_3d.run(cells, steps, 1.0)[0] for steps in (10, 40)]

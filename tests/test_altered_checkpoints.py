@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A checkpoint that is not whole is refused in one line, and leaves the scene as it was."""
+"""An incomplete or altered checkpoint is refused in one line, and does not change the scene."""
 
 import json
 
@@ -21,7 +21,7 @@ def scene(wet, load):
 
 
 def noted(change):
-    """Return a function that alters the note of a checkpoint."""
+    """Return a function that alters the metadata of a checkpoint."""
 
     def alter(arrays):
         note = json.loads(str(arrays["note"]))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Flow in bodies that lie aslant on the grid: of second order, through open sides and along sealed ones."""
+"""Flow in bodies inclined to the grid is of second order, through open sides and along no-flow sides."""
 
 from dataclasses import replace
 
@@ -14,7 +14,7 @@ CONSOLIDATION = 1e-5 / 9810 / (0.4 / WATER)  # m^2/s
 
 
 def turned(cells, angle, drained, off=0.0, dim=2, seepage=False, **options):
-    """Return a column of hard soil with soft water, so many cells high, turned about the last corner of its base.
+    """Return a column of hard soil with soft water, rotated about the last corner of its base.
 
     seepage: whether the top is a seepage face.
     """
@@ -42,7 +42,7 @@ def turned(cells, angle, drained, off=0.0, dim=2, seepage=False, **options):
 
 
 def consolidated(cells, angle, time):
-    """Return the errors of the cells' pressures (rms) and of the outflow, over initial and exact values."""
+    """Return the rms error of the cell pressures over the initial pressure, and the relative error of the outflow."""
     s, along = turned(cells, angle, [(1, 0.0)], pressure=START)
     for end, steps in ((1e-2, 6), (time, 10)):
         s.run(end / CONSOLIDATION, (end / CONSOLIDATION - s.t) / steps, progress=False)
@@ -84,7 +84,9 @@ def test_a_slanted_seepage_face_lets_out_what_flows_to_it(angle):
 
 @pytest.mark.parametrize("length", [1e-4, 1e3])
 def test_flow_along_slanted_sides_does_not_depend_on_the_unit_of_length(length):
-    """Equations of no-flow sides had a weight of 1 / h^2, h in metres: in millimetres 3 % more flowed out."""
+    """An earlier version weighted the equations of no-flow sides by 1 / h^2, with h in metres: in millimetres, 3 % more
+    flowed out.
+    """
 
     def flow(size):
         grid = mpm.Grid([0] * 2, [1.6 * size] * 2, [12, 12])

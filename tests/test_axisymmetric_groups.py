@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Contact of bodies of revolution: patch test, Lamé's tubes, symmetry, friction along a shaft, momentum, restart."""
+"""Contact of bodies of revolution: patch test, Lamé's tubes, symmetry, friction on a shaft, momentum, and restart."""
 
 import numpy as np
 import pytest
@@ -27,7 +27,7 @@ def test_discs_under_pressure_press_each_other_evenly(offset, order, spacings):
 
 
 def in_sleeve(n, stiff, inner=0.43, outer=0.9, p=100.0):
-    """Return the radial force on a core, and its exact value, in a sleeve under a pressure, without strain in z."""
+    """Return the radial force on a core in a sleeve under pressure, without axial strain, and the exact force."""
     grid = mpm.Grid([0, 0], [1 + 2 / n, 2 / n], [n + 2, 2], axisymmetric=True)
     core = mpm.box(grid, [0, 0], [inner, 2 / n])
     sleeve = mpm.box(grid, [inner, 0], [outer, 2 / n], per_cell=3, material=1)
@@ -52,7 +52,7 @@ def test_core_in_a_sleeve_carries_the_pressure_of_lame(stiff):
 
 
 def dome(grid, sign):
-    """Return half a ball, of radius 0.8 m, above or below the plane z = 1 m, which its pole touches."""
+    """Return half of a ball with radius 0.8 m, above or below the plane z = 1 m, which touches its pole."""
     angle = np.linspace(0, np.pi / 2, 25)[::sign]
     arc = np.column_stack([0.8 * np.sin(angle), 1 + sign * (0.8 - 0.8 * np.cos(angle))])
     corners = np.vstack([arc, [[0, 1 + sign * 0.8]] if sign > 0 else [[0, 0.2]]])
@@ -78,7 +78,7 @@ def test_equal_balls_meet_like_a_ball_and_a_rigid_plane():
 
 
 def test_shaft_slips_in_its_sleeve_at_the_friction_angle():
-    """The friction of a core that is pushed through a sleeve; the sleeve's ends bulge, so r is not quite normal."""
+    """A core is pushed through a sleeve with friction. The ends of the sleeve bulge, so r is not exactly the normal."""
     grid, r = mpm.Grid([0, 0], [1.25, 2], [10, 16], axisymmetric=True), 0.43
     core, sleeve = mpm.box(grid, [0, 0.2], [r, 1.8]), mpm.box(grid, [r, 0.6], [0.9, 1.4], per_cell=3)
     conditions = [

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Axisymmetric scenes: exact where stresses are even, of second order, and of the whole revolution."""
+"""Axisymmetric scenes: exact for uniform stresses, of second order otherwise, and forces of the full circumference."""
 
 from dataclasses import replace
 
@@ -27,7 +27,7 @@ def plane(upper=(1.5, 1.5), cells=(7, 9), lower=None):
 
 
 def pressed(radial, axial, inner=0.0, upper=(1.03, 1.01), material=ELASTIC, **options):
-    """Return a cylinder, or a ring, on a smooth floor under pressures on its sides and its top, Pa."""
+    """Return a cylinder or a ring on a smooth floor under pressures on its sides and its top, in Pa."""
     grid = options.pop("grid", None) or plane()
     body = mpm.box(grid, [inner, 0], upper)
     sides = ["right"] + ["left"] * (inner > 0)
@@ -62,7 +62,7 @@ def test_a_body_that_is_blown_up_stretches_evenly(inner):
 
 
 def test_a_pressure_on_curved_sides_is_even_but_for_the_faces_rule():
-    """A body a fifth smaller: 1.3e-4, afloat but for a spring that has next to nothing to hold."""
+    """The body is a fifth smaller: error 1.3e-4. Only weak springs support the floating body."""
 
     def bend(x):
         r, z = x.T
@@ -117,7 +117,7 @@ def test_pieces_have_exact_moments_of_rings():
 
 
 def widened(inner, outer, pressure):
-    """Return how far both sides of a cylinder of `ELASTIC` move under a pressure inside, in plane strain, m."""
+    """Return the displacements of both sides of a cylinder of `ELASTIC` under inner pressure, in m (plane strain)."""
     G, ln = ELASTIC.shear, np.log
 
     def radial(a, b):  # first Piola-Kirchhoff stress, of stretches a and b
@@ -140,7 +140,7 @@ def widened(inner, outer, pressure):
 
 
 def test_a_thick_cylinder_is_widened_as_the_exact_one_at_second_order():
-    """Its hole by half, at finite strain; elements of the reference agree to 1e-6."""
+    """The hole is widened by half at finite strain. Reference elements agree to 1e-6."""
     load, probes, errors = lambda t: 4e5 * t, [[0.5, 0.05], [1.0, 0.05]], []
     exact = widened(0.5, 1.0, 4e5)
     walls = {"bottom": "y", "top": "y"}
@@ -161,9 +161,9 @@ def test_a_thick_cylinder_is_widened_as_the_exact_one_at_second_order():
 
 @pytest.mark.parametrize("bulk", [1e4, 1e2])
 def test_a_cylinder_drains_to_its_side_as_the_exact_one_at_second_order(bulk):
-    """A stiff skeleton and soft water: the excess of density falls as sum 2 / (a J_1(a)) J_0(a r / R) exp(-a^2 T).
+    """With a stiff skeleton and soft water, the excess density is sum 2 / (a J_1(a)) J_0(a r / R) exp(-a^2 T).
 
-    That is exact for any compressibility; the second water is e times as dense at the start.
+    This solution is exact for any compressibility. The initial density of the second water is e times as large.
     """
     soil, water = mpm.Hencky(bulk=1e9, shear=1e9, conductivity=1e-5), mpm.Fluid(bulk=bulk)
     mobility, T, errors = soil.conductivity / water.unit_weight, 0.1, []
@@ -185,7 +185,7 @@ def test_a_cylinder_drains_to_its_side_as_the_exact_one_at_second_order(bulk):
 
 
 def test_flow_to_a_drain_crosses_a_smeared_zone_at_second_order():
-    """A hundred times less permeable than the soil, its edge half a cell off the grid lines."""
+    """The ring is a hundred times less permeable than the soil, and its edge is half a cell off the grid lines."""
     errors, soils = [], [mpm.Hencky(bulk=2e9, shear=1e9, conductivity=k) for k in (1e-7, 1e-5)]
     for cells in (20, 40):
         h = 1 / cells
@@ -200,7 +200,9 @@ def test_flow_to_a_drain_crosses_a_smeared_zone_at_second_order():
 
 
 def test_a_well_half_a_cell_in_radius_takes_what_flows_to_it():
-    """Rings between its face and the first centroid are longer than rings at the face: 8 % too little flowed."""
+    """The rings between face and first centroid are longer than rings at the face. An earlier version gave 8 % too
+    little flow.
+    """
     grid = mpm.Grid([0.05, 0], [1.05, 0.2], [10, 2], axisymmetric=True)
     s = mpm.Simulation(
         grid,
@@ -216,7 +218,9 @@ def test_a_well_half_a_cell_in_radius_takes_what_flows_to_it():
 
 
 def test_a_cavity_in_undrained_soil_has_the_exact_pressure():
-    """Of von Mises's, incompressible, G = 50 s_u, widened to 1.5 times its radius in a ring ten times as wide."""
+    """Incompressible von Mises soil with G = 50 s_u; the cavity is widened to 1.5 times its radius in a ring ten times
+    as wide.
+    """
     strength, h, widened = 1e4, 0.25, 0.5
     soil = mpm.DruckerPrager(bulk=5e4 * strength, shear=50 * strength, friction=0, dilation=0, cohesion=strength)
     grid = plane((11.0, 2 * h), (44, 2))
@@ -240,7 +244,7 @@ def test_cryers_sphere_peaks_within_half_a_percent():
 
 @pytest.mark.slow
 def test_a_rough_circular_footing_carries_what_limit_analysis_says():
-    """On Tresca's soil 6.05 c (Cox, Eason and Hopkins 1961)."""
+    """The exact limit load on Tresca's soil is 6.05 c (Cox, Eason and Hopkins 1961)."""
     coarse, fine = (footing.limit_load("circular", cells).load for cells in (9, 25))
     assert -0.02 < fine[-1] - 1 < 0 and coarse[-1] < fine[-1]
     assert fine[-1] / fine[30] < 1.002  # it flows
@@ -254,7 +258,7 @@ def test_a_rough_circular_footing_carries_what_limit_analysis_says():
     ],
 )
 def test_laws_with_a_state_see_the_hoops(material, confinement):
-    """A triaxial test of a cylinder equals one of a point, up to the penalty gap of its top within the push."""
+    """A triaxial test of a cylinder equals a test of a point, except for the penalty gap at its top."""
     s = pressed(1e5, 1e5, 0.0, (0.038, 0.1), material, grid=plane((0.05, 0.12), (3, 4)))
     s.step(1.0)
     height, side = s.points.corners[:, :, 1].max(), s.conditions[:1]
@@ -287,7 +291,7 @@ RADIUS = 1e6  # m; of a ring that is a slice
 
 
 def slice_or_ring(inner):
-    """Return soil that moves, drains and is loaded, in plane strain or, far from the axis, as a ring."""
+    """Return soil that moves, drains and is loaded, in plane strain or as a ring far from the axis."""
     low, high = inner, inner + 1.3
     grid = mpm.Grid([low, 0], [high, 1.5], [13, 15], axisymmetric=inner > 0)
     body = mpm.box(grid, [low + 0.24, 0], [low + 1.07, 1.03])
@@ -315,7 +319,7 @@ def slice_or_ring(inner):
 
 
 def test_a_ring_far_from_the_axis_is_a_slice(monkeypatch):
-    """The non-orthogonal flux correction is excluded: rings have none."""
+    """The non-orthogonal correction of fluxes is excluded, because rings have no such correction."""
     monkeypatch.setattr(on_grid, "nonorthogonal_facets", lambda contents, facets: facets[:0])
     monkeypatch.setattr(on_grid, "off_middle", lambda sides, grid: np.zeros(len(sides.cells), dtype=bool))
     flat, ring = slice_or_ring(0.0), slice_or_ring(RADIUS)
@@ -327,7 +331,7 @@ def test_a_ring_far_from_the_axis_is_a_slice(monkeypatch):
 
 
 def footed(folder, steps):
-    """Return a run of soil under a circular footing, under its own weight, by a checkpoint half way or without."""
+    """Return a run of soil under a circular footing and its own weight, with or without a restart in the middle."""
     grid = plane((1.0, 1.5), (6, 9))
     body, sand = mpm.box(grid, [0, 0], [0.7, 1.2]), mpm.DruckerPrager(bulk=2e7, shear=1e7, conductivity=1e-6, **WEAK)
     load = mpm.Traction("top", lambda t: (0, -1e5 * t), region=((0, 0), (0.35, 9)))
@@ -408,7 +412,9 @@ def test_plates_press_a_cylinder_and_a_ring_evenly(inner):
 
 @pytest.mark.parametrize(("cells", "error"), [(8, 0.015), pytest.param(16, 0.004, marks=pytest.mark.slow)])
 def test_a_ball_meets_the_force_of_hertz(cells, error):
-    """On sides that move as Boussinesq says; 5 or 10 cells over the contact, whose radius is 1/126 of the ball's."""
+    """The sides move as in Boussinesq's solution. 5 or 10 cells over the contact radius, which is 1/126 of the ball's
+    radius.
+    """
     L, R, depth, nu, h = 4.0, 80.0, 0.005, 0.3, 1 / cells
     grid, top = plane((L + h, L + 1), (4 * cells + 1, 5 * cells + 1), (0, -h)), L + 0.3 * h
     stiff = 1e6 / (1 - nu**2)
@@ -429,7 +435,7 @@ def test_a_ball_meets_the_force_of_hertz(cells, error):
 
 
 def test_springs_around_a_sphere_hold_it_as_lame_says():
-    """Hollow, of radii 1 and 2 m, under a pressure inside; rms of the displacements."""
+    """A hollow sphere of radii 1 and 2 m under inner pressure: rms of the displacements."""
     p, spring, errors, (K, G) = 100.0, 5e5, [], (ELASTIC.bulk, ELASTIC.shear)
     A, B = np.linalg.solve([[3 * K, -4 * G], [3 * K + 2 * spring, -G / 2 + spring / 4]], [-p, 0])
 

@@ -48,7 +48,7 @@ def run(t_end=1.0, dt=1.0, **options):
 
 
 def later(value):
-    """Return a function of time that is sound at the start only."""
+    """Return a function of time that is valid only at the start."""
     return lambda t, *X: (0.0, 0.0) if t < 0.5 else value
 
 
@@ -362,7 +362,9 @@ def test_a_point_that_leaves_the_grid_is_named_with_its_time():
 
 
 def test_steps_by_error_end_at_the_grid_as_soon_as_they_are_exact_enough():
-    """The first step tried leads far beyond the grid, and is too inexact; ever shorter ones only led to its wall."""
+    """The first trial step ends far outside the grid, and is too inaccurate. In an earlier version, all shorter steps
+    ended at the grid's edge.
+    """
     grid = mpm.Grid([0, 0], [0.1, 1.1], [1, 11])
     loads = [mpm.Traction("top", lambda t: (0, 1e5 * t))]
     s = mpm.Simulation(
@@ -385,7 +387,9 @@ def test_a_column_that_slides_is_refused():
 
 @pytest.mark.parametrize("fluid, message", [(False, "the body is inverted"), (True, "the pores have closed")])
 def test_a_load_that_leaves_no_volume_is_refused(fluid, message):
-    """The linear law has an answer for any load: half of the volume is more than the pores, twice more than all."""
+    """The linear law has a solution for any load. A compression by half exceeds the pores, and a double load the
+    volume.
+    """
     law = mpm.LinearElastic(SOFT.bulk, SOFT.shear, porosity=0.4, conductivity=1.0)
     load = [mpm.Traction("top", (0, -(0.5 if fluid else 2.0) * law.oedometric))]
     s = column(fluid=fluid, material=law, conditions=[*load, *([mpm.Drained("top")] if fluid else [])])
