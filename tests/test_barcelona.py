@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Soil that collapses as it gets wet: closed forms of the Barcelona Basic Model in Bishop's stress, scenes."""
+"""Soil that collapses when it is wetted: closed forms of the Barcelona Basic Model in Bishop's stress, and scenes."""
 
 from dataclasses import dataclass, replace
 from typing import ClassVar
@@ -24,7 +24,7 @@ RETENTION = mpm.VanGenuchten(50e3, n=1.6)
 
 
 def felt(s):
-    """Return chi s, Pa."""
+    """Return Bishop's suction stress chi s, in Pa."""
     return (1 + (s / 50e3) ** 1.6) ** (1 / 1.6 - 1) * s
 
 
@@ -47,9 +47,9 @@ SOIL = mpm.BarcelonaBasic(**CONSTANTS, r=R, beta=BETA, reference=REFERENCE)
 
 
 def wetted(suctions, net=NET):
-    """Return ln J, and ln of P_c0 over its initial value, along suctions at a net stress, all isotropic.
+    """Return ln J, and ln of P_c0 divided by its initial value, along suctions at an isotropic net stress.
 
-    ln J = -kappa ln(P / P_0) - (lambda(0) - kappa) ln(P_c0 / P_c0 at the start), P = J (net + chi s) at most P_c(s).
+    ln J = -kappa ln(P / P_0) - (lambda(0) - kappa) ln(P_c0 / initial P_c0), with P = J (net + chi s) <= P_c(s).
     """
     out, start = [], np.log(OCR * P0 / REFERENCE) / power(S0)
     size = start
@@ -100,7 +100,7 @@ def test_soil_of_a_constant_suction_is_compressed_along_its_lambda(s):
 
 
 def test_strength_grows_with_suction_as_bishops_stress():
-    """Drained, under a constant lateral net stress: q = M p' with p' = net + chi s + q / 3."""
+    """Drained tests with constant lateral net stress end at q = M p', with p' = net + chi s + q / 3."""
     for s in (0.0, 3e4, S0):
         soil = replace(SOIL, initial_stress=(-NET - felt(s),) * 3)
         r = element_test(soil, "triaxial drained", 2.0, steps=50, suction=s)
@@ -114,7 +114,7 @@ def points(request):
 
 
 def strained(dim):
-    """Return deformation gradients near I, compressed on average."""
+    """Return deformation gradients near I, with compression on average."""
     return np.eye(dim) * 0.995 + 0.02 * np.random.default_rng(dim).normal(size=(60, dim, dim))
 
 
@@ -128,7 +128,7 @@ def test_without_suction_it_is_modified_cam_clay_to_the_bit(points):
 
 
 def test_under_a_suction_it_is_modified_cam_clay_of_another_lambda(points):
-    """Of another P_c too: at 3e4 Pa, seeded at 1e4 Pa."""
+    """P_c also differs: soil seeded at 1e4 Pa is tested at 3e4 Pa."""
     soil, s, start = points[0], 3e4, 1e4
     F, m = strained(soil.dim), points[0].material
     state = {"suction": np.full(60, s), "suction_at_start": np.full(60, start)}
@@ -145,7 +145,7 @@ def test_under_a_suction_it_is_modified_cam_clay_of_another_lambda(points):
 
 
 def test_soil_softened_below_its_reference_does_not_feel_suction():
-    """Else it would be the weaker the drier it is."""
+    """Otherwise this soil would become weaker as it dries."""
     weak = replace(SOIL, reference=5 * P0)
     found = [element_test(weak, "oedometer", 0.05, steps=5, suction=s).stress[-1] for s in (0.0, S0)]
     assert (found[0] == found[1]).all()
@@ -156,7 +156,7 @@ def test_soil_softened_below_its_reference_does_not_feel_suction():
 
 
 def sample(soil, n, suction, conditions=(), **options):
-    """Return a cylinder of 1 m under the net stress, its sides at a suction that depends on time."""
+    """Return a cylinder of 1 m under the net stress, with suction on its sides as a function of time."""
     grid = mpm.Grid([0, 0], [1 + 2 / n] * 2, [n + 2] * 2, axisymmetric=True)
     sides = [one for side in ("right", "top") for one in (mpm.Pressure(side, NET), mpm.Drained(side, suction))]
     walls = {"left": "x", "bottom": "y"}
@@ -166,13 +166,13 @@ def sample(soil, n, suction, conditions=(), **options):
 
 
 def states(s):
-    """Return suction, ln J and ln of P_c0 over that at the start of the points."""
+    """Return suction, ln J, and ln of P_c0 divided by its initial value, of the points."""
     return s.points.data["suction"], np.log(s.points.J), s.points.data["consolidated"]
 
 
 @pytest.mark.parametrize("steps", [1, 8])
 def test_a_sample_in_a_scene_swells_collapses_and_dries_as_its_closed_form(steps):
-    """Within 1e-8 all the way, in one step too: water flows fast, so suctions are nearly even."""
+    """The error is below 1e-8 at all times, also in one step: water flows fast, so suctions are nearly uniform."""
     turn, end = 1e9, 1.5e9
     soil = replace(SOIL, conductivity=1e-3)
     s = sample(soil, 2, lambda t: -S0 * abs(1 - t / turn))
@@ -189,7 +189,7 @@ def test_a_sample_in_a_scene_swells_collapses_and_dries_as_its_closed_form(steps
 
 
 def test_a_column_in_a_scene_gets_wet_as_in_the_oedometer():
-    """The element test at the suctions of the scene, to 1e-7; sheared as it collapses."""
+    """An element test at the suctions of the scene agrees to 1e-7. The column is sheared as it collapses."""
     s = narrow(replace(SOIL, conductivity=1e-3), 3, lambda t: -S0 * (1 - t / 1e9))
     lab = element_test(replace(SOIL, conductivity=1e-3), "wetting oedometer", 0.0, steps=5, suction=S0)
     for k in range(1, 6):
@@ -203,7 +203,7 @@ def test_a_column_in_a_scene_gets_wet_as_in_the_oedometer():
 
 
 def narrow(soil, cells, suction, width=1, **options):
-    """Return a column of 1 m under the net stress, its foot at a suction that depends on time."""
+    """Return a column of 1 m under the net stress, with suction at its base as a function of time."""
     h = 1 / cells
     grid = mpm.Grid([0, 0], [width * h, 1 + 2 * h], [width, cells + 2])
     conditions = [mpm.Pressure("top", NET), mpm.Drained("bottom", suction)]
@@ -217,7 +217,7 @@ def narrow(soil, cells, suction, width=1, **options):
     ("cells", "dt", "settles"), [(5, 1e6, 0.01), pytest.param(10, 1e5, 0.004, marks=pytest.mark.slow)]
 )
 def test_a_front_that_wets_a_column_leaves_it_collapsed_as_in_the_oedometer(cells, dt, settles):
-    """Water that it takes in is balanced."""
+    """The balance of the absorbed water is checked."""
     s = narrow(replace(SOIL, conductivity=1e-8), cells, 0.0)
     lab = element_test(SOIL, "wetting oedometer", 0.0, steps=100, suction=S0)
     result = s.run(1e7, dt, progress=False)
@@ -228,7 +228,7 @@ def test_a_front_that_wets_a_column_leaves_it_collapsed_as_in_the_oedometer(cell
 
 
 def layers(axisymmetric, other):
-    """Return two soils in cells that they share, at suctions at which the first collapses as it gets wetter."""
+    """Return two soils in common cells, at suctions at which wetting makes the first soil collapse."""
     grid = mpm.Grid([0.0] * 2, [1.0] * 2, [4] * 2, axisymmetric=axisymmetric)
     left = 0.0 if axisymmetric else 0.1
     edges = (0, 0.37, 0.7)
@@ -243,7 +243,9 @@ def layers(axisymmetric, other):
     ids=["beside clay", "axisymmetric, beside elastic soil"],
 )
 def test_the_tangent_has_what_stresses_change_by_with_suction(axisymmetric, other):
-    """Compared with differences, for soil that collapses; without it the forces are off by more than half."""
+    """The tangent is compared with finite differences, for collapsing soil. Without this part, forces differ by more
+    than half.
+    """
     s, rng = layers(axisymmetric, other), np.random.default_rng(3)
     _, momentum, storage = set_up(s, 1e-6)
     u, p = momentum.system.unknowns, storage.system.unknowns
@@ -269,7 +271,7 @@ def test_the_tangent_has_what_stresses_change_by_with_suction(axisymmetric, othe
 
 
 def test_soil_under_its_weight_is_at_rest_with_its_suction():
-    """Seeded on the yield surface, above a water table; then rain collapses it."""
+    """The soil is seeded on the yield surface above a water table; then rain makes it collapse."""
     soil = replace(SOIL, OCR=1.0, conductivity=1e-6)
     s = narrow(
         soil,
@@ -289,7 +291,7 @@ def test_soil_under_its_weight_is_at_rest_with_its_suction():
 
 
 def test_it_shows_the_same_in_any_frame():
-    """In other units, mirrored, carried, cut at a checkpoint, with a far body, in another order."""
+    """Scenes in other units, mirrored, translated, cut at a checkpoint, with a far body, and in another order agree."""
     law = {"M": 1.1, "lambda_": 0.08, "kappa": 0.015, "shear": 2e6, "initial_stress": (-6e4,) * 3, "porosity": 0.4}
     law |= {"r": 0.4, "beta": 4e-5, "reference": 3e3, "conductivity": 1e-7}
     law |= {"retention": ("VanGenuchten", {"entry": 2e4, "n": 1.8})}
@@ -307,7 +309,7 @@ def test_it_shows_the_same_in_any_frame():
 
 
 def test_a_sample_that_may_vibrate_collapses_as_far():
-    """Slowly wetted, with inertia."""
+    """The sample is wetted slowly, with inertia."""
     soil = replace(SOIL, conductivity=1e-3)
     s = sample(soil, 2, lambda t: -S0 * (1 - t / 1e9), inertia=True)
     s.run(1e9, 2.5e8, progress=False)
@@ -318,7 +320,7 @@ def test_a_sample_that_may_vibrate_collapses_as_far():
 
 @dataclass(frozen=True)
 class Swelling(mpm.Hencky):
-    """Soil that swells by ln J = swell times the decrease of its suction, without stress."""
+    """Soil without stress that swells: ln J is swell times the decrease of the suction."""
 
     state: ClassVar = {"suction": 0.0}
     swell: mpm.Field = 1e-6

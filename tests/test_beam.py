@@ -10,7 +10,7 @@ from mpm_dolfinx.verification.biot_fem import BiotFEM
 
 
 def run(arguments="", cells=(40, 12), probe=((1.0, 0.15),)):
-    """Return (material points' result, finite elements' result) of the demo's scene."""
+    """Return the results of material points and of finite elements for the scene of the demo."""
     o = demo.arguments(arguments.split())
     simulation, bottom = demo.scene(o)
     result = simulation.run(o.t_end, o.dt, probes=mpm.probes(simulation.bodies, np.add(probe, [0, bottom])))
@@ -29,7 +29,7 @@ def error(result, fem):
 
 
 def off(result):
-    """Return the errors of the tip at demo.TIMES against finite elements that are converged in time."""
+    """Return the errors of the tip at demo.TIMES, compared with finite elements that are converged in time."""
     found = {round(t, 9): u[0, 1] for t, u in zip(result.t, result.displacement, strict=True)}
     return np.abs([found[t] / u - 1 for t, u in zip(demo.TIMES, demo.TRUTH, strict=True)])
 
@@ -50,7 +50,7 @@ def test_the_tip_is_as_exact_in_half_the_steps_if_their_error_chooses_them():
 
 @pytest.mark.slow
 def test_the_tip_after_the_ramp_is_of_second_order_in_the_step():
-    """Differences of three runs, under all of the load, which carries the tip through fifteen cells."""
+    """Differences of three runs under the full load; the tip moves through fifteen cells."""
 
     def tip(dt):
         o = demo.arguments(f"--ramp 0.08 --t-end 0.24 --dt {dt}".split())
@@ -76,7 +76,7 @@ def test_fluid_balance_and_residuals_close_in_every_step(beam):
 
 
 def test_the_tip_is_the_same_on_all_releases(beam):
-    """Recorded with dolfinx 0.5.2."""
+    """The reference was recorded with dolfinx 0.5.2."""
     tip = np.array(beam[0].displacement)[:, 0]
     assert tip[3] == pytest.approx([-0.024834357, -0.230016549], rel=1e-6)
     assert tip[60] == pytest.approx([-0.063750014, -0.348521414], rel=1e-6)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Contact of groups of bodies: gaps carry nothing, pressed bodies are even, friction, fluid, restart, refusals."""
+"""Contact of groups of bodies: open gaps, uniform pressure, friction, fluid, restart, and refusals."""
 
 from itertools import pairwise
 
@@ -24,7 +24,7 @@ def two_blocks(
     tolerance=1e-8,
     **contact,
 ):
-    """Return two blocks between walls, the upper one on a given path, their face so many cells off the grid."""
+    """Return two blocks between walls, with their interface off the grid lines; the upper block follows a path."""
     n = 8 if dim == 2 else 3
     low, high, y = [0.0] * (dim - 1), [1.0] * (dim - 1), 0.5 + offset / n
     grid = mpm.Grid([0] * dim, [*high, 2.0], [n] * (dim - 1) + [2 * n])
@@ -51,7 +51,7 @@ def two_blocks(
 
 
 def pressed_by(depth, height):
-    """Return the stress of a body between walls that is pressed by a depth."""
+    """Return the stress of a body between walls after a compression by a depth."""
     return E * np.log(1 - depth / height) / (1 - depth / height)
 
 
@@ -85,7 +85,9 @@ def test_a_gap_far_below_a_cell_carries_nothing():
 
 
 def pushed(share, **contact):
-    """Return by how much a block on another one, pushed by so much of 400 Pa, slides in 5 steps under 1 kPa."""
+    """Return the sliding distance of a block on another block, under 1 kPa and a fraction of a shear of 400 Pa, in 5
+    steps.
+    """
     grid = mpm.Grid([0, 0], [3, 2], [12, 8])
     lower, upper = mpm.box(grid, [0.3, 0], [2.7, 0.55]), mpm.box(grid, [1, 0.55], [1.8, 0.95], per_cell=3)
     load = mpm.Traction("top", lambda t: (share * 300 * min(t, 1), -1e3), region=([0, 0.8], [3, 2]))
@@ -106,7 +108,9 @@ def test_a_block_sticks_below_what_friction_and_adhesion_bear_and_slides_above(c
 
 
 def stack(order):
-    """Return places and forces of three blocks of three groups on one another, pressed aslant, in some order."""
+    """Return positions and forces of three stacked blocks of three groups under an inclined load, in some order of
+    bodies.
+    """
     grid, heights = mpm.Grid([-0.3, 0], [1.6, 2], [8, 10]), [0, 0.43, 0.97, 1.5]
     made = [([0, low], [1, high]) for low, high in pairwise(heights)]
     bodies = [mpm.box(grid, *made[i], per_cell=2 + i, material=i) for i in order]
@@ -132,7 +136,7 @@ def test_three_groups_do_the_same_in_any_order():
 
 @pytest.mark.parametrize(("stiff", "spacings"), [((100, 1), (1, 5)), ((1, 100), (1, 5)), ((100, 1), (5, 1))])
 def test_a_block_over_the_seam_of_two_others_presses_them_evenly(stiff, spacings):
-    """Three groups meet in one cell; blocks are a hundred times as stiff as others, or five times as fine."""
+    """Three groups meet in one cell. Blocks are a hundred times as stiff as others, or have finer domains."""
     grid, (low, high) = mpm.Grid([0, 0], [1, 2], [8, 16]), (0.55, 1.05)
     below = [mpm.box(grid, a, b, per_cell=spacings[0]) for a, b in (([0, 0], [0.53, low]), ([0.53, 0], [1, low]))]
     above = mpm.box(grid, [0, low], [1, high], per_cell=spacings[1], material=1)
@@ -163,7 +167,7 @@ def test_contact_resumes_bit_for_bit_and_keeps_the_fluid(tmp_path, wet, friction
 
 
 def heap(wet=False):
-    """Return a block on soil of another group, with fills of the block's group to come."""
+    """Return a block on soil of another group, with later fills of the block's group."""
     grid, y = mpm.Grid([0, 0], [1, 2], [4, 8]), 0.5 + 0.3 / 4
     heights = [(0, y), (y, y + 0.4), (y + 0.4, y + 0.7), (y, y + 0.6)]
     bodies = [mpm.box(grid, [0, low], [1, high], per_cell=2 + i) for i, (low, high) in enumerate(heights)]
@@ -177,7 +181,7 @@ def heap(wet=False):
 
 @pytest.mark.parametrize("wet", [False, True])
 def test_the_contact_bears_what_is_on_it_as_bodies_come_and_go(wet):
-    """In a stage loads change too; wet bodies lose a little of their water's weight as they settle."""
+    """Loads also change in a stage. Wet bodies lose a little of their water's weight as they settle."""
     s, first, again = heap(wet), len(heap().bodies[0]), 1600.0 if wet else 1200.0
 
     def weight():
@@ -212,7 +216,7 @@ def test_moments_of_a_rough_plate_and_of_a_contact_on_a_block_sum_to_zero():
 
 @pytest.mark.parametrize("order", [1, -1])
 def test_a_plate_presses_bodies_of_two_groups_evenly(order):
-    """The bodies stand side by side, with different spacings; both recover elastically, and the plate parts."""
+    """The bodies stand side by side, with different spacings. Both recover elastically when the plate is lifted."""
     grid, y = mpm.Grid([0, 0], [2, 2], [8, 8]), 0.85
     bodies = [mpm.box(grid, [0, 0], [1, y]), mpm.box(grid, [1, 0], [2, y], per_cell=3)][::order]
     plate = mpm.Tool(mpm.HalfSpace([1, y + 0.01], [0, -1]), displacement=lambda t: (0, -0.1 * np.sin(np.pi * t)))
@@ -240,7 +244,7 @@ def test_a_tool_presses_a_face_that_another_group_lay_on(tmp_path):
 
 @pytest.mark.parametrize(("wet", "friction"), [(False, 0.0), (True, 0.5)])
 def test_a_block_on_soil_at_rest_stays_there(wet, friction):
-    """Level: exactly; with an edge: as still as the balance at the start is."""
+    """On level soil, the block does not move. On soil with an edge, it moves as little as the balance allows."""
     density = 1600.0 if wet else 1200.0
     soil = mpm.Hencky(bulk=E / 3, shear=E / 2, porosity=0.4, conductivity=1e-6, grain_density=2000)
     for width, still in ((1.0, 1e-12), (0.6, 1e-5)):
@@ -304,7 +308,7 @@ def test_what_are_no_contacts_is_refused():
 
 @pytest.mark.parametrize(("steps", "error"), [(1, 0.06), pytest.param(10, 0.08, marks=pytest.mark.slow)])
 def test_curved_bodies_press_each_other_with_the_exact_pressures(steps, error):
-    """14 cells over the half-width, in one step and as the contact grows; the upper body is curved, and held on top."""
+    """14 cells over the half-width, in one step and in many steps. The upper body is curved, and held at its top."""
     cells, R, L, nu = 16, 200.0, 4.0, 0.3
     top = L + 0.3 / cells
     grid = mpm.Grid([0, 0], [L, 2 * L + 2], [round(L * cells), round((2 * L + 2) * cells)])
@@ -328,7 +332,7 @@ def test_curved_bodies_press_each_other_with_the_exact_pressures(steps, error):
 
 
 def test_a_block_slides_off_the_edge_of_another():
-    """In no step does it come into the other one; smooth, it meets no force along its path until it falls off."""
+    """The block never penetrates the other block. Without friction, no force acts along its path until it falls."""
     grid = mpm.Grid([0, 0], [2.2, 1.2], [22, 12])
     bodies = [mpm.box(grid, [0.2, 0], [1.1, 0.53]), mpm.box(grid, [0.4, 0.53], [0.8, 0.93], per_cell=3)]
     path = mpm.Displacement("top", lambda t, X: (0.1 * max(0, t - 1), -0.01 * min(t, 1)), region=([0, 0.9], [2.2, 1.2]))
@@ -350,7 +354,7 @@ def test_a_block_slides_off_the_edge_of_another():
 
 @pytest.mark.parametrize("share", [0.995, 1.005])
 def test_a_block_on_a_slope_of_another_body_slips_where_its_tangent_is_the_coefficient_of_friction(share):
-    """The slope is aslant to the grid; gravity turns until the block should not slip yet, or should."""
+    """The slope is inclined to the grid. Gravity rotates to an angle below or above the friction angle."""
     (c, s), mu = (np.cos(0.25), np.sin(0.25)), 0.3
     turn = np.array([[c, -s], [s, c]])
     grid = mpm.Grid([0, 0], [3, 2], [18, 12])
@@ -380,7 +384,7 @@ def test_a_block_on_a_slope_of_another_body_slips_where_its_tangent_is_the_coeff
 
 @pytest.mark.slow
 def test_a_disc_rolls_between_two_bodies():
-    """Held at first, then by friction only: it moves half as far as the upper body, and turns accordingly."""
+    """The disc is held first. Then friction alone moves it half as far as the upper body, and rotates it."""
     n, R, y = 8, 0.5, 1.3
     grid, c, on = mpm.Grid([0, 0], [4, 2], [4 * n, 2 * n]), np.array([1.5, y - R]), ([1, 0.75], [1.1, 0.85])
     round_off = lambda x: c + (x - c) * np.sqrt(1 - ((x - c) / R)[:, ::-1] ** 2 / 2)  # noqa: E731

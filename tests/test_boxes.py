@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Bodies of boxes on a lattice store few numbers, and return the same domains as arrays would."""
+"""Bodies of boxes on a lattice store few numbers, and return the same domains as arrays."""
 
 import tracemalloc
 from dataclasses import replace
@@ -48,7 +48,9 @@ def test_a_shape_has_its_surface_where_no_neighbour_is(dim):
 
 
 def test_what_is_known_of_a_large_body_as_seeded_takes_next_to_no_memory():
-    """Bytes a point: 34 were kept, and up to 600 taken to describe it for a checkpoint."""
+    """Earlier versions kept 34 bytes per point, and took up to 600 bytes per point to describe the body for a
+    checkpoint.
+    """
     grid = mpm.Grid([0, 0, 0], [1.0, 1.0, 1.0], [40, 40, 40])
     points_in_cells(grid, [])
     tracemalloc.start()
@@ -66,7 +68,7 @@ def test_what_is_known_of_a_large_body_as_seeded_takes_next_to_no_memory():
 
 
 def test_the_last_digit_of_coordinates_does_not_decide_how_many_rows_a_box_has():
-    """5.5 cells with one point each: 122 or 131 points of two boxes."""
+    """5.5 cells with one point each: rounding gave 122 or 131 points of two boxes."""
     h = 0.3720326671282925
     for per_cell, rows in ((1, 6), (3, 16)):
         found = []
@@ -79,7 +81,9 @@ def test_the_last_digit_of_coordinates_does_not_decide_how_many_rows_a_box_has()
 
 @pytest.mark.parametrize("kind", ["box", "triangles", "quadrilaterals"])
 def test_domains_share_the_digits_of_their_corners_far_from_the_origin(kind):
-    """Gaps of a last digit interrupt lines of flow through layers: a flow differed by 1e-6, a million cells away."""
+    """Gaps in the last digit interrupt lines of flow through layers. In an earlier version, a distant flow changed by
+    1e-6.
+    """
     grid = mpm.Grid(lower=[4.1e5, -9.3e5], upper=[4.1e5 + 2.1, -9.3e5 + 1.3], cells=[6, 4])
     if kind == "box":
         body = mpm.box(grid, grid.lower + 0.17, grid.upper - 0.13, per_cell=3)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Calls of Python functions in a step: they take most of the time of small scenes."""
+"""Number of calls of Python functions in a step: these calls take most of the time of small scenes."""
 
 import sys
 
@@ -13,7 +13,7 @@ SOIL = mpm.Hencky(bulk=1e7 / 3, shear=5e6, conductivity=1e-4)
 
 
 def block():
-    """Return a draining block of 10 x 10 cells, pressed so much that each step resets the grid."""
+    """Return a draining block of 10 x 10 cells, with so large a load that each step resets the grid."""
     grid = mpm.Grid([0, 0], [1, 1.2], [10, 12])
     load = mpm.Traction("top", lambda t: (0, -1e5 * t))
     walls = {"left": "x", "right": "x", "bottom": "y"}
@@ -22,7 +22,7 @@ def block():
 
 
 def dry_beam():
-    """Return a dry cantilever, which bends into other cells in each step."""
+    """Return a dry cantilever that moves into other cells in each step."""
     return beam(fluid=False, ramp=1.0)[0]
 
 
@@ -48,7 +48,7 @@ def calls(run):
     ids=["draining block", "dry beam"],
 )
 def test_a_step_calls_no_more_functions_than_before(scene, newton, most):
-    """These ceilings only fall.  They count numpy's own functions, of which newer releases need fewer."""
+    """These ceilings only decrease. They include numpy's own functions, and newer releases of numpy need fewer."""
     s, reports = scene(), []
 
     def steps(count):

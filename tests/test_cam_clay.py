@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Modified Cam Clay: closed forms of element tests, return and tangent at random strains, columns in a scene."""
+"""Modified Cam Clay: closed forms of element tests, return mapping and tangent at random strains, and columns."""
 
 from dataclasses import replace
 
@@ -22,7 +22,7 @@ def law(request):
 
 
 def gradients(dim, scale=0.02, n=60):
-    """Return deformation gradients near I, compressed on average, a few with equal stretches."""
+    """Return deformation gradients near I, with compression on average; some have equal stretches."""
     rng = np.random.default_rng(dim)
     F = np.eye(dim) + scale * rng.normal(size=(n - 3, dim, dim))
     return np.concatenate([F, [np.eye(dim) * a for a in (0.98, 0.995, 1.005)]])
@@ -36,7 +36,7 @@ def test_a_law_keeps_its_values_if_the_script_changes_its_arrays():
 
 
 def test_isotropic_compression_follows_lambda_and_kappa():
-    """ln J = -kappa ln(P / P_0), beyond P_c -lambda, and back along kappa."""
+    """ln J = -kappa ln(P / P_0) below P_c, with slope -lambda beyond P_c, and unloading along kappa."""
     r = element_test(CLAY, "isotropic", [0.04, 0.03], steps=20)
     ln_J = -3 * r.strain
     at_yield = -CLAY.kappa * np.log(CLAY.OCR)
@@ -48,7 +48,7 @@ def test_isotropic_compression_follows_lambda_and_kappa():
 
 @pytest.mark.parametrize("OCR", [1.0, 1.5, 8.0])
 def test_undrained_triaxial_compression_ends_at_the_critical_state_of_its_volume(OCR):
-    """P_cs = P_0 (R/2)^Lambda, Q = M P; on the way Q = M sqrt(P (P_c - P)), P_c as the closed volume has it."""
+    """The test ends at P_cs = P_0 (R/2)^Lambda and Q = M P. Before, Q = M sqrt(P (P_c - P)) at constant volume."""
     clay = replace(CLAY, OCR=OCR)
     r = element_test(clay, "triaxial undrained", 0.6, steps=60)
     assert r.p[-1] == pytest.approx(P0 * (OCR / 2) ** CRITICAL, rel=1e-9)
@@ -74,7 +74,7 @@ def test_without_overconsolidation_the_initial_stress_is_on_the_yield_surface():
 
 
 def test_the_return_is_on_the_yield_surface_by_an_associated_flow(law):
-    """From the new elastic strain alone: f = 0, and the plastic strain is along the gradient of f."""
+    """The new elastic strain fulfils f = 0, and the plastic strain has the direction of the gradient of f."""
     m, F = law.material, gradients(law.dim)
     state = law.update(F)
     full = np.tile(np.eye(3), (len(F), 1, 1))
@@ -121,7 +121,7 @@ def test_a_rotation_turns_the_stress_and_leaves_the_state(law):
 
 
 def test_a_column_in_a_scene_follows_the_element_test():
-    """Confined by its initial stress, loaded to first yield and beyond; two processes' pieces see the same law."""
+    """A column is confined by its initial stress and loaded beyond yield. The law is the same on two processes."""
     clay = replace(CLAY, OCR=1.2)
     lab = element_test(clay, "oedometer", 0.02, steps=10)
     load = lambda t: (0, np.interp(t, lab.strain / 0.02, lab.stress[:, 2, 2]))  # noqa: E731

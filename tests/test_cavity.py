@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A cylindrical cavity in von Mises's soil is widened undrained, by the given displacement of its wall."""
+"""Undrained expansion of a cylindrical cavity in von Mises soil, by a prescribed displacement of its wall."""
 
 import numpy as np
 import pytest
@@ -13,9 +13,9 @@ MARKS = (1.05, 1.2, 1.5, 2.0)  # radius of the cavity over the first one
 
 
 def exact(a, outer=OUTER):
-    """Return (p_a - p_b) / s_u of incompressible soil at a / a0: the integral of the difference of the stresses.
+    """Return (p_a - p_b) / s_u of incompressible soil at a / a0, the integral of the stress difference.
 
-    tau_theta - tau_r is 4G ln(r/R) up to 2 s_u, R^2 = r^2 - a^2 + a0^2.
+    tau_theta - tau_r is 4G ln(r/R), limited to 2 s_u, with R^2 = r^2 - a^2 + a0^2.
     """
     b, elastic = np.sqrt(outer**2 + a**2 - 1), np.exp(1 / (2 * RIGIDITY))
     flows = np.sqrt((a**2 - 1) / (1 - elastic**-2))  # radius up to which it does
@@ -24,7 +24,7 @@ def exact(a, outer=OUTER):
 
 
 def soil(bulk):
-    """Return von Mises's soil of a bulk modulus over G, with s_u = 1."""
+    """Return von Mises soil with s_u = 1 and a bulk modulus, divided by G."""
     return mpm.DruckerPrager(bulk=bulk * RIGIDITY, shear=RIGIDITY, friction=0.0, dilation=0.0, cohesion=1.0)
 
 
@@ -69,7 +69,7 @@ def pressures(cells, bulk, marks, outer):
 
 
 def radial(bulk, outer):
-    """Return the solution of `exact` by radial elements, for soil with a bulk modulus over G."""
+    """Return the solution of `exact` by radial elements, for soil with a finite bulk modulus, divided by G."""
     hole, found = cavity(soil(bulk), outer, 150), []
     for a in np.unique(np.round([*np.linspace(1.0025, 1.1, 40), *np.linspace(1.11, MARKS[-1], 90), *MARKS], 9)):
         hole = hole.widened(a)
@@ -88,7 +88,7 @@ def test_the_exact_pressures_are_those_of_fine_quadrature():
 
 @pytest.mark.parametrize("bulk", [10, 1000])
 def test_a_cavity_is_widened_in_soil_that_flows(bulk):
-    """By 1.6 % less pressure at first than incompressible soil with K = 10 G."""
+    """With K = 10 G, the first pressure is 1.6 % lower than in incompressible soil."""
     check([exact(a) for a in MARKS[:2]], 4, bulk, MARKS[:2], OUTER, error=0.07)
 
 
@@ -96,7 +96,7 @@ def test_a_cavity_is_widened_in_soil_that_flows(bulk):
 @pytest.mark.parametrize("bulk", [10, 1000])
 @pytest.mark.parametrize(("cells", "error"), [(8, 0.015), (16, 0.005)])
 def test_pressures_in_a_cavity_converge(cells, error, bulk, monkeypatch):
-    """Undrained up to twice its radius; the radial elements are for nearly incompressible soil, K = 1000 G."""
+    """Undrained expansion to twice the radius. The radial elements have K = 1000 G."""
     monkeypatch.setattr("mpm_dolfinx.verification.cavity.NEAR", 1e-6)  # what soil that flows evenly lets them reach
     reference = radial(bulk, NEAR)
     if bulk == 1000:

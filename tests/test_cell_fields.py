@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Fields of the cells: of second order, up to date, and without any effect on a run."""
+"""Fields of the cells are of second order and up to date, and do not affect a run."""
 
 import manufactured as made
 import numpy as np
@@ -12,7 +12,7 @@ import mpm_dolfinx as mpm
 def test_fields_of_the_cells_are_of_second_order():
     """Displacement, pressure, effective and total stress, at the centroids of the material in the cells.
 
-    Of stresses on twice as many cells again, with linear or even gradients in domains, 1.6.
+    On twice as many cells again, the order of stresses is 1.6, with linear or constant gradients in domains.
     """
     errors = []
     for cells in (6, 12, 24):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Orders of convergence to exact solutions, each as a rate and as a ceiling of the error."""
+"""Orders of convergence to exact solutions; each order has a minimum, and each error a maximum."""
 
 from functools import cache
 
@@ -13,7 +13,7 @@ from helpers import rates
 
 
 def backward_euler(z, steps, size):
-    """Return (p / p0 at depths z, consolidation) after steps of backward Euler of a size in T_v, exact in space."""
+    """Return p / p0 at depths z and the consolidation after equal steps of backward Euler, exact in space."""
     m = (np.arange(4000) + 0.5) * np.pi
     left = (1 + m**2 * size) ** -float(steps)
     return (2 / m * np.sin(np.outer(z, m)) * left).sum(axis=1), 1 - (2 / m**2 * left).sum()
@@ -21,7 +21,7 @@ def backward_euler(z, steps, size):
 
 @cache
 def errors_in_space(cells, steps=20):
-    """Return the largest errors over depth and time of p / p0 and of the consolidation at the same time steps."""
+    """Return the largest errors of p / p0 and of the consolidation over depth and time, with equal time steps."""
     out = terzaghi.run(cells, steps, method="backward-euler")
     exact = [backward_euler(z, k + 1, 1 / steps) for k, z in enumerate(out.z)]
     p = max(np.abs(p - e[0]).max() for p, e in zip(out.p, exact, strict=True))
@@ -36,7 +36,7 @@ def test_consolidation_is_of_second_order_in_the_cell_size(which, ceiling):
 
 @pytest.mark.parametrize("method, order", [("sdirk2", 1.9), ("backward-euler", 0.9)])
 def test_consolidation_in_time_is_of_the_order_of_the_method(method, order):
-    """In the cells' pressures at T_v = 0.5 and 1, against a run of so many steps that time costs nothing."""
+    """Errors of cell pressures at T_v = 0.5 and 1, compared with a run in which the error in time is negligible."""
     runs = [terzaghi.run(20, steps, method=method) for steps in (10, 20, 40)]
     true = terzaghi.run(20, 640)
     for time in (0.5, 1.0):
@@ -57,7 +57,7 @@ def test_steps_chosen_by_their_error_keep_to_it():
 
 @pytest.mark.parametrize("strain", [1e-4, 1e-7])
 def test_consolidation_does_not_depend_on_how_small_the_load_is(strain):
-    """Domains that leave their cells by next to nothing must not close the faces between cells."""
+    """Domains that leave their cells by very small distances must not close the faces between cells."""
     p = terzaghi.run(50, 50, strain).p
     assert max(np.abs(a - b).max() for a, b in zip(p, terzaghi.run(50, 50).p, strict=True)) < 3 * max(strain, 1e-5)
 
@@ -80,7 +80,7 @@ def test_the_columns_stress_is_as_good_as_published(cells):
 
 @pytest.mark.parametrize("cells, ceiling", [(16, 4e-4), (32, 5e-5), (64, 8e-6)])
 def test_the_columns_stress_varies_within_domains(cells, ceiling):
-    """With one gradient a domain errors were 9.8e-4, 3.0e-4, 1.3e-4; its heights were right by chance of the steps."""
+    """With one gradient per domain, errors were 9.8e-4, 3.0e-4 and 1.3e-4; its heights were accurate only by chance."""
     assert column_errors(cells)["stress"] < ceiling
 
 

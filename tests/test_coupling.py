@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The coupler: schemes agree, steps are cut and grow, giving up is clear and keeps the state."""
+"""Coupling: schemes agree, steps are cut and grow, and a run that gives up explains why and keeps its state."""
 
 from dataclasses import replace
 
@@ -92,7 +92,9 @@ OWN = ("Schur-CG",)
 
 @pytest.mark.parametrize("scene", demo.SCENES)
 def test_a_linear_solve_takes_few_iterations_from_drained_to_undrained_whatever_the_cell_size(scene):
-    """To 1e-8, from k = 1e-14 m/s, dt = 1e-9 s to k = 1e2 m/s, dt = 1e9 s, water from 1e4 Pa to incompressible."""
+    """To 1e-8, from k = 1e-14 m/s and dt = 1e-9 s to k = 1e2 m/s and dt = 1e9 s, with water from 1e4 Pa to
+    incompressible.
+    """
     most = [demo.worst(demo.scan(scene, h, schemes=OWN)) for h in (0.06, 0.03)]
     assert max(most) <= 14 and np.ptp(most) <= 1
 
@@ -115,7 +117,7 @@ def test_the_plain_fixed_stress_iteration_needs_more_and_the_fluid_s_compressibi
 
 
 def test_the_filter_takes_at_most_what_the_fixed_stress_operator_has():
-    """0 <= L <= beta V, also in cells that are hardly filled: the preconditioner is positive definite."""
+    """0 <= L <= beta V, also in almost empty cells: the preconditioner is positive definite."""
     s, _ = beam(offset=0.01)
     balances = set_up(s, 0.02)
     storage, contents = balances.matrices.storage, balances.start.on_grid.contents
@@ -146,7 +148,7 @@ def test_the_undrained_pressure_has_no_checkers():
 
 
 def slender(thrust, side_load):
-    """Return a cantilever of 1 m x 0.1 m, pressed by a multiple of its buckling load, and its tip."""
+    """Return a cantilever of 1 m x 0.1 m under a multiple of its buckling load, and a probe at its tip."""
     grid = mpm.Grid([0, 0], [1.2, 1.6], [48, 64])
     body = mpm.box(grid, [0, 1.2], [1, 1.3])
     critical = np.pi**2 * 1e7 * 0.1**2 / 12 / 4  # Pa

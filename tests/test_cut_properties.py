@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The cut of any domain by any grid is that of clippings which share nothing with it: exact ones in 2D."""
+"""The cut of any domain by any grid equals independent clippings, which are exact in 2D."""
 
 from dataclasses import fields
 from fractions import Fraction
@@ -23,13 +23,13 @@ RING = [0, 1, 3, 2]  # corners of a quadrilateral, counterclockwise
 
 
 def triangles(face):
-    """Return the triangles of a face (4, e) about its middle."""
+    """Return the triangles of a face (4, e) about its midpoint."""
     ring = face[RING]
     return [np.stack([a, b, face.mean(axis=0)]) for a, b in zip(ring, np.roll(ring, -1, axis=0), strict=True)]
 
 
 def tetrahedra_of(y):
-    """Return the tetrahedra of a hexahedron (8, 3): triangles about the middles of its faces, and its own middle."""
+    """Return the tetrahedra of a hexahedron (8, 3), between its midpoint and the triangles of its faces."""
     faces = [y[BITS[3][:, axis] == end] for axis in range(3) for end in (0, 1)]
     return [np.vstack([triangle, y.mean(axis=0)]) for face in faces for triangle in triangles(face)]
 
@@ -42,7 +42,7 @@ NEAR = st.sampled_from([sign * e for e in (0, 1e-12, 1e-11, 9e-11, 1.2e-10, 2.5e
 
 
 def put_near_planes(draw, y, near=NEAR):
-    """Return corners y (k, d), cells, moved together so that one is near a plane, and then one corner by itself."""
+    """Return corners y (k, d), in cells, after translations that put one corner near a plane, and one other corner."""
     corner = st.integers(0, len(y) - 1)
     for axis in range(y.shape[1]):
         if draw(st.booleans()):
@@ -55,7 +55,7 @@ def put_near_planes(draw, y, near=NEAR):
 
 
 def in_a_grid(draw, y):
-    """Return a grid, and positions y (k, d), cells, in it, m; it may be no larger than they need."""
+    """Return a grid, and positions y (k, d), in cells, as positions in m. The grid may be just large enough."""
     d = y.shape[1]
     y = y - np.floor(y.min(axis=0) + SNAP / 2) + draw(st.integers(0, 2))
     shape = np.ceil(y.max(axis=0) - SNAP / 2).astype(int).clip(1) + draw(st.integers(0, 2))
@@ -67,7 +67,9 @@ def in_a_grid(draw, y):
 
 @st.composite
 def quadrilaterals(draw):
-    """A grid and a convex quadrilateral (4, 2), m: four points of an ellipse or a box, however small or thin."""
+    """Draw a grid and a convex quadrilateral (4, 2), in m: four points of an ellipse, or a box, of any size and
+    thickness.
+    """
     y = BITS[2] - 0.5
     if draw(st.booleans()):
         angle = np.pi / 4 * np.array([-3, -1, 3, 1]) + numbers(draw, -0.7, 0.7, 4)
@@ -85,7 +87,7 @@ def turn(a, b, c):
 
 @st.composite
 def hexahedra(draw, near=NEAR, folds=False):
-    """A grid and a hexahedron (8, 3), m, a little distorted, none of whose Kuhn tetrahedra is flat or has folded."""
+    """Draw a grid and a slightly distorted hexahedron (8, 3), in m, without flat or inverted Kuhn tetrahedra."""
     y = BITS[3] - 0.5 + numbers(draw, 0, 0.15) * numbers(draw, -1, 1, 8, 3)
     if folds and draw(st.booleans()):
         corner = draw(st.integers(0, 7))
@@ -101,7 +103,9 @@ def hexahedra(draw, near=NEAR, folds=False):
 
 @st.composite
 def dented(draw):
-    """A grid and a box with sides on its planes, one corner pulled out: three of its face's stay on the plane."""
+    """Draw a grid and a box with sides on its planes and one displaced corner; three corners of its face stay on the
+    plane.
+    """
     y, corner, axis = 0.5 + 1.0 * BITS[3], draw(st.integers(0, 7)), draw(st.integers(0, 2))
     y[:, axis] += 0.5
     y[corner, axis] += (2 * BITS[3][corner, axis] - 1) * numbers(draw, 0.1, 0.9)
@@ -112,20 +116,22 @@ def dented(draw):
 
 
 def snapped(grid, corners):
-    """Return corners in cells, on the grid planes that they are near."""
+    """Return corners, in cells, with coordinates near a grid plane moved to this plane."""
     y = (corners - grid.low) / grid.h
     return np.where(np.abs(y - np.rint(y)) < grid.snap, np.rint(y), y)
 
 
 def error(grid, corners):
-    """Return how far `snapped` may be off, in cells: by rounding, or where others would snap a corner or not."""
+    """Return the allowed error of `snapped`, in cells: from rounding, or from a different decision to snap a corner."""
     rounding = 1e-15 * (1 + ((np.abs(corners) + np.abs(grid.low)) / grid.h).max())
     distance = np.abs((corners - grid.low) / grid.h - snapped(grid, corners))
     return rounding + (grid.snap * (np.abs(distance - grid.snap) < rounding)).max()
 
 
 def pieces(grid, *domains):
-    """Return {cell: (fraction, centroid, faces)} of the last domain, in cells, the centroid from the cell's corner."""
+    """Return {cell: (fraction, centroid, faces)} of the last domain, in cells; centroids are relative to the cell's
+    corner.
+    """
     p = cut(grid, np.stack(domains))
     assert (np.diff(p.point * grid.shape.prod() + p.cell) > 0).all() and len(np.unique(p.point)) == len(domains)
     p = Pieces(*(getattr(p, f.name)[p.point == len(domains) - 1] for f in fields(Pieces)))
@@ -137,7 +143,7 @@ def pieces(grid, *domains):
 
 
 def agree(found, parts, total, slack):
-    """Assert that the pieces have the shares and the moments of {cell: (volume, moment)}."""
+    """Assert that the pieces have the fractions and the moments of {cell: (volume, moment)}."""
     nothing = 0.0, np.zeros(len(next(iter(found))))
     for cell in found.keys() | parts.keys():
         fraction, x = found.get(cell, nothing)[:2]
@@ -147,7 +153,7 @@ def agree(found, parts, total, slack):
 
 
 def span(vertices, axis):
-    """Return the cells along an axis that vertices in cells reach into, or touch with all of a side."""
+    """Return the cells along an axis that contain vertices (in cells), or have a side on which all vertices lie."""
     low, high = (extreme(v[axis] for v in vertices) for extreme in (min, max))
     return range(floor(low), max(ceil(high), floor(low) + 1))
 
@@ -196,7 +202,7 @@ def parts_of_polygon(polygon):
 
 
 def conditioned(polygon, slack):
-    """Return area, perimeter and centroid of a polygon, without vertices that small shifts hardly change."""
+    """Return area, perimeter and centroid of a polygon, without vertices that small displacements hardly change."""
     area, moment = area_and_moment(polygon)
     perimeter = sum(np.hypot(*(float(x - w) for x, w in zip(a, b, strict=True))) for a, b in edges(polygon))
     assume(slack * perimeter < 1e-3 * area)
@@ -234,7 +240,7 @@ def test_a_domain_is_cut_among_others_as_by_itself(scenes):
 
 
 def section(polygon, axis, plane):
-    """Return the section of a convex polygon with a line, an interval, none where they do not meet."""
+    """Return the section of a convex polygon with a line as an interval, or None without intersection."""
     other, cuts = 1 - axis, [v[1 - axis] for v in polygon if v[axis] == plane]
     for a, b in edges(polygon):
         if (a[axis] - plane) * (b[axis] - plane) < 0:
@@ -243,7 +249,9 @@ def section(polygon, axis, plane):
 
 
 def beside(polygon, axis, plane):
-    """Return the length of the outline near a line but not on it, seen along it; flat parts count as on it."""
+    """Return the length of the outline near a line but not on it, projected on the line; flat parts count as on the
+    line.
+    """
     out = 0.0
     for a, b in edges(polygon):
         low, high = sorted([float(a[axis] - plane), float(b[axis] - plane)])
@@ -284,7 +292,7 @@ def prism(p, q):
 
 
 def between(tetrahedra, axis, low):
-    """Return tetrahedra that fill the part of some in the cells `low` along an axis."""
+    """Return tetrahedra that fill the part of given tetrahedra in the cells `low` along an axis."""
     for plane, side in ((low, 1), (low + 1, -1)):
         parts = []
         for t in tetrahedra:
@@ -306,7 +314,7 @@ def between(tetrahedra, axis, low):
 
 
 def columns(tetrahedra, axes):
-    """Return {cell: the parts in it}, cut along some of the axes only."""
+    """Return {cell: parts in the cell}, cut along some of the axes only."""
     out = {(): tetrahedra}
     for axis in range(3):
         out = {
@@ -321,7 +329,7 @@ def columns(tetrahedra, axes):
 @repeatable(80)
 @given(hexahedra(folds=True))
 def test_a_hexahedron_has_the_pieces_of_its_tetrahedra(scene):
-    """Inverted tetrahedra count as negative; pieces whose sign is not that of the whole are left out."""
+    """Inverted tetrahedra count as negative. Pieces with a sign other than that of the whole are excluded."""
     grid, corners = scene
     found, y, slack, parts = pieces(grid, corners), snapped(grid, corners), error(grid, corners), {}
     for whole, upright in zip(tetrahedra_of(y), tetrahedra_of(1.0 * BITS[3]), strict=True):
@@ -343,7 +351,9 @@ def test_a_hexahedron_has_the_pieces_of_its_tetrahedra(scene):
 @repeatable(70)
 @given(hexahedra(near=st.just(0.0)) | dented(), st.sampled_from([0, 1, 2]))
 def test_the_open_faces_of_a_hexahedron_are_the_sections_of_its_tetrahedra(scene, axis):
-    """The section of a tetrahedron: its volume times the B-spline of its vertices' heights (Curry, Schoenberg 1966)."""
+    """The section of a tetrahedron is its volume times the B-spline of its vertices' heights (Curry and Schoenberg
+    1966).
+    """
     grid, corners = scene
     found, y, off = pieces(grid, corners), snapped(grid, corners), 1e-11  # how far within the cell a section is taken
     distance, extent = np.abs(y[:, axis] - np.rint(y[:, axis])), np.ptp(y, axis=0)
@@ -364,7 +374,7 @@ def test_the_open_faces_of_a_hexahedron_are_the_sections_of_its_tetrahedra(scene
 @pytest.mark.parametrize("d", [2, 3])
 @pytest.mark.parametrize("gap", [0, 1e-12, 9e-11, 4e-10, 1e-9, 1e-7, 1e-3])
 def test_a_face_is_open_where_the_body_is_no_further_from_it_than_the_snap(d, gap):
-    """From above and from below, on either side of the middle plane."""
+    """From above and from below, on both sides of the middle plane."""
     grid, open_ = Grid([0] * d, [2.0] * d, [2] * d), float(gap < SNAP)
     for axis in range(d):
         above, below = BITS[d] * 0.5 + 0.2, BITS[d] * 0.5 + 0.2
@@ -379,14 +389,14 @@ def test_a_face_is_open_where_the_body_is_no_further_from_it_than_the_snap(d, ga
 
 @st.composite
 def surfaces(draw, d):
-    """A grid, and the corners (2^(d-1), d), m, of a face of a domain, plane or not, and of a unit cube's face."""
+    """Draw a grid, the corners (2^(d-1), d), in m, of a plane or warped face of a domain, and a face of a unit cube."""
     local = np.insert(BITS[d - 1].astype(float), draw(st.integers(0, d - 1)), draw(st.integers(0, 1)), axis=1)
     y = (local - 0.5 + numbers(draw, -0.2, 0.2, *local.shape)) * orders(draw, -4, 0.5) * orders(draw, -3, 0, d)
     return *in_a_grid(draw, put_near_planes(draw, numbers(draw, 0, 1, d) + turned(draw, y))), local
 
 
 def squares(simplices, d):
-    """Return the integrals of z z^T, z = (1, ...), over simplices as large as in their last d coordinates."""
+    """Return the integrals of z z^T, z = (1, ...), over simplices, which have their size in the last d coordinates."""
     out = np.zeros((2 * d + 1, 2 * d + 1))
     for z in (np.insert(s, 0, 1.0, axis=1) for s in simplices):
         e = z[1:, -d:] - z[0, -d:]
@@ -396,7 +406,7 @@ def squares(simplices, d):
 
 
 def parts_of_simplices(simplices, d):
-    """Return {cell: segments or triangles that fill the part in it}; the first d coordinates are in cells."""
+    """Return {cell: segments or triangles that fill the part in the cell}; the first d coordinates are in cells."""
     out = {}
     for simplex in simplices:
         for cell in product(*(span(simplex, axis) for axis in range(d))):
@@ -438,7 +448,7 @@ def test_points_on_a_face_integrate_what_is_quadratic_in_each_cell(d):
 
 @pytest.mark.parametrize("order", [(1, 0, 2), (0, 2, 1), (2, 1, 0)])
 def test_points_on_a_face_do_not_tell_which_axis_was_cut_first(order):
-    """Earlier the tool pressure in 3D, which is not a polynomial, changed with the names of the axes."""
+    """In an earlier version, a tool pressure in 3D that is not a polynomial depended on the order of the axes."""
 
     order, rng = list(order), np.random.default_rng(0)
     grid, waves = Grid([0, 0, 0], [3.0, 4.0, 5.0], [3, 5, 4]), np.array([2.0, 3.0, 4.0])
@@ -473,7 +483,7 @@ def test_pieces_in_3d_have_the_moments_of_products_of_what_they_are():
 
 @pytest.mark.parametrize("off", [1e-11, -1e-11])
 def test_a_face_whose_middle_lies_on_a_plane_within_rounding_has_the_points_of_one_where_it_does(off):
-    """A corner where the plane passed its middle made other triangles, by which a contact changed by 3e-4."""
+    """A corner on a plane through the midpoint gave other triangles, which changed a contact by 3e-4."""
     grid = Grid([0] * 3, [4] * 3, [4] * 3)
     local = np.array([[[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]]])
 

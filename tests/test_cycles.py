@@ -22,7 +22,7 @@ MATRICES = st.lists(st.floats(-0.3, 0.3), min_size=9, max_size=9)
 
 
 def test_a_beam_is_free_of_stress_after_cycles():
-    """0.34 % are left after eight, and after twenty; `demos/run.sh cycles` has these."""
+    """The residual stress is 0.34 % after eight cycles, and after twenty. `demos/run.sh cycles` prints these values."""
     run = cycles.cycle(0.03, 54e3, 8, 10)
     left = run["left"]
     assert left[-1] < 3.5e-3 and left[-1] - left[5] < 0.5 * (left[5] - left[3])
@@ -32,7 +32,9 @@ def test_a_beam_is_free_of_stress_after_cycles():
 
 
 def told(run):
-    """Print residual stress after half and all of the cycles, the drift of the peaks, and the tip without load."""
+    """Print the residual stress after half of the cycles and at the end, the drift of the peaks, and the tip without
+    load.
+    """
     left, peaks, rest = run["left"], run["tips"][5::10], run["tips"][::10]
     numbers = ", ".join(f"{x:.3%}" for x in (left[len(left) // 2 - 1], left[-1]))
     print(f"left {numbers}, peaks {peaks[-1] / peaks[0] - 1:.1e}, tip {rest[-1] / peaks[0]:.1e}")
@@ -64,7 +66,7 @@ def clay(nu):
 
 @pytest.mark.parametrize(("nu", "count", "most"), [(0.49, 8, 0.031), (0.499, 2, 0.037)])
 def test_what_cycles_leave_of_a_nearly_incompressible_beam_soon_stays_the_same(nu, count, most):
-    """With volumes remembered by increments alone it was 7 % after 10 cycles, and 18 % after 2 with nu = 0.499."""
+    """With incremental volume ratios alone, it was 7 % after 10 cycles, and 18 % after 2 cycles with nu = 0.499."""
     left = cycles.cycle(0.06, 54e3, count, 10, material=clay(nu))["left"]
     assert left[-1] < most and left[-1] < 1.2 * left[count // 2 - 1]
 
@@ -72,7 +74,7 @@ def test_what_cycles_leave_of_a_nearly_incompressible_beam_soon_stays_the_same(n
 @pytest.mark.slow
 @pytest.mark.parametrize("load", [5.4e3, 54e3])
 def test_nearly_incompressible_after_two_hundred_cycles_as_after_a_hundred(load):
-    """At 5.4 kPa, where little crosses grid lines, it comes to rest later: 1.56 and 1.58 %."""
+    """At 5.4 kPa, few domains cross grid lines, and the residual stress becomes constant later: 1.56 and 1.58 %."""
     left = told(cycles.cycle(0.03, load, 200, 10, material=clay(0.49)))["left"]
     assert left[-1] < 0.02 and left[-1] < 1.02 * left[99]
 
@@ -89,7 +91,7 @@ def test_what_cycles_leave_falls_with_the_cell_size():
 
 
 def left_of(h, dim=2, **wet):
-    """Return the residual effective stress of a cantilever after three cycles, rms over its peak."""
+    """Return the rms residual effective stress of a cantilever after three cycles, divided by the peak stress."""
     grid = mpm.Grid(
         [0] * dim, [1.2, *[0.4] * (dim - 2), 1.2], np.rint(np.array([1.2, *[0.4] * (dim - 2), 1.2]) / h).astype(int)
     )
@@ -124,7 +126,9 @@ def test_what_cycles_leave_falls_with_the_cell_size_draining_and_in_3d_as_well(h
 
 @pytest.mark.slow
 def test_what_undrained_cycles_leave_falls_slowly_only_where_a_clamp_has_edges():
-    """Stresses at an edge behave as r^(x - 1), x = 0.595: with springs in place of the clamp the order is 1.35."""
+    """The stress near an edge is proportional to r^(x - 1), x = 0.595. With springs in place of the clamp the order is
+    1.35.
+    """
     soil = {"material": replace(clay(0.0), conductivity=0.0), "fluid": mpm.Fluid()}
     sprung, clamped = ([cycles.cycle(h, 54e3, 5, 10, springs=k, **soil) for h in (0.06, 0.03)] for k in (5e7, 0.0))
     assert cycles.orders([0.06, 0.03], [run["left"][-1] for run in sprung])[0] > 1.3
@@ -134,12 +138,12 @@ def test_what_undrained_cycles_leave_falls_slowly_only_where_a_clamp_has_edges()
 
 @pytest.mark.slow
 def test_undrained_more_of_the_stress_is_left_as_where_it_is_nearly_incompressible():
-    """At the clamp's edges it falls slowly, 1.1 % with half the cell size: the stress there is singular."""
+    """Near the clamp's edges the stress is singular: its residual is still 1.1 % with half the cell size."""
     assert left_of(0.03, fluid=mpm.Fluid()) < 0.016
 
 
 def test_what_undrained_cycles_leave_is_bounded():
-    """The volume defect of points is corrected: without, 3.9 and 5.3 % were left after 5 and 10 cycles, and so on."""
+    """The volume defect of points is corrected. Without correction, 3.9 and 5.3 % remained after 5 and 10 cycles."""
     soil = replace(clay(0.0), conductivity=0.0)
     left = cycles.cycle(0.06, 54e3, 10, 10, material=soil, fluid=mpm.Fluid())["left"]
     assert left[-1] < 0.039 and left[-1] < 1.1 * left[4], left
@@ -151,9 +155,9 @@ def test_a_body_that_turns_by_360_degrees_has_its_stresses_back():
 
 @pytest.mark.slow
 def test_a_stretched_block_after_ten_turns_is_that_after_one():
-    """The carried traction of sides rotates with them: the first turn leaves 1e-6 E, later ones less and less.
+    """The stored traction of sides rotates with the sides. The first rotation leaves 1e-6 E, and later ones ever less.
 
-    A traction fixed in space would let sides give way to its rotation in each step: 2.6e-5 E.
+    With a traction fixed in space, each step of the rotation would displace the sides: 2.6e-5 E.
     """
     grid, centre = mpm.Grid([0, 0], [1.6, 1.6], [8, 8]), np.full(2, 0.81)
     block = mpm.box(grid, centre - 0.3, centre + 0.3)
@@ -244,9 +248,9 @@ def test_the_filter_leaves_quadratic_fields_and_what_has_not_moved_and_takes_the
 
 @cache
 def left_in(length=1.0, turned=False):
-    """Return the stress (n, 2, 2), Pa, that a load cycle leaves in a beam, and where it ends (n, 2), in lengths.
+    """Return the stress (n, 2, 2), in Pa, of a beam after a load cycle, and its final positions (n, 2), in lengths.
 
-    turned: with x and y swapped.
+    turned: whether x and y are exchanged.
     """
     way, sides = (slice(None, None, -1), ("bottom", "right")) if turned else (slice(None), ("left", "top"))
     grid = mpm.Grid([0] * 2, [1.2 * length] * 2, [20, 20])
@@ -261,7 +265,7 @@ def left_in(length=1.0, turned=False):
 
 @pytest.mark.parametrize("scene", [{"turned": True}, {"length": 1e-9}, {"length": 1e6}], ids=["turned", "nm", "Mm"])
 def test_what_a_cycle_leaves_does_not_depend_on_the_axes_or_the_unit_of_length(scene):
-    """The filter took one axis after the other, and compared cells with metres: 6e-3 and 8e-2 of it."""
+    """An earlier filter treated the axes one after the other, and compared cells with metres: 6e-3 and 8e-2."""
     (stress, x), (stress0, x0) = left_in(**scene), left_in()
     assert np.abs(stress0).max() > 1e3
     assert stress == pytest.approx(stress0, rel=0, abs=1e-9 * np.abs(stress0).max())
@@ -273,7 +277,7 @@ SAND = mpm.DruckerPrager(bulk=8.3e6, shear=3.8e6, cohesion=1e3, friction=0.5, di
 
 @pytest.mark.parametrize(("dim", "fluid"), [(2, None), (2, mpm.Fluid()), (3, None)])
 def test_weak_soil_that_only_turns_stays_free_of_stress_and_takes_no_cut_step(dim, fluid):
-    """Its strength is that of a turn by 2 degrees, taken as a linearised displacement."""
+    """The strength equals the stress of a rotation by 2 degrees in linearised strain."""
     grid = mpm.Grid([0] * dim, [1.6] * dim, [8] * dim)
     centre = np.full(dim, 0.81)
     block = mpm.box(grid, centre - 0.3, centre + 0.3, per_cell=4 - dim)
@@ -306,7 +310,7 @@ def test_weak_soil_turns_by_360_degrees_without_a_cut_step():
 
 
 def test_a_turn_is_found_where_walls_hold_a_part_of_the_body():
-    """A block hinged at a wall is no rigid body: Newton begins where it would have begun."""
+    """A block hinged at a wall is no rigid body: Newton's method starts as before."""
     grid = mpm.Grid([0, 0], [1.0, 1.0], [10, 10])
     block = mpm.box(grid, [0.0, 0.3], [0.8, 0.7])
 

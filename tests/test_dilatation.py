@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Mean dilatation: nearly incompressible skeletons do not lock, its tangent is consistent, other bodies do without."""
+"""Mean dilatation: nearly incompressible skeletons do not lock, and the tangent is consistent."""
 
 from dataclasses import dataclass, replace
 
@@ -19,7 +19,7 @@ SAND = mpm.DruckerPrager(bulk=2e7, shear=1e7, friction=30.0, dilation=0.0, cohes
 
 @dataclass(frozen=True)
 class Fibrous(mpm.NeoHookean):
-    """A law of a user's for the plane only: its fibres have two components."""
+    """A user-defined law for plane scenes only: its fibres have two components."""
 
     fibre: float = 0.0
     direction: tuple = (1.0, 0.0)
@@ -36,9 +36,10 @@ def skeleton(nu):
 
 @pytest.mark.parametrize("nu", [0.45, 0.499])
 def test_nearly_incompressible_beams_do_not_lock(nu):
-    """Plain Q1 is 1.3 and 26 % too stiff on this grid of ten cells over the depth.
+    """Plain Q1 elements are 1.3 and 26 % too stiff on this grid with ten cells over the depth.
 
-    So are the finite elements, at first order in their size: by 0.9 % with 60 over the length at nu = 0.499.
+    The finite elements are too stiff as well, with first order: by 0.9 % with 60 elements over the length at nu =
+    0.499.
     """
     s, probe = beam(material=skeleton(nu), fluid=False, ramp=1.0)
     tip = s.run(1.0, 0.1, probes=probe).displacement[-1][0, 1]
@@ -54,7 +55,7 @@ def test_nearly_incompressible_beams_do_not_lock(nu):
 
 
 def test_water_in_a_nearly_incompressible_beam_has_its_pressure():
-    """The corner-based volume ratio expelled water in each step: up to thirty times the pressure, steps never grew."""
+    """A volume ratio from the corners expelled water in each step: pressures were up to thirty times too large."""
     wet = Beam(extreme_soil(nu=0.499), WATER)
     fem = BiotFEM(mpm.Grid([0, 0], wet.size, (20, 8)), wet.material, walls={"left": "xy"}, **wet.physics())
     reference = fem.run(0.2, 0.02, probes=[[1.0, 0.2]])
@@ -63,7 +64,7 @@ def test_water_in_a_nearly_incompressible_beam_has_its_pressure():
 
 
 def two_layers(*materials, dim=2):
-    """Return a clamped block of two layers that share a row of cells, with a dead load on its top."""
+    """Return a clamped block of two layers with a common row of cells, under a dead load on its top."""
     grid = mpm.Grid([0] * dim, [0.7, 0.7, 0.5][:dim], [7, 7, 5][:dim])
     layers = [([0, 0.1, 0.1], [0.5, 0.35, 0.4]), ([0, 0.35, 0.1], [0.5, 0.6, 0.4])]
     bodies = [mpm.box(grid, a[:dim], b[:dim], material=k) for k, (a, b) in enumerate(layers)]
@@ -110,7 +111,7 @@ def test_the_tangent_is_the_derivative_of_the_residual(make):
 
 
 def test_a_law_for_the_plane_only_has_its_mean_dilatation_there():
-    """Both means differ by a part of the cells' own error: without one the tip goes down by 9 % less."""
+    """The two means differ by less than the error of the cells. Without a mean, the tip deflects by 9 % less."""
     tips = [sagging(law(bulk=2e8, shear=1e7)) for law in (Fibrous, mpm.NeoHookean)]
     assert tips[0] == pytest.approx(tips[1], rel=1e-2)
 
@@ -156,7 +157,7 @@ def test_compressible_scenes_do_without():
 
 
 def sagging(*materials, far=False, later=False, quadrature="domain", **options):
-    """Return the tip of an elastic beam, with a block elsewhere that is of the second material, or comes later."""
+    """Return the tip of an elastic beam, with a distant block of the second material that is present or comes later."""
     grid = mpm.Grid([0, 0], [1.8, 1.2], [30, 20])
     bodies = [mpm.box(grid, [0, 0.63], [1, 0.93])] + [mpm.box(grid, [1.4, 0], [1.7, 0.3], material=1)] * far
     load = mpm.Traction("top", lambda t: (0, -54e3 * t), region=((0.05, 0.9), (1.0, 1.0)))
@@ -174,7 +175,7 @@ def sagging(*materials, far=False, later=False, quadrature="domain", **options):
 
 @pytest.mark.parametrize("quadrature", ["domain", "point"])
 def test_what_locks_elsewhere_changes_nothing_in_an_elastic_body(quadrature):
-    """With the mean dilatation for the whole scene the tip went down by 7 % more."""
+    """With a mean dilatation in the whole scene, the tip deflected by 7 % more."""
     alone = sagging(SOFT, quadrature=quadrature)
     assert sagging(SOFT, SAND, quadrature=quadrature) == alone
     for other in (SAND, skeleton(0.499)):
@@ -184,9 +185,10 @@ def test_what_locks_elsewhere_changes_nothing_in_an_elastic_body(quadrature):
 
 
 def test_a_skin_that_does_not_lock_shares_the_cells_of_a_beam_that_does():
-    """A skin of a millionth of its stiffness fills the other half of its upper cells: the beam bends as without.
+    """A skin with a millionth of the stiffness fills the other half of the upper cells: the beam bends as without a
+    skin.
 
-    With one mean for all that a cell holds the tip would go down by 1.9 % less.
+    With one mean for the whole content of a cell, the tip would deflect by 1.9 % less.
     """
     grid, clay = mpm.Grid([0, 0], [1.2, 1.2], [20, 20]), skeleton(0.499)
     skin = replace(SOFT, bulk=1e-6 * SOFT.bulk, shear=1e-6 * SOFT.shear, grain_density=0.0)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Given displacements of sides of the bodies: exact stress and reactions, and bodies carried along without stress."""
+"""Prescribed displacements of sides: exact stress and reactions, and rigid motion without stress."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ CENTRE = np.array([0.515, 0.7])
 
 
 def carried(turns, shift):
-    """Return the displacement of a rigid motion: `turns` full turns and a shift (m) by t = 1."""
+    """Return the displacement of a rigid motion: `turns` full rotations and a translation (m) until t = 1."""
 
     def value(t, X):
         a = 2 * np.pi * turns * t
@@ -23,7 +23,7 @@ def carried(turns, shift):
 
 @pytest.mark.parametrize("turns, shift, steps", [(0, 1.0, 40), (1, 0.0, 72), (1, 1.0, 72)])
 def test_a_body_carried_rigidly_keeps_zero_stress(turns, shift, steps):
-    """Ten cells, 360 degrees: below 1e-8 E at all times."""
+    """Ten cells, 360 degrees: the stress is below 1e-8 E at all times."""
     grid = mpm.Grid([0, 0], [2.4, 1.4], [24, 14])
     body = mpm.box(grid, [0.2, 0.45], [0.83, 0.95])
     sides = [mpm.Displacement(side, carried(turns, shift)) for side in ("left", "right", "bottom", "top")]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Elastic domains are divided where grid lines make cells finer, and merge again where cells become coarser."""
+"""Elastic domains are divided where cells become finer, and merged where cells become coarser."""
 
 from functools import partial
 
@@ -18,14 +18,14 @@ RENEWAL = mpm.Numerics(renewal=True)
 
 
 def travelling(dim, high, count, way, axisymmetric=False):
-    """Return a grid whose finest cells travel along the first axis from .2 of its length, as far as way(t)."""
+    """Return a grid whose finest cells move along the first axis, from 0.2 of its length by way(t)."""
     others = [np.linspace(0, high, count // 2 + 1)] * (dim - 1)
     lines = lambda t: [fine_about(0, high, count, high * (0.2 + way(t))), *others]  # noqa: E731
     return mpm.Grid(lines=lines(0), follow=lines, axisymmetric=axisymmetric)
 
 
 def there_and_back(t):
-    """Return .6 after 3 s, and 0 from 6 s on."""
+    """Return 0.6 at 3 s, and 0 from 6 s on."""
     return 0.2 * max(0, 3 - abs(t - 3))
 
 
@@ -53,7 +53,7 @@ def test_even_stresses_are_exact_and_seeded_domains_come_back(dim, axisymmetric)
 
 @pytest.mark.parametrize("dim, axisymmetric", KINDS)
 def test_sealed_soil_keeps_its_water(dim, axisymmetric):
-    """Under pressures that vary from point to point, with a compressible fluid."""
+    """Pressures vary from point to point, with a compressible fluid."""
     grid = travelling(dim, 1.3, 8 if dim == 3 else 16, there_and_back, axisymmetric)
     walls = dict.fromkeys(SIDES[dim], "xyz"[:dim])
     acting = {"pressure": lambda x: 1e5 * np.sin(3 * x[:, 0]) * x[:, 1], "fluid": mpm.Fluid(bulk=1e6), "walls": walls}
@@ -68,7 +68,7 @@ def test_sealed_soil_keeps_its_water(dim, axisymmetric):
 
 @pytest.mark.parametrize("dim, axisymmetric", KINDS)
 def test_linear_pressures_are_exact(dim, axisymmetric):
-    """In steady flow with gravity, through a rigid block that ends within cells."""
+    """Steady flow with gravity, through a rigid block that ends within cells."""
     grid, g = travelling(dim, 1.3, 8 if dim == 3 else 16, lambda t: there_and_back(t / 1e3), axisymmetric), [0.0] * dim
     g[-1] = -9.81
     slope = np.array([0.0 if axisymmetric else 3e3, -2e3, 1e3])[:dim]
@@ -90,7 +90,7 @@ CENTRE = partial(np.interp, xp=[0, 1], fp=[0.6, 3.4])
 
 
 def under_a_load_that_travels(numerics, fixed=False, fluid=None):
-    """Return a layer under a pressure that travels, in cells that are fine under it; or fine everywhere."""
+    """Return a layer under a moving pressure, in cells that are fine under the pressure, or fine everywhere."""
     y, follow = fine_about(0, 1.25, 14, 1.0, 0.25, 3), lambda t: [fine_about(0, 4, 40, CENTRE(t + 1 / 8), 0.3), y]
     lines = [np.linspace(0, 4, 161), y] if fixed else follow(0)
     grid = mpm.Grid(lines=lines, **({} if fixed else {"follow": follow}))
@@ -102,7 +102,7 @@ def under_a_load_that_travels(numerics, fixed=False, fluid=None):
 
 @pytest.mark.parametrize("fluid", [None, mpm.Fluid(bulk=1e8)], ids=["dry", "wet"])
 def test_division_carries_the_accuracy_of_fine_cells_along(fluid):
-    """Means of displacement, stress and pressure under the load, against cells that are fine everywhere."""
+    """Means of displacement, stress and pressure under the load, compared with cells that are fine everywhere."""
     errors, means = [], []
     for fixed, numerics in ((True, mpm.Numerics()), (False, mpm.Numerics()), (False, RENEWAL)):
         s, found = under_a_load_that_travels(numerics, fixed, fluid), []
@@ -120,7 +120,7 @@ def test_division_carries_the_accuracy_of_fine_cells_along(fluid):
 
 @pytest.mark.parametrize("press", [partial(pressed, loaded=False), pressed_in_3d], ids=["2D", "3D"])
 def test_forces_and_fluid_are_in_balance(press):
-    """In each step, below a rough disc or ball that turns and sinks into the soil."""
+    """In each step, below a rough disc or ball that rotates and sinks into the soil."""
     s, replaced = press(), 0
     for _ in range(6):
         report = s.step(0.25)
@@ -135,7 +135,7 @@ def test_forces_and_fluid_are_in_balance(press):
 
 @pytest.mark.parametrize("axisymmetric, rate", [(False, 0.06), (True, 0.25)])
 def test_clay_is_renewed_beside_soil_that_is_divided_with_all_balances(axisymmetric, rate):
-    """Wet clay that yields below a smooth disc or ball, while the finest cells travel to the right."""
+    """Wet clay yields below a smooth disc or ball, while the finest cells move to the right."""
     clay = mpm.DruckerPrager(2e6, 1e6, friction=0.0, dilation=0.0, cohesion=2e3, porosity=0.4, conductivity=1e-6)
     ball = mpm.Tool(mpm.Ball((0.0 if axisymmetric else 1.0, 1.25), 0.25), lambda t: (0, -rate * t))
     s = pressed(loaded=False, soil=clay, disc=ball, axisymmetric=axisymmetric)
@@ -162,7 +162,7 @@ def test_a_run_goes_on_with_the_same_bits(tmp_path):
 
 
 def test_domains_of_a_mesh_are_divided_and_merge_again():
-    """Down to seeded domains only: those of a mesh have no lattice."""
+    """Merging ends at the seeded domains, because domains of a mesh have no lattice."""
     grid = travelling(2, 1.3, 16, there_and_back)
     body = mpm.from_mesh(grid, box_mesh("triangle", (4, 3), [0, 0], [1.3, 1.0]))
     load, walls = mpm.Pressure("top", lambda t: 1e5 * t), {"left": "x", "right": "x", "bottom": "y"}
@@ -211,7 +211,7 @@ def test_the_frame_changes_nothing(frame):
 
 
 def refused(grid, **more):
-    """Make a scene with renewal on a grid."""
+    """Create a scene with renewal on a grid."""
     options = {"numerics": RENEWAL, **more}
     mpm.Simulation(grid, [mpm.box(grid, [0, 0], [1, 1])], [SOFT], walls={"bottom": "xy"}, **options)
 

@@ -18,14 +18,14 @@ def grid(request):
 
 
 def domains(grid, distort):
-    """Domains that fill the box from 0.13 to 0.71, moved by a smooth map."""
+    """Return domains that fill the box from 0.13 to 0.71, after a smooth motion."""
     body = box(grid, [0.13] * grid.dim, [0.71] * grid.dim)
     x = body.lower[:, None] + corner_bits(grid.dim) * body.spacing
     return x + distort * np.sin(3 * np.roll(x, 1, axis=2))
 
 
 def simplices(corners):
-    """The simplices (n, k, d+1, d) of domains and their volumes, all positive."""
+    """Return the simplices (n, k, d+1, d) of domains, and their volumes, all positive."""
     s = np.moveaxis(cutting.vertices(np.moveaxis(corners, 0, 2)), 2, 0)[:, cutting.simplices(corners.shape[2])]
     return s, np.abs(np.linalg.det(s[:, :, 1:] - s[:, :, :1])) / (2, 6)[s.shape[3] - 2]
 
@@ -67,7 +67,7 @@ def test_pieces_of_distorted_domains_have_the_exact_volume_and_centroid(grid):
 
 
 def test_a_domain_about_to_fold_is_cut_as_the_sum_of_its_simplices(grid):
-    """A simplex that is turned inside out counts as negative: it lies in the domain's neighbours too."""
+    """An inverted simplex counts as negative, because it lies in the domain's neighbours too."""
     corners = domains(grid, 0.0)[:1]
     low, size = corners[0, 0], corners[0, -1] - corners[0, 0]
     corners[0, 1] = low + np.array([0.2, 0.6, 0.7])[: grid.dim] * size  # across the diagonal
@@ -111,7 +111,7 @@ def test_open_faces_agree_on_both_sides_and_are_whole_within_the_body(grid):
 @pytest.mark.parametrize("gap", [0.0, 0.5, 1.0, 1.5, 2.0, 5.0])
 @pytest.mark.parametrize("rounding", [-1e-5, 0.0, 1e-5])
 def test_the_face_between_two_domains_is_open_however_near_it_is_to_a_grid_plane(grid, gap, rounding):
-    """Of two domains that meet where vertices begin to be snapped, rounding may snap one only."""
+    """If two domains meet at the distance where vertices are snapped, rounding may snap only one of them."""
     low, high = np.zeros(grid.dim), 2 * grid.h
     corners = low + corner_bits(grid.dim) * grid.h + np.zeros((2, 1, grid.dim))
     upper = corner_bits(grid.dim)[:, -1] == 1
@@ -137,7 +137,7 @@ def test_a_domain_many_cells_long_is_cut_into_all_of_them(grid):
 def test_what_a_domain_has_beyond_a_grid_line_is_a_piece_if_it_is_thicker_than_the_snap_and_no_sliver(
     grid, overhang, count
 ):
-    """Beyond a line it is a piece; beyond two, less than 1e-12 of the domain."""
+    """A part beyond one line is a piece. A part beyond two lines is smaller than 1e-12 of the domain."""
     corners = grid.h * (1 + corner_bits(grid.dim) * (1 + overhang))
     assert len(cut(grid, corners[None]).point) == count(grid.dim)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Bodies with inertia strike, slide, stick and roll, on one another and on tools; tools with a mass fall and bounce."""
+"""Bodies with inertia strike, slide, stick and roll on bodies and tools; tools with a mass fall and bounce."""
 
 import numpy as np
 import pytest
@@ -26,13 +26,13 @@ def of_centre(s, values):
 
 
 def balance(e):
-    """Return how far energies are out of balance, over the largest of them."""
+    """Return the error of the energy balance, divided by the largest energy."""
     total = sum(e[name] for name in ("kinetic", "elastic", "dissipated", "viscous", "friction")) - e["external"]
     return np.abs(total - total[0]).max() / max(np.abs(values).max() for values in e.values())
 
 
 def bars(n, speed=0.05, drift=0.0):
-    """Return two bars, 1 m long, that fly towards each other, c dt = h = 1/n m, off the grid lines."""
+    """Return two bars, 1 m long, that fly towards each other, with c dt = h = 1/n m, off the grid lines."""
     h = 1 / n
     count = 3 * n + round(2.6 * abs(drift) / h)
     grid = mpm.Grid([0, 0], [count * h, h], [count, 1])
@@ -49,7 +49,7 @@ def bars(n, speed=0.05, drift=0.0):
 def fitted(n):
     """Return the restitution of a bar of n elements, c dt = h, that strikes a wall: SDIRK2 with exact contact.
 
-    The method damps the front of the wave, so the bar leaves the wall before the whole front has come back.
+    The method damps the front of the wave, so the bar leaves the wall before the whole front has returned.
     """
     h, k = 1 / n, np.arange(n)
     K, M = np.zeros((2, n + 1, n + 1))
@@ -73,9 +73,9 @@ def fitted(n):
 
 
 def test_two_bars_strike_and_exchange_their_velocities():
-    """Exact: the force is rho c V for 2 L / c, then the bars part as fast as they came.
+    """Exact: the force is rho c V during 2 L / c; then the bars separate with their initial speed.
 
-    The time integration alone loses 1.5 % of the velocity, also on elements that end with the bars.
+    Time integration alone loses 1.5 % of the velocity, also on elements that fit the bars.
     """
     n, speed = 40, 0.05
     s = bars(n, speed)
@@ -92,7 +92,7 @@ def test_two_bars_strike_and_exchange_their_velocities():
 
 
 def incline(angle, aslant, friction=0.3, speed=0.0, n=4, length=0.5):
-    """Return a stiff block, 0.3 x 0.2 m, on an incline along the grid or at 30 degrees to it, and its direction."""
+    """Return a stiff block of 0.3 x 0.2 m on an incline, along the grid or at 30 degrees to it, and its direction."""
     h, turn = 0.2 / n, -np.pi / 6 if aslant else 0.0
     e = np.array([np.cos(turn), np.sin(turn)])
     normal = np.array([-e[1], e[0]])
@@ -126,7 +126,7 @@ def test_a_block_slides_down_a_rough_incline_as_fast_as_it_should(aslant):
 
 @pytest.mark.parametrize("aslant", [False, True])
 def test_friction_brakes_a_block_and_takes_its_energy(aslant):
-    """Exact: it stops after v^2 / (2 mu g)."""
+    """Exact: the block stops after v^2 / (2 mu g)."""
     s, e = incline(0.0, aslant, speed=1.0, length=0.3)
     start = of_centre(s, s.points.x)
     energies = s.run(0.4, 0.02, energies=True, progress=False).energies
@@ -145,9 +145,9 @@ def test_a_block_that_friction_holds_stays():
 @pytest.mark.slow
 @pytest.mark.parametrize("friction", [0.3, 0.1])
 def test_a_disc_rolls_down_an_incline_or_slips(friction):
-    """Exact: it rolls by 2/3 g sin b where mu >= tan b / 3; else it slides by g (sin b - mu cos b).
+    """Exact: the acceleration is 2/3 g sin b if mu >= tan b / 3. Otherwise the disc slides with g (sin b - mu cos b).
 
-    Its spin grows by a / R, or by 2 mu g cos b / R.
+    Its angular velocity grows by a / R, or by 2 mu g cos b / R.
     """
     pytest.importorskip("gmsh")
     angle, turn, radius, t = np.pi / 6, -np.pi / 6, 0.15, 0.4
@@ -189,9 +189,9 @@ def test_a_tool_that_pushes_ever_faster_has_its_acceleration_from_the_first_step
 
 
 def struck(M, V):
-    """Return when a mass M leaves a bar of unit length, stiffness and density that it strikes, and how fast.
+    """Return the time and the speed at which a mass M leaves a bar of unit length, stiffness and density.
 
-    Exact, along characteristics: waves run down the bar from below the mass and come back from its fixed foot.
+    The solution is exact, along characteristics: waves run from the mass to the fixed foot and back.
     """
     n = 4000
     dt, down, v = 1 / n, np.zeros(100 * n), V
@@ -224,7 +224,7 @@ def test_a_hammer_comes_back_as_fast_as_it_should():
 
 @pytest.mark.slow
 def test_a_heavy_hammer_keeps_its_energy_to_a_hundredth():
-    """The loss is the energy of the bar's first half cell, which the hammer meets at once."""
+    """The loss is the energy of the bar's first half cell, which the hammer accelerates at once."""
     t, back = struck(2.0, 1.0)
     s = hammer(20, 2.0)
     e = s.run(np.ceil(40 * (t + 0.4)) / 40, 0.025, energies=True, progress=False).energies
@@ -252,7 +252,7 @@ def test_a_free_tool_falls_as_stones_do_and_goes_along_its_guide():
 
 
 def sledge(mirror=1, **options):
-    """Return a rough free tool that is thrown along a block of soil, and rests on it."""
+    """Return a rough free tool that is thrown along a block of soil, and comes to rest on it."""
     grid = mpm.Grid([0, 0], [1.2, 0.6], [12, 6])
     body = mpm.box(grid, [0, 0], [1.2, 0.43])
     shape = mpm.HalfSpace((0, 0.43), (0, -1))
@@ -283,7 +283,9 @@ def test_a_resumed_strike_has_the_same_bits(tmp_path):
 
 
 def test_bars_that_drift_strike_alike(monkeypatch):
-    """A uniform velocity, by whole cells a step, changes nothing else; later the filter goes with cells crossed."""
+    """A uniform velocity of whole cells per step changes nothing else. Later the filter depends on the number of
+    crossed cells.
+    """
     monkeypatch.setattr("mpm_dolfinx.mechanics.inertia.RELAXES", 0.0)
     still, moves = bars(8), bars(8, drift=2.0)
     still.step(1 / 8), moves.step(1 / 8)
@@ -316,7 +318,7 @@ def dropped(gap, stress=None, **options):
 
 
 def test_a_smooth_disc_bounces_without_spin():
-    """Its moment is the difference of forces times the radius, and so consists of rounding errors alone."""
+    """The moment is the difference of forces times the radius, and therefore consists of rounding errors only."""
     s = dropped(0.02, mass=10.0, velocity=(0, -1))
     assert not s.run(0.08, 0.01, progress=False).cuts
     assert s.outcome("tool_velocity")["tool"][1] > 0.1 and abs(s.outcome("tool_spin")["tool"]) < 1e-10
@@ -331,7 +333,7 @@ def test_a_disc_almost_without_moment_of_inertia_leaves_as_it_rolls():
 
 @pytest.mark.parametrize("gap", [0.1, 0.0])
 def test_a_disc_falls_on_ground_with_an_initial_stress(gap):
-    """The stress is balanced with the tool at rest; the disc sinks under its weight only afterwards."""
+    """The initial stress is balanced with the tool at rest. The disc sinks under its weight only afterwards."""
     s = dropped(gap, mpm.K0(0.4), mass=100.0)
     s.run(0.05, 0.025, progress=False)
     fallen, free = s.tool_travel["tool"][1], -G * 0.05**2 / 2
@@ -353,7 +355,7 @@ def test_free_tools_are_refused_without_inertia():
 
 @pytest.mark.slow
 def test_a_block_on_a_base_that_shakes_moves_by_steps_as_newmark_s():
-    """Newmark (1965): a rigid block slides down while its base pulls away faster than friction can follow."""
+    """Newmark (1965): a rigid block slides down while its base accelerates faster than friction allows."""
     angle, mu, omega, t_end = np.radians(15), 0.4, 4 * np.pi, 1.5
     size = 0.5 * G / omega**2
     dt, v, way = 1e-5, 0.0, 0.0

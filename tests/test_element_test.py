@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Element tests: closed forms of elastic and plastic soil, fixed components, refusals, the command."""
+"""Element tests: closed forms of elastic and plastic soil, fixed components, refusals, and the command."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ SAND = mpm.DruckerPrager(bulk=2e7, shear=1e7, friction=30.0, dilation=10.0, cohe
 
 
 def test_elastic_tests_are_exact():
-    """tau = K tr(eps) I + 2G dev eps of logarithmic strains; Hencky's energy keeps equal stretches apart by 1e-4."""
+    """tau = K tr(eps) I + 2G dev eps of logarithmic strains; Hencky's energy separates equal stretches by 1e-4."""
     K, G, e = ELASTIC.bulk, ELASTIC.shear, 0.1
     r = element_test(ELASTIC, "oedometer", e, steps=5)
     assert r.stress[-1] == pytest.approx(-np.diag([K - 2 / 3 * G] * 2 + [K + 4 / 3 * G]) * e * np.exp(e), rel=2e-7)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Energies and works balance, and each has its exact value."""
+"""Energies and works balance, and each energy has its exact value."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ CLAY = mpm.DruckerPrager(bulk=2e5, shear=1e5, friction=0.0, dilation=0.0, cohesi
 
 
 def off(result):
-    """Return how far the energies are out of balance, over the largest of them."""
+    """Return the error of the energy balance, divided by the largest energy."""
     e = result.energies
     total = e["kinetic"] + e["elastic"] + e["dissipated"] + e["viscous"] - e["external"]
     return np.abs(total - total[0]).max() / max(np.abs(values).max() for values in e.values())
@@ -29,7 +29,7 @@ def test_what_a_pulse_brings_leaves_through_a_quiet_base():
 
 
 def test_energies_of_a_column_that_vibrates_under_its_weight_on_a_base_that_moves_balance():
-    """Dissipation is an error here, of the work of stresses against the law's energy: of second order."""
+    """Dissipation is an error here: the work of stresses minus the energy of the law, of second order."""
     base, lost = mpm.Displacement("bottom", lambda t: (0, 1e-3 * np.sin(30 * t) ** 2), "y"), []
     for n in (5, 10):
         s = column(n, [base], gravity=(0, -9.81))
@@ -50,7 +50,7 @@ def test_a_block_that_falls_gains_what_its_weight_does():
 
 
 def test_a_block_of_moist_soil_gains_what_its_own_weight_does():
-    """Its pores are half full, so a block of saturated weight would gain a ninth more."""
+    """The pores are half full. With the weight of saturated soil, the block would gain a ninth more energy."""
     grid = mpm.Grid([0, 0], [1, 4], [5, 20])
     block = mpm.box(grid, [0.3, 3.1], [0.7, 3.5])
     law = {"porosity": 0.4, "grain_density": 2600.0, "retention": mpm.VanGenuchten(1e4, n=2.0), "conductivity": 1e-6}
@@ -63,7 +63,9 @@ def test_a_block_of_moist_soil_gains_what_its_own_weight_does():
 
 
 def test_soil_that_yields_dissipates_what_is_lost():
-    """A wall of clay thrown aside on its foot comes to rest; its stresses store the energy of Hencky's law."""
+    """A wall of clay is thrown to the side on its foot, and comes to rest. Its stresses store the energy of Hencky's
+    law.
+    """
     grid = mpm.Grid([0, 0], [2.4, 1.2], [16, 8])
     wall = mpm.box(grid, [0.6, 0], [1.2, 0.9])
     velocity = lambda x: np.stack([2 * x[:, 1], 0 * x[:, 1]], axis=1)  # noqa: E731

@@ -241,7 +241,7 @@ assert (root.handlers, root.level, root.filters, root.manager.disable) == before
 
 
 def test_logging_can_be_set_up_after_the_import(tmp_path):
-    """A handler that the import left on the root logger made nothing of `basicConfig`."""
+    """In an earlier version, the import added a handler to the root logger, and `basicConfig` had no effect."""
     code = """
 import logging
 before = list(logging.getLogger().handlers), logging.getLogger().level

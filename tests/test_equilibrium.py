@@ -14,7 +14,7 @@ G = 9.81
 
 
 def weight(s):
-    """Return the weight (d,), N, of grains and pore water, counted from the points."""
+    """Return the weight (d,), in N, of grains and pore water, summed over the points."""
     if s.scene.gravity is None:
         return np.zeros(s.grid.dim)
     p, n = s.points, SOIL.porosity
@@ -25,7 +25,7 @@ def weight(s):
 
 
 def off(s, load=0.0, axes=slice(None)):
-    """Return the resultant of all forces on the bodies, over the largest of them."""
+    """Return the resultant of all forces on the bodies, divided by the largest force."""
     d, tools = s.grid.dim, s.state.stage.of(mpm.Tool)
     pressed = [s.tool_forces[name][:d] for name in tools]
     forces = [*s.wall_reactions.values(), *s.reactions.values(), *pressed, weight(s)]
@@ -34,7 +34,7 @@ def off(s, load=0.0, axes=slice(None)):
 
 
 def held_and_pressed(water):
-    """Return a block with nearly empty cells next to two walls, with a prescribed side and a rough tool; its load."""
+    """Return a block with nearly empty cells at two walls, with a prescribed side and a rough tool, and its load."""
     grid = mpm.Grid([0, 0], [2.2, 1.7], [11, 8])
     s = mpm.Simulation(
         grid,
@@ -70,7 +70,7 @@ def under_a_plate(water):
 
 
 def a_thin_layer(water):
-    """Return a layer a little thicker than a cell: the ghost penalty of its top acts on the floor's nodes."""
+    """Return a layer slightly thicker than a cell: the ghost penalty of its top acts on nodes of the floor."""
     grid, load = mpm.Grid([0, 0], [2.0, 1.0], [10, 5]), (2e3, -1e4)
     options = {"walls": {"bottom": "xy"}, "conditions": [mpm.Traction("top", load)], "gravity": (0, -G)}
     return mpm.Simulation(
@@ -79,7 +79,7 @@ def a_thin_layer(water):
 
 
 def held_in_the_cells_of_a_wall(water):
-    """Return a block whose prescribed top ends in the cells next to a wall, without touching it."""
+    """Return a block whose prescribed top ends in the cells next to a wall, without touching the wall."""
     grid, walls = mpm.Grid([0, 0], [2.2, 1.7], [11, 8]), {"left": "x", "bottom": "xy"}
     held = mpm.Displacement("top", lambda t: (5e-4 * t, -1e-3 * t))
     body = mpm.box(grid, [0.07, 0], [1.3, 1.1])
@@ -124,7 +124,7 @@ def a_cylinder(water):
 
 
 def two_groups(water):
-    """Return a block that slips on a thin one, which the floor holds by the nodes that its pairs act on too."""
+    """Return a block that slips on a thin block; contact pairs act on nodes that the floor fixes."""
     grid = mpm.Grid([0, 0], [1.0, 1.2], [10, 12])
     bodies = [mpm.box(grid, [0, 0], [0.9, 0.09]), mpm.box(grid, [0, 0.12], [0.7, 0.55])]
     push = mpm.Displacement("top", lambda t: (0, -0.04 * t), "y", region=((0, 0.5), (1, 1)))
@@ -141,7 +141,7 @@ def two_groups(water):
 
 
 def held_beside_walls(water, move=lambda t: (0.0, 0.0), **options):
-    """Return a block whose side is held where the floor, which is rough, holds its last nodes too."""
+    """Return a block with a prescribed side; the rough floor also fixes the last nodes of this side."""
     grid = mpm.Grid([0, 0], [2.0, 1.4], [8, 7])
     side = mpm.Displacement("left", move, "x")
     options = {"walls": {"right": "x", "bottom": "xy"}, "gravity": (0, -G), "conditions": [side], **options}
@@ -171,7 +171,7 @@ def test_all_forces_on_the_bodies_are_in_balance(scene, wet):
 
 @pytest.mark.parametrize("rest", [mpm.K0(0.5), None], ids=["initial stress", "without"])
 def test_a_side_that_begins_to_move_along_a_wall_carries_what_it_does_that_moves_from_the_start(rest):
-    """It was held by other cells than before, in matrices of before: reactions were forty times too large."""
+    """In an earlier version, matrices of other cells held this side: reactions were forty times too large."""
     begins, moves = (
         held_beside_walls({}, lambda t, start=start: (1e-3 * max(0.0, t - start), 0.0), initial_stress=rest)[0]
         for start in (1.0, 0.0)
@@ -186,7 +186,7 @@ def test_a_side_that_begins_to_move_along_a_wall_carries_what_it_does_that_moves
 
 
 def test_forces_on_a_held_side_and_on_the_floor_at_its_foot_are_those_of_the_stress_at_rest():
-    """The floor bore the part of the side's last node once more."""
+    """In an earlier version, the floor carried the part of the side's last node a second time."""
     s, _ = held_beside_walls({}, initial_stress=mpm.K0(0.5))
     s.run(1.0, 1.0, progress=False)
     assert s.reactions.array[0, 0] == pytest.approx(-weight(s)[1] / 2 * 0.5 / 2, rel=1e-6)
@@ -194,7 +194,7 @@ def test_forces_on_a_held_side_and_on_the_floor_at_its_foot_are_those_of_the_str
 
 
 def test_walls_of_a_column_bear_what_is_on_them():
-    """Under an even load each wall's force is known: that of a column's oedometric stress."""
+    """Under a uniform load the force of each wall is known from the column's oedometric stress."""
     s = column(cells=5, width=2, fluid=False, conditions=[mpm.Traction("top", (0, -1e4))])
     s.run(1.0, 1.0, progress=False)
     (left, bottom), stress = (s.wall_reactions[wall] for wall in ("left", "bottom")), s.effective_stress()
@@ -206,7 +206,7 @@ def test_walls_of_a_column_bear_what_is_on_them():
 
 
 def test_what_several_walls_hold_counts_once():
-    """For the wall across it; else each has an equal part, in whatever order they are given."""
+    """The wall normal to the component carries the force. Otherwise walls have equal shares, in any order."""
     grid = mpm.Grid([0] * 3, [1.0] * 3, [2] * 3)
     on_walls = np.flatnonzero((np.abs(grid.node_x[:, :2] - 0.5) > 0.4).any(axis=1))
     dofs = (3 * on_walls[:, None] + np.arange(3)).ravel()
@@ -220,7 +220,7 @@ def test_what_several_walls_hold_counts_once():
 
 
 def test_forces_and_outflows_are_histories_of_a_run(tmp_path):
-    """Steps of a beam: its load is on the clamp, by the wall in one half of it and by a given side."""
+    """Steps of a beam: the clamp carries the load, one half by the wall and the other half by a prescribed side."""
     s, probe = beam(h=0.1, load=5.4e3)
     s.run(0.06, 0.02, probes=probe, progress=False)
     s.stage(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Runs that end where a function of the simulation changes its sign."""
+"""Runs that end when a function of the simulation changes its sign."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ import mpm_dolfinx as mpm
 
 
 def pressed(**options):
-    """Return a dry column that a growing load presses; its top sinks by nearly as much in every second."""
+    """Return a dry column under a growing load; its top settles by nearly equal amounts in each second."""
     load = mpm.Traction("top", lambda t: (0, -0.05 * t * SOFT.oedometric))
     return column(cells=4, fluid=False, conditions=[load], **options)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The exact solutions against published numbers, the equations they solve, and each other."""
+"""The exact solutions are compared with published numbers, with their equations, and with each other."""
 
 import numpy as np
 import pytest
@@ -21,12 +21,12 @@ times = pytest.mark.parametrize("T", [0.004, 0.1, 0.7])
 
 
 def first(f, x, h):
-    """First derivative, of fourth order."""
+    """Return the first derivative by differences of fourth order."""
     return (8 * (f(x + h) - f(x - h)) - f(x + 2 * h) + f(x - 2 * h)) / (12 * h)
 
 
 def second(f, x, h):
-    """Second derivative, of fourth order."""
+    """Return the second derivative by differences of fourth order."""
     return (16 * (f(x + h) + f(x - h)) - f(x + 2 * h) - f(x - 2 * h) - 30 * f(x)) / (12 * h * h)
 
 
@@ -257,7 +257,7 @@ def test_large_deflection_of_the_rod_is_the_derivative_of_its_energy():
     s, weight = GAUSS
 
     def energy(P):
-        """Return the strain energy minus the work of the loads, and the tip's deflection."""
+        """Return the strain energy minus the work of the loads, and the deflection of the tip."""
         state = exact._rod(np.array([P * L**2, q * L**3]) / EI, EI / (EA * L**2), EI / (GA * L**2))
         _, y, turn, moment = state(s)
         V = P + q * L * (1 - s)

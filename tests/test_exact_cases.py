@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Mandel's slab against its exact solution, the cantilever against rod theory and converged finite elements."""
+"""Mandel's slab is compared with its exact solution, the cantilever with rod theory and converged finite elements."""
 
 from functools import cache
 
@@ -16,7 +16,7 @@ from mpm_dolfinx.verification.biot_fem import BiotFEM
 
 
 def backward_euler(x, stages, steps):
-    """Return p (Pa) at x after some stages of mandel.SAMPLES of backward Euler, exact in space: a sum of modes."""
+    """Return p (Pa) at x after some stages of mandel.SAMPLES by backward Euler, exact in space, as a sum of modes."""
     ratio = (1 - mandel.NU) / (0.5 - mandel.NU)  # tan r = ratio r
     n, r = np.arange(4000) * np.pi, (np.arange(4000) + 0.5) * np.pi
     for _ in range(60):  # contracts
@@ -73,7 +73,7 @@ def test_the_plate_stays_even_and_settles_as_exact():
 
 @cache
 def finite_elements():
-    """Return the displacement (2,) of the tip at alpha = 1 and 5 by Taylor-Hood's elements, converged to 1e-5."""
+    """Return the displacement (2,) of the tip at alpha = 1 and 5 by Taylor-Hood elements, converged to 1e-5."""
     body = [cantilever.LENGTH, cantilever.HEIGHT]
     fem = BiotFEM(mpm.Grid([0, 0], body, [40, 4]), cantilever.RUBBER, **cantilever.PHYSICS)
     result = fem.run(5, 0.5, probes=[[body[0], body[1] / 2]])

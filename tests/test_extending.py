@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Physics of the user's own: energies, fields, conductivities, terms, sources, state, several laws in one scene."""
+"""User-defined physics: energies, fields, conductivities, terms, sources, state, several laws in one scene."""
 
 from dataclasses import dataclass, replace
 from typing import ClassVar
@@ -14,12 +14,12 @@ from mpm_dolfinx.verification.biot_fem import BiotFEM
 
 
 def load(height):
-    """Return a load on points of this height."""
+    """Return a load on points of a height."""
     return mpm.Traction("top", lambda t: (0, -1e6 * min(1, t)), region=((-1, height), (1, height)))
 
 
 class Own(mpm.Skeleton):
-    """Hencky's law once more, in the user's words."""
+    """Hencky's law as a user-defined law."""
 
     @staticmethod
     def energy(F, shear, bulk):
@@ -63,7 +63,7 @@ def test_an_energy_of_ones_own_gives_what_the_built_in_law_gives():
 
 
 def two_halves(lower, upper, **options):
-    """Return a column of two materials, one on the other."""
+    """Return a column of two materials, one above the other."""
     grid = mpm.Grid([0, 0], [0.1, 1.4], [1, 14])
     bodies = [mpm.box(grid, [0, 0], [0.1, 0.5]), mpm.box(grid, [0, 0.5], [0.1, 1], material=1)]
     walls = {"left": "x", "right": "x", "bottom": "y"}
@@ -73,7 +73,7 @@ def two_halves(lower, upper, **options):
 
 
 def test_a_function_of_place_equals_two_materials():
-    """All that may be a function of place is one here, with a step where the other scene has two materials."""
+    """All data that may be functions of position are functions here, with a step at the other scene's interface."""
     water = {"fluid": mpm.Fluid(), "conditions": [mpm.Drained("top")], "gravity": [0, -9.81]}
     names = ("bulk", "shear", "porosity", "conductivity", "biot", "grain_bulk", "grain_density")
     below = (1e7, 6e6, 0.3, 1e-4, 0.9, 1e9, 2600.0)
@@ -102,7 +102,7 @@ def test_a_beam_whose_moduli_vary_follows_finite_elements():
 
 
 def test_oblique_fibres_on_the_points_follow_finite_elements():
-    """Fibres at an angle push a sheet sideways as it is pressed down; they turn with the points."""
+    """Inclined fibres push a sheet sideways as it is compressed; they rotate with the points."""
 
     def slanted(X):
         angle = np.radians(30 + 30 * X[:, 1])
@@ -120,7 +120,7 @@ def test_oblique_fibres_on_the_points_follow_finite_elements():
 
 
 def test_several_laws_in_one_scene_share_it_as_one_law_would():
-    """Two names for one law are two integrals; the sum is that of the one law, also with mean dilatation."""
+    """Two names of one law give two integrals. Their sum is the integral of the law, also with mean dilatation."""
     for stiff in (SOFT, replace(SOFT, bulk=5e7)):
         own = Own(bulk=stiff.bulk, shear=stiff.shear, conductivity=stiff.conductivity)
         water = {"fluid": mpm.Fluid(), "conditions": [mpm.Drained("top")]}
@@ -133,7 +133,9 @@ def test_several_laws_in_one_scene_share_it_as_one_law_would():
 
 
 def test_each_body_has_the_stress_of_its_own_law():
-    """Hencky, neo-Hookean and Drucker-Prager in one column; under a dead load the stress is the load everywhere."""
+    """Hencky, neo-Hookean and Drucker-Prager soil in one column; under a dead load the stress equals the load
+    everywhere.
+    """
     grid = mpm.Grid([0, 0], [0.1, 1.8], [1, 18])
     sand = mpm.DruckerPrager(2e7, 1e7, friction=30.0, dilation=0.0, cohesion=1e4)
     materials = [mpm.Hencky(1e7, 6e6), mpm.NeoHookean(4e6, 3e6), sand]
@@ -183,7 +185,7 @@ def test_consolidation_with_a_conductivity_law_follows_finite_elements(law):
 
 
 def test_a_conductivity_that_depends_on_place_is_evaluated_at_the_pieces():
-    """k = k0 exp(y): the pressure of a steady flow is known."""
+    """k = k0 exp(y): the pressure of the steady flow is known."""
     soil = mpm.Hencky(
         1e9, 1e9, conductivity=1e-6, conductivity_law=lambda conductivity, x: conductivity * ufl.exp(x[1])
     )
@@ -237,7 +239,7 @@ def test_an_elastic_foundation_converges_to_its_exact_solution_at_second_order()
 
 
 def test_an_energy_and_its_forces_give_the_same_and_may_hold_a_body_alone():
-    """The energy's tangent is factorised as a symmetric one, that of the forces is not."""
+    """The tangent of the energy is factorised as a symmetric matrix, the tangent of the forces is not."""
     grid, positions = mpm.Grid([0, 0], [1.0, 1.4], [10, 14]), []
     body = mpm.box(grid, [0.3, 0.33], [0.7, 1.0])
     pull = mpm.Traction("top", (1e3, -1e3))
@@ -252,7 +254,7 @@ def test_an_energy_and_its_forces_give_the_same_and_may_hold_a_body_alone():
 
 
 def test_a_term_without_symmetry_has_a_consistent_tangent_coupled_too():
-    """A force that turns with the material: F b."""
+    """A force F b, which rotates with the material."""
 
     def follower(points, u, v):
         F = (ufl.Identity(2) + points.grad(u)) * points.F
@@ -309,7 +311,7 @@ def test_a_source_raises_the_steady_pressure_and_the_balance_closes():
 
 
 def test_a_source_may_depend_on_the_pressure_and_on_time():
-    """Leakage c p out of a layer at pressure p0: p'' = c p / kappa; Newton sees the derivative."""
+    """Leakage c p out of a layer at pressure p0: p'' = c p / kappa. Newton's method uses the derivative."""
     leak, soil = 4e-10, replace(SOFT, conductivity=1e-6)
     s = column(
         cells=20,
@@ -358,7 +360,7 @@ class WrongUpdate(Damaged):
 
 
 class Fibres(mpm.NeoHookean):
-    """A law whose direction has more components than F of the plane and of plane strain."""
+    """A law whose direction has more components than F in the plane and in plane strain."""
 
     @staticmethod
     def energy(F, bulk, shear):

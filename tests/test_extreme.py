@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Results of extreme input are right or refused, and the demo would notice if they were not."""
+"""Results of extreme input are correct or refused, and the demo detects wrong results."""
 
 from dataclasses import replace
 from itertools import count
@@ -19,7 +19,7 @@ def judged(make, bound=1e-2):
 
 
 def case(name, setting):
-    """Return a case of a family, judged by its bound."""
+    """Return a case of a family, compared with its bound."""
     return judged(dict(FAMILIES[name].cases())[setting], FAMILIES[name].bound)
 
 
@@ -129,7 +129,7 @@ def raising(error):
 
 
 def spoilt(s, result):
-    """Make the positions nan."""
+    """Set the positions to nan."""
     s.state = replace(s.state, points=replace(s.points, x=np.full_like(s.points.x, nan)))
     return 0.0
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A body is not affected by separate bodies: neither by their stiffness, nor by their motion."""
+"""Separate bodies do not affect each other, neither by their stiffness nor by their motion."""
 
 from functools import cache
 
@@ -16,7 +16,7 @@ CLAY = mpm.DruckerPrager(bulk=E / 1.8, shear=E / 2.6, friction=20.0, dilation=0.
 
 @cache
 def after(kind, stiffer=1.0, wet=False, law=None, steps=2, plate=False):
-    """Return displacements, stresses and pressures of the beam after some steps, and the residuals that these told."""
+    """Return displacements, stresses and pressures of the beam after some steps, and the residuals of these steps."""
     options = {} if law is None else {"numerics": mpm.Numerics(tolerance=1e-10)}  # far below what is compared
     s = beside(kind, stiffer, wet, law, plate, **options)
     n, start = len(s.bodies[0]), s.points.x
@@ -27,7 +27,7 @@ def after(kind, stiffer=1.0, wet=False, law=None, steps=2, plate=False):
 
 
 def off(one, other):
-    """Return the largest difference in proportion to the largest value."""
+    """Return the largest difference, divided by the largest value."""
     return max(np.abs(a - b).max() / np.abs(b).max() for a, b in zip(one, other, strict=True))
 
 
@@ -44,7 +44,7 @@ def test_what_a_far_body_does_changes_nothing(kind, stiffer):
 
 
 def test_a_plate_is_rigid_beside_what_it_lies_on():
-    """Its rigidity was relative to the stiffest body: a far one changed its answer, and no step converged."""
+    """In an earlier version, the stiffest body determined the rigidity of plates: a distant body changed the result."""
     assert off(after("rests", 1e10, plate=True)[0], after(None, plate=True)[0]) < 1e-11
 
 
@@ -54,7 +54,7 @@ def test_a_wet_body_takes_the_same_step_whatever_others_do(kind, stiffer):
 
 
 def test_pressures_of_soil_that_does_not_conduct_are_the_same_next_to_soil_that_does():
-    """Pressures varied in cells as at rest only if any soil in the scene conducted: up to 9e-3 of them."""
+    """Earlier, pressures in cells varied hydrostatically only if any soil conducted: errors up to 9e-3."""
     found = []
     for kind in (None, "drains"):
         law = mpm.Hencky(bulk=E / 1.8, shear=E / 2.6, grain_density=2.0, porosity=0.4)
@@ -72,14 +72,14 @@ def test_pressures_of_soil_that_does_not_conduct_are_the_same_next_to_soil_that_
 
 @pytest.mark.parametrize("kind", ["moves", "loaded"])
 def test_soil_that_yields_takes_the_same_step_whatever_others_do(kind):
-    """With searches and watchdogs of its own; it has yielded, and the far body has not."""
+    """The line search of each part is separate. The beam has yielded, and the distant body has not."""
     (found, told), (alone, as_is) = (after(one, 1e4, law=CLAY) for one in (kind, None))
     q = alone[1][:, 0, 0] - alone[1][:, 1, 1]
     assert np.abs(q).max() > 30.0 and off(found, alone) < 1e-9 and told[0] <= 1e-10 and as_is[0] <= 1e-10
 
 
 def touching(kind, group=1, way=0.02):
-    """Return what two blocks in contact show after three steps, next to a third body of one of their groups."""
+    """Return results of two blocks in contact after three steps, next to a third body of one of their groups."""
     grid = mpm.Grid([0, 0], [4.2, 1.6], [21, 8])
     bodies = [mpm.box(grid, [0.13, 0.0], [1.33, 0.55]), mpm.box(grid, [0.43, 0.55], [1.03, 0.95])]
     groups = [[0], [1]]
@@ -106,22 +106,23 @@ def touching(kind, group=1, way=0.02):
 @pytest.mark.parametrize("way", [0.005, 0.05])
 @pytest.mark.parametrize("group", [0, 1])
 def test_bodies_in_contact_are_not_affected_by_the_motion_of_a_body_beyond_their_reach(way, group):
-    """All groups were one part: it was cut anew when the far body moved, which changed displacements by 4e-6.
+    """In an earlier version, all groups formed one part, which was cut anew when the distant body moved: changes of
+    4e-6.
 
-    The group with the smaller surface had the contact points: the far body's surface decided which one it was.
+    The group with the smaller surface had the contact points, so the distant body's surface decided on them.
     """
     assert off(touching("moves", group, way), touching(None, group, way)) < 1e-9
 
 
 def test_bodies_in_contact_are_not_affected_by_others_whose_contact_is_harder_to_find():
-    """Pressures were augmented, and pairs found anew, in all contacts: stress changed by 2e-3."""
+    """Earlier, pressures were augmented and pairs found anew in all contacts: the stress changed by 2e-3."""
     (x, stress, _), (alone, as_is, _) = touching("pressed"), touching(None)
     assert off((x, stress), (alone, as_is)) < 1e-9
 
 
 @pytest.mark.parametrize("stiffer", [1e6, 1e10, 1e14])
 def test_a_soft_part_is_solved_for_however_stiff_what_it_sits_on_is(stiffer):
-    """Rounding is estimated at each node, and the reported residual includes the soft part's."""
+    """Rounding is estimated at each node, and the reported residual includes the residual of the soft part."""
     grid, load = mpm.Grid([0, 0], [0.1, 1.0], [1, 10]), 0.03
     soft, hard = (mpm.Hencky(bulk=f * 1e5, shear=f * 1e5) for f in (1, stiffer))
     bodies = [mpm.box(grid, [0, 0], [0.1, 0.5]), mpm.box(grid, [0, 0.5], [0.1, 0.9], material=1)]
@@ -135,7 +136,7 @@ def test_a_soft_part_is_solved_for_however_stiff_what_it_sits_on_is(stiffer):
 
 
 def test_parts_are_the_same_on_several_processes(tmp_path):
-    """A wet beam next to a stiff body that moves and drains, on one process and on three."""
+    """A wet beam next to a stiff body that moves and drains, on one process and on three processes."""
     for processes in (1, 3):
         mpirun(processes, "mpi_parts.py", str(tmp_path / f"{processes}.npz"))
     one, three = (dict(np.load(tmp_path / f"{processes}.npz")) for processes in (1, 3))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A far body has no effect: volume defects and drainage are determined for each connected part."""
+"""A distant body has no effect: volume defects and drainage belong to each connected part."""
 
 from functools import cache
 
@@ -38,7 +38,7 @@ FAR = {
 
 
 def scene(far=None, load=54e3, wet=True):
-    """Return a beam with a load on its top for 1 s, next to a far body, and the number of its points."""
+    """Return a beam with a load on its top for 1 s, next to a distant body, and the number of its points."""
     h = 0.1
     grid = mpm.Grid([0, 0], [2.6, 1.2], [26, 12])
     bodies = [mpm.box(grid, [0, 0.65], [1, 0.95])]
@@ -60,7 +60,7 @@ def of_beam(s, count):
 
 @cache
 def cycled(far=None, load=54e3, wet=True):
-    """Return the beam after a cycle of ten steps: its change of volume, and `of_beam`."""
+    """Return the volume change of the beam after a cycle of ten steps, and `of_beam`."""
     s, count = scene(far, load, wet)
     for _ in range(10):
         s.step(0.1)
@@ -75,7 +75,9 @@ def same(one, other):
 
 @pytest.mark.parametrize("far", FAR)
 def test_a_sealed_beam_does_not_see_a_body_far_away(far):
-    """One that moved changed the stress left by 2e-3; one that drained let the volume drift eleven times as far."""
+    """Earlier, a moving distant body changed residual stresses by 2e-3; a draining one let the volume drift eleven
+    times as far.
+    """
     (volume, alone), (volume1, beside) = cycled(), cycled(far)
     assert abs(volume1) < 2e-4 and volume1 == pytest.approx(volume, rel=1e-6)
     same(beside, alone)
@@ -83,7 +85,7 @@ def test_a_sealed_beam_does_not_see_a_body_far_away(far):
 
 @pytest.mark.parametrize("wet", [True, False], ids=["wet", "dry"])
 def test_a_beam_that_hardly_moves_stays_cut_beside_a_body_that_moves(wet):
-    """Domains are cut anew part by part: all at once changed the stress that is left by 4e-4."""
+    """Domains are cut anew in each part separately. Cutting all parts at once changed residual stresses by 4e-4."""
     same(cycled("moving", 5.4, wet)[1], cycled("resting", 5.4, wet)[1])
 
 

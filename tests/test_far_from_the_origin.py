@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Where the origin of the coordinates is does not matter: metres a kilometre away, national coordinates."""
+"""The origin of the coordinates has no effect: metres at a distance of a kilometre, national coordinates."""
 
 from dataclasses import replace
 
@@ -17,9 +17,9 @@ NAMES = {"argvalues": SIZES.values(), "ids": SIZES}
 
 
 def block(origin, size, walls, **options):
-    """Return a simulation of a block, half as high as wide and pressed on a part of its top, and probes on it.
+    """Return a simulation of a block, half as high as wide, with a load on a part of its top, and probes.
 
-    The grid extends beyond it, except at the wall that fixes it.
+    The grid extends beyond the block, except at the wall that fixes it.
     """
     lower = np.array([origin, 0.9 * origin])
     room = [[side not in walls for side in sides] for sides in (("left", "bottom"), ("right", "top"))]
@@ -64,7 +64,7 @@ def test_each_of_two_bodies_far_from_each_other_is_looked_at():
 
 @pytest.mark.parametrize("origin", [0.0, 500.0, 5.123456789e6])
 def test_what_ends_at_a_side_reaches_it_anywhere(origin):
-    """A body up to the walls, a region that ends at the side's own height, probes on the corners."""
+    """A body up to the walls, a region that ends at the height of a side, and probes on corners."""
     for size in (0.7, 0.9, 1.3):
         lower = np.array([origin, 0.9 * origin])
         upper = lower + size
@@ -80,7 +80,7 @@ def test_what_ends_at_a_side_reaches_it_anywhere(origin):
 
 @pytest.mark.parametrize("origin", [3e5, 7e5, 5.4e6])
 def test_water_flows_and_rests_in_national_coordinates_as_at_the_origin(origin):
-    """Faces on grid lines were closed from below: rounding of the coordinates put vertices there off their plane."""
+    """Earlier, faces on grid lines were closed from below, because rounding put vertices off their plane."""
     pressures = []
     for o in (0.0, origin):
         grid = mpm.Grid([0, o], [0.8, o + 2.6], [4, 13])
@@ -105,7 +105,7 @@ def test_water_flows_and_rests_in_national_coordinates_as_at_the_origin(origin):
 
 @pytest.mark.parametrize("dt", [1e3, 1e6])
 def test_layers_under_water_rest_in_national_coordinates_for_any_time(dt):
-    """Rounding of the flow between cells moved all of a sealed body, and this the flow: long steps gave up."""
+    """Earlier, rounding of the flow between cells moved the whole no-flow body: runs with long steps gave up."""
     o = np.array([3.4e5, 3.4e5])
     grid = mpm.Grid(o, np.add(o, [0.4, 0.7]), [4, 7])
     layers = [
@@ -133,7 +133,7 @@ AWAY = np.array([1e4, -3e4]) * 0.25  # m: cells of 0.25 m
 
 
 def sealed(away, **options):
-    """Return a simulation of a soft block of hard water and its moves, m, from where it is seeded."""
+    """Return a simulation of a soft block with stiff water, and its displacements, in m, since seeding."""
     soil = mpm.Hencky(bulk=6e5, shear=4.5e5, porosity=0.34, biot=0.76)
     grid = mpm.Grid(away, np.add(away, [1.75, 1.25]), [7, 5])
     body = mpm.box(grid, away, np.add(away, [1.75, 0.95]), per_cell=3)
@@ -154,7 +154,7 @@ def sealed(away, **options):
 
 
 def test_hard_water_in_soft_soil_loses_no_digits_far_from_the_origin():
-    """Rounding of coordinates, times the undrained modulus, was more than the solver may leave: it gave up."""
+    """Earlier, rounding of coordinates times the undrained modulus exceeded the tolerance, and the run gave up."""
     (near, moves), (far, others) = sealed(np.zeros(2)), sealed(AWAY)
     assert np.abs(moves).max() < 1e-5, "the water is hard"
     assert np.abs(others - moves).max() < 1e-9 * np.abs(moves).max()
@@ -193,7 +193,7 @@ def test_tools_and_contacts_press_far_from_the_origin_as_near_it(kind):
 
 
 def test_functions_are_asked_at_true_places_and_results_are_there(tmp_path):
-    """All functions of places of a scene, and all that it shows, far from the origin."""
+    """All functions of position of a scene, and all of its results, far from the origin."""
     low, high, seen = AWAY, np.add(AWAY, [1.0, 1.5]), {}
 
     def at(name, value):
@@ -242,7 +242,7 @@ def test_functions_are_asked_at_true_places_and_results_are_there(tmp_path):
 
 
 def test_points_at_true_places_are_no_state():
-    """Put into it they would lie elsewhere, without a word."""
+    """In a state these points would silently be at other positions."""
     grid = mpm.Grid([0, -1], [1, 1], [4, 8])
     s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [1, 0.5])], [SOIL], walls={"left": "xy"})
     with pytest.raises(ValueError, match="from_base"):

@@ -13,7 +13,7 @@ DAY = 86400.0
 
 
 def face(s, body, end):
-    """Return the present corners (k, d) on the upper or lower side of a body, by place."""
+    """Return the present corners (k, d) of the upper or lower side of a body, ordered by position."""
     d = s.grid.dim
     start = sum(len(b) for b in s.bodies[:body])
     rows = np.flatnonzero(s.bodies[body].sides[:, -1, end])
@@ -23,14 +23,14 @@ def face(s, body, end):
 
 
 def gap(s, below, above):
-    """Return how far two bodies' sides are apart in plane strain, m, at most."""
+    """Return the largest distance between the sides of two bodies in plane strain, in m."""
     lower, upper = face(s, below, 1), face(s, above, 0)
     x = np.linspace(upper[0, 0], upper[-1, 0], 5001)
     return np.abs(np.interp(x, *upper.T) - np.interp(x, *lower.T)).max()
 
 
 def embankment(slope, lifts=6):
-    """Return soft ground that six lifts of 1 m are built on, their sides 1 : slope, their crest 24 m wide."""
+    """Return soft ground under six lifts of 1 m with slopes 1 : slope and a crest 24 m wide."""
     crest, length = 24.0, 60.0
     base = crest + 2 * lifts * slope
     n = round(base)
@@ -71,7 +71,7 @@ def test_an_embankment_in_lifts_has_its_crest_and_the_ground_beside_it_free_and_
 
 
 def settled(dim=2, per_cell=2, quadrature="domain", until=1.0, **options):
-    """Return ground that settles more on its left than on its right, and a fill as high as 1 m to come."""
+    """Return ground that settles more on its left than on its right, and a fill, 1 m high, that is added later."""
     grid = mpm.Grid([0] * dim, [4.0] * dim, [8] * dim)
     ground = mpm.box(grid, [0] * dim, [*[4] * (dim - 1), 2])
     fill = mpm.box(grid, [1] * (dim - 1) + [2], [3] * (dim - 1) + [3], per_cell=per_cell)

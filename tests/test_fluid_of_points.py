@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""The fluid counted from the points equals the inflow: porosity times density times volume, less the volume defect.
+"""The fluid of the points equals the inflow: porosity times density times volume, minus the volume defect.
 
-The density is the mean over the pieces of a point's domain, by their pressures.
+The density is the mean over the pieces of a point's domain, at their pressures.
 """
 
 import numpy as np
@@ -15,7 +15,7 @@ RIM = {2: ([-1, 1.6], [0.6, 1.9]), 3: ([-1, -1, 0.7], [0.5, 0.5, 1.1])}  # m, be
 
 
 def fluid_of(s):
-    """Return the fluid of the points, m^d at zero pressure, and by how much it has been exchanged since the start."""
+    """Return the fluid of the points, in m^d at zero pressure, and the exchanged fluid since the start."""
     p, pieces = s.points, s.state.pieces
     pressure = pieces.of_cell if pieces.pressure is None else pieces.pressure
     density = pieces.fraction * np.exp(pressure / s.scene.fluid.bulk)
@@ -25,14 +25,14 @@ def fluid_of(s):
 
 
 def smoothed(s):
-    """Return the fluid by the pressures of the points, which are for output."""
+    """Return the fluid from the pressures of the points, which are for output."""
     p = s.points
     fluid = p.volume0 * (p.J - 1 + POROSITY) * np.exp(p.pressure / s.scene.fluid.bulk)
     return (fluid - p.volume0 * p.data["owed"]).sum()
 
 
 def footing(dim=2, axisymmetric=False, dilation=0.0, bulk=np.inf, elastic=False, **options):
-    """Return a wet block, elastic or frictional, into which a strip or a disc is pushed."""
+    """Return a wet block, elastic or frictional, under a strip or a disc."""
     upper, top = ([4.0, 2.0], 1.75) if dim == 2 else ([1.5, 1.5, 1.2], 0.9)
     grid = mpm.Grid([0] * dim, upper, [16, 8] if dim == 2 else [5, 5, 4], axisymmetric=axisymmetric)
     block = mpm.box(grid, [0.0] * dim, [*upper[:-1], top])
@@ -71,9 +71,9 @@ OPEN = {"conditions": [mpm.Drained("top", region=([0.8, 1.6], [5.0, 1.9])), mpm.
     ids=["sealed", "compressible", "elastic", "hard", "disc", "axisymmetric", "3D", "open", "fed"],
 )
 def test_soil_keeps_its_fluid(scene):
-    """Yielded soil had no volume defect before: 3 % of the exchanged fluid was lost, 2 % with deep footings.
+    """Earlier, yielded soil had no volume defect: 3 % of the exchanged fluid was lost, and 2 % with deep footings.
 
-    On a new grid cells weighed pressures by the volumes that they see: 3e-8 of a fluid of 10 MPa was lost.
+    Cells of a new grid weighted pressures by the volumes in the cells: 3e-8 of a fluid of 10 MPa was lost.
     """
     s, steps = footing(**scene), 5
     start, came, lost = fluid_of(s)[0], 0.0, smoothed(s)
@@ -94,7 +94,9 @@ def test_soil_keeps_its_fluid(scene):
 
 @pytest.mark.parametrize("axisymmetric", [False, True], ids=["strip", "disc"])
 def test_sources_and_forces_per_volume_act_on_the_volumes_of_the_points(axisymmetric):
-    """With a mean dilatation they acted on the mean volumes of cells: forces were up to 2e-7 off in these scenes."""
+    """Earlier, with mean dilatation, they acted on the mean volumes of cells: errors of forces up to 2e-7 in these
+    scenes.
+    """
     rate, force = 1e-4, 1e3
     terms = [
         mpm.Source(lambda points, q: rate * q * points.dx),

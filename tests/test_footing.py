@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A footing pushed into soil: it carries the load of limit analysis, and inverted domains stay with it."""
+"""A footing in soil carries the limit load, also with inverted domains."""
 
 from dataclasses import replace
 
@@ -16,7 +16,7 @@ from mpm_dolfinx.stepping.advance import untangled
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_a_held_domain_that_folds_keeps_its_face_and_its_volume(dim):
-    """A face put elsewhere is pulled back, all at once: no step is small enough for that."""
+    """If a prescribed face were moved elsewhere, it would be pulled back at once, and no step would be small enough."""
     grid = mpm.Grid([0] * dim, [1.0] * dim, [4] * dim)
     body = mpm.box(grid, [0] * dim, [1] * (dim - 1) + [0.5])
     held = mpm.Displacement("top", np.zeros(dim))
@@ -48,7 +48,7 @@ def test_the_undrained_limit_load_of_stiff_soil_tends_to_prandtls():
 
 
 def rough_strip(cells, how):
-    """Return the limit load of a rough strip on very stiff soil without friction, over Prandtl's."""
+    """Return the limit load of a rough strip on very stiff soil without friction, divided by Prandtl's load."""
     h, end, edge = 1 / cells, 0.0012, 0.5
     columns, rows = 2 * cells, round(1.2 * cells)
     grid = mpm.Grid(lower=[0, -rows * h], upper=[columns * h, 3 * h], cells=[columns, rows + 3])
@@ -69,7 +69,7 @@ def rough_strip(cells, how):
 
 @pytest.mark.parametrize(("cells", "error"), [(9, 0.03), pytest.param(17, 0.015, marks=pytest.mark.slow)])
 def test_a_strip_carries_the_same_whether_a_side_is_held_or_a_tool_presses_it(cells, error):
-    """Over the true width, which ends in the middle of a cell."""
+    """Load over the true width, which ends in the middle of a cell."""
     held, pressed = (rough_strip(cells, how) for how in ("displacement", "tool"))
     print(f"{cells} cells: load over Prandtl's, held {held:.4f}, by a tool {pressed:.4f}")
     assert held == pytest.approx(1.0, abs=error)
@@ -148,13 +148,13 @@ def test_options_that_would_change_nothing_without_steps_are_refused(capsys):
 
 @pytest.mark.slow
 def test_soil_that_does_not_dilate_is_pushed_in_few_newton_steps_if_it_has_a_small_viscosity():
-    """Without one, bands of shear a cell wide jump: on finer grids step after step is cut."""
+    """Without viscosity, shear bands one cell wide change their position: on finer grids many steps are cut."""
     none, viscous = (footing.effort(21, 0.3, 8, 4.0, "backward-euler", viscosity) for viscosity in (0.0, 0.05))
     assert viscous["cuts"] == 0 < none["cuts"] and viscous["newton"] < 0.7 * none["newton"]
 
 
 def published(friction, dilation):
-    """Return N_c of soil that dilates by less than it has friction (degrees): Loukidis and Salgado (2009)."""
+    """Return N_c of soil with dilation less than friction (degrees): Loukidis and Salgado (2009)."""
     phi, psi = np.radians([friction, dilation])
     share = 1 - np.tan(phi) * np.tan(0.8 * (phi - psi)) ** 2.5
     passive = (1 + np.sin(phi)) / (1 - np.sin(phi))
@@ -166,7 +166,7 @@ def published(friction, dilation):
     ("dilation", "cells", "error"), [(0.0, 9, 0.04), (0.0, 17, 0.015), (20.0, 9, 0.015), (30.0, 9, 0.04)]
 )
 def test_a_footing_on_mohr_coulomb_soil_carries_what_was_published(dilation, cells, error):
-    """The highest load counts: where soil does not dilate, shear bands let it fall afterwards."""
+    """The highest load counts. In soil without dilation, shear bands reduce the load afterwards."""
     elastic = {"bulk": footing.STIFF * footing.SOIL.bulk, "shear": footing.STIFF * footing.SHEAR}
     soil = mpm.MohrCoulomb(**elastic, friction=30.0, dilation=dilation, cohesion=footing.COHESION)
     run = footing.push(soil, cells, 0.006, None, box=(4.0, 2.0), steps=40)
@@ -178,7 +178,7 @@ def test_a_footing_on_mohr_coulomb_soil_carries_what_was_published(dilation, cel
 
 @pytest.mark.slow
 def test_a_footing_is_pushed_in_as_deep_as_it_is_wide():
-    """With the held faces of folded domains put elsewhere no step was small enough at 0.86 of the way."""
+    """Earlier, prescribed faces of inverted domains were moved, and the run failed at 0.86 of the depth."""
     run = footing.push(footing.SOIL, 5, 1.0, footing.RATES["slow"])
     assert not run.total("cuts")
     assert footing.SURFACE["drained, associated"] < run.load[-1] < 1.25 * footing.SURFACE["drained, associated"]
@@ -187,7 +187,9 @@ def test_a_footing_is_pushed_in_as_deep_as_it_is_wide():
 
 @pytest.mark.slow
 def test_a_fast_push_carries_what_limit_analysis_says_of_an_embedded_base():
-    """From 0.37 widths on it was a sixth too much: the wall next to it, just above its base, drained that soil."""
+    """Earlier, loads were a sixth too large from a depth of 0.37 widths on, because the adjacent wall drained that
+    soil.
+    """
     run = footing.push(footing.SOIL, 9, 0.5, footing.RATES["fast"], box=(4.0, 2.5), steps=126)
     depth = np.array(run.settlement)
     for low, high, error in ((0.08, 0.3, 0.04), (0.3, 0.5, 0.05)):  # below 0.08 widths not all of the soil flows
@@ -196,14 +198,14 @@ def test_a_fast_push_carries_what_limit_analysis_says_of_an_embedded_base():
 
 
 def test_a_footing_is_pushed_through_soil_that_yields_without_cut_steps():
-    """With full Newton steps alone, each from rest: one cut step, 103 Newton steps."""
+    """With full Newton steps alone, each from rest: one cut step, and 103 Newton steps."""
     run = footing.push(footing.SOIL, 11, 0.1, footing.RATES["intermediate"], box=(4.0, 2.5), steps=4)
     assert run.total("cuts") == 0 and run.total("newton") < 85
 
 
 @pytest.mark.slow
 def test_finer_cells_are_pushed_as_well():
-    """With shortened steps that ended where the residual fell, before the work turned: three cuts, 259 Newton steps."""
+    """With a line search that accepted any decrease of the residual: three cuts, and 259 Newton steps."""
     run = footing.push(footing.SOIL, 21, 0.06, footing.RATES["intermediate"], box=(4.0, 2.5), steps=4)
     assert run.total("cuts") == 0 and run.total("newton") < 180
 
