@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Flow with a free surface: a conductivity that vanishes above it."""
+"""Flow with a free surface: the conductivity vanishes above it."""
 
 from functools import partial
 
@@ -14,7 +14,7 @@ UPPER, LOWER, WIDTH, TOP, K = 10.0, 2.0, 9.6, 12.0, 1e-5  # m, m, m, m, m/s
 
 
 def dam(cells, heads=(UPPER, LOWER), **options):
-    """Return a rectangular dam of hard soil on an impervious base, so many cells high, with water at its two sides."""
+    """Return a rectangular dam of hard soil on an impervious base, `cells` cells high, with water at both sides."""
     h = TOP / cells
     grid = mpm.Grid([0, 0], [WIDTH + 2 * h, TOP + 2 * h], [round(WIDTH / h) + 2, cells + 2])
     law = mpm.unsaturated(0.5 * 9810 * h)
@@ -34,7 +34,7 @@ def dam(cells, heads=(UPPER, LOWER), **options):
 
 @pytest.mark.parametrize("cells, error", [(20, 0.01), pytest.param(40, 0.005, marks=pytest.mark.slow)])
 def test_a_dam_lets_through_what_dupuit_and_charny_say(cells, error):
-    """Q = k (H1^2 - H2^2) / (2 L), whatever the free surface, which ends on a seepage face above the tail water."""
+    """Q = k (H1^2 - H2^2) / (2 L) for any free surface, which ends on a seepage face above the tail water."""
     s = dam(cells)
     s.run(600, 20, progress=False)
     flow = K * (UPPER**2 - LOWER**2) / (2 * WIDTH)
@@ -48,7 +48,7 @@ def test_a_dam_lets_through_what_dupuit_and_charny_say(cells, error):
 
 @pytest.mark.parametrize("h, error", [(1.0, 0.03), pytest.param(0.5, 0.012, marks=pytest.mark.slow)])
 def test_a_well_takes_what_dupuit_and_charny_say(h, error):
-    """Q = pi k (H^2 - H_w^2) / ln(R / r), here r = 1 m and R = 11 m: cells as wide as the well's radius, or half."""
+    """Q = pi k (H^2 - H_w^2) / ln(R / r), with r = 1 m and R = 11 m, on cells of the radius or half of it."""
     level, r, R = 6.0, 1.0, 11.0
     grid = mpm.Grid([0, 0], [R + h, TOP + 2 * h], [round(R / h) + 1, round(TOP / h) + 2], axisymmetric=True)
     soil = mpm.LinearElastic(bulk=1e9, shear=5e8, conductivity=K, conductivity_law=mpm.unsaturated(0.5 * 9810 * h))
@@ -78,7 +78,7 @@ def test_between_equal_levels_water_is_at_rest():
 
 @pytest.mark.parametrize("cells, error", [(20, 0.015), pytest.param(40, 0.007, marks=pytest.mark.slow)])
 def test_a_free_surface_falls_as_fast_as_its_pores_drain(cells, error):
-    """In a column with a head at its base: dh/dt = -k (1 - H / h) / (specific yield)."""
+    """In a column with a prescribed head at its base: dh/dt = -k (1 - H / h) / (specific yield)."""
     k, drains, high, low, head, h = 1e-5, 0.1, 8.0, 4.0, 2.0, 10.0 / cells
     grid = mpm.Grid([0, 0], [h, 10.0 + h], [1, cells + 1])
     law = mpm.unsaturated(0.5 * 9810 * h, specific_yield=drains)
@@ -96,13 +96,13 @@ def test_a_free_surface_falls_as_fast_as_its_pores_drain(cells, error):
 
 @pytest.mark.parametrize("cells", [10, pytest.param(40, marks=pytest.mark.slow)])
 def test_a_dam_with_suction_lets_through_what_dupuit_and_charny_say_with_kirchhoff_s_potential(cells):
-    """Exact for any retention: between given pressures the flow is that of the integral of k_r, which is linear."""
+    """Exact for any retention curve: the integral of k_r, which is linear, gives the flow between given pressures."""
     assert demo.rectangular(cells) == pytest.approx(1, abs=5e-4)
 
 
 @pytest.mark.slow
 def test_a_column_drains_under_suction_as_by_finite_elements_on_finer_cells():
-    """Within 0.6 % with 40 cells, of second order in h."""
+    """The error is below 0.6 % with 40 cells, and of second order in h."""
     coarse, fine = (found / elements - 1 for found, elements in map(demo.drained, (20, 40)))
     assert abs(fine) < 6e-3
     assert abs(coarse) > 3.2 * abs(fine)
@@ -110,7 +110,7 @@ def test_a_column_drains_under_suction_as_by_finite_elements_on_finer_cells():
 
 @pytest.mark.slow
 def test_the_reservoir_of_the_demo_falls_as_on_finer_cells():
-    """Its flows on cells of 1 m and 0.5 m: within 3 % in steady flow and after the fall, 12 % as it ends."""
+    """Flows on cells of 1 m and 0.5 m agree to 3 % in steady flow and after the drawdown, and to 12 % at its end."""
     coarse, fine = (np.array(demo.run(h).flows) for h in (1.0, 0.5))
     assert fine[0] == pytest.approx([-fine[0, 1], fine[0, 1]], rel=1e-4)
     assert coarse[[0, 2, 3]] == pytest.approx(fine[[0, 2, 3]], abs=0.03 * fine.max())
@@ -119,7 +119,7 @@ def test_the_reservoir_of_the_demo_falls_as_on_finer_cells():
 
 @pytest.mark.slow
 def test_a_block_drains_to_its_side_as_boussinesq_says():
-    """Dupuit's horizontal flow, its bank falling from 8 m to 6 m in a tenth of the time: mean of the free surface."""
+    """Dupuit's horizontal flow, while the water at the side falls from 8 m to 6 m: mean height of the free surface."""
     h, length, k, drains, end = 1.0, 40.0, 1e-5, 0.1, 3e6
     level, cells = partial(np.interp, xp=[0, 0.1 * end], fp=[8.0, 6.0]), 400
 

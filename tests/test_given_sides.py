@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Prescribed displacements: curved and slanted sides, neighbouring walls and sides, and messages of failure."""
+"""Prescribed displacements: curved and inclined sides, adjacent walls and sides, and error messages."""
 
 import sys
 from dataclasses import replace
@@ -18,7 +18,7 @@ WALLS = {"left": "x", "right": "x", "bottom": "xy"}
 
 
 def radial_stress(widened):
-    """Return the nominal radial stress at the hole, Pa, of a cylinder from radius 1 to 2 m: quadrature of its ODE."""
+    """Return the nominal radial stress at the hole, in Pa, of a cylinder with radii 1 and 2 m, by quadrature."""
     G, lam = NEO.shear, NEO.bulk - 2 * NEO.shear / 3
 
     def nominal(s, q):
@@ -38,7 +38,7 @@ def radial_stress(widened):
 
 
 def widened_hole(cells, widened=1e-3, steps=1):
-    """Return the reaction over the exact one of a quarter of a thick-walled cylinder, so many cells over its wall."""
+    """Return the reaction of a quarter of a thick-walled cylinder, divided by the exact reaction."""
     grid = mpm.Grid([0] * 2, [2 + 2 / cells] * 2, [2 * cells + 2] * 2)
 
     def angle(X):
@@ -66,7 +66,7 @@ def test_a_widened_hole_pushes_back_as_the_exact_solution_does(cells, error):
 
 
 def test_a_widened_hole_of_a_nearly_incompressible_body_pushes_back_as_the_exact_solution_does(monkeypatch):
-    """Held in units of lambda + 2G, 5000 G here, it pushed back six times as much."""
+    """With a penalty in units of lambda + 2G, here 5000 G, the reaction was six times too large."""
     monkeypatch.setattr(sys.modules[__name__], "NEO", mpm.NeoHookean(bulk=5e3 * NEO.shear, shear=NEO.shear))
     assert widened_hole(12) == pytest.approx([1, 1], rel=2.5e-3)
 
@@ -76,7 +76,7 @@ def test_a_hole_widened_by_a_tenth_in_steps_pushes_back_as_the_exact_solution_do
 
 
 def pressed(cells, angle):
-    """Return the reaction of a rough block, 1 m high, nu = 0.3, pressed by 1 % along its own axis."""
+    """Return the reaction of a rough block, 1 m high, nu = 0.3, compressed by 1 % along its own axis."""
     grid = mpm.Grid([0, 0], [1.6, 1.6], [round(1.6 * cells)] * 2)
     R = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     body = mpm.mapped(grid, mpm.box(grid, [0, 0], [0.5, 1]), lambda x: x @ R.T + [0.7, 0.2])
@@ -94,7 +94,7 @@ def test_a_block_pressed_aslant_to_the_grid_resists_as_one_along_it(cells, error
 
 
 def test_a_slanted_block_under_uniform_stress_is_exact():
-    """Sheared by 50 % in steps, all sides given: nothing of the grid is seen."""
+    """Shear by 50 % in steps, with all sides prescribed: the grid has no effect."""
     grid = mpm.Grid([0, 0], [2.0, 1.0], [20, 10])
     body = mpm.box(grid, [0.2, 0.13], [0.7, 0.63])
 
@@ -112,7 +112,7 @@ def test_a_slanted_block_under_uniform_stress_is_exact():
 
 
 def pushed_along_a_rough_base(way, steps, start=0.5, h=0.1):
-    """Return the reaction over the way, N/m^2, of a side pushed by so many cells: at once, held for a step, for ten."""
+    """Return the reaction / displacement, in N/m^2, of a side pushed by `way` cells, then held for 1 and 10 steps."""
     grid = mpm.Grid([0, 0], [2.5, 1.2], [round(2.5 / h), round(1.2 / h)])
     wall = mpm.Displacement("left", lambda t, X: (way * h * min(t, 1.0), 0), "x")
     s = mpm.Simulation(grid, [mpm.box(grid, [start, 0], [2, 1])], [SOIL], walls={"bottom": "xy"}, conditions=[wall])
@@ -124,7 +124,7 @@ def pushed_along_a_rough_base(way, steps, start=0.5, h=0.1):
 
 
 def test_a_side_pushed_along_a_rough_base_carries_the_same_in_any_steps_on_any_line_and_while_it_is_held():
-    """It carried from 1 to 1.9 times as much: wall nodes bear the counted force, and bend the prescribed field."""
+    """Earlier, the reaction was up to 1.9 times too large: nodes of the wall carried the force of the side."""
     ways, lines = [(0.001, 1), (0.1, 4), (0.5, 1), (0.5, 10)], (0.5, 0.55, 0.575)
     loads = np.array([[pushed_along_a_rough_base(*way, line) for way in ways] for line in lines])
     print(
@@ -136,7 +136,7 @@ def test_a_side_pushed_along_a_rough_base_carries_the_same_in_any_steps_on_any_l
 
 
 def test_a_side_that_has_come_to_a_grid_line_rests_there():
-    """By 0.02 of a cell it was in nearly empty cells, and its force grew by 8 % while it was held."""
+    """Earlier, a side 0.02 cells inside nearly empty cells had a force that grew by 8 % while it was held."""
     loads = np.array(pushed_along_a_rough_base(0.8, 5, 0.52))
     print(f"at once, held for one step, for ten {loads}")
     assert loads == pytest.approx(loads[0], rel=0.01)
@@ -153,7 +153,7 @@ def test_a_side_one_cell_high_on_a_rough_base_is_held_too():
 
 
 def on_top(*regions, h=0.1, walls=WALLS, side="top"):
-    """Return soil, 2 m by 1 m, with given displacements (region, value) of its top."""
+    """Return soil of 2 m by 1 m with prescribed displacements (region, value) of its top."""
     grid = mpm.Grid([0, 0], [2, 1 + h], [round(2 / h), round(1 / h) + 1])
     held = [mpm.Displacement(side, value, region=((low, -9), (high, 9))) for low, high, value in regions]
     return mpm.Simulation(grid, [mpm.box(grid, [0, 0], [2, 1])], [SOIL], walls=walls, conditions=held)
@@ -187,7 +187,7 @@ def test_a_side_that_something_else_holds_is_named(warned):
 
 @pytest.mark.parametrize(("bulk", "reached"), [(2.2e9, 1.0), (1e11, 0.923)])
 def test_a_sealed_column_that_is_compressed_at_once_is_named_only_if_it_lags_behind(warned, bulk, reached):
-    """Its reaction, 2000 times the modulus of the skeleton times the strain, was called an artefact."""
+    """Earlier, its reaction, 2000 times the skeleton's modulus times the strain, was rejected as an artefact."""
     grid = mpm.Grid([0, 0], [0.2, 1.3], [2, 8])
     body, top = mpm.box(grid, [0, 0], [0.2, 1.0]), mpm.Displacement("top", (0, -0.01), "y")
     s = mpm.Simulation(grid, [body], [SOFT], walls=WALLS, conditions=[top], fluid=mpm.Fluid(bulk=bulk))
@@ -199,7 +199,7 @@ def test_a_sealed_column_that_is_compressed_at_once_is_named_only_if_it_lags_beh
 
 
 def test_a_side_that_comes_to_lie_on_a_grid_line_is_not_named(warned):
-    """There it is held in the cells above the line and below, by forces up to the limit that balance each other."""
+    """On the grid line, the cells above and below hold the side, by forces that balance each other."""
     h, edge, loads = 1 / 9, 4 / 9, []
     grid = mpm.Grid(lower=[0, -10 * h], upper=[18 * h, 3 * h], cells=[18, 13])
     body = mpm.box(grid, [0, -10 * h], [18 * h, h / 4])
@@ -223,7 +223,7 @@ def test_bodies_that_overlap_are_named(warned):
 
 
 def footing_load(width):
-    """Return the mean load over c, sideways and down, of a rough strip on 0 ... 4/9, pushed into soil of a width."""
+    """Return the mean load over c, horizontal and vertical, of a rough strip on 0 to 4/9, in soil of a given width."""
     h, end = 1 / 9, 0.0012
     columns, rows = int(np.ceil(width / h - 1e-9)), 11
     grid = mpm.Grid(lower=[0, -rows * h], upper=[columns * h, 3 * h], cells=[columns, rows + 3])
@@ -237,7 +237,7 @@ def footing_load(width):
 
 
 def test_a_held_region_may_end_anywhere_in_domains_and_cells():
-    """Lines of the points on the grid's lines, and off them."""
+    """Lines of the points are on grid lines, or off them."""
     loads = np.array([footing_load(width) for width in (22 / 9, 2.40, 2.46)])
     print(f"22/9, 2.40, 2.46 wide: load / c down {loads[:, 1]}, sideways {loads[:, 0]}")
     assert loads[:, 1] == pytest.approx(loads[0, 1], rel=0.015)
@@ -245,7 +245,7 @@ def test_a_held_region_may_end_anywhere_in_domains_and_cells():
 
 
 def test_a_region_half_a_cell_wide_at_the_end_of_a_side_is_held_alike_in_any_unit_of_length():
-    """By rounding a sliver of the next domain was held too, which changed the reaction by 3 %."""
+    """Earlier, rounding also prescribed a sliver of the next domain, which changed the reaction by 3 %."""
     forces = []
     for unit in (1.0, 1e-4, 1e3):
         grid = mpm.Grid([0, 0], [unit, 0.6 * unit], [10, 6])
@@ -259,7 +259,7 @@ def test_a_region_half_a_cell_wide_at_the_end_of_a_side_is_held_alike_in_any_uni
 
 
 def test_a_block_turned_in_space_is_pressed_exactly():
-    """Aslant to all axes, nu = 0: by 2 % in two steps, and one at rest in which the sides come where they are to be."""
+    """The block is inclined to all axes, nu = 0: 2 % in two steps, and a third step without motion."""
     grid = mpm.Grid([0, 0, 0], [1, 1, 1], [5] * 3)
     R, _ = np.linalg.qr([[3.0, 1, 0.5], [-1, 3, 0.7], [0.2, -0.9, 3]])
     R *= np.sign(np.diag(R))
@@ -278,7 +278,9 @@ def test_a_block_turned_in_space_is_pressed_exactly():
 
 @pytest.mark.parametrize(("bulk", "fluid"), [(5e8, None), (5e9, None), (2e6, mpm.Fluid())], ids=["499", "4999", "wet"])
 def test_a_flat_side_moves_as_it_is_given_whatever_resists(bulk, fluid):
-    """Soil that cannot give way, pressed in one step: held by 4G the side came .83, .33, .27 of its way."""
+    """Incompressible soil, pressed in one step: with a penalty of 4G the side reached .83, .33, .27 of its
+    displacement.
+    """
     grid = mpm.Grid([0, 0], [1.5, 1.5], [6, 12])
     body, law = mpm.box(grid, [0, 0], [1.5, 1.0]), mpm.Hencky(bulk=bulk, shear=1e6)
     press = mpm.Displacement("top", lambda t, X: (0, -1e-3 * t), components="y")
@@ -290,7 +292,7 @@ def test_a_flat_side_moves_as_it_is_given_whatever_resists(bulk, fluid):
 
 @pytest.mark.parametrize(("bulk", "shear", "at_once"), [(np.inf, 1e6, False), (2.2e9, 1e3, False), (np.inf, 1e6, True)])
 def test_a_side_that_has_no_room_for_its_way_is_refused(bulk, shear, at_once):
-    """Sealed water under it bore 200 GPa, and the side stayed where it was without a word."""
+    """Earlier, undrained water under the side carried 200 GPa, and the side silently did not move."""
     grid = mpm.Grid([0, 0], [0.5, 1.5], [5, 15])
     soil = mpm.Hencky(bulk=2 * shear, shear=shear, conductivity=1e-5)
     press = mpm.Displacement("top", (0, -0.01) if at_once else lambda t, X: (0, -0.01 * t), "y")

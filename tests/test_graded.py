@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A conductivity that changes steadily through the cells: in series along its gradient, in parallel across it."""
+"""A conductivity that varies linearly in the cells: in series along its gradient, in parallel normal to it."""
 
 from dataclasses import replace
 
@@ -14,9 +14,9 @@ from mpm_dolfinx.verification.exact import terzaghi_consolidation
 
 
 def mobilities(slope, dim=2, top=0.33):
-    """Return the mobilities along the axes (n, d) over the arithmetic mean of cells with k = k0 J, J = exp(slope . x).
+    """Return the mobilities along the axes (n, d), divided by the arithmetic mean of k = k0 J, J = exp(slope . x).
 
-    And the harmonic mean (n, 1) over the arithmetic one.
+    The second result (n, 1) is the harmonic mean divided by the arithmetic mean.
     """
     soil = mpm.Hencky(
         SOFT.bulk, SOFT.shear, conductivity=1e-4, conductivity_law=lambda conductivity, J: conductivity * J
@@ -42,7 +42,7 @@ def test_pieces_resist_in_series_along_the_gradient_and_conduct_in_parallel_acro
 
 
 def test_a_gradient_aslant_counts_along_each_axis_by_what_it_changes_there():
-    """In cells of 0.2 m x 0.08 m."""
+    """Cells of 0.2 m x 0.08 m."""
     share, series = mobilities(np.array([0.03, 0.04]), top=0.32)
     part = np.square([0.03 * 0.2, 0.04 * 0.08])
     assert 1 - share == pytest.approx((1 - series) * part / part.sum(), rel=1e-4)
@@ -56,9 +56,9 @@ def test_where_nothing_changes_it_is_the_mean():
     "per_cell, steps, ceilings", [(1, 40, (3e-3, 2e-3)), (2, 40, (3e-3, 2e-3)), (2, 200, (5e-3, 3e-3, 1e-3))]
 )
 def test_a_column_that_shrinks_to_half_with_a_conductivity_law_settles_in_its_time(per_cell, steps, ceilings):
-    """Hencky, k = k0 J^3 / (1 - ln J): the top conducts a tenth of its initial value, within few cells.
+    """Hencky's law, k = k0 J^3 / (1 - ln J): the conductivity of the top decreases to a tenth, within few cells.
 
-    At T = 0.05, 0.1 and 0.5, in equal steps to the last time with a ceiling.
+    Errors at T = 0.05, 0.1 and 0.5, in equal steps; the last error has a bound.
     """
     h, soil = 1 / 50, mpm.Hencky(1e6 / 3, 5e5, porosity=0.7, conductivity=1e-4, conductivity_law=linear_diffusion)
     grid = mpm.Grid([0, 0], [h, 1.0], [1, 50])

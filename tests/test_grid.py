@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The grid finds points by arithmetic, and dolfinx numbers things as the package relies on."""
+"""The grid finds points by arithmetic, and dolfinx numbers cells and nodes as the package assumes."""
 
 import numpy as np
 import pytest
@@ -68,7 +68,7 @@ def test_dolfinx_numbers_vector_dofs_as_scalar_ones(grid):
 
 
 def test_only_what_is_made_with_the_mesh_makes_it():
-    """Notebooks, debuggers and `copy` ask any object for names of their own."""
+    """Notebooks, debuggers and `copy` request unknown names from any object."""
     grid, shared = Grid([0, 0], [1.0, 1.0], [2, 2]), Grid([0, 0], [1.0, 1.0], [2, 2])
     for name in ("_repr_html_", "_ipython_display_", "shape_", "__array__"):
         assert not hasattr(grid, name)

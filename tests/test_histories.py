@@ -50,7 +50,9 @@ def test_rows_that_grow_are_filled_up_and_leave_those_that_were_kept():
 
 @pytest.mark.parametrize("count", [200, 6400])
 def test_another_row_takes_as_long_in_a_long_run(count, times={}):  # noqa: B006
-    """And so does looking at the last one; copying all rows, it would take 32 times as long."""
+    """The time of an additional row, and of reading the last row, is constant. A copy of all rows would take 32 times
+    as long.
+    """
     row, result, spent = Row(0.0, np.zeros((50, 2))), mpm.Result(Rows([Row(0.0, np.zeros((50, 2)))] * count)), []
     for _ in range(200):
         began = time.perf_counter()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Measures of the package's house may only fall: each has a ceiling, which is lowered with its count."""
+"""Measures of the package's code may only decrease: each measure has a ceiling, which is lowered with it."""
 
 import house
 import pytest

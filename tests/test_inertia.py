@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Inertia: a moving body continues to move, and keeps its momentum, at any position of the grid's lines."""
+"""Inertia: a moving body continues to move and keeps its momentum, at any position of the grid lines."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ BLOCK = mpm.NeoHookean(bulk=1e3 / 1.2, shear=1e3 / 2.6, grain_density=2.0, poros
 
 
 class Bar(mpm.LinearElastic):
-    """P = E (F - 1) along each axis, nu = 0: waves of any height keep their shape."""
+    """Law P = E (F - 1) along each axis, nu = 0: waves of any amplitude keep their shape."""
 
     @staticmethod
     def energy(F, bulk, shear):
@@ -31,7 +31,7 @@ def csr(A):
 
 
 def momenta(s):
-    """Return momentum (d,), angular momentum about the centre of mass and kinetic energy, counted from the points."""
+    """Return momentum (d,), angular momentum about the centre of mass, and kinetic energy, summed over the points."""
     points, d = s.points, s.grid.dim
     whole = mpm.Grid(s.grid.lower, s.grid.upper, [1] * d)
     spread = cut(whole, s.state.points.corners, True).second
@@ -46,7 +46,7 @@ def momenta(s):
 
 
 def turning(h=0.25, drift=(0.3, 0.2), numerics=TIGHT, **options):
-    """Return a stiff block, 1 x 0.5 m, that turns by 1 rad/s and flies, without walls."""
+    """Return a stiff block of 1 x 0.5 m that rotates by 1 rad/s and flies, without walls."""
     grid = mpm.Grid([0, 0], [4.0, 3.0], [round(4 / h), round(3 / h)])
     body = mpm.box(grid, [0.6, 0.7], [1.6, 1.2])
     centre = np.array([1.1, 0.95])
@@ -59,7 +59,7 @@ def turning(h=0.25, drift=(0.3, 0.2), numerics=TIGHT, **options):
 
 
 def test_a_block_that_turns_and_flies_keeps_its_momenta_and_energy():
-    """Without the chord of `inertia.chord` it would lose 1.6 % of its angular momentum in two radians."""
+    """Without the chord of `inertia.chord`, it would lose 1.6 % of its angular momentum in two radians."""
     s = turning()
     start = momenta(s)
     assert start[1] == pytest.approx(0.0520833333, rel=1e-8)  # m (a^2 + b^2) / 12
@@ -93,7 +93,7 @@ def test_the_ghost_mass_may_be_a_tenth_or_ten_times_as_large(factor, monkeypatch
 
 
 def test_a_uniform_velocity_added_changes_nothing_else(monkeypatch):
-    """By whole cells a step.  Filter and relaxation go with the cells crossed: they move F by less than 2e-6."""
+    """Whole cells per step. Filter and relaxation depend on the crossed cells, and change F by less than 2e-6."""
     monkeypatch.setattr(inertia, "RELAXES", 0.0)
     still, moves = turning(drift=(0, 0)), turning(drift=(2.5, 0))
     still.step(0.1), moves.step(0.1)
@@ -106,7 +106,7 @@ def test_a_uniform_velocity_added_changes_nothing_else(monkeypatch):
 
 
 def flown(cells, speed=0.23, periods=1.1, amplitude=0.05, per_period=2):
-    """Return errors of u and v of a bar that vibrates and flies, over their amplitudes, and of its momentum."""
+    """Return errors of u and v of a vibrating flying bar, divided by their amplitudes, and of its momentum."""
     h, dt = 1 / cells, 1 / cells * 2 / per_period
     count = cells + 2 * round(speed * periods / h) + 8
     grid = mpm.Grid([0, 0], [count * h, h], [count, 1])
@@ -135,7 +135,7 @@ def test_a_bar_that_vibrates_and_flies_over_the_grid_is_met_at_second_order():
 
 
 def test_frequencies_of_a_clamped_beam_are_those_of_spectral_elements():
-    """f1 to f3, Hz, of a beam of 1 x 0.3 m, nu = 0, converged to eight digits: 1 % with h = 0.05 m, order 2."""
+    """f1 to f3, in Hz, of a beam of 1 x 0.3 m, nu = 0, known to eight digits: 1 % with h = 0.05 m, of second order."""
     exact, off = np.array([3.2441904, 15.985029, 17.6776695]), []
     for h in (0.1, 0.05):
         grid = mpm.Grid([0, 0], [13 * 0.1, 0.8], [round(1.3 / h), round(0.8 / h)])
@@ -153,7 +153,7 @@ def test_frequencies_of_a_clamped_beam_are_those_of_spectral_elements():
 
 
 def column(inertia=True, n=20, **options):
-    """Return a dry confined column, 10 m high: waves run up and down in it at 188.7 m/s."""
+    """Return a dry confined column, 10 m high, with a wave velocity of 188.7 m/s."""
     young, nu = 50e6, 0.3
     soil = mpm.LinearElastic(
         bulk=young / 3 / (1 - 2 * nu), shear=young / 2 / (1 + nu), grain_density=2700.0, porosity=0.3
@@ -166,7 +166,7 @@ def column(inertia=True, n=20, **options):
 
 
 def test_a_sudden_load_runs_down_and_doubles_at_the_base():
-    """Exact: the base bears nothing until t = L / c, then twice the load until 3 L / c."""
+    """Exact: the stress on the base is zero until t = L / c, then twice the load until 3 L / c."""
     s, c = column(n=40, conditions=[mpm.Traction("top", (0, -1e3))]), np.sqrt(67307692.31 / 1890)
     width, dt = s.points.corners[:, :, 0].max(), 10 / 40 / c
     base = []
@@ -178,7 +178,7 @@ def test_a_sudden_load_runs_down_and_doubles_at_the_base():
 
 
 def test_stages_begin_and_end_inertia_with_forces_in_balance():
-    """A column settles under its weight without it, stays at rest with it, and after a load goes on moving."""
+    """A column settles under its weight without inertia, stays at rest with inertia, and moves on after a load."""
     s = column(inertia=False, gravity=(0, -9.81))
     s.run(1.0, 1.0, progress=False)
     settled = s.points.x.copy()
@@ -217,7 +217,7 @@ def test_the_base_bears_the_same_force_before_and_after_inertia_begins(load, flu
 
 @pytest.mark.parametrize("held", [None, mpm.Displacement("bottom", lambda t: (0, 0.03 * min(t, 1)))])
 def test_a_block_off_the_grid_lines_stays_at_rest_when_inertia_begins_and_falls_when_it_is_let_go(held):
-    """Forces balance what the reset of the grid leaves, while the supports stay the same."""
+    """Forces balance the error of the grid reset while the supports do not change."""
     low = 0.53 if held else 0.0
     grid = mpm.Grid([0, 0], [1, 1.2], [10, 12])
     block, walls = mpm.box(grid, [0.32, low], [0.72, low + 0.33]), {} if held else {"bottom": "xy"}
@@ -248,7 +248,7 @@ def test_a_block_falls_as_stones_do():
 
 
 def breathing(n):
-    """Return the first frequency, Hz, of a solid cylinder in plane strain, radius 1 m, n cells, and the exact one.
+    """Return the computed and the exact first frequency, in Hz, of a solid cylinder in plane strain, of radius 1 m.
 
     Exact: x J_0(x) = (1 - 2 nu) / (1 - nu) J_1(x), x = omega R / c_p.
     """
@@ -295,7 +295,7 @@ def test_a_block_slides_down_a_smooth_incline_as_fast_as_it_should():
 
 
 def test_a_saturated_column_shakes_as_the_exact_one():
-    """u-p with the fluid's acceleration in its flux: Zienkiewicz, Chang and Bettess (1980), Pi1 = 1, Pi2 = 0.1."""
+    """u-p form with the fluid's acceleration in its flux: Zienkiewicz, Chang and Bettess (1980), Pi1 = 1, Pi2 = 0.1."""
     frequency, exact = 58.13164491, 1.50970174e-8 * np.exp(-0.7539278j)
     soil = mpm.LinearElastic(
         bulk=50e6 / 1.2, shear=50e6 / 2.6, grain_density=2700.0, porosity=0.3, conductivity=7.70570326e-3
@@ -321,10 +321,11 @@ def test_a_saturated_column_shakes_as_the_exact_one():
 
 
 def test_water_that_flows_freely_does_not_make_a_column_unstable():
-    """Exact settlement of a half-space of hard water and grains, u-p (after de Boer, Ehlers and Liu 1993), at 0.05 s.
+    """Exact settlement at 0.05 s of a half-space of stiff water and grains, u-p form (after de Boer, Ehlers and Liu
+    1993).
 
-    With the face's acceleration alone in the flux, pressures grew from step to step. Water, 1000 kg/m^3, then has more
-    mass in alternating nodal modes than a third of the mixture, 1670 kg/m^3.
+    With the acceleration of the face alone in the flux, pressures would grow from step to step. Water of 1000 kg/m^3
+    then has more mass in alternating nodal modes than a third of the mixture of 1670 kg/m^3.
     """
     soil = mpm.LinearElastic(
         bulk=14.515e6 / 1.2, shear=14.515e6 / 2.6, porosity=0.33, grain_density=2000.0, conductivity=1e-2
@@ -396,9 +397,10 @@ def test_factors_of_safety_are_of_bodies_without_inertia():
 
 
 def test_steps_by_error_meet_it():
-    """A column that swings for two periods: the error of a step is met, so that of the phase is some fifteen times it.
+    """A column vibrates for two periods. The error of each step meets the tolerance; the phase error is fifteen times
+    it.
 
-    Both fall with rtol as steps of second order do.
+    Both errors decrease with rtol as for steps of second order.
     """
     c, period = 188.712839, 40 / 188.712839
     velocity = lambda x: np.stack([0 * x[:, 0], 1e-2 * np.sin(np.pi * x[:, 1] / 20)], axis=1)  # noqa: E731
@@ -413,9 +415,9 @@ def test_steps_by_error_meet_it():
 
 
 def in_frame(length=1.0, mass=1.0, time=1.0, order=(0, 1), sign=(1, 1), wet=False):
-    """Return places, over the length, and J of a turning block after some steps, as in its own frame.
+    """Return positions, divided by the length, and J of a rotating block after some steps, in its own frame.
 
-    order, sign: of the axes, in which it is turned and mirrored.
+    order, sign: order and signs of the axes of the rotated and mirrored scene.
     """
     order, sign, stress = list(order), np.array(sign), mass / (length * time**2)
     size, low, high = (length * np.array(x)[order] for x in ([4.0, 3.0], [0.6, 0.7], [1.6, 1.2]))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Stresses and pressures as seeded: in balance at once, and loaded on from as if they had come by loading."""
+"""Initial stresses and pressures: in equilibrium at once, with the response to later loads as after loading."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ LAWS = {
 
 
 def ground(law="hencky", dim=2, off=0.13, level=2.0, axisymmetric=False, later=False, **options):
-    """Return two layers, 3 m, whose interface and surface are off the grid lines, with a phreatic level in them."""
+    """Return two layers, 3 m, with interface and surface off the grid lines and a phreatic level within."""
     width = [2.0] if dim == 2 else [1.0, 1.0]
     grid = mpm.Grid([0] * dim, [*width, 4.0], [*(round(2 * w) for w in width), 8], axisymmetric=axisymmetric)
     bodies = [
@@ -48,14 +48,14 @@ def ground(law="hencky", dim=2, off=0.13, level=2.0, axisymmetric=False, later=F
 
 
 def vertical(y, off=0.13, level=2.0):
-    """Return the exact vertical effective stress, Pa."""
+    """Return the exact vertical effective stress, in Pa."""
     upper, lower = 9.81 * (0.7 * 2650 + 300), 9.81 * (0.6 * 2650 + 400)
     weight = upper * (3 + off - np.maximum(y, 1 + off)) + lower * np.maximum(1 + off - y, 0)
     return -weight + WEIGHT * (level - y)
 
 
 def moved(s):
-    """Return how far corners have moved, m."""
+    """Return the largest displacement of corners, in m."""
     return np.abs(s.points.corners - s.points.origin).max()
 
 
@@ -93,7 +93,7 @@ def test_along_the_grid_stresses_at_rest_are_the_exact_ones():
 
 
 def slope(level, soil, h=0.25, axisymmetric=False, **options):
-    """Return a bank with a slanted side, wet up to a level, or a mound."""
+    """Return a bank with an inclined side, wet up to a level, or a mound."""
     grid = mpm.Grid([0, 0], [5.5, 3.0], [round(5.5 / h), round(3 / h)], axisymmetric=axisymmetric)
     bank = mpm.mapped(
         grid, mpm.box(grid, [0, 0], [5.1, 2.2]), lambda X: np.stack([X[:, 0] * (1 - X[:, 1] / 4.4), X[:, 1]], axis=1)
@@ -118,7 +118,7 @@ HELD = {"walls": {"left": "x"}, "conditions": [mpm.Displacement("bottom", (0, 0)
 
 @pytest.mark.parametrize("level, axisymmetric, h", [(0.83, False, 0.25), (3.0, False, 0.5), (0.83, True, 0.5)])
 def test_a_bank_in_still_water_stays_where_it_is(level, axisymmetric, h):
-    """Partly emerged and submerged: neither soil nor water moves."""
+    """The bank is partly submerged: neither soil nor water moves."""
     soil = mpm.MohrCoulomb(bulk=5e6, shear=2.5e6, friction=35, dilation=0, cohesion=5e3, **WATER)
     s = slope(level, soil, h, axisymmetric)
     for dt in (1.0, 1e4):
@@ -130,7 +130,7 @@ def test_a_bank_in_still_water_stays_where_it_is(level, axisymmetric, h):
 
 
 def oedometric(stress, law):
-    """Return the stretch of laterally held soil under a vertical Cauchy stress (less than about 1e6 Pa)."""
+    """Return the stretch of laterally confined soil under a vertical Cauchy stress (below about 1e6 Pa)."""
     K, G = 2e6, 1e6
     of = {
         "hencky": lambda x: (K + 4 * G / 3) * np.log(x) / x,
@@ -142,7 +142,7 @@ def oedometric(stress, law):
 
 @pytest.mark.parametrize("law, axisymmetric", [("hencky", False), ("linear", False), ("hencky", True)])
 def test_soil_is_loaded_on_as_if_its_stress_had_come_by_loading(law, axisymmetric):
-    """A stress of a tenth of the modulus as seeded, and then half as much again: the exact stretch between the two."""
+    """The initial stress is a tenth of the modulus; then half as much is added. The stretch must be exact."""
     grid = mpm.Grid([0, 0], [0.5, 1.2], [2, 12], axisymmetric=axisymmetric)
     column, first, second = mpm.box(grid, [0, 0], [0.5, 1.0]), -3e5, -4.5e5
     material = {"hencky": mpm.Hencky, "linear": mpm.LinearElastic}[law](bulk=2e6, shear=1e6, porosity=0.4)
@@ -211,7 +211,7 @@ PAIRS = {
 
 @pytest.mark.parametrize("below, above", [(a, b) for a in PAIRS for b in PAIRS if {a, b} & {"sand", "clay"} and a != b])
 def test_laws_may_lie_on_one_another_in_any_order(below, above):
-    """Three points each, as many as a tensor has axes, with the stress that they are given."""
+    """Three points for each law, as many as axes of a tensor, with their initial stress."""
     grid = mpm.Grid([0, 0], [0.5, 4.0], [1, 8])
     layers = [mpm.box(grid, [0, y], [0.5, y + 1.5], per_cell=1, material=m) for m, y in enumerate((0, 1.5))]
     walls, load = {"left": "x", "right": "x", "bottom": "y"}, {"conditions": [mpm.Traction("top", -1e3)]}

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: MIT
-"""What a scene shows does not depend on how it is written down.
+"""The results of a scene do not depend on its representation.
 
-Random scenes (`scenes`) are run as they are, and once more in other units, mirrored or turned, carried far away, with
-bodies, materials and conditions in another order, beside a far body, and cut at a checkpoint, all at once.  Where the
-two differ the scene is disturbed by a rounding of its loads: what then differs too is chaotic, and says nothing.  Of
-others each transformation is tried by itself, and named.  A far body, or rounding, may cut other steps: that is counted
-by itself, for soil with a history remembers its steps.
+Random scenes (`scenes`) are run in their own form, and again in other units, mirrored or rotated, far away, with
+bodies, materials and conditions in another order, next to a far body, and cut at a checkpoint, all at once. If the
+results differ, a rounding error is added to the loads of the scene. If the results then also differ, the scene is
+chaotic, and gives no information. Otherwise each transformation is tried separately, and named. A far body, or
+rounding, may cause other cuts of steps. Such scenes are counted separately, because soil with a history remembers its
+steps.
 
     INVARIANCE_SEED=1234 bash tests/run.sh -m "" -s tests/test_invariances.py -k reproduced   # one scene
     INVARIANCE_SEEDS=1000:2000 bash tests/run.sh -m slow -s -n 2 tests/test_invariances.py -k many_scenes   # many
@@ -45,9 +46,10 @@ MANY = [range(start, min(start + 10, LAST)) for start in range(FIRST, LAST, 10)]
 
 @dataclass
 class Outcome:
-    """What became of a scene, and what tells more.
+    """Outcome of a scene, with details.
 
-    kind: "same"; "chaotic"; "refused" as it is; "steps": it differs, but other steps were cut; or "differs".
+    kind: "same"; "chaotic"; "refused" in its own form; "steps": different results with other cuts of steps; or
+    "differs".
     """
 
     kind: str
@@ -56,7 +58,7 @@ class Outcome:
 
 
 def tried(scene: Scene, frame: Frame) -> Outcome:
-    """Run a scene as it is and in a frame; find out what differs, if anything does."""
+    """Run a scene in its own form and in a frame, and return the differences, if any."""
     plain = Frame.plain(scene.dim)
     try:
         base = run(scene, plain)
@@ -77,7 +79,7 @@ def tried(scene: Scene, frame: Frame) -> Outcome:
 
 
 def _apart(scene: Scene, base, frame: Frame) -> tuple[dict[str, float] | str, bool]:
-    """Return by how much a scene differs in a frame, or why it found no answer; and whether it took as many steps."""
+    """Return the difference of a scene in a frame, or the reason of its failure, and whether it took as many steps."""
     try:
         shown = run(scene, frame)
     except (ValueError, mpm.GaveUp) as error:
@@ -86,7 +88,7 @@ def _apart(scene: Scene, base, frame: Frame) -> tuple[dict[str, float] | str, bo
 
 
 def _differs(scene: Scene, base, frame: Frame, makes: float = 0.0) -> str:
-    """Return what differs in a frame, or nothing; makes: how many times larger roundings become in the scene."""
+    """Return the differences in a frame, or an empty text. makes: growth factor of rounding errors in the scene."""
     (apart, alike), rounding = _apart(scene, base, frame), resolved(scene, frame, base)
     if isinstance(apart, str):
         return apart
@@ -108,17 +110,17 @@ def line(scene: Scene, frame: Frame, outcome: Outcome) -> str:
 
 
 def quick(seed: int) -> Scene:
-    """Return a small scene in the plane or axisymmetric, of few laws."""
+    """Return a small plane or axisymmetric scene with few laws."""
     return drawn(seed, dim=2, axisymmetric=seed % 4 == 0, laws=LAWS[seed % len(LAWS)])
 
 
 def tell(text: str) -> None:
-    """Print at once, also from workers of pytest-xdist, which show what goes to stderr."""
+    """Print at once, also from workers of pytest-xdist, which show only stderr."""
     print(text, file=sys.stderr, flush=True)
 
 
 def reported(scenes) -> Counter:
-    """Try scenes each in a frame of its own; print what became of each as soon as it did; return how many are what."""
+    """Try each scene in its own frame, print each outcome at once, and return the number of scenes by outcome."""
     count, why = Counter(), Counter()
     for scene in scenes:
         began, frame = time.perf_counter(), composite(scene, 0)
@@ -153,14 +155,14 @@ def test_scenes_show_the_same_in_any_frame(part):
 @pytest.mark.slow
 @pytest.mark.parametrize("seeds", MANY, ids=str)
 def test_many_scenes_show_the_same_in_any_frame(seeds):
-    """All laws and dimensions."""
+    """All laws and dimensions are included."""
     count = reported(drawn(seed) for seed in seeds)
     assert not count["differs"], count
 
 
 @pytest.mark.parametrize("seeds", [range(3), pytest.param(range(3, 43), marks=pytest.mark.slow)], ids=["few", "many"])
 def test_scenes_whose_pores_drain_show_the_same_in_any_frame(seeds):
-    """INVARIANCE_SEEDS=1000:2000 says which many."""
+    """INVARIANCE_SEEDS=1000:2000 selects the scenes."""
     if len(seeds) > 3 and "INVARIANCE_SEEDS" in os.environ:
         seeds = range(*map(int, os.environ["INVARIANCE_SEEDS"].split(":")))
     small = {"dim": 2, "laws": LAWS[0]} if len(seeds) == 3 else {}
@@ -170,7 +172,7 @@ def test_scenes_whose_pores_drain_show_the_same_in_any_frame(seeds):
 
 @pytest.mark.parametrize("seeds", [(3, 6), pytest.param(range(62), marks=pytest.mark.slow)], ids=["few", "many"])
 def test_scenes_with_inertia_ties_and_free_tools_show_the_same_in_any_frame(seeds):
-    """INVARIANCE_SEEDS=1000:2000 says which many."""
+    """INVARIANCE_SEEDS=1000:2000 selects the scenes."""
     if len(seeds) > 2 and "INVARIANCE_SEEDS" in os.environ:
         seeds = range(*map(int, os.environ["INVARIANCE_SEEDS"].split(":")))
     count = reported(newer(seed, laws=LAWS[0 if len(seeds) == 2 else seed % 3]) for seed in seeds)
@@ -183,7 +185,7 @@ SOON = 0.6
 
 @pytest.mark.parametrize("seeds", [(5, 10), pytest.param(range(40), marks=pytest.mark.slow)], ids=["few", "many"])
 def test_scenes_whose_domains_are_renewed_show_the_same_in_any_frame(monkeypatch, seeds):
-    """With inertia and in axisymmetry.  INVARIANCE_SEEDS=1000:2000 says which many."""
+    """With inertia and in axisymmetry. INVARIANCE_SEEDS=1000:2000 selects the scenes."""
     monkeypatch.setattr(renewal, "LONGEST", SOON)
     if len(seeds) > 2 and "INVARIANCE_SEEDS" in os.environ:
         seeds = range(*map(int, os.environ["INVARIANCE_SEEDS"].split(":")))
@@ -195,7 +197,7 @@ def test_scenes_whose_domains_are_renewed_show_the_same_in_any_frame(monkeypatch
 @pytest.mark.parametrize("seed", [17, 24])
 @pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_weak_soil_without_equilibrium_is_told_as_such(monkeypatch, seed):
-    """A plate flattened domains (nan); trial displacements closed pores (a negative conductivity)."""
+    """A plate flattened domains (nan), and trial displacements closed pores (negative conductivity)."""
     monkeypatch.setattr(renewal, "LONGEST", SOON)
     with pytest.raises(mpm.GaveUp, match="may have no equilibrium") as told:
         run(flowing(seed, laws=["DruckerPrager"]), Frame.plain(2))
@@ -204,7 +206,7 @@ def test_weak_soil_without_equilibrium_is_told_as_such(monkeypatch, seed):
 
 @pytest.mark.skipif("INVARIANCE_SEED" not in os.environ, reason="asks for a seed")
 def test_a_scene_is_reproduced(monkeypatch):
-    """INVARIANCE_DRAW=newer (or draining, flowing) says by which function."""
+    """INVARIANCE_DRAW=newer (or draining, flowing) selects the function that draws the scene."""
     seed = int(os.environ["INVARIANCE_SEED"])
     scene = quick(seed) if seed < QUICK else drawn(seed)
     if draw := os.environ.get("INVARIANCE_DRAW"):
@@ -219,7 +221,7 @@ def test_a_scene_is_reproduced(monkeypatch):
 
 
 def test_what_does_depend_on_the_frame_is_found():
-    """A term that knows the first axis, and a load that knows the unit of length."""
+    """The scenes have a term that depends on the first axis, and a load that depends on the unit of length."""
     scene = Scene(
         0,
         (4, 4),
@@ -239,7 +241,7 @@ def test_what_does_depend_on_the_frame_is_found():
 
 @pytest.mark.parametrize("shape", ["box", "hexahedron"])
 def test_bodies_in_3d_prefer_no_diagonal_of_their_domains(shape):
-    """A block that is pressed in at a corner of its top, mirrored along each axis."""
+    """A block under a load on a corner of its top is mirrored along each axis."""
     block = Block((0.0, 0.0, 0.0), (1.5, 1.5, 1.2), 0, kind=shape, uneven=0.2, seed=3)
     walls = {"bottom": "xyz", "left": "x", "right": "x", "front": "y", "back": "y"}
     corner = ((-1.0,) * 3, (0.8, 0.6, 2.0))
@@ -255,7 +257,7 @@ def test_bodies_in_3d_prefer_no_diagonal_of_their_domains(shape):
 
 
 def test_corners_do_not_bend_towards_a_body_beyond_an_empty_cell():
-    """A side that heaves into the next row of cells saw the nodes of a body that rests an empty row above it."""
+    """Earlier, a side that heaved into the next row of cells used nodes of a body at rest above an empty row."""
     law = {"bulk": 2.8e7, "shear": 1.7e6, "porosity": 0.45, "conductivity": 2.7e-9}
     block, walls = Block((0.0, 0.0), (2.431, 2.1315), 0), {"bottom": "y", "left": "x", "right": "x"}
     press = Condition("displacement", "top", (0.0, -0.06), 80.0, "y", ((-1.0, -1.0), (1.344, 5.0)))
@@ -266,7 +268,7 @@ def test_corners_do_not_bend_towards_a_body_beyond_an_empty_cell():
 
 
 def test_a_side_that_drains_a_part_of_a_cell_does_not_see_how_others_lie():
-    """Its flow was corrected for its offset only where some cells lay off each other, be it far away."""
+    """Earlier, the flow was corrected for its offset only if some cells, even far away, were not aligned."""
     law = {"bulk": 4e9, "shear": 2e9, "porosity": 0.4, "conductivity": 1e-7}
     block, walls = Block((0.0, 0.0), (2.0, 1.3), 0), {"bottom": "y", "left": "x", "right": "x"}
     part = ((-1.0, -1.0), (1.15, 5.0))
@@ -278,7 +280,7 @@ def test_a_side_that_drains_a_part_of_a_cell_does_not_see_how_others_lie():
 
 
 def test_tangents_of_soil_that_yields_are_as_firm_in_any_unit_of_length():
-    """Axisymmetric: what was added to them lacked the way around, and steps were cut, or given up, in small lengths."""
+    """Earlier, the regularisation in axisymmetry lacked the circumference: with small units steps were cut."""
     law = {"bulk": 4e7, "shear": 2.4e6, "cohesion": 4.9e3, "friction": 33.0, "dilation": 33.0, "grain_density": 2600.0}
     tool = RigidTool("ball", (0.0, 1.71), 1.0, (0.0, -0.018), 200.0)
     block, walls = Block((0.0, 0.0), (3.36, 1.71), 0), {"bottom": "xy", "right": "x"}
@@ -294,7 +296,7 @@ def test_tangents_of_soil_that_yields_are_as_firm_in_any_unit_of_length():
 
 
 def ledgers(scenes) -> list[tuple[Scene, Ledger]]:
-    """Return what is counted of scenes, but of those that find no step."""
+    """Return the counted quantities of scenes, except for scenes without a converged step."""
     out = []
     for scene in scenes:
         ledger = Ledger()
@@ -317,7 +319,7 @@ def check_balances(found: list[tuple[Scene, Ledger]]) -> None:
 
 
 def test_forces_and_fluid_are_in_balance():
-    """Of bodies that no wall touches, and between walls."""
+    """Bodies that no wall touches, and bodies between walls."""
     free = (held_by_conditions(s, dim=2, axisymmetric=s % 4 == 0, laws=LAWS[s % 3]) for s in range(8))
     walled = (balanced(s, dim=2, axisymmetric=s % 4 == 0, laws=LAWS[s % 3]) for s in range(8, 14))
     found = ledgers([*free, *walled])
@@ -328,12 +330,12 @@ def test_forces_and_fluid_are_in_balance():
 @pytest.mark.slow
 @pytest.mark.parametrize("seeds", MANY, ids=str)
 def test_forces_and_fluid_of_many_scenes_are_in_balance(seeds):
-    """All laws and dimensions."""
+    """All laws and dimensions are included."""
     check_balances(ledgers((held_by_conditions, balanced)[seed % 2](seed) for seed in seeds))
 
 
 def test_soil_that_hardly_changes_its_volume_weighs_what_it_does():
-    """Its weight followed the volumes that cells see: half a percent too much after two steps."""
+    """Earlier, the weight followed the volumes in the cells: it was 0.5 % too large after two steps."""
     law = ("Hencky", {"bulk": 1.3e7, "shear": 8e5, "porosity": 0.46, "grain_density": 2650.0})
     block, base = Block((0.23, 1.78), (2.0, 3.06), 0), Condition("displacement", "bottom", (0.0, 0.0))
     press = Condition("displacement", "top", (0.0, -0.087), 640.0, "xy")

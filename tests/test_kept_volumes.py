@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Domains of yielded soil keep the volumes of their points, so that no cell holds more than its volume."""
+"""Domains of yielded soil keep the volumes of their points, so that no cell is filled beyond its volume."""
 
 import common
 import numpy as np
@@ -14,10 +14,10 @@ WEIGHT, STRONG, VISCOSITY = 20e3, 5e3, 1600.0  # N/m3, Pa, Pa s
 
 
 def collapsed(cells, weak, steps, renewal=False, stages=8, strong=STRONG, wide=6, base="xy", stage=8.0):
-    """Return the fullest cell's filled fraction, volume of domains over that of points, and front, m, of running clay.
+    """Return the largest filling of a cell, domain volume / point volume, and the front, in m, of flowing clay.
 
-    A column, 1 m wide and high, loses its strength in stages of `stage` s, with so many steps in each.  base:
-    components that the wall below it fixes.
+    A column, 1 m wide and high, loses its strength in stages of `stage` s, each with equal steps. base: components that
+    the wall below fixes.
     """
     grid = mpm.Grid([0, 0], [wide, 1 + 1 / cells], [wide * cells, cells + 1])
     moduli = {"bulk": 1500 * WEIGHT, "shear": 30 * WEIGHT, "friction": 0.0, "dilation": 0.0}
@@ -42,7 +42,7 @@ def collapsed(cells, weak, steps, renewal=False, stages=8, strong=STRONG, wide=6
 
 
 def test_no_cell_of_flowing_clay_holds_more_than_its_volume():
-    """Cells were filled to 105 %, and the domains grew by 2 %."""
+    """Without kept volumes, cells were filled to 105 %, and domains grew by 2 %."""
     fill, volume, reach = collapsed(cells=4, weak=1000.0, steps=5)
     assert reach[-1] > 1.5
     assert fill.max() < 1.005
@@ -52,10 +52,10 @@ def test_no_cell_of_flowing_clay_holds_more_than_its_volume():
 @pytest.mark.slow
 @pytest.mark.parametrize(("cells", "renewal", "most"), [(12, False, 1.002), (6, True, 1.015)])
 def test_clay_that_runs_out_by_two_widths_fills_no_cell_twice(cells, renewal, most):
-    """Cells were filled to 110 and 104 %, and domains grew by 2.4 and 5.9 %.  Corners of renewed ones lie on edges.
+    """Without kept volumes, cells were filled to 110 and 104 %, and domains grew by 2.4 and 5.9 %.
 
-    Without renewal domains fold.  While inverted parts counted as positive, the last digits of the corners decided
-    whether a full cell held a fold: the fullest cell was filled to 100.03, or to 107 and 116 %.
+    Without renewal, domains are inverted. If inverted parts counted as positive, the largest filling would be 100.03,
+    107 or 116 %, depending on the last digits of the corners.
     """
     fill, volume, reach = collapsed(cells, weak=400.0, steps=10, renewal=renewal)
     print(f"{cells} cells, renewal {renewal}: {100 * fill.max():.2f} %, volume {np.ptp(volume):.1e}")
@@ -65,9 +65,10 @@ def test_clay_that_runs_out_by_two_widths_fills_no_cell_twice(cells, renewal, mo
 
 
 def sheet(strengths, stage):
-    """Return the front, m, of a sheet of 1 m2 that stretches on a smooth base; strengths, Pa, act for `stage` s each.
+    """Return the front, in m, of a sheet of 1 m2 that stretches on a smooth base; each strength, in Pa, acts for
+    `stage` s.
 
-    Its width L stretches until the weight no longer overcomes the strength s: L' = weight / 8 eta - s L / 2 eta.
+    The width L grows until the weight no longer exceeds the strength s: L' = weight / 8 eta - s L / 2 eta.
     """
     L = 1.0
     for s in strengths:
@@ -79,9 +80,10 @@ def sheet(strengths, stage):
 @pytest.mark.slow
 @pytest.mark.parametrize(("cells", "most", "volumes"), [(6, 1.005, 2e-4), (12, 1.008, 1e-4)])
 def test_clay_runs_out_over_thirty_heights(cells, most, volumes):
-    """A column on a smooth base that loses all but a thousandth of its strength; long sheets stretch uniformly.
+    """A column on a smooth base loses all but a thousandth of its strength. Long sheets stretch uniformly.
 
-    Cells were filled to 100.6 and 101.0 %, as corners of renewed domains left the edges on which they lay.
+    Earlier, cells were filled to 100.6 and 101.0 %, because corners of renewed domains left the edges on which they
+    lay.
     """
     given = {"stages": 11, "strong": 2 * STRONG, "weak": 2e-3 * STRONG, "stage": 3.15}
     fill, volume, front = collapsed(cells, steps=40, renewal=True, wide=34, base="y", **given)
@@ -98,7 +100,7 @@ def test_clay_runs_out_over_thirty_heights(cells, most, volumes):
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_folded_domains_fill_no_cell_twice(dim):
-    """Inverted parts cancel the overlap with other domains; while they counted as positive, a cell held too much."""
+    """Inverted parts cancel the overlap with other domains. If they counted as positive, a cell would be overfilled."""
     grid = mpm.Grid([0.0] * dim, [3.0] * dim, [3] * dim)
     corners = mpm.box(grid, [0.0] * dim, [3.0] * dim).corners()
     corners[np.abs(corners - 1.5).max(axis=2) < 1e-9] += 0.42
@@ -124,7 +126,7 @@ def test_slopes_of_volumes_are_their_derivatives(dim, axisymmetric):
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_shared_corners_move_together_and_held_ones_stay(dim):
-    """A regular block whose middle domain has a tenth too much volume."""
+    """A regular block; the volume of its middle domain is a tenth too large."""
     grid = mpm.Grid([0.0] * dim, [5.0] * dim, [5] * dim)
     body = mpm.box(grid, [1.0] * dim, [4.0] * dim, per_cell=1)
     corners, ids = body.corners(), np.arange(len(body))

@@ -32,7 +32,7 @@ def footing(soil, surcharge=0.0):
 
 @pytest.mark.slow
 def test_a_step_costs_at_most_half_as_much_again_as_with_drucker_and_prager():
-    """Processor time of twelve steps, taken in turn: 1.43 and 1.40 times as much; with slopes at each residual 1.71."""
+    """Processor time of twelve steps in turn: 1.43 and 1.40 times that of Drucker and Prager's law."""
     clay = mpm.ModifiedCamClay(**CLAY)
     scenes = [footing(mpm.DruckerPrager(**SOIL)), footing(mpm.MohrCoulomb(**SOIL)), footing(clay, 2 * C)]
     spent = np.zeros(3)
@@ -58,7 +58,7 @@ mpm.Simulation(grid, [body], [clay], fluid=mpm.Fluid(), walls=walls, conditions=
 
 @pytest.mark.slow
 def test_a_scene_of_clay_in_3d_is_compiled_in_half_a_minute(tmp_path):
-    """Processor time of all of a first run, with an empty cache: 16 s, 8 of them the C compiler's."""
+    """Processor time of a first run with an empty cache: 16 s, including 8 s of the C compiler."""
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     subprocess.run([sys.executable, "-c", SPACE], env={**os.environ, "XDG_CACHE_HOME": str(tmp_path)}, check=True)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Layers of different conductivity, wherever their interfaces lie on the grid."""
+"""Layers of different conductivity, with interfaces at any position on the grid."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -22,7 +22,7 @@ def along(conductivity, J):
 
 
 def side(which, at, pressure, dim=2, axis=None):
-    """Return an open side of a body of many: the faces in the plane `at`, across an axis, else the last one."""
+    """Return the open side of a scene in the plane `at` normal to an axis, or else the last open side."""
     axis = dim - 1 if axis is None else axis
     low, high = np.full(dim, -np.inf), np.full(dim, np.inf)
     low[axis], high[axis] = at - 1e-9, at + 1e-9
@@ -30,7 +30,7 @@ def side(which, at, pressure, dim=2, axis=None):
 
 
 def column(seams, materials=(SAND, CLAY), dim=2, width=H, per_cell=2, place=None, **options):
-    """Return a column of sand, 1 m high, with seams of clay from and to some heights (m)."""
+    """Return a column of sand, 1 m high, with seams of clay between given heights (m)."""
     grid = mpm.Grid([0] * dim, [*[width] * (dim - 1), 1.2], [*[round(width / H)] * (dim - 1), 12])
     heights = np.array([0.0, *np.ravel(seams), 1.0])
     bodies = [
@@ -44,7 +44,7 @@ def column(seams, materials=(SAND, CLAY), dim=2, width=H, per_cell=2, place=None
 
 
 def ends(dim, pressure=TINY):
-    """Return the open lower and upper end of a column."""
+    """Return the open lower and upper ends of a column."""
     lower, upper = (name for name, (axis, _) in SIDES[dim].items() if axis == dim - 1)
     return [side(lower, 0, pressure, dim), side(upper, 1, 0.0, dim)]
 
@@ -61,7 +61,7 @@ def steady(simulation):
 
 
 def resistance(thickness, clay=CLAY):
-    """Return that of a column of 1 m with so much clay, Pa s/m."""
+    """Return the resistance of a column of 1 m with a thickness of clay, in Pa s/m."""
     return 9810 * ((1 - thickness) / SAND.conductivity + thickness / clay.conductivity)
 
 
@@ -108,7 +108,9 @@ def test_a_seam_at_an_open_end_resists_as_exact(offset):
 
 
 def test_a_rounding_of_places_changes_no_flow_where_points_of_two_layers_do_not_match():
-    """A line through the middle of three points lay on the border of two: places 1e-9 cells off changed 5e-5."""
+    """Earlier, a line through the middle of three points lay on a border: positions 1e-9 cells away changed results by
+    5e-5.
+    """
 
     def flow(off):
         grid = mpm.Grid([0, 0], [2 * H, 1.2], [2, 12])
@@ -185,7 +187,7 @@ def test_flow_across_a_seam_is_exact_wherever_the_load_moves_it():
 
 
 def below_after_a_day(offset, load):
-    """Return the pressure below a seam of a cell after a day, over the load on the drained top."""
+    """Return the pressure below a seam of one cell after a day, divided by the load on the drained top."""
     top = [0, 1], [H, 1]
     load_on_top = [mpm.Traction("top", (0, -load), top)]
     s = column(np.array([(0.5, 0.6)]) + offset * H, fluid=mpm.Fluid(), conditions=[*ends(2)[1:], *load_on_top])
@@ -204,7 +206,7 @@ def test_a_seam_holds_the_pressure_below_it_wherever_it_lies_and_is_carried():
 
 @pytest.mark.parametrize("slope", [0.01, 0.1, 0.2])
 def test_aslant_a_seam_is_a_barrier_and_a_drain_conducts(slope):
-    """One cell thick, 1 m long; a thin layer's exact flow."""
+    """The seam is one cell thick and 1 m long. The exact flow is that of a thin layer."""
     low, high, width, steep = 0.45, 0.55, 1.0, 1 + slope**2
 
     def place(x):
@@ -230,7 +232,7 @@ def test_cells_that_conduct_alike_are_treated_as_ever():
 
 
 def settled(ratio, offset, thickness=1):
-    """Return the settlement of a column with a layer so many times softer, some cells thick, over the exact one."""
+    """Return the settlement of a column with a soft layer, some cells thick, divided by the exact settlement."""
     soft = mpm.Hencky(bulk=SAND.bulk / ratio, shear=SAND.shear / ratio)
     load = [mpm.Traction("top", (0, -1.0), ([0, 1], [H, 1]))]
     s = column([((3 + offset) * H, (3 + offset + thickness) * H)], [SAND, soft], conditions=load)
@@ -274,7 +276,7 @@ def test_a_soft_layer_is_named_in_space_and_in_rings_and_in_any_order(dim, rings
 
 
 def test_a_soft_layer_whose_interfaces_move_on_is_named_again(warned):
-    """A column that shrinks by 3 % carries them from grid lines to 0.3 cells off: it loses 11 %, then half."""
+    """A settlement of 3 % moves the interfaces 0.3 cells off the grid lines: the error is 11 %, then half."""
     soft = mpm.Hencky(bulk=SAND.bulk / 10, shear=SAND.shear / 10)
     load = [mpm.Traction("top", lambda t: (0, -2e5 * t), ([0, 1], [H, 1]))]
     s = column([(0.5, 0.6)], [SAND, soft], conditions=load)
@@ -291,7 +293,9 @@ def test_layers_that_lose_little_are_not_named(ratio, offset, warned):
 
 
 def test_pieces_whose_boxes_overlap_a_little_are_counted_once():
-    """A line along a border of two deformed pieces crossed both: a cell conducted a quarter too much, a column 2 %."""
+    """Earlier, a line along the border of two deformed pieces crossed both: the conductivity of a cell was a quarter
+    too large.
+    """
     found = []
     for by in (0.0, 1e-4, 1e-3):
         grid = mpm.Grid([0, 0], [H, 1.2], [1, 12])

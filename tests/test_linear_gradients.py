@@ -17,7 +17,7 @@ SOIL = mpm.Hencky(bulk=1e6, shear=1e6)
 
 
 def seeded(dim, kind):
-    """Return a scene of one body on a lattice or a mesh, in cells that cut its domains."""
+    """Return a scene of one body on a lattice or from a mesh, in cells that cut its domains."""
     lower, upper = np.full(dim, 0.13), np.full(dim, 0.83)
     grid = mpm.Grid(np.zeros(dim), np.ones(dim), [5] * dim)
     body = mpm.box(grid, lower, upper, per_cell=2)
@@ -66,7 +66,7 @@ def test_pieces_have_the_volume_of_their_domain_at_rest(dim):
 
 
 def test_other_soil_tells_nothing():
-    """Layers of one body: each has its own gradient up to the border."""
+    """In layers of one body, each layer has its own gradient up to the interface."""
     s = seeded(2, "lattice")
     upper = s.points.x[:, 1] > 0.48
     F = np.eye(2) + 0.1 * upper[:, None, None] * np.diag([0.0, 1.0])

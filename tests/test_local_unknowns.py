@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Laws with local unknowns: exact values and tangents, failures that name the point, refusals."""
+"""Laws with local unknowns: exact values and tangents, failures that name the point, and refusals."""
 
 from dataclasses import dataclass, replace
 from typing import ClassVar
@@ -17,7 +17,7 @@ from mpm_dolfinx.verification.biot_fem import BiotFEM
 
 @dataclass(frozen=True)
 class Stiffening(mpm.Skeleton):
-    """Pressure K y of y + power y^3 = ln J, shear by a vector (b_12, b_21): both have closed forms."""
+    """Pressure K y with y + power y^3 = ln J, and shear from a vector (b_12, b_21): both have closed forms."""
 
     power: float = 50.0
 
@@ -40,7 +40,7 @@ class Stiffening(mpm.Skeleton):
 
 
 class Named(Stiffening):
-    """The same without trial values: the residuals name F."""
+    """The same law without trial values: the residuals depend on F."""
 
     trial = None
 
@@ -78,7 +78,7 @@ def test_stress_and_tangent_are_those_of_the_closed_form(law, dim):
 
 @dataclass(frozen=True)
 class Stored(Stiffening):
-    """The same unknowns of an energy, which is not stationary in them: K y^2 / 2 + G |shears|^2 / 2."""
+    """The same unknowns from an energy that is not stationary in them: K y^2 / 2 + G |shears|^2 / 2."""
 
     kirchhoff: ClassVar = None
 
@@ -90,7 +90,7 @@ class Stored(Stiffening):
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_an_energy_of_local_unknowns_has_its_tangent(dim):
-    """The derivative of the energy by differences, and of the stress, which has the unknowns' second derivative."""
+    """Derivatives of the energy by differences, and of the stress with the unknowns' second derivatives."""
     F = np.eye(dim) + 0.1 * np.random.default_rng(dim).normal(size=(20, dim, dim))
     at = LawAtPoints(Stored(bulk=2e6, shear=1e6), dim)
     b, log = F @ F.transpose(0, 2, 1), np.log(np.linalg.det(F))
@@ -106,7 +106,7 @@ def test_an_energy_of_local_unknowns_has_its_tangent(dim):
 
 
 def settled(material, **options):
-    """Return the displacement of the top of a column under a load that grows; it has a fluid or none."""
+    """Return the displacement of the top of a column under a growing load, with or without fluid."""
     s = column(
         cells=4,
         material=material,
@@ -119,7 +119,7 @@ def settled(material, **options):
 
 @pytest.mark.parametrize("locks", [False, True], ids=["plain", "mean dilatation"])
 def test_a_column_balances_its_load(locks):
-    """P = tau / J of uniform compression; Newton's method keeps its order."""
+    """P = tau / J of uniform compression. Newton's method keeps its order."""
     s, result, u = settled(SOIL if not locks else replace(SOIL, shear=1e4), fluid=False)
     m = s.materials[0] if hasattr(s, "materials") else s.scene.materials.materials[0]
     assert m.nearly_incompressible == locks
@@ -129,7 +129,7 @@ def test_a_column_balances_its_load(locks):
 
 
 def test_an_energy_of_local_unknowns_keeps_the_order_of_newtons_method():
-    """Without the second derivative of the unknowns in the tangent: 32 Newton steps, not 17."""
+    """Without the second derivative of the unknowns, the tangent leads to 32 Newton steps in place of 17."""
     _, result, u = settled(Stored(bulk=2e6, shear=1e6), fluid=False)
     assert result.newton <= 5 * result.steps and result.cuts == 0 and -0.2 < u < -0.05
 
@@ -142,7 +142,7 @@ def test_a_column_with_water_ends_where_the_dry_one_does():
 
 @dataclass(frozen=True)
 class Brittle(Stiffening):
-    """The same, but without a solution beyond a compression."""
+    """The same law, without a solution beyond a compression."""
 
     least: mpm.Field = -0.05
 
@@ -153,7 +153,7 @@ class Brittle(Stiffening):
 
 
 def test_a_step_without_a_local_solution_is_cut_and_names_the_first_point():
-    """ln J = -0.05 is reached at about half of the load; only the upper half of the column is weak."""
+    """ln J = -0.05 is reached at about half of the load. Only the upper half of the column is weak."""
     weak = Brittle(bulk=2e6, shear=1e6, least=lambda X: np.where(X[:, 1] > 0.5, -0.05, -9.0))
     s = column(cells=4, fluid=False, material=weak, conditions=[mpm.Traction("top", lambda t: (0, -2e5 * t))])
     with pytest.raises(mpm.GaveUp, match=r"Brittle: local equations have no solution at \[0\.\d+ +0\.(4[5-9]|[5-9])"):
@@ -238,7 +238,7 @@ def test_what_a_law_has_is_named(name):
 
 
 def test_what_a_law_in_numpy_does_to_its_arguments_stays_with_it():
-    """Values in place of its trial values: else the tangent would count from these, and the stress be wrong."""
+    """A function that overwrites its arguments changes neither the stress nor the tangent."""
 
     def solution(trial, bulk, crushed):
         np.multiply(trial["volume"], bulk, out=trial["volume"])
@@ -254,7 +254,7 @@ def test_what_a_law_in_numpy_does_to_its_arguments_stays_with_it():
 
 
 class Torn(Crushable):
-    """Foam that has no pressure beyond a compression."""
+    """Foam without pressure beyond a compression."""
 
     @staticmethod
     def solution(trial, bulk):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Many steps of load cycling: the beam comes back, volume and fluid are kept."""
+"""Many load cycles: the beam returns, and volume and fluid are conserved."""
 
 from dataclasses import replace
 
@@ -13,7 +13,7 @@ STEPS = 40  # in a cycle
 
 
 def cycle(h, cycles, material=SOFT, observe=(), **options):
-    """Return (simulation, result) of the beam whose load comes and goes `cycles` times."""
+    """Return (simulation, result) of the beam after `cycles` load cycles."""
     grid = mpm.Grid([0, 0], [1.2, 1.2], [round(1.2 / h)] * 2)
     bottom = (round(0.6 / h) + 0.5) * grid.h[1]
     body = mpm.box(grid, [0, bottom], [1, bottom + 0.3])
@@ -32,7 +32,9 @@ def returned(result):
 
 @pytest.mark.slow
 def test_a_beam_comes_back_after_2000_steps():
-    """0.17 % with h = 0.015 m, 0.65 % with 0.03 m: the residual grows equally in each cycle, and falls as h^2."""
+    """0.17 % with h = 0.015 m, 0.65 % with 0.03 m: the residual grows equally in each cycle, and is proportional to
+    h^2.
+    """
     s, result = cycle(0.02, 50)
     assert result.steps == 2000 and returned(result)[-1] < 5e-3
     assert (s.points.volume0 * s.points.J).sum() == pytest.approx(0.3, rel=1e-4)
@@ -52,9 +54,9 @@ def test_what_is_left_of_a_cycle_falls_with_the_cell_size():
     ],
 )
 def test_a_sealed_beam_keeps_the_volume_of_its_domains(conductivity, bulk, cycles, most):
-    """Corners follow more than the Q1 field, by 7e-5 of the volume in a cycle: the volume defect is corrected.
+    """Corners do not exactly follow the Q1 field: 7e-5 of the volume in a cycle. The volume defect is corrected.
 
-    The remainder, the gain of the last step, does not grow.
+    The remaining error, from the last step, does not grow.
     """
     volumes = []
 
@@ -71,7 +73,7 @@ def test_a_sealed_beam_keeps_the_volume_of_its_domains(conductivity, bulk, cycle
 
 @pytest.mark.parametrize("bulk", [2.2e9, 2e5])
 def test_a_sealed_beam_keeps_the_mass_of_compressible_water_that_flows(bulk):
-    """A balance of volume would lose 2e-6, and with the softer water 9e-4, of the beam's volume in a cycle."""
+    """A balance of volume would lose 2e-6 of the beam's volume in a cycle, and 9e-4 with the softer water."""
     rows = []
 
     def observe(s):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Cells of many sizes, between random lines: they share the properties of equal cells, and their limit is these."""
+"""Cells of many sizes, between random lines, have the properties of equal cells, also in the limit of equal sizes."""
 
 import cryer
 import footing
@@ -21,7 +21,7 @@ EXACT = mpm.Numerics(tolerance=1e-12)
 
 
 def at_random(low, high, cells, seed=0, ratio=3.0):
-    """Return lines with neighbouring cells of up to three times the width."""
+    """Return lines whose neighbouring cells differ by a factor of up to three."""
     rng = np.random.default_rng(seed)
     out = []
     for a, b, n in zip(low, high, cells, strict=True):
@@ -36,7 +36,7 @@ def uneven(dim, axisymmetric=False, seed=0, high=1.3):
 
 
 def nearly_equal(lower, upper, cells, **more):
-    """Return the grid of equal cells, and one whose lines are off theirs by a little more than rounding."""
+    """Return the grid of equal cells, and a grid whose lines differ by slightly more than rounding."""
     equal = mpm.Grid(lower, upper, cells, **more)
     lines = [np.linspace(a, b, n + 1) for a, b, n in zip(lower, upper, cells, strict=True)]
     for x in lines:
@@ -50,7 +50,7 @@ def nearly_equal(lower, upper, cells, **more):
 
 
 def test_lines_that_are_equally_far_apart_are_the_grid_of_equal_cells():
-    """The same arithmetic, and so the same bits and time."""
+    """The arithmetic is the same, and therefore the bits and the time."""
     equal = mpm.Grid([0.1, -0.3], [1.3, 0.9], [12, 10])
     lines = mpm.Grid(lines=[np.linspace(0.1, 1.3, 13), np.linspace(-0.3, 0.9, 11)])
     ends = []
@@ -81,7 +81,7 @@ def test_graded_lines_meet_the_boxes_and_grow_by_the_ratio(largest):
 
 @pytest.mark.parametrize("gap", [1e-3, 0.05, 0.1])
 def test_no_cell_is_narrow_where_boxes_are_near_each_other_or_a_side(gap):
-    """Lines that follow a tool would follow such a cell: it would be the smallest."""
+    """Lines that follow a tool would otherwise follow the narrowest cell."""
     near = mpm.graded([0, 0], [1, 1], [[[0, 0], [0.4, 1]], [[0.4 + gap, 0], [1, 1 - gap]]], 0.1)
     for x in near:
         assert np.diff(x) == pytest.approx(0.1)
@@ -102,7 +102,7 @@ def test_points_and_nodes_are_found_and_shape_functions_are_exact_for_linear_fie
 
 @pytest.mark.parametrize("dim, axisymmetric", KINDS)
 def test_domains_are_cut_exactly(dim, axisymmetric):
-    """Volumes, centroids and areas on faces between cells, from both sides."""
+    """Volumes, centroids, and areas on faces between cells, from both sides."""
     grid, rng = uneven(dim, axisymmetric), np.random.default_rng(3)
     F = np.eye(dim) + 0.3 * rng.normal(size=(100, dim, dim))
     corners = rng.uniform(0.4, 0.9, (100, 1, dim)) + np.einsum("nab,kb->nka", 0.2 * F, corner_bits(dim) - 0.5)
@@ -134,7 +134,7 @@ def test_domains_are_cut_exactly(dim, axisymmetric):
 
 @pytest.mark.parametrize("dim, axisymmetric", KINDS)
 def test_even_stresses_are_exact(dim, axisymmetric):
-    """A block that ends within cells is pressed on all sides by a tenth, in two steps, and lines cross its domains."""
+    """A block that ends within cells is compressed on all sides by a tenth, in two steps; lines cross its domains."""
     grid = uneven(dim, axisymmetric)
     body = mpm.box(grid, [0] * dim, [1.03, 1.01, 0.97][:dim] if dim == 3 else [1.03, 1.01])
     push = (lambda t: -3e5 * t) if not axisymmetric else (lambda t: -4e5 * t)
@@ -152,7 +152,7 @@ def test_even_stresses_are_exact(dim, axisymmetric):
 
 @pytest.mark.parametrize("dim, axisymmetric", KINDS)
 def test_linear_pressures_are_exact(dim, axisymmetric):
-    """In steady flow through a block that ends within cells, in cells and by probes, with gravity."""
+    """Steady flow through a block that ends within cells, in cells and at probes, with gravity."""
     grid, g = uneven(dim, axisymmetric), np.array([0.0] * (dim - 1) + [-9.81])
     slope = np.array([0.0 if axisymmetric else 3e3, -2e3, 1e3])[:dim]
     body = mpm.box(grid, [0] * dim, [1.03] * dim)
@@ -170,7 +170,7 @@ def test_linear_pressures_are_exact(dim, axisymmetric):
 
 
 def test_a_quadratic_motion_is_followed_exactly_by_corners():
-    """The difference at the ends of an edge is divided by the distances, so corners meet parabolas."""
+    """Differences at the ends of an edge are divided by the distances, so corners follow parabolas."""
     from mpm_dolfinx.domains.bending import followed
 
     grid = uneven(2)
@@ -188,7 +188,7 @@ def test_a_quadratic_motion_is_followed_exactly_by_corners():
 
 
 def beam(grid):
-    """Return a clamped wet beam whose ground is stiff, sagging under its weight."""
+    """Return a clamped wet beam with stiff ground, which sags under its weight."""
     soil = mpm.Hencky(1e7, 4e6, porosity=0.4, conductivity=1e-5)
     acting = [mpm.Traction("right", lambda t: (0, -300 * t)), mpm.Drained("top")]
     body = mpm.box(grid, [0, 0.3], [1, 0.6])
@@ -197,7 +197,7 @@ def beam(grid):
 
 
 def layers(grid):
-    """Return two layers, the upper one of a conductivity that changes, which settle."""
+    """Return two settling layers; the conductivity of the upper layer changes."""
     bodies = [mpm.box(grid, [0, 0], [1, 0.4]), mpm.box(grid, [0, 0.4], [1, 0.8], material=1)]
     law = mpm.kozeny_carman
     soils = [mpm.Hencky(1e5, 4e4, porosity=0.4, conductivity=k, conductivity_law=law) for k in (1e-5, 1e-4)]
@@ -216,7 +216,7 @@ def yielding(grid, **soil):
 
 
 def softening(grid):
-    """Return soil that softens in each cell by the cell's size."""
+    """Return soil whose softening depends on the size of each cell."""
     soil = mpm.SofteningDruckerPrager(
         1e6, 4e5, cohesion=1e3, friction=0.0, dilation=0.0, residual=500.0, slip=0.05, viscosity=10.0
     )
@@ -226,7 +226,7 @@ def softening(grid):
 
 
 def vibrating(grid):
-    """Return a wet beam with inertia, let go."""
+    """Return a wet beam with inertia after its release."""
     soil = mpm.Hencky(1e5, 4e4, porosity=0.4, conductivity=1e-3, grain_density=2600)
     body = mpm.box(grid, [0, 0.3], [0.6, 0.6])
     more = {"fluid": mpm.Fluid(), "inertia": True, "gravity": (0, -9.81), "walls": {"left": "xy"}}
@@ -261,7 +261,7 @@ def sliding(grid):
 
 
 def of_points(grid):
-    """Return a dry beam that is integrated at its points."""
+    """Return a dry beam with integration at its points."""
     load = mpm.Traction("right", lambda t: (0, -100 * t))
     numerics = mpm.Numerics(quadrature="point")
     body = mpm.box(grid, [0, 0.3], [1, 0.6])
@@ -279,7 +279,7 @@ SCENES += [(draining, 1e3), (of_points, 1.0), (sliding, 1.0)]
     [pytest.param(*s, marks=[] if s[0] in (beam, touched, sliding) else [pytest.mark.slow]) for s in SCENES],
 )
 def test_lines_that_are_nearly_equal_show_what_equal_cells_do(make, end):
-    """This compares all terms of the code for cells of many sizes with the code for equal cells."""
+    """The test compares all terms of the code for cells of many sizes with the code for equal cells."""
     ends = []
     for grid in nearly_equal([0, 0], [1.2, 1.2], [12, 12]):
         s = make(grid)
@@ -291,7 +291,7 @@ def test_lines_that_are_nearly_equal_show_what_equal_cells_do(make, end):
 
 
 def test_multigrid_takes_as_many_iterations_on_graded_lines(monkeypatch):
-    """As on equal cells of their mean size, within a half, and ends where factors do."""
+    """As many iterations as on equal cells of mean size, to within a half, and the solution of a direct solver."""
     found = []
     lines = mpm.graded([0, -0.6], [1.2, 0.4], [[[0.0, 0.0], [0.3, 0.3]]], 0.02, 1.1)
     for grid, least in ((mpm.Grid([0, -0.6], [1.2, 0.4], [36, 30]), 1), (mpm.Grid(lines=lines), 1), (None, 10**6)):
@@ -310,7 +310,7 @@ def test_multigrid_takes_as_many_iterations_on_graded_lines(monkeypatch):
 
 
 def smooth(cells, strength):
-    """Return lines from 0 to 1 whose distances change smoothly, by 1 : (1 + strength) / (1 - strength)."""
+    """Return lines from 0 to 1 with smoothly varying distances, of ratio (1 + strength) / (1 - strength)."""
     t = np.arange(cells + 1) / cells
     return t + strength / (2 * np.pi) * np.sin(2 * np.pi * t)
 
@@ -318,7 +318,7 @@ def smooth(cells, strength):
 @pytest.mark.slow
 @pytest.mark.parametrize("strength, sizes, per_cell", [(0.6, (6, 12, 24), 2), (-0.6, (24, 48), 1)])
 def test_displacement_and_pressure_are_of_second_order_on_smoothly_graded_lines(strength, sizes, per_cell):
-    """Cells of 1 : 4, fine in the middle or at both sides, while the top passes a fifth of the block."""
+    """Cells of ratio 1 : 4, fine in the middle or at both sides, while the top moves by a fifth of the block."""
     found = []
     for cells in sizes:
         x, steps = smooth(cells, strength), per_cell * cells
@@ -333,7 +333,7 @@ def test_displacement_and_pressure_are_of_second_order_on_smoothly_graded_lines(
 
 
 def over_equal(name, errors, *, bound=1.3):
-    """Print and check the largest and the root mean square error of a history on graded lines over equal cells."""
+    """Print and check the largest and the rms error of a history on graded lines, divided by those on equal cells."""
     largest, mean = (np.divide(*(of(e) for e in errors[::-1])) for of in (np.max, lambda e: np.sqrt(np.mean(e**2))))
     print(f"{name}: error on graded lines over that of equal cells: largest {largest:.2f}, mean {mean:.2f}")
     assert 0 < largest <= bound and 0 < mean <= bound, errors
@@ -341,9 +341,9 @@ def over_equal(name, errors, *, bound=1.3):
 
 @pytest.mark.parametrize("low, largest, until, part", [(0.7, np.inf, 0.01, 0.55), (0.4, 2.0, 0.1, 0.85)])
 def test_a_boundary_layer_needs_fine_cells_where_it_is(low, largest, until, part):
-    """Terzaghi's column, fine above `low`: fewer cells have the same error while the layer is there.
+    """Terzaghi's column with fine cells above `low`: fewer cells have the same error while a boundary layer exists.
 
-    From T = 0.1 on the pressure varies in the whole column; then cells may be larger only in its lower part.
+    From T = 0.1 on, the pressure varies in the whole column, and only cells in its lower part may be larger.
     """
     errors, cells, times = [], 50, np.array([0.005, 0.01, 0.1])
     h, load = 1 / cells, 1e-5 * terzaghi.SOIL.oedometric
@@ -367,7 +367,7 @@ def test_a_boundary_layer_needs_fine_cells_where_it_is(low, largest, until, part
 
 
 def test_a_beam_bends_and_drains_on_graded_lines_as_on_equal_ones():
-    """Lines are fine at the clamp; errors of the whole history, against finite elements with equal steps."""
+    """Lines are fine at the clamp. Errors of the whole history, compared with finite elements in equal steps."""
     o = poroelastic_beam.arguments(["--h", "0.03", "--dt", "0.06"])
     (equal, bottom), errors, active = poroelastic_beam.scene(o), [], []
     h, top = equal.grid.h, bottom + poroelastic_beam.HEIGHT
@@ -387,7 +387,7 @@ def test_a_beam_bends_and_drains_on_graded_lines_as_on_equal_ones():
 
 
 def test_a_sphere_consolidates_on_graded_lines_as_on_equal_ones():
-    """Cryer's sphere in axisymmetry, fine at its centre and at its surface: in the whole history of the pressure."""
+    """Cryer's sphere in axisymmetry, with fine cells at its centre and its surface: whole history of the pressure."""
     n, errors, active = 20, [], []
     upper, fine = [1 + 1 / n] * 2, [[[0, 0], [0.25, 0.25]], [[0.75, 0.75], [1 + 1 / n] * 2]]
     for grid in (None, mpm.Grid(lines=mpm.graded([0, 0], upper, fine, 1 / n, 1.2), axisymmetric=True)):
@@ -436,7 +436,7 @@ def test_what_lines_do_not_allow_is_refused_in_one_line(make, name, value):
 
 
 def test_bodies_in_contact_press_each_other_evenly_between_lines_at_random():
-    """Within the penetration that contact leaves, a thousandth of a cell."""
+    """The penetration that contact allows is a thousandth of a cell."""
     lines, low, high = at_random([0, 0], [1, 2], [8, 16], 5), 0.54625, 1.06
     grid = mpm.Grid(lines=lines)
     bodies = [mpm.box(grid, [0, 0], [1, low], per_cell=2), mpm.box(grid, [0, low], [1, high], per_cell=3)]
@@ -453,7 +453,7 @@ def test_bodies_in_contact_press_each_other_evenly_between_lines_at_random():
 
 @pytest.mark.parametrize(("start", "way", "cut"), [(0.2, 0.04, False), (0.2, 0.12, True), (2.0, 0.12, False)])
 def test_bodies_slide_in_a_step_by_a_cell_of_the_size_where_they_are(start, way, cut):
-    """In cells of 0.05 m up to x = 1.2 m, of 0.2 m beyond; y is divided equally."""
+    """Cells of 0.05 m up to x = 1.2 m, and of 0.2 m beyond; y is divided equally."""
     grid = mpm.Grid(lines=[np.append(np.linspace(-0.4, 1.2, 33), np.linspace(1.4, 3.4, 11)), np.linspace(0, 1.2, 13)])
     ends = ((start - 0.2, 0), (start + 1, 0.4)), ((start, 0.4), (start + 0.4, 0.8))
     hold = mpm.Displacement("top", lambda t: (way * t, -0.004 * t), region=([-0.4, 0.7], [3.4, 1.2]))
@@ -470,7 +470,7 @@ def test_a_footing_in_a_large_box_of_graded_cells_carries_what_it_does_in_a_smal
 
 @pytest.mark.slow
 def test_a_body_that_is_carried_through_graded_lines_and_back_is_as_one_in_equal_cells():
-    """A wet beam, clamped to a support that moves by its length, and bent on its way: residual stress and pressure."""
+    """A wet beam is clamped to a moving support, and bent on its path: residual stress and pressure."""
     h = 0.05
     lines = mpm.graded([-0.2, 0], [2.6, 1.2], [[[-0.2, 0.45], [1.0, 0.85]]], h, 1.2, 3 * h)
     grids = mpm.Grid([-0.2, 0], [2.6, 1.2], [56, 24]), mpm.Grid(lines=lines)

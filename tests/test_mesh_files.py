@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Mesh files: elements and sides are where the file has them, or the file is refused in one line."""
+"""Mesh files: elements and sides are at their positions in the file, or the file is refused in one line."""
 
 import struct
 
@@ -21,7 +21,7 @@ SPACE = mpm.Grid([0, 0, 0], [3, 3, 3], [3, 3, 3])
 
 
 def volume(file, part=None, grid=GRID, **options):
-    """Return the volume, lower and upper corner of the body of a file, and the areas of its sides."""
+    """Return the volume and the lower and upper corner of the body of a file, and the areas of its sides."""
     body = mpm.from_mesh(grid, file, part, **options)
     x = body.corners().reshape(-1, grid.dim)
     areas = {name: surface([body], name).area0.sum() for name in body.names}
@@ -29,7 +29,7 @@ def volume(file, part=None, grid=GRID, **options):
 
 
 def written(folder, text, name="scene.inp"):
-    """Return a file of a text."""
+    """Return a file with a text."""
     file = folder / name
     file.write_text(text)
     return file
@@ -124,7 +124,9 @@ both,
 
 
 def test_sets_of_an_abaqus_file_may_stand_anywhere(tmp_path):
-    """A set between two blocks of elements ended in an IndexError, a node of no cell made it a surface in space."""
+    """Earlier, a set between two blocks of elements caused an IndexError, and an unused node made it a surface in
+    space.
+    """
     file = written(tmp_path, SETS)
     for part, width in {"base": 1, "A": 1, "B": 1, "both": 2, "spans": 2, None: 2}.items():
         V, low, _, areas = volume(file, part)
@@ -155,7 +157,7 @@ def test_elements_of_soil_have_the_shape_of_their_names():
 
 
 def input_file(x, cells, name):
-    """Return an input file of nodes at places x, and of cells of a type."""
+    """Return an input file with nodes at positions x, and cells of a type."""
     lines = ["*NODE", *(f"{k + 1}, {', '.join(map(repr, row.tolist()))}" for k, row in enumerate(x))]
     lines += [f"*ELEMENT, TYPE={name}", *(f"{k + 1}, {str(row.tolist())[1:-1]}" for k, row in enumerate(cells + 1))]
     return "\n".join([*lines, ""])
@@ -199,7 +201,7 @@ NAMES = '$PhysicalNames\n3\n1 7 "crest"\n2 7 "whole"\n2 2 "right"\n$EndPhysicalN
 
 
 def format41(folder, binary):
-    """Return a file of two squares: one in groups 7 and 9, one in 2, 7 and 9; a line in none, and one in 7."""
+    """Return a file of two squares, in groups 7 and 9, and in 2, 7 and 9; a line in no group, and a line in group 7."""
     entities = [(1, 1, ()), (1, 2, (7,)), (2, 1, (7, 9)), (2, 2, (2, 7, 9))]
     elements = [(1, 1, 1, [(4, 5)]), (1, 2, 1, [TOP]), (2, 1, 3, [LEFT]), (2, 2, 3, [RIGHT])]
 
@@ -222,7 +224,7 @@ def format41(folder, binary):
 
 
 def format22(folder):
-    """Return the same in format 2.2: a cell is there once for each of its groups."""
+    """Return the same mesh in format 2.2, with a copy of a cell for each of its groups."""
     rows = [(3, g, LEFT) for g in (7, 9)] + [(3, g, RIGHT) for g in (2, 7, 9)] + [(1, 7, TOP)]
     text = "$MeshFormat\n2.2 0 8\n$EndMeshFormat\n" + NAMES + "$Nodes\n6\n"
     text += "".join(f"{k + 1} {x} {y} {z}\n" for k, (x, y, z) in enumerate(X)) + f"$EndNodes\n$Elements\n{len(rows)}\n"
@@ -232,7 +234,7 @@ def format22(folder):
 
 @pytest.mark.parametrize("made", [format22, lambda f: format41(f, False), lambda f: format41(f, True)])
 def test_a_cell_may_be_in_several_groups_of_gmsh(made, tmp_path):
-    """Of format 4.1 one group of a cell was kept; of format 2.2 a cell in two of them was refused."""
+    """Earlier, only one group of a cell was kept in format 4.1, and cells in two groups were refused in format 2.2."""
     file = made(tmp_path)
     for part, width in {None: 2, "whole": 2, "9": 2, "right": 1}.items():
         V, low, _, areas = volume(file, part)
@@ -273,7 +275,7 @@ Z B8 3 2 9 5 7 10 8 11 12\nZGROUP "clay" SLOT 1\n1 3\nZGROUP "cap" SLOT 1\n2\n""
 
 
 def test_groups_of_flac3d_are_those_of_their_zones(tmp_path):
-    """meshio numbers them through all blocks: zones of later ones were in no group."""
+    """meshio numbers zones through all blocks: earlier, zones of later blocks were in no group."""
     file = written(tmp_path, FLAC, "zones.f3grid")
     assert volume(file, "zone:clay:1", SPACE)[0] == pytest.approx(2)
     assert volume(file, "zone:cap:1", SPACE)[0] == pytest.approx(1 / 3)
@@ -329,7 +331,7 @@ def test_a_bad_file_is_refused_in_one_line(made, name, value, tmp_path):
 
 
 def test_wedges_meet_tetrahedra_and_hexahedra_face_to_face():
-    """Three unit cubes in an L: tetrahedra on a wedge's triangles, and a hexahedron next to its quadrilaterals."""
+    """Three unit cubes in an L: tetrahedra on the triangles of a wedge, and a hexahedron next to its quadrilaterals."""
     wedges, tops, cube = (box_mesh(k, (1,) * 3, low, np.add(low, 1)) for k, low in (
         ("wedge", (0, 0, 0)), ("tetra", (0, 0, 1)), ("hexahedron", (1, 0, 0))))  # fmt: skip
     x, at = np.unique(np.concatenate([m.points for m in (wedges, tops, cube)]), axis=0, return_inverse=True)
@@ -342,7 +344,7 @@ def test_wedges_meet_tetrahedra_and_hexahedra_face_to_face():
 
 
 def test_bodies_of_tetrahedra_in_one_another_are_refused_however_little():
-    """Faces that are plane kites counted as warped: a tenth of an edge was let pass."""
+    """Earlier, plane kites counted as warped faces, and gaps of a tenth of an edge were accepted."""
     one, two = (mpm.from_mesh(SPACE, box_mesh("tetra", (2,) * 3, (x, 0, 0), (x + 1, 1, 1))) for x in (0, 0.99))
     with pytest.raises(ValueError, match=r"bodies 0 and 1: overlap at .* by 0.01 m, must be apart or touch"):
         mpm.Simulation(SPACE, [one, two], [mpm.Hencky(bulk=1e6, shear=5e5)], walls={})

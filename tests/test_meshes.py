@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Bodies from meshes: cells are the points' domains, facets the sides."""
+"""Bodies from meshes: cells are the domains of the points, facets are the sides."""
 
 import signal
 from threading import Thread
@@ -30,14 +30,14 @@ SOIL = mpm.Hencky(bulk=1e6 / 1.2, shear=1e6 / 2.4)
 
 
 def of_kind(kind, upper=(2.0, 1.0, 1.0), **options):
-    """Return a grid, and a box of a kind of cells in it."""
+    """Return a grid, and a box of one kind of cells in it."""
     dim = len(ALL[kind])
     grid = GRID if dim == 2 else SPACE
     return grid, mpm.from_mesh(grid, box_mesh(kind, ALL[kind], (0,) * dim, upper[:dim], **options))
 
 
 def skewed(x):
-    """Return places in a parallelepiped of two units."""
+    """Return positions in a parallelepiped of two units."""
     return x @ np.array([[0.8, 0.2, 0.0], [-0.3, 1.0, 0.1], [0.2, -0.1, 0.9]])[: x.shape[1], : x.shape[1]] + 0.3
 
 
@@ -90,7 +90,7 @@ def test_a_linear_field_is_exact_however_the_mesh_lies(kind):
 
 
 def tip(body, grid, load, x):
-    """Return by how much the end of a body, held at its left, comes down under a load on its top."""
+    """Return the deflection of the end of a body, fixed at its left, under a load on its top."""
     walls = {"left": "xyz"[: grid.dim]} | ({"front": "y", "back": "y"} if grid.dim == 3 else {})
     down = (0,) * (grid.dim - 1) + (-load,)
     traction = mpm.Traction("top", lambda t: np.multiply(t, down))
@@ -127,7 +127,9 @@ def test_a_beam_of_a_mesh_in_3d_bends_as_one_of_boxes():
 
 
 def cylinder(p, bulk, shear):
-    """Return a function for u, sigma_r, sigma_t at radii R of a cylinder, 1 to 2 m, Hencky's law, with p inside."""
+    """Return a function for u, sigma_r and sigma_t at radii R from 1 to 2 m of a cylinder, Hencky's law, inner pressure
+    p.
+    """
 
     def stresses(R, r, slope):
         strain = np.array([np.log(slope), np.log(r / R), 0 * R])
@@ -160,7 +162,7 @@ def cylinder(p, bulk, shear):
 
 
 def pressed_hole(body, side, p, steps, cells):
-    """Return the errors (rms) of displacements and stresses of a quarter of a cylinder of radii 1 and 2 m."""
+    """Return the rms errors of displacements and stresses of a quarter of a cylinder with radii 1 and 2 m."""
     bulk, shear = 2e6, 1e6
     grid = mpm.Grid([0] * 2, [2.6] * 2, [round(2.6 * cells)] * 2)
     body = body(grid)
@@ -189,7 +191,7 @@ def test_a_pressed_hole_has_the_exact_displacements_and_stresses(p, steps):
 
 @pytest.mark.parametrize(("p", "steps"), [(1e3, 1), pytest.param(2e5, 5, marks=pytest.mark.slow)])
 def test_a_polygon_is_as_exact(p, steps):
-    """A mesh of triangles in its place, with thirds as large, has stresses within 0.73 %."""
+    """A mesh of triangles with the same size of cells has stresses with an error of 0.73 %."""
     pytest.importorskip("gmsh")
     inner, outer = (np.linspace(0, np.pi / 2, 1 + n) for n in (48, 96))
     inner, outer = (r * np.stack([np.cos(a), np.sin(a)], axis=1).clip(0) for r, a in ((1, inner), (2, outer[::-1])))
@@ -282,7 +284,7 @@ def test_cells_may_be_numbered_either_way_round(kind):
 
 @pytest.mark.parametrize("kind", ["triangle", "quad", "tetra", "hexahedron", "wedge"])
 def test_a_strip_that_is_bent_round_until_its_ends_meet_is_refused_once_they_overlap(kind):
-    """Overlapping cells share no facet there, and all shared facets have a cell on either side."""
+    """Overlapping cells share no facet there, and shared facets have a cell on either side."""
     dim = len(ALL[kind])
     grid = mpm.Grid([0] * dim, [4, 4, 1][:dim], [8, 8, 2][:dim])
 
@@ -300,7 +302,7 @@ def test_a_strip_that_is_bent_round_until_its_ends_meet_is_refused_once_they_ove
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_no_mesh_of_which_two_cells_hold_one_place_is_taken(dim):
-    """Meshes of random points, with one point moved, or some cells left out, or two added anywhere."""
+    """Meshes of random points with one displaced point, without some cells, or with two additional cells."""
     rng, grid, taken = np.random.default_rng(dim), mpm.Grid([0] * dim, [1.0] * dim, [1] * dim), {True: 0, False: 0}
     for trial in range(30):
         x = rng.random((rng.integers(dim + 3, 20), dim))
@@ -416,7 +418,7 @@ def seed(points, cells, part=None, grid=GRID, **options):
 
 
 def two_meshes(kind, x):
-    """Return two boxes of a kind of cells, the second one beginning at a place."""
+    """Return two boxes of one kind of cells; the second box begins at a given position."""
     one, two = (box_mesh(kind, (1,) * 3, (low, 0, 0), (low + 1, 1, 1)) for low in (0, x))
     rows = np.concatenate([one.cells[-1].data, two.cells[-1].data + len(one.points)])
     return meshio.Mesh(np.concatenate([one.points, two.points]), [(kind, rows)])
@@ -554,7 +556,7 @@ def test_a_polygon_has_the_names_of_its_edges_and_lies_on_others():
 
 
 def test_a_polygon_is_filled_in_any_thread():
-    """Only the main thread may set handlers of signals."""
+    """Only the main thread may set signal handlers."""
     grid = mpm.Grid([0, 0], [1, 1], [4, 4])
     found = []
     pytest.importorskip("gmsh")
@@ -566,7 +568,7 @@ def test_a_polygon_is_filled_in_any_thread():
 
 
 def test_a_polygon_in_national_coordinates_is_filled():
-    """gmsh ended the process."""
+    """Earlier, gmsh ended the process."""
     pytest.importorskip("gmsh")
     origin = np.array([512000.0, 5.4e6])
     grid = mpm.Grid(origin, np.add(origin, [6, 3]), [24, 12])

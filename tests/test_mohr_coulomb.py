@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Mohr and Coulomb's law: the return against all sets of active faces, tangent, objectivity, known strengths."""
+"""Mohr and Coulomb's law: return mapping compared with all sets of active faces, tangent, objectivity, strengths."""
 
 from dataclasses import replace
 from itertools import combinations, permutations
@@ -18,10 +18,10 @@ BRITTLE = replace(SAND, tension=1e5)
 
 
 def by_all_sets(e, m):
-    """Return the principal stresses (n, 3), Pa, of trial strains in any order.
+    """Return the principal stresses (n, 3), in Pa, of trial strains in any order.
 
-    Of all sets of active faces that which is admissible with multipliers >= 0.  Flow that does not dilate has none for
-    soil that is torn apart: it ends at the apex, where it may.
+    The result is that of the admissible set of active faces with multipliers >= 0. Without dilation, soil in tension
+    may have no such set; its stress is then at the apex.
     """
     D = (m.bulk - 2 * m.shear / 3) * np.ones((3, 3)) + 2 * m.shear * np.eye(3)
     p, q, a, b = 1 + m.sine, 1 - m.sine, 1 + m.sine_flow, 1 - m.sine_flow
@@ -48,7 +48,7 @@ def by_all_sets(e, m):
 
 
 def trials(n, seed=0):
-    """Return ordered trial strains (n, 3) that end everywhere, a third of them with two or three equal."""
+    """Return ordered trial strains (n, 3) that end in all regions, a third of them with two or three equal values."""
     rng = np.random.default_rng(seed)
     e = rng.normal(size=(n, 3)) * 10 ** rng.uniform(-2.5, -0.5, size=(n, 1)) + 0.02 * rng.normal(size=(n, 1))
     e[: n // 8, 1] = e[: n // 8, 0]
@@ -131,7 +131,7 @@ def test_a_rotation_turns_the_stress_and_leaves_the_state(law):
 
 
 def test_triaxial_strengths_are_those_of_mohrs_circles():
-    """In compression and extension, of Kirchhoff stresses: (t1 - t3)/2 = c cos phi - (t1 + t3)/2 sin phi."""
+    """Compression and extension, in Kirchhoff stresses: (t1 - t3)/2 = c cos phi - (t1 + t3)/2 sin phi."""
     for strain in (0.1, -0.1):
         r = element_test(replace(SAND, cohesion=1e4), "triaxial drained", strain, steps=10, confinement=1e5)
         tau = np.sort(np.diag(r.stress[-1])) * np.linalg.det(r.F[-1])

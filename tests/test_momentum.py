@@ -49,7 +49,7 @@ def test_the_load_is_the_traction_times_the_area_also_where_a_domain_is_partly_l
 
 @pytest.mark.parametrize("strain", [1e-3, 1e-9])
 def test_a_tiny_load_is_carried_however_stiff_a_part_of_the_body_is(strain):
-    """Round-off in the stiff part is larger than the load."""
+    """The round-off in the stiff part exceeds the load."""
     grid = mpm.Grid([0, 0], [0.1, 1.0], [1, 10])
     bodies = [mpm.box(grid, [0, 0], [0.1, 0.5]), mpm.box(grid, [0, 0.5], [0.1, 1.0], material=1)]
     soft, hard = mpm.Hencky(bulk=1e5, shear=1e5), mpm.Hencky(bulk=1e13, shear=1e13)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Grid lines that follow a tool or a function: each step is as exact as on lines that stay."""
+"""Grid lines that follow a tool or a function: each step is as exact as on fixed lines."""
 
 from functools import partial
 
@@ -18,7 +18,7 @@ from mpm_dolfinx.grid.grid import SIDES
 
 
 def jumping(dim, axisymmetric=False, every=1.0, high=1.3, last=3):
-    """Return a grid whose lines are other random ones every so many seconds, and stay from the last time on."""
+    """Return a grid with new random lines at regular times, which are fixed from the last time on."""
     cells = (8, 7) if dim == 2 else (5, 4, 5)
     lines = partial(at_random, [0] * dim, [high] * dim, cells)
     return mpm.Grid(lines=lines(0), follow=lambda t: lines(min(round(t / every), last)), axisymmetric=axisymmetric)
@@ -42,7 +42,7 @@ def test_even_stresses_are_exact_while_lines_jump_at_random(dim, axisymmetric):
 
 @pytest.mark.parametrize("dim, axisymmetric", KINDS)
 def test_linear_pressures_are_exact_while_lines_jump_at_random(dim, axisymmetric):
-    """In steady flow through a block that ends within cells, with gravity."""
+    """Steady flow through a block that ends within cells, with gravity."""
     grid, g = jumping(dim, axisymmetric, 1e3), np.array([0.0] * (dim - 1) + [-9.81])
     slope = np.array([0.0 if axisymmetric else 3e3, -2e3, 1e3])[:dim]
     rock = mpm.Hencky(bulk=1e15, shear=1e15, porosity=0.4, conductivity=1e-4)
@@ -58,7 +58,7 @@ def test_linear_pressures_are_exact_while_lines_jump_at_random(dim, axisymmetric
 
 
 def test_sealed_soil_keeps_its_water_and_its_stress_while_lines_jump():
-    """Each cell's water changes, their sum does not, though pressures differ from point to point."""
+    """The water of each cell changes, but the sum does not, although pressures differ from point to point."""
     grid = jumping(2)
     soil = mpm.Hencky(1e6, 4e5, porosity=0.4)
     walls = dict.fromkeys(SIDES[2], "xy")
@@ -99,7 +99,7 @@ def test_smallest_cells_move_with_the_tool_by_whole_cells_and_the_others_grow_fr
 
 @pytest.mark.parametrize("load", [None, lambda t: 1e5 * t])
 def test_a_run_goes_on_from_a_checkpoint_with_the_same_bits(load, tmp_path):
-    """Of a tool that moves as told, and of one under a load, whose way is in the checkpoint."""
+    """A tool with a prescribed path, and a tool under a load, whose position is in the checkpoint."""
     file, ends = tmp_path / "kept", []
     for parts in (1, 2):
         s = pushed(load)
@@ -130,7 +130,7 @@ def test_scenes_in_turn_on_one_grid_do_not_disturb_each_other():
 
 
 def test_bodies_and_scenes_made_after_a_run_begin_on_the_given_lines():
-    """With an initial stress and pressure that depend on the cells; bodies from boxes and meshes."""
+    """Initial stress and pressure depend on the cells; bodies are boxes and meshes."""
     ends, grid = [], jumping(2)
     for used in (True, False):
         grid = grid if used else jumping(2)
@@ -155,7 +155,7 @@ TRIANGLE = mpm.Convex([(1, 1), (2, 1), (1.5, 1.9)])
 
 
 def away(y):
-    """Return the distance from a disc, as a function of the user's."""
+    """Return the distance from a disc, as a user-defined function."""
     return np.linalg.norm(y - 1.5, axis=1) - 0.2
 
 
@@ -170,7 +170,7 @@ def away(y):
     ids=["disc", "polygon", "function", "about itself"],
 )
 def test_lines_follow_the_middle_of_a_tool_that_turns(tool, way):
-    """By whole cells towards zero; of a function, its centre."""
+    """Displacements are rounded to whole cells, towards zero. A function gives its centre."""
     given = [[0, 0.5, 0.8, 1.1, 1.45, 1.55, 1.9, 2.2, 2.5, 3]] * 2
     grid = mpm.Grid(lines=given, follow=tool)
     body = mpm.box(grid, [0, 0], [3, 0.2])
@@ -182,7 +182,7 @@ def test_lines_follow_the_middle_of_a_tool_that_turns(tool, way):
 
 
 def test_lines_stay_in_a_stage_without_the_tool_and_follow_one_with_its_name():
-    """Another condition may have the name."""
+    """Another condition may have the same name."""
     disc, again = (mpm.Tool(mpm.Ball((1.5, 1.5), 0.2), lambda t: (0.5 * t, 0), name="bar") for _ in range(2))
     grid = mpm.Grid(lines=[[0, 1, 1.4, 1.6, 2, 3], LINES[1]], follow=disc)
     s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [3, 1])], [SOFT], walls={"bottom": "xy"}, conditions=[disc])
@@ -196,7 +196,7 @@ def test_lines_stay_in_a_stage_without_the_tool_and_follow_one_with_its_name():
 
 
 def test_a_step_keeps_its_cut_by_the_cells_where_it_moves():
-    """A block that is moved by half of STILL of the coarse cells keeps its cut there; in fine cells it does not."""
+    """A block that moves by half of STILL of the coarse cells keeps its cut in coarse cells, but not in fine cells."""
     kept, y = [], np.append(np.linspace(0, 0.1, 21), np.linspace(0.2, 1.2, 11))
     for low, high in ((0.02, 0.08), (0.5, 0.9)):
         grid = mpm.Grid(lines=[np.array([0, 0.1]), y])
@@ -209,7 +209,7 @@ def test_a_step_keeps_its_cut_by_the_cells_where_it_moves():
 
 
 def test_lines_that_move_less_than_corners_may_keep_the_cut():
-    """And lines that stay do."""
+    """The same holds for fixed lines."""
     for way, resets in ((0.0, 1), (1e-5, 1), (1e-2, 3)):
         given = [np.array([0, 0.1]), np.linspace(0, 1.2, 13) ** 1.1 * 1.2**-0.1]
         moved = lambda t, way=way, given=given: [given[0], given[1] + way * t * np.sin(np.pi * given[1] / 1.2) * 0.01]  # noqa: E731
@@ -222,7 +222,7 @@ def test_lines_that_move_less_than_corners_may_keep_the_cut():
 
 @pytest.mark.slow
 def test_a_body_carried_through_lines_that_move_against_it_and_back_is_as_one_in_equal_cells():
-    """A wet beam, clamped to a support that moves by its length, and bent on its way: residual stress and pressure."""
+    """A wet beam is clamped to a moving support, and bent on its path: residual stress and pressure."""
     h = 0.05
     given = mpm.graded([-0.6, 0], [2.6, 1.2], [[[0.0, 0.45], [1.0, 0.85]]], h, 1.2, 3 * h)
     follow = lambda t: carried(given, np.array([-0.25 * np.sin(np.pi * t), 0.05 * np.sin(4 * np.pi * t)]))  # noqa: E731
@@ -232,7 +232,7 @@ def test_a_body_carried_through_lines_that_move_against_it_and_back_is_as_one_in
 
 
 def on_swinging_lines(body, conditions, size=0.06, **more):
-    """Return wet soil of a box, or a mesh, on graded lines that swing along x."""
+    """Return wet soil of a box, or a mesh, on graded lines that oscillate along x."""
     given = mpm.graded([0, 0], [2, 2], [[[0.65, 0.88], [0.98, 1.24]]], size, 1.3)
     swing = lambda t: carried(given, np.array([0.4 * np.sin(20 * t), 0.0]))  # noqa: E731
     grid, numerics = mpm.Grid(lines=given, follow=swing), mpm.Numerics(tolerance=1e-11)
@@ -311,7 +311,7 @@ BALL = mpm.Tool(mpm.Ball((1.5, 1.5), 0.2), lambda t: (0, -t))
 
 
 def step(follow, lines=LINES, there=True, **more):
-    """Make a step, at t = 1 s, on lines that follow; a tool may be there or not."""
+    """Take a step at t = 1 s on lines that follow, with or without a tool."""
     grid = mpm.Grid(lines=lines, follow=follow)
     tool = [follow] if isinstance(follow, mpm.Tool) and there else []
     s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [3, 1])], [SOFT], walls={"bottom": "xy"}, conditions=tool, **more)
@@ -344,7 +344,7 @@ def test_lines_that_cannot_follow_are_refused_in_one_line(make, name, value):
 
 @pytest.mark.slow
 def test_a_cone_meets_the_force_that_it_meets_in_lines_that_are_fine_all_along_its_way():
-    """Blunt, rough, from the surface of clay by two cells, in axisymmetry: in every step."""
+    """A blunt, rough cone penetrates clay by two cells, in axisymmetry: force in every step."""
     clay, h, way, wide = mpm.DruckerPrager(5e6, 1e5, friction=0.0, dilation=0.0, cohesion=1e3), 0.1, 0.2, 0.6
     forces = []
     for follow in (False, True):

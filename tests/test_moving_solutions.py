@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Manufactured motions at large strain are met at second order in the cells and steps together."""
+"""Manufactured motions at large strain are reproduced with second order in cells and steps together."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ SOIL = mpm.NeoHookean(bulk=LAM + 2 / 3 * MU, shear=MU, grain_density=2 * RHO, po
 
 
 def pushed(force):
-    """Return the term of a body force, m/s^2, UFL of reference positions and time, of the mass at rest."""
+    """Return the term of a body force, in m/s^2, a UFL function of reference positions and time."""
 
     def term(points, v, t):
         b = force(points.position - points.displacement, t)
@@ -23,9 +23,9 @@ def pushed(force):
 
 
 def swinging_apart(n, t_end, amplitude=0.05):
-    """Return the error of u, over its amplitude, of x_i = X_i + A sin(2 pi X_i) sin(pi t + phi_i), phi = (0, pi).
+    """Return the error of u, divided by its amplitude: x_i = X_i + A sin(2 pi X_i) sin(pi t + phi_i), phi = (0, pi).
 
-    Wallstedt and Guilkey (2008), between walls that let slide.
+    Wallstedt and Guilkey (2008), between smooth walls.
     """
     phase = (0.0, np.pi)
 
@@ -60,10 +60,10 @@ def swinging_apart(n, t_end, amplitude=0.05):
 
 
 def vortex(n, t_end, amplitude):
-    """Return the error of positions, over the amplitude, in a ring that rotates and returns within a second.
+    """Return the error of positions, divided by the amplitude, in a ring that rotates and returns within a second.
 
     theta = Theta + G(t) h(R), G = A/2 (1 - cos(2 pi t)), h = 1 - 32 (R - 1)^2 + 256 (R - 1)^4 from R = 0.75 to 1.25 m;
-    the material beyond is at rest. Kamojjala, Brannon, Sadeghirad and Guilkey (2015).
+    the material outside is at rest. Kamojjala, Brannon, Sadeghirad and Guilkey (2015).
     """
     w = 2 * np.pi
 
@@ -100,6 +100,6 @@ def test_a_square_whose_sides_swing_apart_is_met_at_second_order():
 
 @pytest.mark.slow
 def test_a_vortex_is_met_at_second_order():
-    """It turns by half a radian, with shear strains up to 1.2; by a radian with 20 and 40 cells the order is 1.1."""
+    """Rotation by half a radian, with shear strains up to 1.2. By a radian with 20 and 40 cells, the order is 1.1."""
     off = [vortex(n, 0.5, 0.5) for n in (20, 40)]
     assert off[1] < 0.01 and np.log2(off[0] / off[1]) > 1.8, off

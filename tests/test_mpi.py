@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The same answer on any number of processes."""
+"""Results are equal on any number of processes."""
 
 import os
 import subprocess
@@ -17,7 +17,7 @@ from mpm_dolfinx.grid.partition import Partition, boxes
 
 
 def mpirun(processes: int, script: str, *arguments: str) -> None:
-    """Run a script of this folder by mpirun; a failing rank aborts all. The limit is one of hanging."""
+    """Run a script of this folder by mpirun. A failing process aborts all. The time limit detects hanging processes."""
     here = Path(__file__).parent
     environment = dict(os.environ)  # given whole: mpirun must not see the MPI variables of this process
     folders = (here, here.parent, here.parent / "demos")
@@ -56,7 +56,7 @@ def test_the_state_is_the_same_on_several_processes(scene, several, tmp_path):
 
 
 def test_a_demo_of_several_processes_prints_what_one_does_or_is_refused(tmp_path, capsys, monkeypatch):
-    """The footing's demo ended with an IndexError at its first picture, others drew some of the points."""
+    """Earlier, the footing's demo ended with an IndexError at its first picture, and others drew only some points."""
     push = "../demos/footing.py --cells 3 --depth 0.05 --steps 2 --box 2 --out".split()
     mpirun(2, *push, str(tmp_path))
     monkeypatch.setattr(common, "MPI", SimpleNamespace(COMM_WORLD=SimpleNamespace(size=2, rank=0)))
@@ -112,7 +112,9 @@ def test_imbalance_memory_and_traffic_are_those_of_the_processes(tmp_path):
 @pytest.mark.parametrize("scene", ["carried", "dug"])
 @pytest.mark.parametrize("processes", [2, *(pytest.param(n, marks=pytest.mark.slow) for n in (3, 4))])
 def test_bodies_that_leave_their_processes_are_distributed_anew_with_the_same_answer(scene, processes, tmp_path):
-    """It kept the cells as seeded.  Resumed runs end with the same bits, and on one process with the same answer."""
+    """Earlier, the scene kept the initial cells. Resumed runs end with equal bits, and on one process with equal
+    results.
+    """
     files = [tmp_path / f"{scene}-{n}.npz" for n in (processes, 1)]
     for n, file in zip((processes, 1), files, strict=True):
         mpirun(n, "mpi_moving.py", str(file), str(tmp_path / "checkpoint"))
@@ -124,7 +126,9 @@ def test_bodies_that_leave_their_processes_are_distributed_anew_with_the_same_an
 
 
 def test_a_second_scene_on_a_grid_is_as_even_as_alone(tmp_path):
-    """It kept the processes' cells of the first scene, and of bodies before their maps: all points lay on one."""
+    """Earlier, the grid kept the distribution of the first scene, and of bodies before their maps: one process had all
+    points.
+    """
     mpirun(2, "mpi_second_scene.py", str(tmp_path / "out.npz"))
     assert np.load(tmp_path / "out.npz")["imbalance"].max() < 1.3
 
@@ -139,7 +143,7 @@ MANY_POINTS = pytest.param("3e5", "boxes", 0.3, marks=pytest.mark.slow)
 
 @pytest.mark.parametrize("points, of, bound", [("1e4", "boxes", 0.28), ("1e4", "meshes", 0.28), MANY_POINTS])
 def test_no_process_holds_arrays_of_the_whole_scene(points, of, bound, tmp_path):
-    """The excess over a quarter is due to borders between processes, and to more points on one process than another.
+    """The excess over a quarter is due to borders between processes, and to uneven numbers of points.
 
     The largest shares are 0.266 of 1e4 points, and 0.265 of 3e5 points.
     """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Multigrid on the background grid ends where factors do, in as many iterations on any grid."""
+"""Multigrid on the background grid has the solution of direct solvers, in as many iterations on any grid."""
 
 from dataclasses import replace
 
@@ -20,19 +20,19 @@ from mpm_dolfinx.solve.solver_choice import THRESHOLDS
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch):
-    """Let small bodies be solved by multigrid."""
+    """Use multigrid for small bodies too."""
     thresholds(monkeypatch, multigrid_2d=1, coarsest=50)
 
 
 def factorised(monkeypatch) -> list[int]:
-    """Return a list that grows with each factorisation that takes the place of the cycles."""
+    """Return a list that grows with each factorisation that replaces multigrid cycles."""
     made, factorise = [], monolithic.BlockSolver._factorised
     monkeypatch.setattr(monolithic.BlockSolver, "_factorised", lambda self: made.append(1) or factorise(self))
     return made
 
 
 def same_end(one: mpm.Simulation, other: mpm.Simulation) -> None:
-    """Assert that two simulations have come to the same state."""
+    """Assert that two simulations are in the same state."""
     assert np.abs(one.points.x - other.points.x).max() < 1e-10
     scale = np.abs(one.points.pressure).max()
     assert other.points.pressure == pytest.approx(one.points.pressure, abs=1e-8 * scale)
@@ -49,7 +49,7 @@ def test_large_elastic_bodies_in_2d_end_where_those_do_whose_matrices_are_factor
 
 
 def test_petscs_options_for_factors_are_not_for_multigrid():
-    """On two processes SuperLU in its place ended the process."""
+    """On two processes, SuperLU as replacement ended the process."""
     A = PETSc.Mat().createAIJ((4, 4), nnz=1, comm=PETSc.COMM_SELF)
     places = np.array([[0, 0, 0], [0, 1, 0], [1, 0, 0], [1, 1, 0]])
     PETSc.Options()["mpm_momentum_pc_type"] = "lu"
@@ -67,7 +67,7 @@ def test_finer_grids_take_no_more_iterations():
 
 
 def layers(X, below: float, above: float):
-    """Return values of a lower layer, a third of the body, and of the upper part."""
+    """Return one value for a lower layer, a third of the body, and another value for the upper part."""
     return np.where(X[:, 1] < 0.1, below, above)
 
 
@@ -115,7 +115,7 @@ def test_factors_that_take_many_iterations_are_made_anew(monkeypatch):
 
 
 def test_a_step_depends_on_no_step_before(monkeypatch):
-    """As it must for a run that is resumed to go on as the first one did."""
+    """Otherwise a resumed run would differ from an uninterrupted run."""
     thresholds(monkeypatch, many=4)
     first, second = pressed(), pressed()
     first.step(0.02)
@@ -126,7 +126,7 @@ def test_a_step_depends_on_no_step_before(monkeypatch):
 
 @pytest.mark.parametrize(("bulk", "load"), [(2.2e9, 1e4), (5e6, 3e6)], ids=["stiff", "soft"])
 def test_sealed_bodies_in_which_hardly_any_fluid_changes_places_converge(bulk, load):
-    """With scales that differ as much as forces and this fluid, rounding left more than steps may leave."""
+    """Earlier, the scales of forces and fluid differed so much that rounding exceeded the tolerance."""
     press = mpm.Traction("top", lambda t: (0, -load * t**2))
     result = column(cells=4, conditions=[press], fluid=mpm.Fluid(bulk=bulk)).run(1.0, 0.01, progress=False)
     assert result.cuts == 0 and result.residual <= 1e-8 and result.balance <= 1e-8
@@ -156,7 +156,7 @@ def test_linear_functions_are_interpolated_exactly_between_nodes_and_constants_b
 
 @given(cells_of_bodies, st.booleans(), st.sampled_from([None, "left", "bottom"]))
 def test_coarse_unknowns_do_not_depend_on_one_another(cells, nodal, wall):
-    """Else coarse matrices were singular."""
+    """Otherwise coarse matrices would be singular."""
     index = indices(cells, nodal)
     places = np.column_stack([index, np.zeros(len(index), dtype=np.int64)])
     walls = np.zeros(len(index), dtype=bool)

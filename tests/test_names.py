@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Names in docstrings and comments exist, at the place that is given."""
+"""Names in docstrings and comments exist, at the given place."""
 
 import ast
 import importlib
@@ -56,7 +56,7 @@ MEMBERS = {node.name: words(node) for tree in TREES.values() for node in tree.bo
 
 
 def of_library(name: str, module: ModuleType) -> bool:
-    """Return whether a dotted name is one of a library that a module imports, or of a part of it."""
+    """Return whether a dotted name belongs to a library that a module imports."""
     first, *rest = name.split(".")
     libraries = [value for value in vars(module).values() if isinstance(value, ModuleType)]
     for found in [vars(module).get(first), *(getattr(library, first, None) for library in libraries)]:
@@ -68,7 +68,7 @@ def of_library(name: str, module: ModuleType) -> bool:
 
 
 def stale(file: Path, name: str) -> bool:
-    """Return whether a name in a file is that of nothing."""
+    """Return whether a name in a file has no object."""
     if Path(name).suffix in WRITTEN or of_library(name, module_of(file)):
         return False
     *before, last = name.split(".")
@@ -86,7 +86,7 @@ def stale(file: Path, name: str) -> bool:
 
 
 def test_names_in_backticks_are_there():
-    """Seven belonged to renamed or moved objects."""
+    """Seven names belonged to renamed or moved objects."""
     found = [(f, name) for f, text in TEXTS.items() for name in NAME.findall(text) if stale(f, name)]
     assert not found, "\n".join(f"{file.relative_to(ROOT)}: {name}" for file, name in found)
 

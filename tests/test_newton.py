@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Newton's method: exploding steps are shortened; residuals above round-off are solved for, however small."""
+"""Newton's method: exploding steps are shortened, and residuals above round-off are reduced, however small."""
 
 from dataclasses import dataclass, replace
 
@@ -17,7 +17,7 @@ SIDES = {"left": "x", "right": "x"}
 
 @dataclass(frozen=True)
 class Stiffening(mpm.Skeleton):
-    """Linear in all components of F - I but the last, along y, whose stress is soft e exp(exponent e^2)."""
+    """A law linear in all components of F - I except the last, along y, with the stress soft e exp(exponent e^2)."""
 
     soft: mpm.Field = 1.0
     exponent: mpm.Field = 1.0
@@ -31,10 +31,11 @@ class Stiffening(mpm.Skeleton):
 
 @pytest.mark.parametrize(("exponent", "shortened"), [(8, False), (14, True)])
 def test_a_newton_step_is_shortened_where_the_residual_grows_more_than_ten_thousandfold(exponent, shortened):
-    """A body under tension across is pulled upward by 1e5 times less on release: its tangent along y is that soft.
+    """A body under lateral tension is pulled upward by 1e5 times less after its release: its tangent along y is that
+    soft.
 
-    The first step overshoots to e = 1, where the residual is 3e3 or 1e6 times its initial value. From there Newton's
-    method returns in a few more iterations than the exponent.
+    The first step overshoots to e = 1, with a residual of 3e3 or 1e6 times the initial one. Newton's method then
+    returns in a few more iterations than the exponent.
     """
     grid, across = mpm.Grid([0, 0], [1.2, 1.5], [12, 15]), 1e5
     pulls = [mpm.Traction("right", (across, 0)), mpm.Traction("top", lambda t: (0, float(t > 1)))]
@@ -60,7 +61,7 @@ def test_a_newton_step_is_shortened_where_the_residual_grows_more_than_ten_thous
 
 
 def pressed_block(t_jump=np.inf):
-    """Return a draining block under a load that grows with time, and falls to a fifth at t_jump (s)."""
+    """Return a draining block under a growing load, which decreases to a fifth at t_jump (s)."""
     grid = mpm.Grid([0, 0], [1, 1.25], [4, 5])
     load = mpm.Traction("top", lambda t: (0, -1e5 * t * (0.2 if t > t_jump else 1.0)))
     conditions = [load, mpm.Drained("top")]
@@ -70,7 +71,7 @@ def pressed_block(t_jump=np.inf):
 
 @pytest.mark.parametrize("t_jump", [np.inf, 0.75])
 def test_an_extrapolated_start_saves_newton_steps_and_changes_no_result_even_after_a_jump(t_jump):
-    """The same steps are taken from rest."""
+    """The same steps are taken from rest for comparison."""
     ahead, from_rest, counts = pressed_block(t_jump), pressed_block(t_jump), []
     for _ in range(10):
         from_rest.state = replace(from_rest.state, trend=None)
@@ -82,13 +83,13 @@ def test_an_extrapolated_start_saves_newton_steps_and_changes_no_result_even_aft
 
 
 def stretch(load):
-    """Return the stretch of a bar of SOIL, held across, by a load over its modulus (dead): ln a / a."""
+    """Return the stretch of a laterally confined bar of SOIL under a dead load, divided by its modulus: ln a / a."""
     return brentq(lambda a: np.log(a) / a - load, 1, 2)
 
 
 @pytest.mark.parametrize(("stiffer", "load", "error"), [(1e7, 0.01, 1e-4), (1e8, 0.03, 1e-5)])
 def test_what_round_off_in_a_stiff_part_does_not_hide_is_solved_for(stiffer, load, error):
-    """After Newton's first step the soft part's residual is 100 times the round-off of the stiff part."""
+    """After Newton's first step, the residual of the soft part is 100 times the round-off of the stiff part."""
     grid = mpm.Grid([0, 0], [0.1, 1.0], [1, 10])
     bodies = [mpm.box(grid, [0, 0], [0.1, 0.5]), mpm.box(grid, [0, 0.5], [0.1, 0.9], material=1)]
     hard = mpm.Hencky(bulk=stiffer * SOIL.bulk, shear=stiffer * SOIL.shear)
@@ -110,7 +111,7 @@ def test_residuals_and_balance_are_told_as_they_are_also_where_they_are_round_of
 
 
 def test_what_the_rounding_of_places_far_from_the_origin_does_not_hide_is_solved_for():
-    """A bar that a given displacement holds, a thousand cells from the origin."""
+    """A bar with a prescribed displacement, a thousand cells from the origin."""
     grid = mpm.Grid([100.0, 0.0], [100.1, 1.2], [1, 12])
     foot, pull = mpm.Displacement("bottom", (0, 0), "y"), mpm.Traction("top", (0, 0.2 * SOIL.oedometric))
     bar = mpm.box(grid, [100.0, 0.1], [100.1, 0.9])
@@ -121,7 +122,7 @@ def test_what_the_rounding_of_places_far_from_the_origin_does_not_hide_is_solved
 
 @pytest.mark.parametrize("share", [1e-12, 2e-13])
 def test_fluid_that_comes_in_is_stored_however_little_it_is(share):
-    """Of the body's volume; its rounding leaves 2e-15."""
+    """The error is relative to the body's volume; rounding causes 2e-15."""
     grid, water = mpm.Grid([0, 0], [0.1, 1.0], [1, 10]), mpm.Fluid(bulk=1e7)
     body, walls = mpm.box(grid, [0, 0], [0.1, 0.8]), SIDES | {"bottom": "y"}
     filling = [lambda points, q: share * q * points.dx]
@@ -133,7 +134,7 @@ def test_fluid_that_comes_in_is_stored_however_little_it_is(share):
 
 @pytest.mark.parametrize("difference", [1e-11, 2e-12])
 def test_fluid_flows_between_sides_however_little_their_pressures_differ(difference):
-    """Of the pressure; to the cells' fluxes, which cancel, rounding may add 2e-15 of each."""
+    """The error is relative to the pressure. Rounding may add 2e-15 of each flux, and these fluxes cancel."""
     grid, high = mpm.Grid([0, 0], [0.1, 1.0], [1, 10]), 1e5
     soil = mpm.Hencky(bulk=1e7, shear=1e7, conductivity=1e-4)
     sides = [mpm.Drained("top", high), mpm.Drained("bottom", high * (1 + difference))]
@@ -146,7 +147,7 @@ def test_fluid_flows_between_sides_however_little_their_pressures_differ(differe
 
 
 def test_what_fluxes_gain_by_displacements_is_what_their_residual_does():
-    """With a law of the conductivity, gravity, and cells that turn and stretch; against central differences."""
+    """With a conductivity law, gravity, and rotating, stretching cells: comparison with central differences."""
     law = lambda conductivity, J: conductivity * J**3 / (1 - ufl.ln(J))  # noqa: E731
     soil = mpm.Hencky(bulk=1e5, shear=1e5, conductivity=1e-2, conductivity_law=law)
     grid, rng = mpm.Grid([0, 0], [1.0, 1.0], [4, 4]), np.random.default_rng(3)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Laws along paths that cycle and rotate: a rotating observer sees rotated stresses."""
+"""Laws along paths with cycles and rotations: a rotating observer sees rotated stresses."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,9 @@ LAWS = {
 
 
 def path(dim, steps=24, points=6):
-    """Return deformation gradients (steps, n, d, d) of two cycles, of each point its own, and turns (steps, d, d)."""
+    """Return deformation gradients (steps, n, d, d) of two cycles, different at each point, and rotations (steps, d,
+    d).
+    """
     rng = np.random.default_rng(dim)
     amplitude, phase = 0.04 * rng.normal(size=(points, dim, dim)), 2 * np.pi * rng.random(size=(points, dim, dim))
     times = np.arange(1, steps + 1) / steps

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Output of a run on the disk and on the terminal."""
+"""Output of a run on disk and on the terminal."""
 
 import csv
 import importlib
@@ -29,7 +29,7 @@ from mpm_dolfinx.points.cutting import volumes
 
 
 def with_h5py():
-    """Skip without an h5py that works with dolfinx; PyPI's has its own HDF5."""
+    """Skip the test without an h5py that works with dolfinx; the h5py of PyPI has its own HDF5."""
     try:
         importlib.import_module("h5py")
     except Exception as error:
@@ -37,7 +37,7 @@ def with_h5py():
 
 
 def index(file):
-    """Return the times of an index and the files of each."""
+    """Return the times of an index and the files of each time."""
     out = {}
     for item in ElementTree.parse(file).iter("DataSet"):
         out.setdefault(float(item.get("timestep")), []).append(file.parent / item.get("file"))
@@ -52,7 +52,7 @@ def table(file):
 
 
 def fields(file):
-    """Return the arrays of a file of dolfinx's, which are text."""
+    """Return the arrays of a text file of dolfinx."""
     arrays = ElementTree.parse(file).iter("DataArray")
     return {a.get("Name", "x"): np.array(a.text.split(), dtype=float) for a in arrays}
 
@@ -142,7 +142,7 @@ def test_fields_of_the_grid_are_read_back_as_they_were(written):
 
 
 def test_all_times_are_in_one_file(tmp_path, capsys):
-    """Also where a body has been dug away between two of them, and without the h5py that it needs."""
+    """Also if a body is removed between two times, and without h5py."""
     with_h5py()
     grid = mpm.Grid([0, -0.4], [1.4, 1.2], [7, 8])
     bodies = [mpm.box(grid, [0, y], [1, y + 0.4]) for y in (0, 0.4)]
@@ -195,7 +195,7 @@ def test_the_table_holds_the_histories(written):
 
 
 def reactions(file, sides=("bottom", "top")):
-    """Return the forces (rows, displacements, 2) that a table holds of two given displacements."""
+    """Return the forces (rows, displacements, 2) of two prescribed displacements in a table."""
     found = table(file)
     return np.stack([[found[f"reaction_{axis}_displacement_{side}"] for axis in "xy"] for side in sides]).transpose(
         2, 0, 1
@@ -203,7 +203,7 @@ def reactions(file, sides=("bottom", "top")):
 
 
 def test_the_table_holds_the_forces_of_given_displacements(tmp_path):
-    """Of a run in one go, of one that was resumed and of one on two processes."""
+    """The run is uninterrupted, resumed, or on two processes."""
     (simulation, writer), forces = sheared(tmp_path / "whole"), [np.zeros((2, 2))]
     simulation.run(1.0, 0.25, observe=[writer, lambda s: forces.append(s.reactions.array)])
     whole = reactions(tmp_path / "whole" / "history.csv")
@@ -382,7 +382,7 @@ def test_points_are_shown_in_one_line_of_numbers():
 
 
 def test_tools_are_written_where_they_are(tmp_path):
-    """A disc that goes down, and a plate outside of the grid, which is not visible."""
+    """A disc that moves down, and an invisible plate outside of the grid."""
     grid = mpm.Grid([0, 0], [1.0, 1.0], [8, 8])
     disc = mpm.Tool(mpm.Ball((0.5, 0.75), 0.25), displacement=lambda t: (0, -0.06 * t))
     walls = {"left": "x", "right": "x", "bottom": "xy"}

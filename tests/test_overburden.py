@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The weight above a position, of domains of any shape, and beside borders between bodies."""
+"""The weight above a position, for domains of any shape, and next to interfaces of bodies."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from mpm_dolfinx.points.cutting import corner_bits
 
 
 def block(dim, cells=4, shift=0.3):
-    """Return the corners of domains that fill a cube of edge `cells` between nodes that lie off a lattice."""
+    """Return the corners of domains that fill a cube with edge `cells`, between irregular nodes."""
     nodes = np.stack(np.meshgrid(*[np.arange(cells + 1.0)] * dim, indexing="ij"), axis=-1)
     inner = ((nodes > 0) & (nodes < cells)).all(axis=-1)
     nodes += np.random.default_rng(1).uniform(-shift, shift, nodes.shape) * inner[..., None]
@@ -19,7 +19,7 @@ def block(dim, cells=4, shift=0.3):
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_domains_with_bent_faces_weigh_what_their_column_does(dim):
-    """Faces were planes through their middle: beside a corner a domain was missed, 7 % of the weight."""
+    """Earlier, faces were planes through their midpoint: near a corner a domain was missed, 7 % of the weight."""
     corners = block(dim)
     x = corners.mean(axis=1)
     weight, surface = overburden(corners, np.full(len(corners), 2.0), x)

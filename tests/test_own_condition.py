@@ -15,7 +15,7 @@ STIFFNESS = 2e6  # Pa/m
 
 
 class Forms:
-    """Work of springs, k (u + w) . v, w the displacement at the start of the step, and its derivative."""
+    """Work of springs, k (u + w) . v, with the displacement w at the start of the step, and its derivative."""
 
     def __init__(self, grid, u):
         self.points = p = FormPoints(grid, before=(grid.dim,))
@@ -70,7 +70,7 @@ class SpringLoads(mpm.Loads):
 
 
 def block(**options):
-    """Return a block that is loaded on top and stands on springs alone, but for rolls."""
+    """Return a block with a load on top, on springs alone, between smooth walls."""
     grid = mpm.Grid([0, -0.2], [1.0, 1.0], [5, 6])
     load = mpm.Traction("top", lambda t: (0, -2e4 * min(t, 1)), name="load")
     walls = {"left": "x", "right": "x"}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A bar that is pushed far into wet clay: clay that slides around it stays out of it."""
+"""A bar is pushed far into wet clay, and clay that slides around the bar does not penetrate it."""
 
 import cone
 import numpy as np
@@ -14,7 +14,7 @@ import mpm_dolfinx as mpm
     [(1000.0, 0.25), *(pytest.param(rate, 1.0, marks=pytest.mark.slow) for rate in demo.RATES.values())],
 )
 def test_wet_clay_flows_around_a_smooth_bar(rate, depth):
-    """No corner is deeper in the bar than 1e-3 h; steps are not cut, and the fluid balances."""
+    """No corner is deeper in the bar than 1e-3 h, steps are not cut, and the fluid is in balance."""
     cells = 4
     run = demo.push_wet(rate, cells, depth)
     corners, excess, _ = run.frame
@@ -31,7 +31,7 @@ def test_wet_clay_flows_around_a_smooth_bar(rate, depth):
     ("cells", "depth", "error"), [(4, 0.5, 0.12), pytest.param(8, 1.0, 0.03, marks=pytest.mark.slow)]
 )
 def test_clay_seeded_anew_resists_a_rough_bar_as_before(cells, depth, error):
-    """It has the stresses of the clay before."""
+    """The new points have the stresses of the old points."""
     run = demo.push(1.0, cells, depth)
     way = np.ceil(np.array(run.depth) / demo.LEG - 1e-9)
     ways = np.array([np.array(run.N)[run.steady & (way == k)].mean() for k in np.unique(way)])
@@ -42,7 +42,7 @@ def test_clay_seeded_anew_resists_a_rough_bar_as_before(cells, depth, error):
 
 @pytest.mark.slow
 def test_lines_that_follow_the_bar_find_the_resistance_in_a_quarter_of_the_cells():
-    """Within a per cent of that in equal cells."""
+    """The resistance agrees with that in equal cells to a per cent."""
     found = []
     for follow in (False, True):
         run = demo.push(1.0, 8, 0.5, follow)
@@ -54,7 +54,7 @@ def test_lines_that_follow_the_bar_find_the_resistance_in_a_quarter_of_the_cells
 
 @pytest.mark.slow
 def test_a_cone_is_pushed_ten_radii_deep_from_the_surface():
-    """Its resistance is that of a deep cone; at most one step in 20 is cut."""
+    """The resistance is that of a deep cone, and at most one step in 20 is cut."""
     run = cone.push(2, 10.0, mpm.MohrCoulomb(**cone.UNDRAINED))
     N, depth = np.array(run.N), np.array(run.depth)
     last = N[depth > 7]

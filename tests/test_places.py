@@ -9,7 +9,9 @@ from mpm_dolfinx.points.cutting import centroids, cut
 
 
 def irregular(X):
-    """Return places (n, 3), m, moved within the unit square or cube by up to a third of a domain; the outline stays."""
+    """Return positions (n, 3), in m, moved within the unit square or cube by up to a third of a domain; its outline is
+    fixed.
+    """
     X = np.asarray(X, dtype=float)
     wave = np.prod([4 * X[:, a] * (1 - X[:, a]) for a in range(X.shape[1]) if np.ptp(X[:, a])], axis=0)
     shifts = [np.sin(37 * X @ np.arange(1, X.shape[1] + 1) + k) for k in range(X.shape[1])]
@@ -17,7 +19,7 @@ def irregular(X):
 
 
 def at_rest(dim, **options):
-    """Return a cube of irregular domains in water at rest, two or four cells a side and a part of one."""
+    """Return a cube of irregular domains in water at rest, with two or four cells and a fraction over its edge."""
     grid = mpm.Grid([0] * dim, [1.2] * dim, [5 if dim == 2 else 3] * dim, **options)
     body = mpm.mapped(grid, mpm.box(grid, [0.0] * dim, [1.0] * dim), irregular)
     walls = {"left": "x", "bottom": "xyz"[:dim]} | ({"front": "y"} if dim == 3 else {})

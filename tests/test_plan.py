@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The choice of solvers is one function that prints itself; users give PETSc's options by the names of its solvers."""
+"""One function chooses the solvers and prints the choice; users pass PETSc's options by the names of its solvers."""
 
 from dataclasses import replace
 

@@ -16,7 +16,7 @@ ELASTIC, CONE, APEX = range(3)
 
 
 class AtPoints:
-    """The law at points, one a cell, where any deformation gradient can be tried."""
+    """The law at points, one in each cell, with arbitrary deformation gradients."""
 
     def __init__(self, dim):
         self.dim, cells = dim, {2: [8, 8], 3: [4, 4, 4]}[dim]
@@ -49,7 +49,7 @@ class AtPoints:
         return out[:, :9].reshape(-1, 3, 3), out[:, 9]
 
     def tangent(self, F):
-        """Return dP/dF (n, d, d, d, d) of the law and by central differences."""
+        """Return dP/dF (n, d, d, d, d), from the law and by central differences."""
         d, h = self.dim, 1e-6
         A = ufl.diff(self.P, self.F)
         A = PointExpression(ufl.as_vector([A[i] for i in np.ndindex(d, d, d, d)]), self.points)
@@ -117,7 +117,7 @@ def test_stress_and_state_are_those_of_the_return_in_principal_strains(law):
 
 
 def test_the_new_state_is_on_the_yield_surface(law):
-    """The stress of a step's end is that of the next step's start, without further flow."""
+    """The stress at the end of a step equals the stress at the start of the next step, without further flow."""
     F = gradients(law.dim)
     state = law.update(F)
     assert np.abs(law.kirchhoff(F, *state) - law.kirchhoff(F)).max() < 1e-9 * SAND.shear
@@ -189,7 +189,7 @@ def oedometric(m, strain):
 @pytest.mark.parametrize("dilation", [0.0, 10.0, 30.0])
 @pytest.mark.parametrize("hardening", [0.0, 5e6])
 def test_a_column_in_an_oedometer_follows_the_exact_path(dilation, hardening):
-    """Stress at yield and plastic slope; the strain out of plane is zero, its plastic part is not."""
+    """Stress at yield and plastic slope. The out-of-plane strain is zero, but its plastic part is not."""
     m = replace(SAND, cohesion=2e4, dilation=dilation, hardening=hardening)
     strain = lambda t: np.array(-0.05 * t)  # noqa: E731
     load = lambda t: (0, oedometric(m, strain(t))[0] / np.exp(strain(t)))  # noqa: E731
@@ -212,7 +212,7 @@ def test_a_column_in_an_oedometer_follows_the_exact_path(dilation, hardening):
 
 
 def assembled(simulation):
-    """Return (tangent, by central differences along a random direction) applied to that direction."""
+    """Return the products of the tangent, and of central differences, with a random direction."""
     momentum, rng = set_up(simulation, 1.0).momentum, np.random.default_rng(1)
     unknowns, nodal = momentum.system.unknowns, momentum.forms.u.x.array
     u, w = 5e-3 * np.random.default_rng(0).normal(size=unknowns.size), rng.normal(size=unknowns.size)
@@ -247,7 +247,7 @@ def test_without_flow_the_law_is_hencky():
 
 @pytest.mark.parametrize("dilation", [10.0, 30.0], ids=["not associated", "associated"])
 def test_a_drained_column_ends_where_the_dry_one_does(dilation):
-    """The coupled problem with an unsymmetric tangent: consolidation of a column that yields."""
+    """The coupled problem with an unsymmetric tangent: consolidation of a yielding column."""
     m = replace(SAND, cohesion=2e4, dilation=dilation, conductivity=1e-2)
     load = mpm.Traction("top", lambda t: (0, -8e5 * min(1, t)))
     dry = column(cells=4, fluid=False, material=m, conditions=[load])
@@ -260,7 +260,7 @@ def test_a_drained_column_ends_where_the_dry_one_does(dilation):
 
 
 def triaxial(m, axial, lateral):
-    """Return the exact axial and lateral stretch and kappa of triaxial compression, from the Kirchhoff stresses."""
+    """Return the exact axial and lateral stretch and kappa in triaxial compression, from the Kirchhoff stresses."""
     s, p = (lateral - axial) / np.sqrt(3), (2 * lateral + axial) / 3
     kappa = max(0.0, s + m.eta * p - m.xi * m.cohesion) / (m.xi * m.hardening)
     strain = [
@@ -272,7 +272,7 @@ def triaxial(m, axial, lateral):
 
 @pytest.mark.slow
 def test_drained_triaxial_compression_follows_the_exact_path():
-    """A cube in 3D: confined to 100 kPa, then loaded axially; stress at yield, plastic slope, lateral strain."""
+    """A cube in 3D is confined to 100 kPa, then loaded axially: stress at yield, plastic slope, lateral strain."""
     m = replace(SAND, cohesion=2e4, match="compression")
 
     def stress(t):
@@ -306,7 +306,9 @@ def test_drained_triaxial_compression_follows_the_exact_path():
 @pytest.mark.slow
 @pytest.mark.parametrize(("friction", "factor"), [(0.0, 2 + np.pi), (20.0, 14.83)])
 def test_a_strip_footing_sinks_at_prandtls_load(friction, factor):
-    """Bearing capacity over the cohesion, associated flow; from above, and a plateau: nothing locks."""
+    """Bearing capacity divided by the cohesion, with associated flow: the load has an upper bound and a plateau,
+    without locking.
+    """
     clay = mpm.DruckerPrager(bulk=2e7, shear=1e7, friction=friction, dilation=friction, cohesion=1e4)
     grid = mpm.Grid([0, 0], [5.0, 3.5], [40, 28])
     soil = mpm.box(grid, [0, 0], [5, 3])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Out-of-plane stresses, their invariants, and records of probes, compared with exact ones."""
+"""Out-of-plane stresses, their invariants, and histories of probes, compared with exact values."""
 
 import csv
 import re
@@ -17,7 +17,7 @@ BULK, SHEAR = 2e6, 1e6
 
 
 def column(law, fluid=None, dim=2, top=-0.1, **options):
-    """Return a unit block on rollers whose top is pressed down by a tenth in one step: uniform, lambda_y = 0.9."""
+    """Return a unit block on smooth walls after a uniform compression by a tenth in one step: lambda_y = 0.9."""
     grid = mpm.Grid([0] * dim, [1.5] * dim, [3] * dim)
     every = {"left": "x", "right": "x", "bottom": "xyz"[dim - 1], "front": "y", "back": "y"}
     walls = {name: axes for name, axes in every.items() if dim == 3 or name not in ("front", "back")}
@@ -71,7 +71,7 @@ def test_total_stress_has_bios_share_of_the_pressure():
 
 @dataclass(frozen=True)
 class Plane(mpm.Skeleton):
-    """A law for the plane only: a user's."""
+    """A user-defined law for plane scenes only."""
 
     @staticmethod
     def kirchhoff(F, bulk, shear):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Reported pressures of points: exact for linear fields, means are kept, and no new extremes."""
+"""Reported pressures of points are exact for linear fields, conserve means, and have no new extremes."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ RANDOM = np.random.default_rng(3)
 
 @pytest.mark.parametrize("offset", [0.0, 0.1, 0.9])
 def test_a_steady_pressure_between_two_drained_sides_is_linear(offset):
-    """The top cell is full, or nearly empty, or nearly full."""
+    """The top cell is full, nearly empty, or nearly full."""
     s = column(offset=offset, conditions=[mpm.Drained("top"), mpm.Drained("bottom", pressure=1.0)])
     s.step(1e9)
     assert s.points.pressure == pytest.approx(1 - s.points.x[:, 1] / (1 + offset / 10), abs=1e-6)
@@ -28,7 +28,7 @@ def test_a_hydrostatic_pressure_is_linear_down_to_the_sealed_floor(offset):
 
 
 def cells(shape, filled):
-    """Return a grid, its reconstruction, and centroids of cells that are filled so far in their last layer."""
+    """Return a grid, its reconstruction, and centroids of cells whose last layer is partly filled."""
     grid = mpm.Grid([0] * len(shape), 0.1 * np.array(shape), shape)
     centroid, faces = np.zeros((grid.num_local, grid.dim)), np.ones((grid.num_local, grid.dim, 2))
     last = grid.midpoints[:, -1] > grid.upper[-1] - grid.h[-1]
@@ -38,7 +38,7 @@ def cells(shape, filled):
 
 
 def outer(grid):
-    """Return no drained sides."""
+    """Return an empty set of drained sides."""
     return np.full((grid.num_owned, grid.dim, 2, 2), np.nan)
 
 
@@ -55,7 +55,9 @@ def test_a_linear_pressure_aslant_is_exact_also_at_sealed_sides(shape, filled):
 
 
 def test_a_steep_pressure_is_not_carried_on_beyond_the_last_cell():
-    """Ten times less from cell to cell: carried on it would be negative at the sealed end."""
+    """The pressure decreases by a factor of ten from cell to cell. An extrapolation would be negative at the no-flow
+    end.
+    """
     grid, reconstruction, centroid, faces = cells((1, 8), 1.0)
     order = np.argsort(grid.midpoints[:, 1])
     p = np.empty(8)
@@ -88,7 +90,9 @@ def test_a_body_of_one_cell_has_its_pressure():
 
 @pytest.mark.parametrize("tilt", [-1e-6, 0.0, 1e-6])
 def test_a_drained_side_that_leans_a_little_leaves_the_slope_along_it(tilt):
-    """Rounding decided: leaning over a sealed base it counted as drained, and water at rest had lost its slope."""
+    """Earlier, rounding decided whether a side inclined over a no-flow base counted as drained, and water at rest lost
+    its slope.
+    """
     grid = mpm.Grid([0, 0], [1.2, 1.0], [6, 5])
     body = mpm.box(grid, [0.2, 0], [1.0, 0.8])
     body = mpm.mapped(grid, body, lambda X: X + tilt * X[:, [1]] * [1, 0])
@@ -110,7 +114,7 @@ def test_a_drained_side_that_leans_a_little_leaves_the_slope_along_it(tilt):
 @pytest.mark.parametrize("drained", [[], [mpm.Drained("top")]], ids=["sealed", "drained"])
 @pytest.mark.parametrize("cells", [1, 2])
 def test_points_in_few_cells_have_the_slope_of_water_at_rest(cells, drained):
-    """At sealed sides it is the head that has no slope: two cells between them had 1283 for 2283 Pa."""
+    """At no-flow sides the head has no slope. Earlier, two cells between such sides had 1283 Pa in place of 2283 Pa."""
     grid = mpm.Grid([0, 0], [0.5, 0.75], [2, cells + 1] if cells == 2 else [2, 1])
     soil = mpm.Hencky(bulk=1e8, shear=6e7, conductivity=1e-3)
     s = mpm.Simulation(

@@ -22,14 +22,14 @@ def around(value, *sides, **options):
 
 
 def hardly_held(points, u):
-    """Return the energy of springs that hold a floating body where it is."""
+    """Return the energy of weak springs that hold a floating body in place."""
     U = points.displacement + points.value(u)
     return 1e-3 * ufl.inner(U, U) / ufl.det(points.F) * points.dx
 
 
 @pytest.mark.parametrize("turn, offset", [(0.0, 0.0), (0.3, 0.0), (1.0, 0.0511), (2.5, 0.03)])
 def test_a_floating_block_has_uniform_stress_at_any_turn_and_offset(turn, offset):
-    """Under 3 MPa its edges are a fifth shorter: the area is that of now."""
+    """Under 3 MPa the edges are a fifth shorter. Pressures act on the present area."""
     grid = mpm.Grid([0, 0], [1.2, 1.2], [12, 12])
     c, s = np.cos(turn), np.sin(turn)
     block = mpm.mapped(
@@ -58,7 +58,7 @@ def test_a_block_between_walls_has_uniform_stress_in_3d(top):
 
 
 def test_a_block_turned_in_space_has_uniform_stress_under_pressure():
-    """Gradients of Q1 functions are bilinear in 3D: at the centroids of the pieces alone it was 1 % off."""
+    """Gradients of Q1 functions are bilinear in 3D: with the centroids of the pieces alone, the error was 1 %."""
     grid, (c, s) = mpm.Grid([0] * 3, [1.2] * 3, [6] * 3), (0.8, 0.6)
     turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ np.array([[1, 0, 0], [0, s, -c], [0, c, s]])
     block = mpm.mapped(grid, mpm.box(grid, [0.3] * 3, [0.8] * 3), lambda X: (X - 0.55) @ turn.T + 0.56)
@@ -82,7 +82,7 @@ def test_a_sealed_saturated_body_shares_the_pressure_between_water_and_skeleton(
 
 
 def clamped_column(load):
-    """Return the sideways displacement of the top of a leaning column that buckles under a dead load of 20 kPa."""
+    """Return the lateral displacement of the top of an inclined column, which buckles under a dead load of 20 kPa."""
     grid = mpm.Grid([0, 0], [1.0, 1.2], [20, 24])
     body = mpm.mapped(grid, mpm.box(grid, [0.45, 0], [0.55, 1.0]), lambda X: X + 0.01 * X[:, 1:] * [1, 0])
     s = mpm.Simulation(grid, [body], [SOFT], walls={"bottom": "xy"}, conditions=load)
@@ -90,7 +90,7 @@ def clamped_column(load):
 
 
 def test_a_clamped_column_does_not_buckle_under_water():
-    """Dead normal loads on its sides and top are overcome at half the load that buckles it from its top alone."""
+    """Dead normal loads on sides and top would buckle the column at half of the load on its top alone."""
     with pytest.raises(mpm.GaveUp, match=r"t = 0\.[56]"):
         clamped_column([mpm.Traction(side, lambda t: -2e4 * t) for side in ("left", "right", "top")])
     water = lambda t: 1e6 * t  # noqa: E731
@@ -113,7 +113,7 @@ def pressed_beam(cells, load, wet):
 
 @pytest.mark.parametrize("wet", [False, True])
 def test_a_beam_under_a_pressure_that_follows_it_agrees_with_finite_elements(wet):
-    """Its tip goes down by a third of its length; the surface ends in the open, the tangent is unsymmetric."""
+    """The tip deflects by a third of the length. The loaded surface ends freely, so the tangent is unsymmetric."""
     load, steps = around(lambda t: 54e3 * min(1, t / 0.1), "top", **BEAM), (0.2, 0.02)
     scene = {"fluid": mpm.Fluid(), "conditions": [mpm.Drained("left"), mpm.Drained("right")]} if wet else {}
     s, probe = pressed_beam(60, load, scene)
@@ -131,7 +131,7 @@ def test_a_beam_under_a_pressure_that_follows_it_agrees_with_finite_elements(wet
 
 
 def clamped_block(dim, tractions):
-    """Return a block clamped at a wall, bent by a first step."""
+    """Return a block clamped at a wall and bent by a first step."""
     lower, upper = [0.0, 0.1, 0.1], [0.47, 0.6, 0.43]
     grid = mpm.Grid([0] * dim, [0.7, 0.7, 0.5][:dim], [7, 7, 5][:dim])
     body = mpm.box(grid, lower[:dim], upper[:dim])

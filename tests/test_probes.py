@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Pressures and stresses of probes at their positions: exact for linear fields, else of second order."""
+"""Pressures and stresses at probes: exact for linear fields, otherwise of second order."""
 
 from dataclasses import replace
 
@@ -18,7 +18,7 @@ UP = {2: "y", 3: "z"}
 
 
 def terzaghi(z, T):
-    """Return the pressure over the load at heights z above a sealed base, over the drainage path."""
+    """Return the pressure divided by the load, at heights z above a no-flow base, divided by the drainage path."""
     M = np.pi / 2 * (2 * np.arange(200) + 1)
     return (2 / M * np.sin(M * (1 - z[:, None])) * np.exp(-(M**2) * T)).sum(axis=1)
 
@@ -49,7 +49,7 @@ def test_a_column_consolidates_at_any_place_as_terzaghi_says(cells, allowed):
 def test_steady_flow_through_layers_is_exact_up_to_their_interface_and_drained_sides(
     dim, axisymmetric, off, lower, upper
 ):
-    """The interface is within a cell; water flows up, or down, against its weight."""
+    """The interface is within a cell. Water flows up, or down, against its weight."""
     n, h, meets = (8, 0.125, 0.55) if dim == 2 else (5, 0.2, 0.5)
     grid = mpm.Grid([0] * dim, [2 * h] * (dim - 1) + [1 + h], [2] * (dim - 1) + [n + 1], axisymmetric=axisymmetric)
     z, side = off * h, [2 * h] * (dim - 1)
@@ -86,7 +86,7 @@ def test_water_at_rest_is_exact_just_below_a_drained_surface_and_at_a_sealed_bas
 
 
 def test_a_steady_pressure_is_exact_up_to_sides_aslant():
-    """Its cells' pressures are known to 1e-4 of it."""
+    """The pressures of its cells are accurate to 1e-4 of the pressure."""
     turn = np.array([[np.cos(0.5), np.sin(0.5)], [-np.sin(0.5), np.cos(0.5)]])
     grid = mpm.Grid([0, 0], [1.6, 1.8], [16, 18])
     box = mpm.box(grid, [0.5, 0.1], [0.9, 1.1])
@@ -116,7 +116,7 @@ def test_what_lies_beyond_a_gap_or_a_contact_tells_nothing(contacts):
 
 @pytest.mark.parametrize("place", [0.0, 0.5, 0.9, 1.0])
 def test_no_pressure_passes_those_around_it_where_one_jumps(place):
-    """All of the load is carried by water, but on the drained side."""
+    """Water carries the whole load, except on the drained side."""
     grid = mpm.Grid([0, 0], [0.2, 1.0], [2, 10])
     body, soil = mpm.box(grid, [0, 0], [0.2, 1]), mpm.LinearElastic(bulk=1e6, shear=1e6, conductivity=1e-6)
     walls, load = SIDES[2] | {"bottom": "y"}, [mpm.Traction("top", (0, -1e3))]
@@ -129,7 +129,7 @@ def test_no_pressure_passes_those_around_it_where_one_jumps(place):
 
 
 def stressed(grid, bodies, materials, field):
-    """Return a simulation whose points have deformation gradients of a field (n, d, d) of their places."""
+    """Return a simulation whose points have deformation gradients (n, d, d) as functions of position."""
     walls = {"bottom": "xyz"[: grid.dim]}
     s = mpm.Simulation(grid, bodies, materials, walls=walls)
     s.state = replace(s.state, points=replace(s.points, F=field(s.points)))
@@ -138,7 +138,7 @@ def stressed(grid, bodies, materials, field):
 
 @pytest.mark.parametrize("dim, axisymmetric", [(2, False), (2, True), (3, False)], ids=["plane", "ring", "space"])
 def test_a_linear_stress_is_exact_at_any_place_of_irregular_domains(dim, axisymmetric):
-    """Up to sides, edges and corners, and next to other materials and bodies."""
+    """Also at sides, edges and corners, and next to other materials and bodies."""
     grid = mpm.Grid([0] * dim, [2.0] * dim, [5 if dim == 2 else 4] * dim, axisymmetric=axisymmetric)
     boxes = [mpm.box(grid, [a] + [0.0] * (dim - 1), [b] + [1.0] * (dim - 1), material=m) for a, b, m in PARTS]
     bodies = [mpm.mapped(grid, boxes[0], irregular), *boxes[1:]]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The English of pages and docstrings: vague words and long sentences only become fewer."""
+"""The English of pages and docstrings: numbers of vague words and long sentences only decrease."""
 
 import re
 

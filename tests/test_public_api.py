@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The user's interface: exported types, one list of conditions, functions by the names of their parameters."""
+"""The user interface: exported types, one list of conditions, and functions with arguments by parameter names."""
 
 import ast
 import inspect

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Tools that a load pushes: they go as far as the bodies resist with as much."""
+"""Tools under a load move until the bodies resist with the same force."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ BALL = mpm.Ball((1.0, 1.3), 0.3)
 
 
 def layer(*tools, wet=False, material=SOIL, **options):
-    """Return a layer, 2 m wide and 1 m high, that stands rough."""
+    """Return a layer, 2 m wide and 1 m high, on a rough floor."""
     grid = mpm.Grid([0, 0], [2.0, 1.5], [16, 12])
     water = {"fluid": mpm.Fluid(), "conditions": [mpm.Drained("top")]} if wet else {}
     options.setdefault("walls", {"left": "x", "right": "x", "bottom": "xy"})
@@ -30,7 +30,7 @@ def pushed(load, shape=BALL, **options):
 
 
 def test_a_plate_compresses_a_column_by_its_load():
-    """Hencky: the stress P J, with P = M ln(J) / J, is that of the load."""
+    """Hencky's law: the stress P J, with P = M ln(J) / J, equals the load."""
     s = layer(
         pushed(lambda t: 2e5 * t, mpm.HalfSpace((0, 1.0), (0, -1))), walls={"left": "x", "right": "x", "bottom": "y"}
     )
@@ -94,7 +94,7 @@ def test_two_loads_squeeze_a_body_between_them():
 
 
 def test_tools_beside_each_other_each_meet_their_load():
-    """They press on one another through the layer; plates share a cell."""
+    """The tools act on each other through the layer. Plates have a common cell."""
     balls = [pushed(lambda t, k=k: (2e3 + 4e3 * k) * t, mpm.Ball((0.4 + 0.6 * k, 1.15), 0.15)) for k in range(3)]
     ends = [(0.0, 0.99), (1.01, 2.0)]
     corners = [[(a, 1.0), (b, 1.0), (b, 1.3), (a, 1.3)] for a, b in ends]
@@ -110,7 +110,9 @@ def test_tools_beside_each_other_each_meet_their_load():
 
 @pytest.mark.parametrize("load", [1e3, 0.1, 1e-6])
 def test_a_light_tool_lies_on_a_heavy_layer(load):
-    """Solvers tell forces to a share of the layer's weight; the plate goes down with it, however light."""
+    """Solvers have a tolerance relative to the layer's weight. The plate moves with the layer, even if it is very
+    light.
+    """
     heavy = mpm.Hencky(bulk=1e6, shear=0.6e6, grain_density=2700, porosity=0.4)
     rolls = {"left": "x", "right": "x", "bottom": "y"}
     options = {"walls": rolls, "gravity": (0, -9.81), "material": heavy}
@@ -124,7 +126,7 @@ def test_a_light_tool_lies_on_a_heavy_layer(load):
 
 @pytest.mark.parametrize("height", [1.0, 1.03])
 def test_a_load_acts_from_the_first_step_on(height):
-    """Where the initial stress had to be balanced, off the grid lines, the load became a part of it."""
+    """Earlier, if the initial stress had to be balanced off the grid lines, the load became a part of this stress."""
     heavy, grid = (
         mpm.Hencky(bulk=1e6, shear=0.6e6, grain_density=2700, porosity=0.4),
         mpm.Grid([0, 0], [1.0, 1.5], [8, 12]),
@@ -141,7 +143,7 @@ def test_a_load_acts_from_the_first_step_on(height):
 
 
 def test_a_load_comes_all_at_once_and_of_any_length_of_its_direction():
-    """Bodies that did not go along jumped off a ball that came back from a try too far."""
+    """Earlier, bodies that did not move along lost contact with a ball that returned from a trial step."""
     ways = []
     for load, direction in ((3e4, (0, -1e300)), (lambda t: 3e4 * min(1, 2 * t), (0, -1e-300))):
         s = layer(mpm.Tool(BALL, load=load, direction=direction))
@@ -153,7 +155,7 @@ def test_a_load_comes_all_at_once_and_of_any_length_of_its_direction():
 
 @pytest.mark.parametrize("x", [1.0, 0.5])
 def test_a_rough_ball_begins_to_press_a_layer(x):
-    """The shear of sticking cells pushed the surface away from it, alternating with no shear at all."""
+    """Earlier, the shear of sticking cells, alternating with zero shear, pushed the surface away."""
     ball = mpm.Ball((x, 1.15), 0.15)
     for load in (50.0, 1e3):
         s = layer(pushed(lambda t, load=load: load * t, ball, friction=0.3))
@@ -168,7 +170,7 @@ def test_a_rough_ball_begins_to_press_a_layer(x):
 
 
 def test_a_load_drags_a_tool_as_far_as_friction_holds_it():
-    """Along the surface, where contact alone has no stiffness; at first no load at all."""
+    """Along the surface contact alone has no stiffness, and the load is zero at first."""
     block = mpm.Convex([(0.6, 1.0), (1.4, 1.0), (1.4, 1.3), (0.6, 1.3)])
     for most, slips in ((2e3, False), (2e4, True)):
         sunk, drag = lambda t: (0, -0.02 * min(t, 1)), lambda t, most=most: most * max(0.0, t - 1)
@@ -183,7 +185,7 @@ def test_a_load_drags_a_tool_as_far_as_friction_holds_it():
 
 
 def test_steps_of_any_length_follow_a_tool_that_its_load_pushes_aside():
-    """The cells in contact under the tool depend on the length of the step; longer steps add some."""
+    """The cells in contact depend on the length of the step, and longer steps add some."""
     press = {"load": lambda t: 1e6 * min(t, 1), "direction": (0, -1)}
     ball = mpm.Tool(mpm.Ball((0.83, 1.15), 0.15), lambda t: (-4 * max(t - 1, 0), 0), **press)
     grid, soil = mpm.Grid([0, 0], [1.6, 1.4], [16, 14]), mpm.Hencky(bulk=1e7 / 3, shear=5e6)

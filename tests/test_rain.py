@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Rain soaks in until the surface ponds, then runs off; water evaporates until the surface is dry."""
+"""Rain infiltrates until the surface ponds, then runs off; water evaporates until the surface is dry."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ K = 1e-5  # m/s
 
 
 def rained(flux, cells=10, retention=True, **options):
-    """Return a column that drains to a head of 0.2 m at its base, under rain on its top."""
+    """Return a column with a head of 0.2 m at its base, and rain on its top."""
     law = mpm.VanGenuchten(WATER / 3.35, residual=0.1, n=2.0) if retention else None
     soil = mpm.LinearElastic(**STIFF, porosity=0.4, conductivity=K, retention=law)
     sides = [mpm.Drained("bottom", pressure=0.2 * WATER), mpm.Rain("top", flux, name="rain", **options)]
@@ -23,7 +23,7 @@ def rained(flux, cells=10, retention=True, **options):
 @pytest.mark.parametrize("retention", [True, False])
 @pytest.mark.parametrize(("depth", "flows"), [(0.0, 0.8), pytest.param(0.05, 0.85, marks=pytest.mark.slow)])
 def test_rain_beyond_what_soil_takes_ponds_and_runs_off(retention, depth, flows):
-    """Steady: Darcy's flow between the pond and the base; the rest of three times the conductivity runs off."""
+    """Steady state: Darcy flow between pond and base. The rest of a rain of three times the conductivity runs off."""
     s = rained(3 * K, ponding=depth * WATER, retention=retention)
     start = water(s)
     for _ in range(6):
@@ -37,7 +37,7 @@ def test_rain_beyond_what_soil_takes_ponds_and_runs_off(retention, depth, flows)
 
 @pytest.mark.parametrize("retention", [True, False])
 def test_all_rain_is_stored_ponds_runs_off_or_flows_out(retention):
-    """Of a storm that fills a pond of 2 cm, and leaves it to the soil and the air."""
+    """A storm fills a pond of 2 cm, and the pond then infiltrates and evaporates."""
     s = rained(lambda t: 9 * K if t <= 1800 else -1e-6, ponding=0.02 * WATER, retention=retention)
     start, depths = water(s), []
     for end in (600, 1800, 2100, 2400):
@@ -55,7 +55,7 @@ def test_all_rain_is_stored_ponds_runs_off_or_flows_out(retention):
 
 @pytest.mark.slow
 def test_a_slope_that_fails_in_a_storm_comes_to_rest_and_its_water_is_all_there():
-    """It slides once it is wet, by a tenth of its height; inertia carries it from balance to balance."""
+    """The wet slope slides by a tenth of its height, with inertia from one equilibrium to the next."""
     grid = mpm.Grid([0, 0], [3.5, 1.25], [28, 10])
     law = {"conductivity": 1e-4, "retention": mpm.VanGenuchten(5e3, residual=0.05, n=2.5), "porosity": 0.4}
     soil = mpm.MohrCoulomb(bulk=3e6, shear=1.5e6, friction=25.0, dilation=0.0, cohesion=100.0, **law)
@@ -122,7 +122,7 @@ def test_rain_on_a_drained_side_is_refused():
 
 
 def test_rain_is_the_same_on_the_left_as_on_the_right():
-    """Mirrored, to rounding."""
+    """The scene is mirrored; results agree to rounding."""
     found = []
     for side, other in (("left", "right"), ("right", "left")):
         grid = mpm.Grid([-1, 0], [1, 0.5], [20, 5])
@@ -140,7 +140,7 @@ def test_rain_is_the_same_on_the_left_as_on_the_right():
 
 
 def test_a_resumed_run_goes_on_as_the_one_that_was_not_broken_off(tmp_path):
-    """Of a body that is carried along, bit by bit."""
+    """A moving body; results agree bit by bit."""
 
     def scene(index=1.5):
         grid = mpm.Grid([-1, 0], [1.4, 0.6], [24, 6])
@@ -162,7 +162,7 @@ def test_a_resumed_run_goes_on_as_the_one_that_was_not_broken_off(tmp_path):
 
 
 def two_soils_in_the_rain(length=1.0, stress=1.0, time=1.0, at=(0.0, 0.0), mirror=False, swapped=False, far=False):
-    """Return cell pressures and outflows of sand next to loam in oscillating rain, in the units of the first."""
+    """Return cell pressures and outflows of sand next to loam in oscillating rain, in the units of the sand."""
     gravity = 9.81 * length / time**2
     density = 1000 * stress * time**2 / length**2
     lower = np.multiply(at, length / 10)
@@ -222,7 +222,7 @@ def test_rain_on_two_soils_is_the_same_in_any_frame(other):
 
 
 def test_a_long_slope_under_steady_rain_is_as_safe_as_its_suction_says():
-    """Dry, and at nine tenths of the conductivity: factors at 1, 2, 3 and 5 m, by the pressures found."""
+    """Dry soil, and rain of nine tenths of the conductivity: factors at 1, 2, 3 and 5 m, from computed pressures."""
     known = {
         0.0: (1.1636053, 1.0462666, 1.0145471, 0.9397027),
         0.9: (1.1739380, 1.0324996, 0.9845665, 0.9397027),
@@ -240,9 +240,10 @@ def test_a_long_slope_under_steady_rain_is_as_safe_as_its_suction_says():
 @pytest.mark.slow
 @pytest.mark.parametrize("depth, share, cells", [(3.0, 0.0, 8), (3.0, 0.9, 8), (1.0, 0.0, 20), (1.0, 0.9, 20)])
 def test_a_long_slope_slides_when_its_strength_is_divided_by_its_factor(depth, share, cells):
-    """A column that may only shear along the slope, its foot at a depth: strength reduction, suction and weight of it.
+    """A column that can only shear along the slope, with its base at a depth: strength reduction with suction and
+    weight.
 
-    Flow is associated, so the exact factor is that of limit analysis, c' + (sigma + chi s) tan phi over tau.
+    Flow is associated, so the exact factor is (c' + (sigma + chi s) tan phi) / tau.
     """
     steep, alpha = np.cos(rain.SLOPE), rain.ALPHA
     height = depth * steep

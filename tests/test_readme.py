@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The pages' code runs, all names in it exist, and the figures equal the demos' output."""
+"""The code of the pages runs, its names exist, and the figures equal the output of the demos."""
 
 import json
 import re

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The finite element reference: beam theory, consolidation, and its two elements against each other."""
+"""The finite element reference: beam theory, consolidation, and comparison of its two elements."""
 
 import numpy as np
 import pytest
@@ -48,7 +48,7 @@ def test_one_dimensional_consolidation_follows_terzaghi(element):
 
 
 def test_a_term_of_the_velocity_and_a_spring_make_a_dry_block_creep_exactly():
-    """Kelvin-Voigt, its spring doubled by an energy: strain = q / 2M (1 - exp(-2M t / eta))."""
+    """A Kelvin-Voigt material with twice the stiffness: strain = q / 2M (1 - exp(-2M t / eta))."""
     eta, load, modulus = 1e8, 1e3, SOFT.oedometric
 
     def damper(points, velocity, v):
@@ -91,7 +91,7 @@ def test_a_modulus_that_jumps_between_cells_is_that_of_each_cell():
 
 
 def elements(cells, soil, conditions, pressure, element="q1-dg0", **options):
-    """Return a column of 1 m of elements between smooth walls, and heights of pressures in its middle."""
+    """Return a column of 1 m of elements between smooth walls, and heights of pressures on its axis."""
     scene = {"walls": {"left": "x", "right": "x", "bottom": "y"}, "fluid": mpm.Fluid(), "element": element, **options}
     fem = BiotFEM(mpm.Grid([0, 0], [1 / cells, 1], (1, cells)), soil, conditions=conditions, pressure=pressure, **scene)
     return fem, (np.arange(cells) + 0.5) / cells
@@ -104,7 +104,7 @@ def across(fem, z):
 
 @pytest.mark.parametrize("element", [pytest.param("taylor-hood", marks=pytest.mark.slow), "q1-dg0"])
 def test_unsaturated_soil_consolidates_by_elements_as_its_linear_theory_says(element):
-    """Of second order in h; compared with material points on the same grid."""
+    """Second order in h; material points on the same grid are compared."""
     exact, off = Pressed(), []
     for cells in (10, 20):
         fem, z = elements(cells, exact.soil, exact.sides, -20e3, element, numerics=mpm.Numerics(tolerance=1e-11))
@@ -123,7 +123,7 @@ def test_unsaturated_soil_consolidates_by_elements_as_its_linear_theory_says(ele
 
 @pytest.mark.slow
 def test_a_front_runs_into_dry_soil_by_elements_as_by_material_points():
-    """Of second order in h: place of -5 m after 12 h, water."""
+    """Second order in h: position of the head of -5 m after 12 h, and absorbed water."""
     known, fronts, waters = Celia(), [], []
     for cells in (25, 50):
         fem, z = elements(cells, known.soil, known.sides, -10 * WATER, gravity=lambda t: (0, -9.81))
@@ -145,7 +145,7 @@ def test_a_front_runs_into_dry_soil_by_elements_as_by_material_points():
 @pytest.mark.slow
 @pytest.mark.parametrize("element", ["taylor-hood", "q1-dg0"])
 def test_soil_under_hydrostatic_suction_settles_by_elements_under_the_weight_of_its_water(element):
-    """Sealed except at its base: water is at rest, and strains follow from weight, suction and water."""
+    """No flow except at the base: water is at rest, and strains follow from weight, suction and water."""
     modulus, law = 1e8, mpm.VanGenuchten(WATER / 2, residual=0.1, n=2.0)
     soil = mpm.LinearElastic(modulus / 3, modulus / 2, porosity=0.4, conductivity=1e-5, retention=law)
     base = mpm.Drained("bottom", pressure=0.3 * WATER)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Errors and values of users' functions, wrong indices, files and contradictions give one line; nothing is lost."""
+"""Errors of user functions, wrong indices, files and contradictions give one line, and no data are lost."""
 
 import resource
 from dataclasses import dataclass
@@ -38,7 +38,7 @@ def steps(simulation, **options):
 
 
 def file(text):
-    """Return a case: a writer into a folder that holds a file of another program's."""
+    """Return a case: a writer into a folder with a file of another program."""
 
     def make(folder):
         name, content = text
@@ -49,7 +49,7 @@ def file(text):
 
 
 def archive(**arrays):
-    """Return a case: a checkpoint that is another archive of numpy's."""
+    """Return a case: a checkpoint that is another archive of numpy."""
 
     def make(folder):
         np.savez(folder / "other.npz", **arrays)
@@ -376,7 +376,7 @@ def test_a_body_that_is_named_twice_is_refused(body):
 
 
 def test_conditions_bodies_and_probes_equal_only_themselves():
-    """Their values may be arrays or functions; `in`, `index` and dictionaries ask for equality and a hash."""
+    """Values may be arrays or functions; `in`, `index` and dictionaries need equality and a hash."""
     load, region = np.array([0.0, -1.0]), np.array([[0.0, 0.0], [1.0, 1.0]])
     makes = {
         "Traction": lambda: mpm.Traction("top", load, region),
@@ -397,12 +397,12 @@ def test_a_result_is_shown_in_a_line():
 
 
 def test_what_one_process_refuses_all_refuse():
-    """Else the others wait for it for ever."""
+    """Otherwise the other processes would wait for ever."""
     mpirun(2, "mpi_refusals.py")
 
 
 def test_mapped_bodies_are_not_integrated_at_points():
-    """Their domains would be boxes from the first step on, while displacements count from where they are seeded."""
+    """Their domains would be boxes from the first step on, while displacements count from the seeded positions."""
     grid = mpm.Grid([0, 0], [1.0, 1.0], [4, 4])
     body = mpm.mapped(grid, mpm.box(grid, [0, 0], [0.5, 0.5]), lambda x: x + 0.1 * x[:, ::-1])
     with pytest.raises(ValueError, match=r"body 0 is mapped or a mesh, must be a box along the grid"):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Invalid fields of a stage, numbers in forms, checkpoints and observers are refused where they are given."""
+"""Invalid fields of a stage, numbers in forms, checkpoints and observers are refused where they are passed."""
 
 import numpy as np
 import pytest

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Regions are compared by their values, however they are given."""
+"""Regions are compared by value, in any form of input."""
 
 from decimal import Decimal
 from fractions import Fraction

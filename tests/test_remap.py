@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The pressure's remap changes nothing at rest, loses nothing in motion, and is exact for linear fields."""
+"""The remap of pressures changes nothing at rest, conserves fluid in motion, and is exact for linear fields."""
 
 from dataclasses import replace
 
@@ -17,14 +17,14 @@ MOVES = [0.01, 0.3, 2.6]
 
 
 def random_beam():
-    """Return a beam at the start of a step, with random pressures of its cells and soft water."""
+    """Return a beam at the start of a step, with random cell pressures and soft water."""
     s, _ = beam(offset=0.3, fluid=mpm.Fluid(bulk=1e6))
     pressure = np.random.default_rng(0).normal(size=s.grid.num_local) * 1e5
     return s, pressure
 
 
 def moved(s, state, pressure, way):
-    """Return a state on a grid whose cells have a pressure (cells,), after a rigid move (in cells) and a new reset."""
+    """Return a state on a grid with cell pressures (cells,) after a rigid motion (in cells) and a reset."""
     state, on_grid, *_ = step.set_up(s.scene, state, 1.0)
     s.scene.storage.p.x.array[:] = pressure
     s.scene.momentum.u.x.array[:] = np.tile(way * s.grid.h, len(s.grid.node_x))
@@ -35,7 +35,7 @@ def moved(s, state, pressure, way):
 
 
 def moving_body(move, pressure, slope, bounds):
-    """Return the pieces' data of a rigid body, their positions after a move (in cells), and the move (m)."""
+    """Return the pieces of a rigid body, their positions after a motion (in cells), and the motion (m)."""
     grid = mpm.Grid([0, 0], [2.0, 2.0], [20, 20])
     points = material_points(grid, [mpm.box(grid, [0.33, 0.41], [1.2, 1.0])])
     old, way = cut(grid, points.corners), move * grid.h * [0.8, 1.0]
@@ -56,7 +56,7 @@ def test_a_thousand_resets_of_a_body_at_rest_change_nothing():
 
 @pytest.mark.parametrize("way", [0.0, 0.4, 1.7])
 def test_the_fluid_stored_in_all_cells_is_kept_without_new_extremes(way):
-    """`way` in cells; the storage coefficient differs from point to point with the porosity."""
+    """`way` is in cells. The storage coefficient varies from point to point with the porosity."""
     s, pressure = random_beam()
     F = s.points.F * (1 + 0.1 * np.sin(s.points.x[:, :1] * 9))[:, :, None]
     at_rest = np.einsum("nab,nkb->nka", np.linalg.inv(F), s.points.corners - s.points.x[:, None])
@@ -69,7 +69,7 @@ def test_the_fluid_stored_in_all_cells_is_kept_without_new_extremes(way):
 
 
 def stored(on_grid, p):
-    """Return sum w S K (exp(p / K) - 1): the mass of fluid that the pressure stores, as a volume at zero pressure."""
+    """Return the sum of w S K (exp(p / K) - 1): the fluid mass stored by the pressure, as a volume at zero pressure."""
     return (on_grid.weight * on_grid.data.pieces["storage"][:, 0]) @ (1e6 * np.expm1(p[on_grid.cut.cells] / 1e6))
 
 
@@ -101,7 +101,7 @@ def test_a_linear_pressure_moves_with_the_body(move):
 
 
 def reconstruct(p, filled=None):
-    """Return (midpoints, slopes, bounds) of cells with values p(x), all full, or only where `filled(x)`."""
+    """Return (midpoints, slopes, bounds) of cells with values p(x): all full, or only cells with `filled(x)`."""
     grid = mpm.Grid([0, 0], [1.0, 0.5], [10, 5])
     faces = np.ones((grid.num_local, 2, 2))
     if filled is not None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Renewal of yielded domains at a grid reset keeps their contents, their volume and their surface."""
+"""Renewal of yielded domains at a grid reset conserves their contents, their volume and their surface."""
 
 from dataclasses import replace
 
@@ -28,9 +28,9 @@ CLAY = mpm.DruckerPrager(bulk=5e6, shear=1e5, friction=0.0, dilation=0.0, cohesi
 
 
 def block(conditions=(), hole=False, uneven=False, rings=False, inner=0.07, **options):
-    """Return a simulation of a block off the grid lines, with a round hole if asked for.
+    """Return a simulation of a block off the grid lines, with or without a round hole.
 
-    uneven: on random lines; rings: in axisymmetry, `inner` m off the axis.
+    uneven: whether lines are random. rings: whether the block is axisymmetric, `inner` m from the axis.
     """
     grid = mpm.Grid([0, 0], [2, 1.5], [16, 12], axisymmetric=rings)
     if uneven:
@@ -44,7 +44,7 @@ def block(conditions=(), hole=False, uneven=False, rings=False, inner=0.07, **op
 
 
 def yielded(s, strain, hardened=0.0):
-    """Return the points with an elastic strain (n, 2, 2) in the plane, as if they had yielded."""
+    """Return the points with an elastic strain (n, 2, 2) in the plane, marked as yielded."""
     e = np.zeros((len(s.state.points), 3, 3))
     e[:, :2, :2] = strain
     value, axes = np.linalg.eigh(2 * e)
@@ -54,7 +54,7 @@ def yielded(s, strain, hardened=0.0):
 
 
 def renewed(s, points, monkeypatch, longest=1e-3):
-    """Return the points with domains renewed that are longer than so many cells, and how many were."""
+    """Return the points after renewal of domains longer than a number of cells, and the number of these domains."""
     monkeypatch.setattr(renewal, "LONGEST", longest)
     own = renewal.Renewal(SeededFaces(s.grid, s.bodies), s.scene.materials)
     state, count = own.renewed(replace(s.state, points=points))
@@ -112,7 +112,7 @@ def test_strains_that_are_linear_stay_within_second_order(monkeypatch, uneven, r
 
 @pytest.mark.parametrize(("uneven", "rings"), [(False, False), (True, False), (True, True)])
 def test_many_renewals_keep_what_a_body_holds(monkeypatch, uneven, rings, count=12):
-    """It turns or rises between them, so that other cells cut it."""
+    """The block rotates or rises between renewals, so that other cells cut it."""
     s = block(hole=True, uneven=uneven, rings=rings, inner=0.0 if rings else 0.07)
     points = yielded(s, 1e-3 * np.diag([1.0, -1.0]), 0.1 + s.state.points.x[:, 0])
     points = replace(points, data=points.data | {"of the user": points.x[:, ::-1] * [-1.0, 1.0]})
@@ -159,7 +159,7 @@ def momenta(s, points):
 
 @pytest.mark.parametrize("uneven", [False, True])
 def test_momentum_stays_and_a_uniform_velocity(monkeypatch, uneven):
-    """The block is turned, so that the grid cuts it anew; its centre stays up to crumbs of a millionth of a cell."""
+    """The block rotates, so that the grid cuts it anew. Its centre is fixed to a millionth of a cell."""
     s = block(hole=True, uneven=uneven, inertia=True)
     points, middle = yielded(s, 1e-3 * np.diag([1.0, -1.0])), np.array([1.0, 0.65])
     R = np.array([[np.cos(0.3), -np.sin(0.3)], [np.sin(0.3), np.cos(0.3)]])
@@ -181,7 +181,7 @@ def test_momentum_stays_and_a_uniform_velocity(monkeypatch, uneven):
 
 
 def test_clay_that_flies_and_stretches_keeps_its_momentum_and_tells_its_energy():
-    """Renewal takes less than a thousandth of its energy."""
+    """Renewal dissipates less than a thousandth of the energy."""
     grid = mpm.Grid([-1, -1], [1.5, 1.5], [20, 20])
     block = mpm.box(grid, [-0.3, -0.3], [0.3, 0.3])
     clay = mpm.DruckerPrager(5e5, 1e4, friction=0.0, dilation=0.0, cohesion=50.0, porosity=0.4, grain_density=2700.0)
@@ -227,7 +227,7 @@ def springs(points, u):
     ids=["held", "tied", "springs"],
 )
 def test_conditions_on_displacements_of_sides_act_on_these(monkeypatch, condition, terms, side):
-    """New domains have a mean displacement, so that held and tied sides slid and steps were given up."""
+    """Earlier, new domains had a mean displacement: held and tied sides slid, and the run failed."""
     monkeypatch.setattr(renewal, "LONGEST", 0.6)
     grid = mpm.Grid([0, 0], [1.5, 1.5], [12, 12])
     box = mpm.box(grid, [0.28, 0.2 * (side == "bottom")], [1.2, 0.8])
@@ -245,7 +245,7 @@ def test_conditions_on_displacements_of_sides_act_on_these(monkeypatch, conditio
 
 @pytest.mark.parametrize("rings", [False, True])
 def test_pressures_act_on_renewed_sides_as_before(monkeypatch, rings):
-    """Also on a region of a side, forces and moments of the loads stay the same."""
+    """Forces and moments of the loads do not change, also on a region of a side."""
     load = mpm.Pressure("top", 1e3, region=([0.5, 0], [1.31, 2]))
     s = block([load, mpm.Traction("hole", (100.0, 200.0))], hole=True, rings=rings, inner=0.2 if rings else 0.07)
     old = yielded(s, 1e-3 * np.diag([1.0, -1.0]))
@@ -261,7 +261,8 @@ def test_pressures_act_on_renewed_sides_as_before(monkeypatch, rings):
 
 
 def layers(wet, rings=False):
-    """Return the scene of a rough disc pushed obliquely into two layers of clay, next to a pressure, dry or wet.
+    """Return the scene of a rough disc that is pushed obliquely into two layers of clay, dry or wet, next to a
+    pressure.
 
     rings: in axisymmetry, with a ball that is pushed along the axis.
     """
@@ -289,7 +290,7 @@ def layers(wet, rings=False):
     ],
 )
 def test_domains_are_renewed_alike_in_any_frame(monkeypatch, wet, inertia, rings):
-    """Mirrored, rotated, carried, in other units and orders, with another body at rest, and after a restart."""
+    """The scene is mirrored, rotated, translated, in other units and orders, with another body, and restarted."""
     monkeypatch.setattr(renewal, "LONGEST", 0.6)
     scene, plain = layers(wet, rings).with_(inertia=inertia), Frame.plain(2)
     base = run(scene, plain)
@@ -306,10 +307,10 @@ def test_domains_are_renewed_alike_in_any_frame(monkeypatch, wet, inertia, rings
 
 @pytest.mark.parametrize(("rings", "off", "motion"), [(False, 0.13, 1e-6), (True, 0.0, 1e-9), (True, 0.13, 1e-4)])
 def test_layers_at_rest_stay_there_when_all_their_domains_are_renewed(monkeypatch, rings, off, motion):
-    """Two layers, whose surface is `off` above a grid line, with pore water.
+    """Two layers with pore water, whose surface is `off` above a grid line.
 
-    Motions are divided by the settlement under their own weight.  In axisymmetry, the weight is integrated with one
-    point a domain, so new domains at a surface off the grid lines move by a ten-thousandth.
+    Motions are divided by the settlement under the weight. In axisymmetry, the weight of a domain has one integration
+    point, so new domains at a surface off the grid lines move by a ten-thousandth.
     """
     monkeypatch.setattr(renewal, "LONGEST", 1e-3)
     monkeypatch.setattr(renewal.Renewal, "flowed", lambda self, points: np.ones(len(points), dtype=bool))
@@ -321,7 +322,7 @@ def test_layers_at_rest_stay_there_when_all_their_domains_are_renewed(monkeypatc
 
 @pytest.mark.parametrize("rings", [False, True])
 def test_cells_keep_their_fluid_and_pressure(monkeypatch, rings):
-    """Compared with other pressures, and with the volume defect of points, but for crumbs of a millionth of a cell."""
+    """Compared with the pressures and volume defects, except for parts of a millionth of a cell."""
     monkeypatch.setattr(renewal, "LONGEST", 0.6)
     s = build(layers(True, rings), Frame.plain(2)).simulation
     s.run((5 if rings else 4) / 8, 1 / 8, progress=False)
@@ -343,9 +344,9 @@ def test_cells_keep_their_fluid_and_pressure(monkeypatch, rings):
 
 
 def bar_in_clay(cells, alpha, soil, rest, speed, follow=False, **options):
-    """Return a simulation of a T-bar of 1 m in the middle of a polygon of clay five diameters wide and high.
+    """Return a simulation of a T-bar of 1 m in the middle of a polygon of clay, five diameters wide and high.
 
-    It rests until the time `rest`, while a pressure comes; follow: whether grid lines follow the bar.
+    The bar rests until the time `rest`, while the pressure increases. follow: whether grid lines follow the bar.
     """
     wide, h = 2.5, 1 / cells
     bar = mpm.Tool(mpm.Ball((0, 0.8), 0.5), lambda t: (0, -speed * max(0, t - rest)), adhesion=alpha * demo.STRENGTH)
@@ -370,7 +371,7 @@ def bar_in_clay(cells, alpha, soil, rest, speed, follow=False, **options):
 @pytest.mark.slow
 @pytest.mark.parametrize(("alpha", "depth", "follow"), [(0.5, 1.25, False), (1.0, 1.25, False), (0.5, 1.0, True)])
 def test_clay_from_a_polygon_flows_around_a_bar(alpha, depth, follow, cells=8):
-    """Without renewal a half rough one gives up after 0.9 diameters."""
+    """Without renewal, a partly rough bar fails at 0.9 diameters."""
     soil = mpm.DruckerPrager(bulk=5e6, shear=1e5, friction=0.0, dilation=0.0, cohesion=demo.STRENGTH)
     s = bar_in_clay(cells, alpha, soil, rest=1.0, speed=1.0, follow=follow)
     result = s.run(1 + depth, 1 / cells / 12, progress=False)
@@ -400,9 +401,9 @@ def test_wet_clay_flows_around_a_bar(rate, cells=4, depth=1.0):
 @pytest.mark.slow
 @pytest.mark.parametrize(("cells", "depth", "error"), [(9, 3.0, 0.04), (17, 0.25, 0.03)])
 def test_clay_is_pressed_through_a_die_of_half_its_width(cells, depth, error, strength=1e3):
-    """Hill's pressure (1950) of a smooth square die is strength (1 + pi / 2), whatever the way.
+    """Hill's pressure (1950) on a smooth square die is strength (1 + pi / 2), for any displacement.
 
-    The die's edge lies in the middle of a cell, rounded by a cell: over a sharp one the surface catches.
+    The edge of the die lies in the middle of a cell, with a radius of one cell. The surface catches at a sharp edge.
     """
     h, long = 1 / cells, depth + 1.5
     low, high = -np.ceil((2 * depth + 0.75) * cells) / cells, np.ceil((long + 0.25) * cells) / cells
@@ -436,7 +437,7 @@ def test_clay_is_pressed_through_a_die_of_half_its_width(cells, depth, error, st
     ],
 )
 def test_a_run_that_renews_is_the_same_after_a_restart_and_on_several_processes(processes, kind, tmp_path):
-    """On one process to the bit."""
+    """Results on one process agree to the bit."""
     mpirun(processes, "mpi_renewal.py", str(tmp_path / "whole"), *kind)
     mpirun(1, "mpi_renewal.py", str(tmp_path / "parts"), "restart", *kind)
     one, other = (np.load(tmp_path / f"{name}.npz") for name in ("whole", "parts"))
@@ -448,7 +449,7 @@ def test_a_run_that_renews_is_the_same_after_a_restart_and_on_several_processes(
 
 
 def test_domains_of_probes_and_those_of_a_scene_that_renews_nothing_stay(monkeypatch):
-    """A probe is put where a domain would be renewed."""
+    """A probe is placed where a domain would be renewed."""
     monkeypatch.setattr(renewal, "LONGEST", 0.6)
 
     def run(place=None, **options):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Soil at rest on sides whose displacement is given, and under plates: as exact as on walls, held by nothing else."""
+"""Soil at rest on prescribed sides and under plates is as exact as on walls."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ def hold(side, components="", region=None, value=None, dim=2):
 
 
 def soil(law="hencky", E=2e7, dim=2, wet=False, bend=None, between=True, given=None, lower=0.0, **options):
-    """Return soil on a base that is held, 2 m wide, or 1 m in 3D; bend: height of layers over x where they dip."""
+    """Return soil on a prescribed base, 2 m wide, or 1 m in 3D. bend: slope of the interface of two layers."""
     up, width = "xyz"[dim - 1], 2.0 if dim == 2 else 1.0
     more = 0.0 if between else 0.5  # m: what has no walls may go aside
     grid = mpm.Grid(
@@ -54,12 +54,12 @@ def soil(law="hencky", E=2e7, dim=2, wet=False, bend=None, between=True, given=N
 
 
 def weight(s):
-    """Return the weight of the bodies, N."""
+    """Return the weight of the bodies, in N."""
     return 9.81 * (s.scene.materials.density(s.points) * s.points.volume0 * s.points.J).sum()
 
 
 def rests(s, load=0.0):
-    """Assert that steps in which nothing changes move nothing, on a base that bears weight and load."""
+    """Assert that steps without changes cause no motion, on a base that carries weight and load."""
     bears = pytest.approx(weight(s) + load, rel=1e-6)
     assert s.reactions.array[:, -1].sum() == bears
     for dt in (1.0, 1e4):
@@ -99,12 +99,12 @@ def test_a_footing_on_soil_at_rest_bears_nothing(wet, axisymmetric):
 
 @pytest.mark.parametrize("bend", [None, 0.2])
 def test_a_plate_bends_nothing_at_rest(bend):
-    """Under layers that dip the stress below a rigid plate is not even."""
+    """Under inclined layers the stress below a rigid plate is not uniform."""
     rests(soil(bend=bend, conditions=[mpm.RigidPlate("top", 1e4)], initial_stress=mpm.K0(0.6, surcharge=5e3)), 1e4)
 
 
 def test_curved_sides_that_are_held_are_at_rest():
-    """Their wet points have the pressures of their centroids from the start: else supports would feel the change."""
+    """Wet points have the pressures of their centroids from the start. Otherwise supports would see a change."""
     grid = mpm.Grid([0, -1], [2, 3], [8, 16])
     body = mpm.mapped(
         grid,
@@ -128,7 +128,7 @@ def test_curved_sides_that_are_held_are_at_rest():
 
 
 def test_half_a_base_bears_all_and_what_then_loses_its_support_sinks_or_is_refused():
-    """Only forces of the scene's conditions hold soil once a stage begins."""
+    """Once a stage begins, only the conditions of the scene support the soil."""
     half = ([-1, -1], [1, 1])
     rests(soil(between=False, lower=0.13, given=[hold("bottom", region=half)]))
     s = soil(between=False, lower=0.13, given=[hold("bottom")])

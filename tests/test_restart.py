@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A run that was broken off and resumed is the run that was not."""
+"""A resumed run equals an uninterrupted run."""
 
 import csv
 import os
@@ -153,7 +153,7 @@ def test_killed_at_random_moments_a_run_ends_with_the_same_bits_and_files(tmp_pa
 
 
 def readable(folder):
-    """Return whether all that the indices name can be read."""
+    """Return whether all files that the indices name can be read."""
     for index in folder.glob("*.pvd"):
         for item in ElementTree.parse(index).iter("DataSet"):
             assert ElementTree.parse(folder / item.get("file")).getroot().tag == "VTKFile"
@@ -162,7 +162,7 @@ def readable(folder):
 
 @pytest.fixture(scope="module")
 def parallel(tmp_path_factory):
-    """Return the beam run by one process, and the output folder of `mpi_restart.py` on two."""
+    """Return the beam of one process, and the output folder of `mpi_restart.py` on two processes."""
     folder = tmp_path_factory.mktemp("parallel")
     one, probe = beam(h=0.06)
     half, end, dt = mpi_restart.T_END / 2, mpi_restart.T_END, mpi_restart.DT
@@ -210,7 +210,7 @@ SLOW = "renewed following sinking rained"
 
 @pytest.mark.parametrize("scenes", [QUICK, pytest.param(SLOW, marks=pytest.mark.slow)])
 def test_any_number_of_processes_reads_a_checkpoint_and_writes_the_same_bits(scenes, tmp_path):
-    """All processes refuse alike a damaged one, and write none if the disk of one process is full."""
+    """All processes refuse a damaged checkpoint alike, and write none if the disk of one process is full."""
     for processes, task in ((3, "write"), (2, "read"), (1, "write"), (4, "read")):
         mpirun(processes, "mpi_checkpoints.py", str(tmp_path), task, *scenes.split())
 
@@ -224,7 +224,7 @@ def checkpoint(tmp_path_factory):
 
 
 def refused(file, match, simulation=None):
-    """Assert that a checkpoint is refused in one line, and leaves the scene as it was."""
+    """Assert that a checkpoint is refused in one line, and does not change the scene."""
     simulation = simulation or beam(h=0.06)[0]
     points = simulation.points
     with pytest.raises(ValueError, match=match) as caught:

@@ -19,7 +19,7 @@ def of_tool(s, quantity):
 
 
 def balance(e):
-    """Return how far energies are out of balance, over the largest of them."""
+    """Return the error of the energy balance, divided by the largest energy."""
     total = sum(e[name] for name in ("kinetic", "elastic", "dissipated", "viscous", "friction")) - e["external"]
     return np.abs(total - total[0]).max() / max(np.abs(values).max() for values in e.values())
 
@@ -55,7 +55,7 @@ def test_a_tool_spins_as_it_flies():
 
 
 def incline(friction, aslant, h=0.05, radius=0.2):
-    """Return a rigid disc on a layer, 30 degrees to gravity, along the grid or at 30 degrees to it, and axes."""
+    """Return a rigid disc on a layer inclined by 30 degrees to gravity, along the grid or not, and axes."""
     turn = -np.pi / 6 if aslant else 0.0
     e = np.array([np.cos(turn), np.sin(turn)])
     normal = np.array([-e[1], e[0]])
@@ -78,7 +78,7 @@ def incline(friction, aslant, h=0.05, radius=0.2):
 @pytest.mark.parametrize("aslant", [False, True])
 @pytest.mark.parametrize("friction", [0.3, 0.1])
 def test_a_rigid_disc_rolls_down_a_layer_or_slips(friction, aslant):
-    """Exact: it rolls by 2/3 g sin b where mu >= tan b / 3; else its spin grows by 2 mu g cos b / R."""
+    """Exact: the acceleration is 2/3 g sin b if mu >= tan b / 3; otherwise the spin grows by 2 mu g cos b / R."""
     s, e = incline(friction, aslant)
     t, slips = 0.4, friction < np.tan(np.pi / 6) / 3
     energies = s.run(t, 0.01, energies=True, progress=False).energies
@@ -92,7 +92,7 @@ def test_a_rigid_disc_rolls_down_a_layer_or_slips(friction, aslant):
 
 
 def tipping(mirror=1, **options):
-    """Return a rough rigid box that tips over on a corner, rounded by 0.15 m, and its angle and spin after t (s)."""
+    """Return a rough rigid box that tips over on a corner of radius 0.15 m, with its angle and spin after t (s)."""
     h, width, r, m, lean, spin = 0.05, 0.6, 0.15, 100.0, 0.3, 1.0
     grid = mpm.Grid([0, 0], [1.2, 0.4], [24, 8])
     top, arm = 0.2 + 0.37 * h, np.sqrt(2) * (width / 2 - r)
@@ -118,7 +118,7 @@ def tipping(mirror=1, **options):
 
 
 def test_a_box_tips_over_as_a_rigid_one_on_either_side_alike(tmp_path):
-    """Exact, without slip: its corner rolls, and its energy is constant."""
+    """Exact, without slip: the corner rolls, and the energy is constant."""
     (s, exact), (other, _), (again, _) = tipping(), tipping(-1), tipping(-1)
     e = s.run(0.24, 0.02, energies=True, progress=False).energies
     rotation, spin = exact(0.24)

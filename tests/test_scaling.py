@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Time and memory go with the points, not with the grid nor with the steps."""
+"""Time and memory are proportional to the points, not to the grid or the steps."""
 
 from pathlib import Path
 
@@ -13,7 +13,7 @@ from mpm_dolfinx.points.cutting import cut_faces
 
 
 def memory() -> float:
-    """Return the memory that this process has at present, MB."""
+    """Return the present memory of this process, in MB."""
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return pages * 4096 / 2**20
 
@@ -28,7 +28,7 @@ def test_memory_does_not_grow_with_the_number_of_steps():
 
 @pytest.mark.parametrize(("dim", "sizes", "most"), [(2, (2e3, 1e4), 7), (3, (3e3, 2e4), 10)])
 def test_memory_for_each_point_is_bounded(dim, sizes, most):
-    """Peaks scatter by up to 35 MB in 3D, so that sizes lie so far apart that this is below 2 kB a point."""
+    """Peaks scatter by up to 35 MB in 3D. Sizes differ so much that this scatter is below 2 kB per point."""
     small, large = (scaling.in_own_process(dim, points, processes=1) for points in sizes)
     per_point = (large["memory_MB"] - small["memory_MB"]) / (large["points"] - small["points"])
     assert 0 < 1024 * per_point < most, "kB"

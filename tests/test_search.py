@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Newton's iterations where soil yields: how far their steps go, and that they begin as the last step went on."""
+"""Newton's iterations in yielding soil: lengths of their steps, and their start from the last motion."""
 
 from dataclasses import replace
 
@@ -50,14 +50,14 @@ def test_a_step_goes_on_as_the_last_one_where_soil_flows():
 
 
 def test_the_second_substep_begins_as_the_first_went_on_where_soil_flows(monkeypatch):
-    """Exactly so in a steady flow; at the end of the first substep it would begin far out of balance."""
+    """In a steady flow the start is exact. From the end of the first substep, the residual would be large."""
     goes_on, so_far = steps_taken(monkeypatch, 2.0), balances.going_on
     monkeypatch.setattr(balances, "going_on", lambda *at: None if at[2].substep.before > 0 else so_far(*at))
     assert goes_on < steps_taken(monkeypatch, 2.0)
 
 
 def test_a_direction_that_leads_backwards_is_turned_round(monkeypatch):
-    """As for tangents with negative stiffness; the linear solver's reversal changes no bit."""
+    """Tangents with negative stiffness give such directions. Their reversal in the linear solver changes no bit."""
     s = pushed()
     s.run(2, 1)
     before, forwards = s.state, s.step(1.0)
@@ -121,7 +121,7 @@ def test_a_step_that_goes_too_far_is_shortened_to_where_the_residuals_do_no_work
 
 @given(end=st.floats(0.002, 0.9), before=st.floats(0.0, 2.0), behind=st.floats(1.0, 1e6))
 def test_a_step_ends_with_little_work_also_where_the_work_has_a_kink(end, before, behind):
-    """As where points yield: a work that falls slowly, then fast."""
+    """The work decreases slowly and then fast, as where points yield."""
     search, tried = Search(), 0
     while search is not None:
         step, tried = search.step, tried + 1
@@ -132,7 +132,7 @@ def test_a_step_ends_with_little_work_also_where_the_work_has_a_kink(end, before
 
 
 def steps_taken(monkeypatch, dt: float, **values) -> int:
-    """Return the Newton steps of three steps of dt of pushed ground with other constants of the search."""
+    """Return the Newton steps in three steps dt of pushed ground, with other constants of the search."""
     with monkeypatch.context() as patched:
         for name, value in values.items():
             patched.setattr(newton if name == "SHIFT" else search, name, value)
@@ -141,7 +141,7 @@ def steps_taken(monkeypatch, dt: float, **values) -> int:
 
 
 def test_a_step_is_full_where_the_forces_balance_and_the_fluid_does_not():
-    """Work is that of both residuals: that of the forces alone, next to none at its start, led back there each time."""
+    """The work of both residuals counts. The work of the forces, almost zero at first, would shorten the steps."""
     grid = mpm.Grid([0, 0], [0.3, 0.8], [3, 8])
     soil = mpm.DruckerPrager(
         bulk=2e7, shear=1e7, friction=30.0, dilation=0.0, cohesion=2e4, porosity=0.6, conductivity=1e-5

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Seepage faces: water leaves where it is pressed out, and does not enter."""
+"""Seepage faces: water leaves under pressure, and does not enter."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ SOIL = mpm.Hencky(bulk=1e9, shear=5e8, porosity=0.3, conductivity=7e-6, grain_de
 
 
 def column(base, dim=2, top=0.0, h=0.25, seepage=True, **options):
-    """Return a column under gravity with given pressures at its base and a seepage face on its top."""
+    """Return a column under gravity with given pressures at its base, and a seepage face on its top."""
     width = 0.5
     box = [*[width] * (dim - 1), HEIGHT + 1.0]
     grid = mpm.Grid([0] * dim, box, [*[2] * (dim - 1), round((HEIGHT + 1.0) / h)])
@@ -35,7 +35,7 @@ def column(base, dim=2, top=0.0, h=0.25, seepage=True, **options):
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_a_column_overflows_where_the_head_at_its_base_is_above_its_top(dim):
-    """4 m of head below a column of 3 m: k / 3 flows out of its top, as in Kratos' verification."""
+    """A head of 4 m below a column of 3 m: the outflow of the top is k / 3, as in Kratos' verification."""
     simulation = column(4 * WEIGHT, dim)
     result = simulation.run(1e7, 1e7, progress=False)
     y, p = simulation.points.x[:, -1], simulation.points.pressure
@@ -68,7 +68,7 @@ def test_under_water_a_seepage_face_is_open_both_ways():
 
 
 def test_a_seepage_face_opens_when_the_soil_is_pressed_and_closes_when_it_swells():
-    """A load presses water out; when it goes the soil would suck it in, but cannot: it stays compressed."""
+    """A load presses water out. After unloading, no water enters, and the soil stays compressed."""
     grid = mpm.Grid([0, 0], [0.5, 1.25], [2, 20])
     body = mpm.box(grid, [0, 0], [0.5, 1.0])
     soil = mpm.Hencky(bulk=2e6, shear=1e6, conductivity=1e-6)

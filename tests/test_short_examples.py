@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Each short example runs as it stands, is short, and prints the number that theory gives, or finer cells."""
+"""Each short example runs unchanged, is short, and prints the value of theory or of finer cells."""
 
 import contextlib
 import io
@@ -31,7 +31,7 @@ def consolidation():
 
 
 def embankment():
-    """Settlement, m, of 3 m of clay in the middle of a bank that is much wider: confined compression by its weight."""
+    """Settlement, m, of 3 m of clay in the middle of a much wider bank: confined compression by the weight."""
     weight = 2 * 9.81 * (0.7 * 2650 + 0.3 * 1000)
     return 3 * weight / (1.5e6 + 4 / 3 * 7e5)
 
@@ -90,7 +90,7 @@ ON_PROCESSES = {"processes"}
 
 @cache
 def ran(name):
-    """Run an example in a folder of its own; return the text that it prints, its variables, and its pictures."""
+    """Run an example in its own folder, and return its printed text, its variables, and its pictures."""
     for module, signs in NEEDS.items():
         if any(sign in SHORT[name].read_text() for sign in signs):
             pytest.importorskip(module)
@@ -103,7 +103,7 @@ def ran(name):
 
 
 def number(text):
-    """Return the number behind the colon of the line that an example prints."""
+    """Return the number after the colon of the printed line of an example."""
     (line,) = text.strip().splitlines()
     return float(line.partition(": ")[2].split()[0].rstrip(","))
 

@@ -16,7 +16,7 @@ WEIGHT = 9810.0  # of water, N/m^3
 
 
 def block(*tractions, walls=WALLS, **options):
-    """Return a block that has taken a step under tractions."""
+    """Return a block after a step under tractions."""
     body = mpm.box(GRID, [0, 0], [1, 1])
     s = mpm.Simulation(
         GRID, [body], [SOIL], walls=walls, conditions=[*tractions, *options.pop("conditions", [])], **options
@@ -53,7 +53,7 @@ def test_a_pressure_of_depth_is_exact_in_its_resultant():
 
 
 def test_a_side_under_a_level_that_rises_is_at_rest():
-    """A block in water that nothing moves: total stress and pore pressure follow the level, effective stress stays."""
+    """A block in water at rest: total stress and pore pressure follow the level; the effective stress is constant."""
     level = lambda t: 1.0 + 0.5 * t  # noqa: E731
     depth = lambda t, x: WEIGHT * (level(t) - x[:, 1])  # noqa: E731
     body = mpm.box(GRID, [0, 0], [1.2, 1])
@@ -92,7 +92,7 @@ def test_heads_and_inflows_of_time_are_of_second_order(name):
 
 
 def test_water_flows_from_side_to_side_by_the_heads_of_its_ends():
-    """A block between two heads: Darcy's flux, linear pressures, whatever the place of its ends in the grid."""
+    """A block between two heads: Darcy's flux and linear pressures, at any position of its ends on the grid."""
     body = mpm.box(GRID, [0.03, 0], [1.04, 1])
     k, heads = 1e-3, lambda X: np.where(X[:, 0] < 0.5, 2e4, 5e3)
     s = mpm.Simulation(
@@ -127,7 +127,9 @@ FORMS = {  # what a function may give, and whether it is then one for each place
 @pytest.mark.parametrize("m", [0, 1, 2, 3, 4])
 @pytest.mark.parametrize("form", FORMS)
 def test_what_a_function_gives_is_read_alike_at_any_number_of_places(form, m, d):
-    """With as many places as components a vector was refused, or read as a number a place, on some processes only."""
+    """Earlier, a vector with as many entries as components was refused, or read as a number for each position, on some
+    processes.
+    """
     function, vectors = FORMS[form]
     X = np.random.default_rng(m).random((m, d))
     want = np.broadcast_to(function(X) if m else 0.0, (m, d) if vectors else (m,))
@@ -199,13 +201,13 @@ def test_functions_are_called_by_the_names_of_their_parameters(kind):
     ids=["plate", "displacement", "rotation", "load", "level", "gravity"],
 )
 def test_functions_of_time_alone_are_none_of_places(make):
-    """One of x was called with the time."""
+    """Earlier, a function of x was called with the time."""
     with pytest.raises(ValueError, match=r"a function of \(x\), must be a function of the time alone"):
         make(lambda x: 1.0)
 
 
 def test_what_a_condition_was_given_is_its_own():
-    """A scene's load and its gravity changed with the arrays and lists that a script went on to use."""
+    """Earlier, a load and gravity changed with arrays and lists that a script continued to use."""
     value, region, gravity, loads = np.array([0.0, -1e4]), [[0, 0], [2, 2]], np.array([0.0, -9.81]), []
     loads.append(mpm.Traction("top", value, region))
     walls = dict(WALLS)

@@ -10,9 +10,9 @@ PLANE = [0, 2]  # axes of the slice that plane strain has
 
 
 def scene(across, make):
-    """Return a scene in plane strain (0), or of a slice of so many cells across, after three steps.
+    """Return a scene in plane strain (0), or of a slice of a number of cells, after three steps.
 
-    make: gives the body's size, walls and options, from a function that places (x, z) in the scene.
+    make: function that returns size, walls and options of the body, from a function that maps (x, z) into the scene.
     """
     flat = across == 0
 
@@ -51,7 +51,7 @@ def ground(soil, **options):
 
 
 def fields(s):
-    """Return displacements, effective stresses and pressures of the points in the plane, and the points' places."""
+    """Return displacements, effective stresses, pressures and positions of the points in the plane."""
     X = s.points.origin.mean(axis=1)
     axes = [*range(s.grid.dim), 2][:3] if s.grid.dim == 2 else [0, 2, 1]
     stress = s.point_fields().effective_stress[:, axes][:, :, axes]

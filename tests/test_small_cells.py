@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Nearly empty cells neither stiffen bodies that hardly change their volume nor hold up soil that flows."""
+"""Nearly empty cells neither stiffen nearly incompressible bodies nor support flowing soil."""
 
 import footing
 import numpy as np
@@ -10,7 +10,7 @@ from mpm_dolfinx.mechanics.ghost_penalty import GHOST
 
 
 def tip(cells, offset, nu):
-    """Return the small sag of the tip of a cantilever of 4 m x 1 m, its underside `offset` cells above a grid line."""
+    """Return the small deflection of a cantilever of 4 m x 1 m, with the underside `offset` cells above a grid line."""
     h = 1 / cells
     grid = mpm.Grid([0, 0], [4 + 2 * h, 1 + 4 * h], [4 * cells + 2, cells + 4])
     bottom = (1 + offset) * h
@@ -24,7 +24,7 @@ def tip(cells, offset, nu):
 
 @pytest.mark.parametrize("nu", [0.499, 0.4999])
 def test_nearly_incompressible_beams_bend_wherever_they_lie_on_the_grid(nu):
-    """With lambda + 2G for a scale the tip came to 0.82 and 0.36 of its way in one step."""
+    """With lambda + 2G as scale, the deflection in one step was 0.82 and 0.36 times the correct one."""
     fine = tip(16, 0.0, nu)
     over = np.array([tip(4, offset, nu) for offset in (0.0, 0.1, 0.3, 0.5)]) / fine
     print(f"nu = {nu}, offsets 0, 0.1, 0.3, 0.5: tip of 16 x 4 cells over that of 64 x 16 {over}")
@@ -33,7 +33,7 @@ def test_nearly_incompressible_beams_bend_wherever_they_lie_on_the_grid(nu):
 
 @pytest.mark.parametrize("reach", [1e-4, 1e-2])
 def test_an_open_side_that_reaches_into_the_next_cell_does_not_drain_what_else_is_in_it(reach):
-    """As the wall of a pit over its base: the side lies behind the centroid, and all water was gone in one step."""
+    """The wall of a pit above its base: the side lies behind the centroid. Earlier, all water was lost in one step."""
     grid, soil = mpm.Grid([0, 0], [4.0, 4.0], [4, 4]), mpm.Hencky(bulk=1e6, shear=6e5, conductivity=1e-8)
     overhang = mpm.box(grid, [2, 0], [4, 3])
     overhang = mpm.mapped(grid, overhang, lambda X: X - np.outer(np.maximum(0, X[:, 1] - 1.5), [reach, 0]))
@@ -54,7 +54,7 @@ def test_an_open_side_that_reaches_into_the_next_cell_does_not_drain_what_else_i
 
 
 def settled(nu, ratio):
-    """Return gamma H / c at which the crest of a vertical cut in soil of G = ratio c has settled H / 50."""
+    """Return gamma H / c at which the crest of a vertical cut in soil with G = ratio c has settled by H / 50."""
     cohesion, height, cells, most = 1e4, 1.0, 10, 5.0
     shear = ratio * cohesion
     soil = mpm.DruckerPrager(
@@ -75,7 +75,9 @@ def settled(nu, ratio):
 
 
 def test_a_vertical_cut_falls_whatever_its_elastic_constants():
-    """It stood at 5, or fell at 4.28 and 4.59; limit analysis has it at 3.78, met at first order in the cells."""
+    """Earlier, the cut was stable at 5, or failed at 4.28 and 4.59. Limit analysis gives 3.78, reached with first
+    order.
+    """
     numbers = [settled(nu, ratio) for nu in (0.3, 0.499) for ratio in (200, 2000)]
     print(f"gamma H / c at a settlement of H / 50, nu = .3, .3, .499, .499, G / c = 200, 2000, 200, 2000: {numbers}")
     assert max(numbers) < 1.02 * min(numbers)
@@ -92,7 +94,7 @@ def limit_load(monkeypatch, nu, strength=1.0, cells=9, steps=40):
 
 
 def test_the_limit_load_of_a_footing_does_not_depend_on_poissons_ratio(monkeypatch):
-    """With lambda + 2G for a scale it was 1.01, 1.03 and 1.13 times as much."""
+    """With lambda + 2G as scale, the limit load was 1.01, 1.03 and 1.13 times the correct one."""
     loads = [limit_load(monkeypatch, nu, cells=5, steps=20) for nu in (0.3, 0.49, 0.499)]
     assert loads == pytest.approx([loads[0]] * 3, rel=1e-3)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Small time steps leave only the error of the cells: nothing diffuses, nothing overshoots, nothing checkers."""
+"""With small time steps only the error of the cells remains: no diffusion, no overshoot, no checkerboard."""
 
 import numpy as np
 import pytest
@@ -27,7 +27,7 @@ def test_on_the_move_the_error_does_not_grow_with_the_number_of_steps():
 
 
 def test_what_the_remap_does_to_soft_water_is_of_second_order_and_not_of_the_steps():
-    """Water so soft that the skeleton stores next to nothing: all of the pressure goes through the remap."""
+    """The water is so soft that the skeleton stores almost nothing: the whole pressure is remapped."""
     runs = ((20, 100), (40, 100), (10, 100), (10, 200))
     coarse, fine, few, many = (demo.column(cells, steps, way=0.5, softness=20.0).error for cells, steps in runs)
     assert np.log2(coarse / fine) > 1.9
@@ -41,7 +41,7 @@ def test_soft_water_on_the_move_is_as_exact_as_hard_water():
 
 @pytest.mark.parametrize("dt", [1e-12, 1e-6, 1e-3, 1.0])
 def test_the_first_step_overshoots_by_nothing_however_small(dt):
-    """In s; the step for which Q1 pressures stop overshooting, h^2 / (6 c_v), is 4e-3 s."""
+    """Steps in s. Q1 pressures stop overshooting at the step h^2 / (6 c_v) = 4e-3 s."""
     load = mpm.Traction("top", (0, -100.0))
     s = column(cells=20, material=SOIL, fluid=WATER, conditions=[mpm.Drained("top"), load])
     s.run(dt, dt)
@@ -59,7 +59,7 @@ def test_only_the_damping_keeps_checkers_out_of_the_first_small_step():
 
 @pytest.mark.slow
 def test_what_the_step_changes_falls_with_the_cells():
-    """Jumps of the step's increment are damped, less where the step's flow is larger: a part of the cells' error."""
+    """Jumps of the increment are damped, less with larger flow in a step: the change is a part of the cells' error."""
     changes = []
     for cells in (5, 10, 15):  # over the load's width
         grid = mpm.Grid([-0.2, 0], [1.4, 1], [28 * cells // 5, 4 * cells])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Soil that softens as it slips, and laws that see the time step: exact paths, and independence of the grid."""
+"""Soil that softens with slip, and laws that use the time step: exact paths, and independence of the grid."""
 
 from dataclasses import dataclass, replace
 from typing import ClassVar
@@ -20,7 +20,7 @@ CLAY = mpm.SofteningDruckerPrager(
 
 
 def test_in_simple_shear_the_cohesion_falls_with_the_slip_in_a_cell():
-    """At small strain, without friction: tau = c - (c - c_r) min(1, gamma_p h / s)."""
+    """Small strain, no friction: tau = c - (c - c_r) min(1, gamma_p h / s)."""
     h = 2.0
     t = element_test(CLAY, "shear drained", 0.12, steps=60, cell_size=h, rate=1.0)
     tau, gamma = t.stress[:, 0, 1], t.strain
@@ -33,7 +33,7 @@ def test_in_simple_shear_the_cohesion_falls_with_the_slip_in_a_cell():
 
 
 def test_a_viscosity_adds_its_stress_at_a_rate():
-    """tau = c + eta dgamma/dt once it flows; at rest it would relax with eta / G."""
+    """tau = c + eta dgamma/dt in flow; at rest it would relax with eta / G."""
     viscous = replace(CLAY, residual=C, viscosity=1e5)
     fast, slow = (
         element_test(viscous, "shear undrained", 0.1, cell_size=1.0, rate=r).stress[-1, 0, 1] for r in (0.05, 1e-9)
@@ -43,7 +43,7 @@ def test_a_viscosity_adds_its_stress_at_a_rate():
 
 
 def run_out(cells):
-    """Return how far a bank of 10 m slides that gains its weight in a second, too weak for it, m."""
+    """Return the run-out, in m, of a bank of 10 m whose weight increases within a second beyond its strength."""
     size, weight, h = 10.0, 1e4, 10.0 / cells
     grid = mpm.Grid([0, 0], [3 * size, size + h], [3 * cells, cells + 1])
     moduli = {"bulk": 60 * size * weight, "shear": 30 * size * weight, "friction": 0.0, "dilation": 0.0}
@@ -64,7 +64,7 @@ def run_out(cells):
 
 @pytest.mark.slow
 def test_a_bank_that_softens_slides_as_far_on_cells_half_as_large():
-    """7.79, 7.78 and 7.47 m on 5, 10 and 20 cells; if it softened by strain, with the slip halved too, 8.21 m on 20."""
+    """7.79, 7.78 and 7.47 m on 5, 10 and 20 cells. With softening by strain, it would be 8.21 m on 20 cells."""
     assert run_out(10) == pytest.approx(run_out(20), rel=0.05)
 
 
@@ -91,7 +91,7 @@ class Maxwell(mpm.Skeleton):
 
 
 def crept(steps, dt, load, m):
-    """Return the stretch of a column after steps of dt, s, under a load, Pa: the recurrence of backward Euler."""
+    """Return the stretch of a column after steps of dt, in s, under a load, in Pa: recurrence of backward Euler."""
     kept = 0.0
     for _ in range(steps):
 
@@ -105,7 +105,7 @@ def crept(steps, dt, load, m):
 
 @pytest.mark.parametrize("fluid", [False, True])
 def test_a_law_sees_the_length_of_the_step(fluid):
-    """Also with water that flows, where a step has two substeps."""
+    """Also with flowing water, where a step has two substeps."""
     m = Maxwell(bulk=2e6, shear=1e6, relaxation=2.0, conductivity=1e3)
     top = [mpm.Traction("top", (0, -3e5)), *[mpm.Drained("top")] * fluid]
     s = column(cells=3, material=m, fluid=fluid, conditions=top)

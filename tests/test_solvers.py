@@ -24,7 +24,7 @@ from mpm_dolfinx.solve.solver_choice import NODAL, THRESHOLDS
 
 
 def momentum(dim: int):
-    """Return the momentum's matrices of a cube on rollers: some nodes have one unknown, some two or three."""
+    """Return the momentum matrices of a cube on smooth walls: nodes have one, two or three unknowns."""
     grid = mpm.Grid([0] * dim, [1.0] * dim, [4] * dim)
     every = {"left": "x", "bottom": "xyz"[dim - 1], "front": "y"}
     walls = {wall: axis for wall, axis in every.items() if dim == 3 or wall != "front"}
@@ -70,7 +70,7 @@ def test_nested_dissection_orders_nodes_of_any_shape_and_lines_come_after_both_s
 
 
 def test_factors_by_nested_dissection_fill_little():
-    """For n x n nodes at most 31/4 n^2 log2 n, with nine neighbours two thirds of it: here 0.44 and 0.56."""
+    """The bound for n x n nodes is 31/4 n^2 log2 n, with nine neighbours two thirds of it. Here: 0.44 and 0.56."""
     for n in (20, 80):
         i = np.arange(n * n)
         x = np.stack([i % n, i // n], axis=1).astype(float)
@@ -101,7 +101,7 @@ def test_a_linear_solver_that_breaks_off_fails_the_step():
 
 
 def quarter_pushed(soil: mpm.Skeleton, n: int, step: float) -> mpm.Simulation:
-    """Return a saturated cube; a prescribed displacement, `step` (m) a second, pushes a quarter of the top."""
+    """Return a saturated cube; a prescribed displacement of `step` (m) per second pushes a quarter of the top."""
     air = n // 4
     grid = mpm.Grid([0, 0, 0], [1.0, 1.0, 1 + air / n], [n, n, n + air])
     walls = dict.fromkeys(("left", "right"), "x") | dict.fromkeys(("front", "back"), "y") | {"bottom": "xyz"}
@@ -112,7 +112,7 @@ def quarter_pushed(soil: mpm.Skeleton, n: int, step: float) -> mpm.Simulation:
 
 
 def pushed(bulk: float) -> list[Report]:
-    """Return the iterations of two steps of such a cube."""
+    """Return the iterations of two steps of this cube."""
     s = quarter_pushed(mpm.Hencky(bulk=bulk, shear=1e6, conductivity=1e-7), 8, 0.01)
     return [s.step(1.0), s.step(1.0)]
 
@@ -133,7 +133,7 @@ BLOCKS = {  # soil, cells, step, m, steps, most iterations
 @pytest.mark.slow
 @pytest.mark.parametrize("block", BLOCKS)
 def test_no_linear_solve_of_a_wet_block_takes_many_iterations(block, monkeypatch):
-    """Printed with -s: `tests/run.sh -m slow -s tests/test_solvers.py`."""
+    """`tests/run.sh -m slow -s tests/test_solvers.py` prints the numbers."""
     counts, solve = [], monolithic.BlockSolver.solve
     monkeypatch.setattr(monolithic.BlockSolver, "solve", noting(counts, solve))
     soil, n, step, steps, most = BLOCKS[block]
@@ -147,14 +147,16 @@ def test_no_linear_solve_of_a_wet_block_takes_many_iterations(block, monkeypatch
 
 
 def test_the_first_solve_of_a_step_leaves_little_of_both_residuals_whatever_given_displacements_pull():
-    """A thousandth of their pull, which is the first residual, is as much as all forces: it cost two more steps."""
+    """A thousandth of the prescribed forces, the first residual, is as large as all other forces: it cost two more
+    steps.
+    """
     for report in pushed(2e6):
         assert max(report.history[0]) > 100 and max(report.history[1]) < 0.5 and report.newton <= 8
 
 
 @pytest.mark.parametrize("bulk", [50e6, 500e6])
 def test_nearly_incompressible_bodies_in_3d_take_few_iterations_a_solve(bulk):
-    """nu = 0.49, 0.499; with multigrid alone the latter takes 60 a solve."""
+    """nu = 0.49 and 0.499. With multigrid alone, the second takes 60 iterations per solve."""
     report = pushed(bulk)[1]
     assert report.coupling < 15 * report.newton
 
@@ -167,7 +169,7 @@ def test_factors_serve_as_soon_as_a_multigrid_cycle_is_foreseen_to_take_too_many
 
 
 def test_factors_in_place_of_a_multigrid_cycle_solve_the_same_problem(monkeypatch):
-    """The factors belong to the previous tangent, the matrix is the present one."""
+    """The factors belong to the previous tangent, and the matrix is the present one."""
     few = pushed(500e6)[0]
     thresholds(monkeypatch, fallback_3d=0)
     many = pushed(500e6)[0]
@@ -185,7 +187,7 @@ def test_factors_in_place_of_a_multigrid_cycle_are_made_once_and_serve_other_tan
 
 
 def test_water_flows_through_a_body_whose_nodes_are_all_held():
-    """PETSc's factors in blocks of a matrix without rows ended the process."""
+    """Earlier, PETSc's block factors of a matrix without rows ended the process."""
     grid = mpm.Grid([0, 0], [1.0, 0.1], [10, 1])
     soil, ends = mpm.Hencky(bulk=2e6, shear=1e6, conductivity=1e-3), (("left", 1e3), ("right", 0.0))
     conditions = {"fluid": mpm.Fluid(), "conditions": [*(mpm.Drained(side, pressure=p) for side, p in ends)]}
@@ -196,7 +198,7 @@ def test_water_flows_through_a_body_whose_nodes_are_all_held():
 
 
 def strip_pushed() -> mpm.Simulation:
-    """Return saturated soil; a prescribed displacement, 0.01 m a second, pushes half of the top."""
+    """Return saturated soil; a prescribed displacement of 0.01 m per second pushes half of the top."""
     grid, half = mpm.Grid([0, 0], [1.0, 1.25], [12, 15]), ((-np.inf, -np.inf), (0.45, np.inf))
     walls, drained = (
         {"left": "x", "right": "x", "bottom": "xy"},
@@ -222,7 +224,7 @@ def test_large_bodies_that_yield_end_where_small_ones_do_by_mumps(monkeypatch):
 
 @pytest.mark.parametrize("solvers", ["factors", "multigrid in 2D", "multigrid in 3D"])
 def test_solvers_go_with_their_step_without_the_help_of_pythons_collector(solvers, monkeypatch):
-    """Their factors use most of a large body's memory."""
+    """Their factors take most of the memory of a large body."""
     made, make = weakref.WeakSet(), schur.LinearSolvers.__init__
     monkeypatch.setattr(schur.LinearSolvers, "__init__", lambda self, *a: made.add(self) or make(self, *a))
     thresholds(monkeypatch, multigrid_2d=1 if solvers == "multigrid in 2D" else THRESHOLDS.multigrid_2d)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Ghost penalty and damping of pressure jumps vanish with the cell size as fast as the scheme's own error.
+"""Effects of ghost penalty and pressure-jump damping vanish with the cell size as fast as the discretisation error.
 
-Where soil yields the damping is that of the tangent.
+In yielding soil the damping uses the tangent.
 """
 
 from functools import cache
@@ -31,14 +31,14 @@ class Soil(mpm.LinearElastic):
 
 
 def exact(x):
-    """Return (displacement, pressure) of an undrained layer of 1 m on a smooth floor, -LOAD cos(K x) on its top.
+    """Return (displacement, pressure) of an undrained layer of 1 m on a smooth floor, with -LOAD cos(K x) on its top.
 
-    Incompressible: u = curl psi, psi = (A sinh Ky + B y cosh Ky) sin Kx.  The floor is free of shear, and so are
-    the walls at Kx = 0 and pi.  A and B follow from the tractions of the top.
+    Incompressible: u = curl psi, psi = (A sinh Ky + B y cosh Ky) sin Kx. Floor and walls at Kx = 0 and pi are free of
+    shear. A and B follow from the tractions on the top.
     """
 
     def derivatives(y):
-        """Return psi's two parts in y and their first three derivatives."""
+        """Return the two parts of psi in y and their first three derivatives."""
         s, c = np.sinh(K * y), np.cosh(K * y)
         a = np.stack([s, K * c, K**2 * s, K**3 * c])
         b = np.stack([y * c, c + K * y * s, 2 * K * s + K**2 * y * c, 3 * K**2 * c + K**3 * y * s])
@@ -55,9 +55,9 @@ def exact(x):
 
 @cache
 def layer(cells, damping=1.0, ghost=1.0, filled=0.5):
-    """Return displacement, pressure, their exact values, and the cells' pressure, at the points of the layer.
+    """Return displacement, pressure, their exact values, and the cell pressure, at the points of the layer.
 
-    Its top row is filled so far.
+    The top row of cells is partly filled.
     """
     h = 1 / (cells - 1 + filled)
     grid = mpm.Grid([0, 0], [1, (cells + 1) * h], [cells, cells + 1])
@@ -89,7 +89,7 @@ def errors(which, **options):
 
 
 def changes(which, filled=0.5, **options):
-    """Return by how much another strength changes displacement or the cells' pressure, relative to the exact ones."""
+    """Return the relative change of displacement or cell pressures with another strength of the damping."""
     changed = (0, 4)[which]
     pairs = [(layer(cells, filled=filled), layer(cells, filled=filled, **options)) for cells in CELLS]
     return np.array([rms(a[changed] - b[changed]) / rms(a[2 + which]) for a, b in pairs])
@@ -119,7 +119,7 @@ def test_what_the_ghost_penalty_changes_vanishes_faster_than_the_error(strength,
 
 
 def pushed(monkeypatch, most, law=mpm.DruckerPrager, **strength):
-    """Return load and pressures (columns, rows), Pa, under a footing pushed into an undrained layer of flat cells."""
+    """Return load and pressures (columns, rows), in Pa, under a footing in an undrained layer of flat cells."""
     monkeypatch.setattr("mpm_dolfinx.materials.evaluate.MOST", most)
     grid = mpm.Grid(lower=[0, -1], upper=[1.6, 0.2], cells=[24, 6])
     soil = law(bulk=13 / 6 * 1e8, shear=1e8, **strength)
@@ -136,7 +136,7 @@ def pushed(monkeypatch, most, law=mpm.DruckerPrager, **strength):
 
 
 def test_pressures_do_not_alternate_where_soil_flows(monkeypatch):
-    """The cells are three times as high as wide; the footing's load stays."""
+    """The cells are three times as high as wide. The load of the footing does not change."""
     (_, plain), (load, p) = (
         pushed(monkeypatch, most, friction=0.0, dilation=0.0, cohesion=1e4) for most in (1.0, MOST)
     )
@@ -147,7 +147,7 @@ def test_pressures_do_not_alternate_where_soil_flows(monkeypatch):
 
 
 def test_what_damps_soft_soil_meets_no_even_gradient_and_loses_no_fluid():
-    """Cells that alternate along both axes are damped as by a damping of jumps, away from the sides."""
+    """Pressures that alternate along both axes are damped as by damping of jumps, away from the sides."""
     grid = mpm.Grid([0, 0], [6.0, 4.0], [6, 4])
     cells, index, rng = np.arange(grid.num_local), grid.index_from_base(grid.midpoints), np.random.default_rng(0)
     own, opening = Unknowns(fem.Function(grid.cellwise()), cells), np.ones((grid.num_local, 2, 2))
@@ -175,7 +175,7 @@ def test_soil_that_could_yield_and_does_not_is_damped_as_elastic_soil(monkeypatc
 
 
 def pressed(times):
-    """Return the softness after each step, and the final positions, of sealed sand that yields under two loads."""
+    """Return the softness after each step, and the final positions, of yielding undrained sand under two loads."""
     grid = mpm.Grid([0, 0], [0.4, 0.5], [4, 5])
     sand = mpm.DruckerPrager(1e7, 1e7, friction=20.0, dilation=0.0, cohesion=1e2, conductivity=0.0)
     first = mpm.Traction("top", lambda t: (0, -2e4 * np.interp(t, [0, *times], [0, 1, 1, 1])))
@@ -188,7 +188,7 @@ def pressed(times):
 
 
 def test_a_step_at_rest_changes_nothing():
-    """Its strain is rounding, whose direction would make soil on its yield surface stiff or a hundred times as soft."""
+    """The strain is rounding. Its direction would make soil on the yield surface stiff, or a hundred times as soft."""
     (flows, rests, last), x = pressed([1, 2, 3])
     (first, alone), y = pressed([1, 1, 2])
     assert 2 < flows.min() and flows.max() < 50

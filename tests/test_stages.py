@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Stages: conditions change, displacements are reset, bodies are dug away and filled in."""
+"""Stages: conditions change, displacements are reset, bodies are excavated and filled."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -16,7 +16,7 @@ WALLS = {"left": "x", "right": "x", "bottom": "y"}
 
 
 def blocks(heights=(0.5, 0.5), later=False, **options):
-    """Return a simulation of blocks on one another, 1 m wide, and a probe in the middle of the lowest block's top."""
+    """Return a simulation of stacked blocks, 1 m wide, and a probe in the middle of the lowest block's top."""
     grid = mpm.Grid([0, 0], [1.0, 1.4], [10, 14])
     bottoms = np.concatenate([[0], np.cumsum(heights)])
     bodies = [mpm.box(grid, [0, a], [1, b]) for a, b in pairwise(bottoms)]
@@ -28,7 +28,7 @@ def blocks(heights=(0.5, 0.5), later=False, **options):
 
 
 def vertical(s):
-    """Return the vertical stress at the points by id."""
+    """Return the vertical stresses of the points, ordered by id."""
     return dict(zip(s.points.id.tolist(), s.effective_stress()[:, 1, 1].tolist(), strict=True))
 
 
@@ -66,7 +66,7 @@ def test_an_excavation_relieves_what_lies_below():
 
 
 def test_the_top_of_what_is_left_is_a_side():
-    """The pressure of an excavation's water goes out through the new surface."""
+    """The pressure of the excavated soil's water drains through the new surface."""
     s, _ = blocks(fluid=mpm.Fluid(), pressure=1e3, gravity=(0, 0), conditions=[mpm.Drained("top")])
     s.run(10.0, 10.0)
     s.stage(remove=[1])
@@ -140,7 +140,7 @@ def test_what_cannot_be_is_refused(stage, message):
 
 
 def bent(later=False):
-    """Return a simulation of two bodies that a map has bent, one on the other, pressed from above."""
+    """Return a simulation of two bodies that a map has bent, one on the other, under a load from above."""
     grid = mpm.Grid([0, 0], [1.0, 1.4], [10, 14])
     boxes = [mpm.box(grid, [0, a], [0.5, a + 0.5]) for a in (0.0, 0.5)]
     bodies = [mpm.mapped(grid, body, lambda x: x + [0.1, 0] * np.sin(x[:, [1]])) for body in boxes]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The state is all that a scene remembers: whatever is tried in between, the same accepted steps give the same bits."""
+"""The state holds all history of a scene: equal accepted steps give equal bits, with any trials between them."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -34,11 +34,11 @@ FIELD = {"sand": "cohesion", "clay": "bulk"}
 
 
 class Refusal(Exception):
-    """Of a user's function."""
+    """Exception of a user function."""
 
 
 def scene(law, wet, held):
-    """Return a column off the grid lines, and the dictionary that its load looks into."""
+    """Return a column off the grid lines, and the dictionary that its load reads."""
     grid = mpm.Grid([0, 0], [0.3, 0.8], [3, 8])
     asked = {"load": 300.0, "refuses": False}
 
@@ -79,7 +79,7 @@ def contents(state):
 
 
 class Driven(RuleBasedStateMachine):
-    """Drives a scene at random; a fresh one that takes the accepted steps alone must end in the same state."""
+    """Drives a scene at random. A new scene with only the accepted steps must end in the same state."""
 
     @initialize(law=st.sampled_from(sorted(LAWS)), wet=st.booleans(), held=st.booleans())
     def begin(self, law, wet, held):
@@ -87,7 +87,7 @@ class Driven(RuleBasedStateMachine):
         self.s, self.asked = scene(*self.made)
 
     def act(self, name, *arguments):
-        """Do something that counts, if it succeeds."""
+        """Take an action that changes the state if it succeeds."""
         perform(self.s, self.asked, name, *arguments)
         self.accepted.append((name, *arguments))
 
@@ -143,7 +143,7 @@ class Driven(RuleBasedStateMachine):
         self.interrupted(share, 0)
 
     def interrupted(self, share, lines):
-        """Break off a step after a share of its lines, less some."""
+        """Interrupt a step after a fraction of its lines."""
         before = self.s.state
         self.s.scene.forget()  # as many lines in both
         with interrupted(10**9) as counted:
@@ -158,7 +158,7 @@ class Driven(RuleBasedStateMachine):
 
     @rule()
     def look(self):
-        """Reading changes nothing."""
+        """Read results, which must change nothing."""
         str(self.s), self.s.effective_stress(), self.s.reactions.array, self.s.points.pressure
         with pytest.raises(ValueError, match="read-only"):
             self.s.points.pressure[:] = 5e4
@@ -188,7 +188,7 @@ class Driven(RuleBasedStateMachine):
 
 
 def perform(s, asked, name, *arguments):
-    """Do something to a scene."""
+    """Apply an action to a scene."""
     if name == "step":
         s.step(*arguments)
     elif name == "load":
@@ -233,7 +233,7 @@ def test_a_run_that_is_interrupted_anywhere_goes_on_to_the_same_end(count):
 
 
 def test_a_kept_state_keeps_its_histories():
-    """They grew with the run: going on from the state a second time was refused."""
+    """Earlier, its histories grew with the run, and a second continuation from the state was refused."""
     s, _ = scene("clay", True, True)
     s.run(1.0, 0.5, progress=False)
     before, rows = s.state, s.result.rows
@@ -266,7 +266,7 @@ def test_nobody_writes_into_a_state_or_its_histories():
 
 
 def test_a_step_within_a_stay_depends_on_the_state_alone():
-    """Open sides that lie aslant in their cells: how pressures slope there was kept from when the grid was reset."""
+    """Open sides are inclined to their cells. Earlier, pressure slopes there were kept from the last reset."""
 
     def build():
         grid = mpm.Grid([0, 0], [2, 1.6], [16, 13])

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Domains that hardly move stay cut: the answer is that of cutting in every step, and a given side does not drift."""
+"""Domains that hardly move keep their cut: results equal those with a cut in each step, without drift of prescribed
+sides.
+"""
 
 from functools import partial
 
@@ -17,7 +19,7 @@ WATER = mpm.Fluid(bulk=1e8)
 
 
 def column(load: float, **options) -> mpm.Simulation:
-    """Return a column of 1 m, off the grid lines, that consolidates under a load, Pa."""
+    """Return a column of 1 m, off the grid lines, that consolidates under a load, in Pa."""
     grid = mpm.Grid([0, 0], [0.5, 1.2], [5, 12])
     body = mpm.box(grid, [0, 0], [0.5, 0.97])
     walls = {"left": "x", "right": "x", "bottom": "y"}

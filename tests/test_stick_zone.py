@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Stick and slip under a disc that is pressed into a block and pulled along (Cattaneo 1938, Mindlin 1949)."""
+"""Stick and slip under a disc that is pressed into a block and pulled sideways (Cattaneo 1938, Mindlin 1949)."""
 
 import numpy as np
 import pytest
@@ -10,9 +10,9 @@ E = 1e6  # Pa
 
 
 def pulled(cells, size, steps, per_cell):
-    """Yield the contact as a disc that presses a nearly incompressible block is pulled along: Q / (mu P), places, p, q.
+    """Yield the contact while a disc on a nearly incompressible block is pulled: Q / (mu P), positions, p and q.
 
-    The half-width is about 1 m; that of a stiff disc on such a block is a contact of equals.
+    The half-width is about 1 m. A stiff disc on such a block acts as a contact of equal bodies.
     """
     R, mu, h = 20.0, 0.3, 1 / cells
     grid = mpm.Grid([-size, 0], [size, size + 4 * h], [round(2 * size * cells), round(size * cells) + 4])
@@ -32,7 +32,7 @@ def pulled(cells, size, steps, per_cell):
 
 
 def ellipse(x, values, half):
-    """Return the half-width of the ellipse that fits values (n,) at x (n,) over the inner 0.8 of it."""
+    """Return the half-width of the ellipse that is fitted to values (n,) at x (n,) over the inner 0.8 of it."""
     middle = 0.0
     for _ in range(5):
         inner = np.abs(x - middle) < 0.8 * half
@@ -43,7 +43,7 @@ def ellipse(x, values, half):
 
 @pytest.mark.slow
 def test_a_disc_that_is_pulled_sticks_where_cattaneo_and_mindlin_say():
-    """The difference of mu p and shear is an ellipse over the stick zone; 16 cells over the half-width."""
+    """mu p minus the shear is an ellipse over the stick zone; 16 cells over the half-width."""
     for pull, x, most, q in pulled(16, 6.0, 3, 1):
         exact = np.sqrt(1 - pull)
         half = ellipse(x, most, 1.0)
@@ -54,7 +54,7 @@ def test_a_disc_that_is_pulled_sticks_where_cattaneo_and_mindlin_say():
 
 
 def test_shear_where_it_sticks_does_not_alternate_from_cell_to_cell():
-    """Stiff friction leaves shears of both signs in turn, which displace no node: as large as their mean."""
+    """Stiff friction causes shears of alternating signs, as large as their mean, which displace no node."""
     *_, (pull, x, _, q) = pulled(8, 4.0, 2, 1)
     inner = q[np.abs(x) < 0.45]
     assert pull == pytest.approx(0.35, abs=0.05) and len(inner) == 8

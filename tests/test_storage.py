@@ -14,7 +14,7 @@ from mpm_dolfinx.points.cutting import corner_bits
 
 
 def residual(s, pressure, dt=1.0):
-    """Return the storage's residual at rest, with cell pressures `pressure` of their heights."""
+    """Return the storage residual at rest, with cell pressures `pressure` as functions of height."""
     storage, forms = set_up(s, dt).storage, s.scene.storage
     y = (s.grid.midpoints + s.scene.last[0].contents.centroid)[:, 1]
     forms.p.x.array[:] = forms.p_n.x.array[:] = pressure(y)
@@ -32,7 +32,7 @@ def test_hydrostatic_pressure_does_not_flow(offset):
 @pytest.mark.parametrize("bulk", [1e4, np.inf])
 @pytest.mark.parametrize("offset", [0.0, 0.1, 0.5])
 def test_a_steady_flow_is_even_however_the_body_lies_on_the_grid(offset, bulk):
-    """Linear is the pressure of water, and the density of one as compressible as the pressure is high."""
+    """The pressure of water is linear, and so is the density of water as compressible as the pressure is high."""
     drained = [mpm.Drained("top", pressure=0.0), mpm.Drained("bottom", pressure=1e4)]
     s = column(offset=offset, conditions=drained, fluid=mpm.Fluid(bulk=bulk))
     length = 1 + offset / 10
@@ -120,11 +120,11 @@ def test_pressure_jumps_are_damped_only_where_next_to_nothing_flows():
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_a_jump_between_two_cells_is_damped_by_a_quarter_of_the_published_stabilisation(dim):
-    """S dp V = Q dt - tau h A [dp] for an inflow into one of two cells, without flow between; the skeleton feels the
+    """S dp V = Q dt - tau h A [dp] for an inflow into one of two cells, without flow between; the skeleton sees the
     sum.
 
-    Published: 3 alpha^2 / (8 (lambda + 3G)) in 2D, for a patch of four cells. It is the same in 3D: pressures that
-    alternate along two axes are a plane strain problem.
+    Published: 3 alpha^2 / (8 (lambda + 3G)) in 2D, for a patch of four cells. The value is the same in 3D: pressures
+    that alternate along two axes are a plane strain problem.
     """
     lam, shear, biot, brought = 2e6, 5e6, 0.8, 1e-6  # the last: share of a cell's volume
     soil = mpm.Hencky(bulk=lam + 2 * shear / 3, shear=shear, porosity=0.4, biot=biot)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The factor of safety: exact for a block, limit analysis and published values for slopes; refusals."""
+"""The factor of safety: exact for a block, limit analysis and published values for slopes, and refusals."""
 
 import io
 import logging
@@ -21,7 +21,7 @@ CONE = mpm.DruckerPrager(bulk=2e8, shear=1e8, friction=PHI, dilation=PHI, cohesi
 
 
 def strength(factor):
-    """Return the load of a block in plane strain with its strength over a factor, Pa."""
+    """Return the load, in Pa, of a block in plane strain with its strength divided by a factor."""
     return 2 * C / factor * np.tan(np.pi / 4 + np.arctan(np.tan(np.radians(PHI)) / factor) / 2)
 
 
@@ -29,7 +29,8 @@ LOAD = strength(EXACT)
 
 
 def block(materials, load=LOAD, run=True, **options):
-    """Return a block on a smooth floor at rest under a load on its top, its right side free; run: or as built."""
+    """Return a block on a smooth floor under a load on its top, with a free right side. run: whether to load it first.
+    """
     grid = mpm.Grid([0, 0], [1.0, 1.0], [4, 4])
     half = (mpm.box(grid, [0, 0], [0.5, 0.25]), mpm.box(grid, [0, 0.25], [0.5, 0.5], material=len(materials) - 1))
     top = mpm.Traction("top", lambda t: (0, -load * min(1, t)), region=((0, 0.3), (0.5, 1)))
@@ -72,7 +73,7 @@ def test_a_block_that_cannot_stand_has_its_factor_as_built():
 
 
 def test_a_steep_bank_that_cannot_stand_has_its_factor_as_built():
-    """45 degrees, phi = 20 degrees, c / (gamma H) = 0.05: the best log-spiral, of associated flow, gives 0.91."""
+    """45 degrees, phi = 20 degrees, c / (gamma H) = 0.05: the best log-spiral, with associated flow, gives 0.91."""
     weak = {"friction": PHI, "dilation": 0.0, "cohesion": 0.05 * 1650 * 0.6 * 9.81 * 4}
     assert mpm.factor_of_safety(bank(10, **weak)).factor == pytest.approx(0.91, rel=0.02)
 
@@ -85,7 +86,7 @@ def test_the_factor_of_a_bank_hardly_depends_on_its_stiffness():
 
 
 def test_pore_pressures_that_are_given_are_a_term():
-    """A uniform pressure u in a block with a free side: the effective stress across is -u."""
+    """A uniform pressure u in a block with a free side: the lateral effective stress is -u."""
     u = 2e3
     K = np.tan(np.pi / 4 + np.arctan(np.tan(np.radians(PHI)) / EXACT) / 2) ** 2
     s = block(
@@ -143,7 +144,7 @@ def test_one_line_says_what_is_wrong(make, options, message):
 
 
 def bank(cells, *, run=4.0, crest=4.0, ground=2.0, wet=False, **strength):
-    """Return a bank 4 m high on ground, or on a rough base, as built, not run; under water, or as heavy as there."""
+    """Return a bank, 4 m high, on ground or a rough base, without a run: under water, or with its buoyant weight."""
     h, middle = 4.0 / cells, crest + run / 2
     below, columns = round(ground / h), round((crest + run + 4) / h)
     grid = mpm.Grid(lower=[0, -below * h], upper=[columns * h, 4 + h], cells=[columns, below + cells + 1])
@@ -172,7 +173,7 @@ def bank(cells, *, run=4.0, crest=4.0, ground=2.0, wet=False, **strength):
 
 
 def test_waiting_long_in_water_is_as_quick_as_without():
-    """Long steps took up to forty times as many: the fluid's residual, which grows with them, made tangents stiff."""
+    """Earlier, long steps took up to forty times as many Newton steps: the fluid's residual made tangents stiff."""
     soil = {"friction": 20.0, "dilation": 0.0, "cohesion": 4e3}
     dry, wet = (mpm.factor_of_safety(bank(4, run=8.0, wet=wet, **soil), dt=1e6, rtol=0.03) for wet in (False, True))
     assert wet.factor == pytest.approx(dry.factor, rel=0.03)
@@ -186,7 +187,7 @@ def test_waiting_long_in_water_is_as_quick_as_without():
     ids=["vertical cut", "slope of 45 degrees on a firm base"],
 )
 def test_factors_are_of_first_order_in_the_cells(shape, height, error):
-    """Against limit analysis; the slope slides on a circle through its toe (Chen 1975)."""
+    """Compared with limit analysis. The slope slides on a circle through its toe (Chen 1975)."""
     clay = {"friction": 0.0, "dilation": 0.0, "cohesion": 1650 * 0.6 * 9.81 * 4 / height}
     coarse, fine = (mpm.factor_of_safety(bank(cells, **shape, **clay)).factor for cells in (8, 16))
     print(f"{shape}: {coarse - 1:+.1%}, {fine - 1:+.1%}, extrapolated {2 * fine - coarse - 1:+.1%}")
@@ -196,7 +197,7 @@ def test_factors_are_of_first_order_in_the_cells(shape, height, error):
 
 @pytest.mark.slow
 def test_soft_soil_changes_its_shape_before_it_slides():
-    """A vertical cut in clay whose Young's modulus is 50, 500 and 5000 times gamma H, nu = 2/7."""
+    """A vertical cut in clay with Young's modulus 50, 500 and 5000 times gamma H, nu = 2/7."""
     weight = 1650 * 0.6 * 9.81 * 4
     clay = {"friction": 0.0, "dilation": 0.0, "cohesion": weight / 3.776, "run": 0.0, "crest": 6.0}
     shears = [ratio * weight / (18 / 7) for ratio in (50, 500, 5000)]
@@ -208,13 +209,13 @@ def test_soft_soil_changes_its_shape_before_it_slides():
 
 @pytest.mark.slow
 def test_a_slope_slides_where_limit_analysis_says():
-    """Log-spiral 1.368; finite elements 1.4 (Griffiths and Lane 1999)."""
+    """The best log-spiral gives 1.368, and finite elements 1.4 (Griffiths and Lane 1999)."""
     assert 1.368 < mpm.factor_of_safety(slope.slope(10)).factor < 1.4
 
 
 @pytest.mark.slow
 def test_the_slope_of_a_bench_mark_slides_at_its_own_weight(monkeypatch):
-    """ACADS 1a, c = 3 kPa, phi = 19.6 degrees: 0.985 to 1.00; it is at rest with twice the strength."""
+    """ACADS 1a, c = 3 kPa, phi = 19.6 degrees: 0.985 to 1.00. The slope is at rest with twice the strength."""
     monkeypatch.setattr(slope, "COHESION", 2 * 3e3)
     monkeypatch.setattr(slope, "FRICTION", np.degrees(np.arctan(2 * np.tan(np.radians(19.6)))))
     assert 0.98 * 0.985 < mpm.factor_of_safety(slope.slope(10)).factor / 2 < 1.02

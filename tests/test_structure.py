@@ -14,7 +14,7 @@ TREES = {path: ast.parse(path.read_text()) for path in ROOT.rglob("*.py")}
 
 
 def assigned(tree):
-    """Yield (class, method, attribute) of the attributes that methods set on their own object."""
+    """Yield (class, method, attribute) of the attributes that methods set on their object."""
     for cls in (node for node in ast.walk(tree) if isinstance(node, ast.ClassDef)):
         for method in (node for node in cls.body if isinstance(node, ast.FunctionDef)):
             for node in ast.walk(method):
@@ -95,7 +95,7 @@ def test_nothing_else_is_set_outside_of_init():
 
 
 def test_no_container_stands_for_an_attribute():
-    """self.x[0] += 1 and self.x[:] = y are attributes that change: see `house.hidden`, whose ceiling only falls."""
+    """self.x[0] += 1 and self.x[:] = y change attributes: see `house.hidden`, whose ceiling only decreases."""
     found = [item for item in house.hidden() if "[0]" in item or "[:]" in item or "[()]" in item]
     assert found == []
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A scene is compiled to the terms that it has, and says so."""
+"""A scene compiles only the terms that it has, and lists them."""
 
 import numpy as np
 import pytest
@@ -63,7 +63,7 @@ def test_what_is_left_out_is_not_compiled():
 
 
 def counted(monkeypatch):
-    """Return a list that grows whenever a tangent is made."""
+    """Return a list that grows with each assembled tangent."""
     made, linearise = [], LinearSolvers.linearise
     monkeypatch.setattr(LinearSolvers, "linearise", lambda *a, **options: (made.append(a), linearise(*a, **options)))
     return made

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Where bodies touch they have no surface: free parts of faces, exact for boxes, after the maps of bent bodies."""
+"""Bodies in contact have no surface at the interface: free parts of faces, exact for boxes and after maps."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ SOIL = mpm.Hencky(bulk=1e6, shear=6e5)
 
 @st.composite
 def stacks(draw, dim):
-    """Return a box with up to three boxes side by side on it, with spacings and offsets of their own."""
+    """Return a box with up to three boxes side by side on it, with different spacings and offsets."""
     grid = mpm.Grid([0] * dim, [4.0] * dim, [4] * dim)
 
     def box(low, high):
@@ -35,7 +35,7 @@ def stacks(draw, dim):
 
 
 def moments(low, high):
-    """Return the area of boxes (n, 2, k) of k dimensions, and its first moments."""
+    """Return the area of boxes (n, 2, k) in k dimensions, and its first moments."""
     area = np.maximum(high - low, 0).prod(axis=1)
     return np.concatenate([[area.sum()], (area[:, None] * (low + high) / 2).sum(axis=0)])
 
@@ -88,7 +88,7 @@ def test_bodies_touch_where_their_maps_put_them():
 
 @pytest.mark.parametrize("per_cell", [2, 3, 5])
 def test_a_curve_that_two_bodies_follow_with_other_domains_is_no_surface(per_cell):
-    """Their edges are other chords of the curve."""
+    """The edges of the two bodies are different chords of the curve."""
     grid = mpm.Grid([0, 0], [3.0, 2.0], [12, 8])
 
     def wave(x):
@@ -134,7 +134,7 @@ def test_a_load_on_what_is_free_beside_a_turned_body_carries_its_whole_force():
 
 
 def test_a_curved_interface_in_3d_between_other_lattices_is_no_surface():
-    """Where chords leave slivers between them, drained ones would empty the bodies."""
+    """Chords leave slivers between the bodies. If these were drained, the bodies would lose their water."""
     errors = []
     for cells in (10, 20):
         grid = mpm.Grid([0] * 3, [1.6] * 3, [cells] * 3)

@@ -16,7 +16,7 @@ matplotlib.use("Agg")
 
 @pytest.fixture(scope="module")
 def ran(tmp_path_factory):
-    """Return the result of a wet column with a tool's row of files, and its folder."""
+    """Return the result of a wet column with a tool, and the folder of its files."""
     folder = tmp_path_factory.mktemp("tables")
     held = mpm.Displacement("bottom", (0, 0), name="floor")
     s = column(cells=4, conditions=[top_load(), mpm.Drained("top", name="crest"), held])

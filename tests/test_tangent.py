@@ -9,7 +9,7 @@ import mpm_dolfinx as mpm
 
 
 def block(fluid: bool, dim: int = 2, law: type[mpm.Skeleton] = mpm.Hencky, **options) -> mpm.Simulation:
-    """Return a block that a load has bent aslant, its foot held."""
+    """Return a block that an inclined load has bent, with a fixed base."""
     grid = mpm.Grid([0.0] * dim, [1.0] * dim, [5] * dim)
     soil = law(bulk=1e5, shear=1e5, conductivity=1e-3, **options)
     wet = {"fluid": mpm.Fluid(bulk=1e7), "conditions": [mpm.Drained("right")]} if fluid else {}
@@ -24,7 +24,7 @@ def block(fluid: bool, dim: int = 2, law: type[mpm.Skeleton] = mpm.Hencky, **opt
 
 @pytest.mark.parametrize("fluid", [False, True], ids=["dry", "wet"])
 def test_products_of_the_tangent_are_what_residuals_change_by(fluid):
-    """In a short step: the derivative of fluxes by displacements is left out."""
+    """The step is short, because the tangent omits the derivative of fluxes by displacements."""
     s, rng, dt = block(fluid), np.random.default_rng(2), 1e-4
     found = s.tangent(dt)
     _, momentum, storage = set_up(s, dt)

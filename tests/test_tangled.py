@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Extreme shear and separation: folded domains are re-derived from F, volume and forces stay right, the run goes on."""
+"""Extreme shear and separation: inverted domains are re-initialised from F, volume and forces are correct."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ SOFT = mpm.NeoHookean(bulk=1e7 / 3, shear=5e6)  # Hencky's law loses its stiffne
 
 
 def sheared(sides, gamma=5.0, steps=100):
-    """Return (simulation, result) of a block of 5 x 5 cells whose sides are sheared by gamma in all."""
+    """Return (simulation, result) of a block of 5 x 5 cells whose sides are sheared by gamma in total."""
     grid = mpm.Grid([0, 0], [5.4, 0.9], [54, 9])
     body = mpm.box(grid, [0.2, 0.13], [0.7, 0.63])
 
@@ -35,7 +35,7 @@ def test_a_block_sheared_by_500_percent_keeps_volume_and_stress():
 
 
 def test_a_block_sheared_between_plates_goes_on_where_domains_have_folded(monkeypatch):
-    """No domain is really inverted: corners that span a little less than their volume are taken for it."""
+    """No domain is really inverted. Corners with slightly less than the volume of the domain count as inverted."""
     monkeypatch.setattr("mpm_dolfinx.points.cutting.TANGLED", 0.87)
     s, result = sheared(("bottom", "top"), gamma=4.0, steps=80)
     assert result.converged and result.residual <= 1e-8
@@ -46,7 +46,7 @@ def test_a_block_sheared_between_plates_goes_on_where_domains_have_folded(monkey
 
 @pytest.mark.parametrize("softness", [1e-3, 1e-6])
 def test_a_column_tears_at_a_weak_layer(softness):
-    """The layer is drawn out to twenty times its height; the rest keeps its volume and carries the same force."""
+    """The layer is stretched to twenty times its height. The rest keeps its volume, and carries the same force."""
     grid = mpm.Grid([0, 0], [0.6, 3.2], [6, 32])
     column = [mpm.box(grid, [0.1, 0], [0.53, 0.5]), mpm.box(grid, [0.1, 0.5], [0.53, 0.6], material=1)]
     column.append(mpm.box(grid, [0.1, 0.6], [0.53, 1.0]))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Terms of the user's own on sides of the bodies: springs, dashpots, loads along the normal."""
+"""User-defined terms on sides of the bodies: springs, dashpots, and normal loads."""
 
 import numpy as np
 import pytest
@@ -18,13 +18,13 @@ def springs(points, u):
 
 
 def robin(points, u, v):
-    """Return the same as forces."""
+    """Return the forces of this energy."""
     U = points.displacement + points.value(u)
     return SPRING * U[1] * points.value(v)[1] * points.dx
 
 
 def column(terms, dim=2, off=0.03, load=LOAD, **options):
-    """Return a column between smooth walls, supported by the terms alone, its base off the grid lines."""
+    """Return a column between smooth walls that only the terms support, with its base off the grid lines."""
     grid = mpm.Grid([0] * dim, [0.5] * (dim - 1) + [1.5], [2] * (dim - 1) + [6])
     body = mpm.box(grid, [0] * (dim - 1) + [0.2 + off], [0.5] * (dim - 1) + [1.2 + off])
     every = {"left": "x", "right": "x", "front": "y", "back": "y"}

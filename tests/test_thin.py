@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A slender body needs several points over its thickness; with too few, a warning names it and the error."""
+"""A slender body needs several points over its thickness; with too few, a warning gives the body and the error."""
 
 import re
 from contextlib import nullcontext
@@ -18,7 +18,7 @@ RUBBER = mpm.NeoHookean(bulk=YOUNG / 3, shear=YOUNG / 2)  # nu = 0: plane strain
 
 
 def bent(cells, per_cell):
-    """Return the tip's deflection of a cantilever, so many cells thick, over that of a rod which shears."""
+    """Return the tip deflection of a cantilever of some cells in thickness, divided by that of a rod with shear."""
     h = HEIGHT / cells
     grid = mpm.Grid([0, 0], [11 * cells * h, 6 * cells * h], [11 * cells, 6 * cells])
     bottom = 4 * HEIGHT
@@ -48,7 +48,7 @@ def test_a_body_too_thin_to_bend_is_named(cells, per_cell, said, warned):
 
 
 def test_a_wet_body_with_one_point_a_cell_is_named_with_what_it_loses(warned):
-    """A sealed beam of 1 m x 0.4 m: 11 and 3.6 % with 4 and 8 points over its height, 1.3 % with 16."""
+    """An undrained beam of 1 m x 0.4 m: errors of 11, 3.6 and 1.3 % with 4, 8 and 16 points over its height."""
     for n in (4, 8):
         beam = Beam(soil(conductivity=0), WATER, h=(0.4 / n, 0.4 / n), per_cell=1, offset=0.3, steps=16, drained=())
         scene = beam()
@@ -62,7 +62,7 @@ def test_a_wet_body_with_one_point_a_cell_is_named_with_what_it_loses(warned):
     ("lower", "per_cell", "refused"), [((0, 0, 0), 1, True), ((0, 0, 0.03), 1, True), ((0, 0.03, 0.03), 1, False)]
 )
 def test_domains_that_meet_on_grid_lines_only_are_refused_in_3d(lower, per_cell, refused):
-    """Newton's method found no descent in dry soil; wet soil alternated from cell to cell by any amount."""
+    """Earlier, Newton's method found no descent in dry soil, and wet soil alternated from cell to cell."""
     grid = mpm.Grid([0, 0, 0], [1, 1, 1], [10, 10, 10])
     body, walls = mpm.box(grid, lower, np.add(lower, [0.6, 0.6, 0.5]), per_cell=per_cell), {"bottom": "xyz"}
     conditions = [mpm.Traction("top", (0, 0, -1e3))]

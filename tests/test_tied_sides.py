@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Ground of finite width between tied sides answers as if it went on uniformly."""
+"""Ground of finite width between tied sides responds as ground of infinite width."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ TIED = mpm.Tied("left", "right")
 
 
 def layer(n, width, base, begins=0.5, conditions=(TIED,), **options):
-    """Return a layer, n cells high and some wide, between tied sides."""
+    """Return a layer between tied sides, n cells high and some cells wide."""
     h = HEIGHT / n
     grid = mpm.Grid([0, 0], [(width + 2) * h, HEIGHT + 3 * h], [width + 2, n + 3])
     body = mpm.box(grid, [begins * h, (1 + OFF) * h], [(begins + width) * h, HEIGHT + (1 + OFF) * h])
@@ -24,7 +24,7 @@ def layer(n, width, base, begins=0.5, conditions=(TIED,), **options):
 
 @pytest.mark.parametrize("begins", [0.0, 0.5])
 def test_a_slope_of_finite_width_settles_and_shears_as_an_infinite_one(begins):
-    """Exact: rho g H^2 / 2 over the modulus of each, and the stress of an infinite layer everywhere."""
+    """Exact: rho g H^2 / 2 divided by each modulus, and the stress of an infinite layer everywhere."""
     s = layer(16, 3, mpm.Displacement("bottom", (0, 0)), begins, gravity=(2.0, -9.81))
     s.run(1.0, 0.5, progress=False)
     top, u = s.points.x[:, 1].argmax(), s.points.displacement
@@ -46,7 +46,7 @@ def test_soil_at_rest_keeps_its_horizontal_stress_between_tied_sides():
 
 @pytest.mark.parametrize("width", [2, 5])
 def test_a_layer_of_finite_width_shakes_as_an_infinite_one(width):
-    """Exact: shear and pressure waves stand between a base that moves both ways and the surface."""
+    """Exact: standing shear and pressure waves between the surface and a base that moves in both directions."""
     n, steps, amplitude = 16, 40, np.array([1e-3, 5e-4])
     w, top = 0.3 * np.pi * C_S / HEIGHT, HEIGHT + (1 + OFF) * HEIGHT / n
 
@@ -68,7 +68,7 @@ def test_a_layer_of_finite_width_shakes_as_an_infinite_one(width):
 
 
 def test_a_pulse_that_leaves_on_one_side_enters_on_the_other():
-    """Exact: after a run through its width the layer has its velocity again, at another place or not."""
+    """Exact: after a run through its width the layer has its initial velocity, also after a translation."""
     n, width = 1, 40
     h = HEIGHT / n / 10
     grid = mpm.Grid([0, 0], [(width + 2) * h, h], [width + 2, 1])

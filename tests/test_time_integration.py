@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Time: order of the steps, laws within them, jumps, steps chosen by their error, output times."""
+"""Time: order of the steps, laws in substeps, jumps, adaptive steps, and output times."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -40,7 +40,7 @@ SCENES = {
 
 @pytest.mark.parametrize("name", SCENES)
 def test_what_changes_within_a_step_is_of_second_order(name):
-    """A column of one metre that settles by a tenth, through cells of a fifth."""
+    """A column of one metre settles by a tenth, through cells of a fifth."""
 
     def end(steps):
         s = column(cells=5, conditions=[*ramp(1e6, 40), OPEN], **SCENES[name])
@@ -55,7 +55,9 @@ def test_what_changes_within_a_step_is_of_second_order(name):
 
 @pytest.mark.parametrize("steps", [1, 7, 100])
 def test_a_sealed_bodys_fluid_keeps_its_mass_whatever_the_steps(steps):
-    """rho V of the pores stays: (n0 + J - 1) exp(p / K_w) = n0, for water as soft as the skeleton at large strain."""
+    """rho V of the pores is constant: (n0 + J - 1) exp(p / K_w) = n0, for water as soft as the skeleton at large
+    strain.
+    """
     s = column(cells=4, conditions=[*ramp(3e6, 1.0)], fluid=SOFT_WATER)
     s.run(1.0, 1 / steps, progress=False)
     J, p = s.points.J, s.points.pressure
@@ -64,7 +66,7 @@ def test_a_sealed_bodys_fluid_keeps_its_mass_whatever_the_steps(steps):
 
 
 def hencky_column(width, headroom=0, load=1.0, porosity=0.7, **options):
-    """Return (simulation, probe at the top, c_v) of a column of 50 cells under a load over its modulus, put on at once.
+    """Return (simulation, probe at the top, c_v) of a column of 50 cells under a sudden load, divided by its modulus.
 
     With k = k0 J^3 / (1 - ln J) the stretch diffuses linearly, at any strain.
     """
@@ -87,7 +89,7 @@ def hencky_column(width, headroom=0, load=1.0, porosity=0.7, **options):
 
 @pytest.mark.parametrize("width", [1, 2])
 def test_a_conductivity_law_is_taken_at_the_stages_of_the_step(width):
-    """Also where cells lie side by side: their differences grew in Newton's steps until these led nowhere."""
+    """Also for adjacent cells: earlier, their differences grew in Newton's steps until the iteration failed."""
     s, top, cv = hencky_column(width)
     final = 1 - 0.5671432904097838  # ln J / J = -1 at the end
     result = s.run(0.1 / cv, 0.1 / cv / 20, probes=top, progress=False)
@@ -102,14 +104,14 @@ def test_a_conductivity_law_is_taken_at_the_stages_of_the_step(width):
 @pytest.mark.parametrize("dt", [1e-2, 1.5e-3, 1e-5])
 @pytest.mark.parametrize("width", [2, 3])
 def test_a_first_step_is_taken_however_long_it_is(width, dt):
-    """From T_v = 1e-5, before any drainage; Newton's method then needs the derivative of fluxes by strains."""
+    """From T_v = 1e-5, before any drainage. Newton's method then needs the derivative of fluxes by strains."""
     s, _, cv = hencky_column(width, headroom=5, numerics=mpm.Numerics(method="backward-euler"))
     report = s.step(dt / cv)
     assert report.newton <= 15 and np.ptp(np.sort(s.points.J)[: 2 * width]) < 1e-8
 
 
 def test_a_step_that_makes_a_law_meaningless_is_shortened():
-    """The first Newton step turns the top cells inside out, where k is not a number: it is shortened."""
+    """The first Newton step inverts the top cells, where k is not a number, and is therefore shortened."""
     s, _, cv = hencky_column(1, headroom=5, load=1.5, porosity=0.8, numerics=mpm.Numerics(method="backward-euler"))
     report = s.step(0.005 / cv)
     assert np.isinf(report.history).any() and 0.475 < s.points.J.min() < 0.6  # ln J / J = -1.5 at 0.475
@@ -161,7 +163,7 @@ def test_backward_euler_is_an_option_and_of_first_order():
 
 
 def test_a_term_of_the_velocity_makes_a_dry_body_creep_exactly():
-    """Kelvin-Voigt: strain = q / M (1 - exp(-M t / eta)), for a load that stays."""
+    """Kelvin-Voigt: strain = q / M (1 - exp(-M t / eta)), under a constant load."""
     eta, load = 1e8, 1e3
 
     def damper(points, velocity, v):
@@ -215,7 +217,7 @@ def swinging(speed):
 
 @pytest.mark.parametrize("name", DRIVEN)
 def test_the_estimated_error_is_that_of_a_run_to_a_factor_that_is_told_whatever_drives_the_water(name):
-    """Against steps an eighth as long: 0.7 to 5 times the estimate, see `newton.ERROR`."""
+    """Compared with steps an eighth as long: 0.7 to 5 times the estimate, see `newton.ERROR`."""
     dt, make = DRIVEN[name]
     s, fine, errors, estimates = make(), make(), [], []
     for _ in range(10):
@@ -236,9 +238,9 @@ def test_output_times_are_hit_whatever_the_steps():
 
 
 def test_steps_grow_over_six_decades_of_consolidation():
-    """From T_v = 1e-6 to 1, in the cells, against steps so short that time costs nothing.
+    """From T_v = 1e-6 to 1, in the cells, compared with steps so short that the error in time is negligible.
 
-    Most is the first steps' damping.
+    Most of the error is the damping of the first steps.
     """
     cv = SOFT.conductivity / 9810 * SOFT.oedometric
 
@@ -255,7 +257,7 @@ def test_steps_grow_over_six_decades_of_consolidation():
 
 
 def test_a_jump_of_the_load_within_the_run_is_found():
-    """The load doubles at 7.3 s, between outputs: steps shrink towards it, and the error stays within its tolerance."""
+    """The load doubles at 7.3 s, between outputs: steps shrink towards this time, and the error meets its tolerance."""
     jump = [mpm.Traction("top", lambda t: (0, -100.0 if t < 7.3 else -200.0))]
 
     def run(times, **options):
@@ -270,7 +272,7 @@ def test_a_jump_of_the_load_within_the_run_is_found():
 
 
 def test_pressures_that_flow_away_within_a_step_do_not_hold_it_up():
-    """A beam of gravel bends as without water: its pressures are 1e-4 of the load.  It took 1466 steps, not 23."""
+    """A beam of gravel bends as without water: pressures are 1e-4 of the load. Earlier it took 1466 steps, now 23."""
     material = replace(SOFT, conductivity=1.0)
     wet, tip = beam(h=0.06, material=material)
     result = wet.run(0.3, rtol=3e-3, t_eval=[0.06], probes=tip, progress=False)
@@ -362,7 +364,7 @@ def test_a_method_that_has_no_error_cannot_choose_its_steps():
 
 
 class Stop:
-    """Interrupts a run after so many outputs."""
+    """Interrupts a run after a number of outputs."""
 
     def __init__(self, count):
         self.count = count
@@ -373,7 +375,7 @@ class Stop:
 
 
 def driven(fails: Callable[[int, float], bool], intervals: int) -> tuple[int, StepControl, list[float]]:
-    """Return cuts, memory and lengths of equal steps; `fails` decides from interval and length which ones fail."""
+    """Return cuts, memory and lengths of equal steps; `fails` selects failing steps by interval and length."""
     rule, control, cuts, taken = StepSize(1.0, 1.0), StepControl(small=1.0), 0, []
     for interval in range(intervals):
         left = 1.0

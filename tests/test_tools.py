@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Rigid tools: exact pressures, sticking and slipping, energy, refusals, restart."""
+"""Rigid tools: exact pressures, stick and slip, energy, refusals, restart."""
 
 from dataclasses import replace
 
@@ -19,12 +19,12 @@ GEL = mpm.Hencky(bulk=1e6, shear=6e5, grain_density=2000, porosity=0.5)
 
 
 def turned(angle):
-    """Return the matrix of a turn."""
+    """Return the matrix of a rotation."""
     return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
 
 
 def deepest(simulation):
-    """Return how deep corners are in the tools, in cells."""
+    """Return the largest depth of corners in the tools, in cells."""
     t, d = simulation.t, simulation.grid.dim
     x = simulation.points.corners.reshape(-1, d)
     tools = [one for one in simulation.conditions if isinstance(one, mpm.Tool)]
@@ -32,7 +32,7 @@ def deepest(simulation):
 
 
 def pressed(angle, offset, cells=4):
-    """Return a cube of 0.8 m between two plates, along a turned axis, pressed by 0.2 m."""
+    """Return a cube of 0.8 m between two plates, compressed by 0.2 m along a rotated axis."""
     R, h = turned(angle), 0.8 / cells
     grid = mpm.Grid([0, 0], [2.0, 2.0], [round(2 / h)] * 2)
     middle = np.array([1.0, 1.0 + offset * h])
@@ -58,7 +58,7 @@ def test_a_plate_presses_a_cube_evenly_wherever_it_lies(angle, offset, error):
 
 
 def test_corners_of_a_gel_that_rough_plates_squeeze_stay_outside():
-    """Aslant to the grid; its corners were 5e-3 cells inside of them."""
+    """Inclined to the grid. Earlier, corners were 5e-3 cells inside the tools."""
     R, middle = turned(0.3), np.array([1.0, 1.04])
     grid = mpm.Grid([0, 0], [2.0, 2.0], [10, 10])
     body = mpm.mapped(grid, mpm.box(grid, [0, 0], [0.8, 0.8]), lambda x: (x - 0.4) @ R.T + middle)
@@ -71,7 +71,7 @@ def test_corners_of_a_gel_that_rough_plates_squeeze_stay_outside():
 
 @pytest.mark.parametrize("steps", [1, 10])
 def test_a_disc_presses_a_layer_with_the_exact_pressures(steps):
-    """15 cells over the half-width, in one step and as the contact grows."""
+    """15 cells over the half-width, in one step and in many steps."""
     cells, R, L, nu = 16, 200.0, 4.0, 0.3
     top = L + 0.3 / cells
     grid = mpm.Grid([0, 0], [L, L + 1], [round(L * cells), round((L + 1) * cells)])
@@ -88,7 +88,7 @@ def test_a_disc_presses_a_layer_with_the_exact_pressures(steps):
 
 
 def on_a_plane(angle, reach, steps=8, mu=0.5):
-    """Return a block on a plane, gravity turned to a share of the angle at which it slips, then held; with its run."""
+    """Return a block on a plane, under gravity at a fraction of the slip angle, and its run."""
     R, slips = turned(angle), np.arctan(mu)
     grid = mpm.Grid([0, 0], [2, 2], [8, 8])
     body = mpm.mapped(grid, mpm.box(grid, [0, 0], [1, 0.5]), lambda x: (x - [0.5, 0]) @ R.T + [1, 0.7])
@@ -142,9 +142,9 @@ def test_a_smooth_retaining_wall_has_the_pressure_of_rankine(way, length):
 
 
 def on_a_floor(way, cells, length, delta, floor, steps):
-    """Return K of a wall of 1 m that is moved against weightless sand, phi = 30 degrees, under a surcharge of 10 kPa.
+    """Return K of a wall of 1 m that moves against weightless sand, phi = 30 degrees, under a surcharge of 10 kPa.
 
-    K: normal pressures over the surcharge, both with c cot(phi) added; an entry a step.
+    K: normal pressures over the surcharge, each plus c cot(phi), with an entry for each step.
     """
     h, load, c, mu = 1 / cells, 1e4, 1e3, np.tan(np.radians(delta))
     rest = c / np.tan(np.radians(30))
@@ -165,7 +165,7 @@ def on_a_floor(way, cells, length, delta, floor, steps):
 
 @pytest.mark.slow
 def test_a_wall_that_gives_way_on_a_rough_floor_nears_rankine_s_pressure():
-    """Q1 velocities over-constrain the sand that flows from the toe: its best mechanism has a larger error."""
+    """Q1 velocities over-constrain the sand at the toe: their best mechanism has a larger error."""
     errors = [3 * on_a_floor(-0.001, cells, 1.5, 0.0, {"friction": 0.8}, 5)[-1] - 1 for cells in (10, 20)]
     print(errors)
     assert max(thrust(10, 0.5), -0.11) < errors[0] < 1.5 * errors[1] < 0
@@ -179,7 +179,7 @@ def test_constraints_of_dilatant_cells_and_friction_at_the_toe_lower_the_thrust_
 
 @pytest.mark.slow
 def test_a_rough_wall_pushes_with_the_exact_pressure():
-    """Prandtl's fan between Rankine's zone and the wall, whose friction is half of the sand's angle."""
+    """Prandtl's fan between Rankine's zone and the wall; the wall has half of the sand's friction angle."""
     phi, delta = np.radians([30, 15])
     turn = delta + np.arcsin(np.sin(delta) / np.sin(phi))
     exact = (1 + np.sin(phi) * np.cos(turn)) / (1 - np.sin(phi)) * np.exp(turn * np.tan(phi))
@@ -188,7 +188,7 @@ def test_a_rough_wall_pushes_with_the_exact_pressure():
 
 
 def work(friction, path, end, steps):
-    """Return the work, J/m, that a plate does on a block along a path (t) -> m, and the sum of its parts' sizes."""
+    """Return the work, in J/m, of a plate on a block along a path (t) -> m, and the sum of its parts' magnitudes."""
     grid = mpm.Grid([0, 0], [1.5, 0.75], [12, 6])
     body = mpm.box(grid, [0.25, 0], [1.25, 0.53])
     plate = mpm.Tool(mpm.HalfSpace((0, 0.53), (0, -1)), displacement=path, friction=friction)
@@ -200,14 +200,14 @@ def work(friction, path, end, steps):
 
 
 def to_and_fro(t):
-    """Down, to the right, to the left, to the right, up."""
+    """Return the path down, to the right, to the left, to the right, and up."""
     corners = np.array([[0, 0], [0, -0.03], [0.05, -0.03], [-0.05, -0.03], [0, -0.03], [0, 0.01]])
     return np.stack([np.interp(t, [0, 1, 2, 4, 5, 6], column) for column in corners.T])
 
 
 @pytest.mark.parametrize(("steps", "error"), [(5, 4.3e-4), (20, 1.2e-4)])
 def test_a_smooth_plate_gives_back_what_it_took(steps, error):
-    """Down, along, and up, by less than resets the grid: to first order in the step."""
+    """Down, sideways and up, by less than the distance that resets the grid: first order in the step."""
 
     def path(t):
         corners = np.array([[0, 0], [0, -3e-5], [3e-5, -3e-5], [0, 0]])
@@ -226,7 +226,7 @@ def test_friction_takes_energy_and_slips_at_its_coefficient():
 
 
 def test_adhesion_bounds_the_shear():
-    """A rough plate that is pushed along clay takes alpha s_u on the area that it touches."""
+    """A rough plate that is pushed along clay has a shear of alpha s_u on its contact area."""
     grid = mpm.Grid([0, 0], [1.5, 0.75], [12, 6])
     body = mpm.box(grid, [0.25, 0], [1.25, 0.5])
     plate = mpm.Tool(mpm.HalfSpace((0, 0.5), (0, -1)), lambda t: (0.1 * max(0, t - 1), -0.01 * min(t, 1)), adhesion=2e3)
@@ -237,7 +237,7 @@ def test_adhesion_bounds_the_shear():
 
 @pytest.mark.parametrize("friction", [0.0, 0.4])
 def test_the_tangent_of_the_contact_is_its_derivative(friction):
-    """In a step in which a disc turns and slips."""
+    """A step in which a disc rotates and slips."""
     grid = mpm.Grid([-0.25, 0], [1.25, 1], [12, 8])
     disc = mpm.Ball((0.5, 0.71), 0.2)
     motion = {"displacement": lambda t: (0.02 * t, -0.01 * t), "rotation_rad": lambda t: 0.2 * t, "centre": (0.5, 0.7)}
@@ -326,7 +326,7 @@ def test_a_tool_that_outruns_the_body_cuts_the_step():
 
 
 def test_a_tool_that_would_be_behind_a_beam_after_a_step_bends_it():
-    """From above to below it in one step: no place was in the tool at its end, and no force acted."""
+    """The tool passes the body in one step: earlier, no position was in the tool at the end, and no force acted."""
     grid = mpm.Grid([0, 0], [1.0, 1.0], [10, 10])
     beam = mpm.box(grid, [0, 0.6], [0.6, 0.7])
     shape = mpm.Convex([[0.4, 0.71], [0.8, 0.71], [0.8, 0.81], [0.4, 0.81]])
@@ -385,7 +385,7 @@ def test_a_refused_step_leaves_the_contact():
 
 
 def test_a_stage_goes_on_with_a_tool_wherever_the_step_before_left_it():
-    """A disc that is small for its cells is 0.014 of one inside at a place, more than a tool that begins may be."""
+    """A disc that is small for its cells is 0.014 cells inside a body, more than a new tool may be."""
     grid = mpm.Grid([0, 0], [1.2, 1.0], [6, 5])
     forces = []
     for stages in (1, 2):
@@ -419,7 +419,7 @@ def test_a_stage_takes_tools_away_and_brings_others():
 
 
 def test_a_plate_presses_a_cube_evenly_in_space():
-    """On a rough floor, which it does not slip on: nu = 0."""
+    """On a rough floor without slip: nu = 0."""
     grid = mpm.Grid([0, 0, 0], [1.2, 1.2, 1], [6, 6, 5])
     body = mpm.box(grid, [0.17, 0.2, 0], [0.97, 1, 0.8])
     floor = mpm.Tool(mpm.HalfSpace((0, 0, 0), (0, 0, 1)), friction=0.2)
@@ -459,7 +459,9 @@ def test_a_state_with_tools_may_be_put_back():
 
 
 def test_a_disc_that_turns_drives_the_body_by_friction():
-    """Anti-clockwise on its top: to the right; its moment is mu times its pressing force times its radius."""
+    """A disc on top that rotates anti-clockwise drives the body to the right. Its moment is mu times force times
+    radius.
+    """
     turn = {"rotation_rad": lambda t: 0.3 * max(0, t - 1), "centre": (0.5, 0.8), "friction": 0.3}
     s = simple(shape=mpm.Ball((0.5, 0.8), 0.2), tool={"displacement": lambda t: (0, -0.01 * min(t, 1)), **turn})
     s.run(2.0, 0.25)
@@ -470,7 +472,7 @@ def test_a_disc_that_turns_drives_the_body_by_friction():
 
 @pytest.mark.parametrize("ends", [(0.3, 0.38), (0.33, 0.41), (0.3, 0.4)])
 def test_a_tool_less_than_a_cell_wide_presses(ends):
-    """Its edges left nothing of it: it went into the body without a force."""
+    """Earlier, its rounded edges left no flat part, and it penetrated the body without force."""
     grid, (a, b) = mpm.Grid([0, 0], [1.0, 0.7], [10, 7]), ends
     stamp = mpm.Convex([(a, 0.5), (b, 0.5), (b, 0.6), (a, 0.6)])
     one_cell = mpm.Displacement("top", lambda t: (0, -0.02 * t), "y", region=((0.3, 0.4), (0.4, 0.6)))

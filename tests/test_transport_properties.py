@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The pressures that random bodies take along on random ways: nothing is lost, new, or smeared that is linear."""
+"""Pressures of random bodies on random paths: no loss, no new extremes, and no change of linear fields."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -21,7 +21,7 @@ AT_REST, CARRIED, STRETCHED, BENT = "at rest", "carried", "turned and stretched"
 
 @dataclass
 class Points:
-    """Material points, as far as pressures need them: their numbers."""
+    """Material points as far as pressures need them: their ids."""
 
     id: np.ndarray
 
@@ -31,7 +31,7 @@ class Points:
 
 @dataclass
 class Motion:
-    """Cells (d,), m, points, their pieces before and where these go, m, their pieces after, and random numbers."""
+    """Cells (d,), in m, points, pieces before and after the motion, in m, and random numbers."""
 
     h: np.ndarray
     points: Points
@@ -41,17 +41,17 @@ class Motion:
     random: np.random.Generator
 
     def brought(self, pressure, slope, bounds):
-        """Return the values of the pieces afterwards, from these values before; the tested code, by its names."""
+        """Return the values of the pieces after the motion, from those before (the tested code, called by name)."""
         old = self.before
         carried = PiecePressures(self.points.id[old.point], old.cell, old.fraction, pressure, self.x, slope, bounds)
         return transport(carried, self.points, self.after)
 
     def mean(self, values):
-        """Return the mean in each point of values of the pieces before."""
+        """Return the mean of piece values before the motion, for each point."""
         return np.bincount(self.before.point, self.before.fraction * values)
 
     def ends(self, bounds):
-        """Return the least and the largest bound of each point, for its pieces after."""
+        """Return the smallest and the largest bound of each point, for its pieces after the motion."""
         first = np.flatnonzero(np.diff(self.before.point, prepend=-1))
         low, high = np.minimum.reduceat(bounds[:, 0], first), np.maximum.reduceat(bounds[:, 1], first)
         return low[self.after.point], high[self.after.point]
@@ -59,7 +59,7 @@ class Motion:
 
 @st.composite
 def motions(draw, *kinds):
-    """A distorted body of some cells on a grid of any shape, in two or three dimensions, on its way over some cells."""
+    """Draw a distorted body of some cells on a grid of any shape, in 2D or 3D, that moves over some cells."""
     d, kind = draw(st.sampled_from([2, 3])), draw(st.sampled_from(kinds))
     h, offset = orders(draw, -2, 2, d), orders(draw, -1, 2, d) * numbers(draw, -1, 1, d)
     grid = mpm.Grid(h * (offset - 8), h * (offset + 8), [16] * d)
@@ -90,7 +90,7 @@ def motions(draw, *kinds):
 
 
 def anything(motion, wide):
-    """Return pressures, slopes and bounds, which may be just the pressures; `wide` scales slopes and bounds."""
+    """Return pressures, slopes and bounds, which may equal the pressures; `wide` scales slopes and bounds."""
     random, of = motion.random, motion.before.point
     p = random.normal(size=len(of)) + 10 * random.normal(size=len(motion.points))[of]
     slope = wide * random.normal(size=motion.x.shape) / motion.h
@@ -141,7 +141,7 @@ def test_an_even_pressure_stays_even(motion):
 
 
 def linear(motion, room):
-    """Return the exact values of a linear pressure after the motion, and the transported ones."""
+    """Return the exact values of a linear pressure after the motion, and the transported values."""
     slope, middle = motion.random.normal(size=motion.x.shape[1]) / motion.h, motion.x.mean(axis=0)
     p = (motion.x - middle) @ slope
     after = motion.brought(p, np.tile(slope, (len(p), 1)), np.tile([-room, room], (len(p), 1)))
@@ -158,7 +158,7 @@ def test_a_linear_pressure_is_carried_exactly(motion, room):
 @repeatable(40)
 @given(motions(BENT), st.sampled_from([np.inf, 1e9]))
 def test_a_linear_pressure_is_carried_exactly_but_for_the_means_of_points_that_bend(motion, room):
-    """Their centroids then are not quite where their pieces go; the means are kept."""
+    """The centroids of points then differ slightly from the positions of their pieces; means are conserved."""
     exact, after = linear(motion, room)
     off = after - exact
     mean = np.bincount(motion.after.point, motion.after.fraction * off)
@@ -193,7 +193,7 @@ def grid_of(*shape):
 
 @dataclass
 class Cells:
-    """Cells of a grid with values p; centroids and origins in cells from the midpoints; open faces."""
+    """Cells of a grid with values p; centroids and origins, in cells, from the midpoints; open faces."""
 
     grid: mpm.Grid
     reconstruction: Reconstruction
@@ -203,7 +203,7 @@ class Cells:
     origin: np.ndarray
 
     def slopes(self, p=None):
-        """Return slopes (n, d), per cell, and bounds (n, 2) of all cells (the tested code, by its names)."""
+        """Return slopes (n, d), per cell, and bounds (n, 2) of all cells (the tested code, called by name)."""
         h, cells = self.grid.h, np.arange(self.grid.num_owned)
         p = self.p if p is None else p
         sealed = np.full((len(cells), len(h), 2, 2), np.nan)
@@ -217,7 +217,7 @@ class Cells:
         return np.stack(np.unravel_index(self.grid.cell_number, self.grid.shape), axis=1)
 
     def neighbours(self, cell):
-        """Return (axis, +-1, neighbour) of a cell's neighbours behind open faces."""
+        """Return (axis, +-1, neighbour) of the neighbours behind open faces of a cell."""
         index = self.index
         for axis in range(self.grid.dim):
             for end in (0, 1):
@@ -229,7 +229,7 @@ class Cells:
 
 @st.composite
 def cells(draw):
-    """Cells with random values, all different or some equal, on centre or off it, some of them with closed faces."""
+    """Draw cells with random values, all different or some equal, with or without offset centroids and closed faces."""
     grid, reconstruction = grid_of(*draw(st.sampled_from([(5, 4), (1, 6), (3, 3, 4), (4, 1, 2)])))
     random, n, d = np.random.default_rng(draw(st.integers(0, 2**32))), grid.num_owned, grid.dim
     p = draw(st.sampled_from([random.normal(size=n), random.integers(-2, 3, size=n)])) * orders(draw, -6, 6)
@@ -253,7 +253,7 @@ def test_a_reconstruction_keeps_between_the_extremes_of_the_cell_and_its_open_ne
 
 
 def share(slope, origin, low, high):
-    """Return the largest share of a slope by which nothing in the cell is below `low` or above `high`, from p = 0."""
+    """Return the largest fraction of a slope that keeps the values in the cell between `low` and `high`, from p = 0."""
     ends = (np.array([-0.5, 0.5]) - origin[:, None]) * slope[:, None]
     reach = ends.min(axis=1).sum(), ends.max(axis=1).sum()
     return min(1.0, *(room / r for room, r in zip((low, high), reach, strict=True) if r))
@@ -262,7 +262,7 @@ def share(slope, origin, low, high):
 @repeatable(100)
 @given(cells())
 def test_a_slope_is_the_harmonic_mean_of_those_to_both_neighbours_as_far_as_no_extreme_is_passed(scene):
-    """Nothing where a neighbour is missing or the slopes to the two have different signs."""
+    """The slope is zero if a neighbour is missing, or if the slopes to the two neighbours have different signs."""
     slope, bounds = scene.slopes()
     for cell, p in enumerate(scene.p):
         sides = np.zeros((scene.grid.dim, 2))
@@ -277,7 +277,9 @@ def test_a_slope_is_the_harmonic_mean_of_those_to_both_neighbours_as_far_as_no_e
 @repeatable(60)
 @given(cells(), st.data())
 def test_slopes_of_linear_values_are_exact_within_the_body_but_for_the_extremes(scene, data):
-    """Where planes of cells are filled alike.  On centres they are exact in 2D; aslant in 3D, neighbours limit them."""
+    """Planes of cells are filled alike. With centred centroids slopes are exact in 2D; in 3D, inclined, neighbours
+    limit them.
+    """
     d, index = scene.grid.dim, scene.index
     g, off = orders(data.draw, -2, 2, d) * data.draw(st.sampled_from([-1, 1])), numbers(data.draw, -0.4, 0.4, d, 8)
     off *= data.draw(st.integers(0, 1))

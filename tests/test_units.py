@@ -12,7 +12,7 @@ from mpm_dolfinx.verification.biot_fem import BiotFEM
 
 
 class Units(NamedTuple):
-    """How many units a metre, a newton and a second are."""
+    """Numbers of units in a metre, a newton and a second."""
 
     length: float = 1.0
     force: float = 1.0
@@ -49,7 +49,7 @@ LOAD = 5e4  # Pa
 
 
 def column(units, *, water=None, **options):
-    """Return the largest pore pressures, Pa, of a column that is loaded in steps, by the histories of a run."""
+    """Return the largest pore pressures, in Pa, of a column that is loaded in steps, from the histories."""
     grid = mpm.Grid([0, 0], np.array([0.2, 1.2]) * units.length, [2, 12])
     body = mpm.box(grid, [0, 0], np.array([0.2, 1.0]) * units.length)
     walls = {"left": "x", "right": "x", "bottom": "y"}
@@ -62,7 +62,7 @@ def column(units, *, water=None, **options):
 
 @pytest.mark.parametrize("name", OTHERS)
 def test_a_column_under_gravity_consolidates_alike_in_all_units(name):
-    """In mm, N, s it had 9.5 for 23.0 kPa: conductivities became mobilities by 9.81, whatever the unit of length."""
+    """Earlier, in mm, N and s it had 9.5 in place of 23.0 kPa, because mobilities used 9.81 for any unit of length."""
     units = OTHERS[name]
     want = column(Units(), gravity=(0, -9.81))
     assert column(units, gravity=(0, -9.81 * units.gravity)) == pytest.approx(want, rel=1e-6)
@@ -109,7 +109,7 @@ def test_fluids_know_their_unit_weight():
 
 @pytest.mark.parametrize("name", OTHERS)
 def test_water_on_sides_and_levels_weigh_what_the_pore_fluid_does(name, warned):
-    """They had 9810 for any fluid, and in any units."""
+    """Earlier, the unit weight was 9810 for any fluid and any units."""
     found = []
     for units in (Units(), OTHERS[name]):
         push, head = mpm.water("top", 1.5 * units.length)
@@ -162,7 +162,7 @@ def test_finite_elements_take_the_same_unit_weight():
 
 
 def test_sides_of_bent_bodies_cover_each_other_alike_in_any_unit_of_length():
-    """In plane strain the unit width of faces was one of their edges: with longer cells, gaps counted as contact."""
+    """Earlier, the unit width was an edge of faces in plane strain: with longer cells, gaps counted as contact."""
 
     def contacts(length):
         grid = mpm.Grid([0, -length], [5 * length, 4 * length], [5, 5])

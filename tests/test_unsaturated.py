@@ -16,7 +16,7 @@ STIFF = {"bulk": 1e10, "shear": 5e9}  # Pa: soil that hardly deforms
 
 
 def column(cells, soils, pressure, conditions=(), edge=None, width=1, **options):
-    """Return a column of 1 m between smooth walls; edge: height from which the second soil lies, m."""
+    """Return a column of 1 m between smooth walls. edge: height of the lower end of the second soil, in m."""
     h = 1 / cells
     grid = mpm.Grid([0, 0], [width * h, 1 + 2 * h], [width, cells + 2])
     ends = [0.0, 1.0] if edge is None else [0.0, edge, 1.0]
@@ -27,13 +27,13 @@ def column(cells, soils, pressure, conditions=(), edge=None, width=1, **options)
 
 
 def heads(s, z):
-    """Return pressures over the weight of water at heights z, m."""
+    """Return pressures at heights z, in m, divided by the unit weight of water."""
     cell = s.cells()
     return np.interp(z, cell.x[:, 1], cell.pressure) / WATER
 
 
 def water(s):
-    """Return the water in all pores, m^2."""
+    """Return the water in all pores, in m^2."""
     return s.cells().water.sum()
 
 
@@ -45,7 +45,7 @@ TAKEN_IN = {1: 0.0288, 6: 0.1518453}  # m
 
 
 def infiltrated(cells, dt):
-    """Return the column of Srivastava and Yeh (1991), and its heads at four heights less the exact ones, by hour."""
+    """Return the column of Srivastava and Yeh (1991), and the errors of its heads at four heights, by hour."""
     a, k = 5.0, 1e-5
     law = mpm.Gardner(WATER / a)
     soil = mpm.LinearElastic(**STIFF, porosity=0.35, conductivity=k, retention=law)
@@ -65,7 +65,7 @@ def infiltrated(cells, dt):
 
 
 def test_rain_on_exponential_soil_is_that_of_srivastava_and_yeh():
-    """Within 0.6 % of the largest head with 20 cells, 0.15 % with 40: of second order in h."""
+    """The error is below 0.6 % of the largest head with 20 cells, and 0.15 % with 40 cells: second order in h."""
     coarse, fine = (infiltrated(cells, 600) for cells in (20, 40))
     for hour in (1, 6):
         size = np.abs(SRIVASTAVA_YEH[1]).max()
@@ -98,20 +98,20 @@ def test_rain_on_exponential_soil_is_of_second_order_in_the_step():
     ],
 )
 def test_a_front_runs_into_dry_soil_as_that_of_celia(cells, front, taken):
-    """Celia, Bouloutas and Zarba (1990), second case, after 12 h: place of -5 m (m), water (relative)."""
+    """Celia, Bouloutas and Zarba (1990), second case, after 12 h: position of the head of -5 m, and water."""
     result = check_celia(cells, front, taken, dt=3600)
     assert result.balance < 1e-8
 
 
 def test_a_front_runs_in_steps_by_the_error_of_its_water():
-    """Within the same bounds, in about as many steps; errors in time are far below errors of the cells."""
+    """The bounds are the same, with about as many steps. Errors in time are far below errors of the cells."""
     result = check_celia(25, 1.2e-3, 2.5e-3, rtol=3e-2)
     assert result.steps < 35
     assert result.balance < 1e-8
 
 
 class Celia:
-    """Soil and sides of Celia's column, and reference values after 12 h: 1600 finite volumes, extrapolated."""
+    """Soil and sides of Celia's column, and reference values after 12 h, extrapolated from 1600 finite volumes."""
 
     law = mpm.VanGenuchten(WATER / 3.35, residual=0.102 / 0.368, n=2.0)
     soil = mpm.LinearElastic(**STIFF, porosity=0.368, conductivity=9.22e-5, retention=law)
@@ -119,12 +119,12 @@ class Celia:
     depth, taken_in = 0.375096, 0.026335  # m, of the head of -5 m; m
 
     def front(self, z, pressure):
-        """Return the depth, m, of a head of -5 m by pressures at heights z (n,), which rise."""
+        """Return the depth, in m, of a head of -5 m, from pressures at increasing heights z (n,)."""
         return np.interp(5.0, -pressure[::-1] / WATER, 1 - z[::-1])
 
 
 def check_celia(cells, front, taken, **steps):
-    """Run the column of Celia; return its result."""
+    """Run the column of Celia, and return its result."""
     known = Celia()
     s = column(cells, [known.soil], -10 * WATER, known.sides, initial_stress=mpm.K0(0.5))
     start = water(s)
@@ -136,7 +136,7 @@ def check_celia(cells, front, taken, **steps):
 
 
 class Liakopoulos:
-    """Del Monte sand, of the user's own: chi is the saturation."""
+    """Del Monte sand as a user-defined curve: chi is the saturation."""
 
     def saturation(self, p):
         return ufl.max_value(1 - 1.9722e-11 * ufl.max_value(-p, 0.0) ** 2.4279, 0.2)
@@ -146,7 +146,7 @@ class Liakopoulos:
 
 
 def test_a_column_drains_and_settles_as_that_of_liakopoulos():
-    """20 cells, up to 2 h: pressures within 0.5 % of the largest, settlement 0.2 %, outflow 2 %."""
+    """20 cells, up to 2 h: errors of 0.5 % of the largest pressure, 0.2 % of the settlement, 2 % of the outflow."""
     E, nu, h = 1.3e6, 0.4, 0.05
     law = {"conductivity": 4.5e-10 * WATER, "retention": Liakopoulos()}
     soil = mpm.LinearElastic(bulk=E / 3 / (1 - 2 * nu), shear=E / 2 / (1 + nu), porosity=0.2975, **law)
@@ -169,7 +169,7 @@ def test_a_column_drains_and_settles_as_that_of_liakopoulos():
 
 
 class Pressed:
-    """A column of 1 m with a suction of 20 kPa, pressed by 1 % of that: its linear theory."""
+    """Linear theory of a column of 1 m with a suction of 20 kPa, under a load of 1 % of the suction."""
 
     chi, jump, c, modulus, load = 0.3535533906, 0.01985921, 1.03261675e-8, 5e6, 200.0
     law = mpm.VanGenuchten(20e3, n=2.0)
@@ -179,16 +179,16 @@ class Pressed:
     M = (2 * np.arange(400) + 1) * np.pi / 2
 
     def settled(self, T):
-        """Return the settlement, m."""
+        """Return the settlement, in m."""
         return self.load / self.modulus * (1 - self.chi * self.jump * (2 / self.M**2 * np.exp(-(self.M**2) * T)).sum())
 
     def pressures(self, T, z):
-        """Return by how much pressures at heights z (n,), m, have risen, over the first jump."""
+        """Return the pressure increments at heights z (n,), in m, divided by the first jump."""
         return (2 / self.M * np.sin(self.M * (1 - z[:, None])) * np.exp(-(self.M**2) * T)).sum(axis=1)
 
 
 def test_unsaturated_soil_consolidates_as_its_linear_theory_says():
-    """A load of 1 % of the suction, 40 cells: settlement and pressures, of the first jump."""
+    """A load of 1 % of the suction, 40 cells: settlement and pressures, divided by the first jump."""
     exact = Pressed()
     s = column(40, [exact.soil], -20e3, exact.sides, gravity=None)
     top = mpm.probes(s.bodies, [[1 / 80, 1.0]])
@@ -202,7 +202,7 @@ def test_unsaturated_soil_consolidates_as_its_linear_theory_says():
 
 @pytest.mark.parametrize("steps", [1, 5])
 def test_a_sealed_cell_pressed_and_let_go_has_its_water_and_suction(steps):
-    """By 3 %, in any number of steps: the change of the content is exact."""
+    """Compression by 3 %, in any number of steps: the change of the fluid content is exact."""
     soil = mpm.Hencky(bulk=1e7, shear=5e6, porosity=0.4, retention=mpm.VanGenuchten(20e3, n=2.0))
     press = mpm.Displacement("top", lambda t: (0, -0.03 * (1 - abs(1 - t))))
     felt = -20e3 * np.sqrt(0.5)
@@ -221,7 +221,7 @@ def test_a_sealed_cell_pressed_and_let_go_has_its_water_and_suction(steps):
 
 @pytest.mark.parametrize("edge", [0.43, 0.5, 0.58])
 def test_soils_under_hydrostatic_suction_are_at_rest(edge):
-    """Of different retention, at any offset of their border from the grid."""
+    """Soils with different retention curves, with the interface at any offset from the grid lines."""
     porous = {"bulk": 1e7, "shear": 5e6, "porosity": 0.4}
     laws = mpm.VanGenuchten(WATER / 2, residual=0.1, n=2.0), mpm.Gardner(WATER / 5)
     soils = [mpm.Hencky(**porous, conductivity=k, retention=law) for k, law in zip((1e-5, 1e-3), laws, strict=True)]
@@ -251,13 +251,13 @@ def test_hydrostatic_suction_is_at_rest():
 
 
 def rising(head, k, a, q, z):
-    """Return heads at heights z, m, above one of this head in exponential soil, in steady rain of q, m/s."""
+    """Return heads at heights z, in m, above a given head in exponential soil, in steady rain of q, in m/s."""
     return np.log(q / k + (np.exp(a * head) - q / k) * np.exp(-a * z)) / a
 
 
 @pytest.mark.parametrize(("off", "k", "a"), [(0.0, 10, 2.5), (0.3, 10, 2.5), (0.5, 10, 2.5), (0.7, 100, 1)])
 def test_seepage_through_layers_is_exact_at_any_offset(off, k, a):
-    """Steady flow through exponential soils; k, a: ratios of the upper soil to the lower one."""
+    """Steady flow through exponential soils. k, a: ratios of the upper soil to the lower soil."""
     k, a, q, edge = (1e-6, k * 1e-6), (2.0, 2.0 * a), 0.5e-6, 0.5 + off / 20
     given = {"bulk": 1e13, "shear": 5e12, "porosity": 0.4}  # else a millimetre of settlement counts
     soils = [
@@ -276,7 +276,7 @@ def test_seepage_through_layers_is_exact_at_any_offset(off, k, a):
 
 @dataclass(frozen=True)
 class Brutsaert(mpm.Retention):
-    """A law derived from the package's."""
+    """A law derived from a class of the package."""
 
     def effective(self, s):
         return 1 / (1 + (s / self.entry) ** 2)
@@ -286,7 +286,7 @@ class Brutsaert(mpm.Retention):
 
 
 class Rising(Liakopoulos):
-    """Wetter where it sucks more."""
+    """An invalid curve: its saturation increases with suction."""
 
     def saturation(self, p):
         return 1 - p / 1e4
@@ -310,7 +310,7 @@ def test_what_is_no_law_of_retention_is_refused(law, said):
 
 
 def test_saturated_scenes_have_nothing_of_retention():
-    """No field of pieces, no form, no table, and no volumes but where rain falls."""
+    """No piece field, no form, no table, and volumes only where rain falls."""
     s = column(2, [mpm.Hencky(1e6, 1e6, conductivity=1e-6)], 0.0, [mpm.Drained("top")])
     s.run(1, 1, progress=False)
     forms = s.scene.storage
@@ -326,7 +326,7 @@ def test_a_specific_yield_does_not_go_with_it():
 
 
 def test_laws_of_the_users_are_those_of_the_package():
-    """Derived from `Retention`, and an object: the same water as the package's own law."""
+    """A subclass of `Retention`, and an object: the same water as with the law of the package."""
     sides = [mpm.Drained("top", pressure=-2e3)]
     found = []
     for law in (mpm.VanGenuchten(5e3, n=2.0, l=0.0), Brutsaert(5e3)):
@@ -339,7 +339,7 @@ def test_laws_of_the_users_are_those_of_the_package():
 
 @pytest.mark.parametrize("cells, steps", [(4, 13), pytest.param(50, 160, marks=pytest.mark.slow)])
 def test_a_body_at_rest_in_itself_keeps_its_water_and_suction_wherever_it_is_carried(cells, steps):
-    """Over so many cells by its sides, in steps of a third of a cell, its rows of domains across grid lines."""
+    """The sides move over several cells, in steps of a third of a cell; rows of domains cross grid lines."""
     h, table, end = 1 / 8, 0.3, 1000.0
     grid = mpm.Grid([0, 0], [1 + (cells + 2) * h, 1 + 2 * h], [cells + 10, 10])
     law = mpm.VanGenuchten(WATER / 2, residual=0.1, n=2.0)
@@ -358,7 +358,7 @@ def test_a_body_at_rest_in_itself_keeps_its_water_and_suction_wherever_it_is_car
 
 @pytest.mark.slow
 def test_a_column_in_axisymmetry_and_in_3d_is_that_of_plane_strain():
-    """Water that soaks in from above: the same pressures."""
+    """Water infiltrates from above: pressures are equal."""
     law = mpm.VanGenuchten(5e3, n=2.0)
     soil = mpm.Hencky(bulk=1e7, shear=5e6, porosity=0.4, conductivity=1e-6, retention=law)
     found = []
@@ -381,7 +381,7 @@ def test_a_column_in_axisymmetry_and_in_3d_is_that_of_plane_strain():
 
 @pytest.mark.parametrize("suction", [1e4, pytest.param(3e4, marks=pytest.mark.slow)])
 def test_suction_is_strength_by_bishops_stress(suction):
-    """Sand without support at its side bears (K_p - 1) chi s, on its present width."""
+    """Sand with a free side carries (K_p - 1) chi s on its present width."""
     grid, felt = mpm.Grid([0, 0], [1.6, 1.2], [8, 6]), suction / np.sqrt(1 + (suction / 1e4) ** 2)
     law = {"conductivity": 1e-3, "retention": mpm.VanGenuchten(1e4, n=2.0)}
     soil = mpm.MohrCoulomb(bulk=1e7, shear=6e6, porosity=0.4, friction=30.0, dilation=0.0, cohesion=10.0, **law)
@@ -395,7 +395,7 @@ def test_suction_is_strength_by_bishops_stress(suction):
 
 
 def test_a_block_with_suction_falls_as_everything_does():
-    """It has the weight and the mass of soil and water; it keeps its water."""
+    """The block has the weight and the mass of soil and water, and keeps its water."""
     soil = mpm.Hencky(1e7, 5e6, porosity=0.4, conductivity=1e-5, retention=mpm.VanGenuchten(2e4, n=2.0))
     grid = mpm.Grid([0, 0], [2, 3], [8, 12])
     scene = {"fluid": mpm.Fluid(), "gravity": (0, -9.81), "walls": {}, "pressure": -3e4, "inertia": True}
@@ -408,7 +408,7 @@ def test_a_block_with_suction_falls_as_everything_does():
 
 @dataclass(frozen=True)
 class Unfelt(mpm.VanGenuchten):
-    """Suction that the skeleton does not feel."""
+    """Suction without effect on the skeleton."""
 
     def bishop(self, p):
         return 0 * p
@@ -429,7 +429,7 @@ def test_water_in_two_soils_that_fall_does_not_flow():
 
 
 def test_a_dry_column_swings_with_the_mass_of_its_water():
-    """It has the period of soil and of the water in its pores, 8 % less than with full pores."""
+    """The period is that of soil and its pore water, 8 % less than with full pores."""
     law, p = mpm.VanGenuchten(1e3, residual=0.3, n=4.0), -1e6
     soil = mpm.LinearElastic(1e7, 5e6, porosity=0.4, retention=law)
     grid = mpm.Grid([0, 0], [0.05, 1.1], [1, 22])
@@ -459,7 +459,7 @@ class Haverkamp:
 @pytest.mark.slow
 @pytest.mark.parametrize("h", [0.1, 0.05])
 def test_a_water_table_rises_under_rain_as_that_of_vauclin(h):
-    """In two dimensions, after 4 and 8 h: its height within 0.3 cm, flow into the ditch 1.5 %."""
+    """In 2D, after 4 and 8 h: errors of 0.3 cm of the height, and 1.5 % of the flow into the ditch."""
     grid = mpm.Grid([0, 0], [3, 2 + 2 * h], [round(3 / h), round(2 / h) + 2])
     soil = mpm.LinearElastic(**STIFF, porosity=0.3, conductivity=0.35 / 3600, retention=Haverkamp())
     sides = [
@@ -493,7 +493,7 @@ def test_a_water_table_rises_under_rain_as_that_of_vauclin(h):
     "cells, times", [(10, "hour day year"), (10, "hour whole"), (9, "hour whole"), (20, "hour whole")]
 )
 def test_very_dry_sand_beside_clay_is_ponded_and_stands_a_year(cells, times, monkeypatch):
-    """From -100 m of suction: an hour that may be cut, then a day, and steps of a month; or a year in one step."""
+    """From a suction of -100 m: an hour with cut steps, then a day, and steps of a month; or a year in one step."""
     grid = mpm.Grid([0, 0], [1, 1 + 2 / cells], [cells, cells + 2])
     porous = {"bulk": 1e8, "shear": 5e7, "porosity": 0.4}
     sand = mpm.Hencky(**porous, conductivity=1e-4, retention=mpm.VanGenuchten(WATER / 14.5, residual=0.1, n=7.0))

@@ -19,7 +19,7 @@ WALLS = {"left": "x", "right": "x", "bottom": "xy"}
 
 
 def overlapping():
-    """Return a scene of two bodies that have come to lie in each other, which its first step finds."""
+    """Return a scene of two bodies that overlap, which its first step detects."""
     grid = mpm.Grid([0, 0], [1, 1], [10, 10])
     s = mpm.Simulation(grid, [mpm.box(grid, [0, 0], [1, 0.3]), mpm.box(grid, [0, 0.5], [1, 0.8])], [SOFT], walls=WALLS)
     down = np.where(s.points.id < len(s.bodies[0]), 0.0, 0.3)[:, None] * [0, 1]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Free water against bodies: buoyancy, and pressures that remain when it falls."""
+"""Free water at bodies: buoyancy, and pressures that remain when the water falls."""
 
 import numpy as np
 import pytest
@@ -28,7 +28,7 @@ def bank(level, h=0.25):
 
 @pytest.mark.parametrize("h", [0.25, 0.125])
 def test_soil_as_heavy_as_water_hardly_moves_in_still_water(h):
-    """Its pressures balance it wherever its sides are; the rest, of constant cell pressures, falls with h."""
+    """Pressures balance it at any position of its sides. The rest, due to constant cell pressures, decreases with h."""
     s = bank(lambda t: 1.5 * min(1.0, t / 10), h=h)
     s.run(2e4, 1e3, progress=False)
     points = s.points
@@ -59,7 +59,7 @@ def test_heavier_soil_under_water_carries_its_weight_less_the_waters():
 
 
 def test_water_that_falls_leaves_a_seepage_face():
-    """Rapid drawdown: pore pressures lag behind, water seeps out of the side that was wet, and none comes in above."""
+    """Rapid drawdown: pore pressures lag behind, water leaves the formerly wet side, and none enters above."""
     s = bank(lambda t: 1.0 if t <= 1e3 else max(0.25, 1.0 - (t - 1e3) / 2e3))
     s.run(1e3, 1e2, progress=False)
     full = s.points.pressure.copy()
@@ -72,7 +72,7 @@ def test_water_that_falls_leaves_a_seepage_face():
 
 
 def test_water_that_is_not_as_heavy_as_the_pores_is_named(warned):
-    """Sea water in the pores, fresh water on the sides: it sank into the soil, without a word."""
+    """Sea water in the pores, fresh water on the sides: earlier, water silently infiltrated the soil."""
     grid = mpm.Grid([0, 0], [0.5, 2.0], [2, 8])
     cases = [(1000.0, 9810.0, 9.8, 0), (1025.0, 9810.0, 9.81, 2), (1025.0, 10055.0, 9.81, 0)]
     for density, unit_weight, g, named in cases:

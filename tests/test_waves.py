@@ -17,7 +17,7 @@ SMOOTH = {"left": "x", "right": "x"}
 
 
 def column(n=20, conditions=(), walls=SMOOTH, **options):
-    """Return a column of n cells, one wide, whose base lies in the middle of a cell."""
+    """Return a column of n cells, one cell wide, with its base in the middle of a cell."""
     h = HEIGHT / n
     grid = mpm.Grid([0, 0], [h, HEIGHT + 3 * h], [1, n + 3])
     body = mpm.box(grid, [0, (1 + OFF) * h], [h, HEIGHT + (1 + OFF) * h])
@@ -29,12 +29,12 @@ def speed(s):
 
 
 def pulse(t, length=0.05):
-    """Return a smooth pulse of 1 in a time (s)."""
+    """Return a smooth pulse of height 1 in a time (s)."""
     return np.sin(np.pi * t / length) ** 2 * (0 < t < length)
 
 
 def layer(n, conditions, inertia=True, **options):
-    """Return a layer on a grid that it may move on, held along y on both sides as if it went on there."""
+    """Return a layer on a grid with room for its motion, fixed along y on both sides as an infinite layer."""
     h = HEIGHT / n
     grid = mpm.Grid([0, 0], [3 * h, HEIGHT + 3 * h], [3, n + 3])
     body = mpm.box(grid, [0.5 * h, (1 + OFF) * h], [2.5 * h, HEIGHT + (1 + OFF) * h])
@@ -44,7 +44,7 @@ def layer(n, conditions, inertia=True, **options):
 
 @pytest.mark.parametrize(("axis", "c", "scene"), [(1, C_P, column), (0, C_S, layer)], ids=["pressure", "shear"])
 def test_a_wave_leaves_through_a_quiet_base(axis, c, scene):
-    """Exact: particles move by q / (rho c) as it passes, and rest when it has left.  40 cells a wave."""
+    """Exact: particles move by q / (rho c) while the wave passes, and then rest. 40 cells per wave."""
     length = 40 * HEIGHT / 20 / c
     load = mpm.Traction("top", lambda t: -1e3 * pulse(t, length) * np.eye(2)[axis])
     s, fastest = scene(20, [load, mpm.Quiet("bottom")]), 0.0
@@ -56,7 +56,7 @@ def test_a_wave_leaves_through_a_quiet_base(axis, c, scene):
 
 
 def test_a_sudden_load_runs_to_a_rigid_base_and_back():
-    """Exact: a triangle in time on top; on the base 0 until L / c, then twice the load until 3 L / c, c dt = h."""
+    """Exact: a triangle in time at the top; at the base 0 until L / c, then twice the load until 3 L / c, c dt = h."""
     n, q = 40, 1e3
     s = column(n, [mpm.Traction("top", (0, -q)), mpm.Displacement("bottom", (0, 0), "y")])
     top = mpm.probes(s.bodies, [[HEIGHT / n / 2, HEIGHT + (1 + OFF) * HEIGHT / n]])
@@ -70,7 +70,7 @@ def test_a_sudden_load_runs_to_a_rigid_base_and_back():
 
 @pytest.mark.slow
 def test_saturated_columns_converge_under_loads_that_swing_or_come_at_once():
-    """The exact u-p solutions of the demo `wave`, at (1, 0.1) and for hard water and grains, with second order."""
+    """Exact u-p solutions of the demo `wave`, at (1, 0.1) and for stiff water and grains: second order."""
     c2 = (wave.MODULUS + 1 / wave.STORED) / wave.MIXED
     w = np.sqrt(0.1 * c2) / wave.LENGTH
     k = wave.GRAVITY * wave.WATER / wave.MIXED * w * wave.LENGTH**2 / c2
@@ -101,7 +101,7 @@ def test_a_wave_that_comes_in_doubles_at_the_surface_and_leaves():
 
 
 def test_a_pulse_in_a_block_leaves_through_all_of_its_sides():
-    """It meets them at all angles."""
+    """The pulse reaches the sides at all angles."""
     n = 12
     grid = mpm.Grid([0, 0], [1 + 2 / n, 1 + 2 / n], [n + 2, n + 2])
     body, sides = mpm.box(grid, [0.6 / n] * 2, [1 + 0.6 / n] * 2), ("left", "right", "bottom", "top")
@@ -119,7 +119,7 @@ def test_a_pulse_in_a_block_leaves_through_all_of_its_sides():
 
 
 def test_a_quiet_base_bears_what_it_bore_at_rest():
-    """A column settles by 13.8 mm under its weight; its base is let go, and moves by less than a thousandth of that."""
+    """A column settles by 13.8 mm under its weight. With a quiet base, it then moves by less than 1/1000 of that."""
     moved = []
     for n in (10, 20):
         s = column(n, [mpm.Displacement("bottom", (0, 0), "y")], gravity=(0, -9.81), inertia=False)
@@ -146,7 +146,7 @@ def test_a_block_stays_at_rest_between_quiet_sides():
 
 @pytest.mark.parametrize("kind", ["3D", "axisymmetry"])
 def test_quiet_bases_bear_what_they_bore_in(kind):
-    """A column settles under its weight and is let go on a quiet base: as in plane strain."""
+    """A column settles under its weight, and is then put on a quiet base, as in plane strain."""
     n, d = 8, 3 if kind == "3D" else 2
     h, e = HEIGHT / n, np.eye(d)[-1]
     size = np.full(d, h)
@@ -164,7 +164,9 @@ def test_quiet_bases_bear_what_they_bore_in(kind):
 
 
 def test_a_base_moves_as_it_should_and_bodies_with_it():
-    """A shear layer on a base that swings: exact velocities at its foot, displacements on top; second order in time."""
+    """A shear layer on an oscillating base: exact velocities at its base, displacements at its top; second order in
+    time.
+    """
     w, n, amplitude = 0.3 * np.pi * C_S / HEIGHT, 16, 1e-3
     top, period, off = HEIGHT + (1 + OFF) * HEIGHT / n, 2 * np.pi / w, []
     sway = mpm.Displacement("bottom", lambda t: (amplitude * np.sin(w * t), 0))
@@ -198,7 +200,7 @@ def test_a_base_follows_an_accelerogram_without_drift():
 
 
 def test_a_record_is_integrated_exactly(tmp_path):
-    """a = 6 t from 1 s on: v = 3 (t - 1)^2, u = (t - 1)^3; after 3 s as fast as then."""
+    """a = 6 t from 1 s on: v = 3 (t - 1)^2, u = (t - 1)^3; after 3 s the velocity is constant."""
     t = np.array([1.0, 1.4, 2.0, 3.0])
     rows = np.stack([t, 6 * (t - 1)], axis=1)
     (tmp_path / "record.txt").write_text("# time, acceleration\n" + "\n".join(f"{a}, {b}" for a, b in rows))

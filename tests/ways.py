@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Rooms that a value passes, and homes of the pressure: `python -m tests.ways` prints them for a small wet column.
+"""Modules that a value passes, and arrays of the pressure: `python -m tests.ways` prints them for a small wet column.
 
-A room is a module with a function that has the value among its arguments or results: the condition, the number, or an
-array of it, alone or in a list, tuple or dictionary.  Nodal forces have the traction's value as their sum, because the
-column is 1 m wide.  A home is an array that keeps the pressures between two steps, of cells, pieces or points.
+A room is a module with a function that has the value among its arguments or results: as the condition, the number, or
+an array of it, alone or in a list, tuple or dictionary. The sum of nodal forces is the traction's value, because the
+column is 1 m wide. A home is an array that stores the pressures between two steps, of cells, pieces or points.
 """
 
 import gc
@@ -23,7 +23,7 @@ LOAD, PRESSURE = 1234.5678, 8765.4321  # Pa
 
 
 class Followed:
-    """Rooms of a value until the first matrices are assembled: module, and its functions that have the value."""
+    """Rooms of a value until the first matrices are assembled: modules, with their functions that have the value."""
 
     def __init__(self, known):
         self.known, self.rooms, self.over = known, {}, False
@@ -42,7 +42,7 @@ class Followed:
             self.rooms.setdefault(str(Path(file).relative_to(ROOT)), {})[code.co_name] = None
 
     def during(self, action) -> dict[str, dict[str, None]]:
-        """Return the rooms of the value while an action is running."""
+        """Return the rooms of the value during an action."""
         sys.setprofile(self)
         try:
             action()
@@ -62,7 +62,7 @@ def column(pressure) -> mpm.Simulation:
 
 
 def numbers(value) -> bool:
-    """Return whether a value is a small array of finite numbers, not empty."""
+    """Return whether a value is a small, nonempty array of finite numbers."""
     return (
         isinstance(value, np.ndarray)
         and value.dtype == float
@@ -73,7 +73,7 @@ def numbers(value) -> bool:
 
 
 def is_load(value) -> bool:
-    """Return whether a value is the traction, its number, or an array of it, or of forces with this sum."""
+    """Return whether a value is the traction, its number, an array of it, or an array of forces with this sum."""
     if isinstance(value, mpm.Traction) or (isinstance(value, float) and abs(value) == LOAD):
         return True
     return numbers(value) and bool((abs(value) == LOAD).any() or abs(abs(value.sum()) / LOAD - 1) < 1e-9)
@@ -89,7 +89,7 @@ def is_pressure(value) -> bool:
 
 
 def rooms() -> dict[str, dict[str, dict[str, None]]]:
-    """Return the rooms of a traction, from its construction on, and of an initial pressure."""
+    """Return the rooms of a traction, from its creation on, and of an initial pressure."""
     loaded = Followed(is_load).during(lambda: column(0.0).step(1e-3))
     return {
         "a traction": loaded,
@@ -98,7 +98,7 @@ def rooms() -> dict[str, dict[str, dict[str, None]]]:
 
 
 def homes() -> list[str]:
-    """Return names and shapes of the arrays of pressures that a simulation keeps between two steps."""
+    """Return names and shapes of the arrays of pressures that a simulation stores between two steps."""
     s, seen = column(0.0), set()
     for _ in range(2):
         s.step(0.7)
@@ -122,7 +122,7 @@ def homes() -> list[str]:
 
 
 def measures() -> dict[str, list[str]]:
-    """Return rooms, each with its functions, and homes."""
+    """Return the rooms with their functions, and the homes."""
     each = {
         f"rooms of {name}": [f"{room}: {', '.join(functions)}" for room, functions in of.items()]
         for name, of in rooms().items()
@@ -131,7 +131,7 @@ def measures() -> dict[str, list[str]]:
 
 
 def main(arguments: list[str]) -> None:
-    """Print the numbers of rooms and homes, and with --list also their names."""
+    """Print the numbers of rooms and homes. With --list, also print their names."""
     for name, found in measures().items():
         print(f"{len(found):4d}  {name}")
         if "--list" in arguments:
