@@ -29,8 +29,7 @@ LOAD = strength(EXACT)
 
 
 def block(materials, load=LOAD, run=True, **options):
-    """Return a block on a smooth floor under a load on its top, with a free right side. run: whether to load it first.
-    """
+    """Return a block on a smooth floor under a load on its top, with a free right side. run: whether to load it."""
     grid = mpm.Grid([0, 0], [1.0, 1.0], [4, 4])
     half = (mpm.box(grid, [0, 0], [0.5, 0.25]), mpm.box(grid, [0, 0.25], [0.5, 0.5], material=len(materials) - 1))
     top = mpm.Traction("top", lambda t: (0, -load * min(1, t)), region=((0, 0.3), (0.5, 1)))
