@@ -10,8 +10,8 @@ demos/results contains the output of the demos, with the run time in `seconds` a
 demos/pictures contains the pictures of each demo, from the run that the pages name first.  A table that a demo writes
 to a file is copied between comments such as `<!-- error_vs_runtime; comparison.md -->` and `<!-- end -->`.
 
-    bash demos/run.sh tables                        # writes the numbers from demos/results
-    bash demos/run.sh tables --run terzaghi mandel  # runs these demos first; `--run all` takes hours
+`bash demos/run.sh tables` writes the numbers from demos/results.  With `--run terzaghi mandel`, it first runs these
+demos; `--run all` takes hours.
 """
 
 from __future__ import annotations

@@ -163,10 +163,11 @@ def note_pressures(
 ) -> None:
     """Store the pressure changes and the estimated pressure error of a step in the report.
 
-    The fluid volumes after the step and after a first-order step differ by `seconds` times the change of rates between
-    substeps. The inverse of the fixed-stress operator converts this difference into a pressure. This pressure is
-    bounded for stiff modes, as in Hosea and Shampine (1996). The error of the step is assumed to be `ERROR` times this
-    pressure. Errors and changes of a cell are weighted by its fill.
+    The step uses the rates of both substeps, and a first-order step only the rates of the second one. The two fluid
+    volumes therefore differ by `seconds` times the change of the rates. The inverse of the fixed-stress operator
+    converts this difference into a pressure. This pressure is bounded for stiff modes, as in Hosea and Shampine (1996).
+    The error of the step is assumed to be `ERROR` times this pressure. Errors and changes of a cell are weighted by the
+    filled fraction of the cell.
 
     `seconds`, s: time weight of the rates of the first substep.
     `dt`, s: length of the step.
