@@ -97,7 +97,7 @@ def test_a_plot_has_the_stress_of_dry_soil_and_the_saturation_of_unsaturated_soi
     wet = mpm.Simulation(grid, [box], [silt], walls={"bottom": "xy"}, **given)
     (drawn,) = mpm.plot(wet, "saturation").collections
     height = wet.points.x[:, 1]
-    assert np.all(drawn.get_array()[height < 1] == 1)
+    assert np.abs(drawn.get_array()[height < 1] - 1).max() < 1e-14  # rounding differs between processors
     assert np.all(np.diff(drawn.get_array()[np.argsort(height)][height[np.argsort(height)] > 1][::2]) < 0)
     (drawn,) = mpm.plot(wet, "suction").collections
     assert np.array_equal(drawn.get_array(), np.maximum(-wet.points.pressure, 0))
