@@ -255,6 +255,13 @@ log(MPI.COMM_WORLD, "step cut to %g s", 0.5)
     assert end["returncode"] == 0 and end["stderr"].splitlines()[-1] == "mpm_dolfinx: step cut to 0.5 s", end["stderr"]
 
 
+def test_the_import_does_not_suppress_warnings(tmp_path):
+    """ffcx of dolfinx 0.5 sends warnings to a handler of the root logger, which the import removes."""
+    code = "import warnings, mpm_dolfinx as mpm; warnings.warn('result', mpm.ResultWarning)"
+    end = ended(start(code, XDG_CACHE_HOME=tmp_path))
+    assert "ResultWarning: result" in end["stderr"]
+
+
 def test_the_users_own_messages_are_not_kept_back(tmp_path):
     code = f"import logging; logging.basicConfig(level=logging.INFO, force=True)\n{SCENE}\nlogging.info('done')"
     end = ended(start(code, XDG_CACHE_HOME=tmp_path))

@@ -86,6 +86,16 @@ def test_light_rain_soaks_in_and_its_water_is_all_there():
     assert 20 * (water(s) - start) == pytest.approx(0.3 * K * 3600, rel=1e-4)
 
 
+def test_rain_may_begin_and_end_in_a_stage_that_keeps_the_other_conditions():
+    s = rained(0.3 * K)
+    drained, rain = s.conditions
+    for conditions, flow in (([drained], None), ([drained, rain], -0.3 * K / 10)):
+        s.stage(conditions=conditions)
+        s.run(s.t + 600, 300, progress=False)
+        assert s.outflows.get("rain") == (None if flow is None else pytest.approx(flow, rel=1e-12))
+    assert s.outcome("flowed")["rain"] == pytest.approx(600 * flow, rel=1e-12)
+
+
 def test_water_evaporates_at_its_rate_and_then_as_the_driest_pressure_lets_it():
     s = rained(-1e-7, driest=-5 * WATER)
     s.run(3600, 1200, progress=False)

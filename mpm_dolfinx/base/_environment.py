@@ -6,6 +6,7 @@ from __future__ import annotations
 import logging
 import os
 import sys
+import warnings
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -41,13 +42,15 @@ def _check() -> None:
             "PETSc has complex numbers, but mpm_dolfinx needs real ones: on Debian, PETSC_DIR unset or ending in "
             "-real and `apt install python3-dolfinx-real`, elsewhere `conda install -c conda-forge 'petsc=*=real*'`"
         )
-    root = logging.getLogger()
+    root, show = logging.getLogger(), warnings.showwarning
     level, handlers = root.level, root.handlers[:]
     import dolfinx  # looks for libraries of PETSc's scalar type
 
     # ffcx of dolfinx 0.5 adds a root handler, which would disable the user's `logging.basicConfig`
     root.setLevel(level)
     root.handlers[:] = handlers
+    if warnings.showwarning is not show:  # ffcx of dolfinx 0.5 also sends all warnings to that handler
+        logging.captureWarnings(False)
     if tuple(map(int, dolfinx.__version__.split(".")[:2])) not in SUPPORTED:
         raise ImportError(f"dolfinx {dolfinx.__version__} is not supported; mpm_dolfinx needs 0.5.2, 0.9, 0.10 or 0.11")
 

@@ -227,10 +227,11 @@ class Stage:
         same = {name for name, one in self.given.items() if before.given.get(name) is one}
         if self.conditions["walls"] == before.conditions["walls"]:
             same |= SIDES[self.free.shape[1]].keys()
-        return {
-            quantity: {name: outcome[quantity][name] if name in same else new for name, new in values.items()}
-            for quantity, values in self.unknown(value).items()
-        }
+        out = self.unknown(value)
+        for quantity, values in out.items():
+            kept = outcome.get(quantity, {})
+            values |= {name: kept[name] for name in same & kept.keys() & values.keys()}
+        return out
 
     def kinetic(self, outcome: Outcome) -> float:
         """Return the kinetic energy (J) of free tools from the results of conditions."""
