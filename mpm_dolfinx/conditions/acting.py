@@ -147,6 +147,8 @@ class Loads:
     """Whether the tangent couples nodes of different cells."""
     touches: bool = False
     """Whether the condition is a contact, which may open."""
+    conducts: bool = False
+    """Whether fluid passes between the cells of `within_reach`."""
     key: Any = None
     """Cache key of the penalty and the pattern, from all data on which they depend except the positions of faces."""
 

@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from mpi4py import MPI
 from petsc4py import PETSc
 
 import numpy as np
@@ -22,7 +21,7 @@ from numpy.typing import NDArray
 from mpm_dolfinx.base.validation import line
 from mpm_dolfinx.contact.shapes import DISTANCE, Distance
 from mpm_dolfinx.contact.tool import Pose, Tool
-from mpm_dolfinx.forms.unknowns import Unknowns
+from mpm_dolfinx.forms.unknowns import Unknowns, petsc_matrix
 from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.parallel.exchange import Exchange, together
 
@@ -133,6 +132,8 @@ class FacePairs(Pairs):
     n: NDArray[np.float64]  # outward unit normal of the other side at y (m, d)
     offset: NDArray[np.float64]  # vector from y to the point, without the displacement in the step (m, d), m
     place: NDArray[np.int64]  # identifier of the point, the same in all updates of the pairs in a step (m,)
+    # outward area vector of the point at the start of the step (m, d), m^(d-1); (m, 0) if no contact conducts
+    outward: NDArray[np.float64]
 
     def at(self, w: NDArray[np.float64], motion: NDArray[np.float64]) -> Geometry:
         """See `Pairs`.  Lever arms are those at the start of the step."""
@@ -180,19 +181,6 @@ def at_nodes(
     kept = column >= 0
     shape, own = (m, max(1, unknowns.global_size)), (row[kept], column[kept])
     return petsc_matrix(scipy.sparse.csr_matrix((value[kept], own), shape=shape), unknowns.size, grid.comm)
-
-
-def petsc_matrix(rows: scipy.sparse.csr_matrix, columns: int, comm: MPI.Intracomm, own: bool = False) -> PETSc.Mat:
-    """Return the PETSc matrix with `rows` on this process and `columns` local columns.
-
-    `own`: whether column indices are local.
-    """
-    rows.sort_indices()  # PETSc requires it
-    start = int(comm.exscan(columns) or 0) if own and comm.size > 1 else 0
-    csr = [values.astype(PETSc.IntType) for values in (rows.indptr, rows.indices + start)]
-    A = PETSc.Mat().createAIJ(((rows.shape[0], None), (columns, None)), csr=(*csr, rows.data), comm=comm)
-    A.assemble()
-    return A
 
 
 def _check_distance(tool: Tool, x: NDArray, gap: NDArray, n: NDArray, h: float) -> None:

@@ -38,8 +38,8 @@ from mpm_dolfinx.base.tolerances import EPSILON, SAME
 from mpm_dolfinx.conditions.acting import Acting, At, Loads, Setting
 from mpm_dolfinx.contact.history import Origin, Rough, joined, pressure_name, shear_name
 from mpm_dolfinx.contact.law import BEGIN, DEPTH, ROUNDS, ContactLaw, ContactState, Touch
-from mpm_dolfinx.contact.pairs import Geometry, Pairs, at_nodes, petsc_matrix
-from mpm_dolfinx.forms.unknowns import Unknowns, collect_garbage
+from mpm_dolfinx.contact.pairs import Geometry, Pairs, at_nodes
+from mpm_dolfinx.forms.unknowns import Unknowns, collect_garbage, petsc_matrix
 from mpm_dolfinx.parallel.exchange import Exchange, over_all
 from mpm_dolfinx.points.material_points import MaterialPoints
 
