@@ -26,7 +26,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.fluid_content import mean_density
-from mpm_dolfinx.base.validation import line
 from mpm_dolfinx.conditions.acting import Setting
 from mpm_dolfinx.contact.groups import Contact
 from mpm_dolfinx.contact.pairing import ContactLoads
@@ -34,6 +33,7 @@ from mpm_dolfinx.contact.problem import FOLLOWS
 from mpm_dolfinx.flow.drained_sides import shapes
 from mpm_dolfinx.flow.feeding import Feeding, Feeds, Fluid, Leaving, Wet
 from mpm_dolfinx.flow.fluxes import CellContents, Conduction, OpenSides
+from mpm_dolfinx.flow.series import none, through
 from mpm_dolfinx.forms.cell_matrices import between_cells
 from mpm_dolfinx.forms.unknowns import Unknowns
 from mpm_dolfinx.grid.grid import sum_by
@@ -41,21 +41,13 @@ from mpm_dolfinx.parallel.exchange import Exchange, over_all
 
 
 class ConductingContacts(Feeding):
-    """The contacts of a stage, at least one of which conducts fluid.
-
-    Raises
-    ------
-    ValueError
-        If the scene has unsaturated soil.
-    """
+    """The contacts of a stage, at least one of which conducts fluid."""
 
     conditions, title = (Contact,), "contacts that conduct"
+    varies = True  # the closed pairs change
 
     def __init__(self, setting: Setting, contacts: Mapping[str, Contact]):
         conduct = {name: one for name, one in contacts.items() if one.conducts}
-        if setting.materials.retentions is not None:
-            name, one = next(iter(conduct.items()))
-            raise ValueError(f"{name}: {line(one)}, must be conducts=False with a retention curve (unsaturated soil)")
         self._names, self._all, self.count = tuple(conduct), tuple(contacts), len(conduct)
 
     def unknown(self, value: float) -> dict[str, NDArray[np.float64]]:
@@ -85,9 +77,10 @@ class Half(NamedTuple):
         return cls(cells, contents.slot(cells), area, area / size[:, None], offset, shape)
 
     def rows(self, contents: CellContents, flow: Conduction, fluid: Fluid) -> NDArray[np.float64]:
-        """Return the pressure (Pa), conductance (m^d/(Pa s)), position (m) and force (N/m^3) of the cell of each pair.
+        """Return pressure (Pa), position (m), force (N/m^3), pressure drop (Pa) and conductances (m^d/(Pa s)) of cells.
 
-        The position is that of the centroid.  The force is the unit weight plus the inertia force.
+        The position is that of the centroid.  The force is the unit weight plus the inertia force.  The pressure drop
+        from the centroid to the surface is due to this force.  Unsaturated soil has a conductance for each law.
         """
         shape, d = self.shape, self.area.shape[1]
         if flow.mobility.shift is not None:
@@ -98,7 +91,11 @@ class Half(NamedTuple):
         force = np.zeros((len(shape), d)) if flow.weight is None else np.broadcast_to(flow.weight, (len(shape), d))
         if fluid.force is not None:
             force = force + fluid.force[self.at]
-        return np.column_stack([fluid.p[self.at], flow.across(self.at, self.normal) * shape, x, force])
+        drop = (flow.deformed(self.at, self.offset) * force).sum(axis=1)
+        conductance = (flow.across(self.at, self.normal) * shape)[:, None]
+        if flow.relative is not None:
+            conductance = conductance * flow.mobility.shares[self.at]
+        return np.column_stack([fluid.p[self.at], x, force, drop, conductance])
 
     def side(self) -> OpenSides:
         """Return the closed part of the surface.  It is no no-flow side of its cells, see `Gradients`."""
@@ -118,6 +115,15 @@ class Links(NamedTuple):
     near: Half  # cells of the points
     far: Half  # cells of the opposite positions
     pairs: NDArray[np.int64]  # lexicographic cells of both sides (m, 2)
+
+
+class Flows(NamedTuple):
+    """Flows through the closed pairs on this process."""
+
+    links: Links
+    flux: NDArray[np.float64]  # flow from the cell of the point to the opposite cell (m,), m^d/s
+    scale: NDArray[np.float64]  # scale of the rounding error of the flow (m,), m^d/s
+    slopes: NDArray[np.float64]  # derivatives of the flow, see `between_cells` (2, m), m^d/(Pa s)
 
 
 class ContactFeeds(Feeds):
@@ -168,40 +174,45 @@ class ContactFeeds(Feeds):
         near, far = np.split(difference, [len(links.near.at)])  # as in `sides`
         self._correction = self._contact.pairs.place[links.closed], near - links.exchange.back(far)
 
-    @staticmethod
-    def _conductance(near: NDArray[np.float64], far: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the conductances (m,) of the closed pairs, in m^d/(Pa s), from the rows of both sides."""
-        own, other = near[:, 1], far[:, 1]
-        return own * np.divide(other, own + other, out=np.zeros(len(own)), where=own + other > 0)
-
-    def _through(self, at: Conduction, fluid: Fluid) -> tuple[Links, NDArray[np.float64], NDArray[np.float64]]:
-        """Return the closed pairs, their flows (m,) in m^d/s, and the scale (m,) of rounding errors of these flows."""
+    def _flows(self, flow: Conduction, fluid: Fluid) -> Flows:
+        """Return the flows through the closed pairs."""
         links, d = self._now, self._grid.dim
-        near = links.near.rows(self._contents, at, fluid)
-        far = links.exchange.back(links.far.rows(self._contents, at, fluid))
-        p, other = near[:, 0], far[:, 0]
-        (x, force), (y, beyond) = (np.split(rows[:, 2:], [d], axis=1) for rows in (near, far))
-        difference = p - other + ((y - x) * (force + beyond)).sum(axis=1) / 2
+        near = links.near.rows(self._contents, flow, fluid)
+        far = links.exchange.back(links.far.rows(self._contents, flow, fluid))
+        cuts = np.cumsum([1, d, d, 1])
+        (p, x, force, ahead, own), (other, y, beyond, _, opposite) = (
+            np.split(row, cuts, axis=1) for row in (near, far)
+        )
+        p, other = p[:, 0], other[:, 0]
+        drop = ((y - x) * (force + beyond)).sum(axis=1) / 2
+        if flow.relative is None:
+            own, opposite = own[:, 0], opposite[:, 0]
+            conductance = own * np.divide(opposite, own + opposite, out=np.zeros(len(own)), where=own + opposite > 0)
+            slopes = conductance, conductance
+        else:
+            no_series, ones = none(len(p), own.shape[1], 1), np.ones(len(p))
+            paths = [no_series._replace(parallel=parallel) for parallel in (own, opposite)]
+            drops = ahead[:, 0], drop - ahead[:, 0]
+            conductance, slopes = through(flow.relative.laws, (p, other), paths, (ones, ones), drops)
         places, correction = self._correction
+        difference = p - other + drop
         _, row, column = np.intersect1d(self._contact.pairs.place[links.closed], places, return_indices=True)
         difference[row] += correction[column]
-        conductance = self._conductance(near, far) * mean_density(p, other, at.bulk)
-        return links, conductance * difference, conductance * (np.abs(p) + np.abs(other))
+        density = mean_density(p, other, flow.bulk)
+        scale = density * conductance * (np.abs(p) + np.abs(other))
+        return Flows(links, density * conductance * difference, scale, np.stack(slopes))
 
     def leaving(self, at: Conduction, fluid: Fluid) -> Leaving:
         """Return the outflow of the cells to cells of other groups."""
-        links, *flows = self._through(at, fluid)
-        rows, n = np.stack(flows), len(fluid.p)
-        own = sum_by(links.near.at, rows, n)
-        cells, turnover = own + [[-1], [1]] * sum_by(links.far.at, links.exchange.send(rows.T).T, n)
-        return Leaving(cells, turnover)
+        links, flux, scale, _ = self._flows(at, fluid)
+        rows, n = np.stack([flux, scale]), len(fluid.p)
+        own, other = (sum_by(links.near.at, rows, n), sum_by(links.far.at, links.exchange.send(rows.T).T, n))
+        return Leaving(own[0] - other[0], own[1] + other[1])
 
     def coupling(self, at: Conduction, fluid: Fluid, unknowns: Unknowns) -> PETSc.Mat:
         """Return the derivative of the outflow with respect to the pressures of both sides."""
-        links = self._now
-        near = links.near.rows(self._contents, at, fluid)
-        slopes = self._conductance(near, links.exchange.back(links.far.rows(self._contents, at, fluid)))
-        return between_cells(unknowns, self._grid, links.pairs, np.stack([slopes, slopes]))
+        links, *_, slopes = self._flows(at, fluid)
+        return between_cells(unknowns, self._grid, links.pairs, slopes)
 
     def settle(self, at: Conduction, fluid: Fluid) -> int:
         """Update the closed pairs, and return the number of changes on this process."""
@@ -214,7 +225,7 @@ class ContactFeeds(Feeds):
 
     def outflows(self, at: Conduction, fluid: Fluid) -> dict[str, NDArray[np.float64]]:
         """Return the flows, in m^d/s, from the bodies `one` to the bodies `other` of each contact."""
-        links, flows, _ = self._through(at, fluid)
+        links, flows, *_ = self._flows(at, fluid)
         pairs = self._contact.pairs
         sums = sum_by(pairs.number[links.closed], pairs.sign[links.closed] * flows, len(self._every))
         sums = over_all(self._grid.comm, sums)
