@@ -21,7 +21,7 @@ class Contact:
 
     Bodies of one group stick where they touch.  Groups cannot penetrate each other, but may slide and separate.
     Fluid passes between groups only with `conducts`.  In a scene with contacts, each body must belong to a group, and
-    each pair of groups must have one contact.  `tool_forces` of the simulation contain the forces on the bodies of `one`.
+    each pair of groups must have one contact.  `tool_forces` of the simulation are the forces on the bodies of `one`.
 
     Parameters
     ----------

@@ -9,6 +9,7 @@ from functools import partial
 from typing import NamedTuple
 
 from mpi4py import MPI
+from petsc4py import PETSc
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,15 +21,16 @@ from mpm_dolfinx.base.tolerances import NEAR, TINY
 from mpm_dolfinx.base.validation import line
 from mpm_dolfinx.bodies.faces import Surface, surface
 from mpm_dolfinx.bodies.touching import BITS, local, weights
-from mpm_dolfinx.conditions.acting import At, Loads, Place, Setting
+from mpm_dolfinx.conditions.acting import Loads, Place, Setting
 from mpm_dolfinx.conditions.conditions import resistance
 from mpm_dolfinx.contact.groups import Contact
 from mpm_dolfinx.contact.history import Origin, pressure_name, shear_name
-from mpm_dolfinx.contact.law import DEPTH, ContactLaw
-from mpm_dolfinx.contact.pairs import FacePairs
+from mpm_dolfinx.contact.law import ContactLaw
+from mpm_dolfinx.contact.pairs import FacePairs, between_cells
 from mpm_dolfinx.contact.problem import ContactProblem, Touching
 from mpm_dolfinx.contact.tool_placing import BEGINS, FACING
 from mpm_dolfinx.domains.cut_domains import CutDomains
+from mpm_dolfinx.forms.unknowns import Unknowns
 from mpm_dolfinx.parallel.exchange import Exchange, first, over_all
 from mpm_dolfinx.points.cutting import FACES
 from mpm_dolfinx.points.material_points import MaterialPoints
@@ -77,7 +79,7 @@ class Contacts(Touching):
     def __init__(self, setting: Setting, contacts: Mapping[str, Contact]):
         super().__init__(setting, contacts)
         sides, self.contacts = setting.sides, tuple(contacts.values())
-        self.conducts = np.array([contact.conducts for contact in self.contacts])
+        self.conducts = any(contact.conducts for contact in self.contacts)
         self._rank = _ranks(setting)
         self._faces: list[tuple[int, Surface, Surface, int]] = []  # contact, own and opposite faces, sign of forces
         for number, contact in enumerate(self.contacts):
@@ -140,7 +142,7 @@ class Contacts(Touching):
             pressure = points.data[pressure_name(self.names[number])][at]
             resistances = np.minimum(own[at], now.resistance[other])
             place = (i + grid.comm.rank * len(self._faces)) * PLACES + row
-            outward = patches.area(points)[row] if self.conducts.any() else np.zeros((len(row), 0))
+            outward = patches.area(points)[row] if self.conducts else np.zeros((len(row), 0))
             fixed = np.full((len(row), 2), [number, sign])
             scalars = np.column_stack([fixed, place, size, resistances, pressure])
             offset = patches.now(present)[row] - y
@@ -289,12 +291,12 @@ class ContactLoads(ContactProblem):
     def __init__(self, contacts: Contacts, cut: CutDomains, law: ContactLaw, origin: Origin, again, cell_pairs):
         super().__init__(law, origin, again=again, cell_pairs=cell_pairs)
         self._contacts, self._cut = contacts, cut
-        self.conducts = bool(contacts.conducts.any())
+        self.conducts = contacts.conducts
 
-    def closed(self, at: At) -> NDArray[np.bool_]:
-        """Return which pairs (m,) conduct fluid at u: those of conducting contacts with at most the allowed gap."""
-        gap, pairs = self.found(at).at.gap, self.pairs
-        return self._contacts.conducts[pairs.number] & (gap <= DEPTH * self.grid.sizes(pairs.cell).min(axis=-1))
+    def joins(self, unknowns: Unknowns) -> PETSc.Mat:
+        """See `Loads`."""
+        pairs = self.within_reach()
+        return between_cells(unknowns, self.grid, pairs, np.zeros((2, len(pairs))))
 
     def within_reach(self) -> NDArray[np.int64]:
         """Return the pairs of cells of bodies that may touch in the step."""

@@ -144,6 +144,14 @@ class FacePairs(Pairs):
         """See `Pairs`."""
         return self.other, shape_values_in(self.grid, self.other, self.y)
 
+    def conducting(self, unknowns: Unknowns, closed: NDArray[np.bool_], slopes: NDArray[np.float64]) -> PETSc.Mat:
+        """Return the result of `between_cells` for the closed pairs.
+
+        `closed` (m,): whether each pair is closed.
+        """
+        cells = np.column_stack([self.grid.cell_number[self.cell], self.other])
+        return between_cells(unknowns, self.grid, cells[closed], slopes)
+
 
 def shape_values_in(grid: Grid, cells: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the Q1 shape functions (m, 2^d) of lexicographic cells (m,) at positions x (m, d), in m."""
@@ -181,6 +189,26 @@ def at_nodes(
     kept = column >= 0
     shape, own = (m, max(1, unknowns.global_size)), (row[kept], column[kept])
     return petsc_matrix(scipy.sparse.csr_matrix((value[kept], own), shape=shape), unknowns.size, grid.comm)
+
+
+def between_cells(unknowns: Unknowns, grid: Grid, pairs: NDArray[np.int64], slopes: NDArray[np.float64]) -> PETSc.Mat:
+    """Return the derivative of the outflow of cells with respect to cell pressures, for flows between pairs of cells.
+
+    `pairs` (m, 2): lexicographic cells of any process.
+    `slopes` (2, m), m^d/(Pa s): derivative of the flow from the first to the second cell with respect to the pressure
+    of the first cell, and minus the derivative with respect to the pressure of the second cell.
+    """
+    (one, other), (own, far) = pairs.T, slopes
+    rows, columns = np.concatenate([one, one, other, other]), np.concatenate([one, other, one, other])
+    to = Exchange(grid.comm, grid.owner(columns))
+    columns = to.back(unknowns.map.indices[grid.locals[to.send(columns)]])
+    to = Exchange(grid.comm, grid.owner(rows))
+    rows, columns = unknowns.map.indices[grid.locals[to.send(rows)]], to.send(columns)
+    values = to.send(np.concatenate([own, -far, -own, far]))
+    start = (grid.comm.exscan(unknowns.size) or 0) if grid.comm.size > 1 else 0
+    shape = (unknowns.size, max(1, unknowns.global_size))
+    at = rows - start, columns
+    return petsc_matrix(scipy.sparse.csr_matrix((values, at), shape=shape), unknowns.size, unknowns.comm)
 
 
 def _check_distance(tool: Tool, x: NDArray, gap: NDArray, n: NDArray, h: float) -> None:

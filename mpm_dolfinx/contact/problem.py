@@ -221,6 +221,12 @@ class ContactProblem(Loads):
         more = law.slope(touch, at, self._shift(found)[of, None] * self.pushes.direction[of])
         return found._replace(balanced=touch.force + more)
 
+    def closed(self, at: At) -> NDArray[np.bool_]:
+        """Return which pairs (m,) of contacts that conduct are closed at u: their gap is at most `DEPTH` cells."""
+        conducts = np.array([contact.conducts for contact in self.now.law.contacts])
+        gap, pairs = self.found(at).at.gap, self.pairs
+        return conducts[pairs.number] & (gap <= DEPTH * self.grid.sizes(pairs.cell).min(axis=-1))
+
     def push(self, at: At, residual: PETSc.Vec, on: Unknowns) -> None:
         """Subtract the contact forces at u from the residual."""
         B, w = self._B(self.now.law, at.unknowns)

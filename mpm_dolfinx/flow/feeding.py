@@ -18,11 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpm_dolfinx.bodies.faces import Surface
-from mpm_dolfinx.conditions.acting import At, Loads
 from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.flow.fluxes import CellContents, Conduction, OpenSides
 from mpm_dolfinx.forms.point_forms import PointData
-from mpm_dolfinx.forms.unknowns import Unknowns
 from mpm_dolfinx.points.material_points import MaterialPoints
 
 
@@ -38,8 +36,8 @@ class Wet(NamedTuple):
     dt: float = np.inf  # length of the step, s
     # results of the conditions in the previous step
     outcome: Mapping[str, Mapping[str, NDArray[np.float64]]] = MappingProxyType({})
-    loads: Sequence[Loads] = ()  # loads in the balance of momentum; empty if only open sides are needed
-    at: At | None = None  # present displacements
+    loads: Sequence[Any] = ()  # loads in the balance of momentum; empty if only open sides are needed
+    at: Any = None  # present displacements, see `acting.At`
 
 
 class Fluid(NamedTuple):
@@ -90,10 +88,10 @@ class Feeds:
         """Return the derivative (n,) of the outflow with respect to the pressure of the cell, in m^d/(Pa s)."""
         return 0.0
 
-    def coupling(self, at: Any, fluid: Fluid, unknowns: Unknowns) -> PETSc.Mat | None:
+    def coupling(self, at: Any, fluid: Fluid, unknowns: Any) -> PETSc.Mat | None:
         """Return the derivative of the outflow with respect to all pressures, without `slope`, or None for zero.
 
-        The entries must be at pairs of cells of `Loads.within_reach`, see `Loads.conducts`.
+        `unknowns`: pressure unknowns.  `Loads.joins` gives the possible entries.
         """
 
     def settle(self, at: Any, fluid: Fluid) -> int:

@@ -55,7 +55,7 @@ from mpm_dolfinx.flow.fluxes import CellContents, Conduction, FluxForms, OpenSid
 from mpm_dolfinx.flow.nonorthogonal import Gradients, NonorthogonalFlow
 from mpm_dolfinx.flow.second_differences import second_differences
 from mpm_dolfinx.flow.unsaturated import Relative
-from mpm_dolfinx.forms.cell_matrices import along_shapes, between_cells, insert_rows
+from mpm_dolfinx.forms.cell_matrices import along_shapes, insert_rows
 from mpm_dolfinx.forms.point_forms import CellSums, FacetSum, FormPoints, PointData, PointForm
 from mpm_dolfinx.forms.unknowns import Unknowns, matrix, sum_ghosts, zero
 from mpm_dolfinx.materials.evaluate import ConductivityAtPieces
@@ -227,7 +227,7 @@ class StorageSystem:
     `cells`, `facets`: active local cells including ghosts, and the faces between two of these cells.
     `momentum`: unknowns of the displacement.
     `parts`: connected parts of the bodies.
-    `joins` (n, 2): lexicographic cells between which conditions conduct fluid, see `Feeds.coupling`.
+    `joins`: functions that return the pattern of couplings of cell pressures, see `Loads.joins`.
     """
 
     def __init__(
@@ -237,7 +237,7 @@ class StorageSystem:
         facets: NDArray[np.int32],
         momentum: Unknowns,
         parts: Parts,
-        joins: NDArray[np.int64] | None = None,
+        joins: Sequence[Callable[[Unknowns], PETSc.Mat]] = (),
     ):
         self._forms = forms
         self.symmetric = not forms.retains
@@ -261,8 +261,8 @@ class StorageSystem:
             zeros = np.zeros((grid.num_local, d, 2))
             pattern = second_differences(own, grid, zeros[: own.size, :, 0], zeros[:, :, 0], zeros)
             pattern.axpy(1.0, self.L, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
-        if joins is not None:
-            more = between_cells(own, grid, joins, np.zeros((2, len(joins))))
+        for join in joins:
+            more = join(own)
             more.axpy(1.0, pattern, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
             pattern = more
         self.C, self.P = pattern.duplicate(), pattern.duplicate()

@@ -10,35 +10,12 @@ from typing import NamedTuple
 from petsc4py import PETSc
 
 import numpy as np
-import scipy.sparse
 import ufl
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.caching import Latest
 from mpm_dolfinx.forms.point_forms import BATCH, NONE, CellSums, FormPoints, Given, Places, PointData, PointExpression
-from mpm_dolfinx.forms.unknowns import Unknowns, petsc_matrix
 from mpm_dolfinx.grid.grid import Grid, sum_by
-from mpm_dolfinx.parallel.exchange import Exchange
-
-
-def between_cells(unknowns: Unknowns, grid: Grid, pairs: NDArray[np.int64], slopes: NDArray[np.float64]) -> PETSc.Mat:
-    """Return the derivative of the outflow of cells with respect to cell pressures, for flows between pairs of cells.
-
-    `pairs` (m, 2): lexicographic cells of any process.
-    `slopes` (2, m), m^d/(Pa s): derivative of the flow from the first to the second cell with respect to the pressure
-    of the first cell, and minus the derivative with respect to the pressure of the second cell.
-    """
-    (one, other), (own, far) = pairs.T, slopes
-    rows, columns = np.concatenate([one, one, other, other]), np.concatenate([one, other, one, other])
-    to = Exchange(grid.comm, grid.owner(columns))
-    columns = to.back(unknowns.map.indices[grid.locals[to.send(columns)]])
-    to = Exchange(grid.comm, grid.owner(rows))
-    rows, columns = unknowns.map.indices[grid.locals[to.send(rows)]], to.send(columns)
-    values = to.send(np.concatenate([own, -far, -own, far]))
-    start = (grid.comm.exscan(unknowns.size) or 0) if grid.comm.size > 1 else 0
-    shape = (unknowns.size, max(1, unknowns.global_size))
-    at = rows - start, columns
-    return petsc_matrix(scipy.sparse.csr_matrix((values, at), shape=shape), unknowns.size, unknowns.comm)
 
 
 def shape_gradients(points: FormPoints) -> list:

@@ -482,9 +482,8 @@ class System:
         self.momentum = MomentumSystem(momentum, dofs, own, on_grid.penalised, stiff, parts)
         if storage is not None:
             unknowns = self.momentum.unknowns
-            joins = [one.within_reach() for one in loads if one.conducts]
-            more = (np.concatenate(joins),) if joins else ()
-            self.storage = StorageSystem(storage, on_grid.cells, on_grid.facets, unknowns, parts, *more)
+            joins = [one.joins for one in loads if one.conducts]
+            self.storage = StorageSystem(storage, on_grid.cells, on_grid.facets, unknowns, parts, joins)
         self.plan = planned(scheme, self.momentum, self.storage, symmetric)
         """Solution method of the linearised problem."""
 

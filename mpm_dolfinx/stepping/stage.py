@@ -293,8 +293,8 @@ def stage(
     setting = Setting(sides, free, materials, momentum.conditions, by_name)
     feeding = [one.feeding(setting) for one in by_name.values() if hasattr(one, "feeding")]
     feeding += [kind(setting, some) for kind in FED if (some := setting.of(*kind.conditions))]
-    if any(contact.conducts for contact in contacts_of(list(by_name.values()))):
-        feeding.append(ConductingContacts(setting, setting.of(Contact)))
+    conducts = {name: contact.conducts for name, contact in setting.of(Contact).items()}
+    feeding += [ConductingContacts(conducts)] * any(conducts.values())
     found = [(kind, setting.of(*kind.conditions)) for kind in KINDS]
     acting = [one.acting(setting) for one in (*momentum.acting, *by_name.values()) if hasattr(one, "acting")]
     acting += [kind(setting, some) for kind, some in found if some]
