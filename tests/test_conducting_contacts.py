@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Pore fluid through closed contacts: two bodies are as one, layers, rest, slip, separation, restart, refusals."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -194,6 +196,25 @@ def test_flow_through_a_contact_inclined_to_the_grid_converges(along):
     (coarse, flow), (fine, _) = (inclined(n, along) for n in (10, 20))
     assert coarse < 5e-3 and abs(flow) < 2e-3
     assert np.log2(coarse / fine) > 1.2
+
+
+@pytest.mark.parametrize("order", [(0, 1, 2), (2, 0, 1)])
+def test_of_three_groups_those_conduct_that_should(order):
+    """The lowest block drains into the base, the middle one through it; the highest one keeps its pressure."""
+    grid, heights = mpm.Grid([0, 0], [0.2, 1.2], [2, 12]), (0, 0.3, 0.62, 1)
+    boxes = [mpm.box(grid, [0, a], [0.2, b]) for a, b in pairwise(heights)]
+    low, middle, high = (order.index(i) for i in range(3))
+    contacts = [mpm.Contact(high, middle), mpm.Contact(low, high), mpm.Contact(middle, low, conducts=True, name="flow")]
+    sides = [mpm.Drained("bottom", region=bottom()), mpm.Traction("top", (0, -1e3), region=top())]
+    soil = mpm.Hencky(bulk=E / 3, shear=E / 2, porosity=0.4, conductivity=1e-4)
+    water = {"fluid": mpm.Fluid(), "walls": WALLS[2], "conditions": [*contacts, *sides]}
+    s = mpm.Simulation(grid, [boxes[i] for i in order], [soil], **water)
+    s.run(5.0, 0.5, progress=False)
+    p, upper = s.points.pressure, s.points.x[:, 1] > 0.62
+    assert p[upper] == pytest.approx(np.full(upper.sum(), p[upper].mean()), rel=1e-3) and p[upper].mean() > 900
+    assert p[~upper].max() < 600
+    assert set(s.outflows) == {"flow", "drained_bottom"}
+    assert 0 < s.outflows["flow"] < s.outflows["drained_bottom"]
 
 
 def test_a_contact_that_conducts_needs_a_fluid():
