@@ -203,6 +203,17 @@ def apart(cells: int, **options) -> mpm.Simulation:
     )
 
 
+def stacked(cells: int, **options) -> mpm.Simulation:
+    """Return two sealed wet blocks in contact.  Their pressures are equal, so no fluid flows between them."""
+    h, soils = 1 / cells, [soil(conductivity=1e-4)]
+    grid = mpm.Grid([0, 0], [1, 1 + 2 * h], [cells, cells + 2])
+    bodies = [mpm.box(grid, [0, a], [1, b]) for a, b in ((0, 0.5), (0.5, 1))]
+    load = mpm.Traction("top", lambda t: (0, -LOAD * t), region=((0, 0.9), (1, 2)))
+    contact = mpm.Contact(0, 1, **options)
+    walls = {"left": "x", "right": "x", "bottom": "y"}
+    return mpm.Simulation(grid, bodies, soils, walls=walls, fluid=mpm.Fluid(), conditions=[load, contact])
+
+
 Make = Callable[[int], mpm.Simulation]
 PAIRS: dict[str, tuple[Make, Make]] = {
     "pore fluid that drains at once": (block, lambda n: block(n, soil(conductivity=1e3), **WATER)),
@@ -224,6 +235,7 @@ PAIRS: dict[str, tuple[Make, Make]] = {
         apart,
         lambda n: apart(n, conditions=[mpm.Contact(0, 1, friction=0.3)]),
     ),
+    "contact that conducts": (stacked, lambda n: stacked(n, conducts=True)),
     "inertia": (block, lambda n: block(n, inertia=True)),
     "inertia of wet soil, both scenes with two substeps": (draining, lambda n: draining(n, inertia=True)),
     "free tool that touches nothing": (

@@ -22,7 +22,7 @@ simulation = mpm.Simulation(
         mpm.Drained("left", region=([0, 0], [0.2, 1])),
         mpm.Drained("top", region=above),
         mpm.Displacement("top", lambda t, X: (0.01 * t, -0.03 * t), region=above),
-        mpm.Contact([1, 2], 0, friction=0.2),
+        mpm.Contact([1, 2], 0, friction=0.2, conducts="conducts" in sys.argv),
     ],
 )
 simulation.run(0.5, 0.5, progress=False)
@@ -42,4 +42,5 @@ if parts:
     order = np.argsort(ids)
     more = {"counts": [len(part[0]) for part in parts], "forces": simulation.tool_forces.array, "push": push[order]}
     more["walls"] = simulation.wall_reactions.array
+    more["outflows"] = simulation.outflows.array
     np.savez(sys.argv[1], x=x[order], p=p[order], shear=s[order], balance=result.balance, **more)

@@ -38,6 +38,7 @@ SLOW = [
     for name, count in (("wetting", (3,)), ("rain", (2, 3, 4)), ("tied", (2, 3)), ("following_3d", (2,)))
 ]
 SLOW.append(pytest.param("mpi_contact.py axisymmetric", (2, 3), marks=pytest.mark.slow))
+SLOW.append(pytest.param("mpi_contact.py conducts", (2, 3), marks=pytest.mark.slow))
 
 
 @pytest.mark.parametrize("scene, several", SCENES + SLOW)

@@ -73,6 +73,8 @@ CHANGES = {
     ("SideFeeds", "_flows"): "the active set of seepage faces",
     ("SideFeeds", "_nonorthogonal"): "the non-orthogonal flow at the start of the substep",
     ("SideFeeds", "_share"): "the same, as a fraction of the flow in unsaturated soil",
+    ("ContactFeeds", "_links"): "the active set of closed contacts",
+    ("ContactFeeds", "_correction"): "the non-orthogonal correction of their flow at the start of the substep",
     ("HoldLoads", "data"): "the rows of prescribed sides with their multipliers",
     ("HoldLoads", "_lacked"): "the gaps of sides at the last change of their multipliers",
     ("ContactProblem", "now"): "the pairs and tractions of contacts in a Newton step",

@@ -104,6 +104,7 @@ BENCHMARK = {
     "ghost penalty on all faces": {"ghost penalty"},
     "rough tool that touches nothing": {"tools"},
     "contact of groups that are apart": {"contacts"},
+    "contact that conducts": {"contacts that conduct"},
     "damping of pressure jumps": {"damping of pressure jumps"},
     "pressure damping as in yielding instead of elastic soil": set(),
     "seepage face": set(),

@@ -147,6 +147,8 @@ class Loads:
     """Whether the tangent couples nodes of different cells."""
     touches: bool = False
     """Whether the condition is a contact, which may open."""
+    conducts: bool = False
+    """Whether fluid may pass between the cells of `within_reach`."""
     key: Any = None
     """Cache key of the penalty and the pattern, from all data on which they depend except the positions of faces."""
 
@@ -204,6 +206,9 @@ class Loads:
 
     def pattern(self, unknowns: Unknowns) -> PETSc.Mat | None:
         """Return a zero matrix with the entries that `coupling` adds to the pattern of cells, or None."""
+
+    def joins(self, unknowns: Unknowns) -> PETSc.Mat | None:
+        """Return a zero matrix with the entries by which fluid may couple the pressures of cells, or None."""
 
     def coupling(self, at: At) -> PETSc.Mat | None:
         """Return the negative derivative of the forces in `push`, without the part that `tangent` adds."""

@@ -20,8 +20,8 @@ class Contact:
     """Two groups of bodies in contact, with slip and separation.
 
     Bodies of one group stick where they touch.  Groups cannot penetrate each other, but may slide and separate.
-    No fluid passes between groups.  In a scene with contacts, each body must belong to a group, and each pair of groups
-    must have one contact.  The forces on the bodies of `one` are in `tool_forces` of the simulation.
+    Fluid passes between groups only with `conducts`.  In a scene with contacts, each body must belong to a group, and
+    each pair of groups must have one contact.  `tool_forces` of the simulation are the forces on the bodies of `one`.
 
     Parameters
     ----------
@@ -31,6 +31,10 @@ class Contact:
         Coulomb's coefficient mu, >= 0.
     adhesion
         Additional shear strength of the contact, Pa, >= 0, as for a `Tool`.
+    conducts
+        Whether pore fluid passes where the contact is closed.  The pressure is then continuous across the contact.  No
+        fluid passes where the contact is open.  A gap of at most 5e-4 cell sizes counts as closed.  `outflows` of the
+        simulation contain the flow from `one` to `other`.  Friction depends on the total pressure in both cases.
     name
         Name of the results; by default "contact".
 
@@ -44,6 +48,7 @@ class Contact:
     other: int | Sequence[int]
     friction: float = 0.0
     adhesion: float = 0.0
+    conducts: bool = field(default=False, kw_only=True)
     name: str | None = field(default=None, kw_only=True, repr=False)
 
     def __post_init__(self):

@@ -9,6 +9,7 @@ from functools import partial
 from typing import NamedTuple
 
 from mpi4py import MPI
+from petsc4py import PETSc
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,10 +26,11 @@ from mpm_dolfinx.conditions.conditions import resistance
 from mpm_dolfinx.contact.groups import Contact
 from mpm_dolfinx.contact.history import Origin, pressure_name, shear_name
 from mpm_dolfinx.contact.law import ContactLaw
-from mpm_dolfinx.contact.pairs import FacePairs
+from mpm_dolfinx.contact.pairs import FacePairs, between_cells
 from mpm_dolfinx.contact.problem import ContactProblem, Touching
 from mpm_dolfinx.contact.tool_placing import BEGINS, FACING
 from mpm_dolfinx.domains.cut_domains import CutDomains
+from mpm_dolfinx.forms.unknowns import Unknowns
 from mpm_dolfinx.parallel.exchange import Exchange, first, over_all
 from mpm_dolfinx.points.cutting import FACES
 from mpm_dolfinx.points.material_points import MaterialPoints
@@ -77,6 +79,7 @@ class Contacts(Touching):
     def __init__(self, setting: Setting, contacts: Mapping[str, Contact]):
         super().__init__(setting, contacts)
         sides, self.contacts = setting.sides, tuple(contacts.values())
+        self.conducts = any(contact.conducts for contact in self.contacts)
         self._rank = _ranks(setting)
         self._faces: list[tuple[int, Surface, Surface, int]] = []  # contact, own and opposite faces, sign of forces
         for number, contact in enumerate(self.contacts):
@@ -139,19 +142,21 @@ class Contacts(Touching):
             pressure = points.data[pressure_name(self.names[number])][at]
             resistances = np.minimum(own[at], now.resistance[other])
             place = (i + grid.comm.rank * len(self._faces)) * PLACES + row
+            outward = patches.area(points)[row] if self.conducts else np.zeros((len(row), 0))
             fixed = np.full((len(row), 2), [number, sign])
             scalars = np.column_stack([fixed, place, size, resistances, pressure])
             offset = patches.now(present)[row] - y
-            rows.append((patches.cell[row], cell, at, np.hstack([scalars, patches.x[row], where, n, offset, old])))
+            vectors = patches.x[row], where, n, offset, old, outward
+            rows.append((patches.cell[row], cell, at, np.hstack([scalars, *vectors])))
         if off := first(grid.comm, off):
             raise NotConverged(off)
         cell, other, at, values = (np.concatenate(column) for column in zip(*rows, strict=True))
         exchange = Exchange(grid.comm, grid.owner(cell))
         cell, other, sent = (exchange.send(columns) for columns in (cell, other, values))
         number, sign, place = sent[:, :3].T.astype(np.int64)
-        x, y, n, offset, shear = np.split(sent[:, 6:], 5, axis=1)
+        x, y, n, offset, shear, outward = np.split(sent[:, 6:], d * np.arange(1, 6), axis=1)
         own = number, grid.locals[cell], *sent[:, 3:6].T, shear, x, sign
-        pairs = FacePairs(grid, *own, other, y, n, offset, place)
+        pairs = FacePairs(grid, *own, other, y, n, offset, place, outward)
         return ContactLaw(self.names, self.contacts, pairs), Origin(
             exchange, at, values[:, 0].astype(np.int64), values[:, 3]
         )
@@ -286,6 +291,12 @@ class ContactLoads(ContactProblem):
     def __init__(self, contacts: Contacts, cut: CutDomains, law: ContactLaw, origin: Origin, again, cell_pairs):
         super().__init__(law, origin, again=again, cell_pairs=cell_pairs)
         self._contacts, self._cut = contacts, cut
+        self.conducts = contacts.conducts
+
+    def joins(self, unknowns: Unknowns) -> PETSc.Mat:
+        """See `Loads`."""
+        pairs = self.within_reach()
+        return between_cells(unknowns, self.grid, pairs, np.zeros((2, len(pairs))))
 
     def within_reach(self) -> NDArray[np.int64]:
         """Return the pairs of cells of bodies that may touch in the step."""

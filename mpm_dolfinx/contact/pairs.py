@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from mpi4py import MPI
 from petsc4py import PETSc
 
 import numpy as np
@@ -22,7 +21,7 @@ from numpy.typing import NDArray
 from mpm_dolfinx.base.validation import line
 from mpm_dolfinx.contact.shapes import DISTANCE, Distance
 from mpm_dolfinx.contact.tool import Pose, Tool
-from mpm_dolfinx.forms.unknowns import Unknowns
+from mpm_dolfinx.forms.unknowns import Unknowns, petsc_matrix
 from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.parallel.exchange import Exchange, together
 
@@ -133,6 +132,8 @@ class FacePairs(Pairs):
     n: NDArray[np.float64]  # outward unit normal of the other side at y (m, d)
     offset: NDArray[np.float64]  # vector from y to the point, without the displacement in the step (m, d), m
     place: NDArray[np.int64]  # identifier of the point, the same in all updates of the pairs in a step (m,)
+    # outward area vector of the point at the start of the step (m, d), m^(d-1); (m, 0) if no contact conducts
+    outward: NDArray[np.float64]
 
     def at(self, w: NDArray[np.float64], motion: NDArray[np.float64]) -> Geometry:
         """See `Pairs`.  Lever arms are those at the start of the step."""
@@ -142,6 +143,14 @@ class FacePairs(Pairs):
     def other_side(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """See `Pairs`."""
         return self.other, shape_values_in(self.grid, self.other, self.y)
+
+    def conducting(self, unknowns: Unknowns, closed: NDArray[np.bool_], slopes: NDArray[np.float64]) -> PETSc.Mat:
+        """Return the result of `between_cells` for the closed pairs.
+
+        `closed` (m,): whether each pair is closed.
+        """
+        cells = np.column_stack([self.grid.cell_number[self.cell], self.other])
+        return between_cells(unknowns, self.grid, cells[closed], slopes)
 
 
 def shape_values_in(grid: Grid, cells: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -182,17 +191,24 @@ def at_nodes(
     return petsc_matrix(scipy.sparse.csr_matrix((value[kept], own), shape=shape), unknowns.size, grid.comm)
 
 
-def petsc_matrix(rows: scipy.sparse.csr_matrix, columns: int, comm: MPI.Intracomm, own: bool = False) -> PETSc.Mat:
-    """Return the PETSc matrix with `rows` on this process and `columns` local columns.
+def between_cells(unknowns: Unknowns, grid: Grid, pairs: NDArray[np.int64], slopes: NDArray[np.float64]) -> PETSc.Mat:
+    """Return the derivative of the outflow of cells with respect to cell pressures, for flows between pairs of cells.
 
-    `own`: whether column indices are local.
+    `pairs` (m, 2): lexicographic cells of any process.
+    `slopes` (2, m), m^d/(Pa s): derivative of the flow from the first to the second cell with respect to the pressure
+    of the first cell, and minus the derivative with respect to the pressure of the second cell.
     """
-    rows.sort_indices()  # PETSc requires it
-    start = int(comm.exscan(columns) or 0) if own and comm.size > 1 else 0
-    csr = [values.astype(PETSc.IntType) for values in (rows.indptr, rows.indices + start)]
-    A = PETSc.Mat().createAIJ(((rows.shape[0], None), (columns, None)), csr=(*csr, rows.data), comm=comm)
-    A.assemble()
-    return A
+    (one, other), (own, far) = pairs.T, slopes
+    rows, columns = np.concatenate([one, one, other, other]), np.concatenate([one, other, one, other])
+    to = Exchange(grid.comm, grid.owner(columns))
+    columns = to.back(unknowns.map.indices[grid.locals[to.send(columns)]])
+    to = Exchange(grid.comm, grid.owner(rows))
+    rows, columns = unknowns.map.indices[grid.locals[to.send(rows)]], to.send(columns)
+    values = to.send(np.concatenate([own, -far, -own, far]))
+    start = (grid.comm.exscan(unknowns.size) or 0) if grid.comm.size > 1 else 0
+    shape = (unknowns.size, max(1, unknowns.global_size))
+    at = rows - start, columns
+    return petsc_matrix(scipy.sparse.csr_matrix((values, at), shape=shape), unknowns.size, unknowns.comm)
 
 
 def _check_distance(tool: Tool, x: NDArray, gap: NDArray, n: NDArray, h: float) -> None:

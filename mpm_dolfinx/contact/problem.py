@@ -38,8 +38,8 @@ from mpm_dolfinx.base.tolerances import EPSILON, SAME
 from mpm_dolfinx.conditions.acting import Acting, At, Loads, Setting
 from mpm_dolfinx.contact.history import Origin, Rough, joined, pressure_name, shear_name
 from mpm_dolfinx.contact.law import BEGIN, DEPTH, ROUNDS, ContactLaw, ContactState, Touch
-from mpm_dolfinx.contact.pairs import Geometry, Pairs, at_nodes, petsc_matrix
-from mpm_dolfinx.forms.unknowns import Unknowns, collect_garbage
+from mpm_dolfinx.contact.pairs import Geometry, Pairs, at_nodes
+from mpm_dolfinx.forms.unknowns import Unknowns, collect_garbage, petsc_matrix
 from mpm_dolfinx.parallel.exchange import Exchange, over_all
 from mpm_dolfinx.points.material_points import MaterialPoints
 
@@ -220,6 +220,12 @@ class ContactProblem(Loads):
             return found
         more = law.slope(touch, at, self._shift(found)[of, None] * self.pushes.direction[of])
         return found._replace(balanced=touch.force + more)
+
+    def closed(self, at: At) -> NDArray[np.bool_]:
+        """Return which pairs (m,) of contacts that conduct are closed at u: their gap is at most `DEPTH` cells."""
+        conducts = np.array([contact.conducts for contact in self.now.law.contacts])
+        gap, pairs = self.found(at).at.gap, self.pairs
+        return conducts[pairs.number] & (gap <= DEPTH * self.grid.sizes(pairs.cell).min(axis=-1))
 
     def push(self, at: At, residual: PETSc.Vec, on: Unknowns) -> None:
         """Subtract the contact forces at u from the residual."""

@@ -26,8 +26,8 @@ from mpm_dolfinx.base.validation import line
 from mpm_dolfinx.bodies.faces import Surface, interpolate
 from mpm_dolfinx.conditions.acting import Acting, At, Loads, Place, Setting
 from mpm_dolfinx.conditions.conditions import HOLD, Drained, Inflow, Quiet, Rain, Tied, holding
-from mpm_dolfinx.contact.pairs import at_nodes, on_owners, petsc_matrix, shape_values_in
-from mpm_dolfinx.forms.unknowns import Unknowns
+from mpm_dolfinx.contact.pairs import at_nodes, on_owners, shape_values_in
+from mpm_dolfinx.forms.unknowns import Unknowns, petsc_matrix
 from mpm_dolfinx.grid.grid import Grid
 
 

@@ -38,14 +38,6 @@ from mpm_dolfinx.forms.point_forms import PointData
 from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.parallel.exchange import over_all, together
 
-THICK = np.sqrt(2)
-"""Area of the largest plane section of a cube, divided by the area of a face.  Source: exact bound (Ball 1986).
-
-Let a convex body of volume V in a cell of edge length h lie on one side of a plane.  The distance from the body's
-centroid to the plane is at least `V / ((d + 1) THICK h^(d-1))`.  A face at a smaller distance from the centroid of the
-cell's material bounds only a part of this material.  Such a face must not drain the whole cell.
-"""
-
 
 class DrainedSides(Feeding):
     """Drained sides, prescribed inflows and rain of a stage.
@@ -119,13 +111,7 @@ class DrainedSides(Feeding):
         pressure, flux, one_way, driest = values[:, 1:5].T
         area = values[:, 5:].copy()  # a view would keep all columns
         drains = np.isfinite(pressure)
-        size, offset = np.linalg.norm(area, axis=1), x - grid.midpoints[cell] - wet.contents.centroid[cell]
-        least = wet.contents.fill[wet.contents.slot(cell)] * grid.sizes(cell).min(axis=-1) / THICK / (grid.dim + 1)
-        normal = area / size[:, None]
-        distance = np.add.reduce(offset * normal, axis=1)
-        shape = size / np.maximum(distance, least)
-        if grid.axisymmetric:  # uses the circumference half-way to the centroid
-            shape = shape * (1 - distance * normal[:, 0] / (2 * x[:, 0]))
+        size, offset, shape = wet.contents.shapes(cell, x, area)
         shape, pressure = (np.where(drains, values, 0.0) for values in (shape, pressure))
         rains = np.isfinite(driest)
         given, rain = np.where(rains, 0.0, flux * size), np.where(rains, flux * size, np.nan)

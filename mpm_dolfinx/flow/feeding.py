@@ -12,6 +12,8 @@ from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple
 
+from petsc4py import PETSc
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -34,6 +36,8 @@ class Wet(NamedTuple):
     dt: float = np.inf  # length of the step, s
     # results of the conditions in the previous step
     outcome: Mapping[str, Mapping[str, NDArray[np.float64]]] = MappingProxyType({})
+    loads: Sequence[Any] = ()  # loads in the balance of momentum; empty if only open sides are needed
+    at: Any = None  # present displacements, see `acting.At`
 
 
 class Fluid(NamedTuple):
@@ -83,6 +87,12 @@ class Feeds:
     def slope(self, at: Any, fluid: Fluid) -> NDArray[np.float64] | float:
         """Return the derivative (n,) of the outflow with respect to the pressure of the cell, in m^d/(Pa s)."""
         return 0.0
+
+    def coupling(self, at: Any, fluid: Fluid, unknowns: Any) -> PETSc.Mat | None:
+        """Return the derivative of the outflow with respect to all pressures, without `slope`, or None for zero.
+
+        `unknowns`: pressure unknowns.  `Loads.joins` gives the possible entries.
+        """
 
     def settle(self, at: Any, fluid: Fluid) -> int:
         """Update the active set, and return the number of changes on this process."""

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx.base import _compat
 from mpm_dolfinx.base.caching import Keyed
-from mpm_dolfinx.base.fluid_content import density_between, mass_potential
+from mpm_dolfinx.base.fluid_content import density_between, mass_potential, mean_density
 from mpm_dolfinx.base.tolerances import TINY
 from mpm_dolfinx.forms.point_forms import FacetForm, FacetSum
 from mpm_dolfinx.forms.unknowns import sum_ghosts
@@ -31,6 +31,13 @@ from mpm_dolfinx.grid.grid import Grid, across_faces, sum_by
 from mpm_dolfinx.points.active import Active
 from mpm_dolfinx.points.material_points import cofactor, determinant
 
+THICK = np.sqrt(2)
+"""Area of the largest plane section of a cube, divided by the area of a face.  Source: exact bound (Ball 1986).
+
+Let a convex body of volume V in a cell of edge length h lie on one side of a plane.  The distance from the body's
+centroid to the plane is at least `V / ((d + 1) THICK h^(d-1))`.  A face at a smaller distance from the centroid of the
+cell's material bounds only a part of this material.  Such a face must not drain the whole cell.
+"""
 ALONG = 0.1  # a side determines the slope along an axis if this component of its unit normal is larger than `ALONG`
 
 
@@ -100,6 +107,10 @@ class Conduction:
         distance = (offset * normal).sum(axis=1)
         shifted = distance - (self.mobility.shift[at] * normal).sum(axis=1)
         return np.divide(distance, shifted, out=np.ones(len(distance)), where=shifted > 0)
+
+    def density(self, p: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the mean relative densities (m,) between two pressures (m,), in Pa, see `fluid_content`."""
+        return mean_density(p, other, self.bulk)
 
     def deformed(self, at: NDArray[np.int64], vector: NDArray[np.float64]) -> NDArray[np.float64]:
         """Map vectors (m, d) in cells `at` by the deformation gradients of these cells."""
@@ -289,6 +300,27 @@ class CellContents(Keyed):
                 hoop[rests] = 1.0
         return CellMotion(F, cofactor(F), determinant(F), moved, hoop)
 
+    def shapes(
+        self, cells: NDArray[np.int32], x: NDArray[np.float64], area: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Return the areas (m,), offsets (m, d) and shapes (m,) of faces in owned cells.
+
+        Offsets, in m, are vectors from the centroid of the cell's material to the face.  Shapes, in m^(d-2), are areas
+        divided by the distances of the centroids.
+
+        `x` (m, d), m: positions of the faces.
+        `area` (m, d), m^(d-1): outward area vectors.
+        """
+        grid = self.grid
+        size, offset = np.linalg.norm(area, axis=1), x - grid.midpoints[cells] - self.centroid[cells]
+        least = self.fill[self.slot(cells)] * grid.sizes(cells).min(axis=-1) / THICK / (grid.dim + 1)
+        normal = area / size[:, None]
+        distance = np.add.reduce(offset * normal, axis=1)
+        shape = size / np.maximum(distance, least)
+        if grid.axisymmetric:  # uses the circumference half-way to the centroid
+            shape = shape * (1 - distance * normal[:, 0] / (2 * x[:, 0]))
+        return size, offset, shape
+
     @property
     def shape_values(self) -> NDArray[np.float64]:
         """Values (n, 2^d) of the shape functions at the centroids of material in filled cells."""
@@ -297,6 +329,69 @@ class CellContents(Keyed):
     def slot(self, cells: NDArray[np.int32]) -> NDArray[np.int64]:
         """Return the index of each cell among the filled cells."""
         return self._slot[cells]
+
+
+@dataclass(frozen=True)
+class HalfFaces:
+    """The halves of m faces that belong to one of the two cells at each face, on the owners of these cells.
+
+    `contents`: material in the cells.
+    `cells` (m,): local cells.
+    `x` (m, d), m: positions of the faces at the last reset of the grid.
+    `area` (m, d), m^(d-1): outward area vectors.
+    """
+
+    contents: CellContents
+    cells: NDArray[np.int32]
+    x: NDArray[np.float64]
+    area: NDArray[np.float64]
+
+    @cached_property
+    def at(self) -> NDArray[np.int64]:
+        """Indices (m,) of the cells among the filled cells."""
+        return self.contents.slot(self.cells)
+
+    @cached_property
+    def _shapes(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        return self.contents.shapes(self.cells, self.x, self.area)
+
+    @cached_property
+    def side(self) -> OpenSides:
+        """These halves as open sides, so that the cells have no no-flow side there, see `nonorthogonal.Gradients`."""
+        none, unknown = np.zeros(len(self.at)), np.full(len(self.at), np.nan)
+        number, seeps = none.astype(np.int64), none.astype(bool)
+        offset = self._shapes[1]
+        return OpenSides(number, self.cells, none, none, none, seeps, self.area, offset, unknown, unknown)
+
+    def rows(self, flow: Conduction, p: NDArray[np.float64], force: NDArray[np.float64] | None) -> NDArray[np.float64]:
+        """Return pressure (Pa), position (m), force (N/m^3), pressure drop (Pa) and conductances (m^d/(Pa s)).
+
+        The position is that of the centroid.  The force is the unit weight plus the inertia force.  It causes the
+        pressure drop from the centroid to the face.  Unsaturated soil has a conductance for each retention curve.
+
+        `p` (n,), Pa: pressures of the filled cells.
+        `force` (n, d), N/m^3: inertia force on the fluid, or None.
+        """
+        contents, d = self.contents, self.area.shape[1]
+        size, offset, shape = self._shapes
+        normal = self.area / size[:, None]
+        if flow.mobility.shift is not None:
+            shape = shape * flow.distance_ratio(self.at, normal, offset)
+        x = contents.grid.midpoints[self.cells] + contents.centroid[self.cells]
+        if flow.motion is not None:
+            x = x + flow.motion.moved[self.at]
+        pull = np.zeros((len(shape), d)) if flow.weight is None else np.broadcast_to(flow.weight, (len(shape), d))
+        if force is not None:
+            pull = pull + force[self.at]
+        drop = (flow.deformed(self.at, offset) * pull).sum(axis=1)
+        conductance = (flow.across(self.at, normal) * shape)[:, None]
+        if flow.relative is not None:
+            conductance = conductance * flow.mobility.shares[self.at]
+        return np.column_stack([p[self.at], x, pull, drop, conductance])
+
+    def total(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the sums (..., n) of values (..., m) over the halves of each filled cell."""
+        return sum_by(self.at, values, len(self.contents.filled))
 
 
 class FluxForms:

@@ -227,10 +227,17 @@ class StorageSystem:
     `cells`, `facets`: active local cells including ghosts, and the faces between two of these cells.
     `momentum`: unknowns of the displacement.
     `parts`: connected parts of the bodies.
+    `joins`: functions that return the pattern of couplings of cell pressures, see `Loads.joins`.
     """
 
     def __init__(
-        self, forms: StorageForms, cells: NDArray[np.int32], facets: NDArray[np.int32], momentum: Unknowns, parts: Parts
+        self,
+        forms: StorageForms,
+        cells: NDArray[np.int32],
+        facets: NDArray[np.int32],
+        momentum: Unknowns,
+        parts: Parts,
+        joins: Sequence[Callable[[Unknowns], PETSc.Mat]] = (),
     ):
         self._forms = forms
         self.symmetric = not forms.retains
@@ -254,6 +261,10 @@ class StorageSystem:
             zeros = np.zeros((grid.num_local, d, 2))
             pattern = second_differences(own, grid, zeros[: own.size, :, 0], zeros[:, :, 0], zeros)
             pattern.axpy(1.0, self.L, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
+        for join in joins:
+            more = join(own)
+            more.axpy(1.0, pattern, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
+            pattern = more
         self.C, self.P = pattern.duplicate(), pattern.duplicate()
 
     @property
@@ -629,7 +640,11 @@ class StorageProblem:
         if self._softer is not None:
             system.C.axpy(1.0, self._softer, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
         fluid, both = self._fluid, zip(self._feeds, self._flow(False).at, strict=True)
-        slope = sum(one.slope(at, fluid) for one, at in both)
+        slope = 0.0
+        for one, at in both:
+            slope = slope + one.slope(at, fluid)
+            if (coupling := one.coupling(at, fluid, system.unknowns)) is not None:
+                system.C.axpy(self.dt, coupling, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
         _add_diagonal(system.C, capacity + self.dt * slope)
 
     def assemble_preconditioner(self, factor: float, share: float) -> PETSc.Mat:

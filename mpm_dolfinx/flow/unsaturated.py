@@ -124,11 +124,13 @@ class Relative:
     shares
         Fractions (DG0) of a cell's mobility at k_r = 1: of soil without a retention curve, and of the soil of each
         curve.
+    laws
+        Relative conductivities as functions of pressure.
     """
 
     def __init__(self, grid: Grid, retentions: Retentions):
-        self._laws = Laws(grid, retentions.laws)
-        self.count = len(self._laws.scales)
+        self.laws = Laws(grid, retentions.laws)
+        self.count = len(self.laws.scales)
         self.shares = fem.Function(grid.cellwise((self.count,)))
         self._tables = fem.Function(grid.cellwise((3 * (self.count - 1),)))
         self._grid = grid
@@ -138,7 +140,7 @@ class Relative:
     def between(self, pressure: fem.Function, drop) -> list[Between]:
         """Return k_r of each law between the two sides of a face, as UFL variables, see `fitted`."""
         out = []
-        for i, law in enumerate(self._laws.conductances):
+        for i, law in enumerate(self.laws.conductances):
             tables = [[self._tables(side)[3 * i + j] for j in range(3)] for side in "+-"]
             scale = fem.Constant(self._grid.mesh, law.scale)
             found = fitted([pressure(side) for side in "+-"], tables, drop, scale, UFL)
@@ -160,7 +162,7 @@ class Relative:
         `p` (c,), Pa: pressures of the local cells.
         `force` (c, d), N/m^3: inertia force on the fluid.
         """
-        self._tables.x.array[:] = np.concatenate([law(p) for law in self._laws.conductances], axis=1).ravel()
+        self._tables.x.array[:] = np.concatenate([law(p) for law in self.laws.conductances], axis=1).ravel()
         if (faces := self._borders.value) is None:
             return None
         pair = p[faces.pair]
@@ -173,7 +175,7 @@ class Relative:
 
     def at(self, cells: NDArray[np.int64], p: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return k_r (m,) of owned cells at the pressures p (m,), in Pa."""
-        k = np.stack([np.ones(len(p)), *(law(p)[:, 1] for law in self._laws.conductances)], axis=1)
+        k = np.stack([np.ones(len(p)), *(law(p)[:, 1] for law in self.laws.conductances)], axis=1)
         return (self.shares.x.array.reshape(-1, self.count)[cells] * k).sum(axis=1)
 
     def through_sides(
@@ -194,12 +196,12 @@ class Relative:
         """
         shares = self.shares.x.array.reshape(-1, self.count)[cells]
         k, derivative = shares[:, 0].copy(), shares[:, 0].copy()
-        for law, share in zip(self._laws.conductances, shares.T[1:], strict=True):
+        for law, share in zip(self.laws.conductances, shares.T[1:], strict=True):
             between = fitted((p, outer), (law(p).T, law(outer).T), drop, law.scale, NUMPY)
             k += share * between.k
             derivative += share * (between.k + between.slopes[0] * (p - outer + drop))
         if (faces := self._borders.value) is not None:
-            found = faces.borders.through_sides(self._laws, faces.mobility, cells, normal, p, outer, drop)
+            found = faces.borders.through_sides(self.laws, faces.mobility, cells, normal, p, outer, drop)
             for rows, *of_borders in found:
                 k[rows], derivative[rows] = of_borders
         return k, np.maximum(derivative, 0.0)
@@ -213,5 +215,5 @@ class Relative:
     def set_borders(self, contents, flow, places: NDArray[np.float64], moved: NDArray[np.float64]) -> None:
         """Store the faces between cells of different soil with their current conductivities, see `borders`."""
         borders = flow.mobility.borders
-        make = partial(borders.faces, self._laws, contents, flow, places, moved) if borders else lambda: None
+        make = partial(borders.faces, self.laws, contents, flow, places, moved) if borders else lambda: None
         self._borders(object(), make)

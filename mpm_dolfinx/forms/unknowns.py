@@ -12,6 +12,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 import numpy as np
+import scipy.sparse
 from dolfinx import fem
 from numpy.typing import NDArray
 
@@ -104,6 +105,19 @@ def matrix(rows: Unknowns, columns: Unknowns, row_length: int | NDArray[np.int64
     A.setPreallocationNNZ((np.minimum(length, columns.size), elsewhere))
     A.setOption(PETSc.Mat.Option.NEW_NONZERO_ALLOCATION_ERR, False)
     A.setLGMap(rows.map, columns.map)
+    return A
+
+
+def petsc_matrix(rows: scipy.sparse.csr_matrix, columns: int, comm: MPI.Intracomm, own: bool = False) -> PETSc.Mat:
+    """Return the PETSc matrix with `rows` on this process and `columns` local columns.
+
+    `own`: whether column indices are local.
+    """
+    rows.sort_indices()  # PETSc requires it
+    start = int(comm.exscan(columns) or 0) if own and comm.size > 1 else 0
+    csr = [values.astype(PETSc.IntType) for values in (rows.indptr, rows.indices + start)]
+    A = PETSc.Mat().createAIJ(((rows.shape[0], None), (columns, None)), csr=(*csr, rows.data), comm=comm)
+    A.assemble()
     return A
 
 

@@ -212,7 +212,10 @@ class Simulation:
 
     @property
     def outflows(self) -> ByName[NDArray[np.float64]]:
-        """Outflow through each drained side and each side with inflow, by name, in m^3/s (m^2/s in plane strain)."""
+        """Outflow through each drained side and each side with inflow, by name, in m^3/s (m^2/s in plane strain).
+
+        A `Contact` that conducts has the flow from its bodies `one` to its bodies `other`.
+        """
         return self.outcome("outflows")
 
     @property

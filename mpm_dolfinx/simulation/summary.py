@@ -69,8 +69,9 @@ def _momentum(s: Scene, state: State) -> list[Part]:
 def _storage(s: Scene, state: State) -> list[Part]:
     storage, count = s.storage, {one.title: one.count for one in state.stage.feeding}
     names = ("pore pressure", "fluxes between cells", "weight of the fluid", "open sides", "damping of pressure jumps")
+    through = "contacts that conduct"
     if storage is None:
-        return [Part(name, False, "no fluid") for name in (*names, "pores that drain", "retention", "sources")]
+        return [Part(name, False, "no fluid") for name in (*names, through, "pores that drain", "retention", "sources")]
     still, f = "no conductivity", storage.fluxes
     return [
         Part(names[0], True, "finite volumes, coupled"),
@@ -78,6 +79,7 @@ def _storage(s: Scene, state: State) -> list[Part]:
         _either(names[2], f.gravity, "gravity", "no gravity" if f.flux else still),
         _either(names[3], names[3] in count, f"{count.get(names[3])} drained or with inflow", "no-flow sides only"),
         _either(names[4], f.damp.used, "little flow within a step", "enough flow within a step, so far"),
+        _either(through, through in count, f"{count.get(through)}", "no fluid passes between groups"),
         _either("pores that drain", storage.drains, "as a free surface falls", "pores stay full"),
         _either("retention", storage.retains, _laws(s), "no suction drains pores"),
         _either("sources", "sources" in count, f"{count.get('sources')}", "none given"),

@@ -10,6 +10,8 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import cache, partial
 
+from mpi4py import MPI
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -151,7 +153,8 @@ class Motion:
                 of_cut = (ids, cut.pieces.cell, cut.pieces.fraction)
                 carried = PiecePressures(*of_cut, None, x, None, None, pressure, start)
                 if cut.domains and net_inflow is not None:
-                    defect = self._volume_defect(state, points, on_grid, data.of_points, net_inflow, keeps)
+                    undrained = partial(self._undrained, state, on_grid, data.of_points, loads)
+                    defect = self._volume_defect(state, points, on_grid, undrained, net_inflow, keeps)
                 now = self.pressures(on_grid, state.stage, t, nodal)
                 points = replace(points, pressure=now, data=points.data | defect)
             _check_inside(cut, points, t, report)
@@ -366,7 +369,7 @@ class Motion:
         state: State,
         points: MaterialPoints,
         on_grid: OnGrid,
-        pieces: PointData,
+        undrained: Callable[[], NDArray[np.bool_]],
         net_inflow: NDArray[np.float64],
         keeps: NDArray[np.bool_],
     ) -> dict[str, NDArray[np.float64]]:
@@ -404,15 +407,25 @@ class Motion:
         share = -np.expm1(-TAKES_IN * cut.moved(points, part, count))[part]
         weight = points.volume0 * ~none
         total, whole = over_all(cut.grid.comm, sum_by(part, np.array([weight * defect, weight]), count))
-        mean = np.divide(total, whole, out=np.zeros(count), where=whole > 0) * self._undrained(state, on_grid, pieces)
+        mean = np.divide(total, whole, out=np.zeros(count), where=whole > 0) * undrained()
         return {"owed": defect, "due": np.where(none | keeps, 0.0, mean[part] + share * (defect - mean[part]))}
 
-    def _undrained(self, state: State, on_grid: OnGrid, pieces: PointData) -> NDArray[np.bool_]:
-        """Return a mask of connected parts without open sides and without sources."""
+    def _undrained(self, state: State, on_grid: OnGrid, pieces: PointData, loads: Sequence[Loads]) -> NDArray[np.bool_]:
+        """Return a mask of connected parts without open sides and without sources.
+
+        Parts between which contacts may conduct fluid are undrained together.
+        """
         cut, (part, count) = on_grid.cut, on_grid.parts
         fed = [one.fed(cut, pieces) for one in state.stage.feeding]
         at = np.concatenate([np.zeros(0, dtype=np.int64), *fed])
-        return over_all(cut.grid.comm, np.bincount(part[at], minlength=count)) == 0
+        if not (conduct := [one for one in loads if one.conducts]):
+            return over_all(cut.grid.comm, np.bincount(part[at], minlength=count)) == 0
+        whole, wholes = on_grid.parts_of_points(conduct)
+        of = np.zeros(count, dtype=np.int64)
+        of[part] = whole
+        return (over_all(cut.grid.comm, np.bincount(whole[at], minlength=wholes)) == 0)[
+            over_all(cut.grid.comm, of, MPI.MAX)
+        ]
 
     def of_bodies(self, on_grid: OnGrid, cells: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the largest values (k, bodies) in each body, from values (k, n) in the active owned cells."""

@@ -208,7 +208,7 @@ def balances(
     if scene.storage is None:
         return Balances(momentum, None, inertia, ahead)
     weight = None if acting.gravity is None else scene.fluid.density * acting.gravity
-    fed = matrices.flow(start.state, weight, start.data, acting.t, dt)
+    fed = matrices.flow(start.state, weight, start.data, acting.t, dt, acting.loads, momentum.at)
     lost = before and before.integrated(substep.before * dt)
     carried = on_grid.softness(start.state), substep.end * on_grid.due(start.state)
     options = (on_grid.contents, *fed, substep.own * dt, lost, *carried)

@@ -21,7 +21,7 @@ from mpm_dolfinx.base import _compat
 from mpm_dolfinx.base.caching import Keyed, Latest
 from mpm_dolfinx.base.fluid_content import mass_potential, pressure_of
 from mpm_dolfinx.base.tolerances import ROUND_OFF, TINY
-from mpm_dolfinx.conditions.acting import Loads
+from mpm_dolfinx.conditions.acting import At, Loads
 from mpm_dolfinx.diagnostics.scene_checks import check_held
 from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.domains.pressure_transport import CellPressures, Reconstruction, share_within, transport
@@ -418,7 +418,7 @@ class OnGrid(Keyed):
 
     def valid(self, points: MaterialPoints, loads: Sequence[Loads]) -> NDArray[np.bool_]:
         """Return a mask (n,) of points in connected parts that hardly move, and touch no part that moves."""
-        part, count = self.parts if self.cut.grid.copies == 1 else self._of_points(*self.parts_of_cells(loads))
+        part, count = self.parts if self.cut.grid.copies == 1 else self.parts_of_points(loads)
         return self.cut.valid(points, part, count)[part]
 
     def parts_of_cells(self, loads: Sequence[Loads]) -> tuple[NDArray[np.int64], int]:
@@ -427,6 +427,10 @@ class OnGrid(Keyed):
             return self.active.parts_of_cells
         pairs = np.concatenate([one.within_reach() for one in loads])
         return joined_parts(self.cut.grid, *self.active.parts_of_cells, pairs)
+
+    def parts_of_points(self, loads: Sequence[Loads]) -> tuple[NDArray[np.int64], int]:
+        """Return `parts`, with parts that may touch as one part."""
+        return self._of_points(*self.parts_of_cells(loads))
 
     @cached_property
     def parts(self) -> tuple[NDArray[np.int64], int]:
@@ -478,7 +482,8 @@ class System:
         self.momentum = MomentumSystem(momentum, dofs, own, on_grid.penalised, stiff, parts)
         if storage is not None:
             unknowns = self.momentum.unknowns
-            self.storage = StorageSystem(storage, on_grid.cells, on_grid.facets, unknowns, parts)
+            joins = [one.joins for one in loads if one.conducts]
+            self.storage = StorageSystem(storage, on_grid.cells, on_grid.facets, unknowns, parts, joins)
         self.plan = planned(scheme, self.momentum, self.storage, symmetric)
         """Solution method of the linearised problem."""
 
@@ -560,7 +565,14 @@ class Assembled(Keyed):
         return at_nodes + sum(one.rounding_beside for one in loads)
 
     def flow(
-        self, state: State, weight: NDArray[np.float64] | None, data: QuadratureData, t: float, dt: float
+        self,
+        state: State,
+        weight: NDArray[np.float64] | None,
+        data: QuadratureData,
+        t: float,
+        dt: float,
+        loads: Sequence[Loads],
+        present: At,
     ) -> tuple[list[Feeds], Callable[[bool], Outflow]]:
         """Return the fluid conditions, and a function `outflow(begins)` that returns the fluxes at u. `begins`: see
         `mobility`.
@@ -572,6 +584,7 @@ class Assembled(Keyed):
         `data`: integration points.
         `t`, s: time of the pressures and fluxes on open sides.
         `dt`, s: length of the step.
+        `loads`, `present`: loads in the balance of momentum, and present displacements.
         """
         on_grid = self._on_grid
         contents = self._on_grid.contents
@@ -579,7 +592,8 @@ class Assembled(Keyed):
         u = self._nodal
         varies = (t,) if any([one.varies for one in self._stage.feeding]) else ()
         at = state.points if weight is not None or varies else on_grid.cut.points  # because gravity may depend on time
-        wet = Wet(on_grid.cut, at, contents, t, data.of_points, on_grid.scale is not None, dt, state.outcome)
+        of_step = on_grid.scale is not None, dt, state.outcome, loads, present
+        wet = Wet(on_grid.cut, at, contents, t, data.of_points, *of_step)
         feeds = [one.placed(wet) for one in self._stage.feeding]
         sides = open_sides(feeds, grid.dim)
 

@@ -32,6 +32,7 @@ from mpm_dolfinx.conditions.conditions import (
 from mpm_dolfinx.conditions.sides import Sides
 from mpm_dolfinx.conditions.unit_weights import with_weight
 from mpm_dolfinx.conditions.walls import fixed_nodes, with_axis
+from mpm_dolfinx.contact.conducting import ConductingContacts
 from mpm_dolfinx.contact.groups import Contact
 from mpm_dolfinx.contact.pairing import Contacts
 from mpm_dolfinx.contact.ties import Ties
@@ -277,7 +278,7 @@ def stage(
     by_name = {name: with_weight(one, fluid) for name, one in given_by_name.items()}
     wet = tuple(of for kind in FED for of in kind.conditions)
     for name, one in by_name.items():
-        if fluid is None and (isinstance(one, wet) or hasattr(one, "feeding")):
+        if fluid is None and (isinstance(one, wet) or hasattr(one, "feeding") or getattr(one, "conducts", False)):
             raise ValueError(f"{name}: {line(one)}, must be in a scene with fluid")
     _check_inertia(by_name, bool(conditions["inertia"]))
     gravity = conditions["gravity"]
@@ -293,6 +294,8 @@ def stage(
     setting = Setting(sides, free, materials, momentum.conditions, by_name)
     feeding = [one.feeding(setting) for one in by_name.values() if hasattr(one, "feeding")]
     feeding += [kind(setting, some) for kind in FED if (some := setting.of(*kind.conditions))]
+    conducts = {name: contact.conducts for name, contact in setting.of(Contact).items()}
+    feeding += [ConductingContacts(conducts)] * any(conducts.values())
     found = [(kind, setting.of(*kind.conditions)) for kind in KINDS]
     acting = [one.acting(setting) for one in (*momentum.acting, *by_name.values()) if hasattr(one, "acting")]
     acting += [kind(setting, some) for kind, some in found if some]

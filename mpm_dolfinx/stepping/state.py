@@ -142,9 +142,9 @@ class State:
         Results of conditions at the end of the last step, by quantity and name. Results of new conditions are nan
         before the first step of a stage. `reactions` (d,), N: forces of prescribed displacements on the bodies.
         `wall_reactions` (d,), N: forces of the grid's walls on the bodies. `outflows`, m^3/s (m^2/s in plane strain):
-        flow through open sides, as volumes at zero pressure. `tool_forces` (d + 1,), in 3D (6,): forces (N) and moments
-        (N m) of tools and contacts on the bodies. `tool_travel`, m: displacement of a load-controlled tool in addition
-        to its prescribed displacement. Other keys belong to user-defined conditions.
+        flow through open sides and contacts that conduct, as volumes at zero pressure. `tool_forces` (d + 1,), in 3D
+        (6,): forces (N) and moments (N m) of tools and contacts on the bodies. `tool_travel`, m: displacement of a
+        load-controlled tool in addition to its prescribed displacement. Other keys belong to user-defined conditions.
     stage
         The present stage, with its conditions.
     begins
