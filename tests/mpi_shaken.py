@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Run on any number of processes: a saturated block on a base that accelerates, in short steps, and a free tool on it."""
+"""Run on any number of processes: a saturated block on a base that accelerates, in short steps, under a free tool."""
 
 import sys
 
