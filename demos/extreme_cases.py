@@ -28,7 +28,7 @@ from pathlib import Path
 
 import common
 import numpy as np
-from extreme.families import FAMILIES
+from extreme.motion import FAMILIES
 from extreme.scenes import Make, Scene
 from scipy.sparse import csr_matrix
 

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Bodies with inertia strike, slide, stick and roll on bodies and tools; tools with a mass fall and bounce."""
 
+import warnings
+
 import numpy as np
 import pytest
 from meshes import box_mesh
@@ -293,6 +295,60 @@ def test_bars_that_drift_strike_alike(monkeypatch):
     assert moves.tool_forces.array == pytest.approx(still.tool_forces.array, abs=1e-10)
     slip = moves.points.data["velocity"] - still.points.data["velocity"]
     assert slip == pytest.approx(np.broadcast_to([2.0, 0.0], slip.shape), abs=1e-10)
+
+
+def flying(dim):
+    """Return two bodies and a free tool of 30 kg that strike each other in flight."""
+    size, gravity = 8 if dim == 2 else 5, (*[0.0] * (dim - 1), -G)
+    grid = mpm.Grid([0] * dim, [2] * dim, [size] * dim)
+    lows, highs = np.full((2, dim), [[0.53], [0.62]]), np.full((2, dim), [[1.1], [1.15]])
+    lows[1, -1], highs[1, -1], foot = 1.11, 1.4, np.full(dim, 0.9)
+    foot[-1] = 0.33
+
+    def velocity(x):
+        above, v = x[:, -1] > 1.105, np.zeros_like(x)
+        v[:, -1], v[:, 0] = np.where(above, -1.0, 0.5), np.where(above, 0.3, -0.3)
+        return v
+
+    tool = mpm.Tool(mpm.Ball(foot, 0.18), mass=30.0, velocity=(*[0] * (dim - 1), 2.0), friction=0.2)
+    bodies = [mpm.box(grid, low, high) for low, high in zip(lows, highs, strict=True)]
+    scene = {"walls": {}, "conditions": [mpm.Contact(1, 0, friction=0.3), tool], "gravity": gravity}
+    tight = mpm.Numerics(tolerance=1e-11)
+    return mpm.Simulation(grid, bodies, [STIFF], inertia=mpm.Moving(velocity), numerics=tight, **scene)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_bodies_and_tools_that_strike_in_flight_keep_their_momentum(dim):
+    """In 3D a free tool that touched a body raised an error of numpy."""
+    s, up = flying(dim), np.eye(dim)[-1]
+    mass_of = mass(s).sum() + 30.0
+
+    def momentum():
+        return mass(s) @ s.points.data["velocity"] + 30.0 * s.outcome("tool_velocity")["tool"]
+
+    start, felt = momentum(), 0.0
+    for _ in range(2):
+        s.run(s.t + 0.01, 0.01, progress=False)
+        felt = max(felt, np.abs(s.tool_forces["tool"]).max())
+        assert momentum() == pytest.approx(start - mass_of * G * s.t * up, abs=1e-12 * mass_of)
+    assert felt > 100.0
+
+
+@pytest.mark.parametrize(("light", "mass_of"), [(True, 5.0), (False, 500.0)])
+def test_a_warning_names_free_tools_that_are_lighter_than_half_a_cell(light, mass_of):
+    """They leave at -0.3 to 1.35 times the speed at which they came, as the time of the strike within a step says."""
+    s = dropped(0.1, mass=mass_of, moment=np.inf)
+    with warnings.catch_warnings(record=True) as seen:
+        warnings.simplefilter("always")
+        s.step(0.01), s.step(0.01)
+    assert [issubclass(one.category, mpm.ResolutionWarning) for one in seen] == [True] * light
+    assert not light or "less than that of half a cell" in str(seen[0].message)
+
+
+def test_the_velocity_of_a_guided_tool_is_checked_in_any_unit():
+    tool = mpm.Tool(mpm.Ball((0, 0), 1e-3), mass=1.0, direction=(0, 1), velocity=(1e-9, 0))
+    with pytest.raises(ValueError, match="along its direction"):
+        tool.check(2)
 
 
 @pytest.mark.parametrize(

@@ -22,7 +22,7 @@ import numpy as np
 import pytest
 from scenes.balancing import ROUNDED, Ledger, balanced, held_by_conditions
 from scenes.comparing import differences, resolved
-from scenes.description import Block, Condition, RigidTool, Scene, draining, drawn, flowing, newer
+from scenes.description import Block, Condition, RigidTool, Scene, draining, drawn, flowing, newer, shaken
 from scenes.frames import Frame, composite
 from scenes.running import counted, run
 
@@ -179,6 +179,20 @@ def test_scenes_with_inertia_ties_and_free_tools_show_the_same_in_any_frame(seed
     assert not count["differs"] and count["same"], count
 
 
+@pytest.mark.parametrize("seeds", [(19, 38), pytest.param(range(60), marks=pytest.mark.slow)], ids=["few", "many"])
+def test_scenes_that_fly_begin_to_move_or_stop_show_the_same_in_any_frame(seeds):
+    """With inertia: all features of `drawn` and `draining`.  INVARIANCE_SEEDS=1000:2000 says which many."""
+    if len(seeds) > 2 and "INVARIANCE_SEEDS" in os.environ:
+        seeds = range(*map(int, os.environ["INVARIANCE_SEEDS"].split(":")))
+    count = reported(rattled(seed) for seed in seeds)
+    assert not count["differs"] and count["same"], count
+
+
+def rattled(seed: int) -> Scene:
+    """Return a scene with inertia in the plane or axisymmetric, of few laws."""
+    return shaken(seed, dim=2, axisymmetric=seed % 4 == 0, laws=LAWS[seed % len(LAWS)])
+
+
 SOON = 0.6
 """Length of domains, in cells, from which on they are renewed in random scenes, where they stretch little."""
 
@@ -206,12 +220,13 @@ def test_weak_soil_without_equilibrium_is_told_as_such(monkeypatch, seed):
 
 @pytest.mark.skipif("INVARIANCE_SEED" not in os.environ, reason="asks for a seed")
 def test_a_scene_is_reproduced(monkeypatch):
-    """INVARIANCE_DRAW=newer (or draining, flowing) selects the function that draws the scene."""
+    """INVARIANCE_DRAW=newer (or draining, flowing, rattled) selects the function that draws the scene."""
     seed = int(os.environ["INVARIANCE_SEED"])
     scene = quick(seed) if seed < QUICK else drawn(seed)
     if draw := os.environ.get("INVARIANCE_DRAW"):
         laws = ["DruckerPrager"] if draw == "flowing" else LAWS[seed % 3]
-        scene = {"newer": newer, "draining": draining, "flowing": flowing}[draw](seed, laws=laws)
+        drawing = {"newer": newer, "draining": draining, "flowing": flowing}
+        scene = rattled(seed) if draw == "rattled" else drawing[draw](seed, laws=laws)
         if scene.renewal:
             monkeypatch.setattr(renewal, "LONGEST", SOON)
     frame = composite(scene, 0)

@@ -29,7 +29,7 @@ def mpirun(processes: int, script: str, *arguments: str) -> None:
 
 NAMES = (
     "beam slab stages waves laws layers initial 3d cycles mesh tools axisymmetric contact grids strike sizes "
-    "following division shared"
+    "following division shared shaken"
 )
 NAMES = NAMES.split()
 SCENES = [(f"mpi_{name}.py", (3,)) for name in NAMES]

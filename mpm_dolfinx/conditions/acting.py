@@ -257,6 +257,11 @@ class Loads:
         return of_cells
 
     @property
+    def rounding_at_unknowns(self) -> NDArray[np.float64] | float:
+        """Rounding errors of the forces at the unknowns in this substep, in N."""
+        return 0.0
+
+    @property
     def rounding_beside(self) -> float:
         """Return the rounding error of contact forces, in N, in the cells of the other bodies."""
         return 0.0

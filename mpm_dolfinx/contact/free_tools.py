@@ -133,8 +133,9 @@ class FreeTools(ContactProblem):
 
     def _onto(self, found: Found, force: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the generalised forces `A^T f` on the tools."""
-        moment = (across(found.at.arm) * force).sum(axis=1, keepdims=True)[:, : self.grid.dim == 2]
-        return np.hstack([force, moment])
+        if self.grid.dim > 2:
+            return force
+        return np.hstack([force, (across(found.at.arm) * force).sum(axis=1, keepdims=True)])
 
     def _sizes(self, found: Found, force: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return upper bounds of the generalised forces on the tools, with lever arm times force for a moment."""
@@ -148,7 +149,8 @@ class FreeTools(ContactProblem):
         dw = w - last.w
         moved = self._onto(last.found, law.slope(last.found.touch, last.found.at, dw))
         d = self.grid.dim
-        moved[:, d:] += (across(last.found.touch.force) * dw).sum(axis=1, keepdims=True)[:, : d == 2]
+        if d == 2:
+            moved[:, d:] += (across(last.found.touch.force) * dw).sum(axis=1, keepdims=True)
         on = law.by_contact(np.column_stack([(dw != 0).any(axis=1), moved]))
         if not on[:, 0].any():
             return last.motion

@@ -172,7 +172,7 @@ class Tool:
         if self.velocity is None:
             return np.zeros(dim)
         v = numbers("Tool: velocity", self.velocity, (dim,), allowed=f"{dim} finite numbers")
-        if not np.allclose(v, self.guide(dim) @ v):
+        if np.linalg.norm(v - self.guide(dim) @ v) > ROUNDED * np.linalg.norm(v):
             raise ValueError(f"Tool: velocity = {line(self.velocity)}, must be along its direction")
         return v
 
@@ -260,9 +260,11 @@ class Tool:
             return
         if self.centre is None and of is None:
             raise ValueError(f"Tool: moment = {line(self.moment)}, must be given with the centre of this shape")
-        if self.moment is None and not np.allclose(self._centre(dim) + self._base, of.centroid, atol=ROUNDED):
-            what = f"Tool: centre = {line(self.centre)}, must be the centroid {of.centroid}"
-            raise ValueError(f"{what}, or be given with a moment")
+        if self.moment is None:
+            off, size = self._centre(dim) + self._base - of.centroid, np.sqrt(of.gyration)
+            if np.linalg.norm(off) > ROUNDED * (size + np.linalg.norm(of.centroid)):
+                what = f"Tool: centre = {line(self.centre)}, must be the centroid {of.centroid}"
+                raise ValueError(f"{what}, or be given with a moment")
 
     def _centre(self, dim: int) -> NDArray[np.float64]:
         if self.centre is None:

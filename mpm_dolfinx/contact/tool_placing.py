@@ -26,6 +26,7 @@ from mpm_dolfinx.contact.pairs import ToolPairs
 from mpm_dolfinx.contact.problem import ContactProblem, Pushes, SubstepMotion, Touching
 from mpm_dolfinx.contact.tool import Pose, Tool, rotation
 from mpm_dolfinx.parallel.exchange import Exchange, first, over_all, together
+from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
 from mpm_dolfinx.points.material_points import MaterialPoints, middle
 
 BEGINS = 1e-2  # allowed penetration into a body at the start, and into prescribed sides, divided by the cell size
@@ -269,8 +270,22 @@ class Tools(Touching):
         edge[edge] = goes_on
         return edge if over_all(grid.comm, int((~edge).sum())) else np.zeros_like(edge)
 
+    def _warn_light(self, place: Place) -> None:
+        """Warn of free tools that are lighter than the half cell which a strike stops at once."""
+        if not (self.free and place.inertia and place.dt):
+            return
+        grid = self.grid
+        dense = float(self._materials.present_density(place.points).max(initial=0.0))
+        half = over_all(grid.comm, dense, MPI.MAX) * grid.least**grid.dim / 2
+        half *= np.pi * grid.least if grid.axisymmetric else 1.0  # the first ring about the axis
+        for tool in self.tools:
+            if tool.free and tool.mass < half:
+                what = "%s: its mass is less than that of half a cell, %.3g kg, so its rebound depends on the step in "
+                warn(grid.comm, ResolutionWarning, what + "which it strikes; use smaller cells", line(tool), half)
+
     def check_start(self, place: Place) -> None:
         """Raise an error for tools inside a body at the start, except at faces in contact from earlier steps."""
+        self._warn_light(place)
         before, t = self._before(place), place.start
         points = place.points
         tools, patches = self.going(LoadMotion(t, t, before, before)), place.cut.surface(self.outside)

@@ -93,6 +93,13 @@ def initial_velocity(grid: Grid, quadrature: str, inertia: bool | Moving | None)
     return velocity
 
 
+def check_masses(materials: Sequence[Skeleton], fluid: Fluid | None) -> None:
+    """Raise ValueError for dry bodies without mass, whose velocities are undetermined."""
+    for number, one in enumerate(materials):
+        if fluid is None and one.grain_density == 0:
+            raise ValueError(f"material {number}: grain_density = 0, must be > 0 for bodies with inertia")
+
+
 def _functions_of(terms):
     """Return the functions of terms in bodies and on sides."""
     if isinstance(terms, str) or not isinstance(terms, Sequence):

@@ -33,6 +33,10 @@ steady states.
 For elastic soil, tau is a quarter of the value that Silvester and Kechkar give for patches of elements (Camargo, White
 and Borja 2021).  Soil in plastic flow needs a tau up to a hundred times larger.  The increase of tau acts on second
 differences only (`second_differences`), because damping of jumps would smear steep pressures.
+
+With inertia, tau decreases by the factor `1 / (1 + r)`.  r is the ratio of two resistances of a macroelement, that of
+its mass and that of its stiffness, see `OnGrid.resisting_mass`.  With the static tau, waves in undrained soil would be
+too slow: a cell would exchange as much water with its neighbours as it does in a static step.
 """
 
 from __future__ import annotations
@@ -353,6 +357,13 @@ class StorageResidual:
     rates: Rates  # at (u, p)
 
 
+class FluidInertia(NamedTuple):
+    """Inertia in a substep, in the n active owned cells."""
+
+    forces: Callable[[], NDArray[np.float64]]  # returns the inertia forces (n, d) on the fluid, N/m^3
+    resists: NDArray[np.float64]  # (n,) see `OnGrid.resisting_mass`
+
+
 class StorageProblem:
     """The fluid balance in one substep.  The pressure at the start of the step is `forms.p_n`.
 
@@ -362,8 +373,7 @@ class StorageProblem:
     `before`: outflow volumes from the rate of the previous substep.
     `softness` (m,): softness of the pieces (1 if no law can yield), see `SoftnessAtPoints`.
     `defect` (n,), m^d: part of the volume defect in the active owned cells that is corrected by the end of the substep.
-    `inertial`: function that returns the inertia forces (n, d), in N/m^3, on the fluid in the active owned cells, or
-    None.
+    `inertial`: inertia of the bodies, or None.
     `scale`: suctions (n,), Pa, at which the pores of the active owned cells drain, or None in saturated scenes.
     """
 
@@ -379,7 +389,7 @@ class StorageProblem:
         before: Rates | None = None,
         softness: NDArray[np.float64] | float = 1.0,
         defect: NDArray[np.float64] | float = 0.0,
-        inertial: Callable[[], NDArray[np.float64]] | None = None,
+        inertial: FluidInertia | None = None,
         scale: NDArray[np.float64] | None = None,
     ):
         self._scale = scale
@@ -394,12 +404,14 @@ class StorageProblem:
         self.dt = dt
         self._before = before or Rates(*np.zeros((4, system.unknowns.size)))
         outflow = flow(before is None)
+        resists = 0.0 if inertial is None else inertial.resists
         squared = 4 * forms.grid.most**2  # the distance of two centroids is at most 2 h
-        tau, least = contents.set_damping(), dt * outflow.mobility.min(axis=1)
+        tau, least = contents.set_damping(1 / (1 + resists)), dt * outflow.mobility.min(axis=1)
         if forms.retains:  # dry pores hardly couple both balances, and their storage stabilises as well
             capacity, coupled = (values / contents.volume for values in forms.drained(data))
-            tau, least = contents.set_damping(np.maximum(coupled, 0.0), capacity), 0.0 * least
+            tau, least = contents.set_damping(np.maximum(coupled, 0.0) / (1 + resists), capacity), 0.0 * least
         softest = contents.softest(softness) if forms.softens else np.array([1.0])
+        softest = (1 + resists) / (1 / softest + resists)  # yield does not change the mass
         known = [(tau * squared > least).any(), (softest * tau * squared > least).any() and softest.max() > 1]
         somewhere = over_all(forms.grid.comm, np.array([*known, any([one.settles for one in feeds])], dtype=float)) > 0
         self.damped, flows, self._settles = somewhere.tolist()
@@ -583,7 +595,7 @@ class StorageProblem:
         system, fluid = self.system, self._fluid
         force = None
         if self._inertial is not None:
-            fluid = fluid._replace(force=self._inertial())
+            fluid = fluid._replace(force=self._inertial.forces())
             force = self._local(fluid.force)
         if system.gravity is None:
             cells = system.between(fluid.pi)
@@ -632,7 +644,7 @@ class StorageProblem:
             A.assemble()
         if forms.fluxes.relative is not None:
             self._flow(False)
-            system.assemble_fluxes(None if self._inertial is None else self._local(self._inertial()))
+            system.assemble_fluxes(None if self._inertial is None else self._local(self._inertial.forces()))
         system.C.zeroEntries()
         system.C.axpy(self.dt, system.T, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
         if self.damped:

@@ -304,8 +304,12 @@ class Skeleton:
         A quarter gives better conditioning and less smearing than a half.  The value for 2 x 2 x 2 cells is too small
         to damp pressures that alternate along two axes only.  Oscillations due to first yield remain.
         """
-        lam = self.bulk - 2 * self.shear / 3
-        return (0.5 if self.state else 0.25) * self.biot**2 * 3 / (8 * (lam + 3 * self.shear))
+        return (0.5 if self.state else 0.25) * self.biot**2 * 3 / (8 * self.macroelement)
+
+    @property
+    def macroelement(self) -> float:
+        """Modulus lambda + 3G, in Pa, that resists a displacement of the middle of 2 x 2 cells."""
+        return self.bulk + 7 * self.shear / 3
 
     def storage(self, fluid_bulk: float, porosity):
         """Return the storage coefficient S = n/K_w + (alpha - n)/K_s, in 1/Pa, at a porosity n."""

@@ -21,8 +21,8 @@ from dolfinx import fem
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.errors import CannotFollow
-from mpm_dolfinx.base.time_integration import in_step
-from mpm_dolfinx.base.tolerances import EPSILON, NEAR
+from mpm_dolfinx.base.time_integration import GAMMA, in_step
+from mpm_dolfinx.base.tolerances import EPSILON, NEAR, TINY
 from mpm_dolfinx.base.validation import line
 from mpm_dolfinx.bodies.faces import Surface, face_vectors
 from mpm_dolfinx.conditions.acting import Acting, At, Loads, Place, Setting
@@ -153,28 +153,35 @@ class GivenDisplacements(Acting):
         # values at the last reset of the grid, like the stiffnesses: constant until the next reset
         tension = np.linalg.norm(stress if points is cut_points else self._materials.total_stress(before), axis=(1, 2))
         confined = [self._materials.confined_modulus(before, *most) for most in ((), (1 / EPSILON,))]
-        moduli = np.stack([modulus, tension, resists, *confined], axis=1)
+        moves = place.inertia and place.dt > TINY
+        inertial = self._materials.present_density(before) / (GAMMA * place.dt) ** 2 if moves else 0.0 * modulus
+        inertial = inertial * self._grid.sizes_at(before.x).min(axis=-1) ** 2
+        moduli = np.stack([modulus, tension, resists, *confined, inertial], axis=1)
         for number, ((hold, *_, axes), p) in enumerate(zip(self._holds, patches, strict=True)):
             at, now = np.searchsorted(chosen, p.at), p.now(points)
             given = [self._given(hold, time, p.X) for time in (t, *ends)] if ends else 3 * [np.zeros_like(now)]
             if place.inertia and ends and t < ends[1]:
                 given[0] = in_step((t - ends[0]) / (ends[1] - ends[0]), given[1], given[0], given[2])
             start, to = (p.origin(points) + given[k] for k in (1, 0))
-            given = np.concatenate(given[1:], axis=1)
+            step, given = given[0] - given[1], np.concatenate(given[1:], axis=1)
+            jumps = HOLD * np.linalg.norm((to - now)[:, axes], axis=1) > self._grid.least  # see `check_came`
+            step = np.where(jumps[:, None], to - now, step)
             R = rotated(self._grid.comm, p.area0, now, to) if len(axes) == d else np.eye(d)  # of the traction
             force, gap = np.einsum("ij,njk,nk->ni", R, stress[at, :d, :d], p.area(points)), to - now
             own = p.area0[:, None] * moduli[at]
-            values = np.column_stack([np.full(len(gap), number), p.area0, own, gap, given, p.area(cut.points), force])
+            number = np.full(len(gap), number)
+            values = np.column_stack([number, p.area0, own, gap, step, given, p.area(cut.points), force])
             rows.append((p.cell, p.x, values))
             bounds.append([start.max(axis=0, initial=-np.inf), -start.min(axis=0, initial=np.inf)])
-        cell, x, values = self._grid.gathered(rows, 7 + 5 * d)
+        cell, x, values = self._grid.gathered(rows, 8 + 6 * d)
         extent = over_all(self._grid.comm, np.array(bounds), MPI.MAX).sum(axis=1)
         sides = [(axes, size) for (*_, axes), size in zip(self._holds, extent, strict=True)]
         inner = inner_cells(self._grid, place.fill, sides, values[:, 0].astype(np.int64), cell, values[:, -2 * d : -d])
         if over_all(self._grid.comm, int((inner != cell).any())):
-            cell, x, values = self._grid.gathered([(self._grid.cell_number[inner], x, values)], 7 + 5 * d)
-        number, *own = values[:, :7].T
-        return HeldPoints(number.astype(np.int64), cell, *own, x, *np.split(values[:, 7:], [d, 3 * d, 4 * d], axis=1))
+            cell, x, values = self._grid.gathered([(self._grid.cell_number[inner], x, values)], 8 + 6 * d)
+        number, *own = values[:, :8].T
+        rest = np.split(values[:, 8:], [d, 2 * d, 4 * d, 5 * d], axis=1)
+        return HeldPoints(number.astype(np.int64), cell, *own, x, *rest)
 
     def _check_meeting(self, t: float) -> None:
         """Raise ValueError if displacements differ where two sides meet, because the stress would be infinite."""
@@ -283,7 +290,7 @@ class HoldLoads(Loads):
         self.share = share
         self._place = place
         self._d = data.points.grid.dim
-        self.key = self._d * row + data["direction"].argmax(axis=1)
+        self.key = np.append(self._d * row + data["direction"].argmax(axis=1), place.dt if place.inertia else 0.0)
         self.under_held = acting.under_held
         self._asked = data["gap"][:, 0]  # prescribed increments of means: `augment` has not changed the gaps yet
         self._lacked = np.full(1, np.inf)  # for each side of a part: last sum of gaps in `augment`, at first infinite
@@ -326,7 +333,9 @@ class HoldLoads(Loads):
     def moved(self, u: fem.Function) -> Loads:
         """Return these penalties with gaps reduced by a displacement u."""
         out = copy(self)
-        out.data = self.data.having(gap=self.data["gap"][:, 0] - self._along(u.x.array.reshape(-1, self._d)))
+        static = (self.held.static[self.row] * self.data["direction"]).sum(axis=1)
+        less = static * self._along(u.x.array.reshape(-1, self._d))
+        out.data = self.data.having(gap=self.data["gap"][:, 0] - less)
         return out
 
     def _along(self, u: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -5,6 +5,9 @@ A Q1 field has too few nodal displacements in a cell to satisfy constraints at m
 at each point would lock sides that are curved or inclined to the grid.  A stiff penalty therefore acts on the mean
 displacement in each cell, and a weak penalty acts on deviations from this mean.  The present traction of the body,
 rotated with the side, is applied explicitly, so that the penalties bear only the traction increment of the step.
+
+With inertia, a second penalty acts on the difference from the prescribed increment of the step.  Its modulus is
+rho (h / (gamma dt))^2 in place of the elastic modulus.  Otherwise the mass of a cell would not follow in short steps.
 """
 
 from __future__ import annotations
@@ -53,8 +56,10 @@ class HeldPoints(NamedTuple):
     resistance: NDArray[np.float64]  # (n,) resisting modulus times area, N
     confined: NDArray[np.float64]  # (n,) confined modulus times area, N, with a limited contribution of the fluid
     undrained: NDArray[np.float64]  # (n,) undrained confined modulus times area, N
+    inertial: NDArray[np.float64]  # (n,) rho (h / (gamma dt))^2 times area, N; 0 without inertia
     x: NDArray[np.float64]  # (n, d) position, m
     gap: NDArray[np.float64]  # (n, d) prescribed position minus present position, m
+    step: NDArray[np.float64]  # (n, d) prescribed displacement since the start of the step, or gap after a jump, m
     given: NDArray[np.float64]  # (n, 2 d) prescribed displacements at start and end of the step, m
     normal: NDArray[np.float64]  # (n, d) area vector at the last reset of the grid, m^(d-1)
     force: NDArray[np.float64]  # (n, d) force of the present stress, rotated with the side, N
@@ -106,6 +111,8 @@ class HeldCells:
         mean has the means of these values over its points.
     stiffness
         Stiffness of each penalty and component, N/m.
+    static
+        Part of each stiffness that resists gaps; the rest resists increments only.
     limit : (2, k, d)
         Largest plausible force, N, of each of k penalties on means: limit[0] for the skeleton, limit[1] for undrained
         soil.  limit[1] applies if the side is at its prescribed position.  Larger forces are numerical artefacts.
@@ -150,14 +157,21 @@ class HeldCells:
         modulus = np.where(flat, total(p.confined)[:, None], total(p.modulus)[:, None])
         each = np.where(flat[at], EVERYWHERE * p.resistance[:, None], WEAK * against[:, None])
         h = [grid.sizes(cells).min(axis=-1, keepdims=True) for cells in (cell, p.cell)]
-        self.stiffness = both(HOLD / h[0] * modulus, each / h[1])
+        static = both(HOLD / h[0] * modulus, each / h[1])
+        # the inertia of a cell resists a short step more than its stiffness
+        weights = both((0 * modulus + HOLD) / h[0], np.where(flat[at], EVERYWHERE, WEAK) / h[1])
+        inert = weights * both(total(p.inertial), p.inertial)[:, None]
+        self.stiffness = static + inert
+        self.static = static / self.stiffness
         # at the end of a side, a small area in a cell may bear the whole force of a node
         short = np.maximum(1.0, grid.smallest_faces(cell) * grid.around(x) / whole)
         outward = normal**2 / np.maximum((normal**2).sum(axis=1, keepdims=True), TINY)
-        skeleton = total(p.resistance + TENSE * p.tension)[:, None]
+        skeleton = total(p.resistance + TENSE * p.tension + p.inertial)[:, None]
         more = outward * np.maximum(total(p.undrained) - total(p.resistance), 0.0)[:, None]
         self.limit = CARRIED * short[:, None] * np.stack([skeleton + 0 * more, skeleton + more])
         self._gap, self._force = both(gap, p.gap), both(0 * gap, p.force)
+        if inert.any():  # a gap at the start causes no velocity
+            self._gap = self.static * self._gap + (1 - self.static) * both(mean(p.step), p.step)
         self._slope, self._along = both(slope, slope[at]), both(along, along[at])
         self._given, self._rise = both(given, given[at]), both(rise, rise[at])
         self._x = both(x, x[at])

@@ -336,16 +336,17 @@ class Inertia(Loads):
         """Return the inertia forces at u, in N."""
         return self._mass.M * self.acceleration(at)
 
+    @cached_property
+    def rounding_at_unknowns(self) -> NDArray[np.float64]:
+        """Rounding errors of the forces, in N: fast bodies move far in comparison with `force / (M rate)`."""
+        moved = self._flight.copy()
+        moved.abs()
+        return ROUND_OFF * self.rate * np.abs((self._mass.M * moved).array_r)
+
     def push(self, at: At, residual: PETSc.Vec, on: Unknowns) -> None:
         """Add the inertia forces to the residual at fixed nodes."""
         if on is not self._mass.unknowns:
             residual += self._mass.held * self.acceleration(at)
-
-    def pattern(self, unknowns: Unknowns) -> PETSc.Mat:
-        """Return a zero matrix with the sparsity of the mass matrix."""
-        zeros = self._mass.M.copy()
-        zeros.zeroEntries()
-        return zeros
 
     @cached_property
     def _slope(self) -> PETSc.Mat:

@@ -321,6 +321,8 @@ class MomentumSystem:
         self.of_whole = self.unknowns.vector()
         """Rounding error of each unknown, in N, times the square root of the size of its connected part."""
         self.K = matrix(self.unknowns, self.unknowns, 3**d * d)
+        self.mass: PETSc.Mat | None = None
+        """Mass matrix, in kg, or None without inertia.  K has its pattern, even while an initial stress is balanced."""
         self.residual, self.step = self.unknowns.vector(), self.unknowns.vector()
         held = active[~among(active, dofs)]
         self.held = Unknowns(forms.u, held, at_nodes)
@@ -539,8 +541,10 @@ class MomentumProblem:
         system, parts = self.system, self.system.of_parts
         both = np.zeros((2, system.unknowns.size))
         size = np.abs(r.array_r)
-        both[0] = size if first else np.maximum(size - system.rounding.array_r, 0.0)
-        least = np.maximum(scales[parts.of], system.of_whole.array_r / self._tolerance)
+        more = sum(one.rounding_at_unknowns for one in self.loads)
+        both[0] = size if first else np.maximum(size - system.rounding.array_r - more, 0.0)
+        whole = system.of_whole.array_r + more * np.sqrt(parts.sizes)[parts.of]
+        least = np.maximum(scales[parts.of], whole / self._tolerance)
         np.divide(size, least, out=both[1], where=size > 0)
         counts, full = parts.norms(both)
         full[~(full < np.inf)] = np.inf
@@ -588,6 +592,10 @@ class MomentumProblem:
         K.assemble()
         pattern = PETSc.Mat.Structure
         K.axpy(1.0, self.system.penalty, pattern.UNKNOWN if first else pattern.SUBSET_NONZERO_PATTERN)
+        if first and self.system.mass is not None:
+            zeros = self.system.mass.copy()
+            zeros.zeroEntries()
+            K.axpy(1.0, zeros, pattern.UNKNOWN)
         for one in self.loads:
             if first and (zeros := one.pattern(self.system.unknowns)) is not None:
                 K.axpy(1.0, zeros, pattern.UNKNOWN)

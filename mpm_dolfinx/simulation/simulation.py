@@ -19,7 +19,13 @@ from mpm_dolfinx.conditions.unit_weights import under
 from mpm_dolfinx.conditions.walls import with_axis
 from mpm_dolfinx.contact.groups import grouped
 from mpm_dolfinx.diagnostics.resolution import check_stiff, warn_thin
-from mpm_dolfinx.diagnostics.scene_parts import check_axisymmetry, check_options, checked_parts, initial_velocity
+from mpm_dolfinx.diagnostics.scene_parts import (
+    check_axisymmetry,
+    check_masses,
+    check_options,
+    checked_parts,
+    initial_velocity,
+)
 from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.materials.initial_stress import InitialStress, by_body
 from mpm_dolfinx.materials.skeleton import Fluid, Skeleton
@@ -118,6 +124,8 @@ class Simulation:
         warn_thin(grid, bodies, with_axis(grid, walls), fluid is not None)
         check_axisymmetry(grid, bodies, quadrature)
         velocity = initial_velocity(grid, quadrature, inertia)
+        if velocity is not None:
+            check_masses(materials, fluid)
         start = time.perf_counter()
         initial = by_body(initial_stress, bodies, later)
         self.scene = Scene(

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from mpm_dolfinx.base.time_integration import Substep
 from mpm_dolfinx.conditions.acting import QUANTITIES, At, Loads, Outcome, Shares
 from mpm_dolfinx.dynamics.motion_error import motion_error
-from mpm_dolfinx.flow.storage import Rates, StorageProblem
+from mpm_dolfinx.flow.storage import FluidInertia, Rates, StorageProblem
 from mpm_dolfinx.mechanics.inertia import Flight, Inertia
 from mpm_dolfinx.mechanics.momentum import MomentumProblem
 from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
@@ -212,8 +212,12 @@ def balances(
     lost = before and before.integrated(substep.before * dt)
     carried = on_grid.softness(start.state), substep.end * on_grid.due(start.state)
     options = (on_grid.contents, *fed, substep.own * dt, lost, *carried)
-    pushed = None if inertia is None else partial(pushed_back, scene, on_grid)
-    storage = StorageProblem(scene.storage, matrices.storage, start.data.pieces, *options, pushed, on_grid.scale)
+    moves = None
+    if inertia is not None:
+        resists = on_grid.resisting_mass(float(substep.own * dt))
+        moves = FluidInertia(partial(pushed_back, scene, on_grid), resists)
+    options = (*options, moves, on_grid.scale)
+    storage = StorageProblem(scene.storage, matrices.storage, start.data.pieces, *options)
     return Balances(momentum, storage, inertia, ahead)
 
 

@@ -30,6 +30,8 @@ def differences(scene: Scene, one: Sequence[Shown], other: Sequence[Shown]) -> d
         if distance.max() > SAME * min(scene.h) or len(np.unique(at)) < len(at):
             return {"points": np.inf}
         for name, values in a.fields.items():
+            if name not in b.fields:  # a far body has energies of its own
+                continue
             others = b.fields[name][at] if len(values) == len(at) and name in OF_POINTS else b.fields[name]
             if values.shape != others.shape:
                 return {name: np.inf}
@@ -38,7 +40,7 @@ def differences(scene: Scene, one: Sequence[Shown], other: Sequence[Shown]) -> d
     return out
 
 
-OF_POINTS = ("displacement", "stress", "volume", "pressure", "saturation")
+OF_POINTS = ("displacement", "velocity", "stress", "volume", "pressure", "saturation")
 
 
 def softest(scene: Scene) -> float:
@@ -66,6 +68,8 @@ def _scales(scene: Scene, run: Sequence[Shown]) -> dict[str, float]:
     for name in ("reactions", "tools"):
         found[name] = max(found[name], 1e-3 * stress * h ** (d - 1))
     found["outflows"] = max(found["outflows"], 1e-3 * (moved / scene.end + _seeps(scene)) * h ** (d - 1))
+    if "velocity" in found:
+        found["velocity"] = max(found["velocity"], moved / scene.end)
     if "rain" in found:
         found["rain"] = max(found["rain"], found["outflows"] * scene.end)
     found["travel"] = max(found["travel"], LEAST * h)
@@ -96,6 +100,8 @@ def resolved(scene: Scene, frame: Frame, run: Sequence[Shown]) -> dict[str, floa
     flows = _seeps(scene) + h / (scene.end / scene.steps)  # what a step's rounding of a volume presses out, too
     out["outflows"] += place / h * flows * h ** (d - 1) / scales["outflows"]
     out |= {name: stress / scales[name] for name in ("stress", "pressure")}
+    if "velocity" in out:
+        out["velocity"] = place / (scene.end / scene.steps) / scales["velocity"]
     forces = {"reactions": HOLD, "tools": STIFF}
     out |= {name: k * stress * h ** (d - 1) / scales[name] for name, k in forces.items()}
     return {name: value + given / h for name, value in out.items()}

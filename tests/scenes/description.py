@@ -77,7 +77,10 @@ class RigidTool:
 
 @dataclass(frozen=True)
 class Stage:
-    """What changes after the first run: "remove", "add", "load", "reset", "free"."""
+    """What changes after the first run: "remove", "add", "load", "reset", "free", "move", "rest".
+
+    With "move" inertia begins, and with "rest" it ends.
+    """
 
     kind: str
     body: int = -1
@@ -91,7 +94,8 @@ class Scene:
     initial: stress at rest, None or "K0" or "given", with `ratio` and `surcharge`, Pa; level: of the water table, m;
     contact: friction between the last body and the others; rate: of a source, 1/s; stiffness: of springs in the bodies,
     N/m^4; uneven: whether grid lines lie at random; renewal: whether domains of yielded soil are renewed;
-    follows: whether grid lines follow the first tool; inertia: whether bodies have it.
+    follows: whether grid lines follow the first tool; inertia: whether bodies have it; flight: their velocity at the
+    start, m/s.
     """
 
     seed: int
@@ -122,6 +126,7 @@ class Scene:
     renewal: bool = False
     follows: bool = False
     inertia: bool = False
+    flight: Vector = ()
 
     @property
     def dim(self) -> int:
@@ -171,6 +176,7 @@ class Scene:
             "source" if self.rate else "",
             "springs" if self.stiffness else "",
             "inertia" if self.inertia else "",
+            "flight" if self.flight else "",
             "renewal" if self.renewal else "",
             "lines follow" if self.follows else "",
             self.method if self.method != "sdirk2" else "",
@@ -393,6 +399,25 @@ def flowing(seed: int, **given) -> Scene:
         scene = _moving(draw, scene.with_(stage=None, rtol=None, initial=None, level=None, method="sdirk2"))
         scene = scene.with_(steps=2 * scene.steps)
     return scene
+
+
+def shaken(seed: int, **given) -> Scene:
+    """Return the scene of a seed with inertia: any of `drawn` or `draining`, which flies, begins to move, or stops."""
+    draw = Draw([seed, 7])
+    scene = (draining if draw.yes(0.2) else drawn)(seed, **given)
+    before, kind = scene.stage, draw.one("none", "move", "rest", "as drawn", weights=[3, 2, 1, 2])
+    scene = _moving(draw, scene.with_(rtol=None, stage=None))
+    stage = {"none": None, "as drawn": before}.get(kind, Stage(kind, len(scene.bodies) - 1))
+    freely = draw.order(0, 3) if draw.yes(0.5) else 1.0
+    laws = tuple(
+        (n, c | {"conductivity": c["conductivity"] * freely} if "conductivity" in c else c) for n, c in scene.materials
+    )
+    speed = draw.order(-2, 0)
+    flight = tuple(speed * draw.between(-1, 1) for _ in range(scene.dim)) if draw.yes(0.5) and kind != "move" else ()
+    if flight and scene.axisymmetric:
+        flight = (0.0, *flight[1:])
+    rtol = 1e-2 if scene.method == "sdirk2" and draw.yes(0.15) else None
+    return scene.with_(stage=stage, materials=laws, flight=flight, rtol=rtol)
 
 
 def _moving(draw: Draw, scene: Scene) -> Scene:

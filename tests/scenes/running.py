@@ -334,7 +334,9 @@ class _Builder:
         scene, frame = self.scene, self.frame
         out = {"numerics": mpm.Numerics(method=scene.method, tolerance=scene.tolerance, renewal=scene.renewal)}
         if scene.inertia:
-            out["inertia"] = True
+            way = frame.vector(scene.flight) * frame.length / frame.time if scene.flight else None
+            begins = not (scene.stage and scene.stage.kind == "move")
+            out["inertia"] = begins if way is None else mpm.Moving(tuple(way))
         down = np.zeros(scene.dim)
         down[-1] = -scene.gravity * frame.length / frame.time**2
         if scene.gravity:
@@ -397,6 +399,11 @@ def shown(built: Built, steps: list[int]) -> Shown:
         "stress": frame.tensor_back(stress / frame.stress),
         "volume": points.J[own] - 1,
     }
+    if scene.inertia:
+        fields["velocity"] = frame.vector_back(points.data["velocity"][own] * frame.time / frame.length)
+        if "energy" in s.state.outcome and not frame.far:
+            energies = np.array(list(s.state.outcome["energy"].values()))
+            fields["energies"] = energies / (frame.force(scene) * frame.length)
     if scene.fluid is not None:
         fields["pressure"] = points.pressure[own] / frame.stress
     if any(law.get("retention") for _, law in scene.materials):
@@ -430,6 +437,9 @@ def _stage(built: Built) -> None:
         built.simulation.stage(add=[body])
     if kind == "load":
         built.loads["factor"] *= 1.3
+    if kind in ("move", "rest"):
+        built.loads["factor"] *= 1.3
+        built.simulation.stage(inertia=kind == "move")
     if kind == "reset":
         built.simulation.stage(reset_displacement=True, conditions=without(built.simulation, mpm.Displacement))
         built.numbers["displacements"] = []
@@ -442,7 +452,12 @@ def run(scene: Scene, frame: Frame) -> list[Shown]:
     """Return what a scene shows at the ends of its stages."""
     built, dt, end = build(scene, frame), scene.end * frame.time / scene.steps, scene.end * frame.time
     steps: list[int] = []
-    options = {"progress": False, "observe": lambda simulation: steps.append(simulation.result.steps)}
+    moves = scene.inertia and not (scene.stage and scene.stage.kind in ("move", "rest", "remove", "add"))
+    options = {
+        "progress": False,
+        "observe": lambda simulation: steps.append(simulation.result.steps),
+        "energies": moves,
+    }
     if scene.rtol:
         built.simulation.run(end, rtol=scene.rtol, t_eval=[end], **options)
     elif frame.cut:
