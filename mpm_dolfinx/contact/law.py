@@ -50,7 +50,7 @@ With a larger k_t, spurious shear tractions would alternate between cells withou
 """
 DEPTH = 5e-4  # allowed mean penetration, divided by the cell size
 SLIVER = 0.25  # fraction of a cell's face; penetrations of smaller contact areas are reduced in proportion
-ROUNDS = 20  # largest number of augmentations
+ROUNDS = 20  # largest number of augmentations, and of updates of the pairs
 BEGIN = 1.0, np.inf, 0.0, 0.0  # initial values of `ContactState.updates`
 SLOW, STIFFER = 0.6, 10.0
 """The stiffness is multiplied by STIFFER if an augmentation leaves more than SLOW times the previous penetration."""
