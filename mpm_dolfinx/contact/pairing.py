@@ -40,8 +40,6 @@ CLEAR = 0.5
 """Gap, divided by the cell size, above which faces cannot touch before the next update of the pairs."""
 DEEP = 0.25
 """Penetration, divided by the cell size, above which a position is taken to lie behind a thin body."""
-CANDIDATES = {2: 8, 3: 24}
-"""Number of nearest points on the surface of another group whose faces may contain the opposite position."""
 BESIDE = 0.6
 """Distance from another group, divided by the cell size, below which domain corners follow the Q1 field alone."""
 PLACES = 1 << 32
@@ -206,7 +204,7 @@ class Contacts(Touching):
         d = self.grid.dim
         x, area = patches.now(points), patches.area(points)
         n = area / np.maximum(np.linalg.norm(area, axis=1, keepdims=True), TINY)
-        count = min(CANDIDATES[d], len(facets.x))
+        count = min(2 * d * 2 ** (d - 1), len(facets.x))  # points on a face and its neighbours may be the nearest
         if not count:  # no body of the other group is active
             none = np.zeros(0, dtype=np.int64)
             return facets, Pairs(none, none, np.zeros((0, 2)), np.zeros(0))
