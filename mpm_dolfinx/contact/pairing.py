@@ -35,11 +35,14 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.points.parts import parts_of_domains
 
 REACH = 2.0
-"""Largest gap, divided by the cell size, that may close in a step.  Motions of more than half this gap are rejected."""
-CLEAR = 0.5
-"""Gap, divided by the cell size, above which faces cannot touch before the next update of the pairs."""
+"""Largest gap, divided by the cell size, that may close in a step.  Motions of more than half this gap are rejected.
+Source: definition, a motion of one cell of each body.
+"""
 DEEP = 0.25
-"""Penetration, divided by the cell size, above which a position is taken to lie behind a thin body."""
+"""Penetration, divided by the cell size, above which a position is taken to lie behind a thin body.
+
+Before the next update of the pairs, faces can neither close a gap nor cause a penetration larger than this value.
+"""
 BESIDE = 0.6
 """Distance from another group, divided by the cell size, below which domain corners follow the Q1 field alone."""
 PLACES = 1 << 32
@@ -120,7 +123,7 @@ class Contacts(Touching):
             cell = self._under(facets, pairs.facet, _on(facets.cut[pairs.facet], pairs.t))
             if present is not points:
                 near = np.isin(patches.cell[pairs.row] * grid.all_cells + cell, cell_pairs())
-                slides = not near[pairs.gap < CLEAR * self._sizes(patches.now(present)[pairs.row])].all()
+                slides = not near[pairs.gap < DEEP * self._sizes(patches.now(present)[pairs.row])].all()
                 off += f"{line(self.contacts[number])}: bodies slide by more than a cell" * slides
                 pairs, cell = Pairs(*(values[near] for values in pairs)), cell[near]
             row = pairs.row
