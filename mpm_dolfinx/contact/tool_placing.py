@@ -28,9 +28,12 @@ from mpm_dolfinx.contact.tool import Pose, Tool, rotation
 from mpm_dolfinx.parallel.exchange import Exchange, first, over_all, together
 from mpm_dolfinx.points.material_points import MaterialPoints, middle
 
-BEGINS = 1e-2  # allowed penetration into a body at the start, and into prescribed sides, divided by the cell size
+BEGINS = 1e-2
+"""Allowed penetration into a body at the start, and into prescribed sides, divided by the cell size.
+
+Tools thinner than this value may pass through points in a step without notice.
+"""
 NEAR = 0.1  # distance from a tool, divided by the cell size, below which corners follow the Q1 field
-STRIDE = 0.02  # tools thinner than this fraction of a cell may pass through points in a step without notice
 LEFT = 1e-3  # penetration of corrected corners, divided by the cell size; zero would roughen the stress
 FACING = 0.5  # smallest cosine between the normal of a face that faces the tool and the direction to the tool
 
@@ -361,7 +364,7 @@ class Tools(Touching):
             inside = x[1][on[gap < -LEFT * h]][:1]  # the middles of thin domains slide along round tools
             if where := first(comm, "".join(np.array2string(place, precision=6) for place in inside + self.grid.base)):
                 return where
-            done[on] += np.maximum(gap, STRIDE * h)
+            done[on] += np.maximum(gap, BEGINS * h)
             on = on[done[on] < length[on]]
         return ""
 
