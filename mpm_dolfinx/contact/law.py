@@ -7,8 +7,8 @@ At a position with gap g, the contact pressure p and its energy psi per area are
 
 <...> is the positive part, and k is a penalty stiffness.  The stiffness is limited so that a Q1 field can follow curved
 surfaces.  The multiplier lambda has one value for each contact and cell.  It starts from the pressure after the
-previous step.  Augmentation (Uzawa's method) updates lambda until the mean penetration in each cell is below `DEPTH`
-cell sizes.
+previous step.  Augmentation (Uzawa's method) updates lambda until the penetrated volume in each cell is below `DEPTH`
+cell volumes.
 
 The shear traction t depends on means over the pairs in a cell: the slip s in the step, and the shear traction t_n after
 the previous step.  Radial return gives
@@ -49,7 +49,6 @@ GRIP = 6.0
 With a larger k_t, spurious shear tractions would alternate between cells without any resistance from the nodes.
 """
 DEPTH = 5e-4  # allowed mean penetration, divided by the cell size
-SLIVER = 0.25  # fraction of a cell's face; penetrations of smaller contact areas are reduced in proportion
 ROUNDS = 20  # largest number of augmentations, and of updates of the pairs
 BEGIN = 1.0, np.inf, 0.0, 0.0  # initial values of `ContactState.updates`
 SLOW, STIFFER = 0.6, 10.0
@@ -234,10 +233,10 @@ class ContactLaw:
 
         `largest`: function that returns the largest of values (k,) in the connected part of each condition.
         """
-        # small parts of faces in a cell cannot correct their penetration alone, but follow their neighbours
+        # penetrations count by volume: small parts of faces follow their neighbours, and correct no penetration alone
         x = self.pairs.x
         plane = self.total(self.pairs.area / np.maximum(self.grid.around(x), TINY))  # both are 0 on the axis
-        whole = np.minimum(1.0, plane / (SLIVER * self.grid.smallest_faces(self.cell)))
+        whole = np.minimum(1.0, plane / self.grid.smallest_faces(self.cell))
         off = whole * np.abs(touch.pressure - state.pressure) / self.mean(self.stiffness(state)) / self._size
         most = largest(off)
         if not over_all(self.grid.comm, int((most > DEPTH).sum())):
