@@ -39,7 +39,6 @@ TENSE = 10
 Plateau (scene "soil" of tests/plateaus.py): half this value changes the result by 2.8e-06, twice this value by 4.7e-06,
 and finer cells by 3.0e-02.
 """
-CARRIED = 0.3  # largest plausible traction increment of a step, divided by (resisting modulus + TENSE * stress)
 
 
 class HeldPoints(NamedTuple):
@@ -108,7 +107,8 @@ class HeldCells:
         Stiffness of each penalty and component, N/m.
     limit : (2, k, d)
         Largest plausible force, N, of each of k penalties on means: limit[0] for the skeleton, limit[1] for undrained
-        soil.  limit[1] applies if the side is at its prescribed position.  Larger forces are numerical artefacts.
+        soil.  limit[1] applies if the side is at its prescribed position.  Larger forces are numerical artefacts,
+        because a traction increment of the modulus is a strain of 1 in a step.
     path
         Increment (d,) of the prescribed displacement in the step, m, for each penalty.
     """
@@ -156,7 +156,7 @@ class HeldCells:
         outward = normal**2 / np.maximum((normal**2).sum(axis=1, keepdims=True), TINY)
         skeleton = total(p.resistance + TENSE * p.tension)[:, None]
         more = outward * np.maximum(total(p.undrained) - total(p.resistance), 0.0)[:, None]
-        self.limit = CARRIED * short[:, None] * np.stack([skeleton + 0 * more, skeleton + more])
+        self.limit = short[:, None] * np.stack([skeleton + 0 * more, skeleton + more])
         self._gap, self._force = both(gap, p.gap), both(0 * gap, p.force)
         self._slope, self._along = both(slope, slope[at]), both(along, along[at])
         self._given, self._rise = both(given, given[at]), both(rise, rise[at])
