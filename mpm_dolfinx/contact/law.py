@@ -51,9 +51,10 @@ With a larger k_t, spurious shear tractions would alternate between cells withou
 DEPTH = 5e-4  # allowed mean penetration, divided by the cell size
 ROUNDS = 20  # largest number of augmentations, and of updates of the pairs
 BEGIN = 1.0, np.inf, 0.0, 0.0  # initial values of `ContactState.updates`
-SLOW, STIFFER = 0.6, 10.0
-"""The stiffness is multiplied by STIFFER if an augmentation leaves more than SLOW times the previous penetration."""
-RAMP = 10.0  # largest ratio of adhesion to normal pressure
+STIFFER = 10.0
+"""The stiffness is multiplied by this factor if an augmentation leaves more than half of the previous penetration."""
+RAMP = 10.0
+"""Largest ratio of adhesion to normal pressure.  Source: definition, the documented limit of adhesion in `Tool`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,7 +250,7 @@ class ContactLaw:
             raise NotConverged(message)
         # the pore fluid, or a nearly incompressible body, is stiffer than k
         updates = state.updates + np.array([0, 0, 1, 0])
-        updates[:, 0] *= np.where(most > SLOW * updates[:, 1], STIFFER, 1.0)
+        updates[:, 0] *= np.where(most > updates[:, 1] / 2, STIFFER, 1.0)
         updates[:, 1] = most
         updates = np.where(most[:, None] > DEPTH, updates, state.updates)
         return replace(state, pressure=np.where(most > DEPTH, touch.pressure, state.pressure), updates=updates)
