@@ -49,7 +49,11 @@ GRIP = 6.0
 With a larger k_t, spurious shear tractions would alternate between cells without any resistance from the nodes.
 """
 DEPTH = 5e-4  # allowed mean penetration, divided by the cell size
-ROUNDS = 20  # largest number of augmentations, and of updates of the pairs
+ROUNDS = int(-np.log2(DEPTH * DEPTH))
+"""Largest number of augmentations, and of updates of the pairs.
+
+As many augmentations halve a penetration of a cell until it is below `DEPTH`, and raise the stiffness as often.
+"""
 BEGIN = 1.0, np.inf, 0.0, 0.0  # initial values of `ContactState.updates`
 STIFFER = 10.0
 """The stiffness is multiplied by this factor if an augmentation leaves more than half of the previous penetration."""
