@@ -28,11 +28,8 @@ from mpm_dolfinx.contact.tool import Pose, Tool, rotation
 from mpm_dolfinx.parallel.exchange import Exchange, first, over_all, together
 from mpm_dolfinx.points.material_points import MaterialPoints, middle
 
-BEGINS = 1e-2
-"""Allowed penetration into a body at the start, and into prescribed sides, divided by the cell size.
-
-Tools thinner than this value may pass through points in a step without notice.
-"""
+# allowed penetration into a body at the start, and into prescribed sides, divided by the cell size; points may pass
+BEGINS = 1e-2  # through thinner tools in a step without notice
 NEAR = 0.1  # distance from a tool, divided by the cell size, below which corners follow the Q1 field
 FACING = 0.5  # smallest cosine between the normal of a face that faces the tool and the direction to the tool
 
@@ -318,8 +315,7 @@ class Tools(Touching):
         """Return the corners of domains.  Small penetrations into tools are reduced to twice `DEPTH`.
 
         Tools constrain means over cells.  Without this correction, corners of sliding domains would stay inside a tool.
-        A linear penetration with the mean `DEPTH` is at most twice `DEPTH`.  A penetration of zero would roughen the
-        stress.
+        A linear penetration with the mean `DEPTH` is at most twice `DEPTH`.  Zero would roughen the stress.
 
         `corners` (n, 2^d, d), in m: corners of the domains.
         `t`, in s: time.

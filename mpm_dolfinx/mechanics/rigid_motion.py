@@ -23,9 +23,8 @@ def rigid_motion(
 ) -> NDArray[np.float64] | None:
     """Return the displacements, in m, of positions x in the rigid motion nearest to prescribed displacements.
 
-    The result is None for a pure translation, or if the rotation leaves more than half of the squared gaps after the
-    best translation.  A rotation whose linearisation stretches the body by less than `NEAR` also counts as none.  All
-    processes must call this function.
+    The result is None if the linearised rotation stretches by less than `NEAR`, or leaves more than half of the squared
+    gaps of the best translation.  All processes must call this function.
 
     `holds`: penalties of prescribed displacements, with direction, gap, in m, and stiffness, the weight in the fit.
     `counts` (k,): whether each penalty is used.
@@ -65,8 +64,7 @@ def rotated(
 ) -> NDArray[np.float64]:
     """Return the rotation nearest to a motion of weighted positions (Kabsch 1976).
 
-    The result is the identity for a negligible rotation or a poor fit, as in `rigid_motion`.  All processes must call
-    this function.
+    The result is the identity if `rigid_motion` would be None.  All processes must call this function.
     """
     d = x.shape[1]
     sums = over_all(comm, np.concatenate([[weight.sum()], weight @ x, weight @ to]))
