@@ -91,6 +91,84 @@ def wetted(cells: int) -> dict[str, float]:
     return {"front": depth + places[-1], "water": 1 + waters[-1]}
 
 
+def forces_of(s: mpm.Simulation, end: float, dt: float, *names: str) -> dict[str, np.ndarray]:
+    """Return the history of each named outcome: the forces (steps, conditions, d) on bodies, without moments."""
+    seen: dict[str, list[np.ndarray]] = {name: [] for name in names}
+
+    def see(s: mpm.Simulation) -> None:
+        for name in names:
+            seen[name].append(np.array(getattr(s, name).array)[:, :2])
+
+    s.run(end, dt, observe=see, progress=False)
+    return {name: np.array(values) for name, values in seen.items()}
+
+
+EXACT = mpm.Numerics(tolerance=1e-10)
+GROUND = mpm.Hencky(bulk=1e6 / 1.2, shear=1e6 / 2.6)
+ROLLERS = {"left": "x", "right": "x", "bottom": "xy"}
+
+
+def dragged(cells: int) -> dict[str, np.ndarray]:
+    """A rough disc that presses soil and is then dragged over it, next to a rough block that presses it."""
+    grid = mpm.Grid([0, 0], [4, 1.5], [4 * cells, round(1.5 * cells)])
+    body = mpm.box(grid, [0, 0], [4, 1.03])
+
+    def path(t: float) -> tuple[float, float]:
+        return 0.1 * max(0.0, t - 1), -0.1 * min(1, t)
+
+    disc = mpm.Tool(mpm.Ball((1.0, 1.53), 0.5), path, friction=0.3, adhesion=2e3)
+    block = mpm.Convex([(2.43, 1.03), (3.07, 1.03), (3.07, 1.4), (2.43, 1.4)])
+    rough = mpm.Tool(block, lambda t: (0, path(t)[1]), friction=0.5)
+    s = mpm.Simulation(grid, [body], [GROUND], walls=ROLLERS, conditions=[disc, rough], numerics=EXACT)
+    return forces_of(s, 2.0, 0.125, "tool_forces")
+
+
+def rubbed(cells: int) -> dict[str, np.ndarray]:
+    """A block with a round base, pressed on another one and pushed aside: its base slides in part, then as a whole."""
+    grid = mpm.Grid([0, 0], [3, 1.5], [3 * cells, round(1.5 * cells)])
+    lower = mpm.box(grid, [0, 0], [3, 0.53], material=0)
+    upper = mpm.mapped(
+        grid,
+        mpm.box(grid, [1, 0.53], [2, 1.03], per_cell=3, material=1),
+        lambda x: x + (1.03 - x[:, 1:]) * np.array([0, 0.2]) * (2 * x[:, :1] - 3) ** 2,
+    )
+
+    def path(t: float) -> tuple[float, float]:
+        return 0.1 * max(0.0, t - 1), -0.08 * min(1, t)
+
+    held = mpm.Displacement("top", path, region=((1, 0.9), (2, 1.1)))
+    soils = [GROUND, mpm.Hencky(bulk=2e6, shear=1e6)]
+    acts = [held, mpm.Contact(1, 0, friction=0.3)]
+    s = mpm.Simulation(grid, [lower, upper], soils, walls=ROLLERS, conditions=acts, numerics=EXACT)
+    return forces_of(s, 2.0, 0.125, "tool_forces")
+
+
+def gripped(cells: int) -> dict[str, np.ndarray]:
+    """A block on a rough base whose top is moved down and aside and is turned, over more than a cell."""
+    grid = mpm.Grid([0, 0], [2, 1.5], [2 * cells, round(1.5 * cells)])
+
+    def path(t: float, X: np.ndarray) -> np.ndarray:
+        angle, arm = 0.15 * t, X - [0.9, 1.03]
+        turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+        return arm @ turn.T - arm + [0.2 * t, -0.2 * t]
+
+    held = [mpm.Displacement("top", path), mpm.Displacement("bottom", (0, 0))]
+    body = mpm.box(grid, [0.43, 0.03], [1.37, 1.03])
+    s = mpm.Simulation(grid, [body], [GROUND], walls={}, conditions=held, numerics=EXACT)
+    return forces_of(s, 1.0, 0.125, "reactions")
+
+
+def tilted(cells: int) -> dict[str, np.ndarray]:
+    """A rigid plate under a load on two soils side by side, of which one is soft: forces of the walls."""
+    grid = mpm.Grid([0, 0], [2, 1.5], [2 * cells, round(1.5 * cells)])
+    halves = [mpm.box(grid, [a, 0], [a + 1, 1.03], material=a) for a in (0, 1)]
+    soils = [GROUND, mpm.Hencky(bulk=2e6, shear=1e6)]
+    plate = mpm.RigidPlate("top", lambda t: 2e5 * t)
+    walls = {"left": "x", "right": "x", "bottom": "xy"}
+    s = mpm.Simulation(grid, halves, soils, walls=walls, conditions=[plate])
+    return forces_of(s, 1.0, 0.25, "wall_reactions")
+
+
 SCENES = {
     "beam": (bent, 0.06, 0.03),
     "clay": (lambda h: bent(h, 0.46), 0.06, 0.03),
@@ -100,6 +178,10 @@ SCENES = {
     "slope": (slope, 6, 12),
     "dry": (wetted, 25, 50),
     "flow": (flowing, 8, 16),
+    "tool": (dragged, 8, 16),
+    "contact": (rubbed, 8, 16),
+    "held": (gripped, 8, 16),
+    "plate": (tilted, 8, 16),
 }
 """Function of each scene, its cells (number or size) while a number is varied, and finer cells for comparison."""
 
@@ -119,7 +201,8 @@ def answer(scene: str, finer: bool = False) -> dict[str, float]:
 
 
 def change(a: dict[str, float], b: dict[str, float]) -> float:
-    return max(abs(a[name] / b[name] - 1) for name in b)
+    """Return the largest change of an answer, divided by the answer, or by the largest value of a history."""
+    return max(float(np.abs(a[name] - b[name]).max() / np.abs(b[name]).max()) for name in b)
 
 
 def moved(where: str, name: str, scene: str) -> tuple[float, float, float]:

@@ -6,7 +6,7 @@ import pytest
 import ways
 
 CEILINGS = {
-    "ad hoc named numbers": 100,
+    "ad hoc named numbers": 77,
     "rules among numbers in functions": 3,
     "imports a file, mean": 5.54,
     "files in a circle of imports": 0,

@@ -7,8 +7,8 @@ At a position with gap g, the contact pressure p and its energy psi per area are
 
 <...> is the positive part, and k is a penalty stiffness.  The stiffness is limited so that a Q1 field can follow curved
 surfaces.  The multiplier lambda has one value for each contact and cell.  It starts from the pressure after the
-previous step.  Augmentation (Uzawa's method) updates lambda until the mean penetration in each cell is below `DEPTH`
-cell sizes.
+previous step.  Augmentation (Uzawa's method) updates lambda until the penetrated volume in each cell is below `DEPTH`
+cell volumes.
 
 The shear traction t depends on means over the pairs in a cell: the slip s in the step, and the shear traction t_n after
 the previous step.  Radial return gives
@@ -42,19 +42,28 @@ from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.parallel.exchange import first, over_all
 
 STIFF = 100.0
-"""The stiffness k is this factor times the modulus from `resistance`, divided by the cell size."""
+"""The stiffness k is this factor times the modulus from `resistance`, divided by the cell size.  Plateau (scene
+"contact" of tests/plateaus.py): half this value changes the result by 1.9e-03, twice this value by 3.2e-03, and finer
+cells by 1.1e-02.
+"""
 GRIP = 6.0
 """The stiffness k_t is this factor times the modulus from `resistance`, divided by the cell size.
 
-With a larger k_t, spurious shear tractions would alternate between cells without any resistance from the nodes.
+With a larger k_t, spurious shear tractions would alternate between cells without any resistance from the nodes. Plateau
+(scene "contact" of tests/plateaus.py): half this value changes the result by 3.6e-03, twice this value by 2.6e-03, and
+finer cells by 1.1e-02.
 """
-DEPTH = 5e-4  # allowed mean penetration, divided by the cell size
-SLIVER = 0.25  # fraction of a cell's face; penetrations of smaller contact areas are reduced in proportion
-ROUNDS = 20  # largest number of augmentations
+DEPTH = 5e-4
+"""Allowed mean penetration, divided by the cell size.  Plateau (scene "contact" of tests/plateaus.py): half this value
+changes the result by 2.6e-03, twice this value by 2.4e-03, and finer cells by 1.1e-02.
+"""
+ROUNDS = int(-np.log2(DEPTH * DEPTH))
+"""Largest number of augmentations, which halve a penetration of a cell to `DEPTH`, or stiffen; of updates of pairs."""
 BEGIN = 1.0, np.inf, 0.0, 0.0  # initial values of `ContactState.updates`
-SLOW, STIFFER = 0.6, 10.0
-"""The stiffness is multiplied by STIFFER if an augmentation leaves more than SLOW times the previous penetration."""
-RAMP = 10.0  # largest ratio of adhesion to normal pressure
+STIFFER = 10.0
+"""The stiffness is multiplied by this factor if an augmentation leaves more than half of the previous penetration."""
+RAMP = 10.0
+"""Largest ratio of adhesion to normal pressure.  Source: definition, the documented limit of adhesion in `Tool`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,10 +243,10 @@ class ContactLaw:
 
         `largest`: function that returns the largest of values (k,) in the connected part of each condition.
         """
-        # small parts of faces in a cell cannot correct their penetration alone, but follow their neighbours
+        # penetrations count by volume: small parts of faces follow their neighbours, and correct no penetration alone
         x = self.pairs.x
         plane = self.total(self.pairs.area / np.maximum(self.grid.around(x), TINY))  # both are 0 on the axis
-        whole = np.minimum(1.0, plane / (SLIVER * self.grid.smallest_faces(self.cell)))
+        whole = np.minimum(1.0, plane / self.grid.smallest_faces(self.cell))
         off = whole * np.abs(touch.pressure - state.pressure) / self.mean(self.stiffness(state)) / self._size
         most = largest(off)
         if not over_all(self.grid.comm, int((most > DEPTH).sum())):
@@ -250,7 +259,7 @@ class ContactLaw:
             raise NotConverged(message)
         # the pore fluid, or a nearly incompressible body, is stiffer than k
         updates = state.updates + np.array([0, 0, 1, 0])
-        updates[:, 0] *= np.where(most > SLOW * updates[:, 1], STIFFER, 1.0)
+        updates[:, 0] *= np.where(most > updates[:, 1] / 2, STIFFER, 1.0)
         updates[:, 1] = most
         updates = np.where(most[:, None] > DEPTH, updates, state.updates)
         return replace(state, pressure=np.where(most > DEPTH, touch.pressure, state.pressure), updates=updates)

@@ -43,8 +43,6 @@ from mpm_dolfinx.forms.unknowns import Unknowns, collect_garbage, petsc_matrix
 from mpm_dolfinx.parallel.exchange import Exchange, over_all
 from mpm_dolfinx.points.material_points import MaterialPoints
 
-FOLLOWS = 8  # largest number of updates of the pairs in a step
-
 
 @dataclass(frozen=True, eq=False)
 class Pushes:
@@ -431,7 +429,7 @@ class ContactProblem(Loads):
         missing[old_at] = False
         off = np.concatenate([off / self.grid.least, np.where(missing, np.inf, 0.0)])
         most = at.parts.largest(self.grid.comm, np.concatenate([of_new[now.of], of_old[law.of]]), off)
-        return Current(now, new.origin, fresh), (most > DEPTH) & (updates[:, 3] < FOLLOWS)
+        return Current(now, new.origin, fresh), (most > DEPTH) & (updates[:, 3] < ROUNDS)
 
     def gripped(self, at: At, points: MaterialPoints) -> MaterialPoints:
         """Return the points with updated contact pressures and shear tractions at u."""

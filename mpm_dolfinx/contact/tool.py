@@ -15,8 +15,6 @@ from mpm_dolfinx.base.validation import check_names, given, line, numbers
 from mpm_dolfinx.contact.shapes import ROUNDED, Ball, Convex, Distance, Placed, Shape, Uniform, uniform, unit_vector
 from mpm_dolfinx.grid.grid import Grid
 
-ONTO = 100  # largest number of projections onto the surface
-
 
 class Pose(NamedTuple):
     """Pose of a tool: a rotation about `centre` (d,), in m, followed by a translation."""
@@ -299,7 +297,7 @@ class Tool:
         cells = grid.corners(np.arange(np.prod(grid.shape)))
         used, at = np.unique(cells[inside[cells].any(axis=1)], return_inverse=True)
         y = y[used]
-        for _ in range(ONTO):  # edges between planes need several projections
+        for _ in range(2 * np.finfo(float).nmant):  # edges between planes need several projections
             gap = solid.distance(y)
             if (gap <= ROUNDED * grid.least).all():
                 break

@@ -21,7 +21,7 @@ from mpm_dolfinx.conditions.acting import At, Loads, Outcome, Place, Setting, Sh
 from mpm_dolfinx.conditions.conditions import resistance
 from mpm_dolfinx.contact.free_tools import FreeTools
 from mpm_dolfinx.contact.history import Origin, pressure_name, shear_name
-from mpm_dolfinx.contact.law import ContactLaw
+from mpm_dolfinx.contact.law import DEPTH, ContactLaw
 from mpm_dolfinx.contact.pairs import ToolPairs
 from mpm_dolfinx.contact.problem import ContactProblem, Pushes, SubstepMotion, Touching
 from mpm_dolfinx.contact.tool import Pose, Tool, rotation
@@ -29,10 +29,12 @@ from mpm_dolfinx.parallel.exchange import Exchange, first, over_all, together
 from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
 from mpm_dolfinx.points.material_points import MaterialPoints, middle
 
-BEGINS = 1e-2  # allowed penetration into a body at the start, and into prescribed sides, divided by the cell size
-NEAR = 0.1  # distance from a tool, divided by the cell size, below which corners follow the Q1 field
-STRIDE = 0.02  # tools thinner than this fraction of a cell may pass through points in a step without notice
-LEFT = 1e-3  # penetration of corrected corners, divided by the cell size; zero would roughen the stress
+# allowed penetration into a body at the start, and into prescribed sides, divided by the cell size; points may pass
+BEGINS = 1e-2  # through thinner tools in a step without notice
+NEAR = 0.1
+"""Distance from a tool, in cell sizes, below which corners follow the Q1 field. Plateau (scene "tool" of
+tests/plateaus.py): half this value changes the result by 4.1e-03, twice this value by 1.5e-03, and finer cells by
+7.1e-02."""
 FACING = 0.5  # smallest cosine between the normal of a face that faces the tool and the direction to the tool
 
 
@@ -328,9 +330,10 @@ class Tools(Touching):
     def pushed_out(
         self, corners: NDArray[np.float64], t: float, free: NDArray[np.bool_], most: float
     ) -> NDArray[np.float64]:
-        """Return the corners of domains.  Small penetrations into tools are reduced to the tolerated depth `LEFT`.
+        """Return the corners of domains.  Small penetrations into tools are reduced to twice `DEPTH`.
 
         Tools constrain means over cells.  Without this correction, corners of sliding domains would stay inside a tool.
+        A linear penetration with the mean `DEPTH` is at most twice `DEPTH`.  Zero would roughen the stress.
 
         `corners` (n, 2^d, d), in m: corners of the domains.
         `t`, in s: time.
@@ -340,7 +343,7 @@ class Tools(Touching):
         out, h = corners.copy(), self.grid.least
         for tool in self.tools:
             gap, pose = self._gaps(tool, out, t), self._pose(tool, t)
-            gap += LEFT * h
+            gap += 2 * DEPTH * h
             at = (gap < 0) & (gap > -most * h)
             own = pose.own(out[at])
             n = together(self.grid.comm, lambda tool=tool, own=own: tool.solid(h).normal(own))
@@ -373,10 +376,10 @@ class Tools(Touching):
         while over_all(comm, len(on)):
             at = y[on] + done[on, None] * along[on]
             gap = together(self.grid.comm, lambda at=at: tool.solid(h).distance(at))
-            inside = x[1][on[gap < -LEFT * h]][:1]  # the middles of thin domains slide along round tools
+            inside = x[1][on[gap < -2 * DEPTH * h]][:1]  # the middles of thin domains slide along round tools
             if where := first(comm, "".join(np.array2string(place, precision=6) for place in inside + self.grid.base)):
                 return where
-            done[on] += np.maximum(gap, STRIDE * h)
+            done[on] += np.maximum(gap, BEGINS * h)
             on = on[done[on] < length[on]]
         return ""
 

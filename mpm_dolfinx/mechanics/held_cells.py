@@ -26,7 +26,10 @@ from mpm_dolfinx.mechanics.ghost_penalty import RATIO
 from mpm_dolfinx.parallel.exchange import over_all
 
 ALIGNED = 1e-2
-"""Largest slope of a side against a grid axis at which cells can follow all points of the side at constant volume."""
+"""Largest slope of a side against a grid axis at which cells can follow all points of the side at constant volume.
+Plateau (scene "held" of tests/plateaus.py): half this value changes the result by 0.0e+00, twice this value by 1.4e-05,
+and finer cells by 4.0e-03.
+"""
 WEAK = 8.0
 """Pointwise penalty stiffness for deviations from the means, in units of (modulus + 10 stress) / cell size.  Plateau
 (scene "soil" of tests/plateaus.py): half this value changes the result by 5.0e-06, twice this value by 7.9e-06, and
@@ -42,7 +45,6 @@ TENSE = 10
 Plateau (scene "soil" of tests/plateaus.py): half this value changes the result by 2.8e-06, twice this value by 4.7e-06,
 and finer cells by 3.0e-02.
 """
-CARRIED = 0.3  # largest plausible traction increment of a step, divided by (resisting modulus + TENSE * stress)
 
 
 class HeldPoints(NamedTuple):
@@ -115,7 +117,8 @@ class HeldCells:
         Part of each stiffness that resists gaps; the rest resists increments only.
     limit : (2, k, d)
         Largest plausible force, N, of each of k penalties on means: limit[0] for the skeleton, limit[1] for undrained
-        soil.  limit[1] applies if the side is at its prescribed position.  Larger forces are numerical artefacts.
+        soil.  limit[1] applies if the side is at its prescribed position.  Larger forces, strains above 1 in a step,
+        are numerical artefacts.
     path
         Increment (d,) of the prescribed displacement in the step, m, for each penalty.
     """
@@ -168,7 +171,7 @@ class HeldCells:
         outward = normal**2 / np.maximum((normal**2).sum(axis=1, keepdims=True), TINY)
         skeleton = total(p.resistance + TENSE * p.tension + p.inertial)[:, None]
         more = outward * np.maximum(total(p.undrained) - total(p.resistance), 0.0)[:, None]
-        self.limit = CARRIED * short[:, None] * np.stack([skeleton + 0 * more, skeleton + more])
+        self.limit = short[:, None] * np.stack([skeleton + 0 * more, skeleton + more])
         self._gap, self._force = both(gap, p.gap), both(0 * gap, p.force)
         if inert.any():  # a gap at the start causes no velocity
             self._gap = self.static * self._gap + (1 - self.static) * both(mean(p.step), p.step)

@@ -13,15 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from mpm_dolfinx.base.tolerances import SAME, TINY
+from mpm_dolfinx.base.tolerances import NEAR, SAME, TINY
 from mpm_dolfinx.forms.point_forms import PointData
 from mpm_dolfinx.parallel.exchange import over_all
-
-TURNS = 1e-3
-"""Smallest rotation that is used as an initial guess, rad."""
-MEETS = 0.1
-"""Largest root mean square gap after a rotation, relative to the gap after the best translation."""
-ITERATIONS = 9
 
 
 def rigid_motion(
@@ -29,8 +23,8 @@ def rigid_motion(
 ) -> NDArray[np.float64] | None:
     """Return the displacements, in m, of positions x in the rigid motion nearest to prescribed displacements.
 
-    The result is None for a pure translation, or if a translation fits nearly as well.  All processes must call this
-    function.
+    The result is None if the linearised rotation stretches by less than `NEAR`, or leaves more than half of the squared
+    gaps of the best translation.  All processes must call this function.
 
     `holds`: penalties of prescribed displacements, with direction, gap, in m, and stiffness, the weight in the fit.
     `counts` (k,): whether each penalty is used.
@@ -48,19 +42,19 @@ def rigid_motion(
     turn = Rotation.identity()
     size = np.sqrt(over_all(comm, float((weight[:, 0] * (arm**2).sum(axis=1)).sum())) / moments[0])
     left = []  # sums of squared gaps: second entry for the best translation, last entry for the best rigid motion
-    for iteration in range(ITERATIONS):
+    while len(left) < 3 or left[-1] < (1 - SAME) * left[-2]:  # Gauss-Newton iterations
         rotated = _apply(turn, arm)
         off = gap - np.einsum("nd,nd->n", e, shift + rotated - arm)
         left.append(over_all(comm, float(weight[:, 0] @ off**2)))
         slope = np.concatenate([e, _spin(rotated, e) / max(size, TINY)], axis=1)
         normal = over_all(comm, np.concatenate([slope.T @ (weight * slope), [slope.T @ (weight[:, 0] * off)]]))
-        part = slice(None) if iteration else slice(d)  # first without rotation
+        part = slice(None) if left[1:] else slice(d)  # first without rotation
         step = np.zeros(len(normal) - 1)
         step[part] = np.linalg.lstsq(normal[:-1][part, part] / moments[0], normal[-1][part] / moments[0], rcond=SAME)[0]
         shift = shift + step[:d]
         angles = step[d:] / max(size, TINY)
         turn = Rotation.from_rotvec(angles if d == 3 else [0.0, 0.0, angles[0]]) * turn
-    if turn.magnitude() < TURNS or not left[-1] < MEETS**2 * left[1]:
+    if turn.magnitude() ** 2 / 2 < NEAR or not left[-1] < left[1] / 2:
         return None
     return shift + _apply(turn, x - centre) - (x - centre)
 
@@ -70,7 +64,7 @@ def rotated(
 ) -> NDArray[np.float64]:
     """Return the rotation nearest to a motion of weighted positions (Kabsch 1976).
 
-    The result is the identity for a negligible rotation or a poor fit.  All processes must call this function.
+    The result is the identity if `rigid_motion` would be None.  All processes must call this function.
     """
     d = x.shape[1]
     sums = over_all(comm, np.concatenate([[weight.sum()], weight @ x, weight @ to]))
@@ -82,7 +76,7 @@ def rotated(
     R = left @ right
     off = np.array([weight @ ((goal - arm @ by.T) ** 2).sum(axis=1) for by in (R, np.eye(d))])
     less, most = over_all(comm, off)
-    return R if less < MEETS**2 * most and np.linalg.norm(R - np.eye(d)) > TURNS else np.eye(d)
+    return R if less < most / 2 and np.linalg.norm(R - np.eye(d)) ** 2 / 4 > NEAR else np.eye(d)
 
 
 def _apply(turn: Rotation, x: NDArray[np.float64]) -> NDArray[np.float64]:
