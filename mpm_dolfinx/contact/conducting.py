@@ -12,7 +12,7 @@ centroid x of the cell's material to the surface.  The factor r is that of `stor
 reset of the grid, and mobilities are pulled back (`Conduction.across`).
 
 The pressures of both cells are implicit.  The set of closed pairs is an active set: it is fixed while fluxes are
-assembled, and updated between Newton steps.  After `FOLLOWS` changes in a substep, it remains fixed.
+assembled, and updated between Newton steps.  After `ROUNDS` changes in a substep, it remains fixed.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ from petsc4py import PETSc
 import numpy as np
 from numpy.typing import NDArray
 
-from mpm_dolfinx.contact.problem import FOLLOWS, ContactProblem
+from mpm_dolfinx.contact.law import ROUNDS
+from mpm_dolfinx.contact.problem import ContactProblem
 from mpm_dolfinx.flow.feeding import Feeding, Feeds, Fluid, Leaving, Wet
 from mpm_dolfinx.flow.fluxes import Conduction, HalfFaces, OpenSides
 from mpm_dolfinx.flow.series import none, through
@@ -163,7 +164,7 @@ class ContactFeeds(Feeds):
         """Update the closed pairs, and return the number of changes on this process."""
         links = self._now
         changes = int((self._contact.closed(self._wet.at) != links.closed).sum())
-        if links.changes == FOLLOWS or not over_all(self._grid.comm, changes):
+        if links.changes == ROUNDS or not over_all(self._grid.comm, changes):
             return 0
         self._links = self._linked(links.changes + 1)
         return changes
