@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.base.validation import check_names, given, line, numbers
-from mpm_dolfinx.contact.shapes import ROUNDED, Ball, Convex, Distance, Placed, Shape, Uniform, uniform, unit_vector
+from mpm_dolfinx.contact.shapes import ROUNDED, Distance, Placed, Shape, Uniform, unit_vector
 from mpm_dolfinx.grid.grid import Grid
 
 ONTO = 100  # largest number of projections onto the surface
@@ -62,7 +62,7 @@ class Tool:
 
     Parameters
     ----------
-    shape : HalfSpace, Ball, Convex, Cone, or callable y (m, d) -> (m,), m
+    shape : HalfSpace, Ball, Convex, Cone, SurfaceMesh, or callable y (m, d) -> (m,), m
         The tool in its initial position.  A function returns the signed distance, positive outside the tool.
     displacement : (d,) or callable t (s) -> (d,), m
         Displacement from the initial position, also in later stages.  In axisymmetry, it must be along the axis.
@@ -130,7 +130,8 @@ class Tool:
 
     def __post_init__(self):
         if not isinstance(self.shape, Placed) and not callable(self.shape):
-            raise ValueError(f"Tool: shape = {line(self.shape)}, must be a HalfSpace, Ball, Convex, Cone or a function")
+            allowed = "a HalfSpace, Ball, Convex, Cone, SurfaceMesh or a function"
+            raise ValueError(f"Tool: shape = {line(self.shape)}, must be {allowed}")
         for name in ("friction", "adhesion"):
             value = getattr(self, name)
             numbers(f"Tool: {name}", value, test=lambda v: (v >= 0) & (v < np.inf), allowed=">= 0 and finite")
@@ -183,7 +184,7 @@ class Tool:
 
     def _uniform(self, dim: int) -> Uniform | None:
         """Return the centroid and squared radius of gyration of a free disc or polygon, or None."""
-        return uniform(self.shape) if self.free and dim == 2 and isinstance(self.shape, (Ball, Convex)) else None
+        return self.shape.uniform if self.free and dim == 2 and isinstance(self.shape, Placed) else None
 
     def inertia(self, dim: int) -> float:
         """Return the moment of inertia about the centre, in kg m^2, or infinity for a tool that does not rotate."""
