@@ -282,9 +282,25 @@ class SurfaceMesh(Placed):
         """Return the signed distances (n,), in m, from the surface."""
         return self._near(y)[2]
 
+    def distance_up_to(self, y: NDArray[np.float64], reach: float) -> NDArray[np.float64]:
+        """Return the signed distances (n,), in m.  Above `reach`, in m, they may be lower bounds of the distance."""
+        low, high = self._bounds
+        out = np.linalg.norm(np.maximum(0, np.maximum(low - y, y - high)), axis=1)
+        near = out <= reach
+        out[near] = self.distance(y[near])
+        return out
+
+    @cached_property
+    def _bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Lower and upper corner of the box around the mesh, in m."""
+        return self.vertices.min(axis=0), self.vertices.max(axis=0)
+
     def normal(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the gradients (n, d) of the distance.  On edges and vertices, return the mean normal."""
-        near, n, gap = self._near(y)
+        return self._normal(y, *self._near(y))
+
+    def _normal(self, y: NDArray[np.float64], near: Nearest, n: NDArray, gap: NDArray) -> NDArray[np.float64]:
+        n = n.copy()
         on = np.flatnonzero(np.abs(gap) <= self._table.rounded)
         n[on] = self._normals[near.facet[on], self._table.part_at(y[on], near.facet[on])]
         away = (near.part > 0) & (np.abs(gap) > self._table.rounded)
@@ -293,7 +309,15 @@ class SurfaceMesh(Placed):
     def curvature(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the second derivatives (n, d, d) of the distance, in 1/m."""
         near, _, gap = self._near(y)
-        d = y.shape[1]
+        return self._curvature(near, gap)
+
+    def geometry(self, y: NDArray[np.float64]) -> tuple[NDArray, NDArray, NDArray]:
+        """Return distances, gradients and second derivatives with a single search of the nearest facets."""
+        near, n, gap = self._near(y)
+        return gap, self._normal(y, near, n, gap), self._curvature(near, gap)
+
+    def _curvature(self, near: Nearest, gap: NDArray[np.float64]) -> NDArray[np.float64]:
+        d = near.offset.shape[1]
         away = (near.part > 0) & (np.abs(gap) > self._table.rounded)
         gap = np.where(away, gap, np.inf)
         e = near.offset / gap[:, None]

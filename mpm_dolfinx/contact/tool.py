@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.base.validation import check_names, given, line, numbers
 from mpm_dolfinx.contact.shapes import ROUNDED, Distance, Placed, Shape, Uniform, unit_vector
+from mpm_dolfinx.contact.surface_mesh import SurfaceMesh
 from mpm_dolfinx.grid.grid import Grid
 
 ONTO = 100  # largest number of projections onto the surface
@@ -234,6 +235,21 @@ class Tool:
     def solid(self, h: float) -> Shape:
         """Return the shape.  `h` is the cell size, in m."""
         return Distance(self.shape, h, self._base) if callable(self.shape) else self._moved or self.shape
+
+    def gap(self, y: NDArray[np.float64], h: float) -> NDArray[np.float64]:
+        """Return the signed distances (n,), in m, of positions y (n, d) in the frame of the tool.
+
+        Distances above the cell size `h`, in m, may be lower bounds.
+        """
+        solid = self.solid(h)
+        return solid.distance_up_to(y, h) if isinstance(solid, SurfaceMesh) else solid.distance(y)
+
+    def geometry(self, y: NDArray[np.float64], h: float) -> tuple[NDArray, NDArray, NDArray]:
+        """Return distances (n,), gradients (n, d) and second derivatives (n, d, d) at positions y, see `Shape`."""
+        solid = self.solid(h)
+        if isinstance(solid, SurfaceMesh):
+            return solid.geometry(y)
+        return solid.distance(y), solid.normal(y), solid.curvature(y)
 
     def check(self, dim: int) -> None:
         """Raise an error for a tool of the wrong dimension, or with an invalid initial motion."""
