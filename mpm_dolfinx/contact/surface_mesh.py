@@ -241,6 +241,11 @@ class SurfaceMesh(Placed):
         return out
 
     @property
+    def on_axis(self) -> bool:
+        """Whether a facet lies on the axis x = 0 of an axisymmetric grid."""
+        return bool((np.abs(self.vertices[self.facets][..., 0]) <= self._table.rounded).all(axis=1).any())
+
+    @property
     def middle(self) -> NDArray[np.float64]:
         """Centroid (d,), in m."""
         return self.centroid

@@ -16,6 +16,7 @@ from mpm_dolfinx.contact.shapes import ROUNDED, Distance, Placed, Shape, Uniform
 from mpm_dolfinx.contact.surface_mesh import SurfaceMesh
 from mpm_dolfinx.grid.grid import Grid
 
+AS_CELL = [0, 1, 2, 2, 0, 1, 2, 2]  # corners of a triangle at the corners of a flat cell
 ONTO = 100  # largest number of projections onto the surface
 
 
@@ -303,10 +304,12 @@ class Tool:
     def drawn(self, grid: Grid, t: float, by_forces: NDArray[np.float64] | float = 0.0) -> NDArray[np.float64]:
         """Return the corners (n, 2^d, d), in m, of the grid cells inside the tool at time t (s), for pictures.
 
-        Corners outside the tool are projected onto its surface, so edges are blunt by a fraction of a cell.
-        `by_forces`: see `pose`.
+        Corners outside the tool are projected onto its surface, so edges are blunt by a fraction of a cell.  The facets
+        of a `SurfaceMesh` in 3D are drawn instead, as flat cells.  `by_forces`: see `pose`.
         """
         pose = self.pose(t, grid.dim, by_forces)
+        if isinstance(self.shape, SurfaceMesh) and grid.dim == 3:
+            return pose.put(self.shape.vertices)[self.shape.facets[:, AS_CELL]]
         solid = self.solid(grid.least)
         nodes = tuple(grid.shape + 1)
         y = pose.own(grid.base + grid.places(np.stack(np.unravel_index(np.arange(np.prod(nodes)), nodes), axis=1)))
