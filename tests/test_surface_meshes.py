@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Tools from surface meshes: distances, normals, curvatures and moments, refusals, files, and scenes with these tools."""
+"""Tools from surface meshes: distances, normals, curvatures, moments, refusals, files, and scenes with these tools."""
 
 from itertools import product
 
@@ -27,7 +27,8 @@ def hull(corners):
 
 def icosphere(divisions, centre=(0.0, 0.0, 0.0), radius=1.0):
     """Return a sphere of 20 * 4^divisions triangles, whose vertices are repeated as in an STL file."""
-    x = np.array([p for a in (-1, 1) for b in (-1, 1) for p in ((0, a, b * 1.618), (a, b * 1.618, 0), (b * 1.618, 0, a))])
+    signs = list(product([-1.0, 1.0], [-1.618, 1.618]))
+    x = np.array([p for a, b in signs for p in ((0, a, b), (a, b, 0), (b, 0, a))])
     x = x / np.linalg.norm(x, axis=1)[:, None]
     t = x[ConvexHull(x).simplices]
     for _ in range(divisions):
@@ -105,7 +106,7 @@ def test_distances_from_a_concave_polygon_are_exact(reverse):
     mesh = mpm.SurfaceMesh(L_SHAPE[::-1] if reverse else L_SHAPE)
     assert mesh.distance(y) == pytest.approx(to_polygon(y, L_SHAPE), abs=1e-14)
     away = mesh.moved([10.0, -3.0])
-    assert away.distance(y + [10.0, -3.0]) == pytest.approx(mesh.distance(y), abs=1e-14)
+    assert away.distance(np.add(y, [10.0, -3.0])) == pytest.approx(mesh.distance(y), abs=1e-14)
 
 
 def test_distances_from_a_concave_prism_are_exact():
@@ -157,13 +158,13 @@ def test_distances_from_a_sphere_converge_with_the_square_of_the_facet_size():
 
 
 def test_volume_centroid_and_inertia_are_exact():
-    box = hull(CORNERS + [1, 2, 3])
+    box = hull(np.add(CORNERS, [1, 2, 3]))
     a, b, c = 1.0, 2.0, 0.5
     assert box.volume == pytest.approx(a * b * c) and box.centroid == pytest.approx([1.5, 3.0, 3.25])
     assert box.inertia == pytest.approx(np.diag([b * b + c * c, a * a + c * c, a * a + b * b]) / 12, abs=1e-12)
     R = turned(np.array([0.0, 0.6, 0.8]), 0.7)
     assert hull(CORNERS @ R.T).inertia == pytest.approx(R @ box.inertia @ R.T, abs=1e-12)
-    flat = mpm.SurfaceMesh(L_SHAPE + [1e3, 0])
+    flat = mpm.SurfaceMesh(np.add(L_SHAPE, [1e3, 0]))
     parts = [(2.0, np.array([1.0, 0.5]), (4 + 1) / 12), (1.0, np.array([0.5, 1.5]), 2 / 12)]
     centre = sum(m * x for m, x, _ in parts) / 3
     moment = sum(m * (g + ((x - centre) ** 2).sum()) for m, x, g in parts)
@@ -207,7 +208,7 @@ def pyramids():
     return np.vstack([x, 1 - x + [0, 0, 0] - [1, 1, 1]]), np.vstack([TETRA, np.array(TETRA) + 4])
 
 
-TWO = np.vstack([CORNERS, CORNERS + [0.5, 0.5, 0.25]])
+TWO = np.vstack([CORNERS, np.add(CORNERS, [0.5, 0.5, 0.25])])
 HULL = ConvexHull(CORNERS).simplices
 BOWTIE = [(0, 0), (1, 1), (1, 0), (0, 1)]
 REFUSED = {
@@ -278,7 +279,8 @@ def pressed(shape, d=2, **tool):
     else:
         grid, walls, size = mpm.Grid([-0.2, -0.2, 0], [1.2, 1.2, 0.8], [7, 7, 4]), {"bottom": "xyz"}, [1, 1, 0.5]
         tool = {"displacement": lambda t: (0.02 * t, 0.01 * t, -0.05 * t), "friction": 0.3, **tool}
-    return mpm.Simulation(grid, [mpm.box(grid, [0] * d, size)], [GEL], walls=walls, conditions=[mpm.Tool(shape, **tool)])
+    body = mpm.box(grid, [0] * d, size)
+    return mpm.Simulation(grid, [body], [GEL], walls=walls, conditions=[mpm.Tool(shape, **tool)])
 
 
 def forces(*arguments, t_end=1.0, **tool):

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Search for the nearest facets of a surface, for many positions at once, in a binary tree of oriented boxes.
 
-Facets are segments in 2D and triangles in 3D.  The axes of a box are the principal axes of its vertices, so boxes around
-smooth parts of a surface are thin (Gottschalk, Lin and Manocha 1996).  All positions descend the tree together.  Arrays
-of vectors have the component as first index here, because their operations are then faster.
+Facets are segments in 2D and triangles in 3D.  The axes of a box are the principal axes of its vertices.  Boxes around
+smooth parts of a surface are therefore thin (Gottschalk, Lin and Manocha 1996).  All positions descend the tree at
+once.  In this file, the component is the first index of vectors, because operations on such arrays are faster.
 """
 
 from __future__ import annotations
@@ -71,9 +71,7 @@ class FacetTree:
             node = 2 * node + (second < first)
         return self._facet[node]
 
-    def within(
-        self, y: NDArray[np.float64], reach: NDArray[np.float64]
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def within(self, y: NDArray[np.float64], reach: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return pairs of a position and a facet, sorted by position.
 
         Each facet that is nearer to position y (d, m) than `reach` (m,), in m, is in a pair.  Pairs of other facets are

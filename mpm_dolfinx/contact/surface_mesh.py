@@ -394,7 +394,7 @@ def _sides(facets: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int
         return vertex[:, None], side.ravel(), np.tile([True, False], len(facets))
     ends = np.stack([facets, np.roll(facets, -1, axis=1)], axis=2).reshape(-1, 2)
     key = np.sort(ends, axis=1) @ [facets.max() + 1, 1]
-    distinct, first, side = np.unique(key, return_index=True, return_inverse=True)
+    _, first, side = np.unique(key, return_index=True, return_inverse=True)
     return np.sort(ends[first], axis=1), side.ravel(), ends[:, 0] < ends[:, 1]
 
 
@@ -422,9 +422,7 @@ def _closed(x: NDArray[np.float64], facets: NDArray[np.int64]) -> tuple[NDArray,
     return np.stack([one // d, other // d], axis=1), sense[one] != sense[other]
 
 
-def _outward(
-    x: NDArray[np.float64], facets: NDArray[np.int64], pairs: tuple[NDArray, NDArray]
-) -> NDArray[np.int64]:
+def _outward(x: NDArray[np.float64], facets: NDArray[np.int64], pairs: tuple[NDArray, NDArray]) -> NDArray[np.int64]:
     """Return the facets with normals out of the solid.  Surfaces inside other surfaces bound cavities."""
     (one, other), agree = pairs[0].T, pairs[1]
     m = len(facets)
@@ -476,8 +474,8 @@ def _check_crossings(x: NDArray[np.float64], facets: NDArray[np.int64], table: F
     at, facet = at[apart], facet[apart]
     below, above = table.heights(a[at].T, facet), table.heights(b[at].T, facet)
     cross = (below * above <= 0) & (below != above)
-    at, facet, below, above = at[cross], facet[cross], below[cross], above[cross]
-    y = a[at] + (below / (below - above))[:, None] * (b - a)[at]
+    at, facet = at[cross], facet[cross]
+    y = a[at] + (below[cross] / (below - above)[cross])[:, None] * (b - a)[at]
     wrong = np.flatnonzero(table.inside(y.T, facet))
     if len(wrong):
         raise ValueError(

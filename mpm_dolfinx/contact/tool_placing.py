@@ -82,7 +82,7 @@ class Tools(Touching):
             if grid.axisymmetric and tool.free and (tool.spin or np.isfinite(tool.moment or np.inf)):
                 raise ValueError(f"{line(tool)}: spin and moment must be left out in axisymmetry")
             if grid.axisymmetric and getattr(tool.shape, "on_axis", False):
-                raise ValueError(f"{line(tool)}: a side lies on the axis, the section must extend over both sides of it")
+                raise ValueError(f"{line(tool)}: a side lies on the axis, must extend over both sides of it")
             if not callable(tool.displacement) and not callable(tool.rotation_rad):
                 self._pose(tool, 0.0)
         self.tools = tuple(tool.on(grid) for tool in self.tools)
