@@ -71,15 +71,15 @@ class FacetTree:
             node = 2 * node + (second < first)
         return self._facet[node]
 
-    def within(self, y: NDArray[np.float64], reach: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def within(self, y: NDArray[np.float64], limit: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return pairs of a position and a facet, sorted by position.
 
-        Each facet that is nearer to position y (d, m) than `reach` (m,), in m, is in a pair.  Pairs of other facets are
+        Each facet that is nearer to position y (d, m) than `limit` (m,), in m, is in a pair.  Pairs of other facets are
         also possible.
         """
         at = np.arange(y.shape[1])
         node = np.zeros(len(at), dtype=np.int64)
-        most = (reach * (1 + SAME) + self._margin) ** 2
+        most = (limit * (1 + SAME) + self._margin) ** 2
         for boxes in self._levels[1:]:
             at, node = np.repeat(at, 2), np.repeat(2 * node, 2)
             node[1::2] += 1

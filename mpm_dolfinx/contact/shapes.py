@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import ClassVar, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -62,9 +62,6 @@ def unit_vector(name: str, value: ArrayLike) -> NDArray[np.float64]:
 
 class Placed:
     """Base class of shapes whose first field is a position or several positions."""
-
-    uniform: ClassVar[Uniform | None] = None
-    """Centroid and squared radius of gyration in 2D, or None for infinite solids."""
 
     @property
     def dim(self) -> int:
@@ -148,11 +145,6 @@ class Ball(Placed):
         """Return the second derivatives (n, d, d) of the distance, in 1/m."""
         return _across(y - self.centre)[2]
 
-    @property
-    def uniform(self) -> Uniform:
-        """Centre and squared radius of gyration of the disc."""
-        return Uniform(np.array(self.centre, dtype=float), self.radius**2 / 2)
-
 
 @dataclass(frozen=True, eq=False)
 class Convex(Placed):
@@ -204,17 +196,19 @@ class Convex(Placed):
         """Return the second derivatives (n, d, d) of the distance, in 1/m."""
         return _flat(y)
 
-    @property
-    def uniform(self) -> Uniform:
-        """Centroid and squared radius of gyration of the polygon."""
-        hull = ConvexHull(np.asarray(self.corners, dtype=float))
-        x = hull.points[hull.vertices]
-        a, b = (x - x[0])[1:-1], (x - x[0])[2:]
-        area = (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / 2
-        share = area / area.sum()
-        centroid = share @ (a + b) / 3
-        second = share @ (a**2 + b**2 + a * b).sum(axis=1) / 6
-        return Uniform(x[0] + centroid, float(second - centroid @ centroid))
+
+def uniform(shape: Ball | Convex) -> Uniform:
+    """Return the centroid and the squared radius of gyration of a disc or polygon."""
+    if isinstance(shape, Ball):
+        return Uniform(np.array(shape.centre, dtype=float), shape.radius**2 / 2)
+    hull = ConvexHull(np.asarray(shape.corners, dtype=float))
+    x = hull.points[hull.vertices]
+    a, b = (x - x[0])[1:-1], (x - x[0])[2:]
+    area = (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / 2
+    share = area / area.sum()
+    centroid = share @ (a + b) / 3
+    second = share @ (a**2 + b**2 + a * b).sum(axis=1) / 6
+    return Uniform(x[0] + centroid, float(second - centroid @ centroid))
 
 
 @dataclass(frozen=True, eq=False)

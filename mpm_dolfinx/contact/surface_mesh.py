@@ -19,7 +19,7 @@ from mpm_dolfinx.base.tolerances import NEAR, ROUND_OFF, TINY
 from mpm_dolfinx.base.validation import line, numbers
 from mpm_dolfinx.bodies.mesh_files import surface_of
 from mpm_dolfinx.contact.facet_search import AT_ONCE, FacetTree
-from mpm_dolfinx.contact.shapes import ROUNDED, Placed, Uniform
+from mpm_dolfinx.contact.shapes import ROUNDED, Placed
 
 if TYPE_CHECKING:  # meshio takes long to import, so functions import it
     import meshio
@@ -287,11 +287,11 @@ class SurfaceMesh(Placed):
         """Return the signed distances (n,), in m, from the surface."""
         return self._near(y)[2]
 
-    def distance_up_to(self, y: NDArray[np.float64], reach: float) -> NDArray[np.float64]:
-        """Return the signed distances (n,), in m.  Above `reach`, in m, they may be lower bounds of the distance."""
+    def distance_up_to(self, y: NDArray[np.float64], limit: float) -> NDArray[np.float64]:
+        """Return the signed distances (n,), in m.  Above `limit`, in m, they may be lower bounds of the distance."""
         low, high = self._bounds
         out = np.linalg.norm(np.maximum(0, np.maximum(low - y, y - high)), axis=1)
-        near = out <= reach
+        near = out <= limit
         out[near] = self.distance(y[near])
         return out
 
@@ -364,11 +364,6 @@ class SurfaceMesh(Placed):
         trace = np.trace(second)
         return trace if len(second) == 2 else trace * np.eye(3) - second
 
-    @property
-    def uniform(self) -> Uniform:
-        """Centroid and squared radius of gyration of the uniform solid in 2D."""
-        return Uniform(self.centroid, float(np.trace(self._moments[2]) / self.volume))
-
 
 def _merged(x: NDArray[np.float64], facets: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Merge vertices that coincide, and return the vertices and the facets that have extent."""
@@ -432,7 +427,7 @@ def _outward(x: NDArray[np.float64], facets: NDArray[np.int64], pairs: tuple[NDA
     if sheets != 2 * number:
         raise ValueError("SurfaceMesh: the surface has one side only, must have an inside and an outside")
     first = np.unique(part, return_index=True)[1]
-    facets = _turned(facets, sheet[:m] != sheet[first][part])
+    facets = _flipped(facets, sheet[:m] != sheet[first][part])
     corners = x[facets] - x.mean(axis=0)
     volume = np.bincount(part, np.linalg.det(corners - corners[first][part][:, :1]))
     area = np.bincount(part, Facets(x, facets).area)
@@ -440,14 +435,14 @@ def _outward(x: NDArray[np.float64], facets: NDArray[np.int64], pairs: tuple[NDA
     if flat.any():
         what = f"the part of the surface at {_place(x[facets[first[flat][0], 0]])} m has no volume"
         raise ValueError(f"SurfaceMesh: {what}, must bound a solid")
-    facets = _turned(facets, (volume < 0)[part])
+    facets = _flipped(facets, (volume < 0)[part])
     if number == 1:
         return facets
     around = np.array([_winding(x[facets[part != k]] - x[facets[first[k], 0]]) for k in range(number)])
-    return _turned(facets, (np.rint(around) % 2 == 1)[part])
+    return _flipped(facets, (np.rint(around) % 2 == 1)[part])
 
 
-def _turned(facets: NDArray[np.int64], which: NDArray[np.bool_]) -> NDArray[np.int64]:
+def _flipped(facets: NDArray[np.int64], which: NDArray[np.bool_]) -> NDArray[np.int64]:
     """Return the facets, some of them with the opposite orientation."""
     return np.where(which[:, None], facets[:, ::-1], facets)
 
@@ -470,8 +465,8 @@ def _check_crossings(x: NDArray[np.float64], facets: NDArray[np.int64], table: F
     ends = facets if x.shape[1] == 2 else _sides(facets)[0]
     a, b = x[ends].swapaxes(0, 1)
     at, facet = table.tree.within((a + b).T / 2, np.linalg.norm(b - a, axis=1) / 2)
-    apart = (ends[at][:, :, None] != facets[facet][:, None]).all(axis=(1, 2))
-    at, facet = at[apart], facet[apart]
+    separate = (ends[at][:, :, None] != facets[facet][:, None]).all(axis=(1, 2))
+    at, facet = at[separate], facet[separate]
     below, above = table.heights(a[at].T, facet), table.heights(b[at].T, facet)
     cross = (below * above <= 0) & (below != above)
     at, facet = at[cross], facet[cross]

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.base.validation import check_names, given, line, numbers
-from mpm_dolfinx.contact.shapes import ROUNDED, Distance, Placed, Shape, Uniform, unit_vector
+from mpm_dolfinx.contact.shapes import ROUNDED, Ball, Convex, Distance, Placed, Shape, Uniform, uniform, unit_vector
 from mpm_dolfinx.contact.surface_mesh import SurfaceMesh
 from mpm_dolfinx.grid.grid import Grid
 
@@ -186,7 +186,11 @@ class Tool:
 
     def _uniform(self, dim: int) -> Uniform | None:
         """Return the centroid and squared radius of gyration of a free disc or polygon, or None."""
-        return self.shape.uniform if self.free and dim == 2 and isinstance(self.shape, Placed) else None
+        if not self.free or dim != 2:
+            return None
+        if isinstance(self.shape, SurfaceMesh):
+            return Uniform(self.shape.centroid, float(self.shape.inertia / self.shape.volume))
+        return uniform(self.shape) if isinstance(self.shape, (Ball, Convex)) else None
 
     def inertia(self, dim: int) -> float:
         """Return the moment of inertia about the centre, in kg m^2, or infinity for a tool that does not rotate."""
