@@ -119,6 +119,29 @@ def test_distances_from_a_concave_prism_are_exact():
     assert mesh.distance(y)[outside] == pytest.approx(exact[outside], abs=1e-14)
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_distances_from_a_rough_star_are_those_of_all_facets_and_all_solid_angles(seed):
+    """The radii of its vertices are random, also far from the origin and in other units."""
+    rng, sphere = np.random.default_rng(seed), icosphere(2)
+    x = sphere.vertices * rng.uniform(0.3, 1.5, (len(sphere.vertices), 1))
+    y = rng.uniform(-1.5, 1.5, (400, 3))
+    t = x[sphere.facets]
+    rows = np.arange(len(t))
+    one = mpm.SurfaceMesh(x, sphere.facets)
+    table = one._table
+    far = np.array([table.distances(np.repeat(at[:, None], len(rows), axis=1), rows).min() for at in y])
+    a, b, c = (t[None] - y[:, None, None]).transpose(2, 0, 1, 3)
+    size = [np.linalg.norm(v, axis=2) for v in (a, b, c)]
+    turns = ((a, b, size[2]), (b, c, size[0]), (c, a, size[1]))
+    under = np.prod(size, axis=0) + sum((u * v).sum(axis=2) * r for u, v, r in turns)
+    angle = 2 * np.arctan2((a * np.cross(b, c)).sum(axis=2), under).sum(axis=1)
+    exact = np.where(np.abs(angle) > 2 * np.pi, -far, far)
+    assert one.distance(y) == pytest.approx(exact, abs=1e-13)
+    shift, unit = np.array([3e3, -1e3, 50.0]), 1e3
+    other = mpm.SurfaceMesh(unit * x + shift, sphere.facets)
+    assert other.distance(unit * y + shift) == pytest.approx(unit * exact, abs=1e-11 * unit)
+
+
 @pytest.mark.parametrize("make", [lambda: mpm.SurfaceMesh(L_SHAPE), lambda: mpm.SurfaceMesh(*bar(L_SHAPE))])
 def test_normals_and_curvatures_are_derivatives(make):
     mesh, rng, h = make(), np.random.default_rng(3), 1e-5
