@@ -7,7 +7,7 @@ A `Simulation` has these parts:
 * materials: `Hencky`, `NeoHookean`, `LinearElastic`, `DruckerPrager`, `SofteningDruckerPrager`, `MohrCoulomb`,
   `ModifiedCamClay`, `BarcelonaBasic`, or your own `Skeleton`;
 * a pore `Fluid`, and conditions on sides: `Traction`, `Pressure`, `Displacement`, `RigidPlate`, `Drained`, `Inflow`;
-* rigid tools (`Tool`) with the shape `HalfSpace`, `Ball`, `Convex` or `Cone`.
+* rigid tools (`Tool`) with the shape `HalfSpace`, `Ball`, `Convex`, `Cone` or `SurfaceMesh`.
 
 `Simulation.run` returns a `Result`, with records at `probes`.  A `Writer` writes results to files, and `one_file` joins
 these files.  `resume` continues a run from a `Checkpoint`.  `Simulation.stage` changes the scene between two runs.
@@ -45,6 +45,7 @@ from mpm_dolfinx.conditions.record import Record
 from mpm_dolfinx.conditions.water import water
 from mpm_dolfinx.contact.groups import Contact
 from mpm_dolfinx.contact.shapes import Ball, Cone, Convex, HalfSpace, Shape
+from mpm_dolfinx.contact.surface_mesh import SurfaceMesh
 from mpm_dolfinx.contact.tool import Pose, Tool
 from mpm_dolfinx.flow.feeding import Feeding, Feeds, Leaving
 from mpm_dolfinx.grid.grid import Grid
@@ -149,6 +150,7 @@ __all__ = [
     "SofteningDruckerPrager",
     "Source",
     "State",
+    "SurfaceMesh",
     "Tangent",
     "Through",
     "Tied",

@@ -83,6 +83,7 @@ WANTED = {  # number, and relative tolerance
     "slope_in_rain": (1.52, 0.05),  # cells and steps of half the size
     "slope_stability": (1.368, 0.03),  # the best log-spiral mechanism
     "t_bar": (4 * np.sqrt(2) + 2 * np.pi, 0.03),  # Randolph and Houlsby
+    "tool_from_stl": (0.8 * 0.6 * 0.4 * 0.6 * 2650 * 9.81 / 1000, 1e-3),  # volume times unit weight, kN
     "triaxial": (1.2 / 2 * 100 * (1.5 / 2) ** 0.8, 2e-3),  # M / 2 p (OCR / 2)^(1 - kappa / lambda), kPa
 }
 ON_PROCESSES = {"processes"}

@@ -162,6 +162,39 @@ def _of_meshio(grid: Grid, mesh: meshio.Mesh | Path, names: Mapping[str, int], t
     return Mesh(_plane(dim, x, cells), cells, parts, sides)
 
 
+def surface_of(mesh: str | os.PathLike | meshio.Mesh) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Return the vertices (n, d) of a mesh and its facets: triangles (m, 3), or lines (m, 2) if the mesh is plane.
+
+    Quadrilaterals are divided into two triangles, and second-order facets are reduced to their corners.
+    """
+    import meshio
+
+    from mpm_dolfinx.bodies import mesh_readers
+
+    name = "mesh"
+    if isinstance(mesh, (str, os.PathLike)):
+        name, mesh = f"mesh {os.fspath(mesh)}", _file(path("mesh", mesh))
+    instance("mesh", mesh, meshio.Mesh)
+    mesh_readers.check_systems(mesh)
+    x, found = _positions(2, mesh.points), {"line": [], "triangle": [], "quad": []}
+    for block in mesh.cells:
+        kind, rows = SECOND_ORDER.get(block.type, block.type), np.asarray(block.data)
+        if kind in found and len(rows):
+            _check_nodes(rows, len(x))
+            if kind != block.type:
+                curved = "line3" if kind == "line" else kind
+                _warn_curved(name, len(rows), 0.0 if curved == "line3" else _edge_node_distance(x, rows, kind))
+            found[kind].append(rows[:, : {"line": 2, "triangle": 3, "quad": 4}[kind]].astype(np.int64))
+    used = np.concatenate([np.zeros(0, np.int64), *(rows.ravel() for of in found.values() for rows in of)])
+    plane = x.shape[1] == 2 or np.ptp(x[used], axis=0)[2] <= NEAR * np.ptp(x[used], axis=0).max() if len(used) else True
+    triangles = [rows[:, of] for rows in found["quad"] for of in ([0, 1, 2], [0, 2, 3])] + found["triangle"]
+    facets = found["line"] if plane else triangles
+    if not facets:
+        kinds = ", ".join(sorted({block.type for block in mesh.cells})) or "none"
+        raise ValueError(f"{name}: has cells {kinds}, must have triangles or quadrilaterals, or lines in a plane z = 0")
+    return x[:, : 2 if plane else 3], np.concatenate(facets)
+
+
 def _positions(dim: int, points: Any) -> NDArray[np.float64]:
     """Return the positions of the vertices of a mesh, in m."""
     x = np.asarray(points, dtype=float)

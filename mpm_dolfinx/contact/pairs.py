@@ -101,16 +101,16 @@ class ToolPairs(Pairs):
 
         def ask() -> None:
             for number, (tool, pose) in enumerate(zip(self.tools, self.poses, strict=True)):
-                solid, rows = tool.solid(h), np.flatnonzero(self.number == number)
+                rows = np.flatnonzero(self.number == number)
                 before, pose = pose, pose.moved(shift[number])
                 if pose.R is not before.R:
                     turn = pose.R @ before.R.T
                     carried[rows] = pose.put(before.own(self.carried[rows]))
                     shear[rows] = shear[rows] @ turn.T
                 y, middle[rows] = pose.own(x[rows]), pose.centre + pose.shift
-                gap[rows], n[rows] = solid.distance(y), solid.normal(y) @ pose.R.T
-                second[rows] = pose.R @ solid.curvature(y) @ pose.R.T
-                if isinstance(solid, Distance):
+                gap[rows], normal, curvature = tool.geometry(y, h)
+                n[rows], second[rows] = normal @ pose.R.T, pose.R @ curvature @ pose.R.T
+                if isinstance(tool.solid(h), Distance):
                     _check_distance(tool, x[rows] + self.grid.base, gap[rows], n[rows], h)
 
         together(self.grid.comm, ask)

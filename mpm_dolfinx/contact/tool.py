@@ -13,7 +13,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.base.validation import check_names, given, line, numbers
 from mpm_dolfinx.contact.shapes import ROUNDED, Ball, Convex, Distance, Placed, Shape, Uniform, uniform, unit_vector
+from mpm_dolfinx.contact.surface_mesh import SurfaceMesh
 from mpm_dolfinx.grid.grid import Grid
+
+AS_CELL = [0, 1, 2, 2, 0, 1, 2, 2]  # corners of a triangle at the corners of a flat cell
 
 
 class Pose(NamedTuple):
@@ -60,7 +63,7 @@ class Tool:
 
     Parameters
     ----------
-    shape : HalfSpace, Ball, Convex, Cone, or callable y (m, d) -> (m,), m
+    shape : HalfSpace, Ball, Convex, Cone, SurfaceMesh, or callable y (m, d) -> (m,), m
         The tool in its initial position.  A function returns the signed distance, positive outside the tool.
     displacement : (d,) or callable t (s) -> (d,), m
         Displacement from the initial position, also in later stages.  In axisymmetry, it must be along the axis.
@@ -128,7 +131,8 @@ class Tool:
 
     def __post_init__(self):
         if not isinstance(self.shape, Placed) and not callable(self.shape):
-            raise ValueError(f"Tool: shape = {line(self.shape)}, must be a HalfSpace, Ball, Convex, Cone or a function")
+            allowed = "a HalfSpace, Ball, Convex, Cone, SurfaceMesh or a function"
+            raise ValueError(f"Tool: shape = {line(self.shape)}, must be {allowed}")
         for name in ("friction", "adhesion"):
             value = getattr(self, name)
             numbers(f"Tool: {name}", value, test=lambda v: (v >= 0) & (v < np.inf), allowed=">= 0 and finite")
@@ -181,7 +185,11 @@ class Tool:
 
     def _uniform(self, dim: int) -> Uniform | None:
         """Return the centroid and squared radius of gyration of a free disc or polygon, or None."""
-        return uniform(self.shape) if self.free and dim == 2 and isinstance(self.shape, (Ball, Convex)) else None
+        if not self.free or dim != 2:
+            return None
+        if isinstance(self.shape, SurfaceMesh):
+            return Uniform(self.shape.centroid, float(self.shape.inertia / self.shape.volume))
+        return uniform(self.shape) if isinstance(self.shape, (Ball, Convex)) else None
 
     def inertia(self, dim: int) -> float:
         """Return the moment of inertia about the centre, in kg m^2, or infinity for a tool that does not rotate."""
@@ -231,6 +239,21 @@ class Tool:
     def solid(self, h: float) -> Shape:
         """Return the shape.  `h` is the cell size, in m."""
         return Distance(self.shape, h, self._base) if callable(self.shape) else self._moved or self.shape
+
+    def gap(self, y: NDArray[np.float64], h: float) -> NDArray[np.float64]:
+        """Return the signed distances (n,), in m, of positions y (n, d) in the frame of the tool.
+
+        Distances above the cell size `h`, in m, may be lower bounds.
+        """
+        solid = self.solid(h)
+        return solid.distance_up_to(y, h) if isinstance(solid, SurfaceMesh) else solid.distance(y)
+
+    def geometry(self, y: NDArray[np.float64], h: float) -> tuple[NDArray, NDArray, NDArray]:
+        """Return distances (n,), gradients (n, d) and second derivatives (n, d, d) at positions y, see `Shape`."""
+        solid = self.solid(h)
+        if isinstance(solid, SurfaceMesh):
+            return solid.geometry(y)
+        return solid.distance(y), solid.normal(y), solid.curvature(y)
 
     def check(self, dim: int) -> None:
         """Raise an error for a tool of the wrong dimension, or with an invalid initial motion."""
@@ -286,10 +309,12 @@ class Tool:
     def drawn(self, grid: Grid, t: float, by_forces: NDArray[np.float64] | float = 0.0) -> NDArray[np.float64]:
         """Return the corners (n, 2^d, d), in m, of the grid cells inside the tool at time t (s), for pictures.
 
-        Corners outside the tool are projected onto its surface, so edges are blunt by a fraction of a cell.
-        `by_forces`: see `pose`.
+        Corners outside the tool are projected onto its surface, so edges are blunt by a fraction of a cell.  The facets
+        of a `SurfaceMesh` in 3D are drawn instead, as flat cells.  `by_forces`: see `pose`.
         """
         pose = self.pose(t, grid.dim, by_forces)
+        if isinstance(self.shape, SurfaceMesh) and grid.dim == 3:
+            return pose.put(self.shape.vertices)[self.shape.facets[:, AS_CELL]]
         solid = self.solid(grid.least)
         nodes = tuple(grid.shape + 1)
         y = pose.own(grid.base + grid.places(np.stack(np.unravel_index(np.arange(np.prod(nodes)), nodes), axis=1)))

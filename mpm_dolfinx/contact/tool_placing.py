@@ -84,6 +84,8 @@ class Tools(Touching):
                 raise ValueError(f"Tool: velocity = {line(tool.velocity)}, must be along the axis in axisymmetry")
             if grid.axisymmetric and tool.free and (tool.spin or np.isfinite(tool.moment or np.inf)):
                 raise ValueError(f"{line(tool)}: spin and moment must be left out in axisymmetry")
+            if grid.axisymmetric and getattr(tool.shape, "on_axis", False):
+                raise ValueError(f"{line(tool)}: a side lies on the axis, must extend over both sides of it")
             if not callable(tool.displacement) and not callable(tool.rotation_rad):
                 self._pose(tool, 0.0)
         self.tools = tuple(tool.on(grid) for tool in self.tools)
@@ -353,7 +355,7 @@ class Tools(Touching):
     def _gaps(self, tool: Tool, corners: NDArray[np.float64], t: float) -> NDArray[np.float64]:
         """Return the distances of corners from a tool at time t, in m."""
         own = self._pose(tool, t).own(corners.reshape(-1, self.grid.dim))
-        gap = together(self.grid.comm, lambda: tool.solid(self.grid.least).distance(own))
+        gap = together(self.grid.comm, lambda: tool.gap(own, self.grid.least))
         return gap.reshape(corners.shape[:2])
 
     def _passed(self, tool: Tool, x: tuple[NDArray[np.float64], ...], times: tuple[float, ...]) -> str:
@@ -367,7 +369,7 @@ class Tools(Touching):
         done = np.zeros(len(y))
         on = np.arange(len(y))
         along = (end - y) / np.maximum(length, TINY)[:, None]
-        inside = together(self.grid.comm, lambda: (tool.solid(h).distance(y) < 0) | (tool.solid(h).distance(end) < 0))
+        inside = together(self.grid.comm, lambda: (tool.gap(y, h) < 0) | (tool.gap(end, h) < 0))
         a, b = together(self.grid.comm, lambda: (tool.solid(h).normal(y[inside]), tool.solid(h).normal(end[inside])))
         crossed = x[1][inside][np.einsum("nd,nd->n", a, b) < 0][:1]  # inside, and the nearest side has changed
         if where := first(comm, "".join(np.array2string(place, precision=6) for place in crossed + self.grid.base)):
@@ -375,7 +377,7 @@ class Tools(Touching):
         on = on[~inside]
         while over_all(comm, len(on)):
             at = y[on] + done[on, None] * along[on]
-            gap = together(self.grid.comm, lambda at=at: tool.solid(h).distance(at))
+            gap = together(self.grid.comm, lambda at=at: tool.gap(at, h))
             inside = x[1][on[gap < -2 * DEPTH * h]][:1]  # the middles of thin domains slide along round tools
             if where := first(comm, "".join(np.array2string(place, precision=6) for place in inside + self.grid.base)):
                 return where
@@ -386,7 +388,7 @@ class Tools(Touching):
     def _deepest(self, tool: Tool, x: NDArray[np.float64], t: float) -> tuple[float, str]:
         """Return the largest penetration of positions x into a tool, in cell sizes, and the position as text."""
         h, pose = self.grid.least, self._pose(tool, t)
-        gap = together(self.grid.comm, lambda: tool.solid(h).distance(pose.own(x)))
+        gap = together(self.grid.comm, lambda: tool.gap(pose.own(x), h))
         deepest = over_all(self.grid.comm, float(gap.min(initial=np.inf)), MPI.MIN)
         place = (
             np.array2string(x[gap.argmin()] + self.grid.base, precision=6) if len(gap) and gap.min() == deepest else ""
