@@ -27,6 +27,7 @@ from mpm_dolfinx.base.validation import line
 from mpm_dolfinx.bodies.faces import Surface, face_vectors
 from mpm_dolfinx.conditions.acting import Acting, At, Loads, Place, Setting
 from mpm_dolfinx.conditions.conditions import HOLD, Displacement, holding, resistance
+from mpm_dolfinx.domains.cut_domains import Patches
 from mpm_dolfinx.forms.point_forms import FormPoints, PointData, PointForm
 from mpm_dolfinx.grid.grid import Grid, sum_by
 from mpm_dolfinx.mechanics.held_cells import HeldCells, HeldPoints, inner_cells
@@ -93,24 +94,25 @@ class GivenDisplacements(Acting):
         return [faces for _, faces, _ in self._holds]
 
     def check_start(self, place: Place) -> None:
-        """Warn once for each condition whose side must jump at the start of a stage with inertia.
-
-        A gap counts as a jump if its strain in the cell exceeds the cell's stress divided by the modulus.
-        """
+        """Warn once for each condition whose side must jump at the start of a stage with inertia."""
         if not (place.inertia and place.dt):
             return
         points = place.points
-        tension, modulus = self._materials.total_stress(points), self._materials.table(points, holding)
         for number, (hold, faces, axes) in enumerate(self._holds):
             p = place.cut.surface(faces)
             gap = (p.origin(points) + self._given(hold, place.start, p.X) - p.now(points))[:, axes]
-            strain = np.linalg.norm(gap, axis=1) / self._grid.sizes_at(p.x).min(axis=-1)
-            sudden = strain > np.maximum(NEAR, np.linalg.norm(tension[p.at], axis=(1, 2)) / modulus[p.at])
+            sudden = self._sudden(points, p, gap)
             jump = over_all(self._grid.comm, float(np.abs(gap[sudden]).max(initial=0.0)), MPI.MAX)
             if jump:
                 what = "%s: moves its side by %.3g m at once at t = %.6g s, as bodies with inertia begin to move; %s"
                 why = "values count from the start or the last reset_displacement, must begin at the present position"
                 self._warn(number, what, jump, place.start, why)
+
+    def _sudden(self, points: MaterialPoints, p: Patches, gap: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return whether gaps (n, k), in m, are jumps: their strain in a cell exceeds stress divided by modulus."""
+        tension, modulus = self._materials.total_stress(points), self._materials.table(points, holding)
+        strain = np.linalg.norm(gap, axis=1) / self._grid.sizes_at(p.x).min(axis=-1)
+        return strain > np.maximum(NEAR, np.linalg.norm(tension[p.at], axis=(1, 2)) / modulus[p.at])
 
     def placed(self, place: Place) -> Loads:
         """Return the penalties in a substep."""
@@ -164,7 +166,7 @@ class GivenDisplacements(Acting):
                 given[0] = in_step((t - ends[0]) / (ends[1] - ends[0]), given[1], given[0], given[2])
             start, to = (p.origin(points) + given[k] for k in (1, 0))
             step, given = given[0] - given[1], np.concatenate(given[1:], axis=1)
-            jumps = HOLD * np.linalg.norm((to - now)[:, axes], axis=1) > self._grid.least  # see `check_came`
+            jumps = HOLD * np.linalg.norm((to - now)[:, axes], axis=1) > self._grid.least
             step = np.where(jumps[:, None], to - now, step)
             R = rotated(self._grid.comm, p.area0, now, to) if len(axes) == d else np.eye(d)  # of the traction
             force, gap = np.einsum("ij,njk,nk->ni", R, stress[at, :d, :d], p.area(points)), to - now
@@ -226,9 +228,9 @@ class GivenDisplacements(Acting):
             start, end = (self._given(hold, t, p.X) for t in (place.start, place.t))
             gaps = (p.origin(of) + given - p.now(of) for of, given in ((before, start), (points, end)))
             old, new, increment = (np.linalg.norm(v[:, axes], axis=1) for v in (*gaps, end - start))
-            if place.begins:  # a prescribed value that begins farther from the present position than penalties yield
-                jump = np.linalg.norm((p.origin(before) + end - p.now(before))[:, axes], axis=1)
-                sudden = HOLD * jump > self._grid.least
+            if place.begins:  # a prescribed value may begin away from the present position
+                gap = (p.origin(before) + end - p.now(before))[:, axes]
+                sudden, jump = self._sudden(before, p, gap), np.linalg.norm(gap, axis=1)
                 old, increment = np.where(sudden, 0.0, old), np.where(sudden, jump, increment)
             moves = increment > NEAR * self._grid.least
             share = 1 - ((new - old)[moves] / increment[moves]).min(initial=np.inf)
