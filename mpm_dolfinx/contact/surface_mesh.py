@@ -18,8 +18,8 @@ from scipy.spatial import cKDTree
 from mpm_dolfinx.base.tolerances import NEAR, ROUND_OFF, TINY
 from mpm_dolfinx.base.validation import line, numbers
 from mpm_dolfinx.bodies.mesh_files import surface_of
-from mpm_dolfinx.contact.facet_search import AT_ONCE, FacetTree
 from mpm_dolfinx.contact.shapes import ROUNDED, Placed
+from mpm_dolfinx.points.facet_search import AT_ONCE, FacetTree
 
 if TYPE_CHECKING:  # meshio takes long to import, so functions import it
     import meshio
