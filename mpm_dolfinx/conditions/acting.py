@@ -21,6 +21,7 @@ import numpy as np
 from dolfinx import fem
 from numpy.typing import NDArray
 
+from mpm_dolfinx.base.time_integration import GAMMA
 from mpm_dolfinx.bodies.faces import Surface
 from mpm_dolfinx.conditions.conditions import Displacement
 from mpm_dolfinx.conditions.sides import Sides
@@ -104,6 +105,11 @@ class Place(NamedTuple):
     before: Outcome  # reactions, outflows and other results of the previous step
     inertia: bool = False  # whether the bodies have inertia
     begins: bool = False  # whether the step is the first of its stage
+
+    @property
+    def rate(self) -> float:
+        """Acceleration divided by displacement in a substep of SDIRK2, in 1/s^2, or 0 without inertia."""
+        return 1 / (GAMMA * self.dt) ** 2 if self.inertia and self.dt > 0 else 0.0
 
 
 class Shares(NamedTuple):

@@ -45,6 +45,10 @@ STIFF = 100.0
 """The stiffness k is this factor times the modulus from `resistance`, divided by the cell size.  Plateau (scene
 "contact" of tests/plateaus.py): half this value changes the result by 1.9e-03, twice this value by 3.2e-03, and finer
 cells by 1.1e-02.
+
+With inertia, `rho h^2 / (GAMMA dt)^2` is added to the modulus, as in the matrix of a substep.  With the modulus alone,
+the correction of a penetration within `DEPTH` would cause large forces in short steps.  If two bars collide, with steps
+of a quarter of the time of a wave through a cell, contact forces then alternate between 0 and twice their value.
 """
 GRIP = 6.0
 """The stiffness k_t is this factor times the modulus from `resistance`, divided by the cell size.
@@ -117,7 +121,8 @@ class ContactLaw:
         self.strength = strength[key // self.grid.num_local]
         h, of_pairs = (self.grid.sizes(cells).min(axis=-1) for cells in (self.cell, pairs.cell))
         self._size = h
-        self._stiffness, self._hold = STIFF / of_pairs * pairs.resistance, GRIP / h * self.mean(pairs.resistance)
+        self._modulus, self._hold = STIFF / of_pairs * pairs.resistance, GRIP / h * self.mean(pairs.resistance)
+        self._stiffness = self._modulus + STIFF * of_pairs * pairs.inertia
         self.frictional = any(contact.frictional for contact in contacts)
 
     def begins(self) -> ContactState:
@@ -247,7 +252,9 @@ class ContactLaw:
         x = self.pairs.x
         plane = self.total(self.pairs.area / np.maximum(self.grid.around(x), TINY))  # both are 0 on the axis
         whole = np.minimum(1.0, plane / self.grid.smallest_faces(self.cell))
-        off = whole * np.abs(touch.pressure - state.pressure) / self.mean(self.stiffness(state)) / self._size
+        # with inertia the allowed penetration decreases as the stiffness increases
+        stiffness = self.mean(state.updates[self.of, 0] * self._modulus)
+        off = whole * np.abs(touch.pressure - state.pressure) / stiffness / self._size
         most = largest(off)
         if not over_all(self.grid.comm, int((most > DEPTH).sum())):
             return state

@@ -22,7 +22,6 @@ from mpm_dolfinx.base.validation import line
 from mpm_dolfinx.bodies.faces import Surface, surface
 from mpm_dolfinx.bodies.touching import BITS, local, weights
 from mpm_dolfinx.conditions.acting import Loads, Place, Setting
-from mpm_dolfinx.conditions.conditions import resistance
 from mpm_dolfinx.contact.groups import Contact
 from mpm_dolfinx.contact.history import Origin, pressure_name, shear_name
 from mpm_dolfinx.contact.law import ContactLaw
@@ -55,7 +54,7 @@ class Facets(NamedTuple):
     x: NDArray[np.float64]  # position (n, d), m
     face: NDArray[np.int64]  # row of the face in its `Surface` (n,)
     cell: NDArray[np.int64]  # lexicographic cell (n,)
-    resistance: NDArray[np.float64]  # reference modulus (n,), Pa
+    stiffness: NDArray[np.float64]  # modulus and density (n, 2), see `Touching._stiffness`
     corners: NDArray[np.float64]  # current corners of the face (n, 2^(d-1), d), m
     cut: NDArray[np.float64]  # corners of the face at the last grid reset (n, 2^(d-1), d), m
     outward: NDArray[np.float64]  # outward unit normal (n, d)
@@ -98,15 +97,14 @@ class Contacts(Touching):
         def again(u: NDArray[np.float64]) -> tuple[ContactLaw, Origin]:
             moved, _ = cut.followed(u.reshape(-1, self.grid.dim), np.zeros(self.grid.num_local, dtype=bool))
             present = replace(points, corners=points.corners + moved)
-            return self._law(cut, points, self._opposite_all(cut, present), present, present, cell_pairs)
+            return self._law(place, self._opposite_all(cut, present), present, present, cell_pairs)
 
-        first_law = self._law(cut, points, found, cut.points, points, cell_pairs)
+        first_law = self._law(place, found, cut.points, points, cell_pairs)
         return ContactLoads(self, cut, *first_law, again, cell_pairs)
 
     def _law(
         self,
-        cut: CutDomains,
-        points: MaterialPoints,
+        place: Place,
         found: Sequence[tuple[Facets, Pairs]],
         seen: MaterialPoints,
         present: MaterialPoints,
@@ -117,7 +115,8 @@ class Contacts(Touching):
         d = self.grid.dim
         rows = []
         off = ""
-        own = self._materials.table(cut.points, resistance)
+        cut, points = place.cut, place.points
+        own = self._stiffness(cut.points)
         for i, ((number, faces, others, sign), (facets, pairs)) in enumerate(zip(self._faces, found, strict=True)):
             patches = cut.surface(faces)
             now = facets if present is seen else self._facets(cut, others, present)
@@ -139,11 +138,11 @@ class Contacts(Touching):
             if self.contacts[number].frictional:
                 old = _rotated(points.data[shear_name(self.names[number])][at], n)
             pressure = points.data[pressure_name(self.names[number])][at]
-            resistances = np.minimum(own[at], now.resistance[other])
-            place = (i + grid.comm.rank * len(self._faces)) * PLACES + row
+            stiffness = np.minimum(own[at], now.stiffness[other]) * [1.0, place.rate]
+            serial = (i + grid.comm.rank * len(self._faces)) * PLACES + row
             outward = patches.area(points)[row] if self.conducts else np.zeros((len(row), 0))
             fixed = np.full((len(row), 2), [number, sign])
-            scalars = np.column_stack([fixed, place, size, resistances, pressure])
+            scalars = np.column_stack([fixed, serial, size, stiffness, pressure])
             offset = patches.now(present)[row] - y
             vectors = patches.x[row], where, n, offset, old, outward
             rows.append((patches.cell[row], cell, at, np.hstack([scalars, *vectors])))
@@ -152,10 +151,10 @@ class Contacts(Touching):
         cell, other, at, values = (np.concatenate(column) for column in zip(*rows, strict=True))
         exchange = Exchange(grid.comm, grid.owner(cell))
         cell, other, sent = (exchange.send(columns) for columns in (cell, other, values))
-        number, sign, place = sent[:, :3].T.astype(np.int64)
-        x, y, n, offset, shear, outward = np.split(sent[:, 6:], d * np.arange(1, 6), axis=1)
-        own = number, grid.locals[cell], *sent[:, 3:6].T, shear, x, sign
-        pairs = FacePairs(grid, *own, other, y, n, offset, place, outward)
+        number, sign, serial = sent[:, :3].T.astype(np.int64)
+        x, y, n, offset, shear, outward = np.split(sent[:, 7:], d * np.arange(1, 6), axis=1)
+        own = number, grid.locals[cell], *sent[:, 3:7].T, shear, x, sign
+        pairs = FacePairs(grid, *own, other, y, n, offset, serial, outward)
         return ContactLaw(self.names, self.contacts, pairs), Origin(
             exchange, at, values[:, 0].astype(np.int64), values[:, 3]
         )
@@ -189,17 +188,17 @@ class Contacts(Touching):
         now, then = (
             np.take_along_axis(of.corners[patches.at], index[:, :, None], axis=1) for of in (points, cut.points)
         )
-        resistances = self._materials.table(cut.points, resistance)[patches.at]
+        stiffness = self._stiffness(cut.points)[patches.at]
         area = patches.area(points)
         n = len(now)
         k = 2 ** (d - 1) * d
         outward = area / np.maximum(np.linalg.norm(area, axis=1, keepdims=True), TINY)
         whole = np.column_stack([patches.face, patches.cell])
-        rows = np.column_stack([patches.now(points), resistances, now.reshape(n, k), then.reshape(n, k), outward])
+        rows = np.column_stack([patches.now(points), stiffness, now.reshape(n, k), then.reshape(n, k), outward])
         whole, rows = (np.concatenate(self.grid.comm.allgather(part)) for part in (whole, rows))
-        x, resistances, now, then, outward = np.split(rows, np.cumsum([d, 1, k, k]), axis=1)
+        x, stiffness, now, then, outward = np.split(rows, np.cumsum([d, 2, k, k]), axis=1)
         shape = (len(rows), 2 ** (d - 1), d)
-        return Facets(x, *whole.T, resistances[:, 0], now.reshape(shape), then.reshape(shape), outward)
+        return Facets(x, *whole.T, stiffness, now.reshape(shape), then.reshape(shape), outward)
 
     def _opposite(
         self, cut: CutDomains, faces: Surface, others: Surface, points: MaterialPoints
@@ -237,12 +236,16 @@ class Contacts(Touching):
         return np.where(np.isin(facets.face[chosen] * grid.all_cells + number, keys), number, facets.cell[chosen])
 
     def near(self, cut: CutDomains, points: MaterialPoints, corners: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return which corners (n, 2^d, d) of domains are near another group; `points` are those before the step."""
+        """Return which moved corners (n, 2^d, d) are near another group, whose corners have also moved.
+
+        `points`: points before the step.
+        """
+        present = replace(points, corners=corners)
         out, largest = np.zeros(corners.shape[:2], dtype=bool), BESIDE * self.grid.sizes_at(corners).max(axis=-1)
         largest = np.broadcast_to(largest, corners.shape[:2])
         for _, *pair, _ in self._faces:
             for own, other in (pair, pair[::-1]) if all(map(len, pair)) else ():
-                x = self._facets(cut, other, points).x
+                x = self._facets(cut, other, present).x
                 rows = np.flatnonzero(self.grid.copy(points.id) == self.grid.copy(own.id[:1]))
                 distance, _ = cKDTree(x).query(corners[rows], distance_upper_bound=BESIDE * self.grid.most)
                 out[rows] |= distance < largest[rows]

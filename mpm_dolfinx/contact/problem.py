@@ -36,6 +36,7 @@ from mpm_dolfinx.base.caching import Latest
 from mpm_dolfinx.base.errors import NotConverged
 from mpm_dolfinx.base.tolerances import EPSILON, SAME
 from mpm_dolfinx.conditions.acting import Acting, At, Loads, Setting
+from mpm_dolfinx.conditions.conditions import resistance
 from mpm_dolfinx.contact.history import Origin, Rough, joined, pressure_name, shear_name
 from mpm_dolfinx.contact.law import BEGIN, DEPTH, ROUNDS, ContactLaw, ContactState, Touch
 from mpm_dolfinx.contact.pairs import Geometry, Pairs, at_nodes
@@ -103,6 +104,10 @@ class Touching(Acting):
         self.names = tuple(given)
         self._frictional = [one.frictional for one in given.values()]
         self.symmetric = not any(self._frictional)
+
+    def _stiffness(self, points: MaterialPoints) -> NDArray[np.float64]:
+        """Return the reference modulus, in Pa, and the density, in kg/m^3, of each point, as columns (n, 2)."""
+        return np.column_stack([self._materials.table(points, resistance), self._materials.present_density(points)])
 
     def kept(self, n: int) -> dict[str, dict[str, NDArray[np.float64]]]:
         """Return zero contact pressures of n points, and zero shear tractions for contacts that resist slip."""

@@ -18,7 +18,6 @@ from mpm_dolfinx.base.time_integration import in_step
 from mpm_dolfinx.base.tolerances import TINY
 from mpm_dolfinx.base.validation import line
 from mpm_dolfinx.conditions.acting import At, Loads, Outcome, Place, Setting, Shares
-from mpm_dolfinx.conditions.conditions import resistance
 from mpm_dolfinx.contact.free_tools import FreeTools
 from mpm_dolfinx.contact.history import Origin, pressure_name, shear_name
 from mpm_dolfinx.contact.law import DEPTH, ContactLaw
@@ -209,7 +208,7 @@ class Tools(Touching):
         patches = cut.surface(self.outside)
         x, area = patches.now(points), patches.area(points)
         size, free = np.linalg.norm(area, axis=1), self._free[patches.face]
-        resistances = self._materials.table(cut.points, resistance)[patches.at]
+        stiffness = self._stiffness(cut.points)[patches.at] * [1.0, place.rate]
         poses, found = [self._posed(tool, start, t) for tool in self.tools], []
         # the initial stress is balanced without loads on tools
         loads = [tool.pushes(t) if t > start and not tool.free else np.nan for tool in self.tools]
@@ -225,13 +224,13 @@ class Tools(Touching):
             )
             vectors = [x[at], pose.put(before.own(x[at])), old @ (pose.R @ before.R.T).T]
             pressure = points.data[pressure_name(self.names[number])][patches.at[at]]
-            scalars = [np.full(len(at), number), size[at], resistances[at], pressure]
+            scalars = [np.full(len(at), number), size[at], *stiffness[at].T, pressure]
             found.append((at, np.concatenate([np.stack(scalars, axis=1), *vectors], axis=1)))
         at, values = (np.concatenate(column) for column in zip(*found, strict=True))
         exchange = Exchange(grid.comm, grid.owner(patches.cell[at]))
         cell, places, sent = (exchange.send(rows) for rows in (patches.cell[at], patches.x[at], values))
-        number, *own = sent[:, :4].T
-        now, carried, shear = np.split(sent[:, 4:], 3, axis=1)
+        number, *own = sent[:, :5].T
+        now, carried, shear = np.split(sent[:, 5:], 3, axis=1)
         acts = np.ones(len(number)), self.tools, poses
         pairs = ToolPairs(grid, number.astype(np.int64), grid.locals[cell], *own, shear, places, *acts, now, carried)
         origin = Origin(exchange, patches.at[at], values[:, 0].astype(np.int64), values[:, 1])
