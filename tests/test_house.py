@@ -8,7 +8,7 @@ import ways
 CEILINGS = {
     "ad hoc named numbers": 77,
     "rules among numbers in functions": 3,
-    "imports a file, mean": 5.56,
+    "imports a file, mean": 5.54,
     "files in a circle of imports": 0,
     "folders in a circle of imports": 0,
     "files of the largest folder": 14,
@@ -17,7 +17,7 @@ CEILINGS = {
     "changes of hidden state": 0,
     "asserts and RuntimeErrors": 3,  # of users on other processes, and of two reference solutions
     "files that name a condition's class, most": 6,
-    "lines of the package": 40000,
+    "lines of the package": 39974,
 }
 
 WAYS = {"rooms of a traction": 13, "rooms of an initial pressure": 15, "homes of the pressure": 4}

@@ -132,7 +132,7 @@ def edges(corners: NDArray[np.float64]) -> NDArray[np.float64]:
 def centroids(corners: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the centroids (n, d), in m, of domains, or in axisymmetry of their sections.
 
-    Inverted simplices have negative volume, as in `cut`.
+    Inverted simplices count with positive volume here, so the centroid of a partly inverted domain lies within it.
     """
     chunks = _chunks(len(corners), corners.shape[2])
     return _centroids(corners) if len(chunks) == 1 else np.concatenate([_centroids(corners[part]) for part in chunks])
@@ -140,11 +140,11 @@ def centroids(corners: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _centroids(corners: NDArray[np.float64]) -> NDArray[np.float64]:
     v = vertices(np.ascontiguousarray(corners.transpose(1, 2, 0)))
-    volume, middle = simplex_volumes(v), v[-1]
+    volume, middle = np.abs(simplex_volumes(v)), v[-1]
     whole, moment = np.add.reduce(volume), np.zeros(middle.shape)
     for share, simplex in zip(volume, simplices(v.shape[1]), strict=True):
         moment += share * (np.add.reduce(v[simplex]) / len(simplex) - middle)
-    return (middle + np.divide(moment, whole, out=np.zeros(moment.shape), where=whole != 0)).T.copy()
+    return (middle + np.divide(moment, whole, out=np.zeros(moment.shape), where=whole > 0)).T.copy()
 
 
 def tangled(corners: NDArray[np.float64], volume: NDArray[np.float64], axisymmetric: bool = False) -> NDArray[np.bool_]:
