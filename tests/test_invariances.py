@@ -179,7 +179,7 @@ def test_scenes_with_inertia_ties_and_free_tools_show_the_same_in_any_frame(seed
     assert not count["differs"] and count["same"], count
 
 
-@pytest.mark.parametrize("seeds", [(19, 38), pytest.param(range(60), marks=pytest.mark.slow)], ids=["few", "many"])
+@pytest.mark.parametrize("seeds", [(38, 76), pytest.param(range(60), marks=pytest.mark.slow)], ids=["few", "many"])
 def test_scenes_that_fly_begin_to_move_or_stop_show_the_same_in_any_frame(seeds):
     """With inertia: all features of `drawn` and `draining`.  INVARIANCE_SEEDS=1000:2000 says which many."""
     if len(seeds) > 2 and "INVARIANCE_SEEDS" in os.environ:

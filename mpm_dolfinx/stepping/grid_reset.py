@@ -130,8 +130,9 @@ class OnGrid(Keyed):
         (3 t^2)`, from the consistent mass and the stiffness of Q1 elements.  `seconds`: t, in s.
         """
         filled, cut = self.contents.filled, self.cut
-        modulus = self.contents.mean(self._quadrature.rows(cut, cut.points, lambda m: m.macroelement))
-        density = self._momentum.inertia.density.x.array[filled]
+        density = cut.to_cells(self._quadrature.materials.present_density(cut.points))
+        modulus = self._quadrature.rows(cut, cut.points, lambda m: m.macroelement)
+        density, modulus = map(self.contents.mean, (density, modulus))
         return density * (cut.grid.sizes(filled).min(axis=-1) / seconds) ** 2 / (3 * modulus)
 
     @property
