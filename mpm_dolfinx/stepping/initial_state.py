@@ -452,7 +452,8 @@ def _report(scene: Scene, seeded: State, points: MaterialPoints, count: int, lef
     largest, changed = (over_all(comm, float(np.abs(v).max(initial=0.0)), MPI.MAX) for v in (before, after - before))
     what = "initial_stress: balanced after %d iterations, changed by at most %.3g of %.3g Pa; %.2g of its forces remain"
     if changed > REMARKABLE * largest or left > REMARKABLE:
-        warn(comm, ConditionWarning, what, count, changed, largest, left)
+        bears = ", until contact bears them in the first step" if left > REMARKABLE else ""
+        warn(comm, ConditionWarning, what + bears, count, changed, largest, left)
     else:
         log(comm, what, count, changed, largest, left)
 
