@@ -14,7 +14,7 @@ from scipy.interpolate import BSpline
 from strategies import numbers, orders, repeatable, turned
 
 from mpm_dolfinx import Grid
-from mpm_dolfinx.points.cutting import Pieces, cut, cut_faces, parallelepipeds
+from mpm_dolfinx.points.cutting import Pieces, centroids, cut, cut_faces, parallelepipeds
 
 SNAP = 1e-10  # cells: a vertex that is nearer to a grid plane is taken to lie on it
 LOST = 5e-12  # share of a domain, or of a face, in slivers that are left out
@@ -496,3 +496,10 @@ def test_a_face_whose_middle_lies_on_a_plane_within_rounding_has_the_points_of_o
         return np.column_stack([x, share])[order]
 
     assert points(off) == pytest.approx(points(0.0), rel=0, abs=10 * abs(off))
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_centroids_of_partly_inverted_domains_lie_within_their_corners(d):
+    corners = np.random.default_rng(d).uniform(size=(1000, 2**d, d))
+    x = centroids(corners)
+    assert np.all((corners.min(axis=1) <= x) & (x <= corners.max(axis=1)))
