@@ -149,7 +149,8 @@ def linearise(s: mpm.Simulation, dt: float) -> System:
     start = step.set_up(s.scene, s.state, RAMP_STEP)
     momentum = balances(s.scene, start, start.acting[-1]).momentum
     matrices, pieces, contents = start.matrices, start.data.pieces, start.on_grid.contents
-    fed = matrices.flow(start.state, None, start.data, start.acting[-1].t, dt)
+    acting = start.acting[-1]
+    fed = matrices.flow(start.state, None, start.data, acting.t, dt, acting.loads, momentum.at)
     storage = StorageProblem(s.scene.storage, matrices.storage, pieces, contents, *fed, dt)
     momentum.assemble_residual()
     storage.assemble_residual()
