@@ -310,3 +310,25 @@ def test_pieces_whose_boxes_overlap_a_little_are_counted_once():
         s.state = replace(s.state, points=replace(s.points, corners=corners))
         found.append(steady(s))
     assert np.divide(found[1:], found[0]) == pytest.approx(np.ones(2), abs=1e-3)
+
+
+@pytest.mark.parametrize("conductivity", [0.0, 1e-12])
+def test_pressures_trapped_in_an_impermeable_wall_do_not_change_the_flow_beside_it(conductivity):
+    """The wall's face is a fifth of a cell off its grid line.  Without initial stress the weight raises its pressure."""
+    h, width, gravity = 0.5, 1.4, (0, -9.81)
+    grid = mpm.Grid([0, 0], [4 * h, 8 * h], [4, 8])
+    bodies = [mpm.box(grid, [0, 0], [width, 4]), mpm.box(grid, [width, 0], [2, 4], material=1)]
+    sand = mpm.LinearElastic(bulk=4e9, shear=2e9, conductivity=1e-5)
+    wall = mpm.LinearElastic(bulk=4e9, shear=2e9, porosity=0.05, conductivity=conductivity)
+    ends = {"top": ((0, 3.9), (width, 4.1)), "bottom": ((0, -0.1), (width, 0.1))}
+    heads = {"top": 1.0, "bottom": 4.0}
+    drained = [mpm.Drained(side, 9810 * heads[side], region=region) for side, region in ends.items()]
+    walls = {"left": "x", "right": "x", "bottom": "xy", "top": "xy"}
+    flows = []
+    for stress in (None, mpm.K0(0.5)):
+        scene = {"walls": walls, "conditions": drained, "gravity": gravity, "initial_stress": stress}
+        s = mpm.Simulation(grid, bodies, [sand, wall], fluid=mpm.Fluid(), pressure=mpm.hydrostatic(4.0), **scene)
+        s.run(1e6, 2e5, progress=False)
+        flows.append(-s.outflows["drained_top"] / (1e-5 * 0.25 * width))
+    assert flows[0] == pytest.approx(flows[1], rel=1e-5)
+    assert flows[0] == pytest.approx(1, abs=0.008)

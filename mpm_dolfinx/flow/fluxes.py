@@ -16,6 +16,8 @@ from functools import cached_property
 from math import prod
 from typing import Any, NamedTuple
 
+from mpi4py import MPI
+
 import numpy as np
 import ufl
 from dolfinx import fem
@@ -28,6 +30,7 @@ from mpm_dolfinx.base.tolerances import TINY
 from mpm_dolfinx.forms.point_forms import FacetForm, FacetSum
 from mpm_dolfinx.forms.unknowns import sum_ghosts
 from mpm_dolfinx.grid.grid import Grid, across_faces, sum_by
+from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.active import Active
 from mpm_dolfinx.points.material_points import cofactor, determinant
 
@@ -504,6 +507,16 @@ class FluxForms:
                 )
                 slope = ufl.max_value(own, 0.0) * dp("+") + ufl.min_value(other, 0.0) * dp("-")
                 self.flux = FacetForm(density * slope * ufl.jump(q) * dS, grid.comm)
+
+    def unequal(self, filled: NDArray[np.int32], mean: NDArray[np.float64]) -> NDArray[np.float64] | None:
+        """Return the mobility of all local cells from that of the filled cells, or None if all mobilities are equal."""
+        most = over_all(self.grid.comm, np.array([mean.max(initial=-np.inf), -mean.min(initial=np.inf)]), MPI.MAX)
+        if most.sum() <= 0:
+            return None
+        out = fem.Function(self.grid.cellwise())
+        out.x.array[filled] = mean
+        out.x.scatter_forward()
+        return out.x.array
 
     def along(
         self,

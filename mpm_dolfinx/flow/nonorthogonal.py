@@ -13,8 +13,9 @@ projection of the centroid onto the side to the centre of the face.
 
 The gradients are fitted by least squares to the pressures of neighbouring cells and drained sides, and to zero flow
 across no-flow sides.  The area vector of a no-flow side follows from the closed surface of the material in the cell.
-The fit is exact for linear pressures.  Gradients are limited so that the corrected pressures at faces stay between the
-pressures of the neighbours.
+The fit is exact for linear pressures.  A neighbour of smaller conductivity has a smaller weight in the fit, and its
+face counts in part as a no-flow side.  Pressures that are trapped in impermeable soil therefore have no effect.
+Gradients are limited so that the corrected pressures at faces stay between the pressures of the neighbours.
 """
 
 from __future__ import annotations
@@ -60,9 +61,10 @@ class Gradients:
 
     `contents`: material in the cells.
     `sides`: open sides of the bodies.
+    `mobility` (c,), m^2/(Pa s): mobility of the local cells, or None if it is equal in all cells or varies in time.
     """
 
-    def __init__(self, contents: CellContents, sides: OpenSides):
+    def __init__(self, contents: CellContents, sides: OpenSides, mobility: NDArray[np.float64] | None = None):
         self._grid = grid = contents.grid
         d = contents.grid.dim
         centroid = contents.centroid
@@ -75,6 +77,13 @@ class Gradients:
         inside = (neighbours >= 0) & (share[contents.filled] > 0)
         for axis, end in np.ndindex(d, 2):
             inside[:, axis, end] &= share[cells[:, axis, end], axis, 1 - end] > 0
+        weight = np.ones(inside.shape)
+        if mobility is not None:  # series conductance of both cells, divided by that of two cells like the own one
+            own, other = mobility[contents.filled][:, None, None], mobility[cells]
+            weight = np.minimum(
+                1.0, np.divide(2 * other, own + other, out=np.zeros(inside.shape), where=own + other > 0)
+            )
+        self._open = np.where(inside, weight, 1.0) * share[contents.filled]
         cells, inside = cells.reshape(-1, 2 * d), inside.reshape(-1, 2 * d)
         separation = centroid[cells] - centroid[contents.filled][:, None]
         along = np.where(inside[:, :, None], separation / 2, 0.0)
@@ -89,6 +98,7 @@ class Gradients:
         self._own = contents.filled[rows]
         self._neighbours = cells[rows]
         self._inside = inside[rows]
+        self._weight = weight.reshape(-1, 2 * d)[rows]
         self._along, self._separation = along[rows], separation[rows]
         place = np.full(len(off), -1)
         place[rows] = np.arange(len(rows))
@@ -100,8 +110,8 @@ class Gradients:
 
     def _no_flow(self, contents: CellContents, sides: OpenSides) -> NDArray[np.float64]:
         """Return the area vectors of no-flow sides in the filled cells, divided by the areas of cell faces."""
-        grid, share = contents.grid, contents.open[contents.filled]
-        out = -(share[:, :, 1] - share[:, :, 0])
+        grid = contents.grid
+        out = -(self._open[:, :, 1] - self._open[:, :, 0])
         for axis in range(grid.dim):
             area = sum_by(contents.slot(sides.cells), sides.area[:, axis], len(out))
             out[:, axis] -= area * grid.along(contents.filled, axis) / grid.volumes(contents.filled)
@@ -117,7 +127,7 @@ class Gradients:
         offset = self._sides.offset[self._faces[known]]
         near = np.broadcast_to((NEAREST * self._grid.sizes(self._own).min(axis=-1)) ** 2, len(self._own))
         squared = np.maximum((self._separation**2).sum(axis=2), near[:, None])
-        to_cells = self._inside[:, :, None] * self._separation / squared[:, :, None]
+        to_cells = (self._inside * self._weight)[:, :, None] * self._separation / squared[:, :, None]
         distance = np.einsum("md,md->m", offset, self._sides.normal[self._faces[known]])
         to_sides = (weight / np.maximum(distance**2, near[at]))[:, None] * offset
         size = np.linalg.norm(no_flow, axis=1, keepdims=True)
@@ -148,6 +158,7 @@ class Gradients:
         out = np.einsum("nk,nki->ni", to_cells, of_cells)
         for axis in range(out.shape[1]):
             out[:, axis] += sum_by(at, to_sides * of_sides[:, axis], len(out))
+        to_cells = self._weight * to_cells
         low, high = to_cells.min(axis=1, initial=0.0), to_cells.max(axis=1, initial=0.0)
         np.minimum.at(low, at, to_sides)
         np.maximum.at(high, at, to_sides)

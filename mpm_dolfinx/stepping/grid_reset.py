@@ -535,7 +535,7 @@ class Assembled(Keyed):
         self.end_step = system.end_step
         self._on_grid, self._stage = on_grid, stage
         self._nodal, self._varies = momentum.nodal, storage is not None and storage.conductivity is not None
-        self._bulk = storage.bulk if storage is not None else np.inf
+        self._bulk, self._fluxes = (storage.bulk, storage.fluxes) if storage is not None else (np.inf, None)
         by_pressure = on_grid.mixes or (self._varies and storage.conductivity.by_pressure)
         self._by_pressure = storage.p_before if by_pressure else None
         self._mobility: Latest[Mobility] = Latest()
@@ -556,6 +556,7 @@ class Assembled(Keyed):
             if (form := storage.fluxes.nonorthogonal) is not None:
                 self._off = form.on(nonorthogonal_facets(on_grid.contents, on_grid.facets))
         self._gradients: Latest[Gradients | None] = Latest()
+        self._conductivities: Latest[NDArray[np.float64] | None] = Latest()
 
     @property
     def solvers(self) -> LinearSolvers:
@@ -618,8 +619,17 @@ class Assembled(Keyed):
 
         def fit() -> Gradients | None:
             needed = self._off.some or off_middle(sides, grid).any()
-            return Gradients(contents, sides) if needed else None
+            return Gradients(contents, sides, kappa) if needed else None
 
+        def spread() -> NDArray[np.float64] | None:
+            return self._fluxes.unequal(contents.filled, mobility(True).mean)
+
+        mixture, kappa = (), None
+        if self._by_pressure is not None:
+            mixture = (self._by_pressure.x.array[on_grid.cells],)
+            varies = (*varies, *mixture)
+        if self._off is not None and not self._varies:
+            kappa = self._conductivities((), spread, grid.comm)
         where = (sides.cells, sides.shape, sides.seeps, sides.area, sides.offset)
         gradients = None if self._off is None else self._gradients(where, fit)
         off = gradients and (self._off, gradients, sides)
@@ -627,10 +637,6 @@ class Assembled(Keyed):
         def set_fluxes(kappa: Mobility, motion: CellMotion | None = None) -> Outflow:
             return self.storage.set_fluxes(contents, feeds, Conduction(kappa, motion, weight, self._bulk), off)
 
-        mixture = ()
-        if self._by_pressure is not None:
-            mixture = (self._by_pressure.x.array[on_grid.cells],)
-            varies = (*varies, *mixture)
         if state.stays and not self._varies:
             of_cut = self._outflow((at, weight, *varies), lambda: set_fluxes(mobility(True)), grid.comm)
             return feeds, lambda begins: of_cut
