@@ -314,7 +314,7 @@ def test_pieces_whose_boxes_overlap_a_little_are_counted_once():
 
 @pytest.mark.parametrize("conductivity", [0.0, 1e-12])
 def test_pressures_trapped_in_an_impermeable_wall_do_not_change_the_flow_beside_it(conductivity):
-    """The wall's face is a fifth of a cell off its grid line.  Without initial stress the weight raises its pressure."""
+    """The wall's face is a fifth of a cell off its grid line.  Weight raises its pressure without initial stress."""
     h, width, gravity = 0.5, 1.4, (0, -9.81)
     grid = mpm.Grid([0, 0], [4 * h, 8 * h], [4, 8])
     bodies = [mpm.box(grid, [0, 0], [width, 4]), mpm.box(grid, [width, 0], [2, 4], material=1)]

@@ -30,7 +30,6 @@ from mpm_dolfinx.base.tolerances import TINY
 from mpm_dolfinx.forms.point_forms import FacetForm, FacetSum
 from mpm_dolfinx.forms.unknowns import sum_ghosts
 from mpm_dolfinx.grid.grid import Grid, across_faces, sum_by
-from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.active import Active
 from mpm_dolfinx.points.material_points import cofactor, determinant
 
@@ -510,8 +509,8 @@ class FluxForms:
 
     def unequal(self, filled: NDArray[np.int32], mean: NDArray[np.float64]) -> NDArray[np.float64] | None:
         """Return the mobility of all local cells from that of the filled cells, or None if all mobilities are equal."""
-        most = over_all(self.grid.comm, np.array([mean.max(initial=-np.inf), -mean.min(initial=np.inf)]), MPI.MAX)
-        if most.sum() <= 0:
+        comm = self.grid.comm
+        if comm.allreduce(mean.max(initial=0.0), MPI.MAX) <= comm.allreduce(mean.min(initial=np.inf), MPI.MIN):
             return None
         out = fem.Function(self.grid.cellwise())
         out.x.array[filled] = mean

@@ -13,7 +13,7 @@ from dataclasses import replace
 from functools import cached_property, partial
 from inspect import signature
 from itertools import pairwise
-from operator import itemgetter
+from operator import attrgetter, itemgetter
 
 from mpi4py import MPI
 
@@ -273,7 +273,7 @@ class SceneMaterials:
         laws, known = [m.conductivity_law for m in self.materials], self.conductivity_laws
         law = np.array([known.index(law) if law in known else -1 for law in laws])[points.material]
         by_place = np.array([law is not None and _names_place(law) for law in laws])[points.material]
-        conductivity = self.table(points, lambda m: m.conductivity)
+        conductivity = self.table(points, attrgetter("conductivity"))
         number = np.where(by_place, len(known) + points.id, law)
         if self.retentions is not None:
             number = number + self.retention_of(points) / (1 + len(self.retentions.laws))
@@ -311,7 +311,7 @@ class SceneMaterials:
 
     def pore_stress(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return alpha chi p at the points, in Pa: the effective stress minus the total stress."""
-        pressure = self.table(points, lambda m: m.biot) * points.pressure
+        pressure = self.table(points, attrgetter("biot")) * points.pressure
         return pressure if self.retentions is None else pressure * self.saturation(points, points.pressure)[2]
 
     def retention_rows(self, points: MaterialPoints) -> NDArray[np.float64]:
@@ -399,7 +399,7 @@ class SceneMaterials:
 
     def porosity(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return the porosity n = 1 - (1 - n_0) / J of the points."""
-        return 1 - (1 - self.table(points, lambda m: m.porosity)) / points.J
+        return 1 - (1 - self.table(points, attrgetter("porosity"))) / points.J
 
     def storage(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return the storage coefficient of the points, in 1/Pa, in a scene with fluid."""
@@ -425,7 +425,7 @@ class SceneMaterials:
     def density(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return the density of the points' soil with saturated pores, in kg/m^3."""
         n, wet = self.porosity(points), self.fluid.density if self.fluid else 0.0
-        return (1 - n) * self.table(points, lambda m: m.grain_density) + n * wet
+        return (1 - n) * self.table(points, attrgetter("grain_density")) + n * wet
 
     def present_density(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return the density of the points' soil with its present pore water, in kg/m^3."""
@@ -440,10 +440,10 @@ class SceneMaterials:
 
         alpha^2 / S is limited to `most` times (lambda + 2G).
         """
-        modulus = self.table(points, lambda m: m.oedometric)
+        modulus = self.table(points, attrgetter("oedometric"))
         if self.fluid is None:
             return modulus
-        fluid = self.table(points, lambda m: m.biot) ** 2 / np.maximum(self.storage(points), TINY)
+        fluid = self.table(points, attrgetter("biot")) ** 2 / np.maximum(self.storage(points), TINY)
         return modulus + np.minimum(fluid, most * modulus)
 
     def state(self, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
@@ -558,7 +558,7 @@ class SceneMaterials:
             out[name][rows] = values
         if self._softness:
             out["softness"], dF = np.ones(len(points)), points.F_of_laws - before.F_of_laws
-            shear = self.table(points, lambda m: m.shear)
+            shear = self.table(points, attrgetter("shear"))
             for number, softness in self._softness.items():
                 _, rows, at = placed[number]
                 out["softness"][rows] = softness(at, dF[rows], shear[rows], dt, before.data["softness"][rows])

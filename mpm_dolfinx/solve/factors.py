@@ -219,23 +219,21 @@ class NodalFactors:
         self._nodes = tuple(np.concatenate(comm.gather(values) or [values]) for values in rows)  # all on process 0
         self._dim, self._symmetric = unknowns.dim, symmetric
         self._factors: Latest[BlockFactors] = Latest()
-        self._present: BlockFactors | None = None
 
     def take(self, rows: NDArray[np.int32], columns: NDArray[np.int32], values: NDArray[np.float64]) -> None:
         """Set the matrix, in compressed rows."""
         if len(rows) > 1:  # otherwise walls fix all nodes, and the matrix is empty, which PETSc rejects
             make = (rows, columns, *self._nodes, self._dim, self._symmetric)
-            self._present = self._factors((rows, columns), lambda: BlockFactors(*make))
-            self._present.take(values)
+            self._factors((rows, columns), lambda: BlockFactors(*make)).take(values)
 
     def factorise(self) -> None:
         """Factorise the matrix if it has changed."""
-        if self._present is not None:
-            self._present.factorise()
+        if self._factors.value is not None:
+            self._factors.value.factorise()
 
     def solve(self, b: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the solution for the right-hand side b, for all unknowns."""
-        return self._present.solve(b) if len(b) else b
+        return self._factors.value.solve(b) if len(b) else b
 
 
 def dissection(x: NDArray[np.float64]) -> NDArray[np.int64]:

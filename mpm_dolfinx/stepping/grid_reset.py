@@ -100,6 +100,7 @@ class OnGrid(Keyed):
         self.stiffness[cut.cells[order]] = rows[order]  # the largest value of a cell is assigned last
         self.contents = None
         self._mixed, self._borders = None, None
+        self.layered = quadrature.layered
         self._sides: Latest[OpenSides] = Latest()
         if storage is not None:
             brought = PieceContents(
@@ -628,7 +629,7 @@ class Assembled(Keyed):
         if self._by_pressure is not None:
             mixture = (self._by_pressure.x.array[on_grid.cells],)
             varies = (*varies, *mixture)
-        if self._off is not None and not self._varies:
+        if self._off is not None and on_grid.layered and not self._varies:
             kappa = self._conductivities((), spread, grid.comm)
         where = (sides.cells, sides.shape, sides.seeps, sides.area, sides.offset)
         gradients = None if self._off is None else self._gradients(where, fit)
