@@ -151,6 +151,8 @@ class Loads:
     """Whether the condition may constrain bodies by other constraints than `touching` returns."""
     couples: bool = False
     """Whether the tangent couples nodes of different cells."""
+    rounding_at_unknowns: NDArray[np.float64] | float = 0.0
+    """Rounding errors of the forces at the unknowns in this substep, in N."""
     touches: bool = False
     """Whether the condition is a contact, which may open."""
     conducts: bool = False
@@ -261,11 +263,6 @@ class Loads:
     def rounding(self, of_cells: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the rounding errors (cells,), in N, of forces in local cells.  `of_cells`: errors of other forces."""
         return of_cells
-
-    @property
-    def rounding_at_unknowns(self) -> NDArray[np.float64] | float:
-        """Rounding errors of the forces at the unknowns in this substep, in N."""
-        return 0.0
 
     @property
     def rounding_beside(self) -> float:

@@ -541,7 +541,9 @@ class MomentumProblem:
         system, parts = self.system, self.system.of_parts
         both = np.zeros((2, system.unknowns.size))
         size = np.abs(r.array_r)
-        more = sum(one.rounding_at_unknowns for one in self.loads)
+        more = 0.0
+        for one in self.loads:
+            more = more + one.rounding_at_unknowns
         both[0] = size if first else np.maximum(size - system.rounding.array_r - more, 0.0)
         whole = system.of_whole.array_r + more * np.sqrt(parts.sizes)[parts.of]
         least = np.maximum(scales[parts.of], whole / self._tolerance)
