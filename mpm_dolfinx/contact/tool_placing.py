@@ -303,6 +303,7 @@ class Tools(Touching):
     def check_end(self, place: Place, points: MaterialPoints, before: MaterialPoints) -> None:
         """Raise an error if a tool contains points, touches prescribed sides, or has crossed a body in a step."""
         t = place.t
+        x, start = (of.within() for of in (points, before))
         for tool in self.tools:
             for hold, faces in self._held:
                 deep, where = self._deepest(tool, place.cut.surface(faces).now(points), t)
@@ -310,12 +311,12 @@ class Tools(Touching):
                     what = f"{line(tool)} and {line(hold)}: both act at {where} at t = {t:g} s"
                     raise ValueError(f"{what}, must be apart; limit the displacement by a region, or move the tool")
             corners = points.corners[self._gaps(tool, points.corners, t).min(axis=1) < -BEGINS * self.grid.least]
-            deep, where = self._deepest(tool, points.x, t)
+            deep, where = self._deepest(tool, x, t)
             held, at_middle = self._deepest(tool, middle(corners), t)
             if deep > NEAR or held > 0:  # a round tool contains the middles, but not the corners, of stretched domains
                 where = where if deep > NEAR else at_middle
                 raise NotConverged(f"{line(tool)}: has passed through the surface, to {where}; renewal may help")
-            if where := self._passed(tool, (before.x, points.x), (place.start, t)):
+            if where := self._passed(tool, (start, x), (place.start, t)):
                 raise NotConverged(f"{line(tool)}: has passed through a body within a step, at {where}")
 
     def near(self, corners: NDArray[np.float64], t: float) -> NDArray[np.bool_]:

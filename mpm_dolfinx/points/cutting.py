@@ -129,22 +129,24 @@ def edges(corners: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.einsum("nki,ka->nia", corners, signs) / 2 ** (corners.shape[2] - 1)
 
 
-def centroids(corners: NDArray[np.float64]) -> NDArray[np.float64]:
+def centroids(corners: NDArray[np.float64], within: bool = False) -> NDArray[np.float64]:
     """Return the centroids (n, d), in m, of domains, or in axisymmetry of their sections.
 
-    Inverted simplices count with positive volume here, so the centroid of a partly inverted domain lies within it.
+    Inverted simplices have negative volume, as in `cut`.  The centroid of a partly inverted domain may lie outside of it.
+    `within`: whether inverted simplices count with positive volume instead, so that all centroids lie within domains.
     """
-    chunks = _chunks(len(corners), corners.shape[2])
-    return _centroids(corners) if len(chunks) == 1 else np.concatenate([_centroids(corners[part]) for part in chunks])
+    parts = [_centroids(corners[part], within) for part in _chunks(len(corners), corners.shape[2])]
+    return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 
-def _centroids(corners: NDArray[np.float64]) -> NDArray[np.float64]:
+def _centroids(corners: NDArray[np.float64], within: bool) -> NDArray[np.float64]:
     v = vertices(np.ascontiguousarray(corners.transpose(1, 2, 0)))
-    volume, middle = np.abs(simplex_volumes(v)), v[-1]
+    volume, middle = simplex_volumes(v), v[-1]
+    volume = np.abs(volume) if within else volume
     whole, moment = np.add.reduce(volume), np.zeros(middle.shape)
     for share, simplex in zip(volume, simplices(v.shape[1]), strict=True):
         moment += share * (np.add.reduce(v[simplex]) / len(simplex) - middle)
-    return (middle + np.divide(moment, whole, out=np.zeros(moment.shape), where=whole > 0)).T.copy()
+    return (middle + np.divide(moment, whole, out=np.zeros(moment.shape), where=whole != 0)).T.copy()
 
 
 def tangled(corners: NDArray[np.float64], volume: NDArray[np.float64], axisymmetric: bool = False) -> NDArray[np.bool_]:

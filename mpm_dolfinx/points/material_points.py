@@ -168,6 +168,10 @@ class MaterialPoints:
     def __len__(self) -> int:
         return len(self.id)
 
+    def within(self) -> NDArray[np.float64]:
+        """Return positions (n, d), in m, within the domains.  They are `x`, unless a domain is partly inverted."""
+        return centroids(self.corners, within=True)
+
     @property
     def J(self) -> NDArray[np.float64]:
         """Volume ratio det F (n,)."""
