@@ -132,7 +132,7 @@ def edges(corners: NDArray[np.float64]) -> NDArray[np.float64]:
 def centroids(corners: NDArray[np.float64], within: bool = False) -> NDArray[np.float64]:
     """Return the centroids (n, d), in m, of domains, or in axisymmetry of their sections.
 
-    Inverted simplices have negative volume, as in `cut`.  The centroid of a partly inverted domain may lie outside of it.
+    Inverted simplices have negative volume, as in `cut`.  The centroid of a partly inverted domain may lie outside.
     `within`: whether inverted simplices count with positive volume instead, so that all centroids lie within domains.
     """
     parts = [_centroids(corners[part], within) for part in _chunks(len(corners), corners.shape[2])]
