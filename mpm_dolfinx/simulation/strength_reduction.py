@@ -28,7 +28,6 @@ from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
 
 from mpm_dolfinx.base.errors import Report
-from mpm_dolfinx.base.tolerances import ROUND_OFF
 from mpm_dolfinx.base.validation import flag, line, numbers, whole
 from mpm_dolfinx.materials.frictional import Frictional
 from mpm_dolfinx.materials.skeleton import Skeleton
@@ -308,8 +307,8 @@ def _mean_stress(scene: Scene, points: MaterialPoints) -> float:
     grid = scene.grid
     size = np.linalg.norm(scene.materials.effective_stress_3d(points), axis=(1, 2))
     moduli, volume = scene.materials.table(points, lambda m: m.oedometric), points.volume0 * points.J
-    far = grid.reach / grid.least
-    sums = np.array([size @ volume, ROUND_OFF * far * moduli @ volume, volume.sum()])
+    far = 2**grid.dim * grid.reach / grid.least  # a gradient is a sum over the corners
+    sums = np.array([size @ volume, np.finfo(float).eps * far * moduli @ volume, volume.sum()])
     total, rounding, whole_volume = over_all(grid.comm, sums)
     if not total > rounding:
         raise ValueError("factor_of_safety: the bodies have no stress, must be in equilibrium under loads")
