@@ -36,7 +36,8 @@ differences only (`second_differences`), because damping of jumps would smear st
 
 With inertia, tau decreases by the factor `1 / (1 + r)`.  r is the ratio of two resistances of a macroelement, that of
 its mass and that of its stiffness, see `OnGrid.resisting_mass`.  With the static tau, waves in undrained soil would be
-too slow: a cell would exchange as much water with its neighbours as it does in a static step.
+too slow: a cell would exchange as much water with its neighbours as it does in a static step.  If water moves freely in
+a substep of length dt, the static tau remains: the factor is `min(1, 1 / (1 + r) + s)` with `s = kappa rho_w / dt`.
 """
 
 from __future__ import annotations
@@ -362,6 +363,7 @@ class FluidInertia(NamedTuple):
 
     forces: Callable[[], NDArray[np.float64]]  # returns the inertia forces (n, d) on the fluid, N/m^3
     resists: NDArray[np.float64]  # (n,) see `OnGrid.resisting_mass`
+    density: float  # of the fluid, kg/m^3
 
 
 class StorageProblem:
@@ -404,9 +406,13 @@ class StorageProblem:
         self.dt = dt
         self._before = before or Rates(*np.zeros((4, system.unknowns.size)))
         outflow = flow(before is None)
+        least = dt * outflow.mobility.min(axis=1)
         resists = 0.0 if inertial is None else inertial.resists
+        if inertial is not None:  # reduces tau by min(1, 1 / (1 + r) + s)
+            free = least * inertial.density / dt**2
+            resists = np.maximum((1 - free) * resists - free, 0.0) / (1 + free * (1 + resists))
         squared = 4 * forms.grid.most**2  # the distance of two centroids is at most 2 h
-        tau, least = contents.set_damping(1 / (1 + resists)), dt * outflow.mobility.min(axis=1)
+        tau = contents.set_damping(1 / (1 + resists))
         if forms.retains:  # dry pores hardly couple both balances, and their storage stabilises as well
             capacity, coupled = (values / contents.volume for values in forms.drained(data))
             tau, least = contents.set_damping(np.maximum(coupled, 0.0) / (1 + resists), capacity), 0.0 * least
