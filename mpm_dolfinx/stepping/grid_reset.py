@@ -622,7 +622,7 @@ class Assembled(Keyed):
             needed = self._off.some or off_middle(sides, grid).any()
             return Gradients(contents, sides, kappa) if needed else None
 
-        def spread() -> NDArray[np.float64] | None:
+        def conductivities() -> NDArray[np.float64] | None:
             return self._fluxes.unequal(contents.filled, mobility(True).mean)
 
         mixture, kappa = (), None
@@ -630,7 +630,7 @@ class Assembled(Keyed):
             mixture = (self._by_pressure.x.array[on_grid.cells],)
             varies = (*varies, *mixture)
         if self._off is not None and on_grid.layered and not self._varies:
-            kappa = self._conductivities((), spread, grid.comm)
+            kappa = self._conductivities((), conductivities, grid.comm)
         where = (sides.cells, sides.shape, sides.seeps, sides.area, sides.offset)
         gradients = None if self._off is None else self._gradients(where, fit)
         off = gradients and (self._off, gradients, sides)
