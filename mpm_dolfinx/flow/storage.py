@@ -406,18 +406,16 @@ class StorageProblem:
         self.dt = dt
         self._before = before or Rates(*np.zeros((4, system.unknowns.size)))
         outflow = flow(before is None)
-        least = dt * outflow.mobility.min(axis=1)
-        resists = 0.0 if inertial is None else inertial.resists
-        if inertial is not None:  # reduces tau by min(1, 1 / (1 + r) + s)
-            free = least * inertial.density / dt**2
-            resists = np.maximum((1 - free) * resists - free, 0.0) / (1 + free * (1 + resists))
+        least, static = dt * outflow.mobility.min(axis=1), 1.0
+        if inertial is not None:
+            static = np.minimum(1.0, 1 / (1 + inertial.resists) + least * inertial.density / dt**2)
         squared = 4 * forms.grid.most**2  # the distance of two centroids is at most 2 h
-        tau = contents.set_damping(1 / (1 + resists))
+        tau = contents.set_damping(static)
         if forms.retains:  # dry pores hardly couple both balances, and their storage stabilises as well
             capacity, coupled = (values / contents.volume for values in forms.drained(data))
-            tau, least = contents.set_damping(np.maximum(coupled, 0.0) / (1 + resists), capacity), 0.0 * least
+            tau, least = contents.set_damping(static * np.maximum(coupled, 0.0), capacity), 0.0 * least
         softest = contents.softest(softness) if forms.softens else np.array([1.0])
-        softest = (1 + resists) / (1 / softest + resists)  # yield does not change the mass
+        softest = 1 / (static / softest + (1 - static))  # yield does not change the mass
         known = [(tau * squared > least).any(), (softest * tau * squared > least).any() and softest.max() > 1]
         somewhere = over_all(forms.grid.comm, np.array([*known, any([one.settles for one in feeds])], dtype=float)) > 0
         self.damped, flows, self._settles = somewhere.tolist()
