@@ -158,15 +158,17 @@ def imbalance(s, before, soil, gravity):
     return np.abs(forces.sum(axis=0)).max() / np.abs(forces).max()
 
 
-def gathered(simulation):
-    """Return positions, pressures, stresses and F of all points by id, and the numbers of points of the processes (on
-    process 0).
+def gathered(simulation, **columns):
+    """Return positions and columns of all points by id, and the numbers of points of the processes (on process 0).
+
+    `columns`: arrays over the points of each process; by default pressures, stresses and F.
     """
     points = simulation.points
-    columns = (points.id, points.x, points.pressure, simulation.effective_stress(), points.F)
-    parts = simulation.grid.comm.gather(columns)
+    columns = columns or {"p": points.pressure, "stress": simulation.effective_stress(), "F": points.F}
+    parts = simulation.grid.comm.gather((points.id, points.x, *columns.values()))
     if not parts:
         return {}
     ids, *rows = (np.concatenate(a) for a in zip(*parts, strict=True))
-    state = zip(("x", "p", "stress", "F"), (values[np.argsort(ids)] for values in rows), strict=True)
-    return {**dict(state), "counts": [len(part[0]) for part in parts]}
+    order = np.argsort(ids)
+    state = {name: values[order] for name, values in zip(("x", *columns), rows, strict=True)}
+    return {**state, "counts": [len(part[0]) for part in parts]}

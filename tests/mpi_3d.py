@@ -5,6 +5,7 @@ import sys
 from dataclasses import replace
 
 import numpy as np
+from helpers import gathered
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.solve import solver_choice as plan
@@ -29,17 +30,6 @@ simulation = mpm.Simulation(
 result = simulation.run(1.0, 0.25, progress=False)
 points = simulation.points
 simulation.cells()
-parts = simulation.grid.comm.gather((points.id, points.x, points.pressure))
-if parts:
-    ids, x, p = (np.concatenate(a) for a in zip(*parts, strict=True))
-    order = np.argsort(ids)
-    counts = [len(part[0]) for part in parts]
-    np.savez(
-        sys.argv[1],
-        x=x[order],
-        p=p[order],
-        balance=result.balance,
-        counts=counts,
-        walls=simulation.wall_reactions.array,
-    )
+if state := gathered(simulation, p=points.pressure):
+    np.savez(sys.argv[1], **state, balance=result.balance, walls=simulation.wall_reactions.array)
     print(result.newton, result.coupling, result.cuts)

@@ -4,6 +4,7 @@
 import sys
 
 import numpy as np
+from helpers import gathered
 
 import mpm_dolfinx as mpm
 
@@ -16,15 +17,9 @@ drained = [mpm.Drained("right"), mpm.Drained("top", region=((0.45, 0), (2, 2)))]
 acting = {"conditions": [push, *drained, mpm.Pressure("right", 2e4)]}
 simulation = mpm.Simulation(grid, bodies, [sand, gel], fluid=mpm.Fluid(), walls={"bottom": "xy"}, **acting)
 result = simulation.run(1.0, 0.2, progress=False)
-stress, points = simulation.effective_stress(), simulation.points
-columns = (points.id, points.x, points.pressure, stress, points.F, points.data["hardened"])
-acts = np.concatenate([simulation.reactions.array.ravel(), simulation.outflows.array])
-parts = simulation.grid.comm.gather(columns)
-if parts:
-    ids, x, p, s, F, hardened = (np.concatenate(a) for a in zip(*parts, strict=True))
-    assert hardened.max() > 1e-3
-    order = np.argsort(ids)
-    state = {"x": x, "p": p, "stress": s, "F": F, "hardened": hardened}
-    counts = [len(part[0]) for part in parts]
-    state = {k: v[order] for k, v in state.items()} | {"reactions": acts[:2], "outflows": acts[2:]}
-    np.savez(sys.argv[1], **state, balance=result.balance, counts=counts, walls=simulation.wall_reactions.array)
+points = simulation.points
+stress, hardened = simulation.effective_stress(), points.data["hardened"]
+acts = {"reactions": simulation.reactions.array.ravel(), "outflows": simulation.outflows.array}
+if state := gathered(simulation, p=points.pressure, stress=stress, F=points.F, hardened=hardened):
+    assert state["hardened"].max() > 1e-3
+    np.savez(sys.argv[1], **state, **acts, balance=result.balance, walls=simulation.wall_reactions.array)

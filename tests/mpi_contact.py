@@ -4,6 +4,7 @@
 import sys
 
 import numpy as np
+from helpers import gathered
 
 import mpm_dolfinx as mpm
 
@@ -35,12 +36,7 @@ simulation.stage(
 )
 result = simulation.run(1.0, 0.125, progress=False)
 points = simulation.points
-data = (points.data["contact_shear"], points.data["contact_pressure"])
-parts = simulation.grid.comm.gather((points.id, points.x, points.pressure, *data))
-if parts:
-    ids, x, p, s, push = (np.concatenate(a) for a in zip(*parts, strict=True))
-    order = np.argsort(ids)
-    more = {"counts": [len(part[0]) for part in parts], "forces": simulation.tool_forces.array, "push": push[order]}
-    more["walls"] = simulation.wall_reactions.array
-    more["outflows"] = simulation.outflows.array
-    np.savez(sys.argv[1], x=x[order], p=p[order], shear=s[order], balance=result.balance, **more)
+shear, push = points.data["contact_shear"], points.data["contact_pressure"]
+forces = {"forces": simulation.tool_forces.array, "walls": simulation.wall_reactions.array}
+if state := gathered(simulation, p=points.pressure, push=push, shear=shear):
+    np.savez(sys.argv[1], **state, outflows=simulation.outflows.array, balance=result.balance, **forces)

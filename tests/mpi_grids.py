@@ -5,7 +5,7 @@ import sys
 from dataclasses import replace
 
 import numpy as np
-from helpers import beam
+from helpers import beam, gathered
 
 from mpm_dolfinx.solve import solver_choice as plan
 
@@ -14,10 +14,6 @@ simulation, _ = beam(h=0.01)
 result = simulation.run(0.04, 0.02, progress=False)
 solvers = simulation.scene.last[1].solvers
 assert solvers.plan.iterative
-parts = simulation.grid.comm.gather((simulation.points.id, simulation.points.x, simulation.points.pressure))
-if parts:
-    ids, x, p = (np.concatenate(a) for a in zip(*parts, strict=True))
-    order = np.argsort(ids)
-    counts = [len(part[0]) for part in parts]
-    print(counts, result.newton, result.coupling)
-    np.savez(sys.argv[1], x=x[order], p=p[order], counts=counts, balance=result.balance)
+if state := gathered(simulation, p=simulation.points.pressure):
+    print(state["counts"], result.newton, result.coupling)
+    np.savez(sys.argv[1], **state, balance=result.balance)

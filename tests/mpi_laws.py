@@ -5,6 +5,7 @@ import sys
 
 import numpy as np
 import ufl
+from helpers import gathered
 
 import mpm_dolfinx as mpm
 
@@ -48,13 +49,8 @@ simulation = mpm.Simulation(
     terms=[push, mpm.Source(lambda points, q, t: 1e-3 * t * points.displacement[0] * q * points.dx)],
 )
 result = simulation.run(1.0, 0.1, progress=False)
-stress, points = simulation.effective_stress(), simulation.points
-columns = (points.id, points.x, points.pressure, stress, points.data["plastic"], points.data["hardened"])
-parts = simulation.grid.comm.gather(columns)
-if parts:
-    ids, x, p, s, plastic, hardened = (np.concatenate(a) for a in zip(*parts, strict=True))
-    assert hardened.max() > 1e-3
-    order = np.argsort(ids)
-    state = {"x": x, "p": p, "stress": s, "plastic": plastic, "hardened": hardened}
-    counts = [len(part[0]) for part in parts]
-    np.savez(sys.argv[1], **{k: v[order] for k, v in state.items()}, balance=result.balance, counts=counts)
+points = simulation.points
+columns = {name: points.data[name] for name in ("plastic", "hardened")}
+if state := gathered(simulation, p=points.pressure, stress=simulation.effective_stress(), **columns):
+    assert state["hardened"].max() > 1e-3
+    np.savez(sys.argv[1], **state, balance=result.balance)

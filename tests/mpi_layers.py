@@ -4,6 +4,7 @@
 import sys
 
 import numpy as np
+from helpers import gathered
 
 import mpm_dolfinx as mpm
 
@@ -25,12 +26,7 @@ simulation = mpm.Simulation(
 places = [[x, y, z] for x, y in ((0.0, 0.25), (0.11, 0.13)) for z in (0.0, 0.31, 0.75, 0.8, 0.88, 0.99)]
 probes = mpm.probes(bodies, places, stress=True)
 result = simulation.run(2.0, 1.0, probes=probes, progress=False)
-points = simulation.points
-parts = simulation.grid.comm.gather((points.id, points.x, points.pressure))
-if parts:
-    ids, x, p = (np.concatenate(a) for a in zip(*parts, strict=True))
-    order = np.argsort(ids)
-    assert p[x[:, 2] < 0.7].min() > 5e4, "the seam holds nothing back"
-    counts = [len(part[0]) for part in parts]
+if state := gathered(simulation, p=simulation.points.pressure):
+    assert state["p"][state["x"][:, 2] < 0.7].min() > 5e4, "the seam holds nothing back"
     probed = {"probe_p": result.probe_pressure[-1], "probe_stress": result.probe_stress[-1]}
-    np.savez(sys.argv[1], x=x[order], p=p[order], balance=result.balance, counts=counts, **probed)
+    np.savez(sys.argv[1], **state, balance=result.balance, **probed)

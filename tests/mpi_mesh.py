@@ -4,6 +4,7 @@
 import sys
 
 import numpy as np
+from helpers import gathered
 from meshes import box_mesh
 
 import mpm_dolfinx as mpm
@@ -23,11 +24,5 @@ simulation = mpm.Simulation(
     conditions=[mpm.Traction("top", lambda t: -1e5 * t), mpm.Drained("right")],
 )
 result = simulation.run(1.0, 0.25, probes=mpm.probes(bodies, [[0.3, 0.4], [0.3, 0.8]]), progress=False)
-points = simulation.points
-parts = grid.comm.gather((points.id, points.x, points.pressure, simulation.effective_stress()))
-if parts:
-    ids, x, p, s = (np.concatenate(a) for a in zip(*parts, strict=True))
-    order = np.argsort(ids)
-    counts = [len(part[0]) for part in parts]
-    out = {"x": x[order], "p": p[order], "stress": s[order], "probes": result.displacement[-1]}
-    np.savez(sys.argv[1], **out, balance=result.balance, counts=counts)
+if state := gathered(simulation, p=simulation.points.pressure, stress=simulation.effective_stress()):
+    np.savez(sys.argv[1], **state, probes=result.displacement[-1], balance=result.balance)

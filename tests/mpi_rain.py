@@ -4,6 +4,7 @@
 import sys
 
 import numpy as np
+from helpers import gathered
 
 import mpm_dolfinx as mpm
 
@@ -34,18 +35,6 @@ result = simulation.run(1800.0, 300.0, progress=False)
 points, cells = simulation.points, simulation.cells()
 volumes = [simulation.outcome(name).array for name in ("flowed", "ponded", "ran_off")]
 water = grid.comm.allreduce(cells.water.sum())
-parts = grid.comm.gather((points.id, points.x, points.pressure, points.displacement))
-if parts:
-    ids, x, p, u = (np.concatenate(a) for a in zip(*parts, strict=True))
-    order = np.argsort(ids)
+if state := gathered(simulation, p=points.pressure, u=points.displacement):
     assert volumes[2].sum() > 0, "nothing runs off"
-    np.savez(
-        sys.argv[1],
-        x=x[order],
-        p=p[order],
-        u=u[order],
-        volumes=np.concatenate(volumes),
-        water=water,
-        balance=result.balance,
-        counts=[len(part[0]) for part in parts],
-    )
+    np.savez(sys.argv[1], **state, volumes=np.concatenate(volumes), water=water, balance=result.balance)

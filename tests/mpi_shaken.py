@@ -4,6 +4,7 @@
 import sys
 
 import numpy as np
+from helpers import gathered
 
 import mpm_dolfinx as mpm
 
@@ -19,18 +20,12 @@ options = {"fluid": mpm.Fluid(bulk=1e8), "walls": {}, "gravity": (0, -9.81), "in
 simulation = mpm.Simulation(grid, [block], [soil], conditions=conditions, **options)
 result = simulation.run(0.02, 0.004, energies=True, progress=False)
 points = simulation.points
-parts = grid.comm.gather((points.id, points.x, points.pressure, points.data["velocity"]))
-if parts:
-    ids, x, p, v = (np.concatenate(a) for a in zip(*parts, strict=True))
-    order = np.argsort(ids)
+if state := gathered(simulation, p=points.pressure, velocity=points.data["velocity"]):
     np.savez(
         sys.argv[1],
-        x=x[order],
-        p=p[order],
-        velocity=v[order],
+        **state,
         tool=[*simulation.outcome("tool_velocity")["tool"], simulation.outcome("tool_spin")["tool"]],
         reaction=simulation.reactions.array[0],
         energies=[of[-1] for of in result.energies.values()],
         balance=result.balance,
-        counts=[len(part[0]) for part in parts],
     )

@@ -4,6 +4,7 @@
 import sys
 
 import numpy as np
+from helpers import gathered
 
 import mpm_dolfinx as mpm
 
@@ -25,10 +26,5 @@ simulation = mpm.Simulation(
     gravity=lambda t: (0, -9.81 * t),
 )
 result = simulation.run(1.0, 0.25, progress=False)
-stress, points = simulation.effective_stress(), simulation.points
-parts = simulation.grid.comm.gather((points.id, points.x, points.pressure, stress))
-if parts:
-    ids, x, p, s = (np.concatenate(a) for a in zip(*parts, strict=True))
-    order = np.argsort(ids)
-    counts = [len(part[0]) for part in parts]
-    np.savez(sys.argv[1], x=x[order], p=p[order], stress=s[order], balance=result.balance, counts=counts)
+if state := gathered(simulation, p=simulation.points.pressure, stress=simulation.effective_stress()):
+    np.savez(sys.argv[1], **state, balance=result.balance)

@@ -4,6 +4,7 @@
 import sys
 
 import numpy as np
+from helpers import gathered
 
 import mpm_dolfinx as mpm
 
@@ -18,18 +19,6 @@ simulation.run(1.0, 0.5, progress=False)
 push = mpm.Displacement("top", lambda t, X: (0, -0.02 * (t - 1)), region=((0.0, 0.0), (0.31, 0.5)))
 simulation.stage(add=[2], remove=[1], conditions=[*simulation.conditions, push], reset_displacement=True)
 result = simulation.run(2.0, 0.25, probes=mpm.probes(bodies, [[0.3, 0.4], [0.9, 0.9]]), progress=False)
-points = simulation.points
-parts = grid.comm.gather((points.id, points.x, points.pressure, simulation.effective_stress()))
-if parts:
-    ids, x, p, s = (np.concatenate(a) for a in zip(*parts, strict=True))
-    order = np.argsort(ids)
-    np.savez(
-        sys.argv[1],
-        x=x[order],
-        p=p[order],
-        stress=s[order],
-        probes=result.displacement[-1],
-        reaction=simulation.reactions.array,
-        balance=result.balance,
-        counts=[len(part[0]) for part in parts],
-    )
+if state := gathered(simulation, p=simulation.points.pressure, stress=simulation.effective_stress()):
+    probes, reaction = result.displacement[-1], simulation.reactions.array
+    np.savez(sys.argv[1], **state, probes=probes, reaction=reaction, balance=result.balance)

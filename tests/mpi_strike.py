@@ -4,6 +4,7 @@
 import sys
 
 import numpy as np
+from helpers import gathered
 
 import mpm_dolfinx as mpm
 
@@ -21,20 +22,14 @@ simulation = mpm.Simulation(
     inertia=mpm.Moving(lambda x: np.stack([np.where(x[:, 1] > 0.43, 0.3, 0.0), 0 * x[:, 1]], axis=1)),
 )
 result = simulation.run(0.05, 0.01, energies=True, progress=False)
-points = simulation.points
-parts = grid.comm.gather((points.id, points.x, points.data["velocity"], points.data["tool_shear"]))
-if parts:
-    ids, x, v, s = (np.concatenate(a) for a in zip(*parts, strict=True))
-    order = np.argsort(ids)
+data = simulation.points.data
+if state := gathered(simulation, velocity=data["velocity"], shear=data["tool_shear"]):
     np.savez(
         sys.argv[1],
-        x=x[order],
-        velocity=v[order],
-        shear=s[order],
+        **state,
         forces=simulation.tool_forces.array,
         tool=[simulation.tool_travel["tool"], simulation.outcome("tool_velocity")["tool"]],
         spin=[simulation.outcome(name)["tool"] for name in ("tool_rotation", "tool_spin")],
         energies=[of[-1] for of in result.energies.values()],
         balance=result.balance,
-        counts=[len(part[0]) for part in parts],
     )

@@ -4,6 +4,7 @@
 import sys
 
 import numpy as np
+from helpers import gathered
 
 import mpm_dolfinx as mpm
 
@@ -23,9 +24,5 @@ simulation = mpm.Simulation(
 )
 result = simulation.run(0.05, 0.01, progress=False)
 points = simulation.points
-parts = grid.comm.gather((points.id, points.x, points.data["velocity"], points.pressure))
-if parts:
-    ids, x, v, p = (np.concatenate(a) for a in zip(*parts, strict=True))
-    order = np.argsort(ids)
-    counts = [len(part[0]) for part in parts]
-    np.savez(sys.argv[1], x=x[order], velocity=v[order], pressure=p[order], balance=result.balance, counts=counts)
+if state := gathered(simulation, velocity=points.data["velocity"], pressure=points.pressure):
+    np.savez(sys.argv[1], **state, balance=result.balance)

@@ -4,6 +4,7 @@
 import sys
 
 import numpy as np
+from helpers import gathered
 
 import mpm_dolfinx as mpm
 
@@ -22,10 +23,6 @@ simulation = mpm.Simulation(
 )
 result = simulation.run(1.0, 0.5, progress=False)
 points = simulation.points
-parts = simulation.grid.comm.gather((points.id, points.x, points.pressure, points.data["tool_shear"]))
-if parts:
-    ids, x, p, s = (np.concatenate(a) for a in zip(*parts, strict=True))
-    order = np.argsort(ids)
-    counts = [len(part[0]) for part in parts]
+if state := gathered(simulation, p=points.pressure, shear=points.data["tool_shear"]):
     forces = {"forces": simulation.tool_forces.array, "travel": simulation.tool_travel.array}
-    np.savez(sys.argv[1], x=x[order], p=p[order], shear=s[order], balance=result.balance, counts=counts, **forces)
+    np.savez(sys.argv[1], **state, balance=result.balance, **forces)

@@ -4,6 +4,7 @@
 import sys
 
 import numpy as np
+from helpers import gathered
 
 import mpm_dolfinx as mpm
 
@@ -18,17 +19,6 @@ quiet = [mpm.Quiet(side, lambda t: (0.1 * (t - 100), 0)) for side in ("bottom", 
 simulation.stage(inertia=True, conditions=[*quiet, mpm.Drained("top")], reset_displacement=True)
 result = simulation.run(100.2, 0.02, energies=True, progress=False)
 points = simulation.points
-parts = grid.comm.gather((points.id, points.x, points.pressure, points.data["velocity"], points.displacement))
-if parts:
-    ids, x, p, v, u = (np.concatenate(a) for a in zip(*parts, strict=True))
-    order = np.argsort(ids)
-    np.savez(
-        sys.argv[1],
-        x=x[order],
-        p=p[order],
-        velocity=v[order],
-        u=u[order],
-        energies=[of[-1] for of in result.energies.values()],
-        balance=result.balance,
-        counts=[len(part[0]) for part in parts],
-    )
+if state := gathered(simulation, p=points.pressure, velocity=points.data["velocity"], u=points.displacement):
+    energies = [of[-1] for of in result.energies.values()]
+    np.savez(sys.argv[1], **state, energies=energies, balance=result.balance)

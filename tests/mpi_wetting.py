@@ -4,6 +4,7 @@
 import sys
 
 import numpy as np
+from helpers import gathered
 
 import mpm_dolfinx as mpm
 
@@ -28,12 +29,7 @@ simulation = mpm.Simulation(
 )
 result = simulation.run(1e5, 2.5e4, progress=False)
 points = simulation.points
-columns = (points.id, points.x, points.pressure, simulation.effective_stress())
-parts = simulation.grid.comm.gather((*columns, points.data["suction"], points.data["consolidated"]))
-if parts:
-    ids, x, p, s, suction, consolidated = (np.concatenate(a) for a in zip(*parts, strict=True))
-    assert consolidated.max() > 1e-2
-    order = np.argsort(ids)
-    state = {"x": x, "p": p, "stress": s, "suction": suction, "consolidated": consolidated}
-    counts = [len(part[0]) for part in parts]
-    np.savez(sys.argv[1], **{k: v[order] for k, v in state.items()}, balance=result.balance, counts=counts)
+columns = {name: points.data[name] for name in ("suction", "consolidated")}
+if state := gathered(simulation, p=points.pressure, stress=simulation.effective_stress(), **columns):
+    assert state["consolidated"].max() > 1e-2
+    np.savez(sys.argv[1], **state, balance=result.balance)
