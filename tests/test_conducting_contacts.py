@@ -220,3 +220,8 @@ def test_of_three_groups_those_conduct_that_should(order):
 def test_a_contact_that_conducts_needs_a_fluid():
     with pytest.raises(ValueError, match=r"flow: Contact\(.*conducts=True\), must be in a scene with fluid"):
         stack(fluid=None)
+
+
+def test_conducts_is_true_or_false():
+    with pytest.raises(ValueError, match="Contact: conducts = 'no', must be True or False"):
+        mpm.Contact(0, 1, conducts="no")

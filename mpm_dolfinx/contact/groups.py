@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from mpm_dolfinx.base.validation import line, numbers
+from mpm_dolfinx.base.validation import flag, line, numbers
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.grid.grid import Grid, GridOfGroups
 
@@ -55,6 +55,7 @@ class Contact:
         for name in ("friction", "adhesion"):
             value = getattr(self, name)
             numbers(f"Contact: {name}", value, test=lambda v: (v >= 0) & (v < np.inf), allowed=">= 0 and finite")
+        flag("Contact: conducts", self.conducts)
 
     @property
     def frictional(self) -> bool:
