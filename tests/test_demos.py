@@ -56,7 +56,7 @@ QUICK = {
     "water_table": ("--h 0.25 --step 1800", ["water_table.png"]),
     "vibration": ("--h 0.1 --cells 8 --periods 1 --steps 16", ["vibration.png"]),
     "wave": ("--cells 8 --steps 10 --periods 2", ["wave.png"]),
-    "shaking": ("--cells 4 --steps 60", ["shaking.png"]),
+    "shaking": ("--cells 4 --steps 60 --bank-cells 4 --bank-steps 20", ["shaking.png"]),
     "dam": ("--h 1 --steps 3 --cells 10", ["dam.png"]),
     "two_gels": ("--cells 4 --hertz 4", ["two_gels.png"]),
     "embankment": ("--h 1 --steps 1", ["embankment.png"]),
