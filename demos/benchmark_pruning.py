@@ -217,7 +217,7 @@ def stacked(cells: int, **options) -> mpm.Simulation:
 Make = Callable[[int], mpm.Simulation]
 PAIRS: dict[str, tuple[Make, Make]] = {
     "pore fluid that drains at once": (block, lambda n: block(n, soil(conductivity=1e3), **WATER)),
-    "flux form": (lambda n: block(n, **SEALED), lambda n: block(n, soil(conductivity=1e-30), **SEALED)),
+    "flux between cells": (lambda n: block(n, **SEALED), lambda n: block(n, soil(conductivity=1e-30), **SEALED)),
     "seepage face": (draining, lambda n: draining(n, conditions=[mpm.Drained("top", seepage=True)])),
     "layers off the grid lines": (partial(layered, off=0.0), partial(layered, off=0.5)),
     "second order in time": (lambda n: draining(n, numerics=mpm.Numerics(method="backward-euler")), draining),
@@ -256,7 +256,7 @@ PAIRS: dict[str, tuple[Make, Make]] = {
     ),
     "ghost penalty on all faces": (block, weighted),
     "damping of pressure jumps": (lambda n: conducting(n, mpm.Hencky), lambda n: conducting(n, Watched)),
-    "pressure damping as in yielding instead of elastic soil": (lambda n: sealed_soil(n, yields=False), sealed_soil),
+    "pressure damping of yielding instead of elastic soil": (lambda n: sealed_soil(n, yields=False), sealed_soil),
     "mean dilatation": (
         lambda n: block(n, soil(nu=LOCKING - 1e-3)),
         lambda n: block(n, soil(nu=LOCKING + 1e-3)),
@@ -265,8 +265,8 @@ PAIRS: dict[str, tuple[Make, Make]] = {
         block,
         partial(plastic, law=mpm.DruckerPrager),
     ),
-    "kept volumes": (partial(yielded, keep_volumes=False), yielded),
-    "renewal that renews nothing": (yielded, partial(yielded, renewal=True)),
+    "volumes of yielded domains kept": (partial(yielded, keep_volumes=False), yielded),
+    "renewal of domains, where none is renewed": (yielded, partial(yielded, renewal=True)),
     "Mohr-Coulomb instead of Drucker-Prager": (
         partial(plastic, law=mpm.DruckerPrager),
         partial(plastic, law=mpm.MohrCoulomb),
@@ -276,13 +276,13 @@ PAIRS: dict[str, tuple[Make, Make]] = {
         partial(plastic, law=mpm.SofteningDruckerPrager, residual=1e8, slip=1e3, viscosity=1.0),
     ),
     "Modified Cam Clay instead of Drucker-Prager": (partial(plastic, law=mpm.DruckerPrager), clayey),
-    "suction in the law": (partial(drying, law=mpm.ModifiedCamClay), partial(drying, law=mpm.BarcelonaBasic, **LOOSE)),
-    "finite strain": (lambda n: block(n, soil(mpm.LinearElastic)), block),
-    "factorisation in each step, linear law": (linear, refactorised),
+    "Barcelona Basic instead of Modified Cam Clay": (partial(drying, law=mpm.ModifiedCamClay), partial(drying, law=mpm.BarcelonaBasic, **LOOSE)),
+    "finite strain instead of a linear law": (lambda n: block(n, soil(mpm.LinearElastic)), block),
+    "linear law, factorised in each step": (linear, refactorised),
     "files written in each step": (block, block),
     "grid reset in each step": (block, restless),
     "grid lines that move": (partial(of_many_sizes, moves=False), partial(of_many_sizes, moves=True)),
-    "division that divides nothing": (
+    "division of domains, where none is divided": (
         partial(of_many_sizes, moves=True),
         partial(of_many_sizes, moves=True, numerics=mpm.Numerics(renewal=True)),
     ),
@@ -298,7 +298,7 @@ PAIRS: dict[str, tuple[Make, Make]] = {
         ),
     ),
     "rain": (draining, lambda n: draining(n, conditions=[mpm.Rain("top", 1e3)])),
-    "retention": (
+    "retention curve": (
         lambda n: restless(n, material=soil(conductivity=1e-8), **HEAVY),
         lambda n: restless(n, material=soil(conductivity=1e-8, retention=mpm.VanGenuchten(1e6)), **HEAVY),
     ),
