@@ -276,7 +276,10 @@ PAIRS: dict[str, tuple[Make, Make]] = {
         partial(plastic, law=mpm.SofteningDruckerPrager, residual=1e8, slip=1e3, viscosity=1.0),
     ),
     "Modified Cam Clay instead of Drucker-Prager": (partial(plastic, law=mpm.DruckerPrager), clayey),
-    "Barcelona Basic instead of Modified Cam Clay": (partial(drying, law=mpm.ModifiedCamClay), partial(drying, law=mpm.BarcelonaBasic, **LOOSE)),
+    "Barcelona Basic instead of Modified Cam Clay": (
+        partial(drying, law=mpm.ModifiedCamClay),
+        partial(drying, law=mpm.BarcelonaBasic, **LOOSE),
+    ),
     "finite strain instead of a linear law": (lambda n: block(n, soil(mpm.LinearElastic)), block),
     "linear law, factorised in each step": (linear, refactorised),
     "files written in each step": (block, block),
