@@ -52,8 +52,7 @@ class DruckerPrager(Frictional):
     cohesion
         Cohesion c_0, Pa, >= 0.  If c_0 is zero, points without mean pressure have no stiffness.
     hardening
-        Linear hardening modulus H, Pa, >= 0: c = c_0 + H kappa, with the accumulated plastic strain kappa.  In
-        associated flow, kappa is work conjugate to c.
+        Linear hardening modulus H, Pa, >= 0: c = c_0 + H kappa, with the accumulated plastic strain kappa.
     match
         Stress states in which the cone coincides with Mohr and Coulomb's yield surface.  "plane strain" gives the
         collapse load of Mohr and Coulomb's law in plane strain, exactly for associated flow.  "compression" is the

@@ -24,7 +24,7 @@ from mpm_dolfinx.materials.trial import PLANE, SPACE
 from mpm_dolfinx.parallel.exchange import Exchange, first, over_all, together
 from mpm_dolfinx.points.material_points import MaterialPoints, unstretched
 
-EXACT, CLOSE = 1e-13, SAME  # errors relative to the largest initial stress: the first ends Newton's method
+EXACT, CLOSE = 1e-13, SAME  # relative stress errors at which Newton's method ends, and which are accepted
 MOST = 30  # largest number of Newton iterations
 LARGEST = 0.2  # limit to the change of a strain component in one iteration
 
@@ -208,10 +208,10 @@ def _in_columns(
     unit_weight: NDArray[np.float64],
     above: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return corners and unit weights of all domains above and below this process's domains.
+    """Return the corners and unit weights of all particle domains above and below given domains.
 
-    `ids` (n,), `corners` (n, 2^d, d), in m, `unit_weight` (n,), in N/m^3: this process's domains in the scene.
-    `above` (k, 2^d, d), in m: corners of the domains whose columns are needed.
+    `ids` (n,), `corners` (n, 2^d, d), in m, `unit_weight` (n,), in N/m^3: particle domains of this process.
+    `above` (k, 2^d, d), in m: corners of the given domains of this process.
     """
     ends = [above[..., :-1].min(axis=(0, 1), initial=np.inf), above[..., :-1].max(axis=(0, 1), initial=-np.inf)]
     low, high = corners[..., :-1].min(axis=1), corners[..., :-1].max(axis=1)
