@@ -91,11 +91,9 @@ def cell_ratios(
 ) -> NDArray[np.float64]:
     """Return the volume ratios (m,) of the pieces of a cut at the start of a step.
 
-    With F-bar, the volume ratio of a cell is the current volume of its domains, computed from the corners, divided by
-    their reference volume.  Differences between the volume ratios of domains in a cell do no work.  If the ratio of a
-    cell were updated by increments only, it could drift from the volume of the domains without any opposing force.
-    Without F-bar, pieces have the ratio of their point.  The same applies in cells with yielded soil, where volumes
-    from corners are meaningless.
+    With F-bar, the volume ratio of a cell is the present volume of its particle domains divided by their
+    reference volume.  A ratio updated by increments would drift from the volumes of the domains.
+    Without F-bar, and in cells with yielded soil, the ratio of a piece is the ratio of its point.
 
     `cut`: cut particle domains.
     `points`: points at the start of the step.

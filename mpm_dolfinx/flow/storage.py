@@ -19,8 +19,7 @@ r is taken at the pressure `(p_n + p) / 2`.  On a face, r is the logarithmic mea
 The residual is the left side of the balance, divided by the r of the storage term.  The tangent neglects the difference
 between the r of a face and the r of the storage term.
 
-The volume of a particle domain drifts away from the volume that its fluid content implies, for three reasons: corners
-do not follow u alone, points move to other cells, and pressure jumps are damped (see below).  Each point stores the
+The volume of a particle domain drifts away from the volume that its fluid content implies.  Each point stores the
 difference of the volumes as its volume defect (`owed`).  Each step corrects a part of this defect at a constant rate.
 
 If no fluid flows within a step, Q1 displacements with DG0 pressures violate the inf-sup condition: pressures that
@@ -36,8 +35,8 @@ differences only (`second_differences`), because damping of jumps would smear st
 
 With inertia, tau decreases by the factor `1 / (1 + r)`.  r is the ratio of two resistances of a macroelement, that of
 its mass and that of its stiffness, see `OnGrid.resisting_mass`.  With the static tau, waves in undrained soil would be
-too slow: a cell would exchange as much water with its neighbours as it does in a static step.  If water moves freely in
-a substep of length dt, the static tau remains: the factor is `min(1, 1 / (1 + r) + s)` with `s = kappa rho_w / dt`.
+too slow.  If water moves freely in a substep of length dt, the static tau remains: the factor is
+`min(1, 1 / (1 + r) + s)` with `s = kappa rho_w / dt`.
 """
 
 from __future__ import annotations
@@ -102,8 +101,7 @@ class StorageForms:
     `pores`.
     `weight` (d,), N/m^3: unit weight rho_w g of the pore fluid, as UFL, or None without gravity.
     `symmetric`: whether to use alpha as the derivative of the content with respect to J_Delta.  If True, the Jacobian
-    is symmetric.  The neglected term is of the order of `(p - p_n) / K_w`.  Newton's method converges as fast without
-    this term.
+    is symmetric.  The neglected term is of the order of `(p - p_n) / K_w`.
     `feeding`: sources and open sides of all stages.
     `inertial` (d,), N/m^3: inertia force `-rho_w a` on the pore fluid, as UFL, or None without inertia.
     """
@@ -434,7 +432,7 @@ class StorageProblem:
     def _damping_of_soft_soil(
         self, tau: NDArray[np.float64], softest: NDArray[np.float64], mobility: NDArray[np.float64]
     ) -> PETSc.Mat:
-        """Return the matrix of additional damping in soft cells."""
+        """Return the matrix of the additional damping in yielding soil."""
         contents, grid = self._contents, self.forms.grid
         flow = self.dt * mobility / grid.sizes(contents.filled) ** 2
         more = np.maximum((softest * tau)[:, None] - flow, 0) - np.maximum(tau[:, None] - flow, 0)
@@ -671,10 +669,9 @@ class StorageProblem:
         factor
             Multiple of beta, >= 0.
         share
-            Weight of the filter L, in [0, 1].  The weight 0 gives the fixed-stress operator.  With the stiffness K, `B
-            K^-1 B^T` equals `beta V` for a smooth pressure, and zero for a checkerboard.  For a pressure that
-            alternates along one axis, this matrix equals `beta V / 2` at nu = 0.  The matrix `beta V - L` gives these
-            three values.  L is the sum of `min(beta V+, beta V-) / (4 d) [p][q]` over the faces.
+            Weight of the filter L, in [0, 1].  The weight 0 gives the fixed-stress operator.  For a checkerboard
+            pressure, `beta V - L` vanishes like `B K^-1 B^T`, with the stiffness K.  L is the sum of
+            `min(beta V+, beta V-) / (4 d) [p][q]` over the faces.
         """
         system = self.system
         system.C.copy(system.P, structure=PETSc.Mat.Structure.SAME_NONZERO_PATTERN)

@@ -59,7 +59,7 @@ def fitted(p: Sequence, tables: Sequence[Sequence], drop, scale, of: Functions) 
     `retention.Conductance`.
     `drop`: pressure drop from the first side to the second due to the weight of the fluid, Pa.
     `scale`: characteristic suction of k_r, Pa.
-    `of`: functions for the type of the arguments: arrays or UFL expressions.
+    `of`: elementary functions of arrays or of UFL expressions.
     """
     (phi0, k0, d0), (phi1, k1, d1) = tables
     jump = p[0] - p[1]
