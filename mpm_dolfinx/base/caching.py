@@ -21,7 +21,7 @@ class Latest(Generic[T]):
 
     The cache is empty during the computation of a value, so an exception leaves no incomplete value behind.
 
-    `derived`: caches of values that depend on this value.  They are emptied together with this cache.
+    `derived`: caches of values that depend on this value; `clear` also empties these caches.
     """
 
     def __init__(self, *derived: Latest) -> None:

@@ -34,14 +34,14 @@ def body_of(ids: NDArray[np.int64], starts: NDArray[np.int64]) -> NDArray[np.int
 
 
 def determinant(F: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the determinants (n,) of F (n, d, d), much faster than numpy."""
+    """Return the determinants (n,) of F (n, d, d)."""
     if F.shape[1] == 2:
         return F[:, 0, 0] * F[:, 1, 1] - F[:, 0, 1] * F[:, 1, 0]
     return np.einsum("ni,ni->n", F[:, 0], np.cross(F[:, 1], F[:, 2]))
 
 
 def middle(corners: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the means (n, d) of corners (n, 2^d, d), much faster than numpy."""
+    """Return the means (n, d) of corners (n, 2^d, d)."""
     total = corners[:, 0].copy()
     for k in range(1, corners.shape[1]):
         total += corners[:, k]
@@ -78,7 +78,7 @@ def in_plane(F: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.fl
 
 
 def cofactor(F: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return `det F F^-T` (n, d, d) of F (n, d, d), much faster than numpy."""
+    """Return `det F F^-T` (n, d, d) of F (n, d, d)."""
     if F.shape[1] == 2:
         flat = F.reshape(-1, 4)[:, ::-1] * [1.0, -1.0, -1.0, 1.0]
         return flat.reshape(F.shape)
