@@ -54,7 +54,7 @@ class FormsOf:
         self._made: dict[Callable, Any] = {}
 
     def __call__(self, make: Callable[..., T], *more) -> T:
-        """Return the forms `make(grid, u, *more)`.  Only the first call with a class `make` compiles them."""
+        """Return the forms `make(grid, u, *more)`.  The forms of each class `make` are compiled once."""
         if make not in self._made:
             self._made[make] = make(self.grid, self.u, *more)
         return self._made[make]

@@ -149,7 +149,7 @@ class Quiet(Condition):
     ValueError
         The scene raises the error.  The bodies have no inertia, or had inertia before the side became quiet.  No point
         lies on the side.  Another `Quiet`, or a `Displacement` of all components, is on the same part of a face.  A
-        wall of the grid fixes the side.  The weight changes as the stage begins, but the kept tractions do not.
+        wall of the grid fixes the side.  The weight changes when the stage begins.
     """
 
     side: str

@@ -34,7 +34,7 @@ def under(fluid: Fluid | None, gravity: Gravity) -> Fluid | None:
 
 
 def weighed(value, fluid: Fluid | None):
-    """Return a water pressure.  A water pressure without a unit weight receives that of the pore fluid."""
+    """Return a water pressure, by default with the unit weight of the pore fluid."""
     by_fluid = isinstance(value, OfWater) and value.given is None and fluid is not None
     return replace(value, given=fluid.unit_weight) if by_fluid else value
 

@@ -137,7 +137,7 @@ def warn_thin(grid: Grid, bodies: Sequence[Body], walls: Mapping[str, str], wet:
     The increment of stress is constant in a cut domain.  In a single step, n points over the thickness therefore give
     `1 - 1/n^2` of the bending stiffness.  In several steps the fraction is larger (`domain_slopes`).  A body with one
     point over its thickness carries no moment.  The body creeps from step to step, because only the stress increment of
-    a step resists bending.  Measurements show that saturated bodies (`wet`) lose more stiffness, and continue to creep.
+    a step resists bending.  Saturated bodies (`wet`) lose more stiffness, and continue to creep.
     """
     few, slender = (FEW_WET, SLENDER_WET) if wet else (FEW, SLENDER)
     for i, body in enumerate(bodies):

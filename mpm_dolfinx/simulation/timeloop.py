@@ -256,7 +256,7 @@ def _counting(scene: Scene, state: State, energies: bool, goes_on: bool) -> Stat
 
 
 class _Stopwatch:
-    """Wall time and profile of a run, including the time of a run that it continues."""
+    """Wall time and profile of a run, and of the runs that it continues."""
 
     def __init__(self, result: Result):
         self._start = time.perf_counter() - result.wall
