@@ -148,7 +148,7 @@ class Loads:
     stiff: bool = False
     """Whether the condition adds a `penalty`."""
     holding: bool = False
-    """Whether the condition may constrain bodies by other constraints than `touching` returns."""
+    """Whether the condition may add constraints that `touching` does not return."""
     couples: bool = False
     """Whether the tangent couples nodes of different cells."""
     rounding_at_unknowns: NDArray[np.float64] | float = 0.0
@@ -298,7 +298,7 @@ class Loads:
     def under_held(
         self, ids: NDArray[np.int64], tracked: NDArray[np.float64], volume: NDArray[np.float64], corners: NDArray
     ) -> NDArray[np.float64]:
-        """Return the corners (n, 2^d, d), in m, of re-initialised domains.  On prescribed sides, corners are `tracked`.
+        """Return the corners (n, 2^d, d), in m, of re-initialised domains; corners on prescribed sides are `tracked`.
 
         A domain with a face on a prescribed side becomes a prism of equal volume.
 

@@ -70,7 +70,7 @@ class Traction(Condition):
     side
         Side of the bodies: "left", "right", "bottom", "top", in 3D also "front" (lower y) and "back" (upper y), or a
         name from a mesh.  The condition applies to all bodies that have a side with this name.
-    value : (d,) or number, or callable (t, X, x) -> (d,) or number, or one of these for each place, Pa
+    value : number or (d,), or callable (t, X, x) -> number or (d,), also for each place, Pa
         Force per reference area.  A number acts along the outward normal at the start of the step.  A negative number
         is compressive.  Several tractions on the same face add up.
     region : ((d,), (d,)), m

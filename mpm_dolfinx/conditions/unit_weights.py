@@ -97,7 +97,7 @@ def other_gravity(fluid: Fluid, gravity: Sequence[NDArray[np.float64]]) -> float
 
     A gravity that varies in the step is returned only if its last magnitude is above 9.81 m/s^2.
 
-    `gravity`: vectors, in m/s^2, at the start of a step and at times in the step.
+    `gravity`: accelerations of gravity, in m/s^2, at the start of a step and at later times in the step.
     """
     first, last = gravity[0], float(np.linalg.norm(gravity[-1]))
     rests = all(np.array_equal(first, g) for g in gravity) and last > 0

@@ -27,7 +27,7 @@ FULL = 1.2
 
 
 def warn_overlaps(cut: CutDomains, bodies: Sequence[Body]) -> Callable[..., Any] | None:
-    """Warn about the fullest cell if domains overlap.  Return a function for the next check; after a warning, None."""
+    """Warn about the fullest cell if particle domains overlap, and return this function, or None after a warning."""
     grid, points = cut.grid, cut.points
     volume = cut.to_cells(points.volume0 * points.J) * cut.pieces_to_cells(cut.pieces.fraction)
     fill = sum_by(cut.cells, cut.plane(volume)[0], grid.num_owned)[cut.cells] / grid.volumes(cut.cells)
@@ -74,7 +74,7 @@ def warn_mixed(
     Returns
     -------
     callable
-        Function for the next check.
+        Function for later checks, with a larger `least` after a warning.
     """
     grid = cut.grid
     points = cut.points

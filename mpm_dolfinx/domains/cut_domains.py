@@ -89,7 +89,7 @@ class Patches:
         return interpolate(points.corners[self.at], self.xi)
 
     def positions(self, points: MaterialPoints) -> Callable[[str], NDArray[np.float64]]:
-        """Return a function of the name of a position: "X" gives reference positions, "x" gives current positions."""
+        """Return a function that maps "X" to the reference positions, and "x" to the current positions."""
         return lambda name: self.X if name == "X" else self.now(points) + self.base
 
     def area(self, points: MaterialPoints) -> NDArray[np.float64]:
@@ -189,8 +189,7 @@ class CutDomains(Keyed):
     def surface(self, faces: Surface) -> Patches:
         """Return the quadrature points on a surface, for faces whose points are on this process.
 
-        The cell of a quadrature point contains the position just under the surface, and a piece of the domain.  Loads
-        therefore act on nodes with stiffness.
+        The cell of a quadrature point contains a piece of the point's domain, so loads act on nodes with stiffness.
         """
         return self.surfaces([faces])[0]
 
@@ -275,7 +274,7 @@ class CutDomains(Keyed):
         return self._filled_cell(at, x + NEAR * (self.points.x[at] - x))
 
     def _filled_cell(self, at: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the cells of positions x, or the cell of the domain's largest piece for cells without a piece."""
+        """Return the cells of positions x; the cell of the domain's largest piece replaces cells without a piece."""
         pieces, cells = self.pieces, self.grid.all_cells
         cell = self.grid.number(self.grid.index_from_base(x)) + self.grid.copy(self.points.id[at])
         key, keys = at * cells + cell, pieces.point * cells + pieces.cell

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Parts of seeded domains after division and merging: their intervals, identifiers, corners and faces.
 
-A part of a seeded particle domain is the image of a box of local coordinates under the bilinear or trilinear map of
-the domain.  A whole domain is the interval [0, 1] along each axis.  A division
-bisects an interval.  Two parts merge if they are the halves of one interval.  On the lattice of a box, whole domains
-also merge, into the intervals [0, 2], [0, 4], and so on.
+A part of a seeded particle domain is the image of a box of local coordinates under the bilinear or trilinear map of the
+domain.  A whole domain is the interval [0, 1] along each axis.  A division bisects an interval.  Two parts merge if
+they are the halves of one interval.  On the lattice of a box, whole domains also merge, into the intervals [0, 2], [0,
+4], and so on.
 """
 
 from __future__ import annotations

@@ -91,13 +91,13 @@ def cell_ratios(
 ) -> NDArray[np.float64]:
     """Return the volume ratios (m,) of the pieces of a cut at the start of a step.
 
-    With F-bar, the volume ratio of a cell is the present volume of its particle domains divided by their
-    reference volume.  A ratio updated by increments would drift from the volumes of the domains.
-    Without F-bar, and in cells with yielded soil, the ratio of a piece is the ratio of its point.
+    With F-bar, the volume ratio of a cell is the present volume of its particle domains divided by their reference
+    volume.  A ratio updated by increments would drift from the volumes of the domains.  Without F-bar, and in cells
+    with yielded soil, the ratio of a piece is the ratio of its point.
 
     `cut`: cut particle domains.
     `points`: points at the start of the step.
-    `share` (n,): weight, from 0 to 1, of the ratio from corners in the geometric mean with the point's ratio; 0 without
+    `share` (n,): weight, from 0 to 1, of the ratio from corners in a geometric mean with the point's ratio; 0 without
     F-bar.
     `flows` (n,): whether points have yielded.
     """

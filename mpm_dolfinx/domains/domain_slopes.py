@@ -56,7 +56,7 @@ class Neighbours:
         self._partner = partner.reshape(-1, 2 * dim).T.copy()  # index of the opposite face; -1 if there is none
 
     def at_neighbours(self, own: NDArray[np.float64], faces: Sequence[NDArray[np.float64]]) -> Callable[[int], tuple]:
-        """Return a function of a face index: data and face centres of neighbours, and whether neighbours exist.
+        """Return a function of a face index that returns data, face centres and mask of the neighbours.
 
         `own` (c, k): c data columns of the points.
         `faces`: centres (d, k), in m, of the points' faces, for each face index.

@@ -2,16 +2,16 @@
 """Correction of the corners of yielded particle domains, so that the domains keep the volumes of their points.
 
 The volume ratio of a point is a mean over its cell.  The corners of its domain follow a field that varies in the cell.
-In yielded soil, F is updated by increments, so the volumes of domains and points would drift apart.  After a
-step, the corners of yielded domains therefore move by the vectors d that minimise
+In yielded soil, F is updated by increments, so the volumes of domains and points would drift apart.  After a step, the
+corners of yielded domains therefore move by the vectors d that minimise
 
     sum_p V_p e_p^2 + SOFT^2 sum_p V_p (mean (d / h)^2 + sum_a mean (D_a / h)^2),  V_p e_p = V_p - V - dV/dx d.
 
 The sums are over the points p.  V_p is the volume of a point, and V is the volume of its domain.  The derivative of V
 with respect to the corners is dV/dx.  The relative volume error after the motion is e_p.  D_a is the change of d along
 an edge of axis a.  The means are over the domain's corners and edges, and h contains the edge lengths of the domain's
-cell.  Shared corners move together.  Fixed corners, and corners of elastic domains, do not move.  Kugelstadt et al.
-(2019) correct cell densities in this way.
+cell.  Shared corners move together.  Fixed corners, and corners of elastic domains, do not move.  Implicit density
+projection corrects the densities of cells in this way (Kugelstadt et al. 2019).
 """
 
 from __future__ import annotations

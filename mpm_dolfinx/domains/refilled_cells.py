@@ -47,7 +47,7 @@ COVERED = 0.25
 Source: definition, the area of a new domain in a full cell, which is divided into four.
 """
 SIDE = np.array([2, 1, 3, 0])
-"""Index of the domain's face at each edge, in the sequence of corners around the domain."""
+"""Face index of each edge of a domain, anticlockwise."""
 START, END = np.array([2, 1, 0, 3]), np.array([0, 3, 1, 2])
 """Corner at which each face starts, and corner at which it ends, anticlockwise."""
 
@@ -537,7 +537,7 @@ def ring_share(r0: NDArray[np.float64], r1: NDArray[np.float64], t: NDArray[np.f
 
 
 def _convex(corners: NDArray[np.float64], volume: NDArray[np.float64] | float) -> tuple[Polygons, NDArray[np.int64]]:
-    """Divide domains into convex polygons, and return the polygons with the domain of each."""
+    """Divide domains into convex polygons, and return the polygons and the index of the domain of each polygon."""
     ring = corners[:, RING]
     edge = np.tile(SIDE, (len(ring), 1))
     away = np.roll(ring, -1, axis=1) - ring

@@ -308,7 +308,7 @@ class CellContents(Keyed):
         """Return the areas (m,), offsets (m, d) and shapes (m,) of faces in owned cells.
 
         Offsets, in m, are vectors from the centroid of the cell's material to the face.  Shapes, in m^(d-2), are areas
-        divided by the distances of the centroids.
+        divided by the distances from the centroids.
 
         `x` (m, d), m: positions of the faces.
         `area` (m, d), m^(d-1): outward area vectors.

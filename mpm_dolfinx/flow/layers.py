@@ -241,8 +241,8 @@ def graded(
 ) -> NDArray[np.float64]:
     """Return the mobilities (n, d) along the axes, divided by `mean`, in cells whose mobility varies gradually.
 
-    The difference between the arithmetic and the harmonic mean of the mobilities is distributed over the axes, in
-    proportion to the variance of a linear fit to the mobility along each axis.
+    The difference between the arithmetic and the harmonic mean of the mobilities is distributed over the axes.  The
+    share of an axis is proportional to the variance of a linear fit along this axis.
 
     `offset` (m, d), m: positions of the pieces relative to the midpoints of cells.
     `kappa` (m,), m^2/(Pa s): mobilities of the pieces.

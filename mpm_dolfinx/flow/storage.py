@@ -33,10 +33,10 @@ For elastic soil, tau is a quarter of the value that Silvester and Kechkar give 
 and Borja 2021).  Soil in plastic flow needs a tau up to a hundred times larger.  The increase of tau acts on second
 differences only (`second_differences`), because damping of jumps would smear steep pressures.
 
-With inertia, tau decreases by the factor `1 / (1 + r)`.  r is the ratio of two resistances of a macroelement, that of
-its mass and that of its stiffness, see `OnGrid.resisting_mass`.  With the static tau, waves in undrained soil would be
-too slow.  If water moves freely in a substep of length dt, the static tau remains: the factor is
-`min(1, 1 / (1 + r) + s)` with `s = kappa rho_w / dt`.
+With inertia, tau decreases by the factor `1 / (1 + r)`.  Here r is the resistance of the mass of a macroelement,
+divided by the resistance of its stiffness, see `OnGrid.resisting_mass`.  With the static tau, waves in undrained soil
+would be too slow.  If water moves freely in a substep of length dt, the static tau remains: the factor is `min(1, 1 /
+(1 + r) + s)` with `s = kappa rho_w / dt`.
 """
 
 from __future__ import annotations
@@ -462,7 +462,7 @@ class StorageProblem:
         return {name: values for one, at in both for name, values in one.run_off(at, fluid).items()}
 
     def passing(self) -> list[Mapping[str, NDArray[np.float64]]]:
-        """Return the rates in a converged substep, from which `volumes` computes volumes."""
+        """Return the rates in a converged substep, for the method `volumes`."""
         fluid, both = self._fluid, zip(self._feeds, self._flow(False).at, strict=True)
         return [one.passing(at, fluid) for one, at in both]
 

@@ -104,7 +104,7 @@ class ElementForces:
 
 
 class Beside(NamedTuple):
-    """Further integrals over each cell, computed together with an element matrix, because both share terms."""
+    """Further integrals over each cell, computed together with an element matrix."""
 
     # UFL tensors T[i, k] (d, d), multiplied by grad v (or by grad v F) for each dof of v
     along: Sequence[ufl.core.expr.Expr] = ()

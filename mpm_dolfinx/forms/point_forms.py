@@ -331,7 +331,7 @@ Given = Mapping[str, NDArray[np.float64]]
 NONE: Given = MappingProxyType({})
 
 Packed = tuple[NDArray[np.float64], list[tuple[slice, NDArray[np.float64], NDArray[np.intp]]]]
-"""Coefficients, one row for each point; for each grid function, its columns, its values, and the dofs of each row."""
+"""Coefficients with a row for each point, and for each grid function its columns, its values and the dofs of rows."""
 
 
 class Rows:

@@ -289,17 +289,17 @@ class Cells:
 
 
 def of_cells(name: str) -> cached_property:
-    """Return a property of a grid that is an attribute of its `Cells`."""
+    """Return a property of `Grid` that reads an attribute of the grid's `Cells`."""
     return cached_property(lambda grid: getattr(grid._of_process, name))
 
 
 def of_places(name: str) -> property:
-    """Return a property of a grid that is an attribute of `at` of its `Cells`."""
+    """Return a property of `Grid` that reads an attribute of the present `CellPlaces`."""
     return property(lambda grid: getattr((grid._cells or grid._of_process).at, name))
 
 
 def of_spacing(name: str) -> property:
-    """Return a property of a grid that is an attribute of its current `Spacing`."""
+    """Return a property of `Grid` that reads an attribute of the present `Spacing`."""
     return property(lambda grid: getattr(grid._spacing, name))
 
 

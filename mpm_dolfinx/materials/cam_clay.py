@@ -2,7 +2,7 @@
 """Modified Cam Clay at finite strain (Borja and Tamagnini 1998), and the Barcelona Basic Model for suction.
 
 The law describes clay whose yield surface grows with plastic compaction.  Plasticity is multiplicative, in principal
-logarithmic strains.  tau is the Kirchhoff stress, e_v is the elastic volume strain, and e is the elastic deviatoric
+logarithmic strains.  Let tau be the Kirchhoff stress, e_v the elastic volume strain, and e the elastic deviatoric
 strain (tension positive).  With P = -tr(tau)/3 and Q = sqrt(3/2) |dev tau|, the law is
 
     P = P_0 exp(-e_v / kappa),   dev tau = 2G e,
@@ -307,7 +307,7 @@ class BarcelonaBasic(ModifiedCamClay):
 
 
 class _Return:
-    """Return to the yield surface for a value of the unknown d.
+    """Result of the return mapping for a value of the unknown d.
 
     `compaction`: a.
     `flow`: h.

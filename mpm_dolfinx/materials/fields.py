@@ -169,7 +169,7 @@ class SceneMaterials:
         ]
 
     def seeds_no_more(self) -> None:
-        """Delete the seeded points when all bodies are in the scene."""
+        """Delete the seeded points, which only bodies that are added later need."""
         self.seeded = self.seeded.of(np.empty(0, dtype=np.int64))
 
     def check_cells(self) -> None:
@@ -642,7 +642,7 @@ def _places(bodies: Sequence[Body], material: int, ids: NDArray[np.int64]) -> ND
 
 
 def _ends(grid: Grid, values: Sequence) -> tuple[float, float]:
-    """Return the least and the largest of some numbers and arrays, over all processes."""
+    """Return the smallest and the largest of all values, over all processes."""
     flat = np.concatenate([np.ravel(one) for one in values])
     least, most = over_all(grid.comm, np.array([flat.min(), -flat.max()]), MPI.MIN)
     return float(least), -float(most)

@@ -33,12 +33,12 @@ LARGEST = 0.2  # limit to the change of a strain component in one iteration
 class K0:
     """Initial effective stress of soil under its own weight, with the coefficient K0 of earth pressure at rest.
 
-    The vertical effective stress is the overburden of soil and fluid plus the surcharge, minus the pore stress
-    alpha chi p.  alpha is Biot's coefficient, chi is Bishop's coefficient, and p is the pore pressure.  The horizontal
-    effective stresses are K0 times the vertical effective stress.  In axisymmetry, the horizontal stresses are radial
-    and circumferential.  The stresses are exact for level ground with level layers.  In other ground, the stresses are
-    changed until they balance the weight, without motion of the points.  A warning is given if balancing changes a
-    stress by more than 5 % of the largest initial stress, as on slopes.
+    The vertical effective stress is the overburden of soil and fluid plus the surcharge, minus alpha chi p.  Here alpha
+    is Biot's coefficient, chi is Bishop's coefficient, and p is the pore pressure.  The horizontal effective stresses
+    are K0 times the vertical effective stress.  In axisymmetry, the horizontal stresses are radial and circumferential.
+    The stresses are exact for level ground with level layers.  In other ground, the stresses are changed until they
+    balance the weight, without motion of the points.  A warning is given if balancing changes a stress by more than 5 %
+    of the largest initial stress, as on slopes.
 
     Parameters
     ----------
@@ -255,7 +255,7 @@ def stressed(
 
 @dataclass(frozen=True, eq=False)
 class _ElasticStrains:
-    """Elastic strains for target stresses, as logarithms of stretches, by Newton's method."""
+    """Newton's method for the elastic (logarithmic) strains that cause target stresses."""
 
     materials: SceneMaterials
     points: MaterialPoints  # n points
@@ -296,7 +296,7 @@ class _ElasticStrains:
         return self.of(elastic)
 
     def residual(self, strain: NDArray[np.float64]) -> tuple[MaterialPoints, NDArray[np.float64]]:
-        """Return the points with these elastic strains, and their stresses minus the target stresses, in Pa."""
+        """Return the points with elastic strains `strain`, and their stresses minus the target stresses, in Pa."""
         tensor = np.zeros((len(strain), 3, 3))
         for value, (i, j) in zip(strain.T, self.components, strict=True):
             tensor[:, i, j] = tensor[:, j, i] = value

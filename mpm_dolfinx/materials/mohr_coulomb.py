@@ -49,7 +49,7 @@ class MohrCoulomb(Frictional):
         Dilation angle psi, degrees, in [0, friction].  If psi = phi, flow is associated and the tangent is symmetric.
         Soil in tension at the apex dilates for any psi.
     cohesion
-        Cohesion c, Pa, >= 0.  If c is zero, points without mean pressure have no stiffness.
+        Cohesion c, Pa, >= 0.  If c is zero, soil without mean stress has no stiffness.
     tension
         Tensile strength T, Pa, >= 0: upper limit of the principal stresses, by default the apex stress c cot phi.
 

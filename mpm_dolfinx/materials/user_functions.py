@@ -9,9 +9,9 @@ points
     Quadrature points.  The integral of 1 over the measure `points.dx` is the volume of the material points.
     `points.value(f)` and `points.grad(f)` are the value and gradient of f = u or v.  In axisymmetry the gradient is (3,
     3), with f_r / r.  `points.F` is the deformation gradient at the start of the step, in the shape of grad u; its
-    determinant is the volume ratio.  `points.position` is the position at the start of the step, and
-    `points.displacement` is
-    state variables, and parameters that are functions of position.
+    determinant is the volume ratio.  `points.position` is the position at the start of the step.
+    `points.displacement` is the displacement since the start of the run, or since a stage that reset it to zero.  Other
+    attributes are the laws' state variables, and parameters that are functions of position.
 t
     Time at which the balances hold, s, as a UFL constant: the end of the step or of its first substep.
 

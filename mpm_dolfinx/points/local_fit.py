@@ -31,7 +31,7 @@ Source: exact. A parabola needs three points.  At an end of the data, these poin
 UNTOLD = (0.0, 1e-10, 1e-6)
 """Weights of the small terms for coefficients of degrees 0, 1 and 2, divided by the sum of the data weights.
 
-Weights 0.01 or 100 times as large change the pressures of a consolidating column by 1e-5 of the load.
+With weights 0.01 or 100 times as large, pressures of a consolidating column change by 1e-5 of the load.
 """
 
 

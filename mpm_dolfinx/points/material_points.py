@@ -98,7 +98,7 @@ class MaterialPoints:
     corners : (n, 2^d, d), m
         Tracked corners of the particle domain, in the order of `grid.corner_bits`.
     F : (n, d, d)
-        Deformation gradient.  With an out-of-plane stretch in plane strain: in-plane part, scaled to det F.
+        Deformation gradient.  In plane strain with an out-of-plane stretch: the in-plane part, scaled to det F.
     volume0 : (n,), m^d
         Reference volume.
     material : (n,)

@@ -76,8 +76,8 @@ class Search:
     def after(self, work: float, growth: float) -> Search | None:
         """Return the next trial, or None if the search ends.
 
-        A full step that does not increase the residual ends the search if `abs(work) <= 1`. A secant gives the next
-        trial. Bisection replaces the secant if one bound does not change in two trials.
+        A full step that does not increase the residual ends the search if `abs(work) <= 1`. Otherwise a secant gives
+        the next trial. Bisection replaces the secant if one bound does not change in two trials.
         `work`: work in the last trial divided by the initial work, or nan.
         `growth`: growth factor of the residual in the last trial.
         """

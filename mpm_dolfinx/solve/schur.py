@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Solvers of the linearised problem. One set of solvers serves while the active cells do not change.
+"""Solvers of the linearised problem, which are kept while the active cells do not change.
 
     [ K  -B^T ] [du]     [R_u]
     [ B   C   ] [dp] = - [R_p]
