@@ -11,8 +11,8 @@ from 0 to 1.  D_a is a second difference of nodal displacements along axis a.  T
 displacements, equal to Q1 at the nodes, and continuous.
 
 D_a belongs to the cell edge along axis a that ends at node i.  D_a is the minmod limiter of the second differences at
-both ends of the edge, or the only second difference.  If cell sizes vary, a second difference is the squared edge
-length times the second derivative of a parabola through three nodes.  Kinks at material boundaries are kept.
+both ends of the edge.  If only one end has a second difference, D_a is this difference.  If cell sizes vary, a second
+difference is the squared edge length times the second derivative of a parabola through three nodes.
 """
 
 from __future__ import annotations

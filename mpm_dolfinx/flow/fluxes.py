@@ -359,7 +359,7 @@ class HalfFaces:
 
     @cached_property
     def side(self) -> OpenSides:
-        """The faces as open sides, so that `nonorthogonal.Gradients` has no no-flow side there."""
+        """The faces as open sides, because water passes through them, see `nonorthogonal.Gradients`."""
         none, unknown = np.zeros(len(self.at)), np.full(len(self.at), np.nan)
         number, seeps = none.astype(np.int64), none.astype(bool)
         offset = self._shapes[1]

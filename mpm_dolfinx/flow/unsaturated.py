@@ -122,8 +122,7 @@ class Relative:
     Attributes
     ----------
     shares
-        Fractions (DG0) of a cell's mobility at k_r = 1: of soil without a retention curve, and of the soil of each
-        curve.
+        Fractions (DG0) of a cell's saturated mobility: of soil without a retention curve, and of soil of each curve.
     laws
         Relative conductivities as functions of pressure.
     """

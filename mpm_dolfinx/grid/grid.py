@@ -359,8 +359,8 @@ class Grid:
     snap
         Distances (d,) along the axes, in cell sizes.  Vertices that are nearer to a grid plane count as on the plane.
     base : (d,), m
-        Origin of all internal positions: the lower corner of the grid, in axisymmetry at the radius 0.  With this
-        origin, positions far from the true origin keep their digits.
+        Origin of all internal positions: the lower corner of the grid, in axisymmetry at the radius 0.  This origin
+        reduces rounding errors of positions far from the true origin.
     low, high : (d,), m
         Lower and upper corner relative to `base`.
     stretches

@@ -74,7 +74,7 @@ def expression(function: Callable, shapes: Sequence[tuple[int, ...]], of: str = 
     """Return the result of a user-defined function as a UFL expression with one of the given shapes.
 
     ValueError is raised if the function fails, or if the result is not UFL.  ValueError is also raised if the result
-    has a wrong shape, or does not depend on `of`.
+    has a wrong shape, or does not depend on the argument `of`.
     """
     value = call(function, **available)
     allowed = f"UFL of shape {' or '.join(map(str, shapes))}{f' that depends on {of}' if of else ''}"
