@@ -2,10 +2,10 @@
 """Interface of all loads in the momentum balance: tractions, prescribed displacements, tools, weight, user conditions.
 
 Conditions of one kind act on three levels: stage, substep and assembly.  The method `acting(setting)` of a condition
-returns an `Acting`, which is created once in a stage and contains the loaded faces.  Its method `placed` returns the
-`Loads` of a substep, for the current position of these faces.  At each assembly, `Loads` add forces to the residual and
-stiffness to the tangent.  The step and the momentum balance call only this interface.  `flow/feeding.py` treats
-conditions on the fluid.
+returns an `Acting`, which is created once in a stage and contains the loaded faces.  The method `placed` of this object
+returns the `Loads` of a substep, for the current position of these faces.  At each assembly, `Loads` add forces to the
+residual and stiffness to the tangent.  The step and the momentum balance call only this interface.  `flow/feeding.py`
+treats conditions on the fluid.
 """
 
 from __future__ import annotations

@@ -6,8 +6,8 @@ A name refers to the position of the side before any map.  The sides of a mesh h
 A side moves with its body, and excludes faces that touched another body at seeding.  Regions and X are reference
 positions before all maps (`mapped`).  Reference areas are areas of the seeded shape, after the maps.
 
-A new kind of condition is a class in a separate file.  Its method `acting` adds terms to the momentum balance
-(`conditions/acting.py`).  Its method `feeding` adds terms to the fluid balance (`flow/feeding.py`).
+A new kind of condition is a class in a separate file.  The method `acting` of this class adds terms to the momentum
+balance (`conditions/acting.py`).  The method `feeding` adds terms to the fluid balance (`flow/feeding.py`).
 
 A value may be a function of time t, reference positions X and current positions x.  The package passes the arguments
 that the function names, see `validation`.
@@ -173,8 +173,8 @@ class OnSide(Condition):
     side
         Side of the bodies, as for `Traction`.
     term
-        Function as in `terms`, see `user_functions`.  Its `points` are quadrature points on the side.  `points.dx` is
-        the area measure, and `points.normal` the outward normal, both at the start of the step.
+        Function as in `terms`, see `user_functions`.  The `points` of the term are quadrature points on the side.
+        `points.dx` is the area measure, and `points.normal` the outward normal, both at the start of the step.
     region : ((d,), (d,)), m
         As for `Traction`.
 
@@ -492,7 +492,7 @@ class RigidPlate(Condition):
     Parameters
     ----------
     side
-        Side of the bodies, as for `Traction`.  Its seeded faces must be connected, and in one plane normal to an axis.
+        Side of the bodies, as for `Traction`.  The seeded faces must be connected, and in one plane normal to an axis.
     force : float or callable t (s) -> float, N (N/m in plane strain)
         Total force on the side, positive for compression.  In axisymmetry it acts on the whole circumference.
     region : ((d,), (d,)), m

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Unit weight of the fluid under the scene's gravity.  It converts hydraulic conductivity to mobility."""
+"""Unit weight of the fluid under the scene's gravity, which converts hydraulic conductivity to mobility."""
 
 from __future__ import annotations
 
@@ -71,10 +71,10 @@ def warn_units(comm: MPI.Intracomm, fluid: Fluid, gravity: Gravity) -> None:
 
 
 def warn_levels(comm: MPI.Intracomm, fluid: Fluid | None, gravity: Gravity, levels: Sequence[tuple[str, Any]]) -> None:
-    """Warn about each water level whose unit weight differs from that of the pore fluid.
+    """Warn about each water level whose unit weight differs from the pore fluid's.
 
     A dry scene with gravity has no pore fluid.  The function then warns about levels whose default unit weight is not
-    that of water under this gravity.
+    the unit weight of water under this gravity.
 
     `levels`: name and water pressure of each level.
     """

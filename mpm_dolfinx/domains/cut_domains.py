@@ -111,9 +111,9 @@ class CutDomains(Keyed):
     grid
         Background grid.
     points
-        Material points of this process.  They must be inside the grid.
+        Material points of this process.  All points must be inside the grid.
     domains
-        Whether to integrate over the exact pieces of the domains.  If not, each point is one piece, as in standard MPM.
+        Whether to integrate over the exact pieces of the domains.  Otherwise each point is one piece, as in MPM.
     second, faces
         Whether to compute second moments and face areas of the pieces.
     """

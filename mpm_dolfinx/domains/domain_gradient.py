@@ -70,7 +70,7 @@ def volume_slopes(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the volumes (n,) of domains, in m^d, and their derivatives (n, 2^d, d) with respect to the corners.
 
-    In axisymmetry the domains are rings.  Their volumes are integrals of `pi r^2 dz`, in m^3.
+    In axisymmetry, the volumes of the rings are integrals of `pi r^2 dz`, in m^3.
     """
     now = domain_volumes(corners, axisymmetric)
     if corners.shape[2] == 3:

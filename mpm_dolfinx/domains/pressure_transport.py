@@ -261,7 +261,7 @@ def halved_pieces(
     storage: tuple[NDArray[np.float64], NDArray[np.float64]],
     bulk: float,
 ) -> PiecePressures:
-    """Return one piece for each new point.  Its pressure follows from the mean slope in the domain of the old point.
+    """Return a piece for each new point, with a pressure from the mean slope in the domain of the old point.
 
     `pieces`: pieces of the n old points.
     `points`: old points, and m new points.

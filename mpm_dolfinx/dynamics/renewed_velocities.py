@@ -56,8 +56,8 @@ def velocities(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the velocities and the velocity gradients of new domains.
 
-    Both are means over the overlap with old domains, whose velocity fields are affine.  A rigid motion of each group of
-    domains then restores the momentum and the angular momentum of the group.
+    The results are means over the overlap with old domains, whose velocity fields are affine.  A rigid motion of each
+    group of domains then restores the momentum and the angular momentum of the group.
 
     `corners` (n, 4, 2), in m: corners of each new domain.
     `x` (n, 2), in m: position of each new domain.

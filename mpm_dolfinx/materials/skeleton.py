@@ -99,11 +99,11 @@ class Skeleton:
     should be scaled to values of about one.
 
     residual
-        Function of the law's fields, state, unknowns and `trial`.  It returns a dict with UFL for each unknown, of the
-        shape of the unknown.  Newton's method solves residual = 0 at each point.
+        Function of the law's fields, state, unknowns and `trial`.  The function returns a dict with UFL for each
+        unknown, of the shape of the unknown.  Newton's method solves residual = 0 at each point.
     solution
-        Alternative to `residual` in numpy, for return mappings with many cases, and for existing codes.  It is a
-        function of arrays (n, ...) of the law's fields, state and `trial`.  It returns a dict with a pair for each
+        Alternative to `residual` in numpy, for return mappings with many cases, and for existing codes.  The function
+        takes arrays (n, ...) of the law's fields, state and `trial`.  The function returns a dict with a pair for each
         unknown: the values (n, ...), and a dict of derivatives (n, ..., ...) by name of the trial value.  A derivative
         may be a function without arguments, called when a tangent is assembled.  A missing derivative is zero.  Without
         a solution, return NaN or infinity; the time step is then reduced.  Newton's method is slow if `energy` is not

@@ -169,7 +169,7 @@ class MaterialPoints:
         return len(self.id)
 
     def within(self) -> NDArray[np.float64]:
-        """Return positions (n, d), in m, within the domains.  They are `x`, unless a domain is partly inverted."""
+        """Return positions (n, d), in m, within the domains: `x`, except for partly inverted domains."""
         return centroids(self.corners, within=True)
 
     @property

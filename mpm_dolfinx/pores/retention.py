@@ -39,7 +39,7 @@ METHODS = ("saturation", "relative_permeability")
 class Retention:
     """Base of retention curves defined by an effective saturation S_e: S = S_r + (1 - S_r) S_e.
 
-    A derived law is a frozen dataclass of numbers.  Its method `effective(s)` returns S_e, and its method `conducts(s)`
+    A derived law is a frozen dataclass of numbers.  The method `effective(s)` returns S_e, and the method `conducts(s)`
     returns k_r, both as UFL of the suction s >= 0, in Pa.  S_e and k_r must be 1 at s = 0.
 
     Parameters
