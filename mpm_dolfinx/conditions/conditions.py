@@ -419,7 +419,7 @@ def holding(material: Skeleton) -> NDArray[np.float64]:
     """Return the reference modulus, in Pa, of the penalty for prescribed displacements.
 
     A Q1 field with constant volumetric strain in each cell cannot follow a curved side.  The penalty converts the
-    difference between this field and the side into pressure, so it must not be stiff compared with the shear stiffness.
+    difference between this field and the side into pressure.  It must not be stiff compared with the shear stiffness.
     In an undrained cavity, a penalty of 300 (lambda + 2G) gives up to 1.9 times the exact pressure.  A penalty of 30
     (4G) gives 1.01 times the exact pressure.
     """

@@ -25,8 +25,8 @@ from mpm_dolfinx.points.material_points import MaterialPoints, middle
 STILL = 3e-4
 """Largest motion of corners, divided by the cell size, for which a cut remains valid.
 
-In a consolidating column of ten cells, a new cut in every step changes pressures by 7e-5 of the load, and the
-settlement by 3e-5 of its value.
+In a consolidating column of ten cells, a new cut in every step changes pressures by 7e-5 of the load.  The settlement
+changes by 3e-5 of its value.
 """
 
 

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Conservative, second-order remap of the pore pressure from one grid to the next.
 
-In each cell the pressure at the position x is reconstructed as `p + s . (x - c)`, with the cell pressure p, the slope
-s, and the centroid c of the cell's storage.  Along an axis, s is van Leer's mean of the slopes towards both neighbours,
-or towards the pressure on a drained side.  At a no-flow side, s is zero.  Then s is scaled so that the pressure in
-the cell stays between the extremes of cell, neighbours and drained sides.
+In each cell the pressure at the position x is reconstructed as `p + s . (x - c)`.  Here p is the cell pressure, s is
+the slope, and c is the centroid of the cell's storage.  Along an axis, s is van Leer's mean of the slopes towards both
+neighbours, or towards the pressure on a drained side.  At a no-flow side, s is zero.  Then s is scaled so that the
+pressure in the cell stays between the extremes of cell, neighbours and drained sides.
 
 A piece of a particle domain receives the pressure at its centroid and moves with the domain.  Then the domain is cut
 again.  The fraction of the domain that remains in a cell keeps its pressure.  A fraction that enters a cell receives

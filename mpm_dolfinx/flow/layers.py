@@ -33,8 +33,8 @@ from mpm_dolfinx.grid.grid import ranges, sum_by
 from mpm_dolfinx.parallel.exchange import over_all
 
 INCLINED = 0.01
-"""If the slope of layers relative to the grid is larger than this value, the pressure position of a cell moves to the
-more conductive end.  Plateau (scene "slope" of tests/plateaus.py): half this value changes the result by 4.1e-04, twice
+"""Slope of layers relative to the grid, above which the pressure position of a cell moves to the more conductive end.
+Plateau (scene "slope" of tests/plateaus.py): half this value changes the result by 4.1e-04, twice
 this value by 5.0e-05, and finer cells by 3.4e-03.
 """
 PAIRS = 2**16

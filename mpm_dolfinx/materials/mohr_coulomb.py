@@ -7,8 +7,8 @@ stresses are t_1 >= t_2 >= t_3, tension positive.  These stresses satisfy
     f_ij = (1 + sin phi) t_i - (1 - sin phi) t_j - 2 c cos phi <= 0  for all i, j,    t_i <= T,
 
 with the friction angle phi, the cohesion c and the tensile strength T.  The direction of flow is
-(1 + sin psi) e_i - (1 - sin psi) e_j on a face f_ij, and e_i at the cut-off T, with the dilation angle psi and the
-principal directions e_i.
+(1 + sin psi) e_i - (1 - sin psi) e_j on a face f_ij, and e_i at the cut-off T.  Here psi is the dilation angle, and
+e_i are the principal directions.
 
 The final stress lies on one of ten faces, edges and vertices of the yield surface.  On each face, edge and vertex, the
 final stress is linear in the trial stress (de Souza Neto, Peric and Owen 2008, 8.2, without the cut-off).  A final

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Line search: length of a Newton step, see `Newton._line_search`.
 
-Without yield, the search accepts a full step even if the residual grows, because linearised rotations of a bending body
-cause a spurious stretch. The step is halved only if a law cannot be evaluated at its end, or if the residual grows by
-more than `EXPLODES`.
+Without yield, the search accepts a full step even if the residual grows. Linearised rotations of a bending body cause a
+spurious stretch. The step is halved only if a law cannot be evaluated at its end, or if the residual grows by more than
+`EXPLODES`.
 
 In yielding soil, the criterion is the work of the residuals of forces and fluid along the step. The search accepts a
 full step if the work at its end is less than half of the initial work. The search also accepts a full step if the
