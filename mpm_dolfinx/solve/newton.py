@@ -399,7 +399,7 @@ class Newton:
     def _errors(self, start: NDArray[np.float64] | None = None) -> Errors:
         """Assemble both residuals, add their relative norms to the history, and return the norms.
 
-        The scales contain the forces at the start of the step, but not those of earlier iterates, which may diverge.
+        The scales contain the forces at the start of the step, but not the forces of earlier iterates.
         Residuals within round-off are returned as 0.
         """
         first = not self.report.history
