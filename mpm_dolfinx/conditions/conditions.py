@@ -95,10 +95,10 @@ class Traction(Condition):
 class Pressure(Condition):
     """Pressure on a side of the bodies, always normal to the moving surface, per current area.
 
-    The pressure is added to tractions.  The pressure acts on skeleton and pore fluid together.  If the water enters the
-    pores, a `Drained` must also prescribe the pore pressure.  A uniform pressure has a potential if the loaded surface
-    is closed, or ends at walls that fix the edges of this surface.  Without a potential the tangent is unsymmetric.
-    The solver is then LU or FGMRES, and the stability of dry equilibria is not checked.
+    A pressure and tractions on the same face add up.  The pressure acts on skeleton and pore fluid together.  If the
+    water enters the pores, a `Drained` must also prescribe the pore pressure.  A uniform pressure has a potential if
+    the loaded surface is closed, or ends at walls that fix the edges of this surface.  Without a potential the tangent
+    is unsymmetric.  The solver is then LU or FGMRES, and the stability of dry equilibria is not checked.
 
     Parameters
     ----------

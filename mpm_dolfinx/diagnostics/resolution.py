@@ -107,8 +107,8 @@ def warn_mixed(
 def _losses(cut: CutDomains, volume: NDArray[np.float64], modulus: NDArray[np.float64]) -> tuple[NDArray, ...]:
     """Return the loss times volume (m^d), the ratio of moduli, and the softest piece of each owned cell.
 
-    With moduli M and volume fractions s in a cell, layers in series have the compliance `sum (s / M)`.  Equal strain in
-    the cell gives the compliance `1 / sum (s M)` instead.  The loss is the difference of both compliances, divided by
+    With moduli M and volume fractions s in a cell, layers in series have the compliance `sum (s / M)`.  With equal
+    strain in the cell the compliance is `1 / sum (s M)`.  The loss is the difference of both compliances, divided by
     the largest `1 / M`.  For two moduli of ratio r < 1, the loss is at most `(1 - sqrt(r))^2`.
     """
     n, order = cut.grid.num_owned, np.argsort(-modulus, kind="stable")

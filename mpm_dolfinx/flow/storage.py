@@ -482,7 +482,7 @@ class StorageProblem:
 
     @property
     def fill(self) -> NDArray[np.float64]:
-        """Volume fraction of material in each cell, the weight of the cell's pressure error."""
+        """Volume fraction of material in each cell, by which pressure errors are weighted."""
         return self._contents.fill
 
     def undrained(self, volumes: NDArray[np.float64]) -> NDArray[np.float64]:
