@@ -21,7 +21,7 @@ class Latest(Generic[T]):
 
     The cache is empty during the computation of a value, so an exception leaves no incomplete value behind.
 
-    `derived`: caches of values that depend on this value.  They are emptied together with this cache.
+    `derived`: caches of values that depend on this value; `clear` also empties these caches.
     """
 
     def __init__(self, *derived: Latest) -> None:
@@ -31,8 +31,8 @@ class Latest(Generic[T]):
     def __call__(self, key: Any, make: Callable[[], T], comm: MPI.Intracomm = MPI.COMM_SELF) -> T:
         """Return the value for a key.  The value is computed again if the key differs from the last key.
 
-        `key`: all data on which the value depends: numbers, objects, arrays that never change, or tuples of these
-        `make`: function that computes the value
+        `key`: all data on which the value depends: numbers, objects, arrays that never change, or tuples of these.
+        `make`: function that computes the value.
         `comm`: processes that compute the value together.  If one of them needs a new value, all compute it.
         """
         other = self._entry is None or not (self._entry[0] is key or same(self._entry[0], key))

@@ -9,10 +9,10 @@ is a linear function a J + b of J, where a is the value of S at n = 1, and
     d zeta = (alpha / rho) d[(J + b / a) rho],    rho = exp(a p / alpha).
 
 The bracket is the mass of a fluid of density rho that fills the volume J + b / a.  The change of zeta in a step is
-computed as alpha times the change of this mass, divided by rho at the mean pressure of the step.  This formula is
+alpha times the change of this mass, divided by rho at the mean pressure of the step.  This formula is
 second-order accurate for any path.  If no fluid flows, the change is exactly zero in a step of any size.
 
-Fluxes between cells conserve mass.  The density of the fluid is rho_w exp(p / K_w).  Its mass flux is -rho_w kappa grad
+Fluxes between cells conserve mass.  The density of the fluid is rho_w exp(p / K_w).  The mass flux is -rho_w kappa grad
 pi.  The mobility kappa is the conductivity divided by the unit weight.  Kirchhoff's transformation gives the mass
 potential pi = K_w (exp(p / K_w) - 1).  The mean density between the pressures p- and p+ is rho_w (pi+ - pi-) / (p+ -
 p-).

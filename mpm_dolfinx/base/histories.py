@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Histories of a run: quantities at each output time.  All results of a run share the same arrays."""
+"""Histories of a run: quantities at each output time, in arrays that all results of the run share."""
 
 from __future__ import annotations
 

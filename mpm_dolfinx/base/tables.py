@@ -18,7 +18,7 @@ Outcome = Mapping[str, Mapping[str, NDArray[np.float64]]]
 
 
 class Histories(Protocol):
-    """Results at the probes at one output time, or at all output times.  Time is then the first axis of arrays."""
+    """Results at the probes at one output time, or at all output times, with time as the first axis of arrays."""
 
     t: Any
     displacement: NDArray[np.float64]

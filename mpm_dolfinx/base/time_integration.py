@@ -9,10 +9,10 @@ the numbers 1 and 2 the ends of its substeps.  The step length is dt.  The two m
     sdirk2           zeta(u1, p1) - zeta_n + gamma dt Q(u1, p1) = 0                               loads at t + gamma dt,
                      zeta(u2, p2) - zeta_n + gamma dt Q(u2, p2) + (1 - gamma) dt Q(u1, p1) = 0    loads at t + dt.
 
-With gamma = 1 - 1 / sqrt(2), `sdirk2` is Alexander's method (1977).  It is second-order and L-stable.  The method does
-not use the rate at the start of the step, because grid resets make this rate noisy.  After a jump of the loads, one
-long step overshoots by a fifth of the change.  Two half steps do not overshoot, see `step_size`.  The error of a step
-is estimated from the rates of the two substeps: see `solve.newton.note_pressures`.
+With gamma = 1 - 1 / sqrt(2), `sdirk2` is Alexander's method (1977).  This method is second-order and L-stable.  The
+method does not use the rate at the start of the step, because grid resets make this rate noisy.  After a jump of the
+loads, one long step overshoots by a fifth of the change.  Two half steps do not overshoot, see `step_size`.  The error
+of a step is estimated from the rates of the two substeps: see `solve.newton.note_pressures`.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Validation of values that users give, as numbers or as functions of time and position.
 
-An error message has one line.  It names the object, the value, and the allowed values.
+An error message has one line.  The message names the object, the value, and the allowed values.
 
 The parameter names of a function decide its arguments:
 

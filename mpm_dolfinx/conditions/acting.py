@@ -2,10 +2,10 @@
 """Interface of all loads in the momentum balance: tractions, prescribed displacements, tools, weight, user conditions.
 
 Conditions of one kind act on three levels: stage, substep and assembly.  The method `acting(setting)` of a condition
-returns an `Acting`, which is created once in a stage and contains the loaded faces.  Its method `placed` returns the
-`Loads` of a substep, for the current position of these faces.  At each assembly, `Loads` add forces to the residual and
-stiffness to the tangent.  The step and the momentum balance call only this interface.  `flow/feeding.py` treats
-conditions on the fluid.
+returns an `Acting`, which is created once in a stage and contains the loaded faces.  The method `placed` of this object
+returns the `Loads` of a substep, for the current position of these faces.  At each assembly, `Loads` add forces to the
+residual and stiffness to the tangent.  The step and the momentum balance call only this interface.  `flow/feeding.py`
+treats conditions on the fluid.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class FormsOf:
         self._made: dict[Callable, Any] = {}
 
     def __call__(self, make: Callable[..., T], *more) -> T:
-        """Return the forms `make(grid, u, *more)`.  Only the first call with a class `make` compiles them."""
+        """Return the forms `make(grid, u, *more)`.  The forms of each class `make` are compiled once."""
         if make not in self._made:
             self._made[make] = make(self.grid, self.u, *more)
         return self._made[make]
@@ -148,7 +148,7 @@ class Loads:
     stiff: bool = False
     """Whether the condition adds a `penalty`."""
     holding: bool = False
-    """Whether the condition may constrain bodies by other constraints than `touching` returns."""
+    """Whether the condition may add constraints that `touching` does not return."""
     couples: bool = False
     """Whether the tangent couples nodes of different cells."""
     rounding_at_unknowns: NDArray[np.float64] | float = 0.0
@@ -298,7 +298,7 @@ class Loads:
     def under_held(
         self, ids: NDArray[np.int64], tracked: NDArray[np.float64], volume: NDArray[np.float64], corners: NDArray
     ) -> NDArray[np.float64]:
-        """Return the corners (n, 2^d, d), in m, of re-initialised domains.  On prescribed sides, corners are `tracked`.
+        """Return the corners (n, 2^d, d), in m, of re-initialised domains; corners on prescribed sides are `tracked`.
 
         A domain with a face on a prescribed side becomes a prism of equal volume.
 

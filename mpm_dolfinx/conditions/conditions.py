@@ -6,8 +6,8 @@ A name refers to the position of the side before any map.  The sides of a mesh h
 A side moves with its body, and excludes faces that touched another body at seeding.  Regions and X are reference
 positions before all maps (`mapped`).  Reference areas are areas of the seeded shape, after the maps.
 
-A new kind of condition is a class in a separate file.  Its method `acting` adds terms to the momentum balance
-(`conditions/acting.py`).  Its method `feeding` adds terms to the fluid balance (`flow/feeding.py`).
+A new kind of condition is a class in a separate file.  The method `acting` of this class adds terms to the momentum
+balance (`conditions/acting.py`).  The method `feeding` adds terms to the fluid balance (`flow/feeding.py`).
 
 A value may be a function of time t, reference positions X and current positions x.  The package passes the arguments
 that the function names, see `validation`.
@@ -70,7 +70,7 @@ class Traction(Condition):
     side
         Side of the bodies: "left", "right", "bottom", "top", in 3D also "front" (lower y) and "back" (upper y), or a
         name from a mesh.  The condition applies to all bodies that have a side with this name.
-    value : (d,) or number, or callable (t, X, x) -> (d,) or number, or one of these for each place, Pa
+    value : number or (d,), or callable (t, X, x) -> number or (d,), also for each place, Pa
         Force per reference area.  A number acts along the outward normal at the start of the step.  A negative number
         is compressive.  Several tractions on the same face add up.
     region : ((d,), (d,)), m
@@ -95,10 +95,10 @@ class Traction(Condition):
 class Pressure(Condition):
     """Pressure on a side of the bodies, always normal to the moving surface, per current area.
 
-    The pressure is added to tractions.  The pressure acts on skeleton and pore fluid together.  If the water enters the
-    pores, a `Drained` must also prescribe the pore pressure.  A uniform pressure has a potential if the loaded surface
-    is closed, or ends at walls that fix the edges of this surface.  Without a potential the tangent is unsymmetric.
-    The solver is then LU or FGMRES, and the stability of dry equilibria is not checked.
+    A pressure and tractions on the same face add up.  The pressure acts on skeleton and pore fluid together.  If the
+    water enters the pores, a `Drained` must also prescribe the pore pressure.  A uniform pressure has a potential if
+    the loaded surface is closed, or ends at walls that fix the edges of this surface.  Without a potential the tangent
+    is unsymmetric.  The solver is then LU or FGMRES, and the stability of dry equilibria is not checked.
 
     Parameters
     ----------
@@ -149,7 +149,7 @@ class Quiet(Condition):
     ValueError
         The scene raises the error.  The bodies have no inertia, or had inertia before the side became quiet.  No point
         lies on the side.  Another `Quiet`, or a `Displacement` of all components, is on the same part of a face.  A
-        wall of the grid fixes the side.  The weight changes as the stage begins, but the kept tractions do not.
+        wall of the grid fixes the side.  The weight changes when the stage begins.
     """
 
     side: str
@@ -173,8 +173,8 @@ class OnSide(Condition):
     side
         Side of the bodies, as for `Traction`.
     term
-        Function as in `terms`, see `user_functions`.  Its `points` are quadrature points on the side.  `points.dx` is
-        the area measure, and `points.normal` the outward normal, both at the start of the step.
+        Function as in `terms`, see `user_functions`.  The `points` of the term are quadrature points on the side.
+        `points.dx` is the area measure, and `points.normal` the outward normal, both at the start of the step.
     region : ((d,), (d,)), m
         As for `Traction`.
 
@@ -419,7 +419,7 @@ def holding(material: Skeleton) -> NDArray[np.float64]:
     """Return the reference modulus, in Pa, of the penalty for prescribed displacements.
 
     A Q1 field with constant volumetric strain in each cell cannot follow a curved side.  The penalty converts the
-    difference between this field and the side into pressure, so it must not be stiff compared with the shear stiffness.
+    difference between this field and the side into pressure.  It must not be stiff compared with the shear stiffness.
     In an undrained cavity, a penalty of 300 (lambda + 2G) gives up to 1.9 times the exact pressure.  A penalty of 30
     (4G) gives 1.01 times the exact pressure.
     """
@@ -492,7 +492,7 @@ class RigidPlate(Condition):
     Parameters
     ----------
     side
-        Side of the bodies, as for `Traction`.  Its seeded faces must be connected, and in one plane normal to an axis.
+        Side of the bodies, as for `Traction`.  The seeded faces must be connected, and in one plane normal to an axis.
     force : float or callable t (s) -> float, N (N/m in plane strain)
         Total force on the side, positive for compression.  In axisymmetry it acts on the whole circumference.
     region : ((d,), (d,)), m

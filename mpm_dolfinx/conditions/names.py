@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Results of conditions by the names of the conditions."""
+"""Results of conditions, by name of the condition."""
 
 from __future__ import annotations
 

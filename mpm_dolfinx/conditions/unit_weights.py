@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Unit weight of the fluid under the scene's gravity.  It converts hydraulic conductivity to mobility."""
+"""Unit weight of the fluid under the scene's gravity, which converts hydraulic conductivity to mobility."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def under(fluid: Fluid | None, gravity: Gravity) -> Fluid | None:
 
 
 def weighed(value, fluid: Fluid | None):
-    """Return a water pressure.  A water pressure without a unit weight receives that of the pore fluid."""
+    """Return a water pressure, by default with the unit weight of the pore fluid."""
     by_fluid = isinstance(value, OfWater) and value.given is None and fluid is not None
     return replace(value, given=fluid.unit_weight) if by_fluid else value
 
@@ -71,10 +71,10 @@ def warn_units(comm: MPI.Intracomm, fluid: Fluid, gravity: Gravity) -> None:
 
 
 def warn_levels(comm: MPI.Intracomm, fluid: Fluid | None, gravity: Gravity, levels: Sequence[tuple[str, Any]]) -> None:
-    """Warn about each water level whose unit weight differs from that of the pore fluid.
+    """Warn about each water level whose unit weight differs from the pore fluid's.
 
     A dry scene with gravity has no pore fluid.  The function then warns about levels whose default unit weight is not
-    that of water under this gravity.
+    the unit weight of water under this gravity.
 
     `levels`: name and water pressure of each level.
     """
@@ -97,7 +97,7 @@ def other_gravity(fluid: Fluid, gravity: Sequence[NDArray[np.float64]]) -> float
 
     A gravity that varies in the step is returned only if its last magnitude is above 9.81 m/s^2.
 
-    `gravity`: vectors, in m/s^2, at the start of a step and at times in the step.
+    `gravity`: accelerations of gravity, in m/s^2, at the start of a step and at later times in the step.
     """
     first, last = gravity[0], float(np.linalg.norm(gravity[-1]))
     rests = all(np.array_equal(first, g) for g in gravity) and last > 0

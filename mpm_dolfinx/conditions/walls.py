@@ -52,10 +52,9 @@ def fixed_corners(grid: Grid, walls: Mapping[str, str], corners: NDArray[np.floa
 def stopped(
     grid: Grid, walls: Mapping[str, str], corners: NDArray[np.float64], before: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return corners (n, 2^d, d), in m.  Some corners outside the grid are moved to its sides.
+    """Return the corners (n, 2^d, d), in m, of particle domains, with corners outside the grid moved to its sides.
 
-    A corner moves to a side if the wall at this side fixes the normal component, or if its old position `before` was in
-    the grid.
+    A corner moves if the wall at this side fixes the normal component, or if its old position `before` was in the grid.
     """
     shut = np.zeros((2, grid.dim), dtype=bool)
     for name, axes in walls.items():

@@ -22,7 +22,7 @@ def water(
     region: Region | None = None,
     unit_weight: float | None = None,
 ) -> tuple[Pressure, Drained]:
-    """Return two conditions for still water at a side.  Both must be conditions of the scene.
+    """Return two conditions for still water at a side.  The scene must have both conditions.
 
     Below the water level, hydrostatic pressure acts on the surface and on the pore fluid.  Above the level, the side is
     a seepage face.  In each step both conditions follow the motion of the side.
@@ -32,12 +32,12 @@ def water(
     side
         Side of the bodies, as for `Traction`.
     level : float or callable t (s) -> float, m
-        Coordinate of the water level along the last axis.  It must be finite.
+        Coordinate of the water level along the last axis.  The level must be finite.
     region : ((d,), (d,)), m
         Box of reference positions.  Water acts on the parts of faces inside the box.
     unit_weight
-        Unit weight > 0 of the water, in N/m^3.  By default it is that of the scene's fluid.  A warning is issued if the
-        unit weight differs from fluid density times gravity.
+        Unit weight > 0 of the water, in N/m^3.  The default is the unit weight of the scene's fluid.  A warning is
+        issued if the unit weight differs from fluid density times gravity.
 
     Raises
     ------

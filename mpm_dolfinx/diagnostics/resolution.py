@@ -27,7 +27,7 @@ FULL = 1.2
 
 
 def warn_overlaps(cut: CutDomains, bodies: Sequence[Body]) -> Callable[..., Any] | None:
-    """Warn about the fullest cell if domains overlap.  Return a function for the next check; after a warning, None."""
+    """Warn about the fullest cell if particle domains overlap, and return this function, or None after a warning."""
     grid, points = cut.grid, cut.points
     volume = cut.to_cells(points.volume0 * points.J) * cut.pieces_to_cells(cut.pieces.fraction)
     fill = sum_by(cut.cells, cut.plane(volume)[0], grid.num_owned)[cut.cells] / grid.volumes(cut.cells)
@@ -74,7 +74,7 @@ def warn_mixed(
     Returns
     -------
     callable
-        Function for the next check.
+        Function for later checks, with a larger `least` after a warning.
     """
     grid = cut.grid
     points = cut.points
@@ -107,8 +107,8 @@ def warn_mixed(
 def _losses(cut: CutDomains, volume: NDArray[np.float64], modulus: NDArray[np.float64]) -> tuple[NDArray, ...]:
     """Return the loss times volume (m^d), the ratio of moduli, and the softest piece of each owned cell.
 
-    With moduli M and volume fractions s in a cell, layers in series have the compliance `sum (s / M)`.  Equal strain in
-    the cell gives the compliance `1 / sum (s M)` instead.  The loss is the difference of both compliances, divided by
+    With moduli M and volume fractions s in a cell, layers in series have the compliance `sum (s / M)`.  With equal
+    strain in the cell the compliance is `1 / sum (s M)`.  The loss is the difference of both compliances, divided by
     the largest `1 / M`.  For two moduli of ratio r < 1, the loss is at most `(1 - sqrt(r))^2`.
     """
     n, order = cut.grid.num_owned, np.argsort(-modulus, kind="stable")
@@ -137,7 +137,7 @@ def warn_thin(grid: Grid, bodies: Sequence[Body], walls: Mapping[str, str], wet:
     The increment of stress is constant in a cut domain.  In a single step, n points over the thickness therefore give
     `1 - 1/n^2` of the bending stiffness.  In several steps the fraction is larger (`domain_slopes`).  A body with one
     point over its thickness carries no moment.  The body creeps from step to step, because only the stress increment of
-    a step resists bending.  Measurements show that saturated bodies (`wet`) lose more stiffness, and continue to creep.
+    a step resists bending.  Saturated bodies (`wet`) lose more stiffness, and continue to creep.
     """
     few, slender = (FEW_WET, SLENDER_WET) if wet else (FEW, SLENDER)
     for i, body in enumerate(bodies):

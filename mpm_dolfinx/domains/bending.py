@@ -2,8 +2,7 @@
 """Displacement of the corners of particle domains: the Q1 field of the grid with a quadratic correction.
 
 In bending the true strain varies linearly over a cell, but the strain of a Q1 field jumps at the grid lines.  Particle
-domains that follow the Q1 field acquire a sawtooth strain.  When the motion reverses, other grid lines cross the body,
-and the sawtooth remains as stress.  The displacement u of a corner at the position x is therefore
+domains that follow the Q1 field acquire a sawtooth strain.  The displacement u of a corner at x is therefore
 
     u(x) = sum_i N_i(x) [u_i - 1/2 sum_a t_a (1 - t_a) D_a],
 
@@ -11,10 +10,9 @@ where N_i are the shape functions, u_i are the nodal displacements, and t_a is t
 from 0 to 1.  D_a is a second difference of nodal displacements along axis a.  The field u is exact for quadratic
 displacements, equal to Q1 at the nodes, and continuous.
 
-D_a belongs to the cell edge along axis a that ends at node i.  Each end of the edge has a second difference.  D_a is
-the smaller of both in absolute value, or zero if their signs differ.  If only one end has a second difference, D_a is
-this difference.  If cell sizes vary, D_a is the squared edge length times the second derivative of a parabola through
-three nodes.  Physical kinks, for example at the boundary of two materials, are kept.
+D_a belongs to the cell edge along axis a that ends at node i.  D_a is the minmod limiter of the second differences at
+both ends of the edge.  If only one end has a second difference, D_a is this difference.  If cell sizes vary, a second
+difference is the squared edge length times the second derivative of a parabola through three nodes.
 """
 
 from __future__ import annotations
@@ -29,8 +27,6 @@ def followed(
     grid: Grid, cells: NDArray[np.int32], x: NDArray[np.float64], u: NDArray[np.float64], filled: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
     """Return two fields (2, n, d), in m: the Q1 displacement of the corners, and its quadratic correction.
-
-    Far nodes of empty neighbour cells are not used, because such nodes may belong to another body.
 
     `cells` (n,): owned cells that contain the corners.
     `x` (n, d), in m: positions of the corners.
@@ -54,7 +50,7 @@ def followed(
 
 
 def _at(u: NDArray[np.float64], nodes: NDArray[np.int32]) -> NDArray[np.float64]:
-    """Return the values of a nodal field at `nodes`."""
+    """Return the values of a nodal field at nodes."""
     return u.take(u.shape[1] * nodes.T[None] + np.arange(u.shape[1])[:, None, None])
 
 

@@ -25,8 +25,8 @@ from mpm_dolfinx.points.material_points import MaterialPoints, middle
 STILL = 3e-4
 """Largest motion of corners, divided by the cell size, for which a cut remains valid.
 
-A column of ten cells consolidates.  With a new cut in every step, pressures change by 7e-5 of the load, and the
-settlement changes by 3e-5 of its value.  Both changes are proportional to STILL.
+In a consolidating column of ten cells, a new cut in every step changes pressures by 7e-5 of the load.  The settlement
+changes by 3e-5 of its value.
 """
 
 
@@ -89,7 +89,7 @@ class Patches:
         return interpolate(points.corners[self.at], self.xi)
 
     def positions(self, points: MaterialPoints) -> Callable[[str], NDArray[np.float64]]:
-        """Return a function of the name of a position: "X" gives reference positions, "x" gives current positions."""
+        """Return a function that maps "X" to the reference positions, and "x" to the current positions."""
         return lambda name: self.X if name == "X" else self.now(points) + self.base
 
     def area(self, points: MaterialPoints) -> NDArray[np.float64]:
@@ -111,9 +111,9 @@ class CutDomains(Keyed):
     grid
         Background grid.
     points
-        Material points of this process.  They must be inside the grid.
+        Material points of this process.  All points must be inside the grid.
     domains
-        Whether to integrate over the exact pieces of the domains.  If not, each point is one piece, as in standard MPM.
+        Whether to integrate over the exact pieces of the domains.  Otherwise each point is one piece, as in MPM.
     second, faces
         Whether to compute second moments and face areas of the pieces.
     """
@@ -143,7 +143,7 @@ class CutDomains(Keyed):
         """Pieces of this process's points, without areas and mean products."""
 
     def faces(self) -> NDArray[np.float64]:
-        """Return areas (m, d, 2), in m^(d-1), of pieces on cell faces.  This object does not keep the areas."""
+        """Return areas (m, d, 2), in m^(d-1), of pieces on cell faces."""
         faces, self._faces = self._faces, None
         return faces
 
@@ -189,8 +189,7 @@ class CutDomains(Keyed):
     def surface(self, faces: Surface) -> Patches:
         """Return the quadrature points on a surface, for faces whose points are on this process.
 
-        The cell of a quadrature point contains the position just under the surface, and a piece of the domain.  Loads
-        therefore act on nodes with stiffness.
+        The cell of a quadrature point contains a piece of the point's domain, so loads act on nodes with stiffness.
         """
         return self.surfaces([faces])[0]
 
@@ -234,7 +233,7 @@ class CutDomains(Keyed):
         return out
 
     def displacement(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the values (n, d) of a Q1 field u (nodes, d) at the points.  The cut must be without `domains`."""
+        """Return the values (n, d) of a Q1 field u (nodes, d) at the points of a cut without `domains`."""
         exchange, cells = self._followed
         return exchange.back(self.grid.at(cells, exchange.send(self._tracked), u))
 
@@ -275,7 +274,7 @@ class CutDomains(Keyed):
         return self._filled_cell(at, x + NEAR * (self.points.x[at] - x))
 
     def _filled_cell(self, at: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the cells of positions x, or the cell of the domain's largest piece where it has no piece."""
+        """Return the cells of positions x; the cell of the domain's largest piece replaces cells without a piece."""
         pieces, cells = self.pieces, self.grid.all_cells
         cell = self.grid.number(self.grid.index_from_base(x)) + self.grid.copy(self.points.id[at])
         key, keys = at * cells + cell, pieces.point * cells + pieces.cell

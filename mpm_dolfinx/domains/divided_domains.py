@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Parts of seeded domains after division and merging: their intervals, identifiers, corners and faces.
 
-A part is the image of a box [a, b] under the bilinear or trilinear map of its domain.  This holds in the reference and
-in the deformed configuration.  A whole domain is the interval [0, 1] along each axis.  A division bisects an interval,
-and two parts merge if they are the halves of one interval.  On the lattice of a box, whole domains also merge, into the
-intervals [0, 2], [0, 4], and so on.
+A part of a seeded particle domain is the image of a box of local coordinates under the bilinear or trilinear map of the
+domain.  A whole domain is the interval [0, 1] along each axis.  A division bisects an interval.  Two parts merge if
+they are the halves of one interval.  On the lattice of a box, whole domains also merge, into the intervals [0, 2], [0,
+4], and so on.
 """
 
 from __future__ import annotations
@@ -28,11 +28,7 @@ PLACES = "corners", "reference", "origin"
 
 
 class SeededDomains:
-    """Seeded domains of the bodies, and identifiers of their parts.
-
-    The identifier of a part follows from its domain and its interval.  `material_points.body_of` finds the body of an
-    identifier.  Within the body, parts have odd indices, and renewed points have even indices.
-    """
+    """Seeded domains of the bodies, and identifiers of their parts, which follow from domain and interval."""
 
     def __init__(self, bodies: Sequence[Body]):
         self.starts = np.cumsum([0, *map(len, bodies)])
@@ -57,7 +53,7 @@ class SeededDomains:
 
     @staticmethod
     def _code(part: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return a number for each interval, which is even for sizes up to 1, and odd for larger sizes."""
+        """Return an integer that identifies each interval."""
         size = np.ptp(part, axis=2)
         code = np.where(size <= 1, 2 * (1 + part[..., 0]) / size, 2 * np.log2(size) - 1)
         return np.rint(code).astype(np.int64)
@@ -92,7 +88,7 @@ class SeededDomains:
         return out
 
     def sizes(self, grid: Grid, points: MaterialPoints) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the edge lengths (n, d) of domains now, and of their seeded domains at seeding, both in cells."""
+        """Return the edge lengths (n, d), in cells, of domains now, and of their seeded domains at seeding."""
         root = roots(points)[0]
         return _lengths(grid.in_cells(points.corners)), self._seeded((root,), lambda: self._as_seeded(grid, root))
 
@@ -109,8 +105,7 @@ class SeededDomains:
     def from_middle(self, places: NDArray[np.int64], axis: int) -> NDArray[np.float64]:
         """Return the indices (n,) of rows of the lattice along an axis, counted from the middle of the body.
 
-        The pairs of rows that merge are therefore the same in a mirrored scene.  The result is nan for domains without
-        a lattice, and for the middle row of an odd number of rows, which has no pair.
+        The result is nan for domains without a lattice, and for the middle row of an odd number of rows.
         """
         out = np.full(len(places), np.nan)
         for i in np.unique(places[places[:, 0] >= 0, 0]):
@@ -120,10 +115,7 @@ class SeededDomains:
         return out
 
     def middle(self, root: NDArray[np.int64], part: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
-        """Return the local coordinates (n,), between 0 and 1, of the middles of intervals along an axis.
-
-        Rows of boxes on a lattice may have different widths, so the middle of a merged domain may not be at 1/2.
-        """
+        """Return the local coordinates (n,), between 0 and 1, of the middles of intervals along an axis."""
         out, size = np.full(len(root), 0.5), np.rint(np.ptp(part, axis=2)[:, axis]).astype(np.int64)
         body = body_of(root, self.starts)
         for i in np.unique(body[size > 1]):
@@ -191,10 +183,7 @@ def halved(points: MaterialPoints, axis: int, domains: SeededDomains, axisymmetr
 def joined(
     lower: MaterialPoints, upper: MaterialPoints, axis: int, domains: SeededDomains, axisymmetric: bool
 ) -> MaterialPoints:
-    """Return the points (n,) merged from their halves.
-
-    F follows from the corners and the reference corners.  Data are means, weighted by reference volumes.
-    """
+    """Return the points (n,) merged from their halves, with F from the corners and weighted means of the data."""
     places = {name: merged(getattr(lower, name), getattr(upper, name), axis) for name in PLACES}
     root, part = roots(lower)
     part = part.copy()
@@ -229,7 +218,7 @@ def _placed(
 def with_defect(new: MaterialPoints, old: MaterialPoints, into: NDArray[np.int64]) -> MaterialPoints:
     """Return new points with a volume defect such that soil and fluid fill the same volume as before.
 
-    `into`: index of the old point of each new point, or of the new point of each old point if points were merged.
+    `into`: index of the old point of each new point; for merged points, index of the new point of each old point.
     """
     if "owed" not in new.data:
         return new

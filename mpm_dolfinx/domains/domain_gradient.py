@@ -70,7 +70,7 @@ def volume_slopes(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the volumes (n,) of domains, in m^d, and their derivatives (n, 2^d, d) with respect to the corners.
 
-    In axisymmetry the domains are rings.  Their volumes are integrals of `pi r^2 dz`, in m^3.
+    In axisymmetry, the volumes of the rings are integrals of `pi r^2 dz`, in m^3.
     """
     now = domain_volumes(corners, axisymmetric)
     if corners.shape[2] == 3:
@@ -91,15 +91,13 @@ def cell_ratios(
 ) -> NDArray[np.float64]:
     """Return the volume ratios (m,) of the pieces of a cut at the start of a step.
 
-    With F-bar, the volume ratio of a cell is the current volume of its domains, computed from the corners, divided by
-    their reference volume.  Differences between the volume ratios of domains in a cell do no work.  If the ratio of a
-    cell were updated by increments only, it could drift from the volume of the domains without any opposing force.
-    Without F-bar, pieces have the ratio of their point.  The same applies in cells with yielded soil, where volumes
-    from corners are meaningless.
+    With F-bar, the volume ratio of a cell is the present volume of its particle domains divided by their reference
+    volume.  A ratio updated by increments would drift from the volumes of the domains.  Without F-bar, and in cells
+    with yielded soil, the ratio of a piece is the ratio of its point.
 
     `cut`: cut particle domains.
     `points`: points at the start of the step.
-    `share` (n,): weight, from 0 to 1, of the ratio from corners in the geometric mean with the point's ratio; 0 without
+    `share` (n,): weight, from 0 to 1, of the ratio from corners in a geometric mean with the point's ratio; 0 without
     F-bar.
     `flows` (n,): whether points have yielded.
     """

@@ -56,7 +56,7 @@ class Neighbours:
         self._partner = partner.reshape(-1, 2 * dim).T.copy()  # index of the opposite face; -1 if there is none
 
     def at_neighbours(self, own: NDArray[np.float64], faces: Sequence[NDArray[np.float64]]) -> Callable[[int], tuple]:
-        """Return a function from a face index to data and face centres of neighbours, and whether neighbours exist.
+        """Return a function of a face index that returns data, face centres and mask of the neighbours.
 
         `own` (c, k): c data columns of the points.
         `faces`: centres (d, k), in m, of the points' faces, for each face index.
@@ -88,7 +88,7 @@ class LinearGradients:
     def at_pieces(
         self, cut: CutDomains, F: NDArray[np.float64], elastic: NDArray[np.bool_], soils: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return `linear_gradients`, varying only in domains of `elastic` points.  All processes must call it."""
+        """Return `linear_gradients` at pieces, uniform in domains of inelastic points.  All processes must call it."""
         make = partial(Neighbours, self._comm, self._bodies, cut.points, elastic)
         return linear_gradients(self._neighbours((cut.points.id, elastic), make, self._comm), cut, F, soils)
 
@@ -110,10 +110,9 @@ def _seeded_faces(bodies: Sequence[Body], ids: NDArray[np.int64], seeded: NDArra
 def _faces_of_parts(
     comm: MPI.Intracomm, bodies: Sequence[Body], points: MaterialPoints, seeded: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    """Return a key for each face of domains and of parts of domains.
+    """Return a key for each face of domains and of parts of domains, equal for both domains at the face.
 
-    On a lattice, the key consists of the lower corner, the normal and the size of the face.  Without a lattice, whole
-    domains keep the keys `seeded`, and parts have neighbours only in their seeded domain.
+    `seeded`: keys of whole domains of bodies without a lattice.
     """
     dim, part = bodies[0].dim, is_part(points)
     root, ends = roots(points)

@@ -1,19 +1,17 @@
 # SPDX-License-Identifier: MIT
 """Correction of the corners of yielded particle domains, so that the domains keep the volumes of their points.
 
-The volume ratio of a point is a mean over its cell.  The corners of its domain, however, follow a field that varies in
-the cell.  In elastic soil, F and the volume ratios of cells are computed from the corners.  In yielded soil, F is
-updated by increments.  The volumes of domains and of points would therefore drift apart, and domains would overlap.
-After a step the corners of yielded domains therefore move by the vectors d that minimise
+The volume ratio of a point is a mean over its cell.  The corners of its domain follow a field that varies in the cell.
+In yielded soil, F is updated by increments, so the volumes of domains and points would drift apart.  After a step, the
+corners of yielded domains therefore move by the vectors d that minimise
 
     sum_p V_p e_p^2 + SOFT^2 sum_p V_p (mean (d / h)^2 + sum_a mean (D_a / h)^2),  V_p e_p = V_p - V - dV/dx d.
 
 The sums are over the points p.  V_p is the volume of a point, and V is the volume of its domain.  The derivative of V
 with respect to the corners is dV/dx.  The relative volume error after the motion is e_p.  D_a is the change of d along
-an edge of axis a.  Without D_a, more narrow domains would become inverted, and corners of renewed domains would leave
-the edges on which they lie.  The means are over the domain's corners and edges, and h contains the edge lengths of the
-domain's cell.  Shared corners move together.  Fixed corners, and corners of elastic domains, do not move.  Kugelstadt
-et al. (2019) correct cell densities in this way.
+an edge of axis a.  The means are over the domain's corners and edges, and h contains the edge lengths of the domain's
+cell.  Shared corners move together.  Fixed corners, and corners of elastic domains, do not move.  Implicit density
+projection corrects the densities of cells in this way (Kugelstadt et al. 2019).
 """
 
 from __future__ import annotations
@@ -58,7 +56,7 @@ def with_volumes(grid: Grid, domains: Domains) -> NDArray[np.float64]:
     rows = Domains(*map(root.send, domains))
     motion = np.zeros_like(rows.corners)
     if grid.comm.rank == 0:
-        order = rows.ids.argsort()  # sums do not depend on the processes
+        order = rows.ids.argsort()  # so that sums do not depend on the number of processes
         motion[order] = _motion(grid, Domains(*(values[order] for values in rows)))
     return domains.corners + root.back(motion)
 

@@ -2,16 +2,15 @@
 """Lattice of the seeded corners of a body, and a third-difference filter of their displacements.
 
 Nodes cannot represent a displacement wave of the corners with a wavelength of two domains, so no nodal force resists
-such a wave.  Corners that cross grid lines excite these waves, which would grow from one load cycle to the next.  The
-filter damps them when the grid is reset.  It replaces the displacement d of the corners from their reference positions,
-for each axis a in turn, by
+such a wave.  Corners that cross grid lines excite these waves.  When the grid is reset, a filter damps them.  For each
+axis a in turn, the filter replaces the displacement d of the corners from their reference positions by
 
     d - D_a^T (s / 64) D_a d.
 
 D_a is the third difference of four corners in a row along axis a.  If the domains in a row have different widths, D_a
-is the divided difference, scaled to the same sum of absolute weights.  The factor is `s = min(1, FAST c)`, where c is
-the number of cells that the corners have crossed since the last grid reset.  Bodies that hardly move are thus not
-filtered.  The result is the mean over all orders of the axes.
+is the divided difference, scaled to the same sum of absolute weights.  The factor is `s = min(1, FAST c)`, with the
+number c of cells that the corners have crossed since the last grid reset.  The filtered displacement is the mean over
+all orders of the axes.
 
 Quadratic fields remain unchanged, even at the surface.  A wave with a length of two domains is reduced by the fraction
 s, and a wave with a length of eight domains by 0.003 s.  The filter leaves out domains that have separated from their
@@ -126,7 +125,7 @@ class Lattice:
         crossed: NDArray[np.float64],
         parts: Sequence[int],
     ) -> NDArray[np.float64]:
-        """Return the change (n, 2^d, d), in m, by which the filter corrects displacements of domain corners.
+        """Return the change (n, 2^d, d), in m, of the domain corners by the filter.
 
         `d` (n, 2^d, d), in m: displacements of the corners.
         `crossed` (n, 2^d): numbers of cells that the corners have crossed since the grid reset.
@@ -156,17 +155,17 @@ def _at_sites(
     values: NDArray[np.float64],
     tolerance: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], slice, Callable[[NDArray[np.float64]], NDArray[np.float64]]]:
-    """Return values at the sites of a lattice, which is distributed over the processes in slabs of layers.
+    """Return the values at a process's sites of a lattice, its range of layers, and a function from sites to rows.
 
-    The function also returns the range of layers of this process, and a function that converts values at sites to rows.
-    A site has nan if its rows of `values` differ by more than `tolerance`.
+    The layers of the lattice are distributed over the processes.  A site has nan if its rows of `values` differ by more
+    than `tolerance`.
     """
     across, starts = int(np.prod(shape[1:])), np.arange(comm.size + 1) * shape[0] // comm.size
     layer = number // across
     rank = starts.searchsorted(layer, side="right") - 1
     exchange = Exchange(comm, rank)
     rows = [(exchange.send(number), exchange.send(values))]
-    for other in range(-MARGIN, MARGIN + 1) if comm.size > 1 else ():  # a slab may be one layer thin
+    for other in range(-MARGIN, MARGIN + 1) if comm.size > 1 else ():  # a process may have one layer only
         to = np.minimum(np.maximum(rank + other, 0), comm.size - 1)
         near = (to != rank) & (to == rank + other) & (layer >= starts[to] - MARGIN) & (layer < starts[to + 1] + MARGIN)
         halo = Exchange(comm, to[near])

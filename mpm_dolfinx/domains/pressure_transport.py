@@ -1,18 +1,16 @@
 # SPDX-License-Identifier: MIT
 """Conservative, second-order remap of the pore pressure from one grid to the next.
 
-In each cell the pressure at the position x is reconstructed as `p + s . (x - c)`, with the cell pressure p, the slope
-s, and the centroid c of the cell's storage.  Along an axis, s is van Leer's mean of the slopes at both ends of the
-cell.  At an open face, the slope follows from the pressure of the neighbour.  At a drained side, the slope follows from
-the pressure on the side.  If an end is neither open nor drained, s is zero.  Then s is scaled so that the pressure in
-the cell stays between the extremes of cell, neighbours and drained sides.
+In each cell the pressure at the position x is reconstructed as `p + s . (x - c)`.  Here p is the cell pressure, s is
+the slope, and c is the centroid of the cell's storage.  Along an axis, s is van Leer's mean of the slopes towards both
+neighbours, or towards the pressure on a drained side.  At a no-flow side, s is zero.  Then s is scaled so that the
+pressure in the cell stays between the extremes of cell, neighbours and drained sides.
 
 A piece of a particle domain receives the pressure at its centroid and moves with the domain.  Then the domain is cut
-again.  A cell may contain a fraction of the domain before and after the cut.  The smaller of both fractions keeps its
-pressure.  Any further fraction in the cell receives the mean pressure of the fractions that left other cells.  The
-centroids of the pieces are remapped in the same way.  The error of the remapped centroid, times the mean slope of the
-domain, corrects the pressure.  The corrections of a domain add up to zero, so the remap is conservative.  Without
-motion, the remap changes nothing.
+again.  The fraction of the domain that remains in a cell keeps its pressure.  A fraction that enters a cell receives
+the mean pressure of the fractions that left other cells.  The centroids of the pieces are remapped in the same way.
+The error of the remapped centroid, times the mean slope of the domain, corrects the pressure.  The remap is
+conservative, and changes nothing without motion.
 """
 
 from __future__ import annotations
@@ -34,20 +32,20 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 
 @dataclass(frozen=True, eq=False)
 class PiecePressures:
-    """Pore pressure of a scene between two steps.  Arrays have a row for each of m pieces, sorted by point and cell.
+    """Pore pressures of m pieces of a scene between two steps, sorted by point and cell.
 
-    Pieces to be moved to the next grid have pressures at their centroids.  Pieces that stay have pressures of cells.
+    Kept pieces have the pressures of their cells.  Other pieces have the pressures at their centroids.
     """
 
     id: NDArray[np.int64]  # identifier of the point (m,)
     cell: NDArray[np.int64]  # lexicographic index of the cell (m,); -1 at the start
     fraction: NDArray[np.float64]  # fraction of the domain (m,)
-    pressure: NDArray[np.float64] | None  # pressure at the centroid (m,), Pa; None for pieces that stay
+    pressure: NDArray[np.float64] | None  # pressure at the centroid (m,), Pa; None for kept pieces
     x: NDArray[np.float64]  # current centroid (m, d), m
-    slope: NDArray[np.float64] | None  # pressure gradient (m, d), Pa/m; None for pieces that stay
-    bounds: NDArray[np.float64] | None  # smallest and largest allowed pressure (m, 2), Pa; None for pieces that stay
-    of_cell: NDArray[np.float64] | None = None  # current pressure of the cell (m,), Pa; None for pieces to be moved
-    start: NDArray[np.float64] | None = None  # pressure of the cell at the grid reset (m,), Pa; None like of_cell
+    slope: NDArray[np.float64] | None  # pressure gradient (m, d), Pa/m; None for kept pieces
+    bounds: NDArray[np.float64] | None  # smallest and largest allowed pressure (m, 2), Pa; None for kept pieces
+    of_cell: NDArray[np.float64] | None = None  # current pressure of the cell (m,), Pa; only for kept pieces
+    start: NDArray[np.float64] | None = None  # pressure of the cell at the grid reset (m,), Pa; only for kept pieces
 
     def __post_init__(self):
         for rows in self.arrays.values():
@@ -202,7 +200,7 @@ def van_leer(one_sided: NDArray[np.float64]) -> NDArray[np.float64]:
 def share_within(
     increment: NDArray[np.float64], low: NDArray[np.float64], high: NDArray[np.float64], slot: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Return for each cell the largest factor (n,) <= 1 by which increments stay within [`low`, `high`]."""
+    """Return the largest factor (n,) <= 1 in each cell for which increments stay within [`low`, `high`]."""
     bound, share = np.where(increment > 0, high[slot], low[slot]), np.ones(len(low))
     excessive = (np.abs(increment) > np.abs(bound)).nonzero()[0]
     np.minimum.at(share, slot[excessive], bound[excessive] / increment[excessive])
@@ -210,7 +208,7 @@ def share_within(
 
 
 def _bounds_of(jump: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the smallest difference to neighbours, or 0 if it is positive, and the largest, or 0 if it is negative."""
+    """Return the smallest difference to neighbours, at most 0, and the largest difference, at least 0."""
     return np.minimum(jump.min(axis=(1, 2)), 0), np.maximum(jump.max(axis=(1, 2)), 0)
 
 
@@ -237,7 +235,7 @@ def transport(old: PiecePressures, points: MaterialPoints, new: Pieces) -> NDArr
     then = np.concatenate([old.pressure[None], old.x.T - centre[:, owner]])
     leaving = sum_by(owner, np.concatenate([left_fraction[None], left_fraction * then]), n)
     mean = np.divide(leaving[1:], leaving[0], out=np.zeros((len(then), n)), where=leaving[0] > 0)
-    # a new piece has the old value on the common part, else the mean of the parts that left
+    # the common part keeps its value, and the rest has the mean of the parts that left
     values = np.zeros((len(then), len(new_key)))
     values[:, match] = then[:, before]
     values = share * values + (1 - share) * mean[:, new.point]
@@ -248,7 +246,7 @@ def transport(old: PiecePressures, points: MaterialPoints, new: Pieces) -> NDArr
 
 
 def _limited(correction, pressure, old: PiecePressures, owner, new: Pieces) -> NDArray[np.float64]:
-    """Return factors of the corrections, one for each domain, that keep pressures within bounds."""
+    """Return the factor of each domain's corrections that keeps pressures within bounds."""
     first, new_first = (of.searchsorted(np.arange(of[-1] + 1)) for of in (owner, new.point))
     low, high = np.minimum.reduceat(old.bounds[:, 0], first), np.maximum.reduceat(old.bounds[:, 1], first)
     margin = np.where(correction > 0, high[new.point] - pressure, low[new.point] - pressure)
@@ -263,7 +261,7 @@ def halved_pieces(
     storage: tuple[NDArray[np.float64], NDArray[np.float64]],
     bulk: float,
 ) -> PiecePressures:
-    """Return one piece for each new point.  Its pressure follows from the mean slope in the domain of the old point.
+    """Return a piece for each new point, with a pressure from the mean slope in the domain of the old point.
 
     `pieces`: pieces of the n old points.
     `points`: old points, and m new points.
@@ -295,7 +293,7 @@ def joined_pieces(
     storage: tuple[NDArray[np.float64], NDArray[np.float64]],
     bulk: float,
 ) -> PiecePressures:
-    """Return the pieces of merged points.  Pieces of the old points of a new point become one piece in each cell.
+    """Return the pieces of merged points, one for each new point in each cell.
 
     `into` (n,): new point of each old point.
     For the other parameters see `halved_pieces`.
@@ -327,7 +325,7 @@ def joined_pieces(
 def _missing(
     held: NDArray[np.float64], store: NDArray[np.float64], potential: NDArray[np.float64], of: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Return the change of potentials, in Pa, by which each point comes to contain the fluid `held`."""
+    """Return the change of potentials, in Pa, after which each point contains the fluid `held`."""
     (total, now), n = sum_by(of, np.array([store, store * potential]), len(held)), len(held)
     return np.divide(held - now, total, out=np.zeros(n), where=total > 0)
 

@@ -31,9 +31,9 @@ Plateau (scene "flow" of tests/plateaus.py): half this value changes the result 
 and finer cells by 9.1e-02.
 """
 CRUMB = NEAR
-"""Smallest area of a part of a domain, divided by the area of its cell.
+"""Smallest area of a part of a domain that is retained, divided by the area of its cell.
 
-Other parts receive the mass and the seeded faces of smaller parts.  Source: `NEAR`.
+Larger parts of the domain receive the mass and the seeded faces of smaller parts.  Source: `NEAR`.
 """
 SMALL = (0.5 / EDGES) ** 2
 """Smallest area of a part of an old domain that remains in a cell, divided by the cell area.
@@ -47,7 +47,7 @@ COVERED = 0.25
 Source: definition, the area of a new domain in a full cell, which is divided into four.
 """
 SIDE = np.array([2, 1, 3, 0])
-"""Index of the domain's face at each edge, in the sequence of corners around the domain."""
+"""Face index of each edge of a domain, anticlockwise."""
 START, END = np.array([2, 1, 0, 3]), np.array([0, 3, 1, 2])
 """Corner at which each face starts, and corner at which it ends, anticlockwise."""
 
@@ -259,7 +259,7 @@ class RefilledCells:
     # ---- new domains ----------------------------------------------------------------------------
 
     def _group(self, cells: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the group of the new domains in each cell: the index of the cell among the renewed cells."""
+        """Return the index of each cell among the renewed cells."""
         number = np.cumsum(self.chosen) - 1
         return number[cells]
 
@@ -328,7 +328,7 @@ class RefilledCells:
 
     @cached_property
     def _face_areas(self) -> NDArray[np.float64]:
-        """Seeded areas of faces, increased so that the parts that are not removed represent the whole face."""
+        """Seeded areas of faces, increased by the areas of removed parts of the face."""
         parts, left = self.parts, self._left
         of, share = self.faces.point[parts.row], self._share(parts.row, parts.t)
         remains = np.isin(of * self.cells + parts.cell, self.pieces.point[left] * self.cells + self.cell[left])
@@ -508,7 +508,7 @@ class RefilledCells:
         group: NDArray[np.int64],
         points: MaterialPoints,
     ) -> NDArray[np.float64]:
-        """Return point data (n, ...) of new domains on the surface, as means over the old surface in each cell."""
+        """Return data (n, ...) of new domains as means over the old surface in their cell, or 0 without a surface."""
         parts = self.parts
         inside = np.flatnonzero(self.chosen[parts.cell])
         cell, of = parts.cell[inside], self.faces.point[parts.row[inside]]
@@ -537,7 +537,7 @@ def ring_share(r0: NDArray[np.float64], r1: NDArray[np.float64], t: NDArray[np.f
 
 
 def _convex(corners: NDArray[np.float64], volume: NDArray[np.float64] | float) -> tuple[Polygons, NDArray[np.int64]]:
-    """Divide domains into convex polygons, and return the polygons with the domain of each."""
+    """Divide domains into convex polygons, and return the polygons and the index of the domain of each polygon."""
     ring = corners[:, RING]
     edge = np.tile(SIDE, (len(ring), 1))
     away = np.roll(ring, -1, axis=1) - ring

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Faces of renewed or divided particle domains, and the seeded faces of bodies that they represent."""
+"""Faces of renewed or divided particle domains, which represent the seeded faces of bodies."""
 
 from __future__ import annotations
 
@@ -125,7 +125,7 @@ def on_parts(faces: Surface, points: MaterialPoints) -> tuple[Surface, NDArray[n
 
 
 class SeededFaces:
-    """Outer faces of the bodies of a scene in 2D: the seeded faces, and the faces that represent them now."""
+    """Outer faces of the bodies of a scene in 2D, at seeding and now."""
 
     def __init__(self, grid: Grid, bodies: Sequence[Body]):
         self.bodies = bodies

@@ -32,10 +32,10 @@ def balancing_tractions(
     Tractions are forces per reference area, computed from the stresses.  Rigid-body fields of tractions are added, so
     that each connected part receives the resultant and the moment of its reactions.
 
-    stresses: total stresses (faces, k, k), in Pa, on each side.
-    parts: connected parts of the bodies.
-    forces (nodes, d), in N: reactions of the sides at the owned nodes of this process, zero at other nodes.
-    held (nodes, d): which displacement components remain fixed.
+    `stresses`: total stresses (faces, k, k), in Pa, on each side.
+    `parts`: connected parts of the bodies.
+    `forces` (nodes, d), in N: reactions of the sides at the owned nodes of this process, zero at other nodes.
+    `held` (nodes, d): which displacement components remain fixed.
 
     Returns for each side the ids (n,) of its points and the tractions (n, d), in Pa.
     """

@@ -36,8 +36,8 @@ def initial_energies(
 ) -> dict[str, NDArray[np.float64]]:
     """Return the energies at the start, in J, see `Result.energies`.
 
-    kinetic: kinetic energy of free tools, in J.
-    renews: whether domains may be renewed.
+    `kinetic`: kinetic energy of free tools, in J.
+    `renews`: whether domains may be renewed.
     """
     works = dict.fromkeys(("internal", "viscous", "friction", "external", *["renewal"] * renews), 0.0)
     return _named(stored(materials, points), works, 0.0, kinetic)
@@ -53,9 +53,9 @@ def after(
 ) -> dict[str, NDArray[np.float64]]:
     """Return the energies after a step, in J.
 
-    kinetic: kinetic energy of free tools, in J.
-    seconds: time weights of the substeps, in s.
-    powers: powers in each substep on this process, in W, see `MomentumProblem.powers`.
+    `kinetic`: kinetic energy of free tools, in J.
+    `seconds`: time weights of the substeps, in s.
+    `powers`: powers in each substep on this process, in W, see `MomentumProblem.powers`.
     """
     counted = seconds[-len(powers) :] @ np.array([list(of.values()) for of in powers])
     work = zip(powers[0], over_all(materials.grid.comm, counted), strict=True)
@@ -69,7 +69,7 @@ def after(
 def after_renewal(
     materials: SceneMaterials, energy: Mapping, old: MaterialPoints, new: MaterialPoints, renewed: int
 ) -> Mapping[str, NDArray[np.float64]]:
-    """Return the energies after a renewal of domains, in J.  `renewal` is the total energy lost by renewals."""
+    """Return the energies after a renewal of domains, in J.  The entry `renewal` is the total loss."""
     if not renewed:
         return energy
     now = stored(materials, new)

@@ -25,10 +25,10 @@ def motion_error(
     omega dt times this difference, with the step dt.  A solve with the matrix of the substep bounds the estimate for
     unresolved modes (Hosea and Shampine 1996).
 
-    K, mass: momentum tangent and mass of the last substep.
-    flights: states of motion after the two substeps.
-    seconds: weight of the first substep's rate in the last substep, in s.
-    own: weight of the last substep's rate in the last substep, in s.
+    `K`, `mass`: momentum tangent and mass of the last substep.
+    `flights`: states of motion after the two substeps.
+    `seconds`: weight of the first substep's rate in the last substep, in s.
+    `own`: weight of the last substep's rate in the last substep, in s.
     """
     first, last = flights
     rate, M = 1 / own**2, mass.M

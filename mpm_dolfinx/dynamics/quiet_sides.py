@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Quiet boundaries that absorb waves.
 
-A quiet side exerts the traction `t = t_0 - Z (v - 2 v_in)`.  t_0 is the constant traction at rest.  v is the velocity
-of the side, and v_in is the velocity of an incoming wave (Joyner and Chen 1975).  The impedance is
+A quiet side exerts the traction `t = t_0 - Z (v - 2 v_in)`.  Here t_0 is the constant traction at rest, v is the
+velocity of the side, and v_in is the velocity of an incoming wave (Joyner and Chen 1975).  The impedance is
 `Z = rho c_p n n + rho c_s (I - n n)`, with the normal n, the density rho, and the speeds c_p of compression waves and
 c_s of shear waves (Lysmer and Kuhlemeyer 1969).  Impedances use small-strain moduli of undrained soil.
 """

@@ -32,11 +32,11 @@ class Momenta(NamedTuple):
     ) -> Momenta:
         """Return the momenta of `count` groups.
 
-        piece (k,): index in `pieces` of each piece.
-        group (k,): group of each piece.
-        mass (k,), in kg: mass of each piece.
-        v (n, 2), in m/s: velocity of each domain.
-        L (n, 2, 2), in 1/s: velocity gradient of each domain.
+        `piece` (k,): index in `pieces` of each piece.
+        `group` (k,): group of each piece.
+        `mass` (k,), in kg: mass of each piece.
+        `v` (n, 2), in m/s: velocity of each domain.
+        `L` (n, 2, 2), in 1/s: velocity gradient of each domain.
         """
         of, x = pieces.point[piece], pieces.x[piece]
         second = pieces.second[piece]
@@ -56,13 +56,13 @@ def velocities(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the velocities and the velocity gradients of new domains.
 
-    Both are means over the overlap with old domains, whose velocity fields are affine.  A rigid motion of each group of
-    domains then restores the momentum and the angular momentum of the group.
+    The results are means over the overlap with old domains, whose velocity fields are affine.  A rigid motion of each
+    group of domains then restores the momentum and the angular momentum of the group.
 
-    corners (n, 4, 2), in m: corners of each new domain.
-    x (n, 2), in m: position of each new domain.
-    group (n,): group of each new domain.
-    masses: masses of the old points and masses of the new points, in kg.
+    `corners` (n, 4, 2), in m: corners of each new domain.
+    `x` (n, 2), in m: position of each new domain.
+    `group` (n,): group of each new domain.
+    `masses`: masses of the old points and masses of the new points, in kg.
     """
     points = work.points
     n, count = len(x), int(group.max()) + 1
@@ -89,10 +89,10 @@ def centred(work: RefilledCells, group: NDArray, x: NDArray, mass: NDArray, old:
     Each domain outside renewed cells keeps its mass.  A mass changes by at most half; a cell that reaches this limit
     does not keep its centre of mass.
 
-    group (n,): group of each new domain.
-    x (n, 2), in m: position of each new domain.
-    mass (n,), in kg: mass of each new domain before the change.
-    old (points,), in kg: masses of the old domains.
+    `group` (n,): group of each new domain.
+    `x` (n, 2), in m: position of each new domain.
+    `mass` (n,), in kg: mass of each new domain before the change.
+    `old` (points,), in kg: masses of the old domains.
     """
     cells, inside = int(work.chosen.sum()), group < work.chosen.sum()
     received = _received(work, old)

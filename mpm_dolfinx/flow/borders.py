@@ -64,7 +64,7 @@ class Borders:
         self._axis = np.abs(offset).argmax(axis=1)
         downward = np.take_along_axis(offset, self._axis[:, None], axis=1) < 0
         self._pair = np.where(downward, grid.facet_cells[self.facets][:, ::-1], grid.facet_cells[self.facets]).T
-        of_others = contents.filled if grid.comm.size > 1 else contents.filled[:0]  # others may need their paths
+        of_others = contents.filled if grid.comm.size > 1 else contents.filled[:0]  # other processes need them
         self._cells = np.unique(np.append(self._pair, of_others))
         self._slot = np.searchsorted(self._cells, self._pair)
 

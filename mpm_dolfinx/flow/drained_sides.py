@@ -173,8 +173,7 @@ class UnsaturatedFaces(OpenFaces):
     ) -> tuple[NDArray[np.float64] | float, NDArray[np.float64] | float]:
         """Return the two terms of the non-orthogonal correction: zero flow, and a fraction of the two-point flux.
 
-        The correction is proportional to the flux, so the correction also decreases if the conductivity decreases. The
-        fraction is limited to [-1, 1], so the correction does not reverse the flux.
+        The fraction is limited to [-1, 1], so that the correction does not reverse the flux.
         """
         difference = fluid.pi[self.at] - self.outer
         share = np.divide(correction, difference, out=np.zeros_like(correction), where=difference != 0).clip(-1, 1)
@@ -198,8 +197,8 @@ class RainedFaces(OpenFaces):
     """All faces on open sides, if at least one side has rain.
 
     Through a face with rain, the outflow is minus the rain.  The outflow is limited from below by the outflow at the
-    pressure of the pond, and from above by the outflow at the pressure `Rain.driest`.  The lower limit also allows
-    seepage.  Faces with rain therefore need no active set, and their `seeps` is False.
+    pressure of the pond, and from above by the outflow at the pressure `Rain.driest`.  Seepage is an outflow at the
+    lower limit, so faces with rain need no active set.
     """
 
     rain: NDArray[np.float64]  # rain (m,), m^d/s; nan for faces without rain

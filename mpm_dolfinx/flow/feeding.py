@@ -89,7 +89,7 @@ class Feeds:
         return 0.0
 
     def coupling(self, at: Any, fluid: Fluid, unknowns: Any) -> PETSc.Mat | None:
-        """Return the derivative of the outflow with respect to all pressures, without `slope`, or None for zero.
+        """Return the derivative of the outflow with respect to pressures, without the part in `slope`; None means zero.
 
         `unknowns`: pressure unknowns.  `Loads.joins` gives the possible entries.
         """
@@ -107,13 +107,13 @@ class Feeds:
         return {}
 
     def passing(self, at: Any, fluid: Fluid) -> Mapping[str, NDArray[np.float64]]:
-        """Return the rates in a substep, from which `volumes` computes volumes.  All processes must call this."""
+        """Return the rates in a substep, for the method `volumes`.  All processes must call this method."""
         return {}
 
     def volumes(
         self, rates: Sequence[Mapping[str, NDArray[np.float64]]], seconds: Sequence[float]
     ) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return the volumes (m^d) since the conditions began, for each quantity and each name of a condition.
+        """Return the volumes (m^d) since the conditions began, by quantity and then by condition.
 
         `rates`: results of `passing` in the substeps of the last step.  `seconds`, s: time weights of these substeps.
         """

@@ -37,8 +37,8 @@ THICK = np.sqrt(2)
 """Area of the largest plane section of a cube, divided by the area of a face.  Source: exact bound (Ball 1986).
 
 Let a convex body of volume V in a cell of edge length h lie on one side of a plane.  The distance from the body's
-centroid to the plane is at least `V / ((d + 1) THICK h^(d-1))`.  A face at a smaller distance from the centroid of the
-cell's material bounds only a part of this material.  Such a face must not drain the whole cell.
+centroid to the plane is at least `V / ((d + 1) THICK h^(d-1))`.  A nearer face bounds only a part of the cell's
+material, and must not drain the whole cell.
 """
 ALONG = 0.1  # a side determines the slope along an axis if this component of its unit normal is larger than `ALONG`
 
@@ -269,7 +269,7 @@ class CellContents(Keyed):
     ) -> NDArray[np.float64]:
         """Set the damping strength tau (n,) of elastic soil in the filled cells, and return tau, in 1/Pa.
 
-        `share` (n,): factor of tau.
+        `share` (n,): factor by which tau is multiplied.
         `less` (n,), 1/Pa: storage due to changes of saturation, which is subtracted from `share * tau`.
         """
         tau, values = self._damped.x, np.maximum(share * self.mean(self._damping) - less, 0.0)
@@ -308,7 +308,7 @@ class CellContents(Keyed):
         """Return the areas (m,), offsets (m, d) and shapes (m,) of faces in owned cells.
 
         Offsets, in m, are vectors from the centroid of the cell's material to the face.  Shapes, in m^(d-2), are areas
-        divided by the distances of the centroids.
+        divided by the distances from the centroids.
 
         `x` (m, d), m: positions of the faces.
         `area` (m, d), m^(d-1): outward area vectors.
@@ -335,7 +335,7 @@ class CellContents(Keyed):
 
 @dataclass(frozen=True)
 class HalfFaces:
-    """The halves of m faces that belong to one of the two cells at each face, on the owners of these cells.
+    """One side of each of m faces, on the process that owns the cell on this side.
 
     `contents`: material in the cells.
     `cells` (m,): local cells.
@@ -359,7 +359,7 @@ class HalfFaces:
 
     @cached_property
     def side(self) -> OpenSides:
-        """These halves as open sides, so that the cells have no no-flow side there, see `nonorthogonal.Gradients`."""
+        """The faces as open sides, because water passes through them, see `nonorthogonal.Gradients`."""
         none, unknown = np.zeros(len(self.at)), np.full(len(self.at), np.nan)
         number, seeps = none.astype(np.int64), none.astype(bool)
         offset = self._shapes[1]
@@ -368,8 +368,8 @@ class HalfFaces:
     def rows(self, flow: Conduction, p: NDArray[np.float64], force: NDArray[np.float64] | None) -> NDArray[np.float64]:
         """Return pressure (Pa), position (m), force (N/m^3), pressure drop (Pa) and conductances (m^d/(Pa s)).
 
-        The position is that of the centroid.  The force is the unit weight plus the inertia force.  It causes the
-        pressure drop from the centroid to the face.  Unsaturated soil has a conductance for each retention curve.
+        The position is the centroid of the cell's material.  The force is the unit weight plus the inertia force.  The
+        pressure drop is from the centroid to the face.  Unsaturated soil has a conductance for each retention curve.
 
         `p` (n,), Pa: pressures of the filled cells.
         `force` (n, d), N/m^3: inertia force on the fluid, or None.
@@ -392,7 +392,7 @@ class HalfFaces:
         return np.column_stack([p[self.at], x, pull, drop, conductance])
 
     def total(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the sums (..., n) of values (..., m) over the halves of each filled cell."""
+        """Return the sums (..., n) of values (..., m) over the faces of each filled cell."""
         return sum_by(self.at, values, len(self.contents.filled))
 
 
@@ -508,7 +508,7 @@ class FluxForms:
                 self.flux = FacetForm(density * slope * ufl.jump(q) * dS, grid.comm)
 
     def unequal(self, filled: NDArray[np.int32], mean: NDArray[np.float64]) -> NDArray[np.float64] | None:
-        """Return the mobility of all local cells from that of the filled cells, or None if all mobilities are equal."""
+        """Return the mobilities of all local cells from `mean` of the filled cells, or None if all are equal."""
         comm = self.grid.comm
         if comm.allreduce(mean.max(initial=0.0), MPI.MAX) <= comm.allreduce(mean.min(initial=np.inf), MPI.MIN):
             return None

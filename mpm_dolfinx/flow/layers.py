@@ -10,7 +10,7 @@ little.
 The pressure of a cell refers to one position in the cell, the pressure position.  In steady flow along a line, the
 pressure at this position equals the mean pressure of the line.  Let R be the resistance of the line, and let s increase
 from 0 to 1 along the line.  The resistance from the pressure position to the lower end is `int (1 - s) dR`, and to the
-upper end `int s dR`.  For a line through several cells, the sum of these resistances is exact.
+upper end `int s dR`.
 
 If layers are inclined by more than `INCLINED`, the pressure position moves to the more conductive end of the cell.
 Without this shift, an inclined drain would be interrupted between rows of cells.  The shape of a piece is approximated
@@ -33,8 +33,8 @@ from mpm_dolfinx.grid.grid import ranges, sum_by
 from mpm_dolfinx.parallel.exchange import over_all
 
 INCLINED = 0.01
-"""If the slope of layers relative to the grid is larger than this value, the pressure position of a cell moves to the
-more conductive end.  Plateau (scene "slope" of tests/plateaus.py): half this value changes the result by 4.1e-04, twice
+"""Slope of layers relative to the grid, above which the pressure position of a cell moves to the more conductive end.
+Plateau (scene "slope" of tests/plateaus.py): half this value changes the result by 4.1e-04, twice
 this value by 5.0e-05, and finer cells by 3.4e-03.
 """
 PAIRS = 2**16
@@ -88,10 +88,10 @@ class MixedCells:
             self._lines.append(Lines(line, piece, length, before, total))
 
     def _crossed(self, rows: slice, first, count, low, high) -> list[tuple[NDArray, NDArray, NDArray]]:
-        """Return, for each axis, all pairs of a line and a piece that it crosses, with weights.
+        """Return the lines, the pieces that they cross, and weights, for each axis.
 
-        The lines run through the centroids of the pieces `rows`.  A weight is below one if the line runs along the
-        border of the piece.
+        The lines run through the centroids of the pieces `rows`.  The weight is below one for a line along the border
+        of a piece.
         """
         line, piece = ranges(first[rows], count[rows])
         line += rows.start
@@ -141,7 +141,7 @@ class MixedCells:
     def _along(self, kappa: NDArray[np.float64], mean: float = 1.0) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the mobilities along the axes, and the shifts of the pressure position divided by the cell size.
 
-        With `mean` 0, only inclined layers cause shifts.  With `mean` 1, shifts lead to the position of mean pressure.
+        With `mean` 0, only inclined layers cause shifts.  With `mean` 1, all layers cause shifts.
         """
         n, d = len(self._filled), self._x.shape[1]
         mobility = np.zeros((n, d))
@@ -241,9 +241,8 @@ def graded(
 ) -> NDArray[np.float64]:
     """Return the mobilities (n, d) along the axes, divided by `mean`, in cells whose mobility varies gradually.
 
-    Pieces conduct in series along the gradient of the mobility, and in parallel across this gradient.  For a gradient
-    in any direction, the difference between arithmetic and harmonic mean is distributed over the axes.  The share of an
-    axis is proportional to the variance of a linear fit to the mobility along this axis.
+    The difference between the arithmetic and the harmonic mean of the mobilities is distributed over the axes.  The
+    share of an axis is proportional to the variance of a linear fit along this axis.
 
     `offset` (m, d), m: positions of the pieces relative to the midpoints of cells.
     `kappa` (m,), m^2/(Pa s): mobilities of the pieces.

@@ -57,7 +57,7 @@ def nonorthogonal_facets(contents: CellContents, facets: NDArray[np.int32]) -> N
 class Gradients:
     """Pressure gradients minus the unit weight of the fluid, in all cells that need the non-orthogonal correction.
 
-    The object is valid for one cut of the domains.
+    The object is valid for one cut of the particle domains.
 
     `contents`: material in the cells.
     `sides`: open sides of the bodies.
@@ -78,7 +78,7 @@ class Gradients:
         for axis, end in np.ndindex(d, 2):
             inside[:, axis, end] &= share[cells[:, axis, end], axis, 1 - end] > 0
         weight = np.ones(inside.shape)
-        if mobility is not None:  # series conductance of both cells, divided by that of two cells like the own one
+        if mobility is not None:  # series conductance of both cells, divided by the value for equal cells
             own, other = mobility[contents.filled][:, None, None], mobility[cells]
             weight = np.minimum(
                 1.0, np.divide(2 * other, own + other, out=np.zeros(inside.shape), where=own + other > 0)

@@ -21,7 +21,7 @@ class Sources(Feeding):
     """All sources of a scene, for all stages.
 
     `sources`: user functions that return UFL terms.
-    `pieces`: quadrature points of all pieces.  Their weights add up to the volumes of the material points.
+    `pieces`: quadrature points of all pieces.  The weights of the points add up to the volumes of the material points.
     `p`: pore pressure of the cells (DG0), Pa.
     `t`, s: time at the end of the substep, a UFL constant.
     """

@@ -19,8 +19,7 @@ r is taken at the pressure `(p_n + p) / 2`.  On a face, r is the logarithmic mea
 The residual is the left side of the balance, divided by the r of the storage term.  The tangent neglects the difference
 between the r of a face and the r of the storage term.
 
-The volume of a particle domain drifts away from the volume that its fluid content implies, for three reasons: corners
-do not follow u alone, points move to other cells, and pressure jumps are damped (see below).  Each point stores the
+The volume of a particle domain drifts away from the volume that its fluid content implies.  Each point stores the
 difference of the volumes as its volume defect (`owed`).  Each step corrects a part of this defect at a constant rate.
 
 If no fluid flows within a step, Q1 displacements with DG0 pressures violate the inf-sup condition: pressures that
@@ -34,10 +33,10 @@ For elastic soil, tau is a quarter of the value that Silvester and Kechkar give 
 and Borja 2021).  Soil in plastic flow needs a tau up to a hundred times larger.  The increase of tau acts on second
 differences only (`second_differences`), because damping of jumps would smear steep pressures.
 
-With inertia, tau decreases by the factor `1 / (1 + r)`.  r is the ratio of two resistances of a macroelement, that of
-its mass and that of its stiffness, see `OnGrid.resisting_mass`.  With the static tau, waves in undrained soil would be
-too slow: a cell would exchange as much water with its neighbours as it does in a static step.  If water moves freely in
-a substep of length dt, the static tau remains: the factor is `min(1, 1 / (1 + r) + s)` with `s = kappa rho_w / dt`.
+With inertia, tau decreases by the factor `1 / (1 + r)`.  Here r is the resistance of the mass of a macroelement,
+divided by the resistance of its stiffness, see `OnGrid.resisting_mass`.  With the static tau, waves in undrained soil
+would be too slow.  If water moves freely in a substep of length dt, the static tau remains: the factor is `min(1, 1 /
+(1 + r) + s)` with `s = kappa rho_w / dt`.
 """
 
 from __future__ import annotations
@@ -102,8 +101,7 @@ class StorageForms:
     `pores`.
     `weight` (d,), N/m^3: unit weight rho_w g of the pore fluid, as UFL, or None without gravity.
     `symmetric`: whether to use alpha as the derivative of the content with respect to J_Delta.  If True, the Jacobian
-    is symmetric.  The neglected term is of the order of `(p - p_n) / K_w`.  Newton's method converges as fast without
-    this term.
+    is symmetric.  The neglected term is of the order of `(p - p_n) / K_w`.
     `feeding`: sources and open sides of all stages.
     `inertial` (d,), N/m^3: inertia force `-rho_w a` on the pore fluid, as UFL, or None without inertia.
     """
@@ -434,7 +432,7 @@ class StorageProblem:
     def _damping_of_soft_soil(
         self, tau: NDArray[np.float64], softest: NDArray[np.float64], mobility: NDArray[np.float64]
     ) -> PETSc.Mat:
-        """Return the matrix of additional damping in soft cells."""
+        """Return the matrix of the additional damping in yielding soil."""
         contents, grid = self._contents, self.forms.grid
         flow = self.dt * mobility / grid.sizes(contents.filled) ** 2
         more = np.maximum((softest * tau)[:, None] - flow, 0) - np.maximum(tau[:, None] - flow, 0)
@@ -464,7 +462,7 @@ class StorageProblem:
         return {name: values for one, at in both for name, values in one.run_off(at, fluid).items()}
 
     def passing(self) -> list[Mapping[str, NDArray[np.float64]]]:
-        """Return the rates in a converged substep, from which `volumes` computes volumes."""
+        """Return the rates in a converged substep, for the method `volumes`."""
         fluid, both = self._fluid, zip(self._feeds, self._flow(False).at, strict=True)
         return [one.passing(at, fluid) for one, at in both]
 
@@ -484,7 +482,7 @@ class StorageProblem:
 
     @property
     def fill(self) -> NDArray[np.float64]:
-        """Volume fraction of material in each cell, the weight of the cell's pressure error."""
+        """Volume fraction of material in each cell, by which pressure errors are weighted."""
         return self._contents.fill
 
     def undrained(self, volumes: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -671,10 +669,9 @@ class StorageProblem:
         factor
             Multiple of beta, >= 0.
         share
-            Weight of the filter L, in [0, 1].  The weight 0 gives the fixed-stress operator.  With the stiffness K, `B
-            K^-1 B^T` equals `beta V` for a smooth pressure, and zero for a checkerboard.  For a pressure that
-            alternates along one axis, this matrix equals `beta V / 2` at nu = 0.  The matrix `beta V - L` gives these
-            three values.  L is the sum of `min(beta V+, beta V-) / (4 d) [p][q]` over the faces.
+            Weight of the filter L, in [0, 1].  The weight 0 gives the fixed-stress operator.  For a checkerboard
+            pressure, `beta V - L` vanishes like `B K^-1 B^T`, with the stiffness K.  L is the sum of
+            `min(beta V+, beta V-) / (4 d) [p][q]` over the faces.
         """
         system = self.system
         system.C.copy(system.P, structure=PETSc.Mat.Structure.SAME_NONZERO_PATTERN)

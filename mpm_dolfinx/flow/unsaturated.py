@@ -59,7 +59,7 @@ def fitted(p: Sequence, tables: Sequence[Sequence], drop, scale, of: Functions) 
     `retention.Conductance`.
     `drop`: pressure drop from the first side to the second due to the weight of the fluid, Pa.
     `scale`: characteristic suction of k_r, Pa.
-    `of`: functions for the type of the arguments: arrays or UFL expressions.
+    `of`: elementary functions of arrays or of UFL expressions.
     """
     (phi0, k0, d0), (phi1, k1, d1) = tables
     jump = p[0] - p[1]
@@ -122,8 +122,7 @@ class Relative:
     Attributes
     ----------
     shares
-        Fractions (DG0) of a cell's mobility at k_r = 1: of soil without a retention curve, and of the soil of each
-        curve.
+        Fractions (DG0) of a cell's saturated mobility: of soil without a retention curve, and of soil of each curve.
     laws
         Relative conductivities as functions of pressure.
     """

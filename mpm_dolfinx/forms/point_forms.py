@@ -113,8 +113,7 @@ class FormPoints:
         """Return grad u at the points as a coefficient that numpy evaluates.
 
         All forms with the same u share the values.  UFL would otherwise expand u as a Taylor polynomial, with many
-        terms in 3D.  The coefficient halves the run time of a kernel for Hencky's law, and divides its compile time by
-        five.
+        terms in 3D.
         """
         if "gradient" not in self.live:
             values = u.x.array
@@ -332,7 +331,7 @@ Given = Mapping[str, NDArray[np.float64]]
 NONE: Given = MappingProxyType({})
 
 Packed = tuple[NDArray[np.float64], list[tuple[slice, NDArray[np.float64], NDArray[np.intp]]]]
-"""Coefficients, one row for each point; for each grid function, its columns, its values, and the dofs of each row."""
+"""Coefficients with a row for each point, and for each grid function its columns, its values and the dofs of rows."""
 
 
 class Rows:

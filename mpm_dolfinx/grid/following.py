@@ -62,7 +62,7 @@ def carried(lines: Sequence[NDArray[np.float64]], shift: NDArray[np.float64]) ->
 
     The smallest cells move by a whole number of cells, rounded towards zero.  A tool therefore moves through the
     smallest cells as through fixed cells.  On each side of the smallest cells, the size of the k-th cell (k = 1, 2,
-    ...) is multiplied by the k-th power of a common factor.  Cells still grow towards the sides, but faster or slower.
+    ...) is multiplied by the k-th power of a common factor.
 
     Raises
     ------

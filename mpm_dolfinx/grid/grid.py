@@ -123,7 +123,7 @@ def ranges(first: NDArray[np.int64], count: NDArray[np.int64]) -> tuple[NDArray[
 
 
 def among(numbers: NDArray[np.integer], chosen: NDArray[np.integer]) -> NDArray[np.bool_]:
-    """Return which numbers (...) occur in the sorted array `chosen` (m,). numpy's `isin` would need more memory."""
+    """Return which numbers (...) occur in the sorted array `chosen` (m,)."""
     if not len(chosen):
         return np.zeros(numbers.shape, dtype=bool)
     return chosen[np.minimum(chosen.searchsorted(numbers), len(chosen) - 1)] == numbers
@@ -289,17 +289,17 @@ class Cells:
 
 
 def of_cells(name: str) -> cached_property:
-    """Return a property of a grid that is an attribute of its `Cells`."""
+    """Return a property of `Grid` that reads an attribute of the grid's `Cells`."""
     return cached_property(lambda grid: getattr(grid._of_process, name))
 
 
 def of_places(name: str) -> property:
-    """Return a property of a grid that is an attribute of `at` of its `Cells`."""
+    """Return a property of `Grid` that reads an attribute of the present `CellPlaces`."""
     return property(lambda grid: getattr((grid._cells or grid._of_process).at, name))
 
 
 def of_spacing(name: str) -> property:
-    """Return a property of a grid that is an attribute of its current `Spacing`."""
+    """Return a property of `Grid` that reads an attribute of the present `Spacing`."""
     return property(lambda grid: getattr(grid._spacing, name))
 
 
@@ -321,9 +321,9 @@ class Grid:
         Ascending coordinates of all grid lines, instead of `lower`, `upper` and `cells`; see `graded`.  Equally spaced
         lines along all axes give a grid of equal cells.
     follow : Tool, or callable -> (n,) along each axis, m
-        Object that the lines follow, at each reset of the grid.  With a tool, the smallest cells of `lines` move like
+        Object that the lines follow, at each reset of the grid.  With a tool, the smallest cells of `lines` move with
         one point: the centre of a ball, the tip of a cone, or the mean of the corners.  If the tool's shape is a
-        function, the smallest cells move like `Tool.centre`.  The other cells widen or narrow.  The tool must be a
+        function, the smallest cells move with `Tool.centre`.  The other cells widen or narrow.  The tool must be a
         condition of the first stage.  Lines do not move in stages without this tool.  A function depends on time t (s),
         the positions x (n, d) of all points, or both.  The function returns all lines.  Along each axis, the number of
         lines and the first and last coordinate must be as in `lines`.
@@ -359,8 +359,8 @@ class Grid:
     snap
         Distances (d,) along the axes, in cell sizes.  Vertices that are nearer to a grid plane count as on the plane.
     base : (d,), m
-        Origin of all internal positions: the lower corner of the grid, in axisymmetry at the radius 0.  With this
-        origin, positions far from the true origin keep their digits.
+        Origin of all internal positions: the lower corner of the grid, in axisymmetry at the radius 0.  This origin
+        reduces rounding errors of positions far from the true origin.
     low, high : (d,), m
         Lower and upper corner relative to `base`.
     stretches
@@ -798,7 +798,7 @@ class Grid:
     def monomials(self) -> NDArray[np.float64]:
         """Coefficients (2^d, 2^d) of the Q1 shape functions about the midpoint of a cell, one in each column.
 
-        Row s has the factors of the monomial s, the product of the offsets along all axes whose bit is set in s.  For
+        Row s belongs to the monomial s, the product of the offsets along the axes whose bits are set in s.  For
         unequal cells, the offsets are divided by the edge lengths, see `over_edges`.
         """
         bits = corner_bits(self.dim)[:, None]

@@ -131,8 +131,7 @@ def _along(
 def _growing(gap: float, size: float, ratio: float, largest: float) -> NDArray[np.float64]:
     """Return edge lengths that fill a gap, and grow from `size` by a common factor.
 
-    The factor is at most `ratio` if possible.  Two numbers of edges are tried, and the number with a factor nearer to 1
-    is used.
+    The factor is at most `ratio` if possible.
     """
     if gap <= 0:
         return np.empty(0)

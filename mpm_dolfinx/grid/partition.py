@@ -89,7 +89,7 @@ def better(load: NDArray[np.float64], of: NDArray[np.int64]) -> NDArray[np.int64
     """Return the boxes (ranks, 2, d) of a new bisection, or None if the boxes `of` are almost as good.
 
     New boxes are returned if their imbalance is below `IMBALANCE`, or below the imbalance of the boxes `of` divided by
-    `IMBALANCE`.  Without this factor, each reset of the grid might distribute a few cells anew.
+    `IMBALANCE`.
     """
     new = boxes(load, len(of))
     return new if imbalance(load, new) < max(IMBALANCE, imbalance(load, of) / IMBALANCE) else None

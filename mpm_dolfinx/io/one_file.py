@@ -27,7 +27,7 @@ def one_file(folder: str | os.PathLike) -> Path:
 
     ParaView, VTK and meshio (xdmf.TimeSeriesReader) read these files.  dolfinx reads the particle domains of one
     output time as a mesh.  For example, `XDMFFile.read_mesh(name="2", xpath="/Xdmf/Domain/Grid")` reads the third time.
-    The elements `<Information>` in points.xdmf describe the fields and their units.  The files of the `Writer` remain.
+    The elements `<Information>` in points.xdmf describe the fields and their units.  Files of the `Writer` remain.
     A call during a run joins the files written so far.
 
     Parameters

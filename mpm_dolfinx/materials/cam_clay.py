@@ -2,7 +2,7 @@
 """Modified Cam Clay at finite strain (Borja and Tamagnini 1998), and the Barcelona Basic Model for suction.
 
 The law describes clay whose yield surface grows with plastic compaction.  Plasticity is multiplicative, in principal
-logarithmic strains.  tau is the Kirchhoff stress, e_v is the elastic volume strain, and e is the elastic deviatoric
+logarithmic strains.  Let tau be the Kirchhoff stress, e_v the elastic volume strain, and e the elastic deviatoric
 strain (tension positive).  With P = -tr(tau)/3 and Q = sqrt(3/2) |dev tau|, the law is
 
     P = P_0 exp(-e_v / kappa),   dev tau = 2G e,
@@ -12,9 +12,9 @@ with associated flow.  P_0 is the pressure at F = I, G is the shear modulus, M i
 P_c is the size of the yield surface, and e_v^p is the plastic volume strain.  The logarithm of the specific volume is
 linear in ln P (bilogarithmic law), with the slope lambda in first loading and the slope kappa in unloading.
 
-The stress at the end of a step is computed from the trial stresses P_t and Q_t, and from P_c,n.  P_c,n is the size of
-the yield surface at the start of the step.  The number a is the plastic compaction divided by kappa.  The number h is
-defined by 6G dgamma / M^2 = exp(h) - 1, with the plastic multiplier dgamma.  With w = (Q_t / (M P_t))^2,
+A step starts from the trial stresses P_t and Q_t, and from the size P_c,n of the yield surface.  The unknowns are the
+plastic compaction divided by kappa, a, and the plastic multiplier dgamma.  With 6G dgamma / M^2 = exp(h) - 1 and
+w = (Q_t / (M P_t))^2, the stress at the end of the step is given by
 
     P = P_t exp(-a),   Q = Q_t exp(-h),   P_c = P_c,n exp(rho a),   rho = kappa / (lambda - kappa),
     (6G kappa / M^2) a = (exp(h) - 1) (2P - P_c).
@@ -53,7 +53,7 @@ GIVEN = {
 
 
 class _Follows(float):
-    """A bulk modulus that the class has derived from other constants."""
+    """Bulk modulus P_0 / kappa, derived from other constants."""
 
     follows = True
 
@@ -127,7 +127,7 @@ class ModifiedCamClay(Skeleton):
         super().__post_init__()
 
     def _set_bulk(self) -> None:
-        """Set the initial bulk modulus, which scales the coupling scheme."""
+        """Set the initial bulk modulus P_0 / kappa."""
         stress, kappa = self.initial_stress, self.kappa
         if callable(stress) or callable(kappa):
             bulk = _FollowsByPlace(stress, kappa)
@@ -210,7 +210,7 @@ LC = {"r": "> kappa / lambda_, <= 1", "beta": ">= 0 1/Pa and finite", "reference
 
 
 def _dried(function: Callable) -> Callable:
-    """Return a function of Modified Cam Clay with lambda(s) and P_c(s) at the suction s."""
+    """Return the function of Modified Cam Clay, evaluated with lambda(s) and P_c(s) at the suction s."""
     arguments = Skeleton.arguments_of(function)
 
     def of(**given):
@@ -307,7 +307,7 @@ class BarcelonaBasic(ModifiedCamClay):
 
 
 class _Return:
-    """Return to the yield surface for a value of the unknown d.
+    """Result of the return mapping for a value of the unknown d.
 
     `compaction`: a.
     `flow`: h.

@@ -31,7 +31,7 @@ MATCHES = {
     "compression": lambda t, s, c: (6 * s / np.sqrt(3) / (3 - s), 6 * c / np.sqrt(3) / (3 - s)),
     "extension": lambda t, s, c: (6 * s / np.sqrt(3) / (3 + s), 6 * c / np.sqrt(3) / (3 + s)),
 }
-"""Parameters (eta, xi) of the cone, from tan phi, sin phi and cos phi, for each match to Mohr and Coulomb's law."""
+"""Functions of tan phi, sin phi and cos phi that return eta and xi, for each match to Mohr and Coulomb's law."""
 LEAST = 1e-20
 """Constant added to the squared deviatoric strain under a square root, so that the root is differentiable at zero.
 Plateau (scene "soil" of tests/plateaus.py): half this value changes the result by 2.3e-11, twice this value by 1.0e-11,
@@ -50,10 +50,9 @@ class DruckerPrager(Frictional):
     dilation
         Dilation angle psi, degrees, in [0, friction].  If psi = phi, flow is associated and the tangent is symmetric.
     cohesion
-        Cohesion c_0, Pa, >= 0.  If c_0 is zero, points without mean pressure have no stiffness.
+        Cohesion c_0, Pa, >= 0.  If c_0 is zero, soil without mean stress has no stiffness.
     hardening
-        Linear hardening modulus H, Pa, >= 0: c = c_0 + H kappa, with the accumulated plastic strain kappa.  In
-        associated flow, kappa is work conjugate to c.
+        Linear hardening modulus H, Pa, >= 0: c = c_0 + H kappa, with the accumulated plastic strain kappa.
     match
         Stress states in which the cone coincides with Mohr and Coulomb's yield surface.  "plane strain" gives the
         collapse load of Mohr and Coulomb's law in plane strain, exactly for associated flow.  "compression" is the

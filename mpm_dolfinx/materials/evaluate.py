@@ -220,9 +220,8 @@ and finer cells by 3.0e-02.
 class SoftnessAtPoints:
     """Softness of yielding points: elastic shear modulus divided by tangent shear modulus.
 
-    In plastic flow, volume strains that alternate from cell to cell grow at constant stress.  These volume strains
-    cause alternating pressures, equal to the volume strains divided by the damping coefficient tau. tau must therefore
-    grow with the softness.  Otherwise the alternating pressures reach the strength of the soil.
+    In plastic flow, volume strains and pressures may alternate from cell to cell.  The damping coefficient tau of
+    pressure jumps must then grow with the softness of the soil.
 
     The strain of a step is e = dev sym dF F^-1, with the change dF of F.  With the Kirchhoff stress T(s) at
     F - (1 - s) dF, the tangent shear modulus is G_t = (dT/ds) : e / (2 e : e) at s = 1.  At rest the direction of e is
@@ -344,7 +343,7 @@ class ConductivityAtPieces:
 
 
 def sampled(law: Callable) -> list[float | None]:
-    """Return numbers that identify a law: its conductivities in three states of deformation."""
+    """Return the conductivities of a law in three states of deformation, which identify the law."""
     out = []
     for J in (0.75, 1.0, 1.25):
         F = ufl.as_matrix([[J, J / 8], [0.0, 1.0]])

@@ -88,7 +88,7 @@ class SceneMaterials:
         places = {i: _places(bodies, i, points.id[own]) for i, own in rows.items()}
 
         def at_points() -> list[tuple[Skeleton, Skeleton]]:
-            """Return each material twice: at the points of this process, and at its first point on all processes."""
+            """Return each material at the points of this process, and at its first point on all processes."""
             return [_evaluated(grid, materials[i], places[i], points.id[rows[i]]) for i in self._used]
 
         evaluated, at_first = zip(*at_points(), strict=True)
@@ -169,7 +169,7 @@ class SceneMaterials:
         ]
 
     def seeds_no_more(self) -> None:
-        """Delete the seeded points when all bodies are in the scene."""
+        """Delete the seeded points, which only bodies that are added later need."""
         self.seeded = self.seeded.of(np.empty(0, dtype=np.int64))
 
     def check_cells(self) -> None:
@@ -228,11 +228,11 @@ class SceneMaterials:
             raise ValueError(f"{law.__name__}: {name} has shape {shape}, in another law {other}; must be equal")
 
     def parts(self, pieces: FormPoints, common: Sequence[str]) -> list[tuple[type[Skeleton], FormPoints, bool]]:
-        """Return the parts of the points: law, integration points, and whether Q1 cells would lock.
+        """Return the law and the integration points of each part, and whether Q1 cells would lock.
 
-        A part contains the points of one law.  If only some materials of a law are nearly incompressible, the law has
-        two parts.  A single part uses `pieces`.  Several parts have their own integration points, with the fields
-        `common` and the parameters and state of the law.
+        A part of the points has one law.  If only some materials of a law are nearly incompressible, the law has two
+        parts.  A single part has the integration points `pieces`.  Each of several parts has its own integration
+        points, with the fields `common` and the parameters and state of the law.
         """
         if len(self._parts) == 1:
             return [(law, pieces, locks) for law, locks, _ in self._parts]
@@ -265,10 +265,9 @@ class SceneMaterials:
         return np.array([known for *_, known in self._parts])[self.part_of(points)]
 
     def conducting(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the conductivity, in m/s, and a number for the law of conductivity at each point.
+        """Return the conductivity, in m/s, and the number of the conductivity law of each point, with shape (n, 2).
 
-        The result has the shape (n, 2).  Points with equal rows conduct equally.  If the conductivity law depends on
-        position, each point has its own number.
+        Points with equal rows conduct equally.
         """
         laws, known = [m.conductivity_law for m in self.materials], self.conductivity_laws
         law = np.array([known.index(law) if law in known else -1 for law in laws])[points.material]
@@ -603,7 +602,7 @@ def _by_place(m: Skeleton) -> list[str]:
 
 
 def _evaluated(grid: Grid, m: Skeleton, X: NDArray[np.float64], ids: NDArray[np.int64]) -> tuple[Skeleton, Skeleton]:
-    """Return a material twice: at this process's points, and at the point with the lowest id on all processes.
+    """Return a material at this process's points, and at the point with the lowest id on all processes.
 
     `X` (n, d), in m: reference positions of this process's points with the material.
     `ids` (n,): ids of these points.
@@ -643,7 +642,7 @@ def _places(bodies: Sequence[Body], material: int, ids: NDArray[np.int64]) -> ND
 
 
 def _ends(grid: Grid, values: Sequence) -> tuple[float, float]:
-    """Return the least and the largest of some numbers and arrays, over all processes."""
+    """Return the smallest and the largest of all values, over all processes."""
     flat = np.concatenate([np.ravel(one) for one in values])
     least, most = over_all(grid.comm, np.array([flat.min(), -flat.max()]), MPI.MIN)
     return float(least), -float(most)

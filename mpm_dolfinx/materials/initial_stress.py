@@ -24,7 +24,7 @@ from mpm_dolfinx.materials.trial import PLANE, SPACE
 from mpm_dolfinx.parallel.exchange import Exchange, first, over_all, together
 from mpm_dolfinx.points.material_points import MaterialPoints, unstretched
 
-EXACT, CLOSE = 1e-13, SAME  # errors relative to the largest initial stress: the first ends Newton's method
+EXACT, CLOSE = 1e-13, SAME  # relative stress errors at which Newton's method ends, and which are accepted
 MOST = 30  # largest number of Newton iterations
 LARGEST = 0.2  # limit to the change of a strain component in one iteration
 
@@ -33,12 +33,12 @@ LARGEST = 0.2  # limit to the change of a strain component in one iteration
 class K0:
     """Initial effective stress of soil under its own weight, with the coefficient K0 of earth pressure at rest.
 
-    The vertical effective stress is the overburden of soil and fluid plus the surcharge, minus the pore stress
-    alpha chi p.  alpha is Biot's coefficient, chi is Bishop's coefficient, and p is the pore pressure.  The horizontal
-    effective stresses are K0 times the vertical effective stress.  In axisymmetry, the horizontal stresses are radial
-    and circumferential.  The stresses are exact for level ground with level layers.  In other ground, the stresses are
-    changed until they balance the weight, without motion of the points.  A warning is given if balancing changes a
-    stress by more than 5 % of the largest initial stress, as on slopes.
+    The vertical effective stress is the overburden of soil and fluid plus the surcharge, minus alpha chi p.  Here alpha
+    is Biot's coefficient, chi is Bishop's coefficient, and p is the pore pressure.  The horizontal effective stresses
+    are K0 times the vertical effective stress.  In axisymmetry, the horizontal stresses are radial and circumferential.
+    The stresses are exact for level ground with level layers.  In other ground, the stresses are changed until they
+    balance the weight, without motion of the points.  A warning is given if balancing changes a stress by more than 5 %
+    of the largest initial stress, as on slopes.
 
     Parameters
     ----------
@@ -208,10 +208,10 @@ def _in_columns(
     unit_weight: NDArray[np.float64],
     above: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return corners and unit weights of all domains above and below this process's domains.
+    """Return the corners and unit weights of all particle domains above and below given domains.
 
-    `ids` (n,), `corners` (n, 2^d, d), in m, `unit_weight` (n,), in N/m^3: this process's domains in the scene.
-    `above` (k, 2^d, d), in m: corners of the domains whose columns are needed.
+    `ids` (n,), `corners` (n, 2^d, d), in m, `unit_weight` (n,), in N/m^3: particle domains of this process.
+    `above` (k, 2^d, d), in m: corners of the given domains of this process.
     """
     ends = [above[..., :-1].min(axis=(0, 1), initial=np.inf), above[..., :-1].max(axis=(0, 1), initial=-np.inf)]
     low, high = corners[..., :-1].min(axis=1), corners[..., :-1].max(axis=1)
@@ -255,7 +255,7 @@ def stressed(
 
 @dataclass(frozen=True, eq=False)
 class _ElasticStrains:
-    """Elastic strains for target stresses, as logarithms of stretches, by Newton's method."""
+    """Newton's method for the elastic (logarithmic) strains that cause target stresses."""
 
     materials: SceneMaterials
     points: MaterialPoints  # n points
@@ -296,7 +296,7 @@ class _ElasticStrains:
         return self.of(elastic)
 
     def residual(self, strain: NDArray[np.float64]) -> tuple[MaterialPoints, NDArray[np.float64]]:
-        """Return the points with these elastic strains, and their stresses minus the target stresses, in Pa."""
+        """Return the points with elastic strains `strain`, and their stresses minus the target stresses, in Pa."""
         tensor = np.zeros((len(strain), 3, 3))
         for value, (i, j) in zip(strain.T, self.components, strict=True):
             tensor[:, i, j] = tensor[:, j, i] = value

@@ -6,9 +6,8 @@ Newton's method solves f = 0 at all points together, up to round-off.  With the 
 
     y = y* + Y (z(F) - z*),     Y = -(df/dy)^-1 df/dz  at (y*, z*).
 
-At the solution, this y has the right value and the right derivative with respect to F.  UFL's derivative of a stress is
-therefore the consistent tangent, although the forms contain no iterations.  y*, z* and Y are coefficients at the
-points.  Expressions that are not differentiated use y* in place of y.
+This y has the right value and the right derivative with respect to F.  UFL's derivative of a stress is therefore the
+consistent tangent, although the forms contain no iterations.  y*, z* and Y are coefficients at the points.
 
 If the law has an energy, the tangent is the second derivative of the energy, and the expression for y has a
 second-order term.  A law in numpy returns y(z) and dy/dz.
@@ -64,8 +63,7 @@ class LocalUnknowns:
     values
         The unknowns by name, as UFL that depends on F; also `trial`.
     known
-        Like `values`, but independent of F, for expressions that are not differentiated with respect to F.  The kernels
-        of such expressions need no trial values.  For laws with an energy, `known` equals `values`.
+        The unknowns as coefficients, independent of F.  For laws with an energy, `known` equals `values`.
     """
 
     def __init__(self, law: type[Skeleton], points: FormPoints, F, values: Mapping[str, object]):
@@ -99,7 +97,7 @@ class LocalUnknowns:
     def solve(self, data: PointData, derive: bool = True, motion: tuple = ()) -> Given:
         """Solve for the unknowns at the present F, and return values for the forms.  All processes must call this.
 
-        `derive`: whether to compute the derivatives with respect to the trial values.  `values` contains them.
+        `derive`: whether to compute the derivatives with respect to the trial values, which `values` needs.
         `motion`: key of the present displacement.  Results are reused while `data`, `motion` and dt are the same.
         """
         key = data.key, motion, float(self._dt.value)
@@ -283,8 +281,7 @@ def _real(name: str, value, shape: tuple[int, ...]) -> NDArray[np.float64]:
 def _newton(system, y: NDArray[np.float64]) -> NDArray[np.int64]:
     """Solve f(y) = 0 in place, and return the indices of points without a solution.
 
-    `system`: function of r point indices and of the y (r, m) of these points.  The function stores y, and returns f,
-    df/dy and the norms of f.
+    `system`: function that returns f, df/dy and the norms of f for point indices (r,) and their y (r, m).
     """
     rows, failed = np.arange(len(y)), np.zeros(len(y), dtype=bool)
     f, slope, norm = system(rows, y)

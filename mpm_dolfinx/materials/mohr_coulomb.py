@@ -7,14 +7,14 @@ stresses are t_1 >= t_2 >= t_3, tension positive.  These stresses satisfy
     f_ij = (1 + sin phi) t_i - (1 - sin phi) t_j - 2 c cos phi <= 0  for all i, j,    t_i <= T,
 
 with the friction angle phi, the cohesion c and the tensile strength T.  The direction of flow is
-(1 + sin psi) e_i - (1 - sin psi) e_j on a face f_ij, and e_i at the cut-off T, with the dilation angle psi and the
-principal directions e_i.
+(1 + sin psi) e_i - (1 - sin psi) e_j on a face f_ij, and e_i at the cut-off T.  Here psi is the dilation angle, and
+e_i are the principal directions.
 
-The return mapping keeps the order of the principal stresses.  The final stress lies on one of ten faces, edges and
-vertices.  On each face, edge and vertex, the final stress is linear in the trial stress (de Souza Neto, Peric and Owen
-2008, 8.2, without the cut-off).  A final stress is valid if it is admissible, the order is kept, and all plastic
-multipliers are >= 0.  The return mapping uses the possible final stress with the least violation, which is a rounding
-error.  Derivatives are computed in numpy, and are exact even for equal eigenvalues.
+The final stress lies on one of ten faces, edges and vertices of the yield surface.  On each face, edge and vertex, the
+final stress is linear in the trial stress (de Souza Neto, Peric and Owen 2008, 8.2, without the cut-off).  A final
+stress must be admissible, in the order of the trial stresses, and have plastic multipliers >= 0.  The return mapping
+chooses the face, edge or vertex with the least violation of these conditions.  Derivatives are exact, even for equal
+eigenvalues.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from mpm_dolfinx.materials.frictional import Frictional
 from mpm_dolfinx.materials.skeleton import Field, _check
 from mpm_dolfinx.materials.trial import PLANE, Coaxial, Isotropic, components, eigen, symmetric
 
-FACE, EDGES, ALL = slice(0, 1), slice(1, 3), slice(None)  # possible places of the final stress in the list of `end`
+FACE, EDGES, ALL = slice(0, 1), slice(1, 3), slice(None)  # main face, its edges, and all faces of `_Return`
 NEVER = 1e6  # largest tensile strength, divided by the bulk modulus
 
 
@@ -49,7 +49,7 @@ class MohrCoulomb(Frictional):
         Dilation angle psi, degrees, in [0, friction].  If psi = phi, flow is associated and the tangent is symmetric.
         Soil in tension at the apex dilates for any psi.
     cohesion
-        Cohesion c, Pa, >= 0.  If c is zero, points without mean pressure have no stiffness.
+        Cohesion c, Pa, >= 0.  If c is zero, soil without mean stress has no stiffness.
     tension
         Tensile strength T, Pa, >= 0: upper limit of the principal stresses, by default the apex stress c cot phi.
 
@@ -196,7 +196,7 @@ class _Return:
     def end(self, few: slice) -> tuple[NDArray, NDArray, NDArray]:
         """Return the final stresses, their derivatives with respect to the trial stresses, and their violation.
 
-        `few`: slice of `_faces` with possible faces and edges of the final stress.  `ALL` also includes the vertices.
+        `few`: slice of the faces and edges that are tried.  `ALL` also includes the vertices.
         """
         with np.errstate(all="ignore"):  # vertices at infinity
             ends = [self._on(faces) for faces in self._faces[few]]
@@ -234,21 +234,21 @@ class _Return:
         return t, np.zeros((len(t), 3, 3)), self._violation(t, conditions(plastic))
 
     def _in_apex(self, x: NDArray) -> list[NDArray]:
-        """Return quantities that are >= 0 if the apex is the final stress."""
+        """Return numbers that are >= 0 if the apex is the final stress."""
         total, difference = x.sum(axis=1), self._p - self._q
         return [total, self._q * total + difference * x[:, 2], self._q * total + difference * (x[:, 1] + x[:, 2])]
 
     def _in_triaxial(self, x: NDArray) -> list[NDArray]:
-        """Like `_in_apex`, for the vertex where t_1 is at the cut-off, and t_2 = t_3."""
+        """Return numbers that are >= 0 if the final stress is the vertex with t_1 at the cut-off and t_2 = t_3."""
         return [-x[:, 1], -x[:, 2], x[:, 0] + self._p / self._q * (x[:, 1] + x[:, 2])]
 
     def _in_extension(self, x: NDArray) -> list[NDArray]:
-        """Like `_in_apex`, for the vertex where t_1 = t_2 are at the cut-off."""
+        """Return numbers that are >= 0 if the final stress is the vertex with t_1 = t_2 at the cut-off."""
         return [x[:, 0], x[:, 1], -x[:, 2], x[:, 0] + x[:, 1] + self._p / self._q * x[:, 2]]
 
 
 def _inverse(A: NDArray) -> NDArray:
-    """Return the inverses of matrices (n, 2, 2), ten times faster than LAPACK."""
+    """Return the inverses of matrices (n, 2, 2)."""
     adjugate = A[:, ::-1, ::-1].transpose(0, 2, 1) * [[1, -1], [-1, 1]]
     return adjugate / (A[:, 0, 0] * A[:, 1, 1] - A[:, 0, 1] * A[:, 1, 0])[:, None, None]
 

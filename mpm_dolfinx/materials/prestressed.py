@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Laws of soil with an initial stress.
 
-A soil with an initial stress responds as if loading had caused this stress.  The law is therefore evaluated at F F_i.
-F is the deformation gradient relative to the seeded state, and F_i is an initial stretch (3, 3) at each point.
-Volumes, porosities and conductivities refer to the seeded state.  In laws with the state variable `plastic`, the
-inverse plastic metric C_p^-1 replaces F_i.
+The law is evaluated at F F_i, with the deformation gradient F relative to the seeded state.  The initial stretch F_i
+(3, 3) of a point causes its initial stress.  Volumes, porosities and conductivities refer to the seeded state.  In laws
+with the state variable `plastic`, the inverse plastic metric C_p^-1 replaces F_i.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from mpm_dolfinx.forms.axes import block, embedded, planar
 from mpm_dolfinx.materials.skeleton import Field, Skeleton
 
 AT_REST = " at rest"
-"""Suffix of the names of state variables at seeding.  At yielded points, present values differ from seeded values."""
+"""Suffix of the names of point data that contain the state variables at seeding."""
 
 
 def stressed(m: Skeleton, knows_space: bool) -> Skeleton:
@@ -44,7 +43,7 @@ def _everywhere(value) -> Callable:
 
 @cache
 def prestressed(law: type[Skeleton], knows_space: bool) -> type[Skeleton]:
-    """Return a law with F_i as the additional field `seeded_stretch`."""
+    """Return the law with F_i as the additional field `seeded_stretch`."""
     names = ("energy", "kirchhoff", "update", "trial")
     used = {name: f for name in names if (f := getattr(law, name)) is not None}
     given = {name: staticmethod(_from_seeded(f, name, knows_space)) for name, f in used.items()}
@@ -54,7 +53,7 @@ def prestressed(law: type[Skeleton], knows_space: bool) -> type[Skeleton]:
 
 
 def _from_seeded(function: Callable, name: str, knows_space: bool) -> Callable:
-    """Return a function of a law, with F replaced by F F_i."""
+    """Return the function of a law, evaluated at F F_i."""
     names = Skeleton.arguments_of(function)
 
     def of(**given):

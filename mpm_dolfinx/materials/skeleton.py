@@ -99,11 +99,11 @@ class Skeleton:
     should be scaled to values of about one.
 
     residual
-        Function of the law's fields, state, unknowns and `trial`.  It returns a dict with UFL for each unknown, of the
-        shape of the unknown.  Newton's method solves residual = 0 at each point.
+        Function of the law's fields, state, unknowns and `trial`.  The function returns a dict with UFL for each
+        unknown, of the shape of the unknown.  Newton's method solves residual = 0 at each point.
     solution
-        Alternative to `residual` in numpy, for return mappings with many cases, and for existing codes.  It is a
-        function of arrays (n, ...) of the law's fields, state and `trial`.  It returns a dict with a pair for each
+        Alternative to `residual` in numpy, for return mappings with many cases, and for existing codes.  The function
+        takes arrays (n, ...) of the law's fields, state and `trial`.  The function returns a dict with a pair for each
         unknown: the values (n, ...), and a dict of derivatives (n, ..., ...) by name of the trial value.  A derivative
         may be a function without arguments, called when a tangent is assembled.  A missing derivative is zero.  Without
         a solution, return NaN or infinity; the time step is then reduced.  Newton's method is slow if `energy` is not
@@ -160,9 +160,9 @@ class Skeleton:
     dilates: ClassVar[bool] = False
     """Whether the law has an angle of `dilation`."""
     elastic_hencky: ClassVar[bool] = False
-    """Whether elastic strains determine the stresses by Hencky's law.  Stresses then determine the elastic energy."""
+    """Whether the stresses follow from the elastic strains by Hencky's law."""
     linear: ClassVar[bool] = False
-    """Whether the stress is linear in F, so that a factorisation is reused until active cells or step size change."""
+    """Whether the stress is linear in F, so that factors of the stiffness matrix can be reused."""
     state: ClassVar[Mapping[str, ArrayLike]] = {}
     by_scene: ClassVar[tuple[str, ...]] = ()
     """Names in `BY_SCENE` that are arguments of the law's functions."""
@@ -297,12 +297,12 @@ class Skeleton:
         return self.bulk + 4 / 3 * self.shear
 
     def pressure_damping(self) -> float:
-        """Return the damping coefficient tau, in 1/Pa, which damps increments of alternating pressures.
+        """Return the coefficient tau, in 1/Pa, that damps alternating increments of the pressure.
 
-        The value for macroelements of 2 x 2 cells is 3 alpha^2 / (8 (lambda + 3G)) (Silvester and Kechkar 1990;
-        Camargo, White and Borja 2021).  tau is half of this value for laws with a state, and a quarter for other laws.
-        A quarter gives better conditioning and less smearing than a half.  The value for 2 x 2 x 2 cells is too small
-        to damp pressures that alternate along two axes only.  Oscillations due to first yield remain.
+        For laws with a state, tau is half of the value for macroelements of 2 x 2 cells, 3 alpha^2 / (8 (lambda + 3G))
+        (Silvester and Kechkar 1990; Camargo, White and Borja 2021).  For other laws tau is a quarter of this value, for
+        better conditioning and less smearing.  In 3D, the value for 2 x 2 x 2 cells would be too small to damp
+        pressures that alternate along two axes only.
         """
         return (0.5 if self.state else 0.25) * self.biot**2 * 3 / (8 * self.macroelement)
 
@@ -374,10 +374,7 @@ def _deviatoric(F):
 
 
 def _stretch_difference(C):
-    """Return the difference of the logarithmic principal stretches of a symmetric 2x2 tensor, as UFL.
-
-    With a single quotient, `ratio`, the second derivatives are half as long as with two quotients.
-    """
+    """Return the difference of the logarithmic principal stretches of a symmetric 2x2 tensor, as UFL."""
     ratio = ((C[0, 0] - C[1, 1]) ** 2 + 4 * C[0, 1] ** 2) / (C[0, 0] + C[1, 1]) ** 2
     radius = ufl.sqrt(ratio + SEPARATION**2 / 4)
     return (ufl.ln(1 + radius) - ufl.ln(1 - radius)) / 2

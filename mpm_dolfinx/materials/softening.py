@@ -99,7 +99,7 @@ class SofteningDruckerPrager(DruckerPrager):
 
 
 def _softened(trial: Trial, bulk, shear, cone, hardened, cohesion, residual, strain, drag) -> dict:
-    """Like `drucker_prager.returned`, with a cohesion that falls to c_r at the plastic shear strain `strain`."""
+    """Return the results of `drucker_prager.returned` for a cohesion that decreases to c_r at the strain `strain`."""
     end = cone[1] * strain  # in terms of `hardened`
     moduli = trial, bulk, shear, *cone
     falling = returned(*moduli, cohesion, (residual - cohesion) / end, hardened, drag)

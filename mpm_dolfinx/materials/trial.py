@@ -2,9 +2,8 @@
 """Trial elastic strain of multiplicative plasticity, and isotropic functions, in UFL and in numpy.
 
 In UFL, isotropic functions of a tensor are Newton's interpolation polynomials at its eigenvalues.  The polynomials are
-exact for smooth functions of each eigenvalue.  The polynomials remain smooth at equal eigenvalues, because
-`_eigenvalues` separates equal eigenvalues.  For principal values that have kinks and depend on all three eigenvalues,
-`Coaxial` gives exact derivatives in numpy.
+exact for smooth functions of each eigenvalue, and remain smooth at equal eigenvalues.  In numpy, `Coaxial` computes the
+exact derivatives of return mappings, which depend on all three eigenvalues.
 """
 
 from __future__ import annotations
@@ -101,11 +100,11 @@ def eigen(b: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float
 
 
 class Coaxial:
-    """Tensors that are coaxial with n other tensors.
+    """Tensors with the principal axes of n given tensors.
 
-    `x` (n, 3), `axes` (n, 3, 3): eigenvalues and axes of the other tensors, see `eigen`.
-    `y` (n, 3): principal values of the coaxial tensors.
-    `plane`: whether the other tensors have the components in `PLANE`.
+    `x` (n, 3), `axes` (n, 3, 3): eigenvalues and axes of the given tensors, see `eigen`.
+    `y` (n, 3): principal values.
+    `plane`: whether the given tensors have the components in `PLANE`.
     """
 
     def __init__(self, x: NDArray[np.float64], axes: NDArray[np.float64], y: NDArray[np.float64], plane: bool):
@@ -122,16 +121,16 @@ class Coaxial:
 
     @property
     def values(self) -> NDArray[np.float64]:
-        """Components (n, 6) of the coaxial tensors."""
+        """Components (n, 6) of the tensors."""
         out = np.zeros((len(self._x), len(SPACE)))  # in the plane the other components are zero
         out[:, : len(self._inner)] = (self._outer @ self._y[:, :, None])[:, :, 0]
         return out
 
     def tangent(self, slopes: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the derivatives of `values` with respect to the components of the other tensors.
+        """Return the derivatives of `values` with respect to the components of the given tensors.
 
         In principal axes, dy_ij = (y_i - y_j) / (x_i - x_j) dx_ij for i != j.  The limit for x_i = x_j is
-        (dy_i/dx_i - dy_i/dx_j) dx_ij, because then an isotropic function also has y_i = y_j.
+        (dy_i/dx_i - dy_i/dx_j) dx_ij.
 
         `slopes` (n, 3, 3): dy/dx.
         """

@@ -8,10 +8,10 @@ the step.  Their arguments are:
 points
     Quadrature points.  The integral of 1 over the measure `points.dx` is the volume of the material points.
     `points.value(f)` and `points.grad(f)` are the value and gradient of f = u or v.  In axisymmetry the gradient is (3,
-    3), with f_r / r.  `points.F` is the deformation gradient at the start of the step, in the shape of grad u, with the
-    volume ratio as determinant.  `points.position` is the position at the start of the step.  `points.displacement` is
-    the displacement since the start of the run, or since a stage that reset it to zero.  Other attributes are the laws'
-    state variables, and parameters that are functions of position.
+    3), with f_r / r.  `points.F` is the deformation gradient at the start of the step, in the shape of grad u; its
+    determinant is the volume ratio.  `points.position` is the position at the start of the step.
+    `points.displacement` is the displacement since the start of the run, or since a stage that reset it to zero.  Other
+    attributes are the laws' state variables, and parameters that are functions of position.
 t
     Time at which the balances hold, s, as a UFL constant: the end of the step or of its first substep.
 
@@ -74,7 +74,7 @@ def expression(function: Callable, shapes: Sequence[tuple[int, ...]], of: str = 
     """Return the result of a user-defined function as a UFL expression with one of the given shapes.
 
     ValueError is raised if the function fails, or if the result is not UFL.  ValueError is also raised if the result
-    has a wrong shape, or does not depend on `of`.
+    has a wrong shape, or does not depend on the argument `of`.
     """
     value = call(function, **available)
     allowed = f"UFL of shape {' or '.join(map(str, shapes))}{f' that depends on {of}' if of else ''}"

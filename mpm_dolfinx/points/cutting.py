@@ -8,9 +8,8 @@ wherever the domain lies on the grid.
 
 The surface of a domain consists of four edges, or in 3D of four triangles about the middle of each face.  The triangles
 of neighbouring domains match, and do not favour a diagonal of the face.  The grid planes slice this surface, one axis
-after the other.  Gauss's theorem gives the volumes and first moments between a slice and the lower face of its cell,
-and in the column of cells below.  The interior of a domain is never cut.  Inverted parts of a domain have negative
-volume, and cancel its overlap with neighbours.  Pieces with negative volume are left out.
+after the other.  Gauss's theorem gives the volume and the first moments of each piece from the slices.  Inverted parts
+of a domain have negative volume, and cancel its overlap with neighbours.  Pieces with negative volume are left out.
 
 In axisymmetry pieces are rings.  The volume of a ring is `2 pi r_c` times the area of its section, where r_c is the
 radius of the section's centroid (Pappus).  Gradients are evaluated at the centroid of the volume,
@@ -467,8 +466,7 @@ def cut_faces(
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Cut faces of domains by the grid, and return integration points, which are exact for products of Q1 functions.
 
-    If a face crosses a grid line, the part of the face in each cell must load the nodes of this cell.  With one point
-    for each face, nodes of partly filled cells would move further in every step, without limit.
+    If a face crosses a grid line, the part of the face in each cell must load the nodes of this cell.
 
     `corners` (faces, 2^(d-1), d), in m: corners of the faces; triangles repeat their last corner.
     `local` (faces, 2^(d-1), e): coordinates at the corners, which are interpolated to the integration points.

@@ -8,7 +8,7 @@ For each position, the polynomial P minimises
 where v_i are the data, o_i are the offsets of the data from the position, and w is a weight.  The value at the position
 is the constant term of P (Lancaster and Salkauskas 1981).  If the data are values of a polynomial of at most the degree
 of P, the fit is exact.  The weights decrease smoothly to zero, so values are continuous when data enter or leave the
-fit.  If data do not determine all coefficients, the small terms set coefficients to zero, higher degrees first.
+fit.  If the data do not determine all coefficients, the small terms make the highest degrees vanish.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ Source: exact. A parabola needs three points.  At an end of the data, these poin
 UNTOLD = (0.0, 1e-10, 1e-6)
 """Weights of the small terms for coefficients of degrees 0, 1 and 2, divided by the sum of the data weights.
 
-Weights 0.01 or 100 times as large change the pressures of a consolidating column by 1e-5 of the load.
+With weights 0.01 or 100 times as large, pressures of a consolidating column change by 1e-5 of the load.
 """
 
 

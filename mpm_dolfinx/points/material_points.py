@@ -34,14 +34,14 @@ def body_of(ids: NDArray[np.int64], starts: NDArray[np.int64]) -> NDArray[np.int
 
 
 def determinant(F: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the determinants (n,) of F (n, d, d), much faster than numpy."""
+    """Return the determinants (n,) of F (n, d, d)."""
     if F.shape[1] == 2:
         return F[:, 0, 0] * F[:, 1, 1] - F[:, 0, 1] * F[:, 1, 0]
     return np.einsum("ni,ni->n", F[:, 0], np.cross(F[:, 1], F[:, 2]))
 
 
 def middle(corners: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the means (n, d) of corners (n, 2^d, d), much faster than numpy."""
+    """Return the means (n, d) of corners (n, 2^d, d)."""
     total = corners[:, 0].copy()
     for k in range(1, corners.shape[1]):
         total += corners[:, k]
@@ -78,7 +78,7 @@ def in_plane(F: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.fl
 
 
 def cofactor(F: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return `det F F^-T` (n, d, d) of F (n, d, d), much faster than numpy."""
+    """Return `det F F^-T` (n, d, d) of F (n, d, d)."""
     if F.shape[1] == 2:
         flat = F.reshape(-1, 4)[:, ::-1] * [1.0, -1.0, -1.0, 1.0]
         return flat.reshape(F.shape)
@@ -98,7 +98,7 @@ class MaterialPoints:
     corners : (n, 2^d, d), m
         Tracked corners of the particle domain, in the order of `grid.corner_bits`.
     F : (n, d, d)
-        Deformation gradient.  With an out-of-plane stretch in plane strain: in-plane part, scaled to det F.
+        Deformation gradient.  In plane strain with an out-of-plane stretch: the in-plane part, scaled to det F.
     volume0 : (n,), m^d
         Reference volume.
     material : (n,)
@@ -169,7 +169,7 @@ class MaterialPoints:
         return len(self.id)
 
     def within(self) -> NDArray[np.float64]:
-        """Return positions (n, d), in m, within the domains.  They are `x`, unless a domain is partly inverted."""
+        """Return positions (n, d), in m, within the domains: `x`, except for partly inverted domains."""
         return centroids(self.corners, within=True)
 
     @property

@@ -170,7 +170,7 @@ def resampled(
 
 
 def _around(x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the distances, from 0 to 4, of positions along the unit square, anti-clockwise from (0, 0)."""
+    """Return the distances, from 0 to 4, of positions along the unit square's sides, anti-clockwise from (0, 0)."""
     near = np.stack([x[:, 1], 1 - x[:, 0], 1 - x[:, 1], x[:, 0]], axis=1)
     side = near.argmin(axis=1)
     along = np.stack([x[:, 0], 1 + x[:, 1], 3 - x[:, 0], 4 - x[:, 1]], axis=1)

@@ -2,9 +2,9 @@
 """Pressures of cells from the water content of their pieces, in unsaturated soil.
 
 A piece is the part of a particle domain in one cell.  The piece has the storage s, in m^d/Pa, and the pore volume n, in
-m^d.  Minus its value at p = 0, the fluid content at the pressure p is `c(p) = s pi(p) + n (S(p) - 1) rho(p)`.  Here
-`pi = K_w (exp(p / K_w) - 1)` and `rho = exp(p / K_w)`, with the bulk modulus K_w of the fluid, and S is the saturation
-of the soil of the piece.  The pressure of a piece differs from the pressure of its cell by an offset.
+m^d.  Its fluid content at the pressure p, minus the content at p = 0, is `c(p) = s pi(p) + n (S(p) - 1) rho(p)`.  Here
+`pi = K_w (exp(p / K_w) - 1)` and `rho = exp(p / K_w)`, with the bulk modulus K_w of the fluid, and S is the saturation.
+The pressure of a piece differs from the pressure of its cell by an offset.
 """
 
 from __future__ import annotations

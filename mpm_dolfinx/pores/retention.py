@@ -39,7 +39,7 @@ METHODS = ("saturation", "relative_permeability")
 class Retention:
     """Base of retention curves defined by an effective saturation S_e: S = S_r + (1 - S_r) S_e.
 
-    A derived law is a frozen dataclass of numbers.  Its method `effective(s)` returns S_e, and its method `conducts(s)`
+    A derived law is a frozen dataclass of numbers.  The method `effective(s)` returns S_e, and the method `conducts(s)`
     returns k_r, both as UFL of the suction s >= 0, in Pa.  S_e and k_r must be 1 at s = 0.
 
     Parameters
@@ -206,7 +206,7 @@ def check_retention(what: str, law) -> None:
 
 
 def sampled(law) -> list[float]:
-    """Return numbers that identify a law: S and k_r at some suctions, and these suctions in Pa."""
+    """Return S and k_r of a law at some suctions, and these suctions in Pa."""
     suctions = scale_of(law) * np.exp2(np.arange(-2, 3))
     return [_value(getattr(law, name), -s) for name in METHODS for s in suctions] + suctions.tolist()
 
@@ -380,7 +380,7 @@ def anywhere(points: FormPoints, **fields: NDArray[np.float64]) -> PointData:
 class Conductance:
     """Integral of the relative permeability with respect to pressure, the potential of flow (Kirchhoff 1894).
 
-    A table holds the integral at suctions with equal steps of the logarithm.  Cubic Hermite polynomials interpolate.
+    Cubic Hermite polynomials interpolate a table of the integral at suctions with equal steps of the logarithm.
     """
 
     def __init__(self, grid: Grid, law):

@@ -19,7 +19,7 @@ class CellFields:
     """Fields of the n cells of this process that contain material.
 
     A mean is a volume average over the material in the cell.  The fields are second-order accurate at the centroid `x`
-    of the material.  The grid is at its position in the next step.
+    of the material.  The grid lines are in their positions of the next step.
 
     Attributes
     ----------

@@ -228,10 +228,9 @@ class _Around:
         return out
 
     def _drained(self, weight: NDArray[np.float64]) -> tuple[NDArray, ...]:
-        """Return for drained sides: index of the probe, position, head, weight, and whether the probe's cell has the
-        side.
+        """Return for each drained side: probe index, position, head, weight, and whether the probe's cell has the side.
 
-        The head is a mean over all drained faces on one side of a cell.  Heads of single faces give false gradients.
+        The head is a mean over all drained faces on one side of a cell.
         """
         sides, d = self._sides, self._grid.dim
         probe, place = np.nonzero(self._counts & (self._local >= 0))

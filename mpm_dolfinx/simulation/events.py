@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Events that end a run: a function of the user changes its sign within a step."""
+"""Events that end a run: sign changes of the user's functions within a step."""
 
 from __future__ import annotations
 

@@ -34,7 +34,7 @@ FINEST = NEAR**2
 Source: epsilon, a smaller step changes only the last four digits of the time.
 """
 SAFETY, SHRINKS, GROWS, KEEPS = 0.9, 0.2, 5.0, 1.2
-"""Constants for the ratio of an adaptive step to the step before.
+"""Constants for the ratio of an adaptive step to the previous step.
 
 The ratio is `SAFETY` times a power of (tolerance / error), but at least `SHRINKS` and at most `GROWS`.  If the ratio is
 between 1 and `KEEPS`, the step keeps its length.  Source: Hairer, Norsett and Wanner (1993), equation 4.13; for `KEEPS`

@@ -9,7 +9,7 @@ bodies come to rest, and the overload vanishes.  In a slide the overload remains
 any viscosity and cell size.
 
 All trials start after one step with soil that cannot yield.  In this step, bodies in equilibrium keep their stresses.
-Bodies that cannot stand get elastic stresses in this step, if no run precedes it.
+Bodies that cannot stand get elastic stresses in this step.
 """
 
 from __future__ import annotations

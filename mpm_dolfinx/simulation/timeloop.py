@@ -87,8 +87,8 @@ def run(
         because the error of such a term or law cannot be estimated. With inertia the error of the motion is limited
         too, relative to the largest motion since the start, see `motion_error`. In unsaturated soil the error of the
         water content is limited too, relative to its largest change in a step so far. The estimated error of a pressure
-        is a fraction of a first-order step's error, see `solve.newton.ERROR`. In tests, the largest true error of a run
-        was 0.7 to 5 times the largest estimate. The ratio was 5 directly after a jump of the load.
+        is the fraction `solve.newton.ERROR` of the error of a first-order step. In tests, the largest true error of a
+        run was 0.7 to 5 times the largest estimate. The ratio was 5 directly after a jump of the load.
     t_eval : (n,), s
         Output times, increasing, in (t, t_end]; t_end is always an output time. Steps end at output times.
     until
@@ -256,7 +256,7 @@ def _counting(scene: Scene, state: State, energies: bool, goes_on: bool) -> Stat
 
 
 class _Stopwatch:
-    """Wall time and profile of a run, including the time of a run that it continues."""
+    """Wall time and profile of a run, and of the runs that it continues."""
 
     def __init__(self, result: Result):
         self._start = time.perf_counter() - result.wall

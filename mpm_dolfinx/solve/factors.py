@@ -4,8 +4,7 @@
 On one process, PETSc factorises displacement matrices with a block for each node.  `dissection` orders the nodes along
 grid lines.  `bash demos/run.sh calibrate` prints the times of several solvers.  With 33000 unknowns in 2D and a
 symmetric matrix, the first factorisation takes 214 ms with blocks of nodes, and 888 ms with scalar entries in minimum
-degree order.  CHOLMOD takes 185 ms, UMFPACK 286 ms, and MUMPS 722 ms.  In the same order of solvers, a second
-factorisation takes 108, 450, 150, 200 and 524 ms, and a solve takes 6, 12, 9, 17 and 175 ms.
+degree order.  CHOLMOD takes 185 ms, UMFPACK 286 ms, and MUMPS 722 ms.
 
 On several processes, one process holds the factors of displacements: shared factors would slow down the many solves.
 At the same time, another process computes the factors of pressures.  In large scenes all processes share the factors of

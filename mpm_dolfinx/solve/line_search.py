@@ -1,28 +1,21 @@
 # SPDX-License-Identifier: MIT
 """Line search: length of a Newton step, see `Newton._line_search`.
 
-Without yield, the search accepts a full step even if the residual grows, because linearised rotations of a bending body
-cause a spurious stretch. The step is halved only if a law cannot be evaluated at its end, or if the residual grows by
-more than `EXPLODES`.
+Without yield, the search accepts a full step even if the residual grows. Linearised rotations of a bending body cause a
+spurious stretch. The step is halved only if a law cannot be evaluated at its end, or if the residual grows by more than
+`EXPLODES`.
 
-In yielding soil, the criterion is the work of the residual forces along the step. The search accepts a full step if the
-work at its end is less than half of the initial work. The search also accepts a full step if the residual decreases,
-and the work does not exceed the initial work. Otherwise bracketed secants seek the step length at which the work is
-zero. The secants end when the work is less than half of the initial work (Matthies and Strang 1979). Steps closer to
-zero work might unload soil, which would be elastic in the next tangent. The work of the fluid's residual is added,
-because forces do nearly no work if only the fluid is out of balance. Soil that has lost its strength needs several
-secants: with one secant, a slumping bank takes twice the Newton steps.
+In yielding soil, the criterion is the work of the residuals of forces and fluid along the step. The search accepts a
+full step if the work at its end is less than half of the initial work. The search also accepts a full step if the
+residual decreases, and the work does not exceed the initial work. Otherwise bracketed secants seek the step length at
+which the work is zero. The secants end when the work is less than half of the initial work (Matthies and Strang 1979).
 
-Flowing soil has almost no stiffness along its mechanisms, and negative stiffness with non-associated flow, so full
-steps overshoot far. The tangent is therefore regularised by a fraction of the elastic shear stiffness, proportional to
-the relative residual of the forces (Levenberg 1944, Marquardt 1963). The residual of the fluid is not used, because it
-grows with the step length even if no soil yields. Elastic soil is regularised too, because full steps overshoot just as
-far when this soil first yields. Before any soil yields, the tangent is regularised only if the iterations do not
-converge. Regularisation from the start would take 1.6 times the Newton steps in wet elastic soil.
+Yielding soil has almost no stiffness along its mechanisms, and negative stiffness with non-associated flow, so full
+steps overshoot. The tangent is therefore regularised by a fraction of the elastic shear stiffness, proportional to the
+relative residual of the forces (Levenberg 1944, Marquardt 1963). Before any soil yields, the tangent is regularised
+only if the iterations do not converge.
 
-A few flowing points may give the tangent a negative stiffness. A Newton step then unloads these points, the next step
-loads them again, and the iterations cycle. The work of the residuals along such a step is negative, and the step is
-reversed.
+Along a Newton step with negative work, the tangent has a negative stiffness, and the step is reversed.
 """
 
 from __future__ import annotations
@@ -83,8 +76,8 @@ class Search:
     def after(self, work: float, growth: float) -> Search | None:
         """Return the next trial, or None if the search ends.
 
-        A full step that does not increase the residual ends the search if `abs(work) <= 1`. A secant gives the next
-        trial. Bisection replaces the secant if one bound does not change in two trials.
+        A full step that does not increase the residual ends the search if `abs(work) <= 1`. Otherwise a secant gives
+        the next trial. Bisection replaces the secant if one bound does not change in two trials.
         `work`: work in the last trial divided by the initial work, or nan.
         `growth`: growth factor of the residual in the last trial.
         """

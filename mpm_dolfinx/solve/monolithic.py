@@ -11,20 +11,16 @@ multigrid cycle approximates K^-1, and another cycle P^-1.  In 2D, a body must b
 (see `plan`).
 
 In 3D, GMRES takes 7 to 12 iterations to the tolerance 1e-3, each with one cycle on K. In 2D, GMRES takes 8 iterations
-to the tolerance 1e-5.  Other methods were tested in 3D with algebraic multigrid and Jacobi smoothing.  In this test,
-GMRES takes 10 to 15 iterations.  Conjugate gradients on the Schur complement take 35 to 60 cycles in their inner
-solves.  Flexible GMRES with inner solves to tolerances of 0.1 or 0.01 takes 12 to 24 cycles.  MINRES with the diagonal
-blocks takes 17 to 23 cycles, and its residual is five times the residual of GMRES.
+to the tolerance 1e-5.  With algebraic multigrid, GMRES takes 10 to 15 cycles in 3D, and flexible GMRES with inner
+solves 12 to 24 cycles.  MINRES with the diagonal blocks takes 17 to 23 cycles, and conjugate gradients on the Schur
+complement 35 to 60 cycles.
 
 At nu = 0.499 the cycle is inaccurate, and GMRES takes more than 100 iterations with 14^3 cells.  If a solve takes, or
 is predicted to take, too many iterations (see `plan`), factors of K replace the cycle.  The solver keeps these factors
-until a solve takes too many iterations again.  With factors of an earlier tangent, a solve takes about 10 iterations.
-With new factors, a solve takes 4 to 6 iterations.  A step takes 6.2 s with kept factors, and 8.5 s with new factors for
-each tangent.
+until a solve takes too many iterations again.
 
 In 2D, GMRES would take 20 to 500 iterations in yielding soil (footing, 41 cells, any smoother).  Shear bands are one
-cell wide, so coarse grids cannot represent these bands.  With a viscosity of 0.05, GMRES takes 28 iterations.  The time
-of GMRES is then 0.9 times the time of a direct solver on 41 cells, but 1.7 times on 81 cells.
+cell wide, so coarse grids cannot represent these bands.
 """
 
 from __future__ import annotations
@@ -44,10 +40,10 @@ from mpm_dolfinx.solve.factors import MOST, direct_solver, displacement_solver, 
 from mpm_dolfinx.solve.solver_choice import MUMPS, SolverPlan
 
 LEAST = 1e-4
-"""Smallest scale of the fluid residual. Its unit is the fluid volume that residual forces displace in a drained body.
+"""Smallest scale of the fluid residual, divided by the fluid volume that residual forces displace in a drained body.
 
-Undrained bodies exchange nearly no fluid.  If this volume is 5e5 times the scale, rounding errors cause a residual of
-2e-5.
+Undrained bodies exchange nearly no fluid.  With a scale of 2e-6 times this volume, rounding errors would cause a
+residual of 2e-5.
 """
 
 IDLE = object()
@@ -162,11 +158,11 @@ class BlockSolver:
         connected part.
         `rtol`: tolerance relative to the norm of both scaled residuals, for each part.
         `slopes`: derivative of the fluxes with respect to displacements, if the tangent includes it.
-        `factors`: factors that already replace the cycles, or None.
+        `factors`: factors from an earlier solve that replace the cycles, or None.
 
         Returns
         -------
-        The number of iterations, and the factors that replace the cycles from now on, or None.
+        The number of iterations, and the factors for later solves, or None.
         """
         operator = BlockOperator(self._momentum, self._storage, factors or self._cycles, self._work)
         on_u, on_p = self._momentum.of_parts, self._storage.of_parts

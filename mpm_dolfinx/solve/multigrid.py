@@ -172,10 +172,10 @@ def _hats(
 def _shared(
     comm: MPI.Intracomm, keys: NDArray[np.int64], count: int, stated: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Return the index of the unknown of each candidate, and whether this process owns the unknown.
+    """Return the index of the coarse unknown with each key, and whether this process owns the unknown.
 
-    The process of lowest rank with a candidate owns the unknown. Each key is sent to one process, which determines the
-    owner. The status of a candidate (`MAYBE`, `NOT` or `IS`) is the largest status on all processes.
+    The process of lowest rank with a key owns its unknown.
+    `stated`: status of each key, `MAYBE`, `NOT` or `IS`; the largest status on all processes applies.
     """
     ask = Exchange(comm, (keys * comm.size // count).astype(np.int32))
     distinct, who = np.unique(ask.send(keys), return_inverse=True)

@@ -64,10 +64,9 @@ ERROR = 1 / 20
 
 For a mode with decay rate l, the stability function of sdirk2 gives an error of `0.081 dt abs(l) e` in a step, at most
 0.28 e. A pressure that follows a varying load has an error of at most 0.14 e. With little decay, the errors of all
-steps add up to 0.081 e. Errors were measured by comparison with steps an eighth as long. The errors are 0.05 to 0.08 e
-if loads rise or oscillate, or if the prescribed pressure on a drained side oscillates. Errors are 0.01 to 0.04 e with
-an oscillating source, and 0.01 to 0.05 e late in a consolidation. The error is 0.17 e in a first step from zero load,
-and 0.26 e after a jump. The error of a run is at most 5 e / 20.
+steps add up to 0.081 e. Errors were measured by comparison with steps an eighth as long. The errors are 0.01 to 0.08 e
+for varying loads, pressures and sources. The error is 0.17 e in a first step from zero load, and 0.26 e after a jump.
+The error of a run is at most 5 e / 20.
 """
 SUDDEN = np.sqrt(2)
 """Pressure change in the second substep, divided by the change in the first substep, below which sdirk2 overshoots.
@@ -280,10 +279,10 @@ class Newton:
         return errors
 
     def _begin(self, ahead: Callable | None) -> tuple[Errors, list[NDArray[np.float64]] | None]:
-        """Choose the start of Newton's method. Return the errors at the start, and the previous (u, p) or None.
+        """Choose the start of Newton's method. Return the errors at the start, and another start or None.
 
         The start is `ahead` if the square of its residual is small. Otherwise each part starts at the guess with the
-        smallest residual. If the start is the previous (u, p), None is returned in place of the previous (u, p).
+        smallest residual. The other start is the previous (u, p).
         """
         start = self._iterate()
         if ahead is not None:
@@ -337,10 +336,9 @@ class Newton:
     def _stable(self, found: Errors) -> Errors:
         """Return the errors. Raise NotConverged if the equilibrium is unstable.
 
-        The tangent of an unstable equilibrium has negative eigenvalues. Smaller steps find the path that leaves this
-        equilibrium. Only dry bodies with symmetric, factorised tangents are checked, because water delays buckling. If
-        the tangent of the last step is reused, an instability is found one step late. If only soft springs resist a
-        motion, a stable solution may seem unstable. One more Newton step decides such cases.
+        The tangent of an unstable equilibrium has negative eigenvalues. Only dry bodies with symmetric, factorised
+        tangents are checked, because water delays buckling. If only soft springs resist a motion, a stable solution may
+        seem unstable. One more Newton step decides such cases.
         """
         plan = self._solvers.plan
         if not self.report.newton or self._storage is not None or not plan.symmetric or plan.iterative:
@@ -401,9 +399,8 @@ class Newton:
     def _errors(self, start: NDArray[np.float64] | None = None) -> Errors:
         """Assemble both residuals, add their relative norms to the history, and return the norms.
 
-        The scales contain the forces at the start of the step, but no forces at earlier iterates. With the large forces
-        of a diverging iterate, every later residual would seem small. Residuals within round-off are returned as 0. The
-        history has the true norms of all residuals, divided by scales of at least `round_off / tolerance`.
+        The scales contain the forces at the start of the step, but not the forces of earlier iterates.
+        Residuals within round-off are returned as 0.
         """
         first = not self.report.history
         with _compat.Timer("residual"):
@@ -512,11 +509,7 @@ class Newton:
             return replace(before, u=away, p=away), failed
 
     def _work(self) -> NDArray[np.float64]:
-        """Return the work of both residuals along the Newton direction, in J.
-
-        The coupling terms cancel in the sum of the two works. The sum thus depends only on the diagonal blocks of the
-        tangent.
-        """
+        """Return the work of both residuals along the Newton direction, in J."""
         system = self._momentum.system
         work = system.of_parts.sums(system.residual.array_r * self._solvers.du.array_r)
         if self._storage is None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Solvers of the linearised problem. One set of solvers serves while the active cells do not change.
+"""Solvers of the linearised problem, which are kept while the active cells do not change.
 
     [ K  -B^T ] [du]     [R_u]
     [ B   C   ] [dp] = - [R_p]
@@ -9,7 +9,7 @@ solved by conjugate gradients (or FGMRES), with the fixed-stress operator as pre
 solves for both unknowns (`monolithic`).
 
 PETSc's PCFIELDSPLIT (full Schur factorisation) takes 0.8 to 1 times the time of these solves, and equally many
-iterations. PCFIELDSPLIT also needs a copy of -B^T for each tangent. Fixed-stress iterations need separate blocks.
+iterations. PCFIELDSPLIT also needs a copy of -B^T for each tangent.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from mpm_dolfinx.solve.solver_choice import AT_ONCE, MULTIGRID, MUMPS, SolverPla
 
 
 def planned(scheme: Scheme, momentum: MomentumSystem, storage: StorageSystem | None, symmetric: bool) -> SolverPlan:
-    """Return the solver plan for problems with these matrices.
+    """Return the solver plan for the matrices of the balances.
 
     `symmetric`: whether K is symmetric.
     """
@@ -86,7 +86,7 @@ class SchurComplement:
 
 @dataclass
 class Kept:
-    """Data that the tangents of a step share. Each step starts without these data.
+    """Data that the tangents of one step share.
 
     `operator`: whether the factors of the fixed-stress operator can be reused.
     `factors`: direct solvers that replace multigrid, or None.

@@ -21,17 +21,17 @@ class Thresholds:
     """Thresholds between methods. `bash demos/run.sh calibrate` measures times on both sides of each threshold.
 
     multigrid_3d
-        Number of unknown displacements in 3D from which multigrid is used. Two steps of a block take 0.66 s with a
-        direct solver and 0.59 s with multigrid (1656 unknowns), 5.6 and 1.8 s (5460), 32 and 4.0 s (12784).
+        Number of unknown displacements in 3D from which multigrid is used. Two steps of a block of 1656 unknowns take
+        0.66 s with a direct solver and 0.59 s with multigrid. With 12784 unknowns, two steps take 32 s with a direct
+        solver and 4.0 s with multigrid.
     multigrid_2d
         The same limit in wet 2D scenes without yield. From 8000 to 74000 unknowns, the times of both solvers are equal
         within 15 %. For larger numbers n the work of factors is larger, because it is proportional to n^1.5.
     mumps
         Number of unknown displacements from which MUMPS computes the factors in wet scenes. With a symmetric K, MUMPS
         is used on several processes only. The processes then share the factors. Below this number, one process holds
-        the factors of K. On one process, two steps of a yielding block take 1.4 s with blocks of nodes and 3.1 s with
-        MUMPS (8192 unknowns), 6.6 and 8.3 s (32768), 18 and 36 s (73728). With 100000 unknowns, the factors of K have
-        1.5e7 entries (0.12 GB).
+        the factors of K. On one process, two steps of a yielding block of 73728 unknowns take 18 s with blocks of nodes
+        and 36 s with MUMPS. With 100000 unknowns, the factors of K have 1.5e7 entries (0.12 GB).
     fallback_3d
         Largest number of unknown displacements in 3D for which a direct solver may replace multigrid. In larger scenes,
         factors need too much memory and time.

@@ -73,13 +73,13 @@ CUT_DEGREE = 20  # quadrature degree on a partly loaded side, because an edge of
 class Space:
     """Space of the unknowns w = (u, p/scale), without fluid w = u, and functions in it.
 
-    old: w at the start of the step
-    past: change of w due to the rate of the previous substep
-    b, f: residual and loads
-    same: copy of w that is not differentiated
-    u, p: displacement and pressure in w
-    p_dofs: degrees of freedom of the pressures
-    of_p: space of the pressures alone
+    `old`: w at the start of the step.
+    `past`: change of w due to the rate of the previous substep.
+    `b`, `f`: residual and loads.
+    `same`: copy of w that is not differentiated.
+    `u`, `p`: displacement and pressure in w.
+    `p_dofs`: degrees of freedom of the pressures.
+    `of_p`: space of the pressures alone.
     """
 
     def __init__(self, grid: Grid, wet: bool, degree: int, pressure: tuple[str, int, tuple[int, ...]]):
@@ -384,7 +384,7 @@ class BiotFEM:
     def _storage(self, F, u, J_n, p, p_n, q, dt: fem.Constant, outlets: Sequence[Drained] | None, pull):
         """Return the change of the fluid content times q, and the flux, as UFL.
 
-        pull: acceleration of gravity, in m/s^2
+        `pull`: acceleration of gravity, in m/s^2.
         """
         law, J = self.material, ufl.det(F)
         # S is linear in the porosity; S_0 and S_1 are finite for infinite bulk moduli
@@ -429,7 +429,7 @@ class BiotFEM:
     def _two_point(self, kappa, F, inverse, p, q, outlets: Sequence[Drained], weight):
         """Return the flux between cells and to drained sides as UFL.
 
-        weight: unit weight divided by `scale`
+        `weight`: unit weight divided by `scale`.
         """
         compliance = self._constant(self.scale / self.fluid.bulk)
         pi = mass_potential_form(p, compliance)

@@ -45,7 +45,7 @@ class _Rings:
     def kirchhoff(self, stretches: NDArray[np.float64], state: State, repeat: int = 1) -> NDArray[np.float64]:
         """Return the radial and circumferential Kirchhoff stresses (n, 2), in Pa.
 
-        repeat: number of copies of all rings in the stretches (n, 2).
+        `repeat`: number of copies of all rings in the stretches (n, 2).
         """
         stress = self._law.stress(self._data(stretches, state, repeat))
         return stress[:, [0, 1], [0, 1]] * stretches.prod(axis=1, keepdims=True)
@@ -136,7 +136,7 @@ def undrained(material: Skeleton, outer: float, radii: Sequence[float], rings: i
     the effective stress at the wall.  The volume of soil is constant, so that a ring of initial radius R has the radius
     r with r^2 - a^2 = R^2 - 1.
 
-    radii: successive radii a of the cavity, in small steps.
+    `radii`: successive radii a of the cavity, in small steps.
     """
     edges = np.geomspace(1, outer, rings + 1)
     R, law = np.sqrt((edges[1:] ** 2 + edges[:-1] ** 2) / 2), _Rings(material, rings)

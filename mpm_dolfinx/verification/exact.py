@@ -5,7 +5,7 @@ Stress is positive in tension, pore pressure in compression, as in the rest of t
 consolidation is T = c_v t / length².  The series of exponentials converges slowly for small T. For T < `SWITCH` a
 closed form replaces the series: the inverse Laplace transform of the solution, with 1 in place of tanh sqrt(s) and coth
 sqrt(s).  The errors of the series and of the closed form are at most of the order of erfc(1/sqrt(`SWITCH`)) < 2e-23.
-Both are therefore exact to round-off.
+The series and the closed form are therefore exact to round-off.
 """
 
 from __future__ import annotations

@@ -57,9 +57,9 @@ class Pores:
         return mean / total
 
     def reached(self, p: NDArray[np.float64], dp: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the pressure decreases of a Newton step after limitation.
+        """Return the limited pressure decreases of a Newton step.
 
-        p (n,): pressures.
-        dp (n,): pressure decreases without limitation.
+        `p` (n,): pressures.
+        `dp` (n,): pressure decreases without limitation.
         """
         return restrained(p, dp, self._scale)
