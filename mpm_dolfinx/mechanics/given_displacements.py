@@ -97,22 +97,29 @@ class GivenDisplacements(Acting):
         """Warn once for each condition whose side must jump at the start of a stage with inertia."""
         if not (place.inertia and place.dt):
             return
-        points = place.points
         for number, (hold, faces, axes) in enumerate(self._holds):
-            p = place.cut.surface(faces)
-            gap = (p.origin(points) + self._given(hold, place.start, p.X) - p.now(points))[:, axes]
-            sudden = self._sudden(points, p, gap)
-            jump = over_all(self._grid.comm, float(np.abs(gap[sudden]).max(initial=0.0)), MPI.MAX)
+            jump = self._jump(place, place.points, hold, axes, place.cut.surface(faces))
+            jump = over_all(self._grid.comm, float(np.abs(jump).max(initial=0.0)), MPI.MAX)
             if jump:
                 what = "%s: moves its side by %.3g m at once at t = %.6g s, as bodies with inertia begin to move; %s"
                 why = "values count from the start or the last reset_displacement, must begin at the present position"
                 self._warn(number, what, jump, place.start, why)
 
-    def _sudden(self, points: MaterialPoints, p: Patches, gap: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return whether gaps (n, k), in m, are jumps: their strain in a cell exceeds stress divided by modulus."""
+    def _jump(
+        self, place: Place, points: MaterialPoints, hold: Displacement, axes: Sequence[int], p: Patches
+    ) -> NDArray[np.float64]:
+        """Return the gaps (n, d), in m, that a side closes at once at the start of a stage, and zeros elsewhere.
+
+        The strain of such a gap in a cell exceeds the stress divided by the modulus.
+        """
+        out = np.zeros_like(p.now(points))
+        if not place.begins:
+            return out
+        out[:, axes] = (p.origin(points) + self._given(hold, place.start, p.X) - p.now(points))[:, axes]
         tension, modulus = self._materials.total_stress(points), self._materials.table(points, holding)
-        strain = np.linalg.norm(gap, axis=1) / self._grid.sizes_at(p.x).min(axis=-1)
-        return strain > np.maximum(NEAR, np.linalg.norm(tension[p.at], axis=(1, 2)) / modulus[p.at])
+        strain = np.linalg.norm(out, axis=1) / self._grid.sizes_at(p.x).min(axis=-1)
+        sudden = strain > np.maximum(NEAR, np.linalg.norm(tension[p.at], axis=(1, 2)) / modulus[p.at])
+        return np.where(sudden[:, None], out, 0.0)
 
     def placed(self, place: Place) -> Loads:
         """Return the penalties in a substep."""
@@ -166,8 +173,8 @@ class GivenDisplacements(Acting):
                 given[0] = in_step((t - ends[0]) / (ends[1] - ends[0]), given[1], given[0], given[2])
             start, to = (p.origin(points) + given[k] for k in (1, 0))
             step, given = given[0] - given[1], np.concatenate(given[1:], axis=1)
-            jumps = HOLD * np.linalg.norm((to - now)[:, axes], axis=1) > self._grid.least
-            step = np.where(jumps[:, None], to - now, step)
+            if place.inertia and ends:
+                step = step + self._jump(place, points, hold, axes, p)
             R = rotated(self._grid.comm, p.area0, now, to) if len(axes) == d else np.eye(d)  # of the traction
             force, gap = np.einsum("ij,njk,nk->ni", R, stress[at, :d, :d], p.area(points)), to - now
             own = p.area0[:, None] * moduli[at]
@@ -226,12 +233,9 @@ class GivenDisplacements(Acting):
         for hold, faces, axes in self._holds:
             p = place.cut.surface(faces)
             start, end = (self._given(hold, t, p.X) for t in (place.start, place.t))
-            gaps = (p.origin(of) + given - p.now(of) for of, given in ((before, start), (points, end)))
-            old, new, increment = (np.linalg.norm(v[:, axes], axis=1) for v in (*gaps, end - start))
-            if place.begins:  # a prescribed value may begin away from the present position
-                gap = (p.origin(before) + end - p.now(before))[:, axes]
-                sudden, jump = self._sudden(before, p, gap), np.linalg.norm(gap, axis=1)
-                old, increment = np.where(sudden, 0.0, old), np.where(sudden, jump, increment)
+            jump = self._jump(place, before, hold, axes, p)  # a prescribed value may begin away from the position
+            gaps = (p.origin(before) + start - p.now(before) - jump, p.origin(points) + end - p.now(points))
+            old, new, increment = (np.linalg.norm(v[:, axes], axis=1) for v in (*gaps, end - start + jump))
             moves = increment > NEAR * self._grid.least
             share = 1 - ((new - old)[moves] / increment[moves]).min(initial=np.inf)
             share = over_all(self._grid.comm, float(share), MPI.MAX)
