@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx.base.tolerances import NEAR, TINY
 from mpm_dolfinx.conditions.conditions import HOLD
-from mpm_dolfinx.grid.grid import Grid, among, sum_by
+from mpm_dolfinx.grid.grid import Grid, among, means_of_rows, sum_by, sums_of_rows
 from mpm_dolfinx.mechanics.ghost_penalty import RATIO
 from mpm_dolfinx.parallel.exchange import over_all
 
@@ -129,13 +129,10 @@ class HeldCells:
         whole = sum_by(at, p.area, len(key))
 
         def total(values: NDArray[np.float64]) -> NDArray[np.float64]:
-            columns = values.reshape(len(values), int(np.prod(values.shape[1:]))).T
-            columns = [sum_by(at, column, len(key)) for column in columns]
-            return np.stack(columns, axis=1).reshape(len(key), *values.shape[1:])
+            return sums_of_rows(at, values, len(key))
 
         def mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
-            each = (slice(None), *(None,) * (values.ndim - 1))
-            return total(p.area[each] * values) / whole[each]
+            return means_of_rows(at, p.area, values, len(key))
 
         def both(means: NDArray, values: NDArray) -> NDArray:
             return np.concatenate([means, values])
