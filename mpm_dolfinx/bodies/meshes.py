@@ -10,15 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from itertools import product
 
 from mpi4py import MPI
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from mpm_dolfinx.base.tolerances import NEAR, SAME
@@ -26,10 +23,10 @@ from mpm_dolfinx.base.validation import whole
 from mpm_dolfinx.bodies.bodies import Body, check_inside
 from mpm_dolfinx.bodies.mesh_cells import KINDS, PARTS, distinct
 from mpm_dolfinx.bodies.touching import Faces, allowance, covers, face_vectors, separation, warps
-from mpm_dolfinx.grid.grid import FACES, Grid, corner_bits, in_chunks, rounding, sum_by
+from mpm_dolfinx.grid.grid import FACES, Grid, corner_bits, linked, rounding, sum_by
 from mpm_dolfinx.parallel.machine_files import once_a_machine
 from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
-from mpm_dolfinx.points.cutting import centroids, simplex_volumes, vertices, volumes
+from mpm_dolfinx.points.cutting import simplex_volumes, vertices, volumes
 
 LONG = 1.5  # domains with edges longer than this factor times (cell size / per_cell) are divided
 SMALL = 0.2  # fraction of the desired domain size; smaller domains cause a warning
@@ -67,7 +64,7 @@ class MeshBody(Body):
     tagged: Mapping[str, NDArray[np.bool_]]  # name of a side -> whether a face belongs to the side (n, d, 2)
     numbers: NDArray[np.int64]  # indices of the domains' corners (n, 2^d); shared corners have one index
 
-    lattice = None
+    lattice, widths = None, ()  # a mesh has no rows
 
     def __len__(self) -> int:
         return len(self.vertices)
@@ -77,27 +74,9 @@ class MeshBody(Body):
         """Number d of dimensions."""
         return self.vertices.shape[2]
 
-    @cached_property
-    def spacing(self) -> NDArray[np.float64]:
-        """Smallest edge lengths (d,), in m, of the bounding boxes of domains."""
-        return np.min([self.boxes(part).min(axis=0) for part in in_chunks(len(self))], axis=0)
-
-    def boxes(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
-        """Return the edge lengths (n, d), in m, of the bounding boxes of the chosen domains, before the map."""
-        x = self.vertices[chosen]
-        return x.max(axis=1) - x.min(axis=1)
-
-    def lower_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the lower corners (n, d), in m, of the bounding boxes of the chosen domains."""
-        return self.vertices[chosen].min(axis=1)
-
     def sides_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.bool_]:
         """Return whether the faces (n, d, 2) of the chosen domains lie on the surface of the body."""
         return self.surface[chosen]
-
-    def centre_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the reference positions (n, d), in m, of the centres of the chosen domains."""
-        return centroids(self.vertices[chosen])
 
     @property
     def aligned(self) -> bool:
@@ -125,7 +104,7 @@ class MeshBody(Body):
 
     def across(self, axis: int) -> tuple[float, float]:
         """Return the approximate number of domains along an axis, and their mean edge length in m."""
-        edge = float(np.concatenate([self.boxes(part)[:, axis] for part in in_chunks(len(self))]).mean())
+        edge = self._mean_edge(axis)
         return float(np.ptp(self.vertices[:, :, axis])) / edge, edge
 
     def reference(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
@@ -141,8 +120,7 @@ def _numbered(vertices: NDArray[np.float64]) -> NDArray[np.int64]:
     """Return the node indices of the corners of domains.  Equal corners have equal indices."""
     x = vertices.reshape(-1, vertices.shape[2])
     pairs = cKDTree(x).query_pairs(NEAR * np.ptp(vertices, axis=1).min(), output_type="ndarray")
-    graph = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(x), len(x)))
-    return connected_components(graph, directed=False)[1].astype(np.int64).reshape(vertices.shape[:2])
+    return linked(len(x), *pairs.T)[0].reshape(vertices.shape[:2])
 
 
 def seeded(
