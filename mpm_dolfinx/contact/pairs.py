@@ -107,9 +107,10 @@ class ToolPairs(Pairs):
                     carried[rows] = pose.put(before.own(self.carried[rows]))
                     shear[rows] = shear[rows] @ turn.T
                 y, middle[rows] = pose.own(x[rows]), pose.centre + pose.shift
-                gap[rows], normal, curvature = tool.geometry(y, h)
+                solid = tool.solid(h)
+                gap[rows], normal, curvature = solid.geometry(y)
                 n[rows], second[rows] = normal @ pose.R.T, pose.R @ curvature @ pose.R.T
-                if isinstance(tool.solid(h), Distance):
+                if isinstance(solid, Distance):
                     _check_distance(tool, x[rows] + self.grid.base, gap[rows], n[rows], h)
 
         together(self.grid.comm, ask)
