@@ -21,6 +21,12 @@ from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
 from mpm_dolfinx.points.cutting import cut_at, kuhn_simplices
 
 BITS = corner_bits(2)  # Source: definition
+MISFIT = 1e-2
+"""Distance, divided by the cell size, by which surfaces that should touch may overlap or miss each other.
+
+This holds for tools and groups of bodies, and for bodies that are placed on others.  In a step, points may pass through
+thinner tools without notice.
+"""
 
 
 @dataclass

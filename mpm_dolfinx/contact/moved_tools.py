@@ -41,9 +41,7 @@ from mpm_dolfinx.base.tolerances import EPSILON, ROUND_OFF, SAME
 from mpm_dolfinx.base.validation import line
 from mpm_dolfinx.conditions.acting import At, Shares
 from mpm_dolfinx.contact.law import ROUNDS
-from mpm_dolfinx.contact.pairs import at_nodes
 from mpm_dolfinx.contact.problem import ContactProblem, Found, SubstepMotion, outer
-from mpm_dolfinx.forms.unknowns import Unknowns
 from mpm_dolfinx.mechanics.inertia import Flight
 from mpm_dolfinx.parallel.exchange import over_all
 
@@ -113,19 +111,6 @@ class MovedTools(ContactProblem):
         out.key = tuple(np.unique(np.concatenate(cells)) for cells in zip(*(one.key for one in substeps), strict=True))
         return out
 
-    def pattern(self, unknowns: Unknowns) -> PETSc.Mat:
-        """Return a zero matrix with the entries by which a tool couples the nodes of all cells under it."""
-        out = None
-        for cells in self.key:
-            B, own = at_nodes(self.grid, unknowns, cells, np.ones((len(cells), 2**self.grid.dim))), unknowns.vector()
-            ones = B.createVecLeft()
-            ones.set(1.0)
-            B.multTranspose(ones, own)
-            more = outer(own, own)
-            out = more if out is None else out + more
-        out.zeroEntries()
-        return out
-
     def begun(self, shares: Shares, earlier: SubstepMotion | None) -> MovedTools:
         """See `Loads`."""
         out = super().begun(shares, earlier)
@@ -193,7 +178,8 @@ class MovedTools(ContactProblem):
 
     def _motion(self, w: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the motions of tools at relative displacements w, from the last linearisation."""
-        last, law, d = self.now.linear, self.now.law, self.grid.dim
+        last, law = self.now.linear, self.now.law
+        d = self.grid.dim
         dw = w - last.w
         moved = self._onto(last, law.slope(last.touch, last.at, dw))
         if d == 2:
@@ -213,7 +199,8 @@ class MovedTools(ContactProblem):
 
     def _reach(self, found: Found) -> NDArray[np.float64]:
         """Return the displacements (k,), in m, at which a single point would bear the load of a tool, or infinity."""
-        law, state, of = self.now.law, self.now.state, self.pairs.number
+        law, state = self.now.law, self.now.state
+        of = self.pairs.number
         along = (found.at.n * self._moved.direction[of, : self.grid.dim]).sum(axis=1)
         k = law.stiffness(state)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -316,7 +303,8 @@ class MovedTools(ContactProblem):
         out = super().outcome(at)
         if not self._rate:
             return out
-        d, names, velocity = self.grid.dim, self.now.law.names, self._after(at).velocity
+        d, names = self.grid.dim, self.now.law.names
+        velocity = self._after(at).velocity
         out["tool_velocity"] = {names[k]: velocity[k, :d] for k in np.flatnonzero(self._moves)}
         rotating = np.flatnonzero(self._moved.guides[:, -1, -1]) if d == 2 else ()
         if len(rotating):

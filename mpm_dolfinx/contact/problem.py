@@ -105,6 +105,7 @@ class ContactProblem(Loads):
     """
 
     linear, smooth, touches = False, False, True
+    key = ()
 
     def __init__(
         self,
@@ -185,7 +186,17 @@ class ContactProblem(Loads):
 
     def pattern(self, unknowns: Unknowns) -> PETSc.Mat | None:
         """Return a zero matrix with the entries that `coupling` adds to the pattern of cells, or None."""
-        return self._pattern_of_pairs(unknowns) if self._cell_pairs is not None else None
+        out = self._pattern_of_pairs(unknowns) if self._cell_pairs is not None else None
+        for cells in self.key:  # a tool that forces move couples the nodes of all cells under it
+            B, own = at_nodes(self.grid, unknowns, cells, np.ones((len(cells), 2**self.grid.dim))), unknowns.vector()
+            ones = B.createVecLeft()
+            ones.set(1.0)
+            B.multTranspose(ones, own)
+            more = outer(own, own)
+            out = more if out is None else out + more
+        if out is not None:
+            out.zeroEntries()
+        return out
 
     def _pattern_of_pairs(self, unknowns: Unknowns) -> PETSc.Mat:
         """Return a matrix with all entries that pairs between groups may have in the step."""
@@ -201,9 +212,7 @@ class ContactProblem(Loads):
             together = all_of.T @ all_of
         all_of = scipy.sparse.kron(together, np.ones((d, d)), format="csr")
         B = at_nodes(grid, unknowns, grid.locals[cell], np.ones((m, 2 ** (d + 1))), other)
-        out = petsc_matrix(all_of, m * d, grid.comm, own=True).PtAP(B)
-        out.zeroEntries()
-        return out
+        return petsc_matrix(all_of, m * d, grid.comm, own=True).PtAP(B)
 
     def coupling(self, at: At) -> PETSc.Mat:
         """Return minus the derivative of the contact forces at u."""

@@ -17,6 +17,7 @@ from mpm_dolfinx.base.errors import NotConverged
 from mpm_dolfinx.base.time_integration import in_step
 from mpm_dolfinx.base.tolerances import TINY
 from mpm_dolfinx.base.validation import line
+from mpm_dolfinx.bodies.touching import MISFIT
 from mpm_dolfinx.conditions.acting import At, Loads, Outcome, Place, Setting, Shares
 from mpm_dolfinx.contact.history import Origin, pressure_name, shear_name
 from mpm_dolfinx.contact.law import DEPTH, ContactLaw
@@ -28,8 +29,6 @@ from mpm_dolfinx.parallel.exchange import Exchange, first, over_all, together
 from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
 from mpm_dolfinx.points.material_points import MaterialPoints, middle
 
-# allowed penetration into a body at the start, and into prescribed sides, divided by the cell size; points may pass
-BEGINS = 1e-2  # through thinner tools in a step without notice
 NEAR = 0.1
 """Distance from a tool, in cell sizes, below which corners follow the Q1 field. Plateau (scene "tool" of
 tests/plateaus.py): half this value changes the result by 4.1e-03, twice this value by 1.5e-03, and finer cells by
@@ -94,21 +93,6 @@ class Tools(Touching):
         self._free = ~np.isin(own, np.concatenate([np.zeros(0, np.int64), *held]))
 
     @property
-    def free(self) -> bool:
-        """Whether any tool is free."""
-        return any(tool.free for tool in self.tools)
-
-    @property
-    def masses(self) -> NDArray[np.float64]:
-        """Masses (kg) and moments of inertia (kg m^2) of free tools, as an array (tools, q), zero for other tools."""
-        d = self.grid.dim
-        out = np.array([np.full(motion_count(d), float(tool.mass or 0)) for tool in self.tools])
-        for row, tool in zip(out, self.tools, strict=True):
-            if tool.rotates(d):
-                row[d:] = tool.inertia(d)
-        return out
-
-    @property
     def turning(self) -> list[bool]:
         """Whether each tool is free and rotates."""
         return [tool.rotates(self.grid.dim) and not self.grid.axisymmetric for tool in self.tools]
@@ -150,13 +134,13 @@ class Tools(Touching):
         out, d = super().unknown(value), self.grid.dim
         tools = dict(zip(self.names, self.tools, strict=True))
         out["tool_travel"] = {name: np.zeros(d if tool.free else ()) for name, tool in tools.items()}
-        if self.free:
-            out["tool_velocity"] = {name: tool.begins(d) for name, tool in tools.items() if tool.free}
-        turning = dict(zip(self.names, self.turning, strict=True))
-        if any(turning.values()):
-            out["tool_rotation"] = {name: np.array(0.0) for name, rotates in turning.items() if rotates}
-            out["tool_spin"] = {name: np.array(float(tools[name].spin)) for name, rotates in turning.items() if rotates}
-        return out
+        turning = [name for name, turns in zip(self.names, self.turning, strict=True) if turns]
+        of_free = {
+            "tool_velocity": {name: tool.begins(d) for name, tool in tools.items() if tool.free},
+            "tool_rotation": {name: np.array(0.0) for name in turning},
+            "tool_spin": {name: np.array(float(tools[name].spin)) for name in turning},
+        }
+        return out | {quantity: values for quantity, values in of_free.items() if values}
 
     def _before(self, place: Place) -> NDArray[np.float64]:
         """Return the displacements of tools due to loads before a step, with rotations of free tools."""
@@ -187,16 +171,18 @@ class Tools(Touching):
         d, q = self.grid.dim, motion_count(self.grid.dim)
         of = [tool for tool in self.tools if tool.free or (tool.load is not None and place.t > place.start)]
         moves = [tool in of and tool.free == place.inertia for tool in self.tools]
-        load, direction = np.zeros(len(self.tools)), np.zeros((len(self.tools), q))
-        guides = np.zeros((len(self.tools), q, q))
+        load, guides = np.zeros(len(self.tools)), np.zeros((len(self.tools), q, q))
+        mass, direction = np.zeros((2, len(self.tools), q))
         for k in np.flatnonzero(moves):
             tool = self.tools[k]
             load[k] = np.nan_to_num(tool.pushes(place.t))
             direction[k, :d] = tool.along(d)
             guides[k, :d, :d] = tool.guide(d) * (np.arange(d) >= self.grid.axisymmetric)[:, None]
-            guides[k, d:, d:] = self.turning[k]
+            mass[k, :d] = tool.mass or 0.0
+            if self.turning[k]:
+                guides[k, d, d], mass[k, d] = 1.0, tool.inertia(d)
         velocity = self._motions(place.before, "tool_velocity", "tool_spin")
-        return Moved(self.masses * place.inertia, guides, velocity, load, direction)
+        return Moved(mass, guides, velocity, load, direction)
 
     def contact(self, place: Place) -> tuple[ContactLaw, Origin]:
         """Return the contact law in a substep, and the material points of its pairs."""
@@ -269,14 +255,15 @@ class Tools(Touching):
 
     def _warn_light(self, place: Place) -> None:
         """Warn of free tools that are lighter than the half cell which a strike stops at once."""
-        if not (self.free and place.inertia and place.dt):
+        free = [tool for tool in self.tools if tool.free]
+        if not (free and place.inertia and place.dt):
             return
         grid = self.grid
         dense = float(self._materials.present_density(place.points).max(initial=0.0))
         half = over_all(grid.comm, dense, MPI.MAX) * grid.least**grid.dim / 2
         half *= np.pi * grid.least if grid.axisymmetric else 1.0  # the first ring about the axis
-        for tool in self.tools:
-            if tool.free and tool.mass < half:
+        for tool in free:
+            if tool.mass < half:
                 what = "%s: its mass is less than that of half a cell, %.3g kg, so its rebound depends on the step in "
                 warn(grid.comm, ResolutionWarning, what + "which it strikes; use smaller cells", line(tool), half)
 
@@ -290,7 +277,7 @@ class Tools(Touching):
         for number, tool in enumerate(self.tools):
             loaded = points.data[pressure_name(self.names[number])] > 0
             deep, where = tools._deepest(tool, np.concatenate([x[~loaded[patches.at]], points.x]), t)
-            if deep > BEGINS:
+            if deep > MISFIT:
                 what = f"{line(tool)}: penetrates a body by {deep:.3g} cells, at {where}, at the start t = {t:g} s"
                 raise ValueError(f"{what}, must be outside of all bodies, or touch them")
 
@@ -301,10 +288,10 @@ class Tools(Touching):
         for tool in self.tools:
             for hold, faces in self._held:
                 deep, where = self._deepest(tool, place.cut.surface(faces).now(points), t)
-                if deep > BEGINS:
+                if deep > MISFIT:
                     what = f"{line(tool)} and {line(hold)}: both act at {where} at t = {t:g} s"
                     raise ValueError(f"{what}, must be apart; limit the displacement by a region, or move the tool")
-            corners = points.corners[self._gaps(tool, points.corners, t).min(axis=1) < -BEGINS * self.grid.least]
+            corners = points.corners[self._gaps(tool, points.corners, t).min(axis=1) < -MISFIT * self.grid.least]
             deep, where = self._deepest(tool, x, t)
             held, at_middle = self._deepest(tool, middle(corners), t)
             if deep > NEAR or held > 0:  # a round tool contains the middles, but not the corners, of stretched domains
@@ -375,7 +362,7 @@ class Tools(Touching):
             inside = x[1][on[gap < -2 * DEPTH * h]][:1]  # the middles of thin domains slide along round tools
             if where := first(comm, "".join(np.array2string(place, precision=6) for place in inside + self.grid.base)):
                 return where
-            done[on] += np.maximum(gap, BEGINS * h)
+            done[on] += np.maximum(gap, MISFIT * h)
             on = on[done[on] < length[on]]
         return ""
 
@@ -437,11 +424,11 @@ class ToolLoads(ContactProblem):
 
     def outcome(self, at: At) -> dict[str, dict[str, NDArray[np.float64]]]:
         """See `Loads`.  Results are also displacements (m) by forces: vectors of free tools, else along the load."""
-        d, out, travel = self.grid.dim, super().outcome(at), {}
+        d, travel = self.grid.dim, {}
         motion = (self.before + self.found(at).motion)[:, :d]
         for name, tool, by_forces in zip(self.now.law.names, self.now.law.contacts, motion, strict=True):
             travel[name] = by_forces if tool.free else np.array(by_forces @ tool.along(d))
-        return out | {"tool_travel": travel}
+        return super().outcome(at) | {"tool_travel": travel}
 
     def near(self, points: MaterialPoints, corners: NDArray[np.float64]) -> NDArray[np.bool_] | bool:
         """Return which corners touch tools."""
