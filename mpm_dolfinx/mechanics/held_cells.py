@@ -152,14 +152,13 @@ class HeldCells:
         local = p.x - grid.midpoints[p.cell]
         moments = {"squares": local[:, :, None] * local[:, None, :], "product": local.prod(axis=1)}
         self.moments = {name: both(mean(values), values) for name, values in moments.items()}
-        against = p.modulus + TENSE * p.tension
         flat = normal**2 > (1 - ALIGNED**2) * (normal**2).sum(axis=1, keepdims=True)
-        modulus = np.where(flat, total(p.confined)[:, None], total(p.modulus)[:, None])
-        each = np.where(flat[at], EVERYWHERE * p.resistance[:, None], WEAK * against[:, None])
         h = [grid.sizes(cells).min(axis=-1, keepdims=True) for cells in (cell, p.cell)]
-        static = both(HOLD / h[0] * modulus, each / h[1])
+        weights = both(np.full(normal.shape, HOLD) / h[0], np.where(flat[at], EVERYWHERE, WEAK) / h[1])
+        means = np.where(flat, total(p.confined)[:, None], total(p.modulus)[:, None])
+        at_points = np.where(flat[at], p.resistance[:, None], (p.modulus + TENSE * p.tension)[:, None])
+        static = weights * both(means, at_points)
         # the inertia of a cell resists a short step more than its stiffness
-        weights = both((0 * modulus + HOLD) / h[0], np.where(flat[at], EVERYWHERE, WEAK) / h[1])
         inert = weights * both(total(p.inertial), p.inertial)[:, None]
         self.stiffness = static + inert
         self.static = static / self.stiffness
