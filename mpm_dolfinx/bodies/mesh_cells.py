@@ -30,6 +30,7 @@ SECOND_ORDER = {
 }
 """First-order type of each second-order cell type.  Second-order cells list their vertices first."""
 LOOPS = {
+    "line": [(0, 1)],
     "triangle": [(0, 1), (1, 2), (2, 0)],
     "quad": [(0, 1), (1, 3), (3, 2), (2, 0)],
     "tetra": [(0, 1, 2), (0, 1, 3), (0, 2, 3), (1, 2, 3)],
