@@ -259,8 +259,8 @@ def _check_overlaps(
     i, j = _box_overlaps(domains, np.flatnonzero(np.isin(cell, outer)), slack)
     count = cell.max() + 1
     both, shared = (np.sort(pairs, axis=1) @ [count, 1] for pairs in (np.stack([cell[i], cell[j]], axis=1), neighbours))
-    apart = (cell[i] != cell[j]) & ~np.isin(both, shared)
-    i, j = i[apart], j[apart]
+    separate = (cell[i] != cell[j]) & ~np.isin(both, shared)
+    i, j = i[separate], j[separate]
     depth = -separation(domains[i], domains[j])
     deep = depth > slack[i] + slack[j]
     if deep.any():

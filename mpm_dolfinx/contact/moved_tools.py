@@ -94,7 +94,8 @@ class MovedTools(ContactProblem):
         motion, still = self.still, np.zeros_like(self.pairs.x)
         for _ in range(ROUNDS):
             found = self._find_at(still, motion)
-            ahead = np.minimum((found.equation.shift * self._moved.direction).sum(axis=1), self._reach(found))
+            newton = (found.equation.shift * self._moved.direction).sum(axis=1)
+            ahead = np.minimum(newton, self._bearing_displacement(found))
             before, motion = motion, self._limited(motion + ahead[:, None] * self._moved.direction)
             if np.abs(motion - before).max() <= EPSILON * self.grid.reach:
                 break
@@ -197,7 +198,7 @@ class MovedTools(ContactProblem):
         h, e = self.grid.least, self._moved.direction
         return np.clip((motion * e).sum(axis=1, keepdims=True), -h, h) * e
 
-    def _reach(self, found: Found) -> NDArray[np.float64]:
+    def _bearing_displacement(self, found: Found) -> NDArray[np.float64]:
         """Return the displacements (k,), in m, at which a single point would bear the load of a tool, or infinity."""
         law, state = self.now.law, self.now.state
         of = self.pairs.number
@@ -244,7 +245,7 @@ class MovedTools(ContactProblem):
         if not self._rate:  # a tool without contact moves until a point bears the load; slip alone has no stiffness
             e = self._moved.direction
             seeks = self._moves & ~bears & ~slides & ((off * e).sum(axis=1) > 0)
-            shift[seeks] = (np.minimum(self._reach(found), self.grid.least)[:, None] * e)[seeks]
+            shift[seeks] = (np.minimum(self._bearing_displacement(found), self.grid.least)[:, None] * e)[seeks]
         return MotionEquation(inverse, off, share * self._moves, shift, slides)
 
     def coupling(self, at: At) -> PETSc.Mat:

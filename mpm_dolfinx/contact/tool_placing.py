@@ -134,7 +134,7 @@ class Tools(Touching):
         out, d = super().unknown(value), self.grid.dim
         tools = dict(zip(self.names, self.tools, strict=True))
         out["tool_travel"] = {name: np.zeros(d if tool.free else ()) for name, tool in tools.items()}
-        turning = [name for name, turns in zip(self.names, self.turning, strict=True) if turns]
+        turning = [name for name, rotates in zip(self.names, self.turning, strict=True) if rotates]
         of_free = {
             "tool_velocity": {name: tool.begins(d) for name, tool in tools.items() if tool.free},
             "tool_rotation": {name: np.array(0.0) for name in turning},
@@ -424,11 +424,11 @@ class ToolLoads(ContactProblem):
 
     def outcome(self, at: At) -> dict[str, dict[str, NDArray[np.float64]]]:
         """See `Loads`.  Results are also displacements (m) by forces: vectors of free tools, else along the load."""
-        d, travel = self.grid.dim, {}
+        d, displacement = self.grid.dim, {}
         motion = (self.before + self.found(at).motion)[:, :d]
         for name, tool, by_forces in zip(self.now.law.names, self.now.law.contacts, motion, strict=True):
-            travel[name] = by_forces if tool.free else np.array(by_forces @ tool.along(d))
-        return super().outcome(at) | {"tool_travel": travel}
+            displacement[name] = by_forces if tool.free else np.array(by_forces @ tool.along(d))
+        return super().outcome(at) | {"tool_travel": displacement}
 
     def near(self, points: MaterialPoints, corners: NDArray[np.float64]) -> NDArray[np.bool_] | bool:
         """Return which corners touch tools."""
