@@ -229,9 +229,10 @@ class MovedTools(ContactProblem):
             S[:, d, :d] += np.einsum("kij,ki->kj", guides[:, :d, :d], across(sums[:, :d, 0]))
         inertia = self._rate * mass
         inertial = inertia * (found.motion - self._free)
-        S = guides @ S
-        bears = inertia.any(axis=1) | (np.trace(S, axis1=1, axis2=2) > 0)
-        S = S + inertia[:, None] * np.eye(len(motions)) + np.eye(len(motions)) - guides
+        S = guides @ S + inertia[:, None] * np.eye(len(motions))
+        whole = np.trace(S, axis1=1, axis2=2)
+        bears = inertia.any(axis=1) | (whole > 0)
+        S = S + np.abs(whole)[:, None, None] * (np.eye(len(motions)) - guides)  # regular beside the guides
         inverse = np.zeros_like(S)
         inverse[bears] = guides[bears] @ np.linalg.inv(S[bears])
         off = self._forces - inertial - np.einsum("kij,kj->ki", guides, sums[:, :, 0])
