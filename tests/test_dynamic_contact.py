@@ -423,7 +423,7 @@ def test_a_disc_falls_on_ground_with_an_initial_stress(gap):
 
 def test_contact_that_never_settles_fails_the_step(monkeypatch):
     s = dropped(0.01, mass=10.0, velocity=(0, -1))
-    monkeypatch.setattr("mpm_dolfinx.contact.free_tools.FreeTools.augment", lambda self, at: True)
+    monkeypatch.setattr("mpm_dolfinx.contact.moved_tools.MovedTools.augment", lambda self, at: True)
     with pytest.raises(mpm.NotConverged, match="no convergence in 25 iterations"):
         s.step(0.02)
 

@@ -6,18 +6,18 @@ import pytest
 import ways
 
 CEILINGS = {
-    "ad hoc named numbers": 77,
+    "ad hoc named numbers": 73,
     "rules among numbers in functions": 3,
     "imports a file, mean": 5.54,
     "files in a circle of imports": 0,
     "folders in a circle of imports": 0,
     "files of the largest folder": 14,
     "parameters of the longest list": 12,
-    "assignments of three and more values": 19,
+    "assignments of three and more values": 18,
     "changes of hidden state": 0,
     "asserts and RuntimeErrors": 3,  # of users on other processes, and of two reference solutions
     "files that name a condition's class, most": 6,
-    "lines of the package": 40017,
+    "lines of the package": 39680,
 }
 
 WAYS = {"rooms of a traction": 13, "rooms of an initial pressure": 15, "homes of the pressure": 4}

@@ -197,6 +197,19 @@ def test_steps_of_any_length_follow_a_tool_that_its_load_pushes_aside():
         assert state.outcome["tool_forces"]["tool"][1] == pytest.approx(-1e6, rel=1e-6)
 
 
+def test_a_load_between_two_axes_pushes_stiff_soil_as_far_as_soft_soil():
+    """A tool moves along its load only: the equation of its motion must be regular in any unit of stress."""
+    found = []
+    for unit in (1.0, 1e6):
+        soil = mpm.Hencky(bulk=1e6 * unit, shear=0.6e6 * unit)
+        tool = mpm.Tool(BALL, load=lambda t, unit=unit: 2e4 * unit * t, direction=(0.3, -1), friction=0.4)
+        s = layer(tool, material=soil)
+        s.run(1.0, 0.25)
+        found.append((s.tool_travel.array[0], s.result.newton))
+    (one, steps), (other, others) = found
+    assert other == pytest.approx(one, rel=1e-9) and others == steps
+
+
 def test_a_run_that_is_resumed_ends_with_the_same_bits(tmp_path):
     whole, half, again = (layer(pushed(lambda t: 2e4 * t)) for _ in range(3))
     whole.run(1.0, 0.25)

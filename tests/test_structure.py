@@ -78,7 +78,7 @@ CHANGES = {
     ("HoldLoads", "data"): "the rows of prescribed sides with their multipliers",
     ("HoldLoads", "_lacked"): "the gaps of sides at the last change of their multipliers",
     ("ContactProblem", "now"): "the pairs and tractions of contacts in a Newton step",
-    ("FreeTools", "now"): "the same, and the positions of tools with a mass",
+    ("MovedTools", "now"): "the same, and the positions of tools that forces move",
     ("Events", "_before"): "the values of events before the step",
     ("Writer", "_lock"): "the lock of the folder, released at its end",
     ("Writer", "closed"): "whether it is closed",

@@ -93,7 +93,7 @@ def test_distances_from_a_box_are_exact(box):
     convex, inside = mpm.Convex(corners), y[to_box(y, lower, upper) < -1e-9]
     assert mesh.distance(inside) == pytest.approx(convex.distance(inside), abs=1e-13 * size)
     assert np.abs(mesh.normal(inside) - convex.normal(inside)).max() < 1e-12
-    assert not mesh.curvature(inside).any()
+    assert not mesh.geometry(inside)[2].any()
     if d == 3:
         R = turned(np.array([0.6, 0.0, 0.8]), rng.uniform(0, 6))
         assert hull(corners @ R.T).distance(y @ R.T) == pytest.approx(to_box(y, lower, upper), abs=1e-13 * size)
@@ -157,7 +157,7 @@ def test_normals_and_curvatures_are_derivatives(make):
     assert len(y) > 3000
     slope = np.stack([(mesh.distance(y + h * e) - mesh.distance(y - h * e)) / (2 * h) for e in np.eye(d)], axis=1)
     bend = np.stack([(mesh.normal(y + h * e) - mesh.normal(y - h * e)) / (2 * h) for e in np.eye(d)], axis=2)
-    n, second = mesh.normal(y), mesh.curvature(y)
+    _, n, second = mesh.geometry(y)
     assert np.linalg.norm(n, axis=1) == pytest.approx(1.0)
     wrong = np.abs(slope - n).max(axis=1) > 1e-6
     wrong |= np.abs(bend - second).max(axis=(1, 2)) > 1e-4
@@ -170,7 +170,7 @@ def test_on_edges_and_vertices_the_normal_is_a_mean():
     y = np.array([(0, 0, 0.5), (1, 1, 0.5), (2, 0, 0), (0.5, 0, 0.5), (0.7, 0.7, 1.0)])
     exact = [(-0.5, -0.5, 0), (0.5, 0.5, 0), (1 / 3, -1 / 3, -1 / 3), (0, -1, 0), (0, 0, 1)]
     assert mesh.normal(y) == pytest.approx(np.array(exact), abs=1e-12)
-    assert np.abs(mesh.distance(y)).max() < 1e-15 and not mesh.curvature(y).any()
+    assert np.abs(mesh.distance(y)).max() < 1e-15 and not mesh.geometry(y)[2].any()
 
 
 def test_distances_from_a_sphere_converge_with_the_square_of_the_facet_size():

@@ -10,7 +10,7 @@ from helpers import set_up
 from layers import compliance, errors
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.contact.tool_placing import BEGINS
+from mpm_dolfinx.bodies.touching import MISFIT
 from mpm_dolfinx.mechanics.momentum import MomentumProblem
 
 E = 1e6  # Pa
@@ -397,7 +397,7 @@ def test_a_stage_goes_on_with_a_tool_wherever_the_step_before_left_it():
         if stages == 2:
             faces = s.scene.on_grid(s.points).cut.surface(s.state.stage.acting[0].outside)
             gap = disc.shape.distance(disc.pose(s.t, 2).own(faces.now(s.points)))
-            assert gap.min() < -BEGINS * grid.h.min()
+            assert gap.min() < -MISFIT * grid.h.min()
             s.stage()
         s.run(1.02, 0.02, progress=False)
         forces.append(s.tool_forces.array[0])

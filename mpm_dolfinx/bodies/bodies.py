@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.base.validation import asked, at_places, instance, numbers
-from mpm_dolfinx.grid.grid import FACES, SIDES, Grid, begin_with, corner_bits, in_chunks
+from mpm_dolfinx.grid.grid import FACES, SIDES, Grid, begin_with, in_chunks
 from mpm_dolfinx.parallel.exchange import together
 from mpm_dolfinx.points.cutting import centroids, domain_volumes, volumes
 from mpm_dolfinx.points.material_points import MaterialPoints
@@ -21,9 +21,8 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 class Body:
     """A seeded body: the reference geometry of all its particle domains.  Every process has an equal object.
 
-    Each domain is the image of a box under `map`.  Subclasses define `spacing`, the edge lengths (n, d) of the boxes in
-    m, or (d,) for equal boxes.  In a `RowsBody`, `spacing` (d,) contains the smallest edge lengths.  Large bodies are
-    processed in chunks, so no array over all domains is stored.
+    Each domain is the image of a reference domain under `map`: of a box on a lattice, or of a part of a mesh cell.
+    Large bodies are processed in chunks, so no array over all domains is stored.
     """
 
     material: int = 0  # index in the scene's list of materials
@@ -38,8 +37,8 @@ class Body:
         raise NotImplementedError
 
     def lower_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the lower corners (n, d), in m, of the boxes of the chosen domains."""
-        raise NotImplementedError
+        """Return the lower corners (n, d), in m, of the bounding boxes of the chosen domains, before the map."""
+        return self.reference(chosen).min(axis=1)
 
     def sides_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.bool_]:
         """Return whether the faces (n, d, 2) of the chosen domains lie on the surface of the body."""
@@ -62,7 +61,12 @@ class Body:
 
     def centre_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.float64]:
         """Return the reference positions (n, d), in m, of the centres of the chosen domains."""
-        return self.lower_of(chosen) + 0.5 * self.spacing
+        return centroids(self.reference(chosen))
+
+    @cached_property
+    def spacing(self) -> NDArray[np.float64]:
+        """Smallest edge lengths (d,), in m, of the boxes of the domains."""
+        return np.min([self.boxes(part).min(axis=0) for part in in_chunks(len(self))], axis=0)
 
     @cached_property
     def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -103,7 +107,11 @@ class Body:
 
     def across(self, axis: int) -> tuple[float, float]:
         """Return the mean number of domains along an axis, and their mean edge length in m."""
-        return len(self) / max(1, len(self._with_face(axis, 0))), float(self.spacing[axis])
+        return len(self) / max(1, len(self._with_face(axis, 0))), self._mean_edge(axis)
+
+    def _mean_edge(self, axis: int) -> float:
+        """Return the mean edge length of the domains' boxes along an axis, in m."""
+        return sum(float(self.boxes(part)[:, axis].sum()) for part in in_chunks(len(self))) / len(self)
 
     def outer(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return all surface faces, as domains (n,) and face indices (n,), sorted by face index."""
@@ -112,7 +120,7 @@ class Body:
 
     def reference(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
         """Return the reference positions (n, 2^d, d), in m, of corners of the chosen domains, before the map."""
-        return self.lower_of(chosen)[:, None] + corner_bits(self.dim) * self.spacing
+        raise NotImplementedError
 
     def corners(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
         """Return the corners (n, 2^d, d) of the chosen domains after the map, in m."""
@@ -142,13 +150,13 @@ class Body:
         return out
 
     def boxes(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
-        """Return the edge lengths (n, d), in m, of the boxes of the chosen domains, before the map."""
-        return np.broadcast_to(self.spacing, (len(self), self.dim))[chosen]
+        """Return the edge lengths (n, d), in m, of the bounding boxes of the chosen domains, before the map."""
+        return np.ptp(self.reference(chosen), axis=1)
 
     @property
     def volume_of_boxes(self) -> float:
-        """Total volume of all boxes, in m^d.  The boxes must be equal."""
-        return float(len(self) * self.spacing.prod())
+        """Total volume of all boxes, in m^d."""
+        return sum(float(self.boxes(part).prod(axis=1).sum()) for part in in_chunks(len(self)))
 
     def size(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
         """Return the edge lengths (n, d), in m, of chosen boxes, scaled uniformly to the volumes of their domains."""

@@ -4,9 +4,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,20 +18,29 @@ from mpm_dolfinx.grid.grid import MOST, Grid, among, begin_with, corner_bits, in
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LatticeBody(Body):
-    """A body that consists of all or some boxes of a lattice."""
+    """A body that consists of all or some boxes of a lattice, whose rows may have different widths."""
 
-    origin: NDArray[np.float64]  # lower corner of the lattice (d,), m
-    spacing: NDArray[np.float64]  # edge lengths of the boxes (d,), m
-    count: tuple[int, ...]  # number of boxes along each axis
+    rows: tuple[NDArray[np.float64], ...]  # coordinates of the rows' boundaries along each axis (count + 1,), m
+    widths: tuple[NDArray[np.float64], ...]  # widths of the rows along each axis (count,), m
     filled: NDArray[np.integer] | None = None  # lexicographic indices of the body's boxes (n,), ascending; None: all
 
     def __len__(self) -> int:
         return int(np.prod(self.count)) if self.filled is None else len(self.filled)
 
+    @cached_property
+    def count(self) -> tuple[int, ...]:
+        """Number of boxes of the lattice along each axis."""
+        return tuple(map(len, self.widths))
+
+    @cached_property
+    def spacing(self) -> NDArray[np.float64]:
+        """Smallest widths (d,) of the rows along each axis, in m."""
+        return np.array([widths.min() for widths in self.widths])
+
     @property
     def dim(self) -> int:
         """Number d of dimensions."""
-        return len(self.count)
+        return len(self.rows)
 
     def _index(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.int64]:
         """Return the lattice indices of the chosen domains."""
@@ -46,11 +54,19 @@ class LatticeBody(Body):
 
     def _at(self, index: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return the positions, in m, of lattice corners."""
-        return self.origin + index * self.spacing
+        return np.stack([rows[i] for rows, i in zip(self.rows, np.moveaxis(index, -1, 0), strict=True)], axis=-1)
 
     def lower_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the lower corners (n, d), in m, of the boxes of the chosen domains."""
+        """Return the lower corners (n, d), in m, of the boxes of the chosen domains, before the map."""
         return self._at(self._index(chosen))
+
+    def boxes(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
+        """Return the edge lengths (n, d), in m, of the boxes of the chosen domains, before the map."""
+        return np.stack([widths[i] for widths, i in zip(self.widths, self._index(chosen).T, strict=True)], axis=-1)
+
+    def centre_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return the reference positions (n, d), in m, of the centres of the chosen domains."""
+        return self.lower_of(chosen) + 0.5 * self.boxes(chosen)
 
     def reference(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
         """Return the reference positions (n, 2^d, d), in m, of corners of the chosen domains, before the map.
@@ -114,62 +130,33 @@ class LatticeBody(Body):
         corners = self.places(rows)[:, None] + corner_bits(self.dim)
         return np.ravel_multi_index(tuple(np.moveaxis(corners, 2, 0)), tuple(np.add(self.lattice, 1)))
 
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class RowsBody(LatticeBody):
-    """A body of boxes on a lattice with rows of different widths."""
-
-    rows: tuple[NDArray[np.float64], ...]  # coordinates of the rows' boundaries along each axis (count + 1,), m
-
-    def _at(self, index: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the positions, in m, of lattice corners."""
-        return np.stack([rows[i] for rows, i in zip(self.rows, np.moveaxis(index, -1, 0), strict=True)], axis=-1)
-
-    def boxes(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
-        """Return the edge lengths (n, d), in m, of the boxes of the chosen domains, before the map."""
-        index = self._index(chosen)
-        return self._at(index + 1) - self._at(index)
-
-    def centre_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the reference positions (n, d), in m, of the centres of the chosen domains."""
-        return self.lower_of(chosen) + 0.5 * self.boxes(chosen)
-
-    def across(self, axis: int) -> tuple[float, float]:
-        """Return the mean number of domains along an axis, and their mean edge length in m."""
-        low, high = self.bounds
-        return super().across(axis)[0], float(high[axis] - low[axis]) / self.lattice[axis]
-
-    @property
-    def volume_of_boxes(self) -> float:
-        """Total volume of all boxes, in m^d."""
-        return sum(float(self.boxes(part).prod(axis=1).sum()) for part in in_chunks(len(self)))
-
     def corner_rows(self, axis: int) -> NDArray[np.float64]:
         """Return the coordinates, in m, of the boundaries of the body's rows along an axis."""
         low, high = self._ends
         return self.rows[axis][low[axis] : high[axis] + 2]
 
 
-def _rows(grid: Grid, axis: int, low: float, high: float, per_cell: int) -> NDArray[np.float64]:
-    """Return the boundaries of rows from `low` to `high`, in m, with `per_cell` rows in each whole cell."""
+def _rows(
+    grid: Grid, axis: int, low: float, high: float, per_cell: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the boundaries and widths of rows from `low` to `high`, in m, with `per_cell` rows in each whole cell."""
+    if grid.even:
+        count = int(_rounded((high - low) / (grid.h[axis] / per_cell)))
+        width = (high - low) / count
+        return low + np.arange(count + 1) * width, np.broadcast_to(width, count)
     lines = grid.lines[axis] + grid.base[axis]
     tolerance = SAME * grid.finest[axis]
     ends = np.concatenate([[low], lines[(lines > low + tolerance) & (lines < high - tolerance)], [high]])
     width = grid.widths[axis][grid.cells_along(axis, (ends[1:] + ends[:-1]) / 2 - grid.base[axis])]
     count = _rounded(np.diff(ends) / width * per_cell)
     parts = [np.linspace(a, b, n + 1)[:-1] for a, b, n in zip(ends[:-1], ends[1:], count, strict=True)]
-    return np.concatenate([*parts, [high]])
+    rows = np.concatenate([*parts, [high]])
+    return rows, np.diff(rows)
 
 
 def _rounded(rows: NDArray[np.float64]) -> NDArray[np.int64]:
     """Return numbers of rows as integers >= 1, unaffected by rounding errors of coordinates."""
     return np.maximum(1, np.rint(NEAR * np.rint(rows / NEAR))).astype(np.int64)
-
-
-def _lattice(rows: list[NDArray[np.float64]], **more: Any) -> RowsBody:
-    """Return a body on a lattice.  `rows` are the boundaries of the lattice's rows along each axis, in m."""
-    narrowest, count = np.array([np.diff(r).min() for r in rows]), tuple(len(r) - 1 for r in rows)
-    return RowsBody(origin=np.array([r[0] for r in rows]), spacing=narrowest, count=count, rows=tuple(rows), **more)
 
 
 def box(grid: Grid, lower: ArrayLike, upper: ArrayLike, per_cell: int = 2, material: int = 0) -> Body:
@@ -201,12 +188,8 @@ def box(grid: Grid, lower: ArrayLike, upper: ArrayLike, per_cell: int = 2, mater
     if not (upper > lower).all():
         raise ValueError(f"body: box {lower.tolist()} to {upper.tolist()}, upper must be > lower")
     material, per_cell = whole("body: material", material, 0), whole("body: per_cell", per_cell)
-    if not grid.even:
-        rows = [_rows(grid, a, lower[a], upper[a], per_cell) for a in range(grid.dim)]
-        return check_inside(grid, _lattice(rows, material=material))
-    count = _rounded((upper - lower) / (grid.h / per_cell))
-    lattice = {"origin": lower, "spacing": (upper - lower) / count, "count": tuple(count.tolist())}
-    return check_inside(grid, LatticeBody(**lattice, material=material))
+    rows, widths = zip(*(_rows(grid, a, lower[a], upper[a], per_cell) for a in range(grid.dim)), strict=True)
+    return check_inside(grid, LatticeBody(rows=rows, widths=widths, material=material))
 
 
 def shape(
@@ -235,24 +218,16 @@ def shape(
     """
     begin_with("body: grid", grid)
     material, per_cell = whole("body: material", material, 0), whole("body: per_cell", per_cell)
-    count = grid.shape * per_cell
-    index = np.stack(np.meshgrid(*map(np.arange, count), indexing="ij"), axis=-1).reshape(-1, grid.dim)
-    allowed = f"one bool for each position, ({len(index)},)"
-    if grid.even:
-        spacing = grid.h / per_cell
-        x = grid.lower + (index + 0.5) * spacing
-    else:
-        rows = [_rows(grid, a, grid.lower[a], grid.upper[a], per_cell) for a in range(grid.dim)]
-        x = np.stack([((r[1:] + r[:-1]) / 2)[i] for r, i in zip(rows, index.T, strict=True)], axis=1)
+    rows, widths = zip(*(_rows(grid, a, grid.lower[a], grid.upper[a], per_cell) for a in range(grid.dim)), strict=True)
+    whole_lattice = LatticeBody(rows=rows, widths=widths, material=material)
+    x = whole_lattice.centre
+    allowed = f"one bool for each position, ({len(x)},)"
     filled = np.asarray(asked("body: inside(x)", allowed, inside, x))
-    if filled.shape != (len(index),) or filled.dtype != bool:  # such as a signed distance
+    if filled.shape != (len(x),) or filled.dtype != bool:  # such as a signed distance
         raise ValueError(f"body: inside(x) has shape {filled.shape} of {filled.dtype}, must be {allowed}")
     if not filled.any():
         raise ValueError(
             "body: inside(x) is False at all points, must be True at one: is the shape smaller than a cell?"
         )
     numbers_of = np.flatnonzero(filled).astype(np.int32 if len(filled) <= MOST else np.int64)
-    if not grid.even:
-        return check_inside(grid, _lattice(rows, filled=numbers_of, material=material))
-    lattice = {"origin": grid.lower, "spacing": spacing, "count": tuple(count.tolist()), "filled": numbers_of}
-    return check_inside(grid, LatticeBody(**lattice, material=material))
+    return check_inside(grid, replace(whole_lattice, filled=numbers_of))

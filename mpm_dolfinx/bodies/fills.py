@@ -15,16 +15,14 @@ from scipy.sparse import coo_array, csr_array, diags
 
 from mpm_dolfinx.base.tolerances import NEAR, SAME
 from mpm_dolfinx.bodies.bodies import Body
-from mpm_dolfinx.bodies.touching import Cover, Faces, covered, covers, local, meeting, warn_near, weights
+from mpm_dolfinx.bodies.touching import MISFIT, Cover, Faces, covered, covers, local, meeting, warn_near, weights
 from mpm_dolfinx.grid.grid import FACES, REACH, Grid
 from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
 from mpm_dolfinx.points.cutting import TANGLED, centroids, domain_volumes, volumes
 from mpm_dolfinx.points.material_points import MaterialPoints
 
-MISFIT = 0.01  # largest distance of a fill's edges from a bent surface without a warning, divided by the cell size
 UPRIGHT = 0.95  # cosine of the largest angle between an axis and normals of mesh faces on the side opposite a contact
-INSIDE = 0.05  # fraction of a domain's shortest edge; deeper penetration into a fill is an error
 
 
 @dataclass
@@ -224,7 +222,7 @@ def _penetration(
     """Return the depth of a body in the fill, in m, their gap, in cells, and the position of either."""
     start = _start(bodies, other)
     rows = np.flatnonzero((points.id >= start) & (points.id < start + len(bodies[other])))
-    both = [(c, INSIDE / 2 * np.ptp(c, axis=1).min(axis=1) + misfit) for c in (points.corners[rows], corners)]
+    both = [(c, np.full(len(c), MISFIT / 2 * grid.least + misfit)) for c in (points.corners[rows], corners)]
     found = grid.comm.allgather(meeting(*both, grid.in_cells))
     deepest, nearest = max(found, key=lambda m: m[0]), min(found, key=lambda m: m[1])
     return deepest if deepest[0] else nearest

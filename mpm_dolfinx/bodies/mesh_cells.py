@@ -15,7 +15,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mpm_dolfinx.base.tolerances import SAME
 from mpm_dolfinx.grid.grid import FACES, corner_bits
 
 KINDS = {2: {"triangle": 3, "quad": 4}, 3: {"tetra": 4, "hexahedron": 8, "wedge": 6, "pyramid": 5}}
@@ -31,6 +30,7 @@ SECOND_ORDER = {
 }
 """First-order type of each second-order cell type.  Second-order cells list their vertices first."""
 LOOPS = {
+    "line": [(0, 1)],
     "triangle": [(0, 1), (1, 2), (2, 0)],
     "quad": [(0, 1), (1, 3), (3, 2), (2, 0)],
     "tetra": [(0, 1, 2), (0, 1, 3), (0, 2, 3), (1, 2, 3)],
@@ -113,88 +113,3 @@ PARTS = {
     "wedge": _wedge(),
     "pyramid": _of_simplices("pyramid", (0, 1, 2, 4), (0, 2, 3, 4)),
 }
-
-
-@dataclass(frozen=True, eq=False)
-class Polytopes:
-    """Convex mesh cells of any types."""
-
-    x: NDArray[np.float64]  # vertices (n, k, d), m, padded by repeating the last one
-    normals: NDArray[np.float64]  # normals of facets (n, f, d), padded by zeros
-    edges: NDArray[np.float64]  # edge vectors (n, e, d), m, padded by zeros
-    warp: NDArray[np.float64]  # largest distance of facet vertices from the mean plane of their facet (n,), m
-
-    @classmethod
-    def of(cls, x: NDArray[np.float64], cells: dict[str, NDArray[np.int64]]) -> Polytopes:
-        """Return all cells as polytopes, from the nodes `x` (nodes, d), in m, and the nodes of cells by type."""
-        d = x.shape[1]
-        most = [max(len(of) for of in parts) for parts in zip(*(_shape(kind) for kind in cells), strict=True)]
-        rows = [_polytopes(d, kind, x[nodes], *most) for kind, nodes in cells.items()]
-        return cls(*map(np.concatenate, zip(*rows, strict=True)))
-
-    def overlaps(
-        self, i: NDArray[np.int64], j: NDArray[np.int64], slack: NDArray[np.float64]
-    ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return which pairs (k,) of cells i, j (n,) overlap, and the depths (k,) of the overlaps, in m.
-
-        Two convex cells overlap if no plane separates them.  It is sufficient to try planes parallel to a facet of
-        either cell.  In 3D, planes parallel to one edge of each cell must also be tried.  Overlaps less deep than
-        `slack` (n,), in m, are ignored.
-        """
-        left, depth = np.arange(len(i)), np.full(len(i), np.inf)
-        for normals in self._planes():
-            if not len(left):
-                break
-            n = normals(i[left], j[left])
-            length = np.linalg.norm(n, axis=1)
-            known = length > 0
-            n = n / np.where(known, length, 1.0)[:, None]
-            a, b = (np.einsum("nkd,nd->nk", self.x[c[left]], n) for c in (i, j))
-            lap = np.minimum(a.max(axis=1) - b.min(axis=1), b.max(axis=1) - a.min(axis=1))
-            depth[left] = np.minimum(depth[left], np.where(known, lap, np.inf))
-            left = left[depth[left] > slack[left]]
-        return left, depth[left]
-
-    def _planes(self):
-        """Yield functions that return the normals of planes that may separate pairs of cells."""
-        for f in range(self.normals.shape[1]):
-            yield lambda i, j, f=f: self.normals[i, f]
-            yield lambda i, j, f=f: self.normals[j, f]
-        if self.x.shape[2] == 3:
-            for e in range(self.edges.shape[1]):
-                for g in range(self.edges.shape[1]):
-                    yield lambda i, j, e=e, g=g: _crossed(self.edges[i, e], self.edges[j, g])
-
-
-def _crossed(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the cross products of edges, which are zero for edges that are parallel within rounding."""
-    out = np.cross(a, b)
-    size = np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1)
-    return np.where((np.linalg.norm(out, axis=1) > SAME * size)[:, None], out, 0.0)
-
-
-def _shape(kind: str) -> tuple[range, list, list]:
-    """Return the vertices, facets and edges of a cell type."""
-    return range(1 + max(map(max, LOOPS[kind]))), LOOPS[kind], edges(kind)
-
-
-def _polytopes(dim: int, kind: str, x: NDArray[np.float64], vertices: int, facets: int, edges: int) -> tuple:
-    """Return the arrays of `Polytopes` for cells of one type."""
-    _, loops, ends = _shape(kind)
-    corners = np.concatenate([x, np.repeat(x[:, -1:], vertices - x.shape[1], axis=1)], axis=1)
-    normals, warp = np.zeros((len(x), facets, dim)), np.zeros(len(x))
-    for f, loop in enumerate(loops):
-        c = x[:, list(loop)]
-        if dim == 2:
-            t = c[:, 1] - c[:, 0]
-            normals[:, f] = np.stack([t[:, 1], -t[:, 0]], axis=1)
-            continue
-        n = np.cross(c[:, 2] - c[:, 0], c[:, -1] - c[:, 1])
-        normals[:, f] = n / np.maximum(np.linalg.norm(n, axis=1), np.finfo(float).tiny)[:, None]
-        if len(loop) == 4:
-            off = np.einsum("nd,nd->n", c[:, 0] - c[:, 1] + c[:, 2] - c[:, 3], normals[:, f])
-            warp = np.maximum(warp, np.abs(off) / 4)
-    along = np.zeros((len(x), edges, dim))
-    for e, (a, b) in enumerate(ends):
-        along[:, e] = x[:, b] - x[:, a]
-    return corners, normals, along, warp

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import redirect_stderr, redirect_stdout
 from functools import partial
 from io import StringIO
@@ -127,17 +127,10 @@ def _of_meshio(grid: Grid, mesh: meshio.Mesh | Path, names: Mapping[str, int], t
     dim = grid.dim
     x = _positions(grid.dim, mesh.points)
     sets = mesh_readers.sets_of(mesh)
-    blocks = []
-    curved = 0
-    off = 0.0
-    for block in mesh.cells:
-        kind, rows = _first_order(dim, block)
-        _check_nodes(rows, len(x))
-        if kind != block.type and kind in KINDS[dim]:
-            curved, off = curved + len(rows), max(off, _edge_node_distance(x, rows, kind))
-        blocks.append((kind, rows[:, : _vertices(dim, kind)]))
-    if curved:
-        _warn_curved(name, curved, off)
+    known = {"vertex": 1, "line": 2, **SIDES_OF[dim], **KINDS[dim]}
+    for other in [block.type for block in mesh.cells if SECOND_ORDER.get(block.type, block.type) not in known][:1]:
+        raise ValueError(f"mesh: has cells {other!r}, must have {' and '.join(KINDS[dim])} for a grid in {dim}D")
+    blocks = _first_order(name, x, mesh, known, KINDS[dim])
     if tags is not None and tags not in mesh.cell_data:
         known = ", ".join(mesh.cell_data) or "none, for the cells have no data"
         raise ValueError(f"mesh: cell_tags = {line(tags)}, must be the name of cell data of the mesh: {known}")
@@ -176,15 +169,10 @@ def surface_of(mesh: str | os.PathLike | meshio.Mesh) -> tuple[NDArray[np.float6
         name, mesh = f"mesh {os.fspath(mesh)}", _file(path("mesh", mesh))
     instance("mesh", mesh, meshio.Mesh)
     mesh_readers.check_systems(mesh)
-    x, found = _positions(2, mesh.points), {"line": [], "triangle": [], "quad": []}
-    for block in mesh.cells:
-        kind, rows = SECOND_ORDER.get(block.type, block.type), np.asarray(block.data)
-        if kind in found and len(rows):
-            _check_nodes(rows, len(x))
-            if kind != block.type:
-                curved = "line3" if kind == "line" else kind
-                _warn_curved(name, len(rows), 0.0 if curved == "line3" else _edge_node_distance(x, rows, kind))
-            found[kind].append(rows[:, : {"line": 2, "triangle": 3, "quad": 4}[kind]].astype(np.int64))
+    x, known = _positions(2, mesh.points), {"line": 2, "triangle": 3, "quad": 4}
+    found = {kind: [] for kind in known}
+    for kind, rows in _first_order(name, x, mesh, known, known):
+        found[kind].extend([rows] * bool(len(rows)))
     used = np.concatenate([np.zeros(0, np.int64), *(rows.ravel() for of in found.values() for rows in of)])
     plane = x.shape[1] == 2 or np.ptp(x[used], axis=0)[2] <= NEAR * np.ptp(x[used], axis=0).max() if len(used) else True
     triangles = [rows[:, of] for rows in found["quad"] for of in ([0, 1, 2], [0, 2, 3])] + found["triangle"]
@@ -205,18 +193,28 @@ def _positions(dim: int, points: Any) -> NDArray[np.float64]:
     return x
 
 
-def _first_order(dim: int, block: Any) -> tuple[str, NDArray[np.int64]]:
-    """Return the first-order cell type of a meshio block, and the nodes of its cells."""
-    kind = SECOND_ORDER.get(block.type, block.type)
-    if kind not in [*KINDS[dim], *SIDES_OF[dim], "vertex", "line"]:
-        raise ValueError(f"mesh: has cells {block.type!r}, must have {' and '.join(KINDS[dim])} for a grid in {dim}D")
-    rows = np.asarray(block.data, dtype=np.int64)
-    return kind, rows if rows.ndim == 2 else rows.reshape(len(rows), 0)
+def _first_order(
+    name: str, x: NDArray[np.float64], mesh: meshio.Mesh, known: Mapping[str, int], counted: Collection[str]
+) -> list[tuple[str, NDArray[np.int64]]]:
+    """Return the type and the corners of the cells of each block of known types.  Warn of second-order cells.
 
-
-def _vertices(dim: int, kind: str) -> int:
-    """Return the number of vertices of a cell type."""
-    return {"vertex": 1, "line": 2, **SIDES_OF[dim], **KINDS[dim]}[kind]
+    `known`: number of corners of each type.
+    `counted`: types of which second-order cells cause the warning.
+    """
+    blocks = []
+    curved, off = 0, 0.0
+    for block in mesh.cells:
+        kind, rows = SECOND_ORDER.get(block.type, block.type), np.asarray(block.data, dtype=np.int64)
+        if kind not in known:
+            continue
+        rows = rows if rows.ndim == 2 else rows.reshape(len(rows), 0)
+        _check_nodes(rows, len(x))
+        if kind != block.type and kind in counted and len(rows):
+            curved, off = curved + len(rows), max(off, _edge_node_distance(x, rows, kind))
+        blocks.append((kind, rows[:, : known[kind]]))
+    if curved:
+        _warn_curved(name, curved, off)
+    return blocks
 
 
 def _check_nodes(rows: NDArray[np.int64], count: int) -> None:

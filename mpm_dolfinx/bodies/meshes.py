@@ -10,25 +10,23 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from itertools import product
 
 from mpi4py import MPI
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from mpm_dolfinx.base.tolerances import NEAR, SAME
 from mpm_dolfinx.base.validation import whole
 from mpm_dolfinx.bodies.bodies import Body, check_inside
-from mpm_dolfinx.bodies.mesh_cells import KINDS, PARTS, Polytopes, distinct
-from mpm_dolfinx.bodies.touching import Faces, covers, face_vectors
-from mpm_dolfinx.grid.grid import FACES, Grid, corner_bits, in_chunks, rounding, sum_by
+from mpm_dolfinx.bodies.mesh_cells import KINDS, PARTS, distinct
+from mpm_dolfinx.bodies.touching import Faces, allowance, covers, face_vectors, separation, warps
+from mpm_dolfinx.grid.grid import FACES, Grid, corner_bits, linked, rounding, sum_by
 from mpm_dolfinx.parallel.machine_files import once_a_machine
 from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
-from mpm_dolfinx.points.cutting import centroids, simplex_volumes, vertices, volumes
+from mpm_dolfinx.points.cutting import simplex_volumes, vertices, volumes
 
 LONG = 1.5  # domains with edges longer than this factor times (cell size / per_cell) are divided
 SMALL = 0.2  # fraction of the desired domain size; smaller domains cause a warning
@@ -66,7 +64,7 @@ class MeshBody(Body):
     tagged: Mapping[str, NDArray[np.bool_]]  # name of a side -> whether a face belongs to the side (n, d, 2)
     numbers: NDArray[np.int64]  # indices of the domains' corners (n, 2^d); shared corners have one index
 
-    lattice = None
+    lattice, widths = None, ()  # a mesh has no rows
 
     def __len__(self) -> int:
         return len(self.vertices)
@@ -76,27 +74,9 @@ class MeshBody(Body):
         """Number d of dimensions."""
         return self.vertices.shape[2]
 
-    @cached_property
-    def spacing(self) -> NDArray[np.float64]:
-        """Smallest edge lengths (d,), in m, of the bounding boxes of domains."""
-        return np.min([self.boxes(part).min(axis=0) for part in in_chunks(len(self))], axis=0)
-
-    def boxes(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
-        """Return the edge lengths (n, d), in m, of the bounding boxes of the chosen domains, before the map."""
-        x = self.vertices[chosen]
-        return x.max(axis=1) - x.min(axis=1)
-
-    def lower_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the lower corners (n, d), in m, of the bounding boxes of the chosen domains."""
-        return self.vertices[chosen].min(axis=1)
-
     def sides_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.bool_]:
         """Return whether the faces (n, d, 2) of the chosen domains lie on the surface of the body."""
         return self.surface[chosen]
-
-    def centre_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the reference positions (n, d), in m, of the centres of the chosen domains."""
-        return centroids(self.vertices[chosen])
 
     @property
     def aligned(self) -> bool:
@@ -124,7 +104,7 @@ class MeshBody(Body):
 
     def across(self, axis: int) -> tuple[float, float]:
         """Return the approximate number of domains along an axis, and their mean edge length in m."""
-        edge = float(np.concatenate([self.boxes(part)[:, axis] for part in in_chunks(len(self))]).mean())
+        edge = self._mean_edge(axis)
         return float(np.ptp(self.vertices[:, :, axis])) / edge, edge
 
     def reference(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
@@ -140,8 +120,7 @@ def _numbered(vertices: NDArray[np.float64]) -> NDArray[np.int64]:
     """Return the node indices of the corners of domains.  Equal corners have equal indices."""
     x = vertices.reshape(-1, vertices.shape[2])
     pairs = cKDTree(x).query_pairs(NEAR * np.ptp(vertices, axis=1).min(), output_type="ndarray")
-    graph = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(x), len(x)))
-    return connected_components(graph, directed=False)[1].astype(np.int64).reshape(vertices.shape[:2])
+    return linked(len(x), *pairs.T)[0].reshape(vertices.shape[:2])
 
 
 def seeded(
@@ -195,7 +174,7 @@ def _divided(grid: Grid, mesh: Mesh, part: str | None, per_cell: int, name: str)
     outer = (facet > 0) & (count[facet] == 1)  # facet 0: face inside a cell
     twice = (of > 0) & (count[of] == 2)
     _check_sides(mesh, domains, facets, facet, count == 2, name)
-    _check_overlaps(mesh.x, cells, np.unique(cell[outer.any(axis=1)]), by[twice].reshape(-1, 2), name)
+    _check_overlaps(domains, cell, np.unique(cell[outer.any(axis=1)]), by[twice].reshape(-1, 2), name)
     tagged = {side: outer & _in_side(facets, rows)[facet] for side, rows in mesh.sides.items()}
     vertices, row, kept = _split(grid, domains, per_cell)
     surface, *tagged_rows = (rows[row].reshape(kept.shape) & kept for rows in (outer, *tagged.values()))
@@ -261,8 +240,8 @@ def _check_sides(
 
 
 def _check_overlaps(
-    x: NDArray[np.float64],
-    cells: dict[str, NDArray[np.int64]],
+    domains: NDArray[np.float64],
+    cell: NDArray[np.int64],
     outer: NDArray[np.int64],
     neighbours: NDArray[np.int64],
     name: str,
@@ -272,48 +251,43 @@ def _check_overlaps(
     The number of cells that cover a position changes only across the surface of the mesh.  If any cells overlap, at
     least one of them is at the surface, so only the cells `outer` at the surface are checked.
 
-    `neighbours` (n, 2): pairs of cells that share a facet.
+    `domains` (n, 2^d, d): corners of the particle domains.
+    `cell` (n,): cell of each domain.
+    `neighbours` (m, 2): pairs of cells that share a facet.
     """
-    corners = [x[nodes] for nodes in cells.values()]
-    boxes = np.concatenate([np.stack([c.min(axis=1), c.max(axis=1)], axis=1) for c in corners])
-    size = boxes[:, 1] - boxes[:, 0]
-    slack = NEAR / 2 * size.min(axis=1) + rounding(x)
-    pairs = np.stack(_box_overlaps(boxes, size, outer, slack), axis=1)
-    both = np.unique(np.sort(pairs, axis=1) @ [len(boxes), 1])
-    both = np.setdiff1d(both, np.sort(neighbours, axis=1) @ [len(boxes), 1], assume_unique=True)
-    pairs = np.stack(np.divmod(both, len(boxes)), axis=1)
-    near_ones, place = np.unique(pairs, return_inverse=True)
-    kinds = np.repeat(np.arange(len(cells)), list(map(len, corners)))[near_ones]
-    row = near_ones - np.cumsum([0, *map(len, corners)])[kinds]
-    solid = Polytopes.of(x, {kind: nodes[row[kinds == k]] for k, (kind, nodes) in enumerate(cells.items())})
-    i, j = place.reshape(pairs.shape).T
-    slack = slack[near_ones] + 2 * solid.warp
-    deep, depth = solid.overlaps(i, j, slack[i] + slack[j])
-    if len(deep):
-        one, other = boxes[pairs[deep[depth.argmax()]]]
-        meet = (np.maximum(one[0], other[0]) + np.minimum(one[1], other[1])) / 2
-        what = f"{len(np.unique(pairs[deep]))} cells overlap, most deeply at {meet}"
-        raise ValueError(f"{name}: {what} by {depth.max():.3g} m; cells must be apart or touch")
+    slack = allowance(np.ptp(domains, axis=1).min(axis=1)) + rounding(domains) + 2 * warps(domains)
+    i, j = _box_overlaps(domains, np.flatnonzero(np.isin(cell, outer)), slack)
+    count = cell.max() + 1
+    both, shared = (np.sort(pairs, axis=1) @ [count, 1] for pairs in (np.stack([cell[i], cell[j]], axis=1), neighbours))
+    separate = (cell[i] != cell[j]) & ~np.isin(both, shared)
+    i, j = i[separate], j[separate]
+    depth = -separation(domains[i], domains[j])
+    deep = depth > slack[i] + slack[j]
+    if deep.any():
+        k = np.where(deep, depth, 0.0).argmax()
+        one, other = domains[i[k]], domains[j[k]]
+        meet = (np.maximum(one.min(axis=0), other.min(axis=0)) + np.minimum(one.max(axis=0), other.max(axis=0))) / 2
+        what = f"{len(np.unique(cell[[i[deep], j[deep]]]))} cells overlap, most deeply at {meet}"
+        raise ValueError(f"{name}: {what} by {depth[k]:.3g} m; cells must be apart or touch")
 
 
 def _box_overlaps(
-    boxes: NDArray[np.float64], size: NDArray[np.float64], outer: NDArray[np.int64], slack: NDArray[np.float64]
+    domains: NDArray[np.float64], outer: NDArray[np.int64], slack: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return pairs of cells with overlapping bounding boxes.  The first cell of a pair is one of `outer`."""
-    octave, middle = np.frexp(size.max(axis=1))[1], (boxes[:, 0] + boxes[:, 1]) / 2
-    of = [[rows[octave[rows] == k] for k in np.unique(octave[rows])] for rows in (outer, np.arange(len(boxes)))]
-    largest = [[size[rows].max(axis=0) for rows in groups] for groups in of]
+    """Return pairs of domains with overlapping bounding boxes.  The first domain of a pair is one of `outer`."""
+    low, high = domains.min(axis=1), domains.max(axis=1)
+    size, middle = high - low, (low + high) / 2
+    octave = np.frexp(size.max(axis=1))[1]
+    of = [[rows[octave[rows] == k] for k in np.unique(octave[rows])] for rows in (outer, np.arange(len(domains)))]
     out = [np.empty((2, 0), dtype=np.int64)]
-    for a, most in zip(of[0], largest[0], strict=True):
-        for b, other in zip(of[1], largest[1], strict=True):
-            trees = [cKDTree(middle[rows] * (2 / (most + other))) for rows in (a, b)]
-            pairs = trees[0].sparse_distance_matrix(trees[1], 1.0, p=np.inf, output_type="ndarray")
-            i, j = a[pairs["i"]], b[pairs["j"]]
-            overlap = (i != j) & (np.abs(middle[i] - middle[j]) < (size[i] + size[j]) / 2).all(axis=1)
-            i, j = i[overlap], j[overlap]
-            lap = np.minimum(boxes[i, 1], boxes[j, 1]) - np.maximum(boxes[i, 0], boxes[j, 0])
-            overlap = (lap > (slack[i] + slack[j])[:, None]).all(axis=1)
-            out.append(np.stack([i[overlap], j[overlap]]))
+    for a, b in product(*of):
+        scale = (size[a].max(axis=0) + size[b].max(axis=0)) / 2
+        trees = [cKDTree(middle[rows] / scale) for rows in (a, b)]
+        pairs = trees[0].sparse_distance_matrix(trees[1], 1.0, p=np.inf, output_type="ndarray")
+        i, j = a[pairs["i"]], b[pairs["j"]]
+        lap = np.minimum(high[i], high[j]) - np.maximum(low[i], low[j])
+        overlap = (i != j) & (lap > (slack[i] + slack[j])[:, None]).all(axis=1)
+        out.append(np.stack([i[overlap], j[overlap]]))
     return tuple(np.concatenate(out, axis=1))
 
 

@@ -21,6 +21,12 @@ from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
 from mpm_dolfinx.points.cutting import cut_at, kuhn_simplices
 
 BITS = corner_bits(2)  # Source: definition
+MISFIT = 1e-2
+"""Distance, divided by the cell size, by which surfaces that should touch may overlap or miss each other.
+
+This holds for tools and groups of bodies, and for bodies that are placed on others.  In a step, points may pass through
+thinner tools without notice.
+"""
 
 
 @dataclass
@@ -357,14 +363,18 @@ def solids(body: Body) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     if body.aligned and np.isclose(size.prod(), body.volume_of_boxes, rtol=SAME, atol=0):
         return (low + corner_bits(len(size)) * size)[None], allowance(np.full(1, edge))
     corners = body.corners()
-    warp = np.zeros(len(body))
-    if len(size) == 3 and not body.aligned:
-        for face, index in enumerate(FACES[3]):
-            f, n = corners[:, index], face_vectors(corners, face)  # only the part along the normal is warp
-            off = np.einsum("nd,nd->n", f[:, 0] - f[:, 1] - f[:, 2] + f[:, 3], n)
-            warp = np.maximum(warp, np.abs(off) / np.maximum(np.linalg.norm(n, axis=1), TINY) / 4)
-    edge = np.ptp(corners, axis=1).min(axis=1)
-    return corners, allowance(edge) + 2 * (body.bend(np.arange(len(body))) + warp)
+    warp = 0.0 if body.aligned else warps(corners)
+    return corners, allowance(np.ptp(corners, axis=1).min(axis=1)) + 2 * (body.bend(np.arange(len(body))) + warp)
+
+
+def warps(domains: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the largest distances (n,), in m, of domain corners (n, 2^d, d) from the mean planes of their faces."""
+    out = np.zeros(len(domains))
+    for face, index in enumerate(FACES[3] if domains.shape[2] == 3 else ()):
+        f, n = domains[:, index], face_vectors(domains, face)  # only the part along the normal is warp
+        off = np.einsum("nd,nd->n", f[:, 0] - f[:, 1] - f[:, 2] + f[:, 3], n)
+        out = np.maximum(out, np.abs(off) / np.maximum(np.linalg.norm(n, axis=1), TINY) / 4)
+    return out
 
 
 def allowance(edge: NDArray[np.float64]) -> NDArray[np.float64]:

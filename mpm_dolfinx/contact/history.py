@@ -10,7 +10,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from mpm_dolfinx.grid.grid import sum_by
+from mpm_dolfinx.grid.grid import means_of_rows
 from mpm_dolfinx.parallel.exchange import Exchange
 from mpm_dolfinx.points.material_points import MaterialPoints
 
@@ -53,12 +53,9 @@ class Origin:
         for number, (name, contact) in enumerate(contacts.items()):
             rows = np.flatnonzero(self.number == number)
             at, area = self.point[rows], self.area[rows]
-            whole = sum_by(at, area, n)
-            whole[whole == 0] = 1.0
-            means = [sum_by(at, area * column, n) / whole for column in (push[rows], *shear[rows].T)]
-            data[pressure_name(name)] = means[0]
+            data[pressure_name(name)] = means_of_rows(at, area, push[rows], n)
             if contact.frictional:
-                data[shear_name(name)] = np.stack(means[1:], axis=1)
+                data[shear_name(name)] = means_of_rows(at, area, shear[rows], n)
         return replace(points, data=data)
 
 

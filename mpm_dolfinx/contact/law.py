@@ -38,7 +38,7 @@ from mpm_dolfinx.base.tolerances import EPSILON, NEAR, ROUND_OFF, TINY
 from mpm_dolfinx.base.validation import line
 from mpm_dolfinx.contact.history import Rough
 from mpm_dolfinx.contact.pairs import Geometry, Pairs
-from mpm_dolfinx.grid.grid import sum_by
+from mpm_dolfinx.grid.grid import means_of_rows, sum_by, sums_of_rows
 from mpm_dolfinx.parallel.exchange import first, over_all
 
 STIFF = 100.0
@@ -133,15 +133,11 @@ class ContactLaw:
 
     def total(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the sums (k, ...) of values (m, ...) over the pairs of each condition."""
-        size = len(self.area)
-        columns = values.reshape(len(values), int(np.prod(values.shape[1:], dtype=int))).T
-        out = np.stack([sum_by(self.of, column, size) for column in columns], axis=1)
-        return out.reshape(size, *values.shape[1:])
+        return sums_of_rows(self.of, values, len(self.area))
 
     def mean(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the area-weighted means (k, ...) of values (m, ...) over the pairs of each condition."""
-        each = (slice(None), *(None,) * (values.ndim - 1))
-        return self.total(self.pairs.area[each] * values) / self.area[each]
+        return means_of_rows(self.of, self.pairs.area, values, len(self.area))
 
     def stiffness(self, state: ContactState) -> NDArray[np.float64]:
         """Return the stiffness k (m,), in Pa/m, of the pairs."""
@@ -278,9 +274,7 @@ class ContactLaw:
 
     def by_contact(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the sums (contacts, ...) of values (m, ...) over the pairs of each contact, on all processes."""
-        columns = values.reshape(len(values), int(np.prod(values.shape[1:], dtype=int))).T
-        sums = np.stack([sum_by(self.pairs.number, column, len(self.contacts)) for column in columns], axis=1)
-        return over_all(self.grid.comm, sums).reshape(len(self.contacts), *values.shape[1:])
+        return over_all(self.grid.comm, sums_of_rows(self.pairs.number, values, len(self.contacts)))
 
     def forces(self, touch: Touch, at: Geometry) -> NDArray[np.float64]:
         """Return the forces, in N, and moments, in N m, of each contact on the bodies, as sums over all processes.

@@ -20,14 +20,14 @@ from mpm_dolfinx.base.errors import NotConverged
 from mpm_dolfinx.base.tolerances import NEAR, TINY
 from mpm_dolfinx.base.validation import line
 from mpm_dolfinx.bodies.faces import Surface, surface
-from mpm_dolfinx.bodies.touching import BITS, local, weights
+from mpm_dolfinx.bodies.touching import BITS, MISFIT, local, weights
 from mpm_dolfinx.conditions.acting import Loads, Place, Setting
 from mpm_dolfinx.contact.groups import Contact
 from mpm_dolfinx.contact.history import Origin, pressure_name, shear_name
 from mpm_dolfinx.contact.law import ContactLaw
 from mpm_dolfinx.contact.pairs import FacePairs, between_cells
 from mpm_dolfinx.contact.problem import ContactProblem, Touching
-from mpm_dolfinx.contact.tool_placing import BEGINS, FACING
+from mpm_dolfinx.contact.tool_placing import FACING
 from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.forms.unknowns import Unknowns
 from mpm_dolfinx.parallel.exchange import Exchange, first, over_all
@@ -280,7 +280,7 @@ class Contacts(Touching):
         for number, faces, others, _ in self._faces:
             _, pairs = self._opposite(cut, faces, others, points)
             deepest = over_all(comm, float(pairs.gap.min(initial=np.inf)), MPI.MIN)
-            if deepest < -BEGINS * h:
+            if deepest < -MISFIT * h:
                 row = pairs.row[pairs.gap == deepest][:1]
                 where = first(comm, "".join(f"{x}" for x in cut.surface(faces).now(points)[row] + cut.grid.base))
                 return f"{line(self.contacts[number])}: bodies overlap by {-deepest / h:.3g} cells at {where}"

@@ -55,8 +55,7 @@ class Pairs:
     def at(self, w: NDArray[np.float64], motion: NDArray[np.float64]) -> Geometry:
         """Return the geometry at the relative displacements w (m, d), in m.
 
-        `motion` (contacts,), in m: displacements of tools that loads cause in the step.  With free tools, its shape is
-        (contacts, q), with displacements in m and rotations in rad.
+        `motion` (contacts, q), in m and rad: motions of tools that forces cause in the step, see `motion_count`.
         """
         raise NotImplementedError
 
@@ -95,23 +94,23 @@ class ToolPairs(Pairs):
         n = np.zeros((m, d))
         second = np.zeros((m, d, d))
         middle = np.zeros((m, d))
-        shift = motion if motion.ndim > 1 else motion[:, None] * [tool.along(d) for tool in self.tools]
         x = self.now + w
-        carried = self.carried + shift[self.number, :d]
+        carried = self.carried + motion[self.number, :d]
         shear = self.shear.copy()
 
         def ask() -> None:
             for number, (tool, pose) in enumerate(zip(self.tools, self.poses, strict=True)):
                 rows = np.flatnonzero(self.number == number)
-                before, pose = pose, pose.moved(shift[number])
+                before, pose = pose, pose.moved(motion[number])
                 if pose.R is not before.R:
                     turn = pose.R @ before.R.T
                     carried[rows] = pose.put(before.own(self.carried[rows]))
                     shear[rows] = shear[rows] @ turn.T
                 y, middle[rows] = pose.own(x[rows]), pose.centre + pose.shift
-                gap[rows], normal, curvature = tool.geometry(y, h)
+                solid = tool.solid(h)
+                gap[rows], normal, curvature = solid.geometry(y)
                 n[rows], second[rows] = normal @ pose.R.T, pose.R @ curvature @ pose.R.T
-                if isinstance(tool.solid(h), Distance):
+                if isinstance(solid, Distance):
                     _check_distance(tool, x[rows] + self.grid.base, gap[rows], n[rows], h)
 
         together(self.grid.comm, ask)

@@ -7,22 +7,13 @@ bodies are therefore equal and opposite within rounding.  If both sides deform, 
 start of the step.  After convergence, the pairs are updated at the new positions, and the step is solved again.  The
 updates end when gaps change by less than `DEPTH` cells.
 
-A load-controlled tool has one more unknown: its displacement a along the direction e of the load.  Let `f(w - a e)` be
-the forces on points.  Let D be minus the derivative of these forces with respect to w, and let `s = e . D e`.  Newton's
-method solves `e . f = load` together with the equilibrium of the bodies, by
-
-    da = (e . D dw + load - e . f) / s.
-
-The forces are therefore `f + (D e) (load - e . f) / s`.  Minus the derivative of these forces is
-`D - (D e) (e . D) / s`.
+Forces may also move the tools, see `moved_tools`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from copy import copy
-from dataclasses import dataclass, fields, replace
-from functools import cached_property
+from dataclasses import fields, replace
 from typing import Any, NamedTuple
 
 from mpi4py import MPI
@@ -33,8 +24,6 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.caching import Latest
-from mpm_dolfinx.base.errors import NotConverged
-from mpm_dolfinx.base.tolerances import EPSILON, SAME
 from mpm_dolfinx.conditions.acting import Acting, At, Loads, Setting
 from mpm_dolfinx.conditions.conditions import resistance
 from mpm_dolfinx.contact.history import Origin, Rough, joined, pressure_name, shear_name
@@ -45,45 +34,24 @@ from mpm_dolfinx.parallel.exchange import Exchange, over_all
 from mpm_dolfinx.points.material_points import MaterialPoints
 
 
-@dataclass(frozen=True, eq=False)
-class Pushes:
-    """Prescribed loads on load-controlled tools."""
-
-    names: Sequence[str]  # names of the tools, for error messages
-    start: NDArray[np.float64]  # displacement that the load caused before the step (k,), m
-    direction: NDArray[np.float64]  # unit vector of the load (k, d)
-    load: NDArray[np.float64]  # load (k,), N; nan for tools without a load
-
-
-@dataclass(frozen=True, eq=False)
-class LinearMotion:
-    """Displacements of load-controlled tools in a step, as a linear function of relative displacements w'.
-
-    The displacements are `motion + shift + sum slope . (w' - w)`.  The sum is over the pairs of a tool.
-    """
-
-    w: NDArray[np.float64]  # relative displacements of the pairs (m, d), m
-    motion: NDArray[np.float64]  # displacements of the tools at w (k,), m
-    shift: NDArray[np.float64]  # Newton increment of `motion` (k,), m
-    slope: NDArray[np.float64]  # derivative with respect to the relative displacements of each pair (m, d)
-
-
 class Found(NamedTuple):
     """Geometry, forces and tool motions of a contact at given displacements."""
 
+    w: NDArray[np.float64]  # relative displacements of the pairs (m, d), m
     at: Geometry  # geometry of the pairs
     touch: Touch  # forces of the pairs
-    motion: NDArray[np.float64]  # displacements of tools that loads cause (k,), m
+    motion: NDArray[np.float64]  # motions of tools that forces cause (k, q), m and rad
     balanced: NDArray[np.float64]  # forces on points after the Newton increment of the tools (m, d), N
+    equation: Any = None  # equation of motion of tools that forces move, see `moved_tools`
 
 
 class Current(NamedTuple):
-    """Current contact pairs with their law, material points, state of the iterations, and tool motions."""
+    """Current contact pairs with their law, material points, and state of the iterations."""
 
     law: ContactLaw
     origin: Origin
     state: ContactState
-    linear: LinearMotion | None = None
+    linear: Found | None = None  # contact at which the motion of tools is linearised
 
 
 class SubstepMotion(NamedTuple):
@@ -129,8 +97,6 @@ class ContactProblem(Loads):
     ----------
     law, origin
         Contact law at the start of the step, and the material points of its pairs.
-    pushes
-        Prescribed loads on the tools.
     again
         Function of displacements (a local array, in m), which finds the pairs at these displacements.  It returns the
         law and the origin of the pairs, see `FacePairs`.
@@ -139,24 +105,21 @@ class ContactProblem(Loads):
     """
 
     linear, smooth, touches = False, False, True
+    key = ()
 
     def __init__(
         self,
         law: ContactLaw,
         origin: Origin,
-        pushes: Pushes | None = None,
         again: Callable[[NDArray[np.float64]], tuple[ContactLaw, Origin]] | None = None,
         cell_pairs: Callable[[], NDArray[np.int64]] | None = None,
     ):
         self.grid = law.grid
-        self.pushes = pushes
         self._again = again
         self._cell_pairs = cell_pairs
         self.now = Current(law, origin, law.begins())
         self._operator: Latest[tuple[PETSc.Mat, PETSc.Vec]] = Latest()
         self._found: Latest[Found] = Latest()
-        if self.pushed:
-            self.now = self.now._replace(linear=self._linearised(np.zeros_like(law.pairs.x), self._begins()))
 
     @property
     def pairs(self) -> Pairs:
@@ -164,30 +127,14 @@ class ContactProblem(Loads):
         return self.now.law.pairs
 
     @property
-    def pushed(self) -> bool:
-        """Whether any tool is load-controlled."""
-        return self.pushes is not None and not np.isnan(self.pushes.load).all()
-
-    @property
     def couples(self) -> bool:
         """Whether the contact couples nodes of different cells."""
-        return self.pushed or self._cell_pairs is not None
+        return self._cell_pairs is not None
 
     @property
-    def _loaded(self) -> NDArray[np.int64]:
-        """Indices of the tools that loads move."""
-        return np.flatnonzero(~np.isnan(self.pushes.load)) if self.pushed else np.empty(0, dtype=np.int64)
-
-    @cached_property
-    def key(self) -> tuple[NDArray[np.int32], ...]:
-        """The cells under each tool that loads move."""
-        return tuple(np.unique(self.pairs.cell[self.pairs.number == number]) for number in self._loaded)
-
-    def joined(self, substeps: Sequence[ContactProblem]) -> ContactProblem:
-        """See `Loads`."""
-        out = copy(self)
-        out.key = tuple(np.unique(np.concatenate(cells)) for cells in zip(*(one.key for one in substeps), strict=True))
-        return out
+    def still(self) -> NDArray[np.float64]:
+        """Motions of tools (k, q) without forces, in m and rad.  Between groups there are no tools, and q is 0."""
+        return np.zeros((len(self.now.law.contacts), 0))
 
     def found(self, at: At) -> Found:
         """Return the contact at the displacements u."""
@@ -214,15 +161,15 @@ class ContactProblem(Loads):
         return self._operator((law, unknowns), make, self.grid.comm) if law is self.now.law else make()
 
     def _find_at(self, w: NDArray[np.float64], motion: NDArray[np.float64]) -> Found:
-        law, state = self.now.law, self.now.state
-        of = self.pairs.number
+        """Return the contact at relative displacements w and motions of the tools."""
+        law = self.now.law
         at = law.pairs.at(w, motion)
-        touch = law.touch(state, at)
-        found = Found(at, touch, motion, touch.force)
-        if not self.pushed:
-            return found
-        more = law.slope(touch, at, self._shift(found)[of, None] * self.pushes.direction[of])
-        return found._replace(balanced=touch.force + more)
+        touch = law.touch(self.now.state, at)
+        return Found(w, at, touch, motion, touch.force)
+
+    def _motion(self, w: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the motions of tools that forces cause at relative displacements w."""
+        return self.still
 
     def closed(self, at: At) -> NDArray[np.bool_]:
         """Return which pairs (m,) of contacts that conduct are closed at u: their gap is at most `DEPTH` cells."""
@@ -240,7 +187,7 @@ class ContactProblem(Loads):
     def pattern(self, unknowns: Unknowns) -> PETSc.Mat | None:
         """Return a zero matrix with the entries that `coupling` adds to the pattern of cells, or None."""
         out = self._pattern_of_pairs(unknowns) if self._cell_pairs is not None else None
-        for cells in self.key:
+        for cells in self.key:  # a tool that forces move couples the nodes of all cells under it
             B, own = at_nodes(self.grid, unknowns, cells, np.ones((len(cells), 2**self.grid.dim))), unknowns.vector()
             ones = B.createVecLeft()
             ones.set(1.0)
@@ -270,19 +217,9 @@ class ContactProblem(Loads):
     def coupling(self, at: At) -> PETSc.Mat:
         """Return minus the derivative of the contact forces at u."""
         collect_garbage(self.grid.comm)  # with friction in 3D, pairs in 12 cells fill 60 MB in each iteration
-        where, touch, *_ = found = self.found(at)
-        law = self.now.law
-        unknowns = at.unknowns
-        B, _ = self._B(law, unknowns)
-        K = petsc_matrix(law.tangent(touch, where), B.getLocalSize()[0], self.grid.comm, own=True).PtAP(B)
-        if not self.pushed:
-            return K
-        _, slope, _ = self._reactions(found)
-        for k in np.flatnonzero((slope > 0) & ~np.isnan(self.pushes.load)):
-            e = self.pushes.direction[k] * (self.pairs.number == k)[:, None]
-            sides = (self._nodal(unknowns, law.slope(touch, where, e, adjoint)) for adjoint in (False, True))
-            K.axpy((SAME - 1) / slope[k], outer(*sides), PETSc.Mat.Structure.UNKNOWN)
-        return K
+        found, law = self.found(at), self.now.law
+        B, _ = self._B(law, at.unknowns)
+        return petsc_matrix(law.tangent(found.touch, found.at), B.getLocalSize()[0], self.grid.comm, own=True).PtAP(B)
 
     def _nodal(self, unknowns: Unknowns, values: NDArray[np.float64]) -> PETSc.Vec:
         """Return the nodal forces `B^T v` for values v at the pairs."""
@@ -292,108 +229,21 @@ class ContactProblem(Loads):
         B.multTranspose(w, out)
         return out
 
-    def _motion(self, w: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the displacements of tools that loads cause, from the last linearisation."""
-        if not self.pushed:
-            return np.zeros(len(self.now.law.contacts)) if self.pushes is None else np.zeros_like(self.pushes.start)
-        linear, h = self.now.linear, self.grid.least
-        if not over_all(self.grid.comm, int((w != linear.w).any())):
-            return linear.motion
-        more = self.now.law.by_contact((linear.slope * (w - linear.w)).sum(axis=1)[:, None])[:, 0]
-        return np.clip(linear.motion + linear.shift + more, -h, h)
-
-    def _linearised(self, w: NDArray[np.float64], motion: NDArray[np.float64]) -> LinearMotion:
-        """Return the linearised displacements of the tools."""
-        law, of = self.now.law, self.pairs.number
-        at, touch, *_ = found = self._find_at(w, motion)
-        _, slope, _ = self._reactions(found)
-        by = np.divide(1, slope, out=np.zeros(len(slope)), where=slope > 0)
-        shift = self._shift(found)
-        slope = law.slope(touch, at, self.pushes.direction[of], adjoint=True)
-        return LinearMotion(w, motion, shift, by[of, None] * slope)
-
-    def _reactions(self, found: Found) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Return the reactions of tools along their loads, with their derivatives and rounding errors."""
-        law, e = self.now.law, self.pushes.direction[self.pairs.number]
-        slope = law.slope(found.touch, found.at, e)
-        both = (e * found.touch.force).sum(axis=1), (e * slope).sum(axis=1)
-        reaction, slope = law.by_contact(np.stack(both, axis=1)).T
-        off = law.rounding(self.now.state) * (found.touch.stiff > 0)
-        return reaction, slope, law.by_contact(off[:, None])[:, 0]
-
-    def _seek(self, found: Found) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Return the displacements of tools at which one point would bear the load, and which tools touch bodies."""
-        law, state = self.now.law, self.now.state
-        of = self.pairs.number
-        along, k = (found.at.n * self.pushes.direction[of]).sum(axis=1), law.stiffness(state)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            far = found.at.gap - state.pressure[law.of] / k + self.pushes.load[of] / (k * self.pairs.area * along)
-            far = np.where(along > 0, far / along, np.inf)
-        nearest = np.full(len(self.pushes.load), np.inf)  # inf: no point can bear the load
-        np.minimum.at(nearest, of, far)
-        touches = law.by_contact((found.touch.push > 0)[:, None].astype(float))[:, 0] > 0
-        return over_all(self.grid.comm, nearest, MPI.MIN), touches
-
-    def _shift(self, found: Found) -> NDArray[np.float64]:
-        """Return the Newton increments of tool displacements that bring reactions to the loads."""
-        reaction, slope, _ = self._reactions(found)
-        off = np.nan_to_num(self.pushes.load - reaction)
-        far, touches = self._seek(found)
-        seeks = np.where((off > 0) & ~touches, np.minimum(far, self.grid.least), 0.0)  # slip alone has no stiffness
-        return np.divide(off, slope, out=seeks, where=slope > 0)
-
-    def _begins(self) -> NDArray[np.float64]:
-        """Return guesses of tool displacements.  Tools move at most until a point bears the load."""
-        motion = np.zeros(len(self.now.law.contacts))
-        still = np.zeros_like(self.pairs.x)
-        h = self.grid.least
-        for _ in range(ROUNDS):
-            found = self._find_at(still, motion)
-            before, motion = motion, np.clip(motion + np.minimum(self._shift(found), self._seek(found)[0]), -h, h)
-            if np.abs(motion - before).max() <= EPSILON * self.grid.reach:
-                break
-        return motion
-
     def settle(self, at: At, sticks: bool) -> bool:
         """See `Loads`.  Each condition, one for each contact and cell, may change between stick and slip."""
-        changed, w = False, self._apart_by(self.now.law, at) if self.pushed else None
-        motion = self.found(at).motion
-        if self.now.law.frictional:
-            state, changed = self.now.law.choose(self.now.state, self.found(at).touch, sticks)
-            self.now = self.now._replace(state=state)
-        if self.pushed:
-            self.now = self.now._replace(linear=self._linearised(w, motion))
+        if not self.now.law.frictional:
+            return False
+        state, changed = self.now.law.choose(self.now.state, self.found(at).touch, sticks)
+        self.now = self.now._replace(state=state)
         return changed
 
     def augment(self, at: At) -> bool:
-        """Augment the contact pressures if mean penetrations are too large, and return whether contact forces changed.
-
-        If penetrations are small enough, tools whose reaction differs from the load are moved.
-        """
-        found = self.found(at)
+        """Augment the contact pressures if mean penetrations are too large, and return whether forces changed."""
         law, state = self.now.law, self.now.state
         part = at.parts.cells[law.cell]
-        new = law.augmented(state, found.touch, lambda of: at.parts.largest(self.grid.comm, part, of)[part])
+        new = law.augmented(state, self.found(at).touch, lambda of: at.parts.largest(self.grid.comm, part, of)[part])
         self.now = self.now._replace(state=new)
-        if new is not state or not self.pushed:
-            return new is not state
-        reaction, slope, unknown = self._reactions(found)
-        load, h = self.pushes.load, self.grid.least
-        off = np.nan_to_num(reaction - load)
-        wrong = np.abs(off) > np.maximum(SAME * np.nan_to_num(load), unknown)
-        if not wrong.any():
-            return False
-        _, touches = self._seek(found)
-        failed = wrong & ((found.motion >= h) | (touches & (slope <= 0)))
-        for k in np.flatnonzero(failed)[:1]:
-            why = f"the reaction is {reaction[k]:.6g} N for any displacement; do the bodies constrain the tool?"
-            if reaction[k] == 0:
-                why = "there is no contact within a cell; does the tool start at the surface of a body?"
-            raise NotConverged(f"{self.pushes.names[k]}: load {load[k]:.6g} N, but {why}")
-        linear = self.now.linear
-        motion = np.clip(linear.motion + linear.shift * wrong, -h, h)
-        self.now = self.now._replace(linear=self._linearised(linear.w, motion))
-        return True
+        return new is not state
 
     def follow(self, at: At) -> bool:
         """Update the pairs at u, and return whether the update changes the equilibrium."""
@@ -465,23 +315,20 @@ class ContactProblem(Loads):
         return 0.0
 
     def outcome(self, at: At) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """See `Loads`.  Results are forces (N) and moments (N m) on bodies, and tool displacements (m) due to loads.
+        """See `Loads`.  Results are forces (N) and moments (N m) on bodies.
 
         The forces and moments of each contact are one array: (3,), or (6,) in 3D.
         """
-        where, touch, motion, _ = self.found(at)
-        names = self.now.law.names
+        found, where = self.found(at), self.found(at).at
         if self.pairs.other_side() is not None:  # arms to present positions: moments of a body at rest sum to zero
             where = where._replace(arm=where.arm + self.grid.at(self.pairs.cell, self.pairs.x, at.nodal))
-        out = {"tool_forces": dict(zip(names, self.now.law.forces(touch, where), strict=True))}
-        if self.pushes is not None:
-            out["tool_travel"] = dict(zip(names, self.pushes.start + motion, strict=True))
-        return out
+        return {"tool_forces": dict(zip(self.now.law.names, self.now.law.forces(found.touch, where), strict=True))}
 
     def touching(self) -> tuple[NDArray[np.int32], NDArray[np.int64] | None, NDArray[np.float64], NDArray[np.float64]]:
         """See `Loads`.  With friction or adhesion, contact constrains all directions."""
-        at, touch, *_ = self._find_at(np.zeros_like(self.pairs.x), np.zeros(len(self.now.law.contacts)))
         law = self.now.law
+        at = law.pairs.at(np.zeros_like(self.pairs.x), self.still)
+        touch = law.touch(self.now.state, at)
         d = self.grid.dim
         other = self.pairs.other_side()
         on = np.flatnonzero(touch.stiff > 0)

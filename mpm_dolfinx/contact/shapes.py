@@ -20,6 +20,10 @@ DISTANCE = 0.1
 """Largest deviation of the slope of a user's distance function from 1."""
 
 
+DistanceField = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
+"""Signed distances (n,), in m, their gradients (n, d), and their second derivatives (n, d, d), in 1/m."""
+
+
 class Shape(Protocol):
     """A rigid solid.  Positions y (n, d), in m, are in the frame of the tool."""
 
@@ -29,15 +33,16 @@ class Shape(Protocol):
     def normal(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the gradients (n, d) of the distance."""
 
-    def curvature(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the second derivatives (n, d, d) of the distance, in 1/m."""
+    def geometry(self, y: NDArray[np.float64]) -> DistanceField:
+        """Return the signed distances with their first and second derivatives."""
 
 
 def _flat(y: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the second derivatives of the distance from planes, which are zero."""
     return np.zeros((*y.shape, y.shape[1]))
 
 
-def _across(offset: NDArray[np.float64]) -> tuple[NDArray, NDArray, NDArray]:
+def _across(offset: NDArray[np.float64]) -> DistanceField:
     """Return the lengths of vectors, their directions, and the second derivatives of the lengths."""
     r = np.maximum(np.linalg.norm(offset, axis=1), TINY)
     e = offset / r[:, None]
@@ -78,6 +83,14 @@ class Placed:
         place = fields(self)[0].name
         return replace(self, **{place: np.asarray(getattr(self, place)) + by})
 
+    def geometry(self, y: NDArray[np.float64]) -> DistanceField:
+        """Return the signed distances with their first and second derivatives."""
+        raise NotImplementedError
+
+    def normal(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the gradients (n, d) of the distance, or a mean normal where several parts are equally near."""
+        return self.geometry(y)[1]
+
 
 @dataclass(frozen=True, eq=False)
 class HalfSpace(Placed):
@@ -105,13 +118,9 @@ class HalfSpace(Placed):
         """Return the signed distances (n,), in m, from the surface."""
         return (y - self.point) @ self._n
 
-    def normal(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the gradients (n, d) of the distance."""
-        return np.broadcast_to(self._n, y.shape)
-
-    def curvature(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the second derivatives (n, d, d) of the distance, in 1/m."""
-        return _flat(y)
+    def geometry(self, y: NDArray[np.float64]) -> DistanceField:
+        """See `Placed`."""
+        return self.distance(y), np.broadcast_to(self._n, y.shape), _flat(y)
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,15 +144,12 @@ class Ball(Placed):
 
     def distance(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the signed distances (n,), in m, from the surface."""
-        return _across(y - self.centre)[0] - self.radius
+        return np.linalg.norm(y - self.centre, axis=1) - self.radius
 
-    def normal(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the gradients (n, d) of the distance."""
-        return _across(y - self.centre)[1]
-
-    def curvature(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the second derivatives (n, d, d) of the distance, in 1/m."""
-        return _across(y - self.centre)[2]
+    def geometry(self, y: NDArray[np.float64]) -> DistanceField:
+        """See `Placed`."""
+        r, e, second = _across(y - self.centre)
+        return r - self.radius, e, second
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,15 +192,12 @@ class Convex(Placed):
         """Return the signed distances (n,), in m, from the surface."""
         return self._each(y).max(axis=1)
 
-    def normal(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the gradients (n, d) of the distance.  Where planes are equally near, return their mean normal."""
+    def geometry(self, y: NDArray[np.float64]) -> DistanceField:
+        """See `Placed`.  Where planes are equally near, the gradient is their mean normal."""
         each = self._each(y)
-        near = each >= each.max(axis=1, keepdims=True) - ROUNDED * np.abs(each).max(axis=1, keepdims=True)
-        return near @ self._planes[:, :-1] / near.sum(axis=1, keepdims=True)
-
-    def curvature(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the second derivatives (n, d, d) of the distance, in 1/m."""
-        return _flat(y)
+        gap = each.max(axis=1)
+        near = each >= gap[:, None] - ROUNDED * np.abs(each).max(axis=1, keepdims=True)
+        return gap, near @ self._planes[:, :-1] / near.sum(axis=1, keepdims=True), _flat(y)
 
 
 def uniform(shape: Ball | Convex) -> Uniform:
@@ -237,31 +240,29 @@ class Cone(Placed):
     def _axis(self) -> NDArray[np.float64]:
         return unit_vector("Cone: axis", self.axis)
 
-    def _polar(self, y: NDArray[np.float64]) -> tuple:
-        """Return the heights above the tip, in m, and the results of `_across` for the offsets from the axis."""
+    def _polar(self, y: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the heights (n,) above the tip, and the offsets (n, d) from the axis, in m."""
         z = (y - self.tip) @ self._axis
-        return z, *_across(y - self.tip - z[:, None] * self._axis)
+        return z, y - self.tip - z[:, None] * self._axis
 
     def distance(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the signed distances (n,), in m, from the flank."""
-        z, r, _, _ = self._polar(y)
+        z, offset = self._polar(y)
         beta = np.radians(self.angle_deg)
-        return r * np.cos(beta) - z * np.sin(beta)
+        return np.linalg.norm(offset, axis=1) * np.cos(beta) - z * np.sin(beta)
 
-    def normal(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the gradients (n, d) of the distance.  On the axis, return the mean of the flank's normals."""
+    def geometry(self, y: NDArray[np.float64]) -> DistanceField:
+        """See `Placed`.  On the axis, the gradient is the mean of the flank's normals."""
+        z, offset = self._polar(y)
+        r, away, second = _across(offset)
         beta = np.radians(self.angle_deg)
-        z, r, away, _ = self._polar(y)
-        return away * (r > ROUNDED * np.abs(z))[:, None] * np.cos(beta) - self._axis * np.sin(beta)
-
-    def curvature(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the second derivatives (n, d, d) of the distance, in 1/m."""
-        _, r, _, second = self._polar(y)
+        normal = away * (r > ROUNDED * np.abs(z))[:, None] * np.cos(beta) - self._axis * np.sin(beta)
+        gap = r * np.cos(beta) - z * np.sin(beta)
         if y.shape[1] == 2:
-            return _flat(y)
+            return gap, normal, _flat(y)
         near_axis = r[:, None, None] <= NEAR * np.abs(y - self.tip).max(initial=0.0)
         along = self._axis[:, None] * self._axis / np.where(near_axis, np.inf, r[:, None, None])
-        return np.where(near_axis, 0.0, second - along) * np.cos(np.radians(self.angle_deg))
+        return gap, normal, np.where(near_axis, 0.0, second - along) * np.cos(beta)
 
 
 @dataclass(frozen=True, eq=False)
@@ -297,12 +298,12 @@ class Distance:
         slopes = [(self._at(y + e) - self._at(y - e)) / (2 * step) for e in step * np.eye(y.shape[1])]
         return np.stack(slopes, axis=1)
 
-    def curvature(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the second derivatives (n, d, d) of the distance, in 1/m."""
-        y, wide = y + self.base, _power_of_two(SECOND * self.size)
+    def geometry(self, y: NDArray[np.float64]) -> DistanceField:
+        """See `Placed`."""
+        at, wide = y + self.base, _power_of_two(SECOND * self.size)
         steps = wide * np.eye(y.shape[1])
-        slopes = [(self._slopes(y + e, wide) - self._slopes(y - e, wide)) / (2 * wide) for e in steps]
-        return np.stack(slopes, axis=2)
+        slopes = [(self._slopes(at + e, wide) - self._slopes(at - e, wide)) / (2 * wide) for e in steps]
+        return self.distance(y), self.normal(y), np.stack(slopes, axis=2)
 
 
 def _power_of_two(x: float) -> float:

@@ -11,27 +11,19 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from mpm_dolfinx.base.tolerances import NEAR, ROUND_OFF, TINY
 from mpm_dolfinx.base.validation import line, numbers
 from mpm_dolfinx.bodies.mesh_files import surface_of
-from mpm_dolfinx.contact.shapes import ROUNDED, Placed
+from mpm_dolfinx.contact.shapes import ROUNDED, DistanceField, Placed
+from mpm_dolfinx.grid.grid import linked
 from mpm_dolfinx.points.facet_search import AT_ONCE, FacetTree
 
 if TYPE_CHECKING:  # meshio takes long to import, so functions import it
     import meshio
 
 SHAPES = {2: "(n, 2) in 2D", 3: "(n, 3) in 3D"}
-
-
-def _groups(count: int, i: NDArray[np.int64], j: NDArray[np.int64]) -> tuple[int, NDArray[np.int64]]:
-    """Return the number of groups of connected objects, and the group of each object."""
-    links = coo_matrix((np.ones(len(i), dtype=bool), (i, j)), shape=(count, count))
-    number, group = connected_components(links, directed=False)
-    return number, group.astype(np.int64)
 
 
 def _place(x: NDArray[np.float64]) -> str:
@@ -300,39 +292,21 @@ class SurfaceMesh(Placed):
         """Lower and upper corner of the box around the mesh, in m."""
         return self.vertices.min(axis=0), self.vertices.max(axis=0)
 
-    def normal(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the gradients (n, d) of the distance.  On edges and vertices, return the mean normal."""
-        return self._normal(y, *self._near(y))
-
-    def _normal(self, y: NDArray[np.float64], near: Nearest, n: NDArray, gap: NDArray) -> NDArray[np.float64]:
-        n = n.copy()
-        on = np.flatnonzero(np.abs(gap) <= self._table.rounded)
-        n[on] = self._normals[near.facet[on], self._table.part_at(y[on], near.facet[on])]
-        away = (near.part > 0) & (np.abs(gap) > self._table.rounded)
-        return np.where(away[:, None], near.offset / np.where(away, gap, 1.0)[:, None], n)
-
-    def curvature(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the second derivatives (n, d, d) of the distance, in 1/m."""
-        near, _, gap = self._near(y)
-        return self._curvature(near, gap)
-
-    def geometry(self, y: NDArray[np.float64]) -> tuple[NDArray, NDArray, NDArray]:
-        """Return distances, gradients and second derivatives with a single search of the nearest facets."""
+    def geometry(self, y: NDArray[np.float64]) -> DistanceField:
+        """See `Placed`.  On edges and vertices, the gradient is the mean normal."""
         near, n, gap = self._near(y)
-        return gap, self._normal(y, near, n, gap), self._curvature(near, gap)
-
-    def _curvature(self, near: Nearest, gap: NDArray[np.float64]) -> NDArray[np.float64]:
-        d = near.offset.shape[1]
-        away = (near.part > 0) & (np.abs(gap) > self._table.rounded)
-        gap = np.where(away, gap, np.inf)
-        e = near.offset / gap[:, None]
-        out = np.eye(d) - e[:, :, None] * e[:, None, :]
+        d, on = y.shape[1], np.abs(gap) <= self._table.rounded
+        n = n.copy()
+        n[on] = self._normals[near.facet[on], self._table.part_at(y[on], near.facet[on])]
+        away = (near.part > 0) & ~on
+        far = np.where(away, gap, np.inf)[:, None]
+        e = near.offset / far
+        second = np.eye(d) - e[:, :, None] * e[:, None, :]
         if d == 3:
-            k = (near.part - 1) % d
-            t = self._table.along[near.facet, k] * ((near.part > 0) & (near.part <= d))[:, None]
+            t = self._table.along[near.facet, (near.part - 1) % d] * ((near.part > 0) & (near.part <= d))[:, None]
             t = t / np.maximum(np.linalg.norm(t, axis=1), TINY)[:, None]
-            out -= t[:, :, None] * t[:, None, :]
-        return out / gap[:, None, None]
+            second -= t[:, :, None] * t[:, None, :]
+        return gap, np.where(away[:, None], e, n), second / far[:, None]
 
     @cached_property
     def _moments(self) -> tuple[float, NDArray, NDArray]:
@@ -372,7 +346,7 @@ def _merged(x: NDArray[np.float64], facets: NDArray[np.int64]) -> tuple[NDArray[
     facets = same.ravel()[facets.reshape(-1, x.shape[1])]
     size = np.ptp(x, axis=0).max(initial=0.0) if len(x) else 0.0
     pairs = cKDTree(x).query_pairs(NEAR * size, output_type="ndarray") if size else np.zeros((0, 2), np.int64)
-    _, group = _groups(len(x), *pairs.T)
+    group, _ = linked(len(x), *pairs.T)
     first = np.unique(group, return_index=True)[1]
     x, facets = x[first], group[facets]
     facets = facets[(facets != np.roll(facets, 1, axis=1)).all(axis=1)]
@@ -409,7 +383,7 @@ def _closed(x: NDArray[np.float64], facets: NDArray[np.int64]) -> tuple[NDArray,
         flip = sense[one] == sense[other]
         ahead = [(k // d) * d + (k + 1) % d for k in (one, other)]
         start, end = np.where(flip, other, ahead[1]), np.where(flip, ahead[1], other)
-        number, fan = _groups(len(side), np.append(one, ahead[0]), np.append(start, end))
+        fan, number = linked(len(side), np.append(one, ahead[0]), np.append(start, end))
         if number > len(x):
             twice = np.bincount(facets.ravel()[np.unique(fan, return_index=True)[1]], minlength=len(x)) > 1
             what = f"parts of the surface touch in the vertex {_place(x[twice][0])} m"
@@ -421,9 +395,9 @@ def _outward(x: NDArray[np.float64], facets: NDArray[np.int64], pairs: tuple[NDA
     """Return the facets with normals out of the solid.  Surfaces inside other surfaces bound cavities."""
     (one, other), agree = pairs[0].T, pairs[1]
     m = len(facets)
-    number, part = _groups(m, one, other)
+    part, number = linked(m, one, other)
     turn = np.where(agree, 0, m)  # facets m to 2 m are turned
-    sheets, sheet = _groups(2 * m, np.append(one, one + m), np.append(other + turn, other + m - turn))
+    sheet, sheets = linked(2 * m, np.append(one, one + m), np.append(other + turn, other + m - turn))
     if sheets != 2 * number:
         raise ValueError("SurfaceMesh: the surface has one side only, must have an inside and an outside")
     first = np.unique(part, return_index=True)[1]

@@ -98,11 +98,9 @@ class Ties(Acting):
             other = grid.number(grid.index_from_base(inside)) + p.cell // grid.cells * grid.cells
             area = np.linalg.norm(p.area(points), axis=1)
             stiffness = HOLD * modulus[p.at] * area / grid.sizes_at(p.x).min(axis=-1)
-            values = np.concatenate([np.stack([stiffness, other], axis=1), gap, y], axis=1)
-            rows.append((p.cell, p.x, values))
-        cell, x, values = grid.gathered(rows, 2 + 2 * d)
-        stiffness, other, gap, y = np.split(values, [1, 2, 2 + d], axis=1)
-        return TieLoads(grid, cell, x, other[:, 0].astype(np.int64), y, stiffness[:, 0], gap)
+            rows.append((p.cell, p.x, {"other": other, "y": y, "stiffness": stiffness, "gap": gap}))
+        cell, x, fields = grid.gathered(rows)
+        return TieLoads(grid, cell, x, **fields | {"other": fields["other"].astype(np.int64)})
 
 
 class TieLoads(Loads):

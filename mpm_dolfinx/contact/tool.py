@@ -248,13 +248,6 @@ class Tool:
         solid = self.solid(h)
         return solid.distance_up_to(y, h) if isinstance(solid, SurfaceMesh) else solid.distance(y)
 
-    def geometry(self, y: NDArray[np.float64], h: float) -> tuple[NDArray, NDArray, NDArray]:
-        """Return distances (n,), gradients (n, d) and second derivatives (n, d, d) at positions y, see `Shape`."""
-        solid = self.solid(h)
-        if isinstance(solid, SurfaceMesh):
-            return solid.geometry(y)
-        return solid.distance(y), solid.normal(y), solid.curvature(y)
-
     def check(self, dim: int) -> None:
         """Raise an error for a tool of the wrong dimension, or with an invalid initial motion."""
         of = dim if callable(self.shape) else self.shape.dim

@@ -17,19 +17,18 @@ from mpm_dolfinx.base.errors import NotConverged
 from mpm_dolfinx.base.time_integration import in_step
 from mpm_dolfinx.base.tolerances import TINY
 from mpm_dolfinx.base.validation import line
+from mpm_dolfinx.bodies.touching import MISFIT
 from mpm_dolfinx.conditions.acting import At, Loads, Outcome, Place, Setting, Shares
-from mpm_dolfinx.contact.free_tools import FreeTools
 from mpm_dolfinx.contact.history import Origin, pressure_name, shear_name
 from mpm_dolfinx.contact.law import DEPTH, ContactLaw
+from mpm_dolfinx.contact.moved_tools import Moved, MovedTools
 from mpm_dolfinx.contact.pairs import ToolPairs
-from mpm_dolfinx.contact.problem import ContactProblem, Pushes, SubstepMotion, Touching
+from mpm_dolfinx.contact.problem import ContactProblem, SubstepMotion, Touching
 from mpm_dolfinx.contact.tool import Pose, Tool, rotation
 from mpm_dolfinx.parallel.exchange import Exchange, first, over_all, together
 from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
 from mpm_dolfinx.points.material_points import MaterialPoints, middle
 
-# allowed penetration into a body at the start, and into prescribed sides, divided by the cell size; points may pass
-BEGINS = 1e-2  # through thinner tools in a step without notice
 NEAR = 0.1
 """Distance from a tool, in cell sizes, below which corners follow the Q1 field. Plateau (scene "tool" of
 tests/plateaus.py): half this value changes the result by 4.1e-03, twice this value by 1.5e-03, and finer cells by
@@ -43,20 +42,20 @@ def _box(x: NDArray[np.float64]) -> list[tuple[NDArray[np.float64], MPI.Op]]:
 
 
 def motion_count(dim: int) -> int:
-    """Return the number of motions of a free tool: d displacements, and in 2D a rotation."""
+    """Return the number of motions of a tool: d displacements, and in 2D a rotation."""
     return dim + (dim == 2)
 
 
 class LoadMotion(NamedTuple):
-    """Displacements of tools that loads cause in a step.  Free tools also have rotations."""
+    """Motions of tools that forces cause in a step."""
 
     start: float  # start of the step, s
     end: float  # end of the step, s
-    before: NDArray[np.float64]  # displacements at the start (k,), m
-    after: NDArray[np.float64]  # displacements at the end (k,), m
+    before: NDArray[np.float64]  # motions at the start (k, q), m and rad
+    after: NDArray[np.float64]  # motions at the end (k, q), m and rad
 
     def at(self, t: float) -> NDArray[np.float64]:
-        """Return the displacements at time t (s), by linear interpolation in the step."""
+        """Return the motions at time t (s), by linear interpolation in the step."""
         share = (t - self.start) / (self.end - self.start) if self.end > self.start else 1.0
         return self.before + share * (self.after - self.before)
 
@@ -71,7 +70,7 @@ class Tools(Touching):
         grid, self.tools = setting.grid, tuple(tools.values())
         self._held = [(hold, faces) for hold, faces, _ in setting.held]
         """Prescribed displacements with their faces.  Tools must not touch these faces."""
-        still = np.zeros(len(self.tools))
+        still = np.zeros((len(self.tools), motion_count(grid.dim)))
         self.by_loads, self._end = LoadMotion(0.0, 0.0, still, still), None
         if len({id(tool) for tool in self.tools}) < len(self.tools):
             raise ValueError("tools: one tool is listed twice, tools must be distinct")
@@ -94,41 +93,9 @@ class Tools(Touching):
         self._free = ~np.isin(own, np.concatenate([np.zeros(0, np.int64), *held]))
 
     @property
-    def free(self) -> bool:
-        """Whether any tool is free."""
-        return any(tool.free for tool in self.tools)
-
-    @property
-    def masses(self) -> NDArray[np.float64]:
-        """Masses (kg) and moments of inertia (kg m^2) of free tools, as an array (tools, q), zero for other tools."""
-        d = self.grid.dim
-        out = np.array([np.full(motion_count(d), float(tool.mass or 0)) for tool in self.tools])
-        for row, tool in zip(out, self.tools, strict=True):
-            if tool.rotates(d):
-                row[d:] = tool.inertia(d)
-        return out
-
-    @property
-    def guides(self) -> NDArray[np.float64]:
-        """Projections (tools, q, q) onto the motions that free tools can perform."""
-        d = self.grid.dim
-        out = np.zeros((len(self.tools), motion_count(d), motion_count(d)))
-        out[:, d:, d:] = np.reshape(self.turning, (-1, 1, 1))
-        for one, tool in zip(out, self.tools, strict=True):
-            one[:d, :d] = tool.guide(d) * tool.free * (np.arange(d) >= self.grid.axisymmetric)[:, None]
-        return out
-
-    @property
     def turning(self) -> list[bool]:
         """Whether each tool is free and rotates."""
         return [tool.rotates(self.grid.dim) and not self.grid.axisymmetric for tool in self.tools]
-
-    def pushes(self, t: float) -> NDArray[np.float64]:
-        """Return the loads (tools, q), in N, on free tools at time t (s).  Torques are zero."""
-        d = self.grid.dim
-        out = np.zeros((len(self.tools), motion_count(d)))
-        out[:, :d] = [np.nan_to_num(tool.pushes(t)) * tool.free * tool.along(d) for tool in self.tools]
-        return out
 
     def going(self, by_loads: LoadMotion, end: float | None = None) -> Tools:
         """Return the tools with the motion that loads cause in a step."""
@@ -167,26 +134,25 @@ class Tools(Touching):
         out, d = super().unknown(value), self.grid.dim
         tools = dict(zip(self.names, self.tools, strict=True))
         out["tool_travel"] = {name: np.zeros(d if tool.free else ()) for name, tool in tools.items()}
-        if self.free:
-            out["tool_velocity"] = {name: tool.begins(d) for name, tool in tools.items() if tool.free}
-        turning = dict(zip(self.names, self.turning, strict=True))
-        if any(turning.values()):
-            out["tool_rotation"] = {name: np.array(0.0) for name, rotates in turning.items() if rotates}
-            out["tool_spin"] = {name: np.array(float(tools[name].spin)) for name, rotates in turning.items() if rotates}
-        return out
+        turning = [name for name, rotates in zip(self.names, self.turning, strict=True) if rotates]
+        of_free = {
+            "tool_velocity": {name: tool.begins(d) for name, tool in tools.items() if tool.free},
+            "tool_rotation": {name: np.array(0.0) for name in turning},
+            "tool_spin": {name: np.array(float(tools[name].spin)) for name in turning},
+        }
+        return out | {quantity: values for quantity, values in of_free.items() if values}
 
     def _before(self, place: Place) -> NDArray[np.float64]:
         """Return the displacements of tools due to loads before a step, with rotations of free tools."""
-        if self.free:
-            return self._of_free(place.before, "tool_travel", "tool_rotation")
-        return np.array([place.before["tool_travel"][name] for name in self.names], dtype=float)
+        return self._motions(place.before, "tool_travel", "tool_rotation")
 
-    def _of_free(self, before: Outcome, along: str, around: str) -> NDArray[np.float64]:
-        """Return the displacements and rotations of free tools, or the rates of both."""
+    def _motions(self, before: Outcome, along: str, around: str) -> NDArray[np.float64]:
+        """Return the displacements and rotations (tools, q) of tools by forces, or the rates of both."""
         d = self.grid.dim
-        out = np.zeros((len(self.names), motion_count(d)))
-        for row, name in zip(out, self.names, strict=True):
-            row[:d] = before[along].get(name, 0.0)
+        out = np.zeros((len(self.tools), motion_count(d)))
+        for row, name, tool in zip(out, self.names, self.tools, strict=True):
+            value = before.get(along, {}).get(name, 0.0)
+            row[:d] = value if np.ndim(value) else value * tool.along(d)
             row[d:] = before.get(around, {}).get(name, 0.0)
         return out
 
@@ -194,14 +160,32 @@ class Tools(Touching):
         """Return the contact loads of tools in a substep."""
         before = self._before(place)
         tools = self.going(LoadMotion(place.start, place.t, before, before), place.start + place.dt * place.inertia)
-        if not (self.free and place.inertia):  # an initial stress is balanced without inertia
-            return ToolLoads(tools, place)
-        velocity = self._of_free(place.before, "tool_velocity", "tool_spin")
-        options = {"velocity": velocity, "pushes": self.pushes(place.t)}
-        return FreeToolLoads(tools, place, mass=self.masses, guides=self.guides, **options)
+        moved = self._moved(place)
+        return MovedToolLoads(tools, place, moved=moved) if moved.guides.any() else ToolLoads(tools, place)
 
-    def contact(self, place: Place) -> tuple[ContactLaw, Origin, Pushes]:
-        """Return the contact law in a substep, the material points of its pairs, and the loads of tools."""
+    def _moved(self, place: Place) -> Moved:
+        """Return the tools that forces move: free tools with inertia, and load-controlled tools without inertia.
+
+        No tool moves while an initial stress is balanced.
+        """
+        d, q = self.grid.dim, motion_count(self.grid.dim)
+        of = [tool for tool in self.tools if tool.free or (tool.load is not None and place.t > place.start)]
+        moves = [tool in of and tool.free == place.inertia for tool in self.tools]
+        load, guides = np.zeros(len(self.tools)), np.zeros((len(self.tools), q, q))
+        mass, direction = np.zeros((2, len(self.tools), q))
+        for k in np.flatnonzero(moves):
+            tool = self.tools[k]
+            load[k] = np.nan_to_num(tool.pushes(place.t))
+            direction[k, :d] = tool.along(d)
+            guides[k, :d, :d] = tool.guide(d) * (np.arange(d) >= self.grid.axisymmetric)[:, None]
+            mass[k, :d] = tool.mass or 0.0
+            if self.turning[k]:
+                guides[k, d, d], mass[k, d] = 1.0, tool.inertia(d)
+        velocity = self._motions(place.before, "tool_velocity", "tool_spin")
+        return Moved(mass, guides, velocity, load, direction)
+
+    def contact(self, place: Place) -> tuple[ContactLaw, Origin]:
+        """Return the contact law in a substep, and the material points of its pairs."""
         cut, points = place.cut, place.points
         start, t = place.start, place.t
         grid, d = self.grid, self.grid.dim
@@ -210,8 +194,6 @@ class Tools(Touching):
         size, free = np.linalg.norm(area, axis=1), self._free[patches.face]
         stiffness = self._stiffness(cut.points)[patches.at] * [1.0, place.rate]
         poses, found = [self._posed(tool, start, t) for tool in self.tools], []
-        # the initial stress is balanced without loads on tools
-        loads = [tool.pushes(t) if t > start and not tool.free else np.nan for tool in self.tools]
         for number, (tool, pose) in enumerate(zip(self.tools, poses, strict=True)):
             before = self._pose(tool, start)
             n = together(grid.comm, lambda tool=tool, pose=pose: tool.solid(grid.least).normal(pose.own(x)) @ pose.R.T)
@@ -234,9 +216,7 @@ class Tools(Touching):
         acts = np.ones(len(number)), self.tools, poses
         pairs = ToolPairs(grid, number.astype(np.int64), grid.locals[cell], *own, shear, places, *acts, now, carried)
         origin = Origin(exchange, patches.at[at], values[:, 0].astype(np.int64), values[:, 1])
-        along = np.array([tool.along(d) for tool in self.tools])
-        pushes = Pushes([line(tool) for tool in self.tools], self.by_loads.before, along, np.array(loads))
-        return ContactLaw(self.names, self.tools, pairs), origin, pushes
+        return ContactLaw(self.names, self.tools, pairs), origin
 
     def _edge(
         self, tool: Tool, pose: Pose, x: NDArray[np.float64], unit: NDArray[np.float64], faces: NDArray[np.bool_]
@@ -275,14 +255,15 @@ class Tools(Touching):
 
     def _warn_light(self, place: Place) -> None:
         """Warn of free tools that are lighter than the half cell which a strike stops at once."""
-        if not (self.free and place.inertia and place.dt):
+        free = [tool for tool in self.tools if tool.free]
+        if not (free and place.inertia and place.dt):
             return
         grid = self.grid
         dense = float(self._materials.present_density(place.points).max(initial=0.0))
         half = over_all(grid.comm, dense, MPI.MAX) * grid.least**grid.dim / 2
         half *= np.pi * grid.least if grid.axisymmetric else 1.0  # the first ring about the axis
-        for tool in self.tools:
-            if tool.free and tool.mass < half:
+        for tool in free:
+            if tool.mass < half:
                 what = "%s: its mass is less than that of half a cell, %.3g kg, so its rebound depends on the step in "
                 warn(grid.comm, ResolutionWarning, what + "which it strikes; use smaller cells", line(tool), half)
 
@@ -296,7 +277,7 @@ class Tools(Touching):
         for number, tool in enumerate(self.tools):
             loaded = points.data[pressure_name(self.names[number])] > 0
             deep, where = tools._deepest(tool, np.concatenate([x[~loaded[patches.at]], points.x]), t)
-            if deep > BEGINS:
+            if deep > MISFIT:
                 what = f"{line(tool)}: penetrates a body by {deep:.3g} cells, at {where}, at the start t = {t:g} s"
                 raise ValueError(f"{what}, must be outside of all bodies, or touch them")
 
@@ -307,10 +288,10 @@ class Tools(Touching):
         for tool in self.tools:
             for hold, faces in self._held:
                 deep, where = self._deepest(tool, place.cut.surface(faces).now(points), t)
-                if deep > BEGINS:
+                if deep > MISFIT:
                     what = f"{line(tool)} and {line(hold)}: both act at {where} at t = {t:g} s"
                     raise ValueError(f"{what}, must be apart; limit the displacement by a region, or move the tool")
-            corners = points.corners[self._gaps(tool, points.corners, t).min(axis=1) < -BEGINS * self.grid.least]
+            corners = points.corners[self._gaps(tool, points.corners, t).min(axis=1) < -MISFIT * self.grid.least]
             deep, where = self._deepest(tool, x, t)
             held, at_middle = self._deepest(tool, middle(corners), t)
             if deep > NEAR or held > 0:  # a round tool contains the middles, but not the corners, of stretched domains
@@ -381,7 +362,7 @@ class Tools(Touching):
             inside = x[1][on[gap < -2 * DEPTH * h]][:1]  # the middles of thin domains slide along round tools
             if where := first(comm, "".join(np.array2string(place, precision=6) for place in inside + self.grid.base)):
                 return where
-            done[on] += np.maximum(gap, BEGINS * h)
+            done[on] += np.maximum(gap, MISFIT * h)
             on = on[done[on] < length[on]]
         return ""
 
@@ -402,7 +383,14 @@ class ToolLoads(ContactProblem):
     def __init__(self, tools: Tools, place: Place):
         super().__init__(*tools.contact(place))
         self._tools, self._place = tools, place
+        self.before = tools.by_loads.before
+        """Motions of the tools by forces before the step (k, q), m and rad."""
         self.shares, self._earlier = Shares(np.inf, 0.0, None), None
+
+    @property
+    def still(self) -> NDArray[np.float64]:
+        """See `ContactProblem`."""
+        return np.zeros_like(self.before)
 
     def begun(self, shares: Shares, earlier: SubstepMotion | None) -> ToolLoads:
         """See `Loads`."""
@@ -434,6 +422,14 @@ class ToolLoads(ContactProblem):
         out._tools = self._tools.going(by_loads._replace(after=by_loads.before + self.found(at).motion))
         return out
 
+    def outcome(self, at: At) -> dict[str, dict[str, NDArray[np.float64]]]:
+        """See `Loads`.  Results are also displacements (m) by forces: vectors of free tools, else along the load."""
+        d, displacement = self.grid.dim, {}
+        motion = (self.before + self.found(at).motion)[:, :d]
+        for name, tool, by_forces in zip(self.now.law.names, self.now.law.contacts, motion, strict=True):
+            displacement[name] = by_forces if tool.free else np.array(by_forces @ tool.along(d))
+        return super().outcome(at) | {"tool_travel": displacement}
+
     def near(self, points: MaterialPoints, corners: NDArray[np.float64]) -> NDArray[np.bool_] | bool:
         """Return which corners touch tools."""
         return self._tools.near(corners, self._place.t)
@@ -449,5 +445,5 @@ class ToolLoads(ContactProblem):
         self._tools.check_end(self._place, points, before)
 
 
-class FreeToolLoads(FreeTools, ToolLoads):
-    """Contact loads of tools, of which at least one is free."""
+class MovedToolLoads(MovedTools, ToolLoads):
+    """Contact loads of tools, of which at least one is moved by forces."""

@@ -20,13 +20,12 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import bmat, coo_matrix, csr_matrix, diags, identity
-from scipy.sparse.csgraph import connected_components
+from scipy.sparse import bmat, csr_matrix, diags, identity
 from scipy.sparse.linalg import lsmr, norm
 
 from mpm_dolfinx.base.tolerances import NEAR, SAME
 from mpm_dolfinx.domains.domain_gradient import volume_slopes
-from mpm_dolfinx.grid.grid import Grid, sum_by
+from mpm_dolfinx.grid.grid import Grid, linked, sum_by
 from mpm_dolfinx.parallel.exchange import to_root
 
 SOFT = 0.15
@@ -114,5 +113,4 @@ def _joined(
     )
     count = int(place.max(initial=0)) + 1
     total = count + int(node.max(initial=0)) + 1
-    links = coo_matrix((np.ones(len(node)), (place.ravel()[seeded], count + node.ravel())), shape=(total, total))
-    return connected_components(links, directed=False)[1].astype(np.int64)[place].reshape(number.shape)
+    return linked(total, place.ravel()[seeded], count + node.ravel())[0][place].reshape(number.shape)

@@ -30,7 +30,6 @@ from numpy.typing import NDArray
 from mpm_dolfinx.base.caching import Latest
 from mpm_dolfinx.base.tolerances import NEAR
 from mpm_dolfinx.bodies.bodies import Body
-from mpm_dolfinx.bodies.boxes import RowsBody
 from mpm_dolfinx.bodies.faces import Surface
 from mpm_dolfinx.bodies.touching import Faces, covers
 from mpm_dolfinx.domains.renewed_faces import ROOT, is_part, roots
@@ -69,7 +68,7 @@ class Lattice:
         self._stop = start + len(body)
         self._dim, self._count = body.dim, body.lattice
         self._thirds = None
-        if isinstance(body, RowsBody):
+        if any((widths != widths[0]).any() for widths in body.widths):
             self._thirds = [_divided(body.corner_rows(axis)) for axis in range(self._dim)]
         self._numbers: Latest[NDArray[np.int64]] = Latest()
         self._tolerance = np.append(np.full(self._dim, NEAR * body.spacing.min()), NEAR)

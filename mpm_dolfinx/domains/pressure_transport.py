@@ -24,7 +24,7 @@ from dolfinx import fem
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.fluid_content import mass_potential, pressure_of
-from mpm_dolfinx.grid.grid import Grid, sum_by
+from mpm_dolfinx.grid.grid import Grid, means_of_rows, sum_by
 from mpm_dolfinx.parallel.exchange import Exchange
 from mpm_dolfinx.points.cutting import Pieces
 from mpm_dolfinx.points.material_points import MaterialPoints
@@ -307,16 +307,12 @@ def joined_pieces(
     key = into[of] * (2 + pieces.cell.max(initial=-1)) + 1 + pieces.cell
     _, at, piece = np.unique(key, return_index=True, return_inverse=True)
     piece, m = piece.ravel(), len(at)
-
-    def mean(values: NDArray, weight: NDArray) -> NDArray:
-        total = sum_by(piece, weight, m)
-        return np.divide(sum_by(piece, weight * values, m), total, out=np.zeros(m), where=total > 0)
-
-    potential = mean(given.pressure, np.where(sum_by(piece, store, m)[piece] > 0, store, fraction))
+    weight = np.where(sum_by(piece, store, m)[piece] > 0, store, fraction)
+    potential = means_of_rows(piece, weight, given.pressure, m)
     point, share = into[of][at], sum_by(piece, fraction, m)
     held = sum_by(into[of], store * given.pressure, len(new))
     potential += _missing(held, share * (storage[1] * new.volume0 * new.J)[point], potential, point)[point]
-    x, slope = (np.stack([mean(c, fraction) for c in rows.T], axis=1) for rows in (pieces.x, pieces.slope))
+    x, slope = (means_of_rows(piece, fraction, rows, m) for rows in (pieces.x, pieces.slope))
     pressure = pressure_of(potential, bulk)
     bounds = _outermost(pieces.bounds, piece, m)
     return PiecePressures(new.id[point], pieces.cell[at], share, pressure, x, slope, bounds)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.tolerances import EPSILON, NEAR, SAME, TINY
-from mpm_dolfinx.grid.grid import FACES, TURN, Grid, corner_bits, ranges, sum_by
+from mpm_dolfinx.grid.grid import FACES, TURN, Grid, corner_bits, means_of_rows, ranges, sum_by, sums_of_rows
 from mpm_dolfinx.points.cutting import (
     cut,
     domain_volumes,
@@ -231,7 +231,7 @@ class RefilledCells:
         on = (np.minimum(x, 1 - x) < NEAR).any(axis=2)
         starts, ends = (np.flatnonzero(on[:, k]) for k in (0, 1))
         once = crossed.copy()
-        chord = np.stack([sum_by(cell, column, self.cells) for column in (x[:, 1] - x[:, 0]).T], axis=1)
+        chord = sums_of_rows(cell, x[:, 1] - x[:, 0], self.cells)
         P, Q = np.zeros((self.cells, 2)), np.zeros((self.cells, 2))
         for at, k, place in ((starts, 0, P), (ends, 1, Q)):
             once &= np.bincount(cell[at], minlength=self.cells) == 1
@@ -454,16 +454,14 @@ class RefilledCells:
         """Return the slopes (n, 2, k), in 1/m, of point values (points, k) in new domains, from least squares."""
         pieces, grid = self.pieces, self.grid
         weight = pieces.fraction * self.points.volume0[pieces.point]
-        whole = np.maximum(sum_by(self.cell, weight, self.cells), TINY)
 
-        def means(columns: NDArray) -> NDArray:
-            return np.stack([sum_by(self.cell, weight * c, self.cells) / whole for c in columns.T], axis=1)
+        def means(rows: NDArray) -> NDArray:
+            return means_of_rows(self.cell, weight, rows, self.cells)
 
         y, q = self.points.x[pieces.point] / grid.sizes_of(self.cell), values[pieces.point]
-        y = y - means(y)[self.cell]
-        q = q - means(q)[self.cell]
-        normal = means((y[:, :, None] * y[:, None]).reshape(-1, 4)).reshape(-1, 2, 2)
-        right = means((y[:, :, None] * q[:, None]).reshape(len(y), -1)).reshape(-1, 2, q.shape[1])
+        y, q = (rows - means(rows)[self.cell] for rows in (y, q))
+        normal = means(y[:, :, None] * y[:, None])
+        right = means(y[:, :, None] * q[:, None])
         value, axes = np.linalg.eigh(normal)
         some = value > SAME  # `value` in squared cell sizes; a single row of pieces determines no slope across it
         inverse = np.where(some, 1 / np.where(some, value, 1.0), 0.0)
@@ -517,8 +515,7 @@ class RefilledCells:
         flat = values[of].reshape(len(of), int(np.prod(values.shape[1:])))
         count = int(self.chosen.sum())
         number = self._group(cell)
-        whole = np.maximum(sum_by(number, length, count), TINY)
-        means = np.stack([sum_by(number, length * column, count) / whole for column in flat.T], axis=1)
+        means = means_of_rows(number, length, flat, count)
         pieces = values[self.pieces.point[self.remainders[1]]]
         out = np.concatenate([means, pieces.reshape(len(pieces), flat.shape[1])])[group]
         out *= (parent != NONE).any(axis=1)[:, None]

@@ -99,15 +99,15 @@ class QuietSides(Acting):
             area, at = p.area(points), p.at
             incoming = side.at(place.t, d)
             size = np.linalg.norm(area, axis=1, keepdims=True)
-            n, z = area / size, np.stack([across[at], along[at] - across[at]], axis=1)
-            push = 2 * (z[:, :1] * incoming + z[:, 1:] * (n @ incoming)[:, None] * n)
+            n = area / size
+            z, more = across[at], along[at] - across[at]
+            push = 2 * (z[:, None] * incoming + (more * (n @ incoming))[:, None] * n)
             force = push + points.data[traction_name(name)][at] * p.area0[:, None] / size
-            rows.append((p.cell, p.x, np.concatenate([size, n, z, force], axis=1)))
-        cell, x, values = self._grid.gathered(rows, 3 + 2 * d)
-        size, normal, z, force = np.split(values, [1, 1 + d, 3 + d], axis=1)
+            fields = {"size": size[:, 0], "normal": n, "across": z, "along": more, "force": force}
+            rows.append((p.cell, p.x, fields))
+        cell, x, fields = self._grid.gathered(rows)
         forms = self._forms(QuietForms, self._forms.velocity)
-        fields = {"normal": normal, "across": z[:, 0], "along": z[:, 1], "force": force}
-        return QuietLoads(forms, forms.points.at(cell, x, size[:, 0], **fields))
+        return QuietLoads(forms, forms.points.at(cell, x, fields.pop("size"), **fields))
 
 
 class QuietLoads(Loads):

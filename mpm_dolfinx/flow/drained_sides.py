@@ -100,22 +100,19 @@ class DrainedSides(Feeding):
         grid, rows = self._grid, []
         patches = wet.cut.surfaces(self.surfaces)
         for i, ((outlet, _), p) in enumerate(zip(self._outlets, patches, strict=True)):
-            given, n = together(grid.comm, partial(outlet.through, wet.t, p.positions(wet.points))), len(p.x)
-            columns = np.empty((n, 5 + grid.dim))
-            for k, column in enumerate((i, *given)):
-                columns[:, k] = column
-            columns[:, 5:] = p.area(wet.points)
-            rows.append((p.cell, p.x, columns))
-        cell, x, values = grid.gathered(rows, 5 + grid.dim)
-        number = values[:, 0].astype(np.int64)
-        pressure, flux, one_way, driest = values[:, 1:5].T
-        area = values[:, 5:].copy()  # a view would keep all columns
+            given = together(grid.comm, partial(outlet.through, wet.t, p.positions(wet.points)))
+            fields = [np.broadcast_to(np.asarray(values, dtype=float), len(p.x)) for values in (i, *given)]
+            names = "number", "pressure", "flux", "one_way", "driest"
+            rows.append((p.cell, p.x, dict(zip(names, fields, strict=True)) | {"area": p.area(wet.points)}))
+        cell, x, fields = grid.gathered(rows)
+        number, pressure, flux, one_way, driest, area = fields.values()
+        number = number.astype(np.int64)
         drains = np.isfinite(pressure)
         size, offset, shape = wet.contents.shapes(cell, x, area)
         shape, pressure = (np.where(drains, values, 0.0) for values in (shape, pressure))
         rains = np.isfinite(driest)
         given, rain = np.where(rains, 0.0, flux * size), np.where(rains, flux * size, np.nan)
-        return OpenSides(number, cell, shape, pressure, given, one_way > 0, area, offset, rain, driest.copy())
+        return OpenSides(number, cell, shape, pressure, given, one_way > 0, area, offset, rain, driest)
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,8 @@ from mpi4py import MPI
 import numpy as np
 from dolfinx import fem
 from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from mpm_dolfinx.base import _compat
 from mpm_dolfinx.base.tolerances import NEAR, SAME
@@ -93,6 +95,28 @@ def sum_by(index: NDArray, values: NDArray[np.float64], size: int) -> NDArray[np
         index = (index + size * np.arange(prod(shape))[:, None]).ravel()
     sums = np.bincount(index, weights=values.ravel(), minlength=size * prod(shape))
     return sums.astype(float, copy=False).reshape(*shape, size)
+
+
+def sums_of_rows(index: NDArray, rows: NDArray[np.float64], size: int) -> NDArray[np.float64]:
+    """Return the sums (size, ...) of rows (n, ...) with equal index (n,).  Sums are floats."""
+    return np.ascontiguousarray(np.moveaxis(sum_by(index, np.moveaxis(rows, 0, -1), size), -1, 0))
+
+
+def means_of_rows(index: NDArray, weight: NDArray, rows: NDArray[np.float64], size: int) -> NDArray[np.float64]:
+    """Return the means (size, ...), with a weight (n,), of rows (n, ...) with equal index (n,); 0 without weight."""
+    whole = sum_by(index, weight, size)
+    sums = sum_by(index, weight * np.moveaxis(rows, 0, -1), size)
+    return np.ascontiguousarray(np.moveaxis(sums / np.where(whole == 0, 1.0, whole), -1, 0))
+
+
+def linked(count: int, one: NDArray[np.int64], other: NDArray[np.int64]) -> tuple[NDArray[np.int64], int]:
+    """Return the group (count,) of each object, and the number of groups of objects that links connect.
+
+    `one`, `other` (m,): both objects of each link.
+    """
+    links = coo_matrix((np.ones(len(one)), (one, other)), shape=(count, count))
+    number, group = connected_components(links, directed=False)
+    return group.astype(np.int64), number
 
 
 def polynomial(
@@ -712,13 +736,24 @@ class Grid:
             return np.zeros(number.shape, dtype=np.int32)
         return self.partition.owner(np.array(np.unravel_index(number % self.cells, tuple(self.shape))))
 
-    def gathered(self, rows: Sequence[tuple], width: int) -> tuple[NDArray, NDArray, NDArray]:
-        """Send rows (cells, positions, values) to the owners of the cells, and return the received rows."""
-        empty = (np.empty(0, dtype=np.int64), np.empty((0, self.dim)), np.empty((0, width)))
-        parts = [np.concatenate(column) for column in zip(empty, *rows, strict=True)]
-        travel = Exchange(self.comm, self.owner(parts[0]))
-        cell, x, values = map(travel.send, parts)
-        return self.locals[cell], x, values
+    def gathered(
+        self, parts: Sequence[tuple[NDArray[np.int64], NDArray[np.float64], Mapping[str, NDArray]]]
+    ) -> tuple[NDArray[np.int32], NDArray[np.float64], dict[str, NDArray[np.float64]]]:
+        """Send positions and their values to the owners of cells.  Return the local cells, positions and values.
+
+        `parts`: for each part, lexicographic cells (n,), positions (n, d), in m, and values (n, ...) by name.
+        """
+        cell, x = (np.concatenate([part[k] for part in parts]) for k in (0, 1))
+        shapes = {name: values.shape[1:] for name, values in parts[0][2].items()}
+        columns = [
+            np.concatenate([values[name].reshape(len(values[name]), prod(shape)) for *_, values in parts])
+            for name, shape in shapes.items()
+        ]
+        travel = Exchange(self.comm, self.owner(cell))
+        cell, x, sent = map(travel.send, (cell, x, np.concatenate(columns, axis=1)))
+        columns = np.split(sent, np.cumsum([prod(shape) for shape in shapes.values()])[:-1], axis=1)
+        named = zip(shapes.items(), columns, strict=True)
+        return self.locals[cell], x, {name: values.reshape(len(x), *shape).copy() for (name, shape), values in named}
 
     def node_places(self, nodes: NDArray[np.integer]) -> NDArray[np.int64]:
         """Return the indices (n, d + 1) of local nodes (n,) along the axes.  Column d is the index of the copy."""

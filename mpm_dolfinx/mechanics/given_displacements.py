@@ -29,7 +29,7 @@ from mpm_dolfinx.conditions.acting import Acting, At, Loads, Place, Setting
 from mpm_dolfinx.conditions.conditions import HOLD, Displacement, holding, resistance
 from mpm_dolfinx.domains.cut_domains import Patches
 from mpm_dolfinx.forms.point_forms import FormPoints, PointData, PointForm
-from mpm_dolfinx.grid.grid import Grid, sum_by
+from mpm_dolfinx.grid.grid import Grid, sum_by, sums_of_rows
 from mpm_dolfinx.mechanics.held_cells import HeldCells, HeldPoints, inner_cells
 from mpm_dolfinx.mechanics.rigid_motion import rigid_motion, rotated
 from mpm_dolfinx.parallel.exchange import first, over_all, together
@@ -97,22 +97,29 @@ class GivenDisplacements(Acting):
         """Warn once for each condition whose side must jump at the start of a stage with inertia."""
         if not (place.inertia and place.dt):
             return
-        points = place.points
         for number, (hold, faces, axes) in enumerate(self._holds):
-            p = place.cut.surface(faces)
-            gap = (p.origin(points) + self._given(hold, place.start, p.X) - p.now(points))[:, axes]
-            sudden = self._sudden(points, p, gap)
-            jump = over_all(self._grid.comm, float(np.abs(gap[sudden]).max(initial=0.0)), MPI.MAX)
+            jump = self._jump(place, place.points, hold, axes, place.cut.surface(faces))
+            jump = over_all(self._grid.comm, float(np.abs(jump).max(initial=0.0)), MPI.MAX)
             if jump:
                 what = "%s: moves its side by %.3g m at once at t = %.6g s, as bodies with inertia begin to move; %s"
                 why = "values count from the start or the last reset_displacement, must begin at the present position"
                 self._warn(number, what, jump, place.start, why)
 
-    def _sudden(self, points: MaterialPoints, p: Patches, gap: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return whether gaps (n, k), in m, are jumps: their strain in a cell exceeds stress divided by modulus."""
+    def _jump(
+        self, place: Place, points: MaterialPoints, hold: Displacement, axes: Sequence[int], p: Patches
+    ) -> NDArray[np.float64]:
+        """Return the gaps (n, d), in m, that a side closes at once at the start of a stage, and zeros elsewhere.
+
+        The strain of such a gap in a cell exceeds the stress divided by the modulus.
+        """
+        out = np.zeros_like(p.now(points))
+        if not place.begins:
+            return out
+        out[:, axes] = (p.origin(points) + self._given(hold, place.start, p.X) - p.now(points))[:, axes]
         tension, modulus = self._materials.total_stress(points), self._materials.table(points, holding)
-        strain = np.linalg.norm(gap, axis=1) / self._grid.sizes_at(p.x).min(axis=-1)
-        return strain > np.maximum(NEAR, np.linalg.norm(tension[p.at], axis=(1, 2)) / modulus[p.at])
+        strain = np.linalg.norm(out, axis=1) / self._grid.sizes_at(p.x).min(axis=-1)
+        sudden = strain > np.maximum(NEAR, np.linalg.norm(tension[p.at], axis=(1, 2)) / modulus[p.at])
+        return np.where(sudden[:, None], out, 0.0)
 
     def placed(self, place: Place) -> Loads:
         """Return the penalties in a substep."""
@@ -158,7 +165,8 @@ class GivenDisplacements(Acting):
         moves = place.inertia and place.dt > TINY
         inertial = self._materials.present_density(before) / (GAMMA * place.dt) ** 2 if moves else 0.0 * modulus
         inertial = inertial * self._grid.sizes_at(before.x).min(axis=-1) ** 2
-        moduli = np.stack([modulus, tension, resists, *confined, inertial], axis=1)
+        moduli = {"modulus": modulus, "tension": tension, "resistance": resists, "inertial": inertial}
+        moduli |= dict(zip(("confined", "undrained"), confined, strict=True))
         for number, ((hold, *_, axes), p) in enumerate(zip(self._holds, patches, strict=True)):
             at, now = np.searchsorted(chosen, p.at), p.now(points)
             given = [self._given(hold, time, p.X) for time in (t, *ends)] if ends else 3 * [np.zeros_like(now)]
@@ -166,24 +174,22 @@ class GivenDisplacements(Acting):
                 given[0] = in_step((t - ends[0]) / (ends[1] - ends[0]), given[1], given[0], given[2])
             start, to = (p.origin(points) + given[k] for k in (1, 0))
             step, given = given[0] - given[1], np.concatenate(given[1:], axis=1)
-            jumps = HOLD * np.linalg.norm((to - now)[:, axes], axis=1) > self._grid.least
-            step = np.where(jumps[:, None], to - now, step)
+            if place.inertia and ends:
+                step = step + self._jump(place, points, hold, axes, p)
             R = rotated(self._grid.comm, p.area0, now, to) if len(axes) == d else np.eye(d)  # of the traction
             force, gap = np.einsum("ij,njk,nk->ni", R, stress[at, :d, :d], p.area(points)), to - now
-            own = p.area0[:, None] * moduli[at]
-            number = np.full(len(gap), number)
-            values = np.column_stack([number, p.area0, own, gap, step, given, p.area(cut.points), force])
-            rows.append((p.cell, p.x, values))
+            fields = {name: p.area0 * values[at] for name, values in moduli.items()}
+            fields |= {"number": np.full(len(gap), number), "area": p.area0, "gap": gap, "step": step, "given": given}
+            rows.append((p.cell, p.x, fields | {"normal": p.area(cut.points), "force": force}))
             bounds.append([start.max(axis=0, initial=-np.inf), -start.min(axis=0, initial=np.inf)])
-        cell, x, values = self._grid.gathered(rows, 8 + 6 * d)
+        cell, x, fields = self._grid.gathered(rows)
         extent = over_all(self._grid.comm, np.array(bounds), MPI.MAX).sum(axis=1)
         sides = [(axes, size) for (*_, axes), size in zip(self._holds, extent, strict=True)]
-        inner = inner_cells(self._grid, place.fill, sides, values[:, 0].astype(np.int64), cell, values[:, -2 * d : -d])
+        inner = inner_cells(self._grid, place.fill, sides, fields["number"].astype(np.int64), cell, fields["normal"])
         if over_all(self._grid.comm, int((inner != cell).any())):
-            cell, x, values = self._grid.gathered([(self._grid.cell_number[inner], x, values)], 8 + 6 * d)
-        number, *own = values[:, :8].T
-        rest = np.split(values[:, 8:], [d, 2 * d, 4 * d, 5 * d], axis=1)
-        return HeldPoints(number.astype(np.int64), cell, *own, x, *rest)
+            cell, x, fields = self._grid.gathered([(self._grid.cell_number[inner], x, fields)])
+        number = fields.pop("number").astype(np.int64)
+        return HeldPoints(number=number, cell=cell, x=x, **fields)
 
     def _check_meeting(self, t: float) -> None:
         """Raise ValueError if displacements differ where two sides meet, because the stress would be infinite."""
@@ -212,8 +218,8 @@ class GivenDisplacements(Acting):
             why = "the reaction is an artefact; does another condition also hold the side, or is the step too large?"
             self._warn(number, ARTEFACT, x + self._grid.base, why)
         number, force = held.number[loads.row], (loads.share.sum(axis=1) * force)[:, None] * data["direction"]
-        sums = np.stack([sum_by(number, column, len(self._holds)) for column in force.T], axis=1)
-        return dict(zip(self._names, self._grid.comm.allreduce(sums), strict=True))
+        sums = self._grid.comm.allreduce(sums_of_rows(number, force, len(self._holds)))
+        return dict(zip(self._names, sums, strict=True))
 
     def _warn(self, number: int, what: str, *values) -> None:
         """Warn of a fault of a condition, once for each condition and fault."""
@@ -226,12 +232,9 @@ class GivenDisplacements(Acting):
         for hold, faces, axes in self._holds:
             p = place.cut.surface(faces)
             start, end = (self._given(hold, t, p.X) for t in (place.start, place.t))
-            gaps = (p.origin(of) + given - p.now(of) for of, given in ((before, start), (points, end)))
-            old, new, increment = (np.linalg.norm(v[:, axes], axis=1) for v in (*gaps, end - start))
-            if place.begins:  # a prescribed value may begin away from the present position
-                gap = (p.origin(before) + end - p.now(before))[:, axes]
-                sudden, jump = self._sudden(before, p, gap), np.linalg.norm(gap, axis=1)
-                old, increment = np.where(sudden, 0.0, old), np.where(sudden, jump, increment)
+            jump = self._jump(place, before, hold, axes, p)  # a prescribed value may begin away from the position
+            gaps = (p.origin(before) + start - p.now(before) - jump, p.origin(points) + end - p.now(points))
+            old, new, increment = (np.linalg.norm(v[:, axes], axis=1) for v in (*gaps, end - start + jump))
             moves = increment > NEAR * self._grid.least
             share = 1 - ((new - old)[moves] / increment[moves]).min(initial=np.inf)
             share = over_all(self._grid.comm, float(share), MPI.MAX)

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx.base.tolerances import NEAR, TINY
 from mpm_dolfinx.conditions.conditions import HOLD
-from mpm_dolfinx.grid.grid import Grid, among, sum_by
+from mpm_dolfinx.grid.grid import Grid, among, means_of_rows, sum_by, sums_of_rows
 from mpm_dolfinx.mechanics.ghost_penalty import RATIO
 from mpm_dolfinx.parallel.exchange import over_all
 
@@ -129,13 +129,10 @@ class HeldCells:
         whole = sum_by(at, p.area, len(key))
 
         def total(values: NDArray[np.float64]) -> NDArray[np.float64]:
-            columns = values.reshape(len(values), int(np.prod(values.shape[1:]))).T
-            columns = [sum_by(at, column, len(key)) for column in columns]
-            return np.stack(columns, axis=1).reshape(len(key), *values.shape[1:])
+            return sums_of_rows(at, values, len(key))
 
         def mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
-            each = (slice(None), *(None,) * (values.ndim - 1))
-            return total(p.area[each] * values) / whole[each]
+            return means_of_rows(at, p.area, values, len(key))
 
         def both(means: NDArray, values: NDArray) -> NDArray:
             return np.concatenate([means, values])
@@ -155,14 +152,13 @@ class HeldCells:
         local = p.x - grid.midpoints[p.cell]
         moments = {"squares": local[:, :, None] * local[:, None, :], "product": local.prod(axis=1)}
         self.moments = {name: both(mean(values), values) for name, values in moments.items()}
-        against = p.modulus + TENSE * p.tension
         flat = normal**2 > (1 - ALIGNED**2) * (normal**2).sum(axis=1, keepdims=True)
-        modulus = np.where(flat, total(p.confined)[:, None], total(p.modulus)[:, None])
-        each = np.where(flat[at], EVERYWHERE * p.resistance[:, None], WEAK * against[:, None])
         h = [grid.sizes(cells).min(axis=-1, keepdims=True) for cells in (cell, p.cell)]
-        static = both(HOLD / h[0] * modulus, each / h[1])
+        weights = both(np.full(normal.shape, HOLD) / h[0], np.where(flat[at], EVERYWHERE, WEAK) / h[1])
+        means = np.where(flat, total(p.confined)[:, None], total(p.modulus)[:, None])
+        at_points = np.where(flat[at], p.resistance[:, None], (p.modulus + TENSE * p.tension)[:, None])
+        static = weights * both(means, at_points)
         # the inertia of a cell resists a short step more than its stiffness
-        weights = both((0 * modulus + HOLD) / h[0], np.where(flat[at], EVERYWHERE, WEAK) / h[1])
         inert = weights * both(total(p.inertial), p.inertial)[:, None]
         self.stiffness = static + inert
         self.static = static / self.stiffness

@@ -12,17 +12,14 @@ import numpy as np
 import ufl
 from dolfinx import fem
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from mpm_dolfinx.base.tolerances import NEAR
 from mpm_dolfinx.base.validation import line
-from mpm_dolfinx.bodies.faces import Surface
 from mpm_dolfinx.conditions.acting import Acting, Loads, Place, Setting
 from mpm_dolfinx.conditions.conditions import RIGIDITY, RigidPlate, Traction, facing, inward
 from mpm_dolfinx.forms.point_forms import FormPoints, PointData, PointForm
-from mpm_dolfinx.grid.grid import Grid
+from mpm_dolfinx.grid.grid import Grid, linked
 from mpm_dolfinx.mechanics.tractions import Tractions
 from mpm_dolfinx.parallel.exchange import over_all
 
@@ -60,7 +57,7 @@ class Plates(Acting):
         for (name, plate), faces in zip(plates.items(), self._faces, strict=True):
             area = faces.area0 * self._grid.around(faces.places().mean(axis=1))
             even[name] = plate.traction(area.sum(), inward(faces))
-            _check_flat(plate, faces)
+            _check_flat(plate, faces.places(), facing(faces)[0])
         self._even = Tractions(setting, even)
         self.surfaces = self._faces
         self.held = [
@@ -79,16 +76,14 @@ class Plates(Acting):
             length = faces.area0.sum() ** (1 / (d - 1))
             modulus = oedometric[patches.at].max(initial=0.0)  # only of the material under the plate
             rigidity = RIGIDITY * over_all(grid.comm, float(modulus), MPI.MAX) * length
-            rigidity = rigidity * np.linalg.norm(area, axis=1, keepdims=True)
+            rigidity = rigidity * np.linalg.norm(area, axis=1)
             axis = facing(faces)[0]
             normal = np.tile(np.eye(d)[axis], (len(area), 1))
             tilt = normal - area / area[:, [axis]]  # slope of the face; the face's normal is (-slope, 1)
-            rows.append((patches.cell, patches.x, np.concatenate([rigidity, normal, tilt], axis=1)))
-        cell, x, values = grid.gathered(rows, 1 + 2 * d)
-        rigidity, normal, tilt = np.split(values, [1, 1 + d], axis=1)
+            rows.append((patches.cell, patches.x, {"rigidity": rigidity, "normal": normal, "tilt": tilt}))
+        cell, x, fields = grid.gathered(rows)
         forms = self._forms(PlateForms)
-        data = forms.points.at(cell, x, np.ones(len(cell)), rigidity=rigidity, normal=normal, tilt=tilt)
-        return PlateLoads(forms, data, self._even.placed(place))
+        return PlateLoads(forms, forms.points.at(cell, x, np.ones(len(cell)), **fields), self._even.placed(place))
 
 
 class PlateLoads(Loads):
@@ -123,9 +118,12 @@ class PlateLoads(Loads):
         return self._data.cells
 
 
-def _check_flat(plate: RigidPlate, faces: Surface) -> None:
-    """Raise ValueError if the faces under a plate are not one flat, connected side."""
-    corners, axis = faces.places(), facing(faces)[0]
+def _check_flat(plate: RigidPlate, corners: NDArray[np.float64], axis: int) -> None:
+    """Raise ValueError if the faces under a plate are not one flat, connected side.
+
+    `corners` (n, 2^(d-1), d), in m: corners of the faces.
+    `axis`: axis normal to the side.
+    """
     tangential = np.arange(corners.shape[2]) != axis
     low = corners.min(axis=1)[:, tangential]
     high = corners.max(axis=1)[:, tangential]
@@ -137,8 +135,7 @@ def _check_flat(plate: RigidPlate, faces: Surface) -> None:
         pairs = cKDTree(X / size).query_pairs(1 + NEAR, p=np.inf, output_type="ndarray")
         i, j = pairs.T
         pairs = pairs[(np.abs(X[i] - X[j]) <= (extent[i] + extent[j]) / 2 + NEAR * size).all(axis=1)]
-        graph = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(X), len(X)))
-        _, part = connected_components(graph, directed=False)
+        part, _ = linked(len(X), *pairs.T)
         apart = np.flatnonzero(part != part[0])
     if len(apart):
         one, other = corners.mean(axis=1)[[0, apart[0]]]

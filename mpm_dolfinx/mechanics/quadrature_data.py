@@ -15,7 +15,7 @@ from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.domains.domain_gradient import cell_ratios
 from mpm_dolfinx.domains.domain_slopes import LinearGradients
 from mpm_dolfinx.forms.point_forms import FormPoints, Places, PointData
-from mpm_dolfinx.grid.grid import in_chunks, sum_by
+from mpm_dolfinx.grid.grid import in_chunks, means_of_rows, sum_by
 from mpm_dolfinx.materials.evaluate import ConductivityAtPieces
 from mpm_dolfinx.materials.fields import SceneMaterials
 from mpm_dolfinx.materials.skeleton import Skeleton
@@ -147,12 +147,10 @@ class QuadraturePoints:
         flows = cut.to_cells(self.materials.dilating(cut.points))
         size, volume = self._grid.num_local, (cut.points.volume0 * cut.points.J)[cut.pieces.point]
         weight = cut.pieces_to_cells(cut.pieces.fraction * volume)
-        whole = sum_by(cut.cells, weight, size)
         all_flow = sum_by(cut.cells, weight * ~flows, size)[cut.cells] == 0
         if not over_all(self._grid.comm, int(all_flow.any())):
             return pieces
-        columns = [sum_by(cut.cells, weight * column, size)[cut.cells] for column in cut.x.T]
-        middle = np.stack(columns, axis=1) / whole[cut.cells, None]
+        middle = means_of_rows(cut.cells, weight, cut.x, size)[cut.cells]
         share = np.where(all_flow, SHARE, 1.0)[:, None]
         mixed = None if cut.mixed is None else share**2 * cut.mixed
         return Places(self._grid, cut.cells, middle + share * (cut.x - middle), mixed)

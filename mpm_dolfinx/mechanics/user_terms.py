@@ -92,10 +92,9 @@ class OwnTermsOfStage(Acting):
         p = place.cut.surface(faces)
         area, now = p.area(place.points), p.now(place.points)
         size = np.linalg.norm(area, axis=1, keepdims=True)
-        rows = np.concatenate([size, area / size, now, now - p.origin(place.points)], axis=1)
-        cell, x, values = self._grid.gathered([(p.cell, p.x, rows)], 1 + 3 * self._grid.dim)
-        normal, position, displacement = np.split(values[:, 1:], 3, axis=1)
-        return of.at(cell, x, values[:, 0], normal=normal, position=position, displacement=displacement)
+        fields = {"normal": area / size, "position": now, "displacement": now - p.origin(place.points)}
+        cell, x, fields = self._grid.gathered([(p.cell, p.x, fields | {"size": size[:, 0]})])
+        return of.at(cell, x, fields.pop("size"), **fields)
 
 
 class OwnLoads(Loads):

@@ -528,7 +528,7 @@ def _polygons(
     v, group = np.concatenate(list(part), axis=1), np.tile(group, 3)
     near = grid.snap.max()  # corners nearer to a plane lie on it
     two = slice(-3, -1)  # two barycentric coordinates, from which areas are computed
-    middle = np.stack([sum_by(group, x, len(first)) for x in v[two]]) / np.bincount(group)
+    middle = sum_by(group, v[two], len(first)) / np.bincount(group)
     order = np.lexsort((np.arctan2(*(v[two] - middle[:, group])), group))
     v, group = v[:, order], group[order]
     after = _around(group)
@@ -542,7 +542,7 @@ def _polygons(
     corner = bend > near * (np.linalg.norm(a, axis=0) + np.linalg.norm(b, axis=0))
     v, group = v[:, corner], group[corner]
     after, sides = _around(group), np.bincount(group, minlength=len(first))
-    middle = np.stack([sum_by(group, x, len(first)) for x in v]) / np.maximum(sides, 1)
+    middle = sum_by(group, v, len(first)) / np.maximum(sides, 1)
     triangle = sides[group] == 3
     begins = np.diff(group, prepend=-1).nonzero()[0]
     alone = begins[triangle[begins]]

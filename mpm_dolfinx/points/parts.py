@@ -12,10 +12,8 @@ from mpi4py import MPI
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import label
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
-from mpm_dolfinx.grid.grid import Grid, corner_bits
+from mpm_dolfinx.grid.grid import Grid, corner_bits, linked
 from mpm_dolfinx.parallel.exchange import over_all
 
 
@@ -145,8 +143,7 @@ def joined_parts(
     cells, at = np.unique(np.concatenate(grid.comm.allgather(np.unique(pairs, axis=0))), return_inverse=True)
     of = np.where(grid.owner(cells) == grid.comm.rank, part[grid.locals[cells]], 0)
     one, other = over_all(grid.comm, of, MPI.MAX)[at].reshape(-1, 2).T - 1
-    joins = coo_array((np.ones(len(one)), (one, other)), shape=(count, count))
-    total, new = connected_components(joins, directed=False)
+    new, total = linked(count, one, other)
     return np.append(0, new + 1)[part], total
 
 
@@ -165,10 +162,8 @@ def _touching(index: NDArray[np.int64]) -> tuple[NDArray[np.int64], int]:
 
 def _joined(rows: NDArray[np.int64], columns: NDArray[np.int64], shape: Sequence[int]) -> tuple[NDArray[np.int64], int]:
     """Return the component of each row, and the number of components.  Rows with a common column are connected."""
-    n = sum(shape)
-    pairs = coo_array((np.ones(len(rows)), (rows, shape[0] + columns)), shape=(n, n)).tocsr()
-    count, part = connected_components(pairs, directed=False)
-    return part[: shape[0]].astype(np.int64), count
+    part, count = linked(sum(shape), rows, shape[0] + columns)
+    return part[: shape[0]], count
 
 
 def _over_processes(

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.fluid_content import mass_potential
-from mpm_dolfinx.grid.grid import sum_by
+from mpm_dolfinx.grid.grid import means_of_rows, sum_by
 from mpm_dolfinx.stepping.scene import Scene
 from mpm_dolfinx.stepping.state import State
 
@@ -63,9 +63,7 @@ def cell_fields(scene: Scene, state: State) -> CellFields:
 
     def mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the mean of piece values in each cell."""
-        columns = values.reshape(len(values), -1).T
-        sums = [sum_by(places.slots, weight * column, len(volume)) / volume for column in columns]
-        return np.stack(sums, axis=1).reshape(len(volume), *values.shape[1:])
+        return means_of_rows(places.slots, weight, values, len(volume))
 
     effective = mean(cut.to_cells(scene.materials.effective_stress(points)))
     moved = mean(cut.pieces_to_cells(cut.total_displacement(points)))

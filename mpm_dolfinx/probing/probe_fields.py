@@ -21,7 +21,7 @@ from mpm_dolfinx.bodies.faces import interpolate
 from mpm_dolfinx.domains.fitted import fitted_at
 from mpm_dolfinx.domains.pressure_transport import van_leer
 from mpm_dolfinx.flow.feeding import Wet, open_sides
-from mpm_dolfinx.grid.grid import Grid, sum_by
+from mpm_dolfinx.grid.grid import Grid, means_of_rows, sum_by
 from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.local_fit import RADIUS, fitted, near
 from mpm_dolfinx.probing.probes import Probes
@@ -244,9 +244,8 @@ class _Around:
         direction = 2 * axis + (sides.normal[face, axis] > 0)
         side, group = np.unique(2 * d * row + direction, return_inverse=True)
         area = np.linalg.norm(sides.area[face], axis=1)
-        columns = np.column_stack([offset, sides.pressure[face] - offset @ weight]) * area[:, None]
-        total = sum_by(group, area, len(side))
-        means = np.stack([sum_by(group, column, len(side)) / total for column in columns.T], axis=1)
+        columns = np.column_stack([offset, sides.pressure[face] - offset @ weight])
+        means = means_of_rows(group, area, columns, len(side))
         row = side // (2 * d)
         return probe[row], means[:, :d], means[:, d], np.ones(len(row)), (place == self._lattice.middle)[row]
 

@@ -27,7 +27,6 @@ from mpm_dolfinx.domains.kept_volumes import Domains, with_volumes
 from mpm_dolfinx.domains.lattice import filtered, given, seeded
 from mpm_dolfinx.domains.pressure_transport import PiecePressures, Reconstruction
 from mpm_dolfinx.flow.storage import StorageForms
-from mpm_dolfinx.forms.point_forms import PointData
 from mpm_dolfinx.grid.grid import REACH, Grid, in_chunks, sum_by
 from mpm_dolfinx.materials.fields import SceneMaterials
 from mpm_dolfinx.mechanics.momentum import MomentumForms
@@ -153,7 +152,7 @@ class Motion:
                 of_cut = (ids, cut.pieces.cell, cut.pieces.fraction)
                 carried = PiecePressures(*of_cut, None, x, None, None, pressure, start)
                 if cut.domains and net_inflow is not None:
-                    undrained = partial(self._undrained, state, on_grid, data.of_points, loads)
+                    undrained = partial(self._undrained, state, on_grid, data, loads)
                     defect = self._volume_defect(state, points, on_grid, undrained, net_inflow, keeps)
                 now = self.pressures(on_grid, state.stage, t, nodal)
                 points = replace(points, pressure=now, data=points.data | defect)
@@ -410,22 +409,22 @@ class Motion:
         mean = np.divide(total, whole, out=np.zeros(count), where=whole > 0) * undrained()
         return {"owed": defect, "due": np.where(none | keeps, 0.0, mean[part] + share * (defect - mean[part]))}
 
-    def _undrained(self, state: State, on_grid: OnGrid, pieces: PointData, loads: Sequence[Loads]) -> NDArray[np.bool_]:
+    def _undrained(
+        self, state: State, on_grid: OnGrid, data: QuadratureData, loads: Sequence[Loads]
+    ) -> NDArray[np.bool_]:
         """Return a mask of connected parts without open sides and without sources.
 
         Parts between which contacts may conduct fluid are undrained together.
         """
         cut, (part, count) = on_grid.cut, on_grid.parts
-        fed = [one.fed(cut, pieces) for one in state.stage.feeding]
+        fed = [one.fed(cut, data.of_points) for one in state.stage.feeding]
         at = np.concatenate([np.zeros(0, dtype=np.int64), *fed])
-        if not (conduct := [one for one in loads if one.conducts]):
-            return over_all(cut.grid.comm, np.bincount(part[at], minlength=count)) == 0
-        whole, wholes = on_grid.parts_of_points(conduct)
+        conduct = [one for one in loads if one.conducts]
+        whole, wholes = on_grid.parts_of_points(conduct) if conduct else on_grid.parts
         of = np.zeros(count, dtype=np.int64)
         of[part] = whole
-        return (over_all(cut.grid.comm, np.bincount(whole[at], minlength=wholes)) == 0)[
-            over_all(cut.grid.comm, of, MPI.MAX)
-        ]
+        closed = over_all(cut.grid.comm, np.bincount(whole[at], minlength=wholes)) == 0
+        return closed[over_all(cut.grid.comm, of, MPI.MAX)]
 
     def of_bodies(self, on_grid: OnGrid, cells: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the largest values (k, bodies) in each body, from values (k, n) in the active owned cells."""

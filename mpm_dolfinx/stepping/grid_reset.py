@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cached_property, partial
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +21,6 @@ from mpm_dolfinx.base.caching import Keyed, Latest
 from mpm_dolfinx.base.fluid_content import mass_potential, pressure_of
 from mpm_dolfinx.base.tolerances import ROUND_OFF, TINY
 from mpm_dolfinx.conditions.acting import At, Loads
-from mpm_dolfinx.diagnostics.scene_checks import check_held
 from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.domains.pressure_transport import CellPressures, Reconstruction, share_within, transport
 from mpm_dolfinx.flow.borders import Borders
@@ -654,39 +652,3 @@ class Assembled(Keyed):
             return self._outflow((*at_u, nodal), partial(at_present, nodal, begins), grid.comm)
 
         return feeds, outflow
-
-
-def assembled(
-    momentum: MomentumForms,
-    storage: StorageForms | None,
-    scheme: Scheme,
-    systems: Latest[System],
-    on_grid: OnGrid,
-    stage: Stage,
-    loads: Sequence[Loads],
-    begins: bool,
-    *pairs: Any,
-) -> Assembled:
-    """Return the matrices for cut domains and a stage.
-
-    `begins`: whether every connected part of a body must have supports.
-
-    Raises
-    ------
-    ValueError
-        A body, or at the start of a stage a connected part of a body, has a free rigid-body mode.
-    """
-    grid, free = on_grid.cut.grid, stage.free
-    dofs = momentum.active.now.dofs[free[momentum.active.now.nodes].ravel()]
-    stiff, symmetric = any(one.stiff for one in loads), momentum.symmetric and stage.symmetric
-
-    def make() -> System:
-        if not stage.inertia and not any(one.holding for one in loads):
-            check_held(on_grid.active, free, [held for one in loads if (held := one.touching())], begins)
-        return System(momentum, storage, scheme, on_grid, dofs, stiff, symmetric, loads)
-
-    # a cell between active nodes may become active, so active cells may differ for equal dofs
-    with _compat.Timer("integration data"):
-        others = pairs, on_grid.not_full if stage.inertia else None, () if grid.follow is None else grid.lines
-        system = systems((stage, on_grid.cells, dofs, on_grid.penalised, *others), make, grid.comm)
-        return Assembled(momentum, storage, system, on_grid, stage, loads)

@@ -35,7 +35,7 @@ from mpm_dolfinx.domains.pressure_transport import PiecePressures, at_start, tra
 from mpm_dolfinx.domains.refilled_cells import New, RefilledCells, misshapen
 from mpm_dolfinx.domains.renewed_faces import AREA, ENDS, PARENT, PART, ROOT, SeededFaces, is_part, with_faces
 from mpm_dolfinx.dynamics.renewed_velocities import MOTION, centred, velocities
-from mpm_dolfinx.grid.grid import sum_by
+from mpm_dolfinx.grid.grid import means_of_rows, sum_by
 from mpm_dolfinx.materials.fields import SceneMaterials
 from mpm_dolfinx.parallel.exchange import first, over_all
 from mpm_dolfinx.points.cutting import centroids, domain_volumes
@@ -172,11 +172,8 @@ class Renewal:
         n, mass = len(corners), points.volume0
         J = points.J
         weight = share * mass[old]
-        total = sum_by(at, weight, n)
-
         x = centroids(corners)
-        off = x - np.stack([sum_by(at, weight * column, n) / total for column in points.x[old].T], axis=1)
-
+        off = x - means_of_rows(at, weight, points.x[old], n)
         size = np.abs(domain_volumes(corners, self._grid.axisymmetric))
         count = int(group.max()) + 1
         M, V = (sum_by(groups, part * of[source], count) for of in (mass, mass * J))
@@ -185,8 +182,7 @@ class Renewal:
             flat = values.reshape(len(values), int(np.prod(values.shape[1:])))
             if not flat.shape[1]:
                 return np.zeros((n, *values.shape[1:]))
-            means = np.stack([sum_by(at, weight * column, n) / total for column in flat[old].T], axis=1)
-            means = means + np.einsum("ni,nik->nk", off, work.slopes(flat, group))
+            means = means_of_rows(at, weight, flat[old], n) + np.einsum("ni,nik->nk", off, work.slopes(flat, group))
             low, high = np.full((count, flat.shape[1]), np.inf), np.full((count, flat.shape[1]), -np.inf)
             np.minimum.at(low, groups, flat[source])
             np.maximum.at(high, groups, flat[source])

@@ -25,6 +25,7 @@ from mpm_dolfinx.conditions.acting import Loads
 from mpm_dolfinx.conditions.conditions import OnSide
 from mpm_dolfinx.conditions.unit_weights import other_gravity, weighed
 from mpm_dolfinx.diagnostics.resolution import warn_mixed, warn_overlaps
+from mpm_dolfinx.diagnostics.scene_checks import check_held
 from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.domains.renewed_faces import SeededFaces
 from mpm_dolfinx.flow.sources import Sources
@@ -43,7 +44,7 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.solve.numerics import Numerics
 from mpm_dolfinx.stepping.advance import Motion
 from mpm_dolfinx.stepping.division import Division
-from mpm_dolfinx.stepping.grid_reset import Assembled, OnGrid, System, assembled
+from mpm_dolfinx.stepping.grid_reset import Assembled, OnGrid, System
 from mpm_dolfinx.stepping.moving_lines import with_lines
 from mpm_dolfinx.stepping.renewal import Renewal
 from mpm_dolfinx.stepping.stage import Stage, stage
@@ -343,14 +344,35 @@ class Scene:
         `now`: present loads.
         `as_cut`: function that returns the loads at the positions at which domains were cut.
         `begins`: whether all parts of the bodies must have supports.
+
+        Raises
+        ------
+        ValueError
+            A body, or at the start of a stage a connected part of a body, has a free rigid-body mode.
         """
 
         def make() -> Assembled:
-            problems = (self.momentum, self.storage, self.scheme, self._systems)
-            pairs = [(on_grid.key, one.key) for one in now if one.couples]  # contact pairs depend on the positions
-            return assembled(*problems, on_grid, stage, as_cut(), begins, *pairs)
+            loads, active = as_cut(), self.momentum.active.now
+            with _compat.Timer("integration data"):
+                dofs = active.dofs[stage.free[active.nodes].ravel()]
+                pairs = tuple((on_grid.key, one.key) for one in now if one.couples)  # depend on the positions
+                others = pairs, on_grid.not_full if stage.inertia else None, () if grid.follow is None else grid.lines
+                # a cell between active nodes may become active, so active cells may differ for equal dofs
+                key = (stage, on_grid.cells, dofs, on_grid.penalised, *others)
+                system = self._systems(key, lambda: self._system(on_grid, stage, dofs, loads, begins), grid.comm)
+                return Assembled(self.momentum, self.storage, system, on_grid, stage, loads)
 
-        return self._assembled((on_grid.key, stage, *(one.key for one in now)), make, self.grid.comm)
+        grid = self.grid
+        return self._assembled((on_grid.key, stage, *(one.key for one in now)), make, grid.comm)
+
+    def _system(
+        self, on_grid: OnGrid, stage: Stage, dofs: NDArray[np.int32], loads: Sequence[Loads], begins: bool
+    ) -> System:
+        """Return vectors, matrices and solvers for the active cells, see `assembled`.  `dofs`: see `System`."""
+        if not stage.inertia and not any(one.holding for one in loads):
+            check_held(on_grid.active, stage.free, [held for one in loads if (held := one.touching())], begins)
+        stiff, symmetric = any(one.stiff for one in loads), self.momentum.symmetric and stage.symmetric
+        return System(self.momentum, self.storage, self.scheme, on_grid, dofs, stiff, symmetric, loads)
 
     def seeded(self, chosen: Sequence[bool]) -> MaterialPoints:
         """Return the points of the chosen bodies on this process, as seeded."""
