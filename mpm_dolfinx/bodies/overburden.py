@@ -22,8 +22,8 @@ def overburden(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the overburden stress (k,), in Pa, at positions x, and the level (k,), in m, of the ground above them.
 
-    Two domains may meet exactly above a position.  Both results are therefore means over vertical lines on all sides of
-    the position, very close to it.
+    Two domains may meet exactly above a position.  Both results are therefore means over vertical lines close to the
+    position, on all sides.
 
     `corners` (n, 2^d, d), in m: corners of the particle domains of all bodies; the last axis is vertical.
     `unit_weight` (n,), in N/m^3: unit weights of the domains.

@@ -419,9 +419,9 @@ def holding(material: Skeleton) -> NDArray[np.float64]:
     """Return the reference modulus, in Pa, of the penalty for prescribed displacements.
 
     A Q1 field with constant volumetric strain in each cell cannot follow a curved side.  The penalty converts the
-    difference between this field and the side into pressure.  It must not be stiff compared with the shear stiffness.
-    In an undrained cavity, a penalty of 300 (lambda + 2G) gives up to 1.9 times the exact pressure.  A penalty of 30
-    (4G) gives 1.01 times the exact pressure.
+    difference between this field and the side into pressure.  The penalty must therefore not be stiff compared with the
+    shear stiffness.  In an undrained cavity, a penalty of 300 (lambda + 2G) gives up to 1.9 times the exact pressure.
+    A penalty of 30 (4G) gives 1.01 times the exact pressure.
     """
     return (YIELDING if material.state else 1.0) * resistance(material)
 

@@ -8,11 +8,11 @@ is closed (`ContactProblem.closed`).  The two cells conduct in series, as in the
     Q = r [p_1 - p_2 + rho_w g . (x_2 - x_1)] / (d_1 / (A kappa_1) + d_2 / (A kappa_2)).
 
 A is the area of the pair's point, kappa is the mobility of a cell across the surface, and d is the distance from the
-centroid x of the cell's material to the surface.  The factor r is that of `storage`.  All quantities refer to the last
-reset of the grid, and mobilities are pulled back (`Conduction.across`).
+centroid x of the cell's material to the surface.  The factor r is the relative density of the fluid, see `storage`.
+All quantities refer to the last reset of the grid, and mobilities are pulled back (`Conduction.across`).
 
-The pressures of both cells are implicit.  The set of closed pairs is an active set: it is fixed while fluxes are
-assembled, and updated between Newton steps.  After `ROUNDS` changes in a substep, it remains fixed.
+The pressures of both cells are implicit.  The closed pairs are an active set, which is updated between Newton steps.
+After `ROUNDS` changes in a substep, the active set remains fixed.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class ConductingContacts(Feeding):
 
 
 class Links(NamedTuple):
-    """The closed pairs whose points are in cells of this process, and the other sides of closed pairs."""
+    """The closed pairs with their points in cells of this process, and the opposite sides of closed pairs."""
 
     law: Any  # contact law of the pairs
     closed: NDArray[np.bool_]  # whether each pair of the law is closed (m,)
@@ -108,7 +108,7 @@ class ContactFeeds(Feeds):
 
     @property
     def _now(self) -> Links:
-        """The closed pairs.  They are found again if the contact has updated its pairs."""
+        """The closed pairs, which are determined again after the contact has updated its pairs."""
         if self._contact.now.law is not self._links.law:
             self._links = self._linked(self._links.changes)
         return self._links

@@ -34,7 +34,8 @@ class Contact:
     conducts
         Whether pore fluid passes where the contact is closed.  The pressure is then continuous across the contact.  No
         fluid passes where the contact is open.  A gap of at most 5e-4 cell sizes counts as closed.  `outflows` of the
-        simulation contain the flow from `one` to `other`.  Friction depends on the total pressure in both cases.
+        simulation contain the flow from `one` to `other`.  Friction depends on the total pressure with and without
+        `conducts`.
     name
         Name of the results; by default "contact".
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Derivatives of nodal forces with respect to the pressures of cells, for laws that depend on suction.
 
-The total stress depends on the pressure through such a law, and through the term chi p of Bishop's stress.  In cells
-with F-bar, the mean stress pi also depends on the pressure.
+The total stress depends on the pressure p through the suction in the law, and through the term chi p of Bishop's
+stress.  In cells with F-bar, the mean stress pi also depends on the pressure.
 """
 
 from __future__ import annotations

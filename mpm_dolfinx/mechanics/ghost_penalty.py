@@ -3,11 +3,11 @@
 
 Without a penalty, nearly empty cells would spoil conditioning and accuracy.  The ghost penalty adds the term
 `gamma s 2G h/3 int [d_n u].[d_n v] dS` over faces, with the displacement increment u of the step and the test function
-v.  gamma is `GHOST`, s is the strength of the face, G is the shear modulus, h is the cell size, and [d_n u] is the jump
-of the normal derivative.  The penalty resists motion like a viscosity, so it must not act on load-bearing cells:
+v.  Here gamma is `GHOST`, s is the strength of the face, G the shear modulus, h the cell size, and [d_n u] the jump of
+the normal derivative.  The penalty resists motion like a viscosity, so it must not act on load-bearing cells:
 
-* The strength s has two factors.  The first factor falls from 1 to 0 while the filling of the emptier cell rises from 0
-  to `RATIO` times the filling of the fuller cell.  The second factor is the squared ratio of the filling of the fuller
+* The strength s has two factors.  The first factor decreases from 1 to 0 as the ratio of the fillings of the emptier
+  and the fuller cell increases from 0 to `RATIO`.  The second factor is the squared ratio of the filling of the fuller
   cell to the largest filling of the emptier cell's neighbours.  The penalty does not resist kinks of a body between
   equally filled cells.
 * The factor 2G contains the shear modulus only.  With lambda + 2G, nearly empty cells of nearly incompressible bodies
@@ -48,7 +48,7 @@ Plateau (scene "soil" of tests/plateaus.py): half this value changes the result 
 and finer cells by 3.0e-02.
 """
 SPARSE, FULL = 0.2, 0.9
-"""Two numbers for integration at points: strength of the penalty, and largest volume fraction of a penalised cell."""
+"""Strength of the penalty and largest volume fraction of a penalised cell, for integration at material points."""
 
 
 def stiffness(material: Skeleton) -> NDArray[np.float64]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""F-bar: one volume ratio per cell, against volumetric locking of nearly incompressible skeletons.
+"""F-bar: one volume ratio for each cell, against volumetric locking of nearly incompressible skeletons.
 
 Without F-bar, four volume constraints per cell suppress the bending modes of a Q1 quadrilateral, with errors of up to
 50 % at nu = 0.499.  F-bar scales the deformation gradient F that the law receives.  The scaled gradient Fbar has the
@@ -14,11 +14,10 @@ the law's energy psi and Psi = psi(Fbar) / J_n, the energy sum w Psi has the der
 
     sum w [dPsi/dF : dF + pi d(det Delta)],   pi = (sum w dPsi/dtheta) / (sum w).
 
-The residual has the additional term with pi.  The tangent of the residual at fixed theta and pi is symmetric.  The
-derivatives with respect to theta and pi add a matrix of rank two in each cell (Simo, Taylor and Pister 1985).  Coombs
-et al. (2018) used incremental F-bar in the material point method.  For a law without an energy, P(Fbar) : dFbar
-replaces dPsi.  The points store Fbar.  The next step starts from the volume ratios of the particle domains
-(`cell_ratios`).
+The tangent of the residual at fixed theta and pi is symmetric.  The derivatives with respect to theta and pi add a
+matrix of rank two in each cell (Simo, Taylor and Pister 1985; incremental F-bar in material points: Coombs et al.
+2018).  For a law without an energy, P(Fbar) : dFbar replaces dPsi.  The points store Fbar.  The next step starts from
+the volume ratios of the particle domains (`cell_ratios`).
 """
 
 from __future__ import annotations
@@ -124,12 +123,11 @@ class FBar:
     def _slopes(self, law: type[Skeleton], F, Fbar, values: Mapping[str, object]) -> tuple:
         """Return the derivatives of both results of `stresses` with respect to F and theta.
 
-        In 2D a law without an energy is differentiated with respect to Fbar only, which halves the time for tangents.
-        With Fbar = s F,
+        In 2D a law without an energy is differentiated with respect to Fbar only.  With Fbar = s F,
 
             dtau = s C : dF + (theta dtau/dtheta) (dtheta / theta - F^-T : dF),   C = dtau/dFbar,
 
-        for F (d, d) and the (d, d) components of s F. In 3D this formula would take two minutes to compile.
+        for F (d, d) and the (d, d) components of s F.
         """
         P, slope = self.stresses(law, F, Fbar, values)
         if law.kirchhoff is None or self.grid.dim == 3:

@@ -23,10 +23,10 @@ def rigid_motion(
 ) -> NDArray[np.float64] | None:
     """Return the displacements, in m, of positions x in the rigid motion nearest to prescribed displacements.
 
-    The result is None if the linearised rotation stretches by less than `NEAR`, or leaves more than half of the squared
-    gaps of the best translation.  All processes must call this function.
+    The result is None if the linearised rotation stretches by less than `NEAR`.  The result is also None if more than
+    half of the squared gaps of the best translation remain.  All processes must call this function.
 
-    `holds`: penalties of prescribed displacements, with direction, gap, in m, and stiffness, the weight in the fit.
+    `holds`: penalties of prescribed displacements, with direction, gap, in m, and stiffness, which weights the fit.
     `counts` (k,): whether each penalty is used.
     """
     d = x.shape[1]

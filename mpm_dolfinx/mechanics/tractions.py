@@ -175,7 +175,7 @@ class PressureLoads(Loads):
 def closed(grid: Grid, free: NDArray[np.bool_], pressures: Sequence[tuple[Pressure, Surface]]) -> bool:
     """Return whether each surface of equal pressure is closed, or ends on walls that fix the normal displacement.
 
-    The corners of faces must not lie on the edges of other faces.
+    Corners of a face must not lie on edges of other faces.
 
     `free` (nodes, d): whether walls leave each displacement component free.
     """

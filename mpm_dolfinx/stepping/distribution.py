@@ -19,17 +19,17 @@ from mpm_dolfinx.stepping.state import State
 
 
 class Distributed(Protocol):
-    """A simulation or its copy.  Scene and state are replaced together."""
+    """Interface of a simulation, whose scene and state are replaced together."""
 
     scene: Scene
     state: State
 
 
 def distribute(simulation: Distributed) -> None:
-    """Distribute the cells anew if the processes then have more equal numbers of points.
+    """Distribute the cells anew if this makes the numbers of points on the processes more equal.
 
     The function acts only before a step that resets the grid.  If no cell changes its owner, points are still sent to
-    the owners of their cells.  On a grid with `follow`, this happens after the lines have moved.
+    the owners of their cells.  On a grid with `follow`, the lines move before the distribution.
     """
     grid = simulation.scene.grid
     if grid.comm.size == 1 or (state := simulation.state).stays:
@@ -43,7 +43,7 @@ def distribute(simulation: Distributed) -> None:
 
 
 def distribute_by(simulation: Distributed, boxes: NDArray[np.int64]) -> bool:
-    """Distribute the cells by boxes (ranks, 2, d) (see `Partition`).  Return whether this is possible."""
+    """Distribute the cells by boxes (ranks, 2, d) (see `Partition`).  Return False if this is impossible."""
     new = simulation.scene.distributed(boxes)
     if new is not None:
         simulation.scene, simulation.state = new, new.adopted(simulation.state)

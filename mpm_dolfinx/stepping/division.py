@@ -2,8 +2,8 @@
 """Division and merging of elastic particle domains where grid cells become finer or coarser.
 
 A domain is bisected along a local axis if each half is at least as long, in cells, as the whole domain was at seeding.
-A stretched domain is longer in cells, and may therefore be divided too. Two halves merge if the merged domain is at
-most as long, in cells, as one domain at seeding. Whole domains on the lattice of a box merge too, except at the
+Stretch makes a domain longer in cells, so stretched domains may be divided too. Two halves merge if the merged domain
+is at most as long, in cells, as one domain at seeding. Whole domains on the lattice of a box merge too, except at the
 surface. Domains are not replaced if they yield, contain probes, or have a side whose displacement a condition needs.
 
 The corners of elastic domains determine F, so a division adds no error: both halves have the mapping of the whole
@@ -41,8 +41,9 @@ class Division:
         self._domains = SeededDomains(faces.bodies)
 
     def divided(self, state: State) -> tuple[State, int]:
-        """Return the state with divided and merged domains, and the number of replaced domains. All processes must call
-        it.
+        """Return the state with divided and merged domains, and the number of replaced domains.
+
+        All processes must call this method.
         """
         now, seeded = self._domains.sizes(self._grid, state.points)
         some = _divides(now, seeded).any() or _merges(now, seeded).any()

@@ -41,7 +41,7 @@ class Result:
     renewed
         Number of particle domains replaced by renewal, division or merging.
     renewals
-        Number of resets of the grid with such replacements.
+        Number of resets of the grid that replaced particle domains.
     balance
         Largest relative error of the fluid mass balance so far.
     residual
@@ -156,8 +156,7 @@ class Result:
         return self.outcome("energy")
 
     def outcome(self, quantity: str) -> ByName[NDArray[np.float64]]:
-        """Return the results (n, ...) of conditions at the output times, by name. Results are nan at times without the
-        condition.
+        """Return the results (n, ...) of conditions at the output times, by name; nan at times without the condition.
 
         `quantity`: name of the results, such as "reactions".
         """
