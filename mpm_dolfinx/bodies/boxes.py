@@ -167,7 +167,7 @@ def box(grid: Grid, lower: ArrayLike, upper: ArrayLike, per_cell: int = 2, mater
     grid
         Background grid.
     lower, upper : (d,), m
-        Corners of the box, inside the grid.  They need not lie on grid lines.
+        Corners of the box, inside the grid.  Corners need not lie on grid lines.
     per_cell
         Points per cell and direction, >= 1, rounded to fit the box.  In grids of unequal cells, domains end at grid
         lines.  With 1 point, bodies deflect too much and creep; a warning names slender bodies.  In 3D, a body that
@@ -197,8 +197,8 @@ def shape(
 ) -> Body:
     """Seed a body from a lattice over the whole grid, and return it.
 
-    The body consists of all domains of the lattice with centres inside a shape.  Its surface has steps of the size of a
-    domain.  `mapped` gives bodies with smooth sides.
+    The body consists of all domains of the lattice with centres inside a shape.  The surface of the body has steps of
+    the size of a domain.  `mapped` gives bodies with smooth sides.
 
     Parameters
     ----------

@@ -6,9 +6,9 @@ At a position with gap g, the contact pressure p and its energy psi per area are
     p = <lambda - k g>,     psi = p^2 / (2 k).
 
 <...> is the positive part, and k is a penalty stiffness.  The stiffness is limited so that a Q1 field can follow curved
-surfaces.  The multiplier lambda has one value for each contact and cell.  It starts from the pressure after the
-previous step.  Augmentation (Uzawa's method) updates lambda until the penetrated volume in each cell is below `DEPTH`
-cell volumes.
+surfaces.  The multiplier lambda has one value for each contact and cell.  The multiplier starts from the pressure after
+the previous step.  Augmentation (Uzawa's method) updates lambda until the penetrated volume in each cell is below
+`DEPTH` cell volumes.
 
 The shear traction t depends on means over the pairs in a cell: the slip s in the step, and the shear traction t_n after
 the previous step.  Radial return gives
@@ -62,7 +62,7 @@ DEPTH = 5e-4
 changes the result by 2.6e-03, twice this value by 2.4e-03, and finer cells by 1.1e-02.
 """
 ROUNDS = int(-np.log2(DEPTH * DEPTH))
-"""Largest number of augmentations, which halve a penetration of a cell to `DEPTH`, or stiffen; of updates of pairs."""
+"""Largest number of augmentations, and of updates of pairs: twice the halvings that reduce a cell size to `DEPTH`."""
 BEGIN = 1.0, np.inf, 0.0, 0.0  # initial values of `ContactState.updates`
 STIFFER = 10.0
 """The stiffness is multiplied by this factor if an augmentation leaves more than half of the previous penetration."""

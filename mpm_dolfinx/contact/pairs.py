@@ -2,8 +2,8 @@
 """Contact pairs: a quadrature point on a surface, and the opposite position on a tool or another group of bodies.
 
 The displacement w of the point relative to the opposite position is `w = B u`, where u are the nodal displacements.
-The columns of B belong to the nodes of the point's cell.  In pairs between groups, they also belong to the nodes of the
-cell with the opposite position.  A position on a tool moves with the tool.
+The columns of B belong to the nodes of the point's cell.  In pairs between groups, the columns also belong to the nodes
+of the cell with the opposite position.  A position on a tool moves with the tool.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class Pairs:
 
     @property
     def largest_coordinate(self) -> NDArray[np.float64] | float:
-        """Largest coordinates, in m, from which gaps are computed.  They determine the rounding errors of the gaps."""
+        """Largest coordinates, in m, which determine the rounding errors of gaps."""
         return self.grid.reach
 
     def other_side(self) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
@@ -136,7 +136,7 @@ class FacePairs(Pairs):
     outward: NDArray[np.float64]
 
     def at(self, w: NDArray[np.float64], motion: NDArray[np.float64]) -> Geometry:
-        """See `Pairs`.  Lever arms are those at the start of the step."""
+        """See `Pairs`.  Lever arms refer to the start of the step."""
         gap = np.einsum("md,md->m", self.n, self.offset + w)
         return Geometry(gap, self.n, None, w, self.x + self.grid.base, self.shear)
 

@@ -98,8 +98,8 @@ class ContactProblem(Loads):
     law, origin
         Contact law at the start of the step, and the material points of its pairs.
     again
-        Function of displacements (a local array, in m), which finds the pairs at these displacements.  It returns the
-        law and the origin of the pairs, see `FacePairs`.
+        Function of displacements (a local array, in m), which finds the pairs at these displacements.  The function
+        returns the law and the origin of the pairs, see `FacePairs`.
     cell_pairs
         Function that returns all pairs of cells, as integers `first * cells + second`, that contact pairs may join.
     """

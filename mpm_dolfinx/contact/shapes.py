@@ -101,7 +101,7 @@ class HalfSpace(Placed):
     point : (d,), m
         A position on the plane.
     outward : (d,)
-        Normal of the plane, of any length.  It points out of the tool towards the bodies.
+        Normal of the plane, of any length.  The normal points out of the tool towards the bodies.
     """
 
     point: ArrayLike
@@ -156,8 +156,8 @@ class Ball(Placed):
 class Convex(Placed):
     """The convex hull of corners: a polygon in 2D, a polyhedron in 3D.
 
-    The signed distance is the largest distance from the planes of the surface.  It is exact inside the hull.  Outside
-    the hull, it is too small near edges and corners, but no contact occurs there.
+    The signed distance is the largest distance from the planes of the surface.  The distance is exact inside the hull.
+    Outside the hull, the distance is too small near edges and corners, but no contact occurs there.
 
     Parameters
     ----------

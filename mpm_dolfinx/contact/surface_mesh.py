@@ -133,9 +133,9 @@ class Facets:
 class SurfaceMesh(Placed):
     """A solid inside a closed surface of triangles in 3D, or inside closed polygons in 2D, convex or not.
 
-    The distance is exact.  Its gradient is the normal of the nearest facet.  If an edge or vertex is nearest, the
-    gradient points away from this edge or vertex.  On edges and vertices, it is the mean of the adjacent normals,
-    weighted by angle.  Facets are flat, so the second derivatives are zero where a facet is nearest.
+    The distance is exact.  The gradient of the distance is the normal of the nearest facet.  If an edge or vertex is
+    nearest, the gradient points away from this edge or vertex.  On edges and vertices, the gradient is the mean of the
+    adjacent normals, weighted by angle.  Facets are flat, so the second derivatives are zero where a facet is nearest.
 
     Vertices nearer than 10^-6 times the size of the mesh are merged, as STL files repeat them.  Facets without extent
     are left out.  The orientation of facets in the input has no effect: normals point out of the solid.  A surface

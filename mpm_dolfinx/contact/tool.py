@@ -66,13 +66,13 @@ class Tool:
     shape : HalfSpace, Ball, Convex, Cone, SurfaceMesh, or callable y (m, d) -> (m,), m
         The tool in its initial position.  A function returns the signed distance, positive outside the tool.
     displacement : (d,) or callable t (s) -> (d,), m
-        Displacement from the initial position, also in later stages.  In axisymmetry, it must be along the axis.
+        Displacement from the initial position, also in later stages; in axisymmetry only along the axis.
     rotation_rad : float or callable t (s) -> float, rad
         Counterclockwise rotation about `centre`.  The tool is rotated first, and then displaced.  Tools can rotate only
         in 2D, and not in axisymmetry.
     centre : (d,), m
-        Centre of rotation and reference of moments.  In a free tool, it is also the centre of mass.  The centre moves
-        with the tool.  The default is the centroid of a free disc or polygon, and the origin for other tools.
+        Centre of rotation, reference of moments, and centre of mass of a free tool.  The centre moves with the tool.
+        The default is the centroid of a free disc or polygon, and the origin for other tools.
     friction
         Coulomb's coefficient mu, >= 0.
     adhesion
@@ -289,8 +289,8 @@ class Tool:
     def pose(self, t: float, dim: int, by_forces: NDArray[np.float64] | float = 0.0) -> Pose:
         """Return the pose at time t (s).
 
-        `by_forces`, in m: displacement that the load causes.  For a free tool, it is a vector of the displacement (d,),
-        in m, and possibly the rotation, in rad.
+        `by_forces`, in m: displacement that the load causes.  For a free tool, `by_forces` is a vector of the
+        displacement (d,), in m, and possibly the rotation, in rad.
         """
         shift = self._given("displacement", t, dim)
         if shift.ndim == 0 and shift:

@@ -6,8 +6,8 @@ at each point would lock sides that are curved or inclined to the grid.  A stiff
 displacement in each cell, and a weak penalty acts on deviations from this mean.  The present traction of the body,
 rotated with the side, is applied explicitly, so that the penalties bear only the traction increment of the step.
 
-With inertia, a second penalty acts on the difference from the prescribed increment of the step.  Its modulus is
-rho (h / (gamma dt))^2 in place of the elastic modulus.  Otherwise the mass of a cell would not follow in short steps.
+With inertia, a second penalty acts on the difference from the prescribed increment of the step.  The modulus of this
+penalty is rho (h / (gamma dt))^2.  With the elastic modulus alone, the mass of a cell would lag in short steps.
 """
 
 from __future__ import annotations
