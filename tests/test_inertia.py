@@ -470,6 +470,30 @@ def test_steps_by_error_meet_it():
     assert all(10 < off < 20 for off, _ in found) and 1.7 < found[1][1] / found[0][1] < 2.2
 
 
+@pytest.mark.parametrize("frame", [0.5, 50.0])
+def test_steps_by_error_are_the_same_in_a_frame_that_moves_uniformly(frame):
+    """A bar vibrates with velocities of 0.05 m/s, and flies by up to 400 cells.  Steps of a size relative to the whole
+    velocity would be up to three times as few, and the error ten times as large."""
+
+    def steps(speed):
+        grid = mpm.Grid([0, 0], [1.8 + 0.8 * speed, 0.1], [18 + round(8 * speed), 1])
+        bar = mpm.box(grid, [0.23, 0], [1.23, 0.1])
+        law = Bar(bulk=1 / 3, shear=0.5, grain_density=2.0, porosity=0.5)
+        velocity = lambda x: np.stack([speed + 0.05 * np.cos(np.pi * (x[:, 0] - 0.23)), 0 * x[:, 1]], axis=1)  # noqa: E731
+        walls = {"bottom": "y", "top": "y"}
+        s = mpm.Simulation(grid, [bar], [law], walls=walls, inertia=mpm.Moving(velocity))
+        return np.diff(s.run(0.8, rtol=1e-3, progress=False).t)[:-2]  # the last two are fitted to the end
+
+    still = steps(0.0)
+    assert len(still) == 16 and steps(frame) == pytest.approx(still, rel=0.1)
+
+
+def test_steps_by_error_of_a_body_at_rest_grow():
+    """No Newton step, and therefore no tangent, was needed: PETSc raised an error."""
+    s = column(conditions=[mpm.Traction("top", lambda t: (0, -1e3 * (t > 1)))])
+    assert s.run(1.0, rtol=1e-3, progress=False).steps < 10 and not s.points.displacement.any()
+
+
 def in_frame(length=1.0, mass=1.0, time=1.0, order=(0, 1), sign=(1, 1), wet=False):
     """Return positions, divided by the length, and J of a rotating block after some steps, in its own frame.
 

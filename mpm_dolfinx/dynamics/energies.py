@@ -31,6 +31,20 @@ def stored(materials: SceneMaterials, points: MaterialPoints) -> dict[str, NDArr
     return dict(zip(("kinetic", "elastic"), over_all(materials.grid.comm, np.array([kinetic, elastic])), strict=True))
 
 
+def drift(materials: SceneMaterials, points: MaterialPoints, held: NDArray[np.bool_]) -> list[float]:
+    """Return the mean velocity of all bodies, in m/s, with zeros along axes that have a frame of their own.
+
+    These are the axes along which supports hold bodies, and the radius.  All processes must call this function.
+
+    `held` (d,): along which axes supports hold bodies of this process.
+    """
+    mass = materials.present_density(points) * points.volume0 * points.J
+    held = held | (np.arange(len(held)) < materials.grid.axisymmetric)
+    sums = [[mass.sum()] * len(held), mass @ points.data[VELOCITY], held]
+    total, momentum, held = over_all(materials.grid.comm, np.array(sums))
+    return np.where(held > 0, 0.0, momentum / total).tolist()
+
+
 def initial_energies(
     materials: SceneMaterials, points: MaterialPoints, kinetic: float, renews: bool
 ) -> dict[str, NDArray[np.float64]]:

@@ -15,7 +15,13 @@ from mpm_dolfinx.solve.schur import LinearSolvers
 
 
 def motion_error(
-    solvers: LinearSolvers, K: PETSc.Mat, mass: Mass, flights: Sequence[Flight], seconds: float, own: float
+    solvers: LinearSolvers,
+    K: PETSc.Mat,
+    mass: Mass,
+    flights: Sequence[Flight],
+    seconds: float,
+    own: float,
+    drift: Sequence[float],
 ) -> tuple[float, float]:
     """Return the estimated error and the size of the motion of a step, in J^(1/2).
 
@@ -29,6 +35,7 @@ def motion_error(
     `flights`: states of motion after the two substeps.
     `seconds`: weight of the first substep's rate in the last substep, in s.
     `own`: weight of the last substep's rate in the last substep, in s.
+    `drift`: mean velocity of free bodies at the start of the run, in m/s, see `energies.drift`.
     """
     first, last = flights
     rate, M = 1 / own**2, mass.M
@@ -40,4 +47,4 @@ def motion_error(
         solvers.solve_u.solve(M * off * rate, filtered)
         inert = filtered.dot(M * filtered)
         energy += filtered.dot(K * filtered) - rate * inert if stiff else inert
-    return float(np.sqrt(max(energy, 0.0))), float(np.sqrt(last.velocity.dot(M * last.velocity)))
+    return float(np.sqrt(max(energy, 0.0))), mass.size(last.velocity, drift)

@@ -42,7 +42,7 @@ from dolfinx import fem
 from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.base.caching import Latest
-from mpm_dolfinx.base.tolerances import ROUND_OFF
+from mpm_dolfinx.base.tolerances import NEAR, ROUND_OFF
 from mpm_dolfinx.base.validation import at_places, numbers
 from mpm_dolfinx.conditions.acting import At, Loads
 from mpm_dolfinx.domains.cut_domains import CutDomains
@@ -253,6 +253,18 @@ class Mass:
         out = self.unknowns.vector()
         self._solver.solve(rhs, out)
         return out
+
+    def size(self, velocity: PETSc.Vec, drift: ArrayLike) -> float:
+        """Return the size of velocities of the unknowns relative to a uniform velocity `drift` (d,), in J^(1/2).
+
+        The size does not depend on the uniform motion of the frame.  It is at least `NEAR` times the size of the
+        velocities themselves, because smaller relative velocities are rounding errors.
+        """
+        uniform = np.zeros_like(self._forms.work.x.array)
+        uniform.reshape(-1, self._forms.grid.dim)[:] = drift
+        relative = velocity - self.unknowns.gather(uniform, self.unknowns.vector())
+        size, whole = (float(np.sqrt(v.dot(self.M * v))) for v in (relative, velocity))
+        return max(size, NEAR * whole)
 
     def carried(
         self, points: MaterialPoints, velocities: tuple[PETSc.Vec, PETSc.Vec], moved: NDArray[np.float64]

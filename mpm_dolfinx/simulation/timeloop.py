@@ -22,7 +22,7 @@ from mpm_dolfinx.base.histories import Row, Rows
 from mpm_dolfinx.base.time_integration import EULER
 from mpm_dolfinx.base.tolerances import SAME
 from mpm_dolfinx.base.validation import flag, functions, instance, line
-from mpm_dolfinx.dynamics.energies import initial_energies
+from mpm_dolfinx.dynamics.energies import drift, initial_energies
 from mpm_dolfinx.parallel.exchange import by_user
 from mpm_dolfinx.parallel.messages import ResolutionWarning, log, logger, warn
 from mpm_dolfinx.probing.probe_fields import probe_pressures, probe_stresses
@@ -220,9 +220,11 @@ def _histories(
     latest = simulation.state.result
     control = simulation.state.control
     if after is None:
-        motion = 0.0 if rule.by_error and state.stage.inertia else None
         before = (0.0,) if control is None else control.first
-        fresh = StepControl(times.interval, rule.first, first=before, motion=motion)
+        fresh = StepControl(times.interval, rule.first, first=before)
+        if rule.by_error and state.stage.inertia:
+            held = state.stage.supported(state.points.corners)
+            fresh = replace(fresh, motion=0.0, drift=drift(simulation.scene.materials, state.points, held))
         return Result(Rows([_row(simulation, probes)])), fresh
     if latest is None or control is None or after.rows.run is not latest.rows.run:
         raise ValueError("after: histories of another run, must be histories of the last run, or a result of `resume`")

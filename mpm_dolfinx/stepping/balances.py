@@ -70,13 +70,14 @@ class Start(NamedTuple):
         """Return the error and the size of the motion in the step, see `motion_error`.  Both are zero if the run does
         not need them.
 
-        `flights`: velocities after each substep.
+        `flights`: velocities after each substep, or none for bodies at rest, which need no Newton step and no tangent.
         """
         control = self.state.control
         if control is None or control.motion is None or len(flights) < 2:
             return 0.0, 0.0
         times = float(substep.before * self.dt), float(substep.own * self.dt)
-        return motion_error(self.matrices.solvers, self.matrices.momentum.K, self.matrices.mass, flights, *times)
+        made = self.matrices
+        return motion_error(made.solvers, made.momentum.K, made.mass, flights, *times, control.drift)
 
 
 class Balances(NamedTuple):

@@ -31,7 +31,7 @@ from mpm_dolfinx.conditions.conditions import (
 )
 from mpm_dolfinx.conditions.sides import Sides
 from mpm_dolfinx.conditions.unit_weights import with_weight
-from mpm_dolfinx.conditions.walls import fixed_nodes, with_axis
+from mpm_dolfinx.conditions.walls import fixed_corners, fixed_nodes, with_axis
 from mpm_dolfinx.contact.conducting import ConductingContacts
 from mpm_dolfinx.contact.groups import Contact
 from mpm_dolfinx.contact.pairing import Contacts
@@ -172,6 +172,12 @@ class Stage:
     def held(self) -> list[tuple[Any, Surface, Sequence[int]]]:
         """Conditions that support faces, each with faces and axes."""
         return [one for acting in self.acting for one in acting.held]
+
+    def supported(self, corners: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return along which axes (d,) walls hold corners (n, 2^d, d) of domains, or conditions hold sides."""
+        out = fixed_corners(self.materials.grid, self.conditions["walls"], corners).any(axis=(0, 1))
+        out[[axis for _, _, axes in self.held for axis in axes]] = True
+        return out
 
     def placed(self, place: Place) -> list[Loads]:
         """Return the loads in the balance of momentum in a substep."""

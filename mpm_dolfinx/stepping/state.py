@@ -50,6 +50,8 @@ class StepControl:
         Smallest and largest cell pressures of each body at the start of the run, or None before the first step.
     motion : J^(1/2)
         Largest motion since the start of the run, see `motion_error`; None if the run does not limit errors of motion.
+    drift : m/s
+        Mean velocity of free bodies at the start of the run, see `motion_error`.
     filled
         Largest change of the water content in a step since the start of the run.
     """
@@ -62,6 +64,7 @@ class StepControl:
     first: Sequence[float] = (0.0,)
     start: Sequence[Sequence[float]] | None = None
     motion: float | None = None
+    drift: Sequence[float] = (0.0,)
     filled: float = 0.0
 
 

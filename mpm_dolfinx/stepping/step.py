@@ -66,7 +66,7 @@ def step(scene: Scene, state: State, dt: float, how: tuple = ()) -> tuple[State,
         earlier = [one.flown(both.momentum.at) for one in acting.loads]
     bodies = partial(scene.motion.of_bodies, on_grid)
     note_pressures(report, start.matrices.solvers, both.storage, acting.substep.before * dt, dt, rates, bodies)
-    report.moves = start.moves(flights[1:], acting.substep)
+    report.moves = start.moves(flights[1:] if report.newton else [], acting.substep)
     start.matrices.end_step()
     seconds = dt * np.array([acting.substep.before, acting.substep.own])
     at, outcome = both.momentum.at, both.outcome(state, passed, seconds)
