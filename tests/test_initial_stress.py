@@ -260,6 +260,15 @@ def test_what_is_no_initial_state_is_refused(options, said):
         ground(**options)
 
 
+@pytest.mark.parametrize("law", ["hencky", "linear"])
+def test_open_water_without_a_surcharge_is_warned_of(law, recwarn):
+    """Elastic soil started in tension, without a warning.  Frictional soil is refused."""
+    ground(law, level=2.9), ground(law, level=6.0, initial_stress=mpm.K0(0.5, surcharge=2.87 * WEIGHT))
+    assert not [one for one in recwarn if "tension" in str(one.message)]
+    with pytest.warns(mpm.ConditionWarning, match="K0 gives vertical tension, such as .* water as surcharge"):
+        ground(law, level=6.0)
+
+
 @pytest.mark.parametrize("value", [-0.1, np.inf, "half"])
 def test_what_is_no_ratio_is_refused(value):
     with pytest.raises(ValueError, match="K0: ratio = "):

@@ -38,7 +38,8 @@ class K0:
     are K0 times the vertical effective stress.  In axisymmetry, the horizontal stresses are radial and circumferential.
     The stresses are exact for level ground with level layers.  In other ground, the stresses are changed until they
     balance the weight, without motion of the points.  A warning is given if balancing changes a stress by more than 5 %
-    of the largest initial stress, as on slopes.
+    of the largest initial stress, as on slopes.  Another warning is given for vertical tension, where the
+    pore pressure exceeds the overburden, as under open water without a surcharge.
 
     Parameters
     ----------
@@ -160,6 +161,19 @@ class InitialStresses:
 
         together(materials.grid.comm, fill)
         return stressed(materials, points, rows, target)
+
+    def lifted(self, materials: SceneMaterials, points: MaterialPoints) -> str:
+        """Return a point with vertical tension by K0, and this tension, or an empty string.  `points`: result of `of`.
+
+        All processes must call this method.
+        """
+        kept = [body for body, stress in self.given.items() if isinstance(stress, K0)]
+        own = np.isin(np.searchsorted(self._start, points.id, side="right") - 1, kept)
+        d = points.x.shape[1]
+        vertical, pore = materials.effective_stress_3d(points)[:, d - 1, d - 1], materials.pore_stress(points)
+        rows = np.flatnonzero(own & (vertical > SAME * np.abs(pore)))[:1]  # beyond rounding errors
+        where = points.x + materials.grid.base
+        return first(materials.grid.comm, "".join(f"{vertical[i]:.4g} Pa at {where[i].tolist()}" for i in rows))
 
     def _at(self, stress: InitialStress, body: int, points: MaterialPoints, above: list[NDArray]) -> NDArray:
         """Return the effective stress, in Pa, of points of a body."""

@@ -80,7 +80,7 @@ def first_state(scene: Scene, conditions: Mapping[str, Any], later: Sequence[int
     if scene.fluid and scene.materials.conducts:
         warn_units(comm, scene.fluid, gravity)
     points = scene.seeded(present)
-    points = scene.initial.of(scene.materials, points, present, first.gravity_at(0.0) if scene.initial.given else None)
+    points = _prestressed(scene, points, present, first.gravity_at(0.0) if scene.initial.given else None)
     pieces = None
     if all(present):
         scene.materials.seeds_no_more()
@@ -269,6 +269,17 @@ def _check_weight(after: Stage, before: Stage | None, t: float) -> None:
         raise ValueError(f"{what} after {line(was.tolist())}, {allowed}")
 
 
+def _prestressed(
+    scene: Scene, points: MaterialPoints, present: Sequence[bool], gravity: NDArray | None
+) -> MaterialPoints:
+    """Return new points with their initial stress, see `InitialStresses.of`."""
+    points = scene.initial.of(scene.materials, points, present, gravity)
+    if scene.initial.given and (where := scene.initial.lifted(scene.materials, points)):
+        what = "initial_stress: K0 gives vertical tension, such as %s, because the pore pressure exceeds the overburden"
+        warn(scene.grid.comm, ConditionWarning, what + "; K0 needs the weight of open water as surcharge", where)
+    return points
+
+
 def _with_contacts(before: Stage, conditions: Sequence[Condition]) -> list[Condition]:
     """Return the conditions with the scene's contacts."""
     standing, given = contacts_of(before.given.values()), contacts_of(checked(conditions))
@@ -306,9 +317,7 @@ def _filled(
         fill = next((body for body in waiting if touches(scene.bodies, standing, body)), waiting[0])
         placed = scene.seeded(np.arange(len(scene.bodies)) == fill)
         placed = put(scene.grid, scene.bodies, standing, fill, points, placed)
-        placed = scene.initial.of(
-            scene.materials, placed, [i in (*standing, *add) for i in range(len(scene.bodies))], gravity
-        )
+        placed = _prestressed(scene, placed, [i in (*standing, *add) for i in range(len(scene.bodies))], gravity)
         if scene.momentum.inertia is not None:
             placed = replace(placed, data=placed.data | resting(placed))
         points, new = points.joined(placed), new.joined(placed)
