@@ -318,6 +318,23 @@ def test_a_tool_keeps_its_values_if_the_script_changes_its_arrays():
     assert floor.shape.distance(np.array([[0.0, 5.0]])) == 3
 
 
+def test_a_stage_may_begin_with_a_tool_whose_edges_are_in_soft_soil():
+    """Soil at the edge of a tool lay inside the tool by 0.02 cells.  The next stage was refused."""
+    grid = mpm.Grid([0, 0], [2, 1.6], [16, 12])
+    clay = mpm.DruckerPrager(bulk=2e6, shear=1e6, friction=20, dilation=0, cohesion=3e3)
+    block = mpm.SurfaceMesh([(0.6, 1.002), (1.2, 1.002), (1.2, 1.4), (0.6, 1.4)])
+    tool = mpm.Tool(block, displacement=lambda t: (0, -0.02 * t), adhesion=1e3, name="block")
+    walls = {"left": "x", "right": "x", "bottom": "xy"}
+    options = {"conditions": [tool], "gravity": (0, -9.81), "initial_stress": mpm.K0(0.6)}
+    body = mpm.box(grid, [0, 0], [2, 1.0])
+    in_stages, whole = (mpm.Simulation(grid, [body], [clay], walls=walls, **options) for _ in range(2))
+    for t in (0.5, 1.0, 1.5):
+        in_stages.run(t, 0.5, progress=False)
+        in_stages.stage()
+    whole.run(1.5, 0.5, progress=False)
+    assert in_stages.tool_forces["block"] == pytest.approx(whole.tool_forces["block"], rel=1e-2)
+
+
 def test_a_tool_that_outruns_the_body_cuts_the_step():
     s = simple(tool={"displacement": lambda t: (0, -0.58 * t)})
     with pytest.raises(mpm.NotConverged):

@@ -268,16 +268,19 @@ class Tools(Touching):
                 warn(grid.comm, ResolutionWarning, what + "which it strikes; use smaller cells", line(tool), half)
 
     def check_start(self, place: Place) -> None:
-        """Raise an error for tools inside a body at the start, except at faces in contact from earlier steps."""
+        """Raise an error for tools inside a body at the start.
+
+        A tool that is in contact from earlier steps may be as deep as at the end of a step, see `check_end`.
+        """
         self._warn_light(place)
         before, t = self._before(place), place.start
         points = place.points
         tools, patches = self.going(LoadMotion(t, t, before, before)), place.cut.surface(self.outside)
         x = patches.now(points)
         for number, tool in enumerate(self.tools):
-            loaded = points.data[pressure_name(self.names[number])] > 0
-            deep, where = tools._deepest(tool, np.concatenate([x[~loaded[patches.at]], points.x]), t)
-            if deep > MISFIT:
+            touches = over_all(self.grid.comm, int((points.data[pressure_name(self.names[number])] > 0).any()))
+            deep, where = tools._deepest(tool, points.within() if touches else np.concatenate([x, points.x]), t)
+            if deep > (NEAR if touches else MISFIT):
                 what = f"{line(tool)}: penetrates a body by {deep:.3g} cells, at {where}, at the start t = {t:g} s"
                 raise ValueError(f"{what}, must be outside of all bodies, or touch them")
 
