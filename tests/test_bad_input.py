@@ -13,6 +13,7 @@ GRID_3D = mpm.Grid([0, 0, 0], [1.0, 1.0, 1.0], [2, 2, 2])
 BODY = mpm.box(GRID, [0, 0.2], [0.5, 0.5])
 NAN = float("nan")
 WATER = mpm.Fluid()
+CLAY = {"M": 1.2, "lambda_": 0.07, "kappa": 0.015, "shear": 3e6, "initial_stress": (-1e5,) * 3}
 OPEN = mpm.Drained("top")
 
 
@@ -155,6 +156,13 @@ CASES = {
     "fluid of nan": (lambda: mpm.Fluid(bulk=NAN), "Fluid: bulk", "= nan"),
     "fluid of no density": (lambda: mpm.Fluid(density=0), "Fluid: density", "= 0"),
     "fluid without bounds": (lambda: mpm.Fluid(density=np.inf), "Fluid: density", "= inf"),
+    "fluid of functions": (lambda: mpm.Fluid(density=lambda X: 1000.0), "Fluid: density", "must be > 0 and finite"),
+    "fluid of a soft function": (lambda: mpm.Fluid(bulk=lambda t: 1e9), "Fluid: bulk", "must be > 0"),
+    "switch as a modulus": (lambda: soil(shear=True), "Hencky: shear", "= True"),
+    "complex slope": (lambda: mpm.ModifiedCamClay(**{**CLAY, "M": 1j}), "ModifiedCamClay: M", "= 1j"),
+    "no longest step": (lambda: mpm.Adaptive(1e-3, max_step=None), "max_step", "= None"),
+    "no velocity": (lambda: scene(inertia=mpm.Moving(None)), "velocity", "= None"),
+    "list of fields": (lambda: mpm.plot(scene(), ["pressure"]), "plot: field", "= ['pressure']"),
     "fluid of a word": (lambda: scene(fluid="water"), "fluid", "'water'"),
     # ---- the scene
     "unknown quadrature": (lambda: scene(numerics=mpm.Numerics(quadrature="gauss")), "quadrature", "'gauss'"),

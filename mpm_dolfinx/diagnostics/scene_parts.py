@@ -88,7 +88,7 @@ def initial_velocity(grid: Grid, quadrature: str, inertia: bool | Moving | None)
         raise ValueError(f"inertia = {line(inertia)} with quadrature {quadrature!r}, must be None")
     if callable(velocity):
         check_names("velocity", velocity, ("x",))
-    elif grid.axisymmetric and np.ravel(velocity)[:1].any():
+    elif numbers("velocity", velocity, (grid.dim,), allowed=f"{grid.dim} finite numbers")[0] and grid.axisymmetric:
         raise ValueError(f"velocity = {line(velocity)}, must be (0, v): axisymmetric bodies move along the axis")
     return velocity
 

@@ -92,7 +92,7 @@ def _values(simulation: Simulation, field: str) -> NDArray[np.float64]:
     known |= {name: lambda rows=rows: rows for name, rows in {**points.data, **fields}.items() if rows.ndim == 1}
     if simulation.scene.fluid is None:  # the effective stress is the stress
         known |= {name.removeprefix("effective_"): known[name] for name in known if name.startswith("effective_")}
-    if field not in known:
+    if not isinstance(field, str) or field not in known:
         names = ", ".join(
             name for name in {**known, **(fields or fields_of_points(simulation))} if name not in points.INTERNAL
         )

@@ -334,8 +334,8 @@ def _check(obj, name: str, test: Callable, allowed: str) -> None:
     if callable(value):
         return
     try:
-        good = np.asarray(test(value))
-    except TypeError:
+        good = np.asarray(test(value) if np.asarray(value).dtype.kind in "iuf" else False)
+    except (TypeError, ValueError):
         good = np.array(False)
     if not good.all():
         value = value if good.ndim == 0 else float(np.broadcast_to(value, good.shape)[np.argmin(good)])
@@ -507,10 +507,11 @@ class Fluid:
     gravity: float | None = None
 
     def __post_init__(self):
-        _check(self, "bulk", lambda v: 0 < v, "> 0")
+        finite = {"test": lambda v: (0 < v) & (v < inf), "allowed": "> 0 and finite"}
+        numbers("Fluid: bulk", self.bulk, test=lambda v: 0 < v, allowed="> 0")
         if self.gravity is not None:
-            _check(self, "gravity", lambda v: (0 < v) & (v < inf), "> 0 and finite")
-        _check(self, "density", lambda v: (0 < v) & (v < inf), "> 0 and finite")
+            numbers("Fluid: gravity", self.gravity, **finite)
+        numbers("Fluid: density", self.density, **finite)
         object.__setattr__(self, "density", float(self.density))  # forms with an integer times gravity do not compile
 
     @property

@@ -81,9 +81,9 @@ class Adaptive:
     max_step: float = inf
 
     def __post_init__(self):
-        for name in ("first_step", "max_step"):
-            if (value := getattr(self, name)) is not None and value != inf:
-                numbers(name, value, test=lambda v: v > 0, allowed="> 0")
+        if self.first_step is not None:
+            numbers("first_step", self.first_step, test=lambda v: v > 0, allowed="> 0")
+        numbers("max_step", self.max_step, test=lambda v: v > 0, allowed="> 0")
 
 
 @dataclass(frozen=True)
