@@ -36,6 +36,19 @@ def test_a_slope_of_finite_width_settles_and_shears_as_an_infinite_one(begins):
     assert stress[:, 0, 1] == pytest.approx(RHO * 2.0 * depth, abs=3e-3 * most)
 
 
+@pytest.mark.parametrize("gravity, warned", [((0, -9.81), False), ((3.4, -9.2), True)])
+def test_a_slope_in_which_water_would_flow_on_is_warned_of(gravity, warned, recwarn):
+    """Pressures between the tied sides became those of water at rest in inclined gravity, without a warning."""
+    grid = mpm.Grid([0, 0], [1.0, 1.2], [5, 6])
+    soil = mpm.Hencky(bulk=2e6, shear=1e6, conductivity=1e-4)
+    body, options = mpm.box(grid, [0.2, 0], [0.8, 1.0]), {"walls": {"bottom": "xy"}, "gravity": gravity}
+    for fluid in (None, mpm.Fluid()):
+        mpm.Simulation(
+            grid, [body], [soil], fluid=fluid, conditions=[TIED, mpm.Drained("top")][: 1 + bool(fluid)], **options
+        )
+        assert any("through tied sides" in str(one.message) for one in recwarn) == (warned and fluid is not None)
+
+
 def test_soil_at_rest_keeps_its_horizontal_stress_between_tied_sides():
     s = layer(8, 2, mpm.Displacement("bottom", (0, 0)), gravity=(0, -9.81), initial_stress=mpm.K0(0.5))
     s.run(1.0, 0.5, progress=False)

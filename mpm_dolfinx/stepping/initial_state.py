@@ -28,13 +28,13 @@ from mpm_dolfinx.bodies.faces import Surface, surface
 from mpm_dolfinx.bodies.fills import put, touches
 from mpm_dolfinx.bodies.touching import check_apart
 from mpm_dolfinx.conditions.acting import Place
-from mpm_dolfinx.conditions.conditions import Quiet
+from mpm_dolfinx.conditions.conditions import Quiet, Tied
 from mpm_dolfinx.conditions.unit_weights import warn_levels, warn_units, waters
 from mpm_dolfinx.domains.fitted import fitted_at
 from mpm_dolfinx.domains.pressure_transport import PiecePressures, at_start
 from mpm_dolfinx.dynamics.at_rest import balancing_tractions
 from mpm_dolfinx.dynamics.quiet_sides import QuietSides, traction_name
-from mpm_dolfinx.grid.grid import sum_by
+from mpm_dolfinx.grid.grid import SIDES, sum_by
 from mpm_dolfinx.materials.initial_stress import strained
 from mpm_dolfinx.mechanics.inertia import resting
 from mpm_dolfinx.mechanics.momentum import MomentumProblem
@@ -74,6 +74,7 @@ def first_state(scene: Scene, conditions: Mapping[str, Any], later: Sequence[int
             f"{next(iter(quiet))}: cannot balance an initial stress, must begin a stage later: first prescribe the side"
         )
     _check_weight(first, None, 0.0)
+    _warn_dammed(scene, first, 0.0)
     scene.check_followed(first)
     comm, gravity = scene.grid.comm, first.conditions["gravity"]
     warn_levels(comm, scene.fluid, gravity, [("pressure", scene.initial.pressure), *waters(first.named)])
@@ -122,6 +123,7 @@ def begin_stage(
     conditions = _with_contacts(before, named.get("conditions", tuple(before.given.values())))
     after = scene.stage({**before.conditions, **named, "conditions": conditions}, present, later)
     _check_weight(after, before, state.t)
+    _warn_dammed(scene, after, state.t)
     if "gravity" in named or waters(after.given) != waters(before.given):
         warn_levels(scene.grid.comm, scene.fluid, after.conditions["gravity"], waters(after.named))
     if remove:
@@ -267,6 +269,19 @@ def _check_weight(after: Stage, before: Stage | None, t: float) -> None:
         what = f"{next(iter(quiet))}: its traction at rest does not bear the weight, gravity = {line(now.tolist())}"
         allowed = "must begin a stage later: first prescribe the side in a stage without inertia"
         raise ValueError(f"{what} after {line(was.tolist())}, {allowed}")
+
+
+def _warn_dammed(scene: Scene, stage: Stage, t: float) -> None:
+    """Warn of gravity that drives water towards tied sides, which would flow on in ground that repeats itself."""
+    tied = stage.of(Tied)
+    gravity = stage.gravity_at(t) if tied and scene.fluid and scene.materials.conducts else None
+    for name, one in tied.items() if gravity is not None else ():
+        if along := gravity[SIDES[scene.grid.dim][one.side][0]]:
+            what = (
+                "%s: gravity has the component %.3g between the sides, but must have none with flowing pore fluid: no "
+            )
+            more = "fluid flows through tied sides, so pressures will rise from one side to the other"
+            warn(scene.grid.comm, ConditionWarning, what + more, name, along)
 
 
 def _prestressed(
