@@ -88,6 +88,10 @@ class Feeds:
         """Return the derivative (n,) of the outflow with respect to the pressure of the cell, in m^d/(Pa s)."""
         return 0.0
 
+    def by_force(self, at: Any, fluid: Fluid) -> NDArray[np.float64] | float:
+        """Return the derivative (n, d), in m^(d+3)/(N s), of the outflow with respect to `fluid.force` in the cell."""
+        return 0.0
+
     def coupling(self, at: Any, fluid: Fluid, unknowns: Any) -> PETSc.Mat | None:
         """Return the derivative of the outflow with respect to pressures, without the part in `slope`; None means zero.
 

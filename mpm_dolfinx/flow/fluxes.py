@@ -403,7 +403,9 @@ class FluxForms:
     `flows`: whether any material is permeable.  If False, no fluxes are computed.
     `pressure`: pore pressure of the cells (DG0), Pa.
     `bulk`: bulk modulus of the fluid, Pa.
-    `inertial` (d,), N/m^3: inertia force on the pore fluid, as UFL, or None without inertia.
+    `displacement`: increment of the displacement since the start of the step, m.
+    `inertial` (d,), N/m^3: inertia force on the pore fluid, as UFL, or None without inertia.  The derivative of the
+    fluxes with respect to this force is the form `by_motion`; it omits the dependence of relative conductivities.
     `relative`: relative conductivities in unsaturated soil, see `unsaturated`, or None.
     """
 
@@ -415,6 +417,7 @@ class FluxForms:
         flows: bool,
         pressure: fem.Function,
         bulk: float,
+        displacement: fem.Function,
         inertial: ufl.core.expr.Expr | None = None,
         relative: Any = None,
     ):
@@ -454,6 +457,7 @@ class FluxForms:
             else:
                 along = ufl.avg(inertial) - (h0**2 * along_n[0] - h1**2 * along_n[1]) / (3 * (h0 + h1))
             weight = along if weight is None else weight + along
+            by_motion = ufl.derivative(along, displacement, ufl.TrialFunction(displacement.function_space))
         drop = 0.0 if weight is None else ufl.dot(weight, offset)
         if relative is not None:
             between = relative.between(pressure, drop)
@@ -483,7 +487,7 @@ class FluxForms:
             self.nonorthogonal = FacetForm(
                 -conductance * ufl.dot(ufl.avg(self.slope), along) * ufl.jump(q) * dS, grid.comm
             )
-        self.gravity = None
+        self.gravity = self.by_motion = None
         if (weight is not None or relative is not None) and flows:
             # still water must not flow: its pressure increases with depth by the unit weight at zero pressure.
             # Pressure and weight are in one form, so that rounding errors are small and conserve mass
@@ -491,6 +495,9 @@ class FluxForms:
             difference = ufl.jump(pressure) + drop
             flux = T * density * difference * ufl.jump(q) * dS
             self.gravity = FacetForm(flux, grid.comm)
+            if inertial is not None:
+                conductance = T if relative is None else T * density
+                self.by_motion = FacetForm(conductance * ufl.dot(by_motion, offset) * ufl.jump(q) * dS, grid.comm)
             if relative is not None:
 
                 def by_k(k):

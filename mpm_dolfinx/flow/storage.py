@@ -155,7 +155,8 @@ class StorageForms:
         self._derivatives = CellSums([ufl.diff(stored, p), *(part for slope in along for part in slope)], pieces)
         self.symmetric, self.softens = symmetric, materials.evolves
         relative = Relative(pieces.grid, retentions) if self.retains and materials.conducts else None
-        self.fluxes = FluxForms(pieces.grid, active, weight, materials.conducts, self.p, bulk, inertial, relative)
+        of_fluid = (self.p, bulk, displacement, inertial, relative)
+        self.fluxes = FluxForms(pieces.grid, active, weight, materials.conducts, *of_fluid)
         self.feeding = tuple(feeding)
         """Sources and open sides of all stages."""
 
@@ -253,6 +254,9 @@ class StorageSystem:
         self.T, self.D, self.L = (matrix(own, own, 2 * d + 1) for _ in range(3))
         self.B = matrix(own, momentum, 2**d * d)
         self.B_momentum = self.B if forms.symmetric else matrix(own, momentum, 2**d * d)
+        self.by_motion: PETSc.Mat | None = None
+        """Derivative (m^(d-1)) of outflows by inertia with respect to displacements, or None without inertia."""
+        self._momentum = momentum
         self.residual, self.step, self._potentials = (own.vector() for _ in range(3))
         self.damp, self._alternation = (form.on(facets) for form in (fluxes.damp, fluxes.alternation))
         self._facets = facets
@@ -287,8 +291,13 @@ class StorageSystem:
         return places, places[:0]
 
     def change_by(self, u: PETSc.Vec, out: PETSc.Vec, *slopes: FluxSlope) -> None:
-        """Set `out` to the change (m^d) of the residual due to an increment u.  `slopes` add the changes of fluxes."""
+        """Set `out` to the change (m^d) of the residual due to an increment u.
+
+        `slopes`: changes of the fluxes, with those by inertia, in place of `by_motion`.
+        """
         self.B.mult(u, out)
+        if self.by_motion is not None and not slopes:
+            self.by_motion.multAdd(u, out, out)
         for slope in slopes:
             out.array_w[:] += slope(u)
 
@@ -328,6 +337,24 @@ class StorageSystem:
             nonorthogonal = NonorthogonalFlow(self._forms.fluxes, facets, gradients, contents, sides, flow.weight)
         return Outflow([one.conducting(flow) for one in feeds], total, mobility, nonorthogonal)
 
+    def assemble_by_motion(self, dt: float, filled: NDArray[np.int64], rows: NDArray[np.float64]) -> None:
+        """Assemble `by_motion`.
+
+        `dt`, s: time weight of the outflow.
+        `rows` (n, k), m^(d-1)/s: derivative of the outflow through open sides with respect to the nodal displacements,
+        in the owned cells `filled`.
+        """
+        grid, fluxes = self._forms.grid, self._forms.fluxes
+        if self.by_motion is None:
+            d = grid.dim
+            self.by_motion = matrix(self.unknowns, self._momentum, d * (d + 1) * 2**d)
+        zero(self.by_motion)
+        facets = self._facets if fluxes.relative is None else fluxes.relative.uniform(self._facets)
+        fluxes.by_motion.on(facets).assemble_matrix(self.by_motion)
+        insert_rows(self.by_motion, grid, filled, rows)
+        self.by_motion.assemble()
+        self.by_motion.scale(dt)
+
     def assemble_fluxes(self, force: NDArray[np.float64] | None = None) -> None:
         """Assemble the matrix of fluxes, in unsaturated soil at the current pressures.
 
@@ -362,6 +389,7 @@ class FluidInertia(NamedTuple):
     forces: Callable[[], NDArray[np.float64]]  # returns the inertia forces (n, d) on the fluid, N/m^3
     resists: NDArray[np.float64]  # (n,) see `OnGrid.resisting_mass`
     density: float  # of the fluid, kg/m^3
+    rate: float  # acceleration divided by the displacement, 1/s^2
 
 
 class StorageProblem:
@@ -653,13 +681,22 @@ class StorageProblem:
             system.C.axpy(1.0, system.D, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
         if self._softer is not None:
             system.C.axpy(1.0, self._softer, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
-        fluid, both = self._fluid, zip(self._feeds, self._flow(False).at, strict=True)
+        fluid, both = self._fluid, [*zip(self._feeds, self._flow(False).at, strict=True)]
         slope = 0.0
         for one, at in both:
             slope = slope + one.slope(at, fluid)
             if (coupling := one.coupling(at, fluid, system.unknowns)) is not None:
                 system.C.axpy(self.dt, coupling, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
         _add_diagonal(system.C, capacity + self.dt * slope)
+        if self._inertial is None or forms.fluxes.by_motion is None:
+            system.by_motion = None
+            return
+        by_force = np.zeros((len(capacity), forms.grid.dim))
+        for one, at in both:
+            by_force += one.by_force(at, fluid)
+        shapes = -self._inertial.density * self._inertial.rate * self._contents.shape_values
+        rows = shapes[:, :, None] * by_force[:, None]
+        system.assemble_by_motion(self.dt, self._contents.filled, rows.reshape(len(rows), -1))
 
     def assemble_preconditioner(self, factor: float, share: float) -> PETSc.Mat:
         """Return the fixed-stress operator `C + factor (beta V - share L)` for the current C.

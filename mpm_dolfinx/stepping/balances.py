@@ -215,7 +215,7 @@ def balances(
     moves = None
     if inertia is not None:
         resists = on_grid.resisting_mass(float(substep.own * dt))
-        moves = FluidInertia(partial(pushed_back, scene, on_grid), resists, scene.fluid.density)
+        moves = FluidInertia(partial(pushed_back, scene, on_grid), resists, scene.fluid.density, inertia.rate)
     options = (*options, moves, on_grid.scale)
     storage = StorageProblem(scene.storage, matrices.storage, start.data.pieces, *options)
     return Balances(momentum, storage, inertia, ahead)
