@@ -10,7 +10,7 @@ sides.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 from math import prod
@@ -365,14 +365,19 @@ class HalfFaces:
         offset = self._shapes[1]
         return OpenSides(number, self.cells, none, none, none, seeps, self.area, offset, unknown, unknown)
 
-    def rows(self, flow: Conduction, p: NDArray[np.float64], force: NDArray[np.float64] | None) -> NDArray[np.float64]:
+    def rows(
+        self,
+        flow: Conduction,
+        p: NDArray[np.float64],
+        force: Callable[[NDArray[np.int64]], NDArray[np.float64]] | None,
+    ) -> NDArray[np.float64]:
         """Return pressure (Pa), position (m), force (N/m^3), pressure drop (Pa) and conductances (m^d/(Pa s)).
 
         The position is the centroid of the cell's material.  The force is the unit weight plus the inertia force.  The
         pressure drop is from the centroid to the face.  Unsaturated soil has a conductance for each retention curve.
 
         `p` (n,), Pa: pressures of the filled cells.
-        `force` (n, d), N/m^3: inertia force on the fluid, or None.
+        `force`: see `Fluid`.
         """
         contents, d = self.contents, self.area.shape[1]
         size, offset, shape = self._shapes
@@ -384,7 +389,7 @@ class HalfFaces:
             x = x + flow.motion.moved[self.at]
         pull = np.zeros((len(shape), d)) if flow.weight is None else np.broadcast_to(flow.weight, (len(shape), d))
         if force is not None:
-            pull = pull + force[self.at]
+            pull = pull + force(self.at)
         drop = (flow.deformed(self.at, offset) * pull).sum(axis=1)
         conductance = (flow.across(self.at, normal) * shape)[:, None]
         if flow.relative is not None:
@@ -396,6 +401,13 @@ class HalfFaces:
         return sum_by(self.at, values, len(self.contents.filled))
 
 
+class InertiaForce(NamedTuple):
+    """Inertia force on the pore fluid."""
+
+    moved: fem.Function  # motion that causes the force, see `InertiaForms.moved`
+    force: ufl.core.expr.Expr  # force (d,) as UFL, N/m^3
+
+
 class FluxForms:
     """Compiled forms over the faces between active cells, and their coefficients.
 
@@ -403,9 +415,8 @@ class FluxForms:
     `flows`: whether any material is permeable.  If False, no fluxes are computed.
     `pressure`: pore pressure of the cells (DG0), Pa.
     `bulk`: bulk modulus of the fluid, Pa.
-    `displacement`: increment of the displacement since the start of the step, m.
-    `inertial` (d,), N/m^3: inertia force on the pore fluid, as UFL, or None without inertia.  The derivative of the
-    fluxes with respect to this force is the form `by_motion`; it omits the dependence of relative conductivities.
+    `inertial`: inertia force on the pore fluid, or None without inertia.  The form `by_motion` is the derivative of the
+    fluxes due to this force.  It omits the dependence of relative conductivities on the force.
     `relative`: relative conductivities in unsaturated soil, see `unsaturated`, or None.
     """
 
@@ -417,8 +428,7 @@ class FluxForms:
         flows: bool,
         pressure: fem.Function,
         bulk: float,
-        displacement: fem.Function,
-        inertial: ufl.core.expr.Expr | None = None,
+        inertial: InertiaForce | None = None,
         relative: Any = None,
     ):
         self.grid = grid
@@ -451,13 +461,14 @@ class FluxForms:
         if inertial is not None:
             # mean over two cells as for the mass: weights 1/6, 2/3, 1/6 of three nodes in a row.  With the value at the
             # face, freely flowing water would have more mass than all of the soil in modes that alternate between nodes
-            along_n = [ufl.dot(ufl.grad(inertial)(side), n0) for side in "+-"]
+            force = inertial.force
+            along_n = [ufl.dot(ufl.grad(force)(side), n0) for side in "+-"]
             if grid.even:
-                along = ufl.avg(inertial) - across / 6 * (along_n[0] - along_n[1])
+                along = ufl.avg(force) - across / 6 * (along_n[0] - along_n[1])
             else:
-                along = ufl.avg(inertial) - (h0**2 * along_n[0] - h1**2 * along_n[1]) / (3 * (h0 + h1))
+                along = ufl.avg(force) - (h0**2 * along_n[0] - h1**2 * along_n[1]) / (3 * (h0 + h1))
             weight = along if weight is None else weight + along
-            by_motion = ufl.derivative(along, displacement, ufl.TrialFunction(displacement.function_space))
+            by_motion = ufl.derivative(along, inertial.moved, ufl.TrialFunction(inertial.moved.function_space))
         drop = 0.0 if weight is None else ufl.dot(weight, offset)
         if relative is not None:
             between = relative.between(pressure, drop)

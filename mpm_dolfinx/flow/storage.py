@@ -55,7 +55,7 @@ from numpy.typing import NDArray
 from mpm_dolfinx.base.fluid_content import change_of_content, mass_potential
 from mpm_dolfinx.base.tolerances import EPSILON, SAME
 from mpm_dolfinx.flow.feeding import Feeding, Feeds, Fluid
-from mpm_dolfinx.flow.fluxes import CellContents, Conduction, FluxForms, OpenSides
+from mpm_dolfinx.flow.fluxes import CellContents, Conduction, FluxForms, InertiaForce, OpenSides
 from mpm_dolfinx.flow.nonorthogonal import Gradients, NonorthogonalFlow
 from mpm_dolfinx.flow.second_differences import second_differences
 from mpm_dolfinx.flow.unsaturated import Relative
@@ -103,7 +103,7 @@ class StorageForms:
     `symmetric`: whether to use alpha as the derivative of the content with respect to J_Delta.  If True, the Jacobian
     is symmetric.  The neglected term is of the order of `(p - p_n) / K_w`.
     `feeding`: sources and open sides of all stages.
-    `inertial` (d,), N/m^3: inertia force `-rho_w a` on the pore fluid, as UFL, or None without inertia.
+    `inertial`: inertia force `-rho_w a` on the pore fluid, or None without inertia.
     """
 
     def __init__(
@@ -116,7 +116,7 @@ class StorageForms:
         weight: ufl.core.expr.Expr | None,
         symmetric: bool,
         feeding: Sequence[Feeding],
-        inertial: ufl.core.expr.Expr | None = None,
+        inertial: InertiaForce | None = None,
     ):
         self.grid = pieces.grid
         self.p, self.p_n = pressure.now, pressure.start
@@ -155,7 +155,7 @@ class StorageForms:
         self._derivatives = CellSums([ufl.diff(stored, p), *(part for slope in along for part in slope)], pieces)
         self.symmetric, self.softens = symmetric, materials.evolves
         relative = Relative(pieces.grid, retentions) if self.retains and materials.conducts else None
-        of_fluid = (self.p, bulk, displacement, inertial, relative)
+        of_fluid = (self.p, bulk, inertial, relative)
         self.fluxes = FluxForms(pieces.grid, active, weight, materials.conducts, *of_fluid)
         self.feeding = tuple(feeding)
         """Sources and open sides of all stages."""
@@ -188,7 +188,7 @@ class StorageForms:
     ) -> NDArray[np.float64]:
         """Return the outflow of active cells to other cells due to the pressures and the fluid's weight, in m^d/s.
 
-        `force` (c, d), N/m^3: inertia force on the fluid in the local cells, or None.
+        `force` (c, d), N/m^3: inertia force on the fluid in the local cells; None without inertia or in saturated soil.
         """
         relative, borders = self.fluxes.relative, None
         if relative is not None:
@@ -386,7 +386,8 @@ class StorageResidual:
 class FluidInertia(NamedTuple):
     """Inertia in a substep, in the n active owned cells."""
 
-    forces: Callable[[], NDArray[np.float64]]  # returns the inertia forces (n, d) on the fluid, N/m^3
+    move: Callable[[], None]  # sets the acceleration in the forms to that at u
+    forces: Callable[[NDArray[np.int64] | slice], NDArray[np.float64]]  # see `Fluid.force`
     resists: NDArray[np.float64]  # (n,) see `OnGrid.resisting_mass`
     density: float  # of the fluid, kg/m^3
     rate: float  # acceleration divided by the displacement, 1/s^2
@@ -625,8 +626,9 @@ class StorageProblem:
         system, fluid = self.system, self._fluid
         force = None
         if self._inertial is not None:
-            fluid = fluid._replace(force=self._inertial.forces())
-            force = self._local(fluid.force)
+            self._inertial.move()
+            fluid = fluid._replace(force=self._inertial.forces)
+            force = self._local_force()
         if system.gravity is None:
             cells = system.between(fluid.pi)
         else:
@@ -640,10 +642,13 @@ class StorageProblem:
             turnover = turnover + leaving.turnover
         return Rates(cells + net, net, turnover, gain)
 
-    def _local(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return values of the active owned cells as an array over local cells."""
-        out = np.zeros((self.forms.grid.num_local, values.shape[1]))
-        out[self.system.unknowns.owned] = values
+    def _local_force(self) -> NDArray[np.float64] | None:
+        """Return the inertia forces on the fluid in local cells, see `StorageForms.driven`."""
+        if self._inertial is None or self.forms.fluxes.relative is None:
+            return None
+        self._inertial.move()
+        out = np.zeros((self.forms.grid.num_local, self.forms.grid.dim))
+        out[self.system.unknowns.owned] = self._inertial.forces(slice(None))
         return out
 
     def net_inflow(self, rates: Rates) -> NDArray[np.float64]:
@@ -674,7 +679,7 @@ class StorageProblem:
             A.assemble()
         if forms.fluxes.relative is not None:
             self._flow(False)
-            system.assemble_fluxes(None if self._inertial is None else self._local(self._inertial.forces()))
+            system.assemble_fluxes(self._local_force())
         system.C.zeroEntries()
         system.C.axpy(self.dt, system.T, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
         if self.damped:

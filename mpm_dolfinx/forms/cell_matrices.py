@@ -81,9 +81,7 @@ def insert(A: PETSc.Mat, grid: Grid, cells: NDArray[np.int32], matrices: NDArray
         A.setValuesLocalRCV(dofs, dofs, matrices, addv=True)
 
 
-def insert_for_each_axis(
-    A: PETSc.Mat, grid: Grid, cells: NDArray[np.int32], matrices: NDArray[np.float64]
-) -> None:
+def insert_for_each_axis(A: PETSc.Mat, grid: Grid, cells: NDArray[np.int32], matrices: NDArray[np.float64]) -> None:
     """Add the element matrices (cells, n, n) of Q1 scalars to `A`, for each component of Q1 vectors."""
     for axis in range(grid.dim if len(cells) else 0):
         dofs = (grid.cell_nodes[cells] * grid.dim + axis).astype(PETSc.IntType)

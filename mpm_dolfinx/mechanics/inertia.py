@@ -48,7 +48,7 @@ from mpm_dolfinx.base.validation import at_places, numbers
 from mpm_dolfinx.conditions.acting import At, Loads
 from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.forms.cell_matrices import at_centroids, insert_for_each_axis
-from mpm_dolfinx.forms.point_forms import CellSums, FormPoints, Places, PointData, PointForm
+from mpm_dolfinx.forms.point_forms import CellSums, FormPoints, Places, PointData
 from mpm_dolfinx.forms.unknowns import Unknowns, matrix, sum_ghosts
 from mpm_dolfinx.grid.grid import polynomial, sum_by
 from mpm_dolfinx.mechanics.ghost_penalty import kinks
@@ -153,13 +153,16 @@ class InertiaForms:
     def __init__(self, points: FormPoints, of_laws: Sequence[FormPoints], u: fem.Function):
         self.grid, V = points.grid, u.function_space
         grid, d = self.grid, self.grid.dim
-        self._u, self._flight, self._rate = u, fem.Function(V), fem.Constant(grid.mesh, 0.0)
-        self.acceleration = self._rate * (u - self._flight)
-        """Acceleration at u as UFL, in m/s^2."""
+        self._u, self._flight, self._rate = u, np.zeros(len(u.x.array)), fem.Constant(grid.mesh, 0.0)
+        self.moved = fem.Function(V)
+        """Displacement minus the inertial predictor at the last call of `move`, in m."""
+        self.acceleration = self._rate * self.moved
+        """Acceleration as UFL, in m/s^2."""
         self.midpoint = fem.Constant(grid.mesh, 0.0)
         """1 in a substep with a midpoint rule, and 0 in other substeps."""
+        shared: Latest[tuple[NDArray, NDArray]] = Latest()
         for seen in dict.fromkeys([points, *of_laws] if not grid.axisymmetric else []):  # axisymmetric bodies: no spin
-            chords: Latest[tuple[NDArray, NDArray]] = Latest()
+            chords = shared if len(of_laws) == 1 else Latest()
             seen.follow("gradient", (d, d), partial(self._seen, chords, 0))
             seen.follow("turn", (d, d), partial(self._seen, chords, 1))
         self.pieces = p = FormPoints(grid, spread=(d, d))
@@ -178,17 +181,21 @@ class InertiaForms:
         self.midpoint.value = float(midpoint and inertia is not None)
         self._rate.value = 0.0 if inertia is None else inertia.rate
         if inertia is not None:
-            self._flight.x.array[:] = inertia.flight
+            self._flight[:] = inertia.flight
+
+    def move(self) -> None:
+        """Set the acceleration to that at u."""
+        np.subtract(self._u.x.array, self._flight, out=self.moved.x.array)
 
     def at(self, cells: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return accelerations, in m/s^2, at places in cells.  `values` are the shape functions at these places."""
-        nodal = self._rate.value * (self._u.x.array - self._flight.x.array).reshape(-1, self.grid.dim)
-        return np.einsum("nk,nkd->nd", values, nodal[self.grid.cell_nodes[cells]])
+        nodal = self.moved.x.array.reshape(-1, self.grid.dim)[self.grid.cell_nodes[cells]]
+        return self._rate.value * (values[:, :, None] * nodal).sum(axis=1)
 
     def _seen(self, chords: Latest[tuple[NDArray, NDArray]], which: int, data: PointData) -> NDArray[np.float64]:
         """Return the gradients for laws, or the rotations of the laws' stresses, see `chord`.
 
-        `chords`: the last result, shared by all forms at the same u.
+        `chords`: the last result, shared by forms with the same points.
         """
         d = self.grid.dim
         if which and not self.midpoint.value:
@@ -274,7 +281,8 @@ class Mass:
         (off, second), of = self._moments, cut.pieces.point
         L = columns(velocity_gradients(points)).take(of, axis=2)
         v = points.data[VELOCITY][of] + (L * off).sum(axis=1).T
-        fields = {"velocity": cut.pieces_to_cells(v), "turn": cut.pieces_to_cells(product(L, second).transpose(2, 0, 1))}
+        turn = product(L, second).transpose(2, 0, 1)
+        fields = {"velocity": cut.pieces_to_cells(v), "turn": cut.pieces_to_cells(turn)}
         b[:], (dofs, at) = 0.0, pieces.places.dofs
         sums = forms._momentum(PointData(forms.moving, pieces.places, pieces.volume, fields))
         b[dofs] = sum_by(at, sums.ravel(), len(dofs))
