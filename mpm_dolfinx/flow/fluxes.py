@@ -401,13 +401,6 @@ class HalfFaces:
         return sum_by(self.at, values, len(self.contents.filled))
 
 
-class InertiaForce(NamedTuple):
-    """Inertia force on the pore fluid."""
-
-    moved: fem.Function  # motion that causes the force, see `InertiaForms.moved`
-    force: ufl.core.expr.Expr  # force (d,) as UFL, N/m^3
-
-
 class FluxForms:
     """Compiled forms over the faces between active cells, and their coefficients.
 
@@ -415,8 +408,8 @@ class FluxForms:
     `flows`: whether any material is permeable.  If False, no fluxes are computed.
     `pressure`: pore pressure of the cells (DG0), Pa.
     `bulk`: bulk modulus of the fluid, Pa.
-    `inertial`: inertia force on the pore fluid, or None without inertia.  The form `by_motion` is the derivative of the
-    fluxes due to this force.  It omits the dependence of relative conductivities on the force.
+    `inertial`: motion, and the inertia force (d,) on the pore fluid that it causes, in N/m^3, as UFL; None without
+    inertia.  `by_motion` is the derivative of this part of the fluxes, at fixed relative conductivities.
     `relative`: relative conductivities in unsaturated soil, see `unsaturated`, or None.
     """
 
@@ -428,7 +421,7 @@ class FluxForms:
         flows: bool,
         pressure: fem.Function,
         bulk: float,
-        inertial: InertiaForce | None = None,
+        inertial: tuple[fem.Function, ufl.core.expr.Expr] | None = None,
         relative: Any = None,
     ):
         self.grid = grid
@@ -461,14 +454,14 @@ class FluxForms:
         if inertial is not None:
             # mean over two cells as for the mass: weights 1/6, 2/3, 1/6 of three nodes in a row.  With the value at the
             # face, freely flowing water would have more mass than all of the soil in modes that alternate between nodes
-            force = inertial.force
+            moved, force = inertial
             along_n = [ufl.dot(ufl.grad(force)(side), n0) for side in "+-"]
             if grid.even:
                 along = ufl.avg(force) - across / 6 * (along_n[0] - along_n[1])
             else:
                 along = ufl.avg(force) - (h0**2 * along_n[0] - h1**2 * along_n[1]) / (3 * (h0 + h1))
             weight = along if weight is None else weight + along
-            by_motion = ufl.derivative(along, inertial.moved, ufl.TrialFunction(inertial.moved.function_space))
+            by_motion = ufl.derivative(along, moved, ufl.TrialFunction(moved.function_space))
         drop = 0.0 if weight is None else ufl.dot(weight, offset)
         if relative is not None:
             between = relative.between(pressure, drop)

@@ -55,7 +55,7 @@ from numpy.typing import NDArray
 from mpm_dolfinx.base.fluid_content import change_of_content, mass_potential
 from mpm_dolfinx.base.tolerances import EPSILON, SAME
 from mpm_dolfinx.flow.feeding import Feeding, Feeds, Fluid
-from mpm_dolfinx.flow.fluxes import CellContents, Conduction, FluxForms, InertiaForce, OpenSides
+from mpm_dolfinx.flow.fluxes import CellContents, Conduction, FluxForms, OpenSides
 from mpm_dolfinx.flow.nonorthogonal import Gradients, NonorthogonalFlow
 from mpm_dolfinx.flow.second_differences import second_differences
 from mpm_dolfinx.flow.unsaturated import Relative
@@ -103,7 +103,7 @@ class StorageForms:
     `symmetric`: whether to use alpha as the derivative of the content with respect to J_Delta.  If True, the Jacobian
     is symmetric.  The neglected term is of the order of `(p - p_n) / K_w`.
     `feeding`: sources and open sides of all stages.
-    `inertial`: inertia force `-rho_w a` on the pore fluid, or None without inertia.
+    `inertial`: motion and the inertia force `-rho_w a` on the pore fluid, see `FluxForms`, or None without inertia.
     """
 
     def __init__(
@@ -116,7 +116,7 @@ class StorageForms:
         weight: ufl.core.expr.Expr | None,
         symmetric: bool,
         feeding: Sequence[Feeding],
-        inertial: InertiaForce | None = None,
+        inertial: tuple[fem.Function, ufl.core.expr.Expr] | None = None,
     ):
         self.grid = pieces.grid
         self.p, self.p_n = pressure.now, pressure.start
@@ -254,9 +254,9 @@ class StorageSystem:
         self.T, self.D, self.L = (matrix(own, own, 2 * d + 1) for _ in range(3))
         self.B = matrix(own, momentum, 2**d * d)
         self.B_momentum = self.B if forms.symmetric else matrix(own, momentum, 2**d * d)
-        self.by_motion: PETSc.Mat | None = None
-        """Derivative (m^(d-1)) of outflows by inertia with respect to displacements, or None without inertia."""
-        self._momentum = momentum
+        flows = fluxes.by_motion is not None
+        self.by_motion = matrix(own, momentum, d * (d + 1) * 2**d) if flows else None
+        """Derivative (m^(d-1)) of the outflow by inertia with respect to displacements, see `assemble_by_motion`."""
         self.residual, self.step, self._potentials = (own.vector() for _ in range(3))
         self.damp, self._alternation = (form.on(facets) for form in (fluxes.damp, fluxes.alternation))
         self._facets = facets
@@ -273,6 +273,11 @@ class StorageSystem:
             more.axpy(1.0, pattern, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
             pattern = more
         self.C, self.P = pattern.duplicate(), pattern.duplicate()
+
+    @property
+    def moves(self) -> bool:
+        """Whether inertia contributes to the tangent of the outflow."""
+        return self.by_motion is not None and self.by_motion.assembled
 
     @property
     def gravity(self) -> FacetSum | None:
@@ -296,7 +301,7 @@ class StorageSystem:
         `slopes`: changes of the fluxes, with those by inertia, in place of `by_motion`.
         """
         self.B.mult(u, out)
-        if self.by_motion is not None and not slopes:
+        if self.moves and not slopes:
             self.by_motion.multAdd(u, out, out)
         for slope in slopes:
             out.array_w[:] += slope(u)
@@ -344,16 +349,13 @@ class StorageSystem:
         `rows` (n, k), m^(d-1)/s: derivative of the outflow through open sides with respect to the nodal displacements,
         in the owned cells `filled`.
         """
-        grid, fluxes = self._forms.grid, self._forms.fluxes
-        if self.by_motion is None:
-            d = grid.dim
-            self.by_motion = matrix(self.unknowns, self._momentum, d * (d + 1) * 2**d)
-        zero(self.by_motion)
+        A, fluxes = self.by_motion, self._forms.fluxes
+        zero(A)
         facets = self._facets if fluxes.relative is None else fluxes.relative.uniform(self._facets)
-        fluxes.by_motion.on(facets).assemble_matrix(self.by_motion)
-        insert_rows(self.by_motion, grid, filled, rows)
-        self.by_motion.assemble()
-        self.by_motion.scale(dt)
+        fluxes.by_motion.on(facets).assemble_matrix(A)
+        insert_rows(A, self._forms.grid, filled, rows)
+        A.assemble()
+        A.scale(dt)
 
     def assemble_fluxes(self, force: NDArray[np.float64] | None = None) -> None:
         """Assemble the matrix of fluxes, in unsaturated soil at the current pressures.
@@ -693,8 +695,10 @@ class StorageProblem:
             if (coupling := one.coupling(at, fluid, system.unknowns)) is not None:
                 system.C.axpy(self.dt, coupling, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
         _add_diagonal(system.C, capacity + self.dt * slope)
-        if self._inertial is None or forms.fluxes.by_motion is None:
-            system.by_motion = None
+        if system.by_motion is None:
+            return
+        if self._inertial is None:
+            zero(system.by_motion)  # after a stage with inertia
             return
         by_force = np.zeros((len(capacity), forms.grid.dim))
         for one, at in both:

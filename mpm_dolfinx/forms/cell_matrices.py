@@ -18,16 +18,6 @@ from mpm_dolfinx.forms.point_forms import BATCH, NONE, CellSums, FormPoints, Giv
 from mpm_dolfinx.grid.grid import Grid, sum_by
 
 
-def at_centroids(points: FormPoints) -> list:
-    """Return the values and the gradients of the Q1 shape functions at the points as UFL, a pair for each node."""
-    h, d, out = points.grid.edge_in_forms(), points.grid.dim, []
-    for signs in points.grid.signs.tolist():
-        t = [0.5 + signs[a] * points.offset[a] / h[a] for a in range(d)]
-        slopes = [signs[a] / h[a] * prod(t[b] for b in range(d) if b != a) for a in range(d)]
-        out.append((prod(t), ufl.as_vector(slopes)))
-    return out
-
-
 def shape_gradients(points: FormPoints) -> list:
     """Return the gradients of the Q1 shape functions at the points as UFL; in 3D, their means over each piece."""
     grid, xi = points.grid, points.offset
@@ -78,13 +68,6 @@ def insert(A: PETSc.Mat, grid: Grid, cells: NDArray[np.int32], matrices: NDArray
     """Add the element matrices (cells, n, n) of Q1 vectors to `A`."""
     if len(cells):
         dofs = element_dofs(grid, cells).astype(PETSc.IntType)
-        A.setValuesLocalRCV(dofs, dofs, matrices, addv=True)
-
-
-def insert_for_each_axis(A: PETSc.Mat, grid: Grid, cells: NDArray[np.int32], matrices: NDArray[np.float64]) -> None:
-    """Add the element matrices (cells, n, n) of Q1 scalars to `A`, for each component of Q1 vectors."""
-    for axis in range(grid.dim if len(cells) else 0):
-        dofs = (grid.cell_nodes[cells] * grid.dim + axis).astype(PETSc.IntType)
         A.setValuesLocalRCV(dofs, dofs, matrices, addv=True)
 
 

@@ -47,9 +47,8 @@ from mpm_dolfinx.base.tolerances import ROUND_OFF
 from mpm_dolfinx.base.validation import at_places, numbers
 from mpm_dolfinx.conditions.acting import At, Loads
 from mpm_dolfinx.domains.cut_domains import CutDomains
-from mpm_dolfinx.forms.cell_matrices import at_centroids, insert_for_each_axis
 from mpm_dolfinx.forms.point_forms import CellSums, FormPoints, Places, PointData
-from mpm_dolfinx.forms.unknowns import Unknowns, matrix, sum_ghosts
+from mpm_dolfinx.forms.unknowns import Unknowns, insert_for_each_axis, matrix, sum_ghosts
 from mpm_dolfinx.grid.grid import polynomial, sum_by
 from mpm_dolfinx.mechanics.ghost_penalty import kinks
 from mpm_dolfinx.points.cutting import spreads
@@ -153,7 +152,8 @@ class InertiaForms:
     def __init__(self, points: FormPoints, of_laws: Sequence[FormPoints], u: fem.Function):
         self.grid, V = points.grid, u.function_space
         grid, d = self.grid, self.grid.dim
-        self._u, self._flight, self._rate = u, np.zeros(len(u.x.array)), fem.Constant(grid.mesh, 0.0)
+        self._u, self._rate = u, fem.Constant(grid.mesh, 0.0)
+        self._flight = fem.Function(V)
         self.moved = fem.Function(V)
         """Displacement minus the inertial predictor at the last call of `move`, in m."""
         self.acceleration = self._rate * self.moved
@@ -166,10 +166,10 @@ class InertiaForms:
             seen.follow("gradient", (d, d), partial(self._seen, chords, 0))
             seen.follow("turn", (d, d), partial(self._seen, chords, 1))
         self.pieces = p = FormPoints(grid, spread=(d, d))
-        pairs = combinations_with_replacement(at_centroids(p), 2)
+        pairs = combinations_with_replacement(p.shapes(), 2)
         self._mass = CellSums([N * M + ufl.dot(g, p.spread * h) for (N, g), (M, h) in pairs], p)
         self.moving = p = FormPoints(grid, velocity=(d,), turn=(d, d))
-        momenta = [p.velocity * N + ufl.dot(p.turn, g) for N, g in at_centroids(p)]
+        momenta = [p.velocity * N + ufl.dot(p.turn, g) for N, g in p.shapes()]
         self._momentum = CellSums([momentum[i] for momentum in momenta for i in range(d)], p)
         self.density = fem.Function(grid.cellwise())
         """Density of the material in the cells, in kg/m^3."""
@@ -181,11 +181,11 @@ class InertiaForms:
         self.midpoint.value = float(midpoint and inertia is not None)
         self._rate.value = 0.0 if inertia is None else inertia.rate
         if inertia is not None:
-            self._flight[:] = inertia.flight
+            self._flight.x.array[:] = inertia.flight
 
     def move(self) -> None:
         """Set the acceleration to that at u."""
-        np.subtract(self._u.x.array, self._flight, out=self.moved.x.array)
+        np.subtract(self._u.x.array, self._flight.x.array, out=self.moved.x.array)
 
     def at(self, cells: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return accelerations, in m/s^2, at places in cells.  `values` are the shape functions at these places."""
@@ -237,7 +237,7 @@ class InertiaForms:
         for of in (unknowns, held):
             A = matrix(of, unknowns, 3**grid.dim + 2 * grid.dim * 3 ** (grid.dim - 1))
             A.setOption(PETSc.Mat.Option.IGNORE_ZERO_ENTRIES, True)  # the mass does not couple the axes
-            insert_for_each_axis(A, grid, places.filled, of_cells)
+            insert_for_each_axis(A, grid.cell_nodes[places.filled], grid.dim, of_cells)
             ghost.assemble_matrix(A)
             A.assemble()
             matrices.append(A)

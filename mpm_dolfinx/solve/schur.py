@@ -239,7 +239,7 @@ class LinearSolvers:
             with using(self.scheme.petsc_options):
                 count, kept.factors = self._block.solve(self.du, self.dp, scales, rtol, slopes, kept.factors)
             return count
-        symmetric = slope is None and self._storage.by_motion is None
+        symmetric = slope is None and not self._storage.moves
         self._set_krylov(self._krylov if symmetric else PETSc.KSP.Type.FGMRES)
         if slope is not None:
             self._schur.setPythonContext(replace(self._context, slopes=slopes))

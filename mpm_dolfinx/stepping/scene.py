@@ -28,7 +28,6 @@ from mpm_dolfinx.diagnostics.resolution import warn_mixed, warn_overlaps
 from mpm_dolfinx.diagnostics.scene_checks import check_held
 from mpm_dolfinx.domains.cut_domains import CutDomains
 from mpm_dolfinx.domains.renewed_faces import SeededFaces
-from mpm_dolfinx.flow.fluxes import InertiaForce
 from mpm_dolfinx.flow.sources import Sources
 from mpm_dolfinx.flow.storage import CellPressure, StorageForms
 from mpm_dolfinx.grid.grid import Grid, in_chunks
@@ -120,7 +119,7 @@ class Scene:
             moves = self.momentum.inertia
             inertial = None
             if moves is not None:
-                inertial = InertiaForce(moves.moved, -fem.Constant(grid.mesh, fluid.density) * moves.acceleration)
+                inertial = moves.moved, -fem.Constant(grid.mesh, fluid.density) * moves.acceleration
             pieces = self.pieces.pieces
             feeding = [Sources(sources, pieces, p.now, self.t)] if sources else []
             of_fluid = (scene, weight, symmetric, feeding, inertial)
