@@ -13,11 +13,11 @@ CEILINGS = {
     "folders in a circle of imports": 0,
     "files of the largest folder": 14,
     "parameters of the longest list": 12,
-    "assignments of three and more values": 18,
+    "assignments of three and more values": 17,
     "changes of hidden state": 0,
     "asserts and RuntimeErrors": 3,  # of users on other processes, and of two reference solutions
     "files that name a condition's class, most": 6,
-    "lines of the package": 39766,
+    "lines of the package": 39902,
 }
 
 WAYS = {"rooms of a traction": 13, "rooms of an initial pressure": 15, "homes of the pressure": 4}

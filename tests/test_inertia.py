@@ -12,6 +12,8 @@ import mpm_dolfinx as mpm
 from mpm_dolfinx.base.time_integration import GAMMA
 from mpm_dolfinx.mechanics import inertia
 from mpm_dolfinx.points.cutting import cut
+from mpm_dolfinx.stepping.balances import balances, flight_of
+from mpm_dolfinx.stepping.step import set_up
 
 TIGHT = mpm.Numerics(tolerance=1e-10)
 BLOCK = mpm.NeoHookean(bulk=1e3 / 1.2, shear=1e3 / 2.6, grain_density=2.0, porosity=0.5)  # nu = 0.3, 1 kg/m^3
@@ -339,6 +341,52 @@ def test_water_that_flows_freely_does_not_make_a_column_unstable():
     s.run(0.05, 0.0025, progress=False)
     assert 10 - s.points.corners[:, :, 1].max() == pytest.approx(1.7066e-4, rel=0.03)
     assert s.points.pressure.max() == pytest.approx(3e3, rel=0.05)
+
+
+@pytest.mark.parametrize("kind", ["equal cells", "unequal cells", "unsaturated", "axisymmetric", "3D"])
+def test_the_tangent_contains_the_acceleration_of_the_water(kind):
+    """Comparison with central differences of the residual, at rest, where the geometry of the fluxes has no effect."""
+    d = 3 if kind == "3D" else 2
+    options = {"conductivity": 1e-2, "grain_density": 2000.0, "porosity": 0.4}
+    if kind == "unsaturated":
+        options["retention"] = mpm.VanGenuchten(1e4)
+    soil = mpm.Hencky(bulk=1e6, shear=1e6, **options)
+    grid = mpm.Grid([0.0] * d, [1.2] * d, [4] * d, axisymmetric=kind == "axisymmetric")
+    if kind == "unequal cells":
+        grid = mpm.Grid(lines=[[0, 0.2, 0.5, 0.9, 1.2], [0, 0.3, 0.5, 0.8, 1.2]])
+    body, walls = mpm.box(grid, [0.0] * d, [1.0] * d), {"bottom": "xyz"[:d], "left": "x"}
+    conditions = [mpm.Drained("top")]
+    s = mpm.Simulation(grid, [body], [soil], walls=walls, conditions=conditions, fluid=mpm.Fluid(), inertia=True)
+    start = set_up(s.scene, s.state, 1e-3)
+    both = balances(s.scene, start, start.begun(start.acting[0], None), None, flight_of(start))
+    (u, unknowns), storage = (both.momentum.forms.u, both.momentum.system.unknowns), both.storage
+    both.momentum.assemble_residual()
+    storage.assemble_residual()
+    storage.assemble_tangent()
+    system, there = storage.system, []
+    v = unknowns.gather_owned(np.random.default_rng(3).standard_normal(unknowns.size))
+    out, content = system.unknowns.vector(), system.unknowns.vector()
+    system.change_by(v, out)
+    system.B.mult(v, content)
+    for step in (1e-7, -2e-7):
+        unknowns.add(u, step, v)
+        there.append(storage.assemble_residual().vector.array.copy())
+    exact = (there[0] - there[1]) / 2e-7
+    assert out.array == pytest.approx(exact, abs=1e-6 * np.abs(exact).max())
+    assert np.abs(content.array - exact).max() > 0.1 * np.abs(exact).max()
+
+
+@pytest.mark.parametrize("steps", [50, 7000])
+def test_newton_takes_two_steps_for_a_sudden_load_on_permeable_pores(steps):
+    """k / (g dt) = 0.5 and 70: Newton's method took 15 steps in each substep, or failed, when accelerations lagged."""
+    soil = mpm.LinearElastic(bulk=12e6, shear=5.6e6, porosity=0.33, grain_density=2000.0, conductivity=1e-2)
+    grid = mpm.Grid([0, 0], [0.5, 11.5], [1, 23])
+    body = mpm.box(grid, [0, 0.5], [0.5, 10.5])
+    conditions = [mpm.Traction("top", (0, -3e3)), mpm.Drained("top"), mpm.Displacement("bottom", (0, 0), "y")]
+    fluid, walls = mpm.Fluid(density=1000.0, bulk=np.inf, gravity=10.0), {"left": "x", "right": "x"}
+    s = mpm.Simulation(grid, [body], [soil], walls=walls, conditions=conditions, fluid=fluid, inertia=True)
+    for _ in range(3):
+        assert s.step(0.1 / steps).newton <= 4
 
 
 @pytest.mark.parametrize("bulk", [1e7, 2.2e9])

@@ -146,8 +146,11 @@ class OpenFaces:
 
     def driven(self, fluid: Fluid) -> NDArray[np.float64]:
         """Return the outflow (m,) through each face due to inertia forces on the fluid, in m^d/s."""
-        along = np.einsum("md,md->m", fluid.force[self.at], self.offset)
-        return np.where(self.seeps, 0.0, self.open_by(fluid) * along)
+        return np.einsum("md,md->m", fluid.force(self.at), self.by_force(fluid))
+
+    def by_force(self, fluid: Fluid) -> NDArray[np.float64]:
+        """Return the derivative (m, d) of `driven` with respect to the force, in m^(d+3)/(N s)."""
+        return np.where(self.seeps, 0.0, self.open_by(fluid))[:, None] * self.offset
 
 
 @dataclass(frozen=True)
@@ -217,9 +220,9 @@ class RainedFaces(OpenFaces):
             np.where(np.isnan(self.rain), values, 0.0) for values in self.pond.nonorthogonal(fluid, difference)
         )
 
-    def driven(self, fluid: Fluid) -> NDArray[np.float64]:
-        """Return the outflow (m,) through each face due to inertia forces, in m^d/s: 0 for faces with rain."""
-        return np.where(np.isnan(self.rain), super().driven(fluid), 0.0)
+    def by_force(self, fluid: Fluid) -> NDArray[np.float64]:
+        """Return the derivative (m, d) of `driven` with respect to the force: 0 for faces with rain."""
+        return np.where(np.isnan(self.rain)[:, None], super().by_force(fluid), 0.0)
 
     def open_by(self, fluid: Fluid) -> NDArray[np.float64]:
         """Return the outflow (m,) through each face per unit difference of mass potentials, in m^d/(Pa s)."""
@@ -309,6 +312,10 @@ class SideFeeds(Feeds):
     def slope(self, at: OpenFaces, fluid: Fluid) -> NDArray[np.float64]:
         """Return the derivative of the outflow with respect to the pressure of the cell."""
         return sum_by(at.at, self._if_open(at, (1 + self._share) * at.derivative(fluid)), len(fluid.pi))
+
+    def by_force(self, at: OpenFaces, fluid: Fluid) -> NDArray[np.float64]:
+        """Return the derivative of the outflow with respect to the inertia force."""
+        return sum_by(at.at, at.by_force(fluid).T, len(fluid.pi)).T
 
     def settle(self, at: OpenFaces, fluid: Fluid) -> int:
         """Open all seepage faces with outflow, close all others, and return the number of changes on this process."""

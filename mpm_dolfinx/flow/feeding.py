@@ -8,7 +8,7 @@ The method `feeding(setting)` of a condition creates its `Feeding` once in a sta
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple
 
@@ -46,7 +46,8 @@ class Fluid(NamedTuple):
     p: NDArray[np.float64]  # pressure (n,), Pa
     pi: NDArray[np.float64]  # mass potential (n,), Pa, see `fluid_content`
     density: NDArray[np.float64]  # density divided by the density at zero pressure (n,)
-    force: NDArray[np.float64] | None = None  # inertia force on the fluid (n, d), N/m^3
+    # function that returns the inertia forces (k, d), N/m^3, on the fluid in k of the n cells, or None
+    force: Callable[[NDArray[np.int64]], NDArray[np.float64]] | None = None
 
 
 class Leaving(NamedTuple):
@@ -86,6 +87,10 @@ class Feeds:
 
     def slope(self, at: Any, fluid: Fluid) -> NDArray[np.float64] | float:
         """Return the derivative (n,) of the outflow with respect to the pressure of the cell, in m^d/(Pa s)."""
+        return 0.0
+
+    def by_force(self, at: Any, fluid: Fluid) -> NDArray[np.float64] | float:
+        """Return the derivative (n, d), in m^(d+3)/(N s), of the outflow with respect to `fluid.force` in the cell."""
         return 0.0
 
     def coupling(self, at: Any, fluid: Fluid, unknowns: Any) -> PETSc.Mat | None:

@@ -10,7 +10,7 @@ sides.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 from math import prod
@@ -365,14 +365,19 @@ class HalfFaces:
         offset = self._shapes[1]
         return OpenSides(number, self.cells, none, none, none, seeps, self.area, offset, unknown, unknown)
 
-    def rows(self, flow: Conduction, p: NDArray[np.float64], force: NDArray[np.float64] | None) -> NDArray[np.float64]:
+    def rows(
+        self,
+        flow: Conduction,
+        p: NDArray[np.float64],
+        force: Callable[[NDArray[np.int64]], NDArray[np.float64]] | None,
+    ) -> NDArray[np.float64]:
         """Return pressure (Pa), position (m), force (N/m^3), pressure drop (Pa) and conductances (m^d/(Pa s)).
 
         The position is the centroid of the cell's material.  The force is the unit weight plus the inertia force.  The
         pressure drop is from the centroid to the face.  Unsaturated soil has a conductance for each retention curve.
 
         `p` (n,), Pa: pressures of the filled cells.
-        `force` (n, d), N/m^3: inertia force on the fluid, or None.
+        `force`: see `Fluid`.
         """
         contents, d = self.contents, self.area.shape[1]
         size, offset, shape = self._shapes
@@ -384,7 +389,7 @@ class HalfFaces:
             x = x + flow.motion.moved[self.at]
         pull = np.zeros((len(shape), d)) if flow.weight is None else np.broadcast_to(flow.weight, (len(shape), d))
         if force is not None:
-            pull = pull + force[self.at]
+            pull = pull + force(self.at)
         drop = (flow.deformed(self.at, offset) * pull).sum(axis=1)
         conductance = (flow.across(self.at, normal) * shape)[:, None]
         if flow.relative is not None:
@@ -403,7 +408,8 @@ class FluxForms:
     `flows`: whether any material is permeable.  If False, no fluxes are computed.
     `pressure`: pore pressure of the cells (DG0), Pa.
     `bulk`: bulk modulus of the fluid, Pa.
-    `inertial` (d,), N/m^3: inertia force on the pore fluid, as UFL, or None without inertia.
+    `inertial`: motion, and the inertia force (d,) on the pore fluid that it causes, in N/m^3, as UFL; None without
+    inertia.  `by_motion` is the derivative of this part of the fluxes, at fixed relative conductivities.
     `relative`: relative conductivities in unsaturated soil, see `unsaturated`, or None.
     """
 
@@ -415,7 +421,7 @@ class FluxForms:
         flows: bool,
         pressure: fem.Function,
         bulk: float,
-        inertial: ufl.core.expr.Expr | None = None,
+        inertial: tuple[fem.Function, ufl.core.expr.Expr] | None = None,
         relative: Any = None,
     ):
         self.grid = grid
@@ -448,12 +454,14 @@ class FluxForms:
         if inertial is not None:
             # mean over two cells as for the mass: weights 1/6, 2/3, 1/6 of three nodes in a row.  With the value at the
             # face, freely flowing water would have more mass than all of the soil in modes that alternate between nodes
-            along_n = [ufl.dot(ufl.grad(inertial)(side), n0) for side in "+-"]
+            moved, force = inertial
+            along_n = [ufl.dot(ufl.grad(force)(side), n0) for side in "+-"]
             if grid.even:
-                along = ufl.avg(inertial) - across / 6 * (along_n[0] - along_n[1])
+                along = ufl.avg(force) - across / 6 * (along_n[0] - along_n[1])
             else:
-                along = ufl.avg(inertial) - (h0**2 * along_n[0] - h1**2 * along_n[1]) / (3 * (h0 + h1))
+                along = ufl.avg(force) - (h0**2 * along_n[0] - h1**2 * along_n[1]) / (3 * (h0 + h1))
             weight = along if weight is None else weight + along
+            by_motion = ufl.derivative(along, moved, ufl.TrialFunction(moved.function_space))
         drop = 0.0 if weight is None else ufl.dot(weight, offset)
         if relative is not None:
             between = relative.between(pressure, drop)
@@ -483,7 +491,7 @@ class FluxForms:
             self.nonorthogonal = FacetForm(
                 -conductance * ufl.dot(ufl.avg(self.slope), along) * ufl.jump(q) * dS, grid.comm
             )
-        self.gravity = None
+        self.gravity = self.by_motion = None
         if (weight is not None or relative is not None) and flows:
             # still water must not flow: its pressure increases with depth by the unit weight at zero pressure.
             # Pressure and weight are in one form, so that rounding errors are small and conserve mass
@@ -491,6 +499,9 @@ class FluxForms:
             difference = ufl.jump(pressure) + drop
             flux = T * density * difference * ufl.jump(q) * dS
             self.gravity = FacetForm(flux, grid.comm)
+            if inertial is not None:
+                conductance = T if relative is None else T * density
+                self.by_motion = FacetForm(conductance * ufl.dot(by_motion, offset) * ufl.jump(q) * dS, grid.comm)
             if relative is not None:
 
                 def by_k(k):

@@ -103,7 +103,7 @@ class StorageForms:
     `symmetric`: whether to use alpha as the derivative of the content with respect to J_Delta.  If True, the Jacobian
     is symmetric.  The neglected term is of the order of `(p - p_n) / K_w`.
     `feeding`: sources and open sides of all stages.
-    `inertial` (d,), N/m^3: inertia force `-rho_w a` on the pore fluid, as UFL, or None without inertia.
+    `inertial`: motion and the inertia force `-rho_w a` on the pore fluid, see `FluxForms`, or None without inertia.
     """
 
     def __init__(
@@ -116,7 +116,7 @@ class StorageForms:
         weight: ufl.core.expr.Expr | None,
         symmetric: bool,
         feeding: Sequence[Feeding],
-        inertial: ufl.core.expr.Expr | None = None,
+        inertial: tuple[fem.Function, ufl.core.expr.Expr] | None = None,
     ):
         self.grid = pieces.grid
         self.p, self.p_n = pressure.now, pressure.start
@@ -155,7 +155,8 @@ class StorageForms:
         self._derivatives = CellSums([ufl.diff(stored, p), *(part for slope in along for part in slope)], pieces)
         self.symmetric, self.softens = symmetric, materials.evolves
         relative = Relative(pieces.grid, retentions) if self.retains and materials.conducts else None
-        self.fluxes = FluxForms(pieces.grid, active, weight, materials.conducts, self.p, bulk, inertial, relative)
+        of_fluid = (self.p, bulk, inertial, relative)
+        self.fluxes = FluxForms(pieces.grid, active, weight, materials.conducts, *of_fluid)
         self.feeding = tuple(feeding)
         """Sources and open sides of all stages."""
 
@@ -187,7 +188,7 @@ class StorageForms:
     ) -> NDArray[np.float64]:
         """Return the outflow of active cells to other cells due to the pressures and the fluid's weight, in m^d/s.
 
-        `force` (c, d), N/m^3: inertia force on the fluid in the local cells, or None.
+        `force` (c, d), N/m^3: inertia force on the fluid in the local cells; None without inertia or in saturated soil.
         """
         relative, borders = self.fluxes.relative, None
         if relative is not None:
@@ -253,6 +254,9 @@ class StorageSystem:
         self.T, self.D, self.L = (matrix(own, own, 2 * d + 1) for _ in range(3))
         self.B = matrix(own, momentum, 2**d * d)
         self.B_momentum = self.B if forms.symmetric else matrix(own, momentum, 2**d * d)
+        flows = fluxes.by_motion is not None
+        self.by_motion = matrix(own, momentum, d * (d + 1) * 2**d) if flows else None
+        """Derivative (m^(d-1)) of the outflow by inertia with respect to displacements, see `assemble_by_motion`."""
         self.residual, self.step, self._potentials = (own.vector() for _ in range(3))
         self.damp, self._alternation = (form.on(facets) for form in (fluxes.damp, fluxes.alternation))
         self._facets = facets
@@ -271,6 +275,11 @@ class StorageSystem:
         self.C, self.P = pattern.duplicate(), pattern.duplicate()
 
     @property
+    def moves(self) -> bool:
+        """Whether inertia contributes to the tangent of the outflow."""
+        return self.by_motion is not None and self.by_motion.assembled
+
+    @property
     def gravity(self) -> FacetSum | None:
         """Form of fluxes between cells of one soil, due to p and weight.  None in saturated soil without weight."""
         return (self._uniform or self._over_uniform())[1]
@@ -287,8 +296,13 @@ class StorageSystem:
         return places, places[:0]
 
     def change_by(self, u: PETSc.Vec, out: PETSc.Vec, *slopes: FluxSlope) -> None:
-        """Set `out` to the change (m^d) of the residual due to an increment u.  `slopes` add the changes of fluxes."""
+        """Set `out` to the change (m^d) of the residual due to an increment u.
+
+        `slopes`: changes of the fluxes, with those by inertia, in place of `by_motion`.
+        """
         self.B.mult(u, out)
+        if self.moves and not slopes:
+            self.by_motion.multAdd(u, out, out)
         for slope in slopes:
             out.array_w[:] += slope(u)
 
@@ -328,6 +342,21 @@ class StorageSystem:
             nonorthogonal = NonorthogonalFlow(self._forms.fluxes, facets, gradients, contents, sides, flow.weight)
         return Outflow([one.conducting(flow) for one in feeds], total, mobility, nonorthogonal)
 
+    def assemble_by_motion(self, dt: float, filled: NDArray[np.int64], rows: NDArray[np.float64]) -> None:
+        """Assemble `by_motion`.
+
+        `dt`, s: time weight of the outflow.
+        `rows` (n, k), m^(d-1)/s: derivative of the outflow through open sides with respect to the nodal displacements,
+        in the owned cells `filled`.
+        """
+        A, fluxes = self.by_motion, self._forms.fluxes
+        zero(A)
+        facets = self._facets if fluxes.relative is None else fluxes.relative.uniform(self._facets)
+        fluxes.by_motion.on(facets).assemble_matrix(A)
+        insert_rows(A, self._forms.grid, filled, rows)
+        A.assemble()
+        A.scale(dt)
+
     def assemble_fluxes(self, force: NDArray[np.float64] | None = None) -> None:
         """Assemble the matrix of fluxes, in unsaturated soil at the current pressures.
 
@@ -359,9 +388,11 @@ class StorageResidual:
 class FluidInertia(NamedTuple):
     """Inertia in a substep, in the n active owned cells."""
 
-    forces: Callable[[], NDArray[np.float64]]  # returns the inertia forces (n, d) on the fluid, N/m^3
+    move: Callable[[], None]  # sets the acceleration in the forms to that at u
+    forces: Callable[[NDArray[np.int64] | slice], NDArray[np.float64]]  # see `Fluid.force`
     resists: NDArray[np.float64]  # (n,) see `OnGrid.resisting_mass`
     density: float  # of the fluid, kg/m^3
+    rate: float  # acceleration divided by the displacement, 1/s^2
 
 
 class StorageProblem:
@@ -597,8 +628,9 @@ class StorageProblem:
         system, fluid = self.system, self._fluid
         force = None
         if self._inertial is not None:
-            fluid = fluid._replace(force=self._inertial.forces())
-            force = self._local(fluid.force)
+            self._inertial.move()
+            fluid = fluid._replace(force=self._inertial.forces)
+            force = self._local_force()
         if system.gravity is None:
             cells = system.between(fluid.pi)
         else:
@@ -612,10 +644,13 @@ class StorageProblem:
             turnover = turnover + leaving.turnover
         return Rates(cells + net, net, turnover, gain)
 
-    def _local(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return values of the active owned cells as an array over local cells."""
-        out = np.zeros((self.forms.grid.num_local, values.shape[1]))
-        out[self.system.unknowns.owned] = values
+    def _local_force(self) -> NDArray[np.float64] | None:
+        """Return the inertia forces on the fluid in local cells, see `StorageForms.driven`."""
+        if self._inertial is None or self.forms.fluxes.relative is None:
+            return None
+        self._inertial.move()
+        out = np.zeros((self.forms.grid.num_local, self.forms.grid.dim))
+        out[self.system.unknowns.owned] = self._inertial.forces(slice(None))
         return out
 
     def net_inflow(self, rates: Rates) -> NDArray[np.float64]:
@@ -646,20 +681,31 @@ class StorageProblem:
             A.assemble()
         if forms.fluxes.relative is not None:
             self._flow(False)
-            system.assemble_fluxes(None if self._inertial is None else self._local(self._inertial.forces()))
+            system.assemble_fluxes(self._local_force())
         system.C.zeroEntries()
         system.C.axpy(self.dt, system.T, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
         if self.damped:
             system.C.axpy(1.0, system.D, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
         if self._softer is not None:
             system.C.axpy(1.0, self._softer, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
-        fluid, both = self._fluid, zip(self._feeds, self._flow(False).at, strict=True)
+        fluid, both = self._fluid, [*zip(self._feeds, self._flow(False).at, strict=True)]
         slope = 0.0
         for one, at in both:
             slope = slope + one.slope(at, fluid)
             if (coupling := one.coupling(at, fluid, system.unknowns)) is not None:
                 system.C.axpy(self.dt, coupling, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
         _add_diagonal(system.C, capacity + self.dt * slope)
+        if system.by_motion is None:
+            return
+        if self._inertial is None:
+            zero(system.by_motion)  # after a stage with inertia
+            return
+        by_force = np.zeros((len(capacity), forms.grid.dim))
+        for one, at in both:
+            by_force += one.by_force(at, fluid)
+        shapes = -self._inertial.density * self._inertial.rate * self._contents.shape_values
+        rows = shapes[:, :, None] * by_force[:, None]
+        system.assemble_by_motion(self.dt, self._contents.filled, rows.reshape(len(rows), -1))
 
     def assemble_preconditioner(self, factor: float, share: float) -> PETSc.Mat:
         """Return the fixed-stress operator `C + factor (beta V - share L)` for the current C.

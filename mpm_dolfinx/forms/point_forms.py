@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property, partial
-from math import factorial
+from math import factorial, prod
 from types import MappingProxyType
 
 from mpi4py import MPI
@@ -84,6 +84,16 @@ class FormPoints:
     def at(self, cells: NDArray[np.int32], x: NDArray[np.float64], weight: NDArray[np.float64], **fields) -> PointData:
         """Return points with given positions x (m), weights (m^d) and fields, see `PointData`."""
         return PointData(self, Places(self.grid, cells, x), weight, fields)
+
+    def shapes(self) -> list:
+        """Return the values and the gradients of the Q1 shape functions at the points, as UFL pairs."""
+        h, d = self.grid.edge_in_forms(), self.grid.dim
+        out = []
+        for signs in self.grid.signs.tolist():
+            t = [0.5 + signs[a] * self.offset[a] / h[a] for a in range(d)]
+            slopes = [signs[a] / h[a] * prod(t[b] for b in range(d) if b != a) for a in range(d)]
+            out.append((prod(t), ufl.as_vector(slopes)))
+        return out
 
     def value(self, f):
         """Return a Q1 function, test function or trial function at the points."""

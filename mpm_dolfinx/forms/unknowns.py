@@ -121,6 +121,13 @@ def petsc_matrix(rows: scipy.sparse.csr_matrix, columns: int, comm: MPI.Intracom
     return A
 
 
+def insert_for_each_axis(A: PETSc.Mat, nodes: NDArray[np.int32], dim: int, matrices: NDArray[np.float64]) -> None:
+    """Add element matrices (cells, n, n) of scalars to `A`, for each of `dim` components at the nodes (cells, n)."""
+    for axis in range(dim if len(nodes) else 0):
+        dofs = (nodes * dim + axis).astype(PETSc.IntType)
+        A.setValuesLocalRCV(dofs, dofs, matrices, addv=True)
+
+
 def zero(A: PETSc.Mat) -> None:
     """Set a matrix to zero before assembly.  The matrix may never have been assembled."""
     if A.assembled:

@@ -32,6 +32,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import cached_property, partial
+from itertools import combinations_with_replacement
 from typing import NamedTuple
 
 from petsc4py import PETSc
@@ -46,8 +47,8 @@ from mpm_dolfinx.base.tolerances import NEAR, ROUND_OFF
 from mpm_dolfinx.base.validation import at_places, numbers
 from mpm_dolfinx.conditions.acting import At, Loads
 from mpm_dolfinx.domains.cut_domains import CutDomains
-from mpm_dolfinx.forms.point_forms import FormPoints, Places, PointData, PointForm
-from mpm_dolfinx.forms.unknowns import Unknowns, matrix, sum_ghosts
+from mpm_dolfinx.forms.point_forms import CellSums, FormPoints, Places, PointData
+from mpm_dolfinx.forms.unknowns import Unknowns, insert_for_each_axis, matrix, sum_ghosts
 from mpm_dolfinx.grid.grid import polynomial, sum_by
 from mpm_dolfinx.mechanics.ghost_penalty import kinks
 from mpm_dolfinx.points.cutting import spreads
@@ -103,18 +104,25 @@ def moving(
     return {VELOCITY: v, RATE: L @ points.F[:, :d, :d]}
 
 
+def columns(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return values (n, ...) as an array (..., n).  Operations on such arrays of small tensors are faster."""
+    return np.ascontiguousarray(np.moveaxis(values, 0, -1))
+
+
 def inverses(A: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the inverses of matrices (n, d, d), faster than numpy."""
-    if A.shape[1] > 2:
-        return np.linalg.inv(A)
-    (a, b), (c, e) = np.ascontiguousarray(A.transpose(1, 2, 0))
-    return (np.array([[e, -b], [-c, a]]) / (a * e - b * c)).transpose(2, 0, 1)
+    """Return the inverses of matrices (d, d, n)."""
+    if len(A) > 2:
+        return columns(np.linalg.inv(A.transpose(2, 0, 1)))
+    (a, b), (c, e) = A
+    return np.array([[e, -b], [-c, a]]) / (a * e - b * c)
 
 
 def product(A: NDArray[np.float64], B: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the products of matrices (n, d, d), faster than numpy."""
-    A, B = (np.ascontiguousarray(of.transpose(1, 2, 0)) for of in (A, B))
-    return sum(A[:, j, None] * B[None, j] for j in range(len(B))).transpose(2, 0, 1)
+    """Return the products of matrices (d, d, n)."""
+    out = A[:, 0, None] * B[0]
+    for j in range(1, len(B)):
+        out += A[:, j, None] * B[j]
+    return out
 
 
 def chord(G: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -129,10 +137,10 @@ def chord(G: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float
 
     `G` (n, d, d): gradient of the displacement since the start of the step.
     """
-    one, G = np.eye(G.shape[1]), np.ascontiguousarray(G.transpose(1, 2, 0)).transpose(2, 0, 1)
+    one, G = np.eye(G.shape[1])[:, :, None], columns(G)
     delta = one + G
-    seen = delta + 0.5 * product(inverses(delta).swapaxes(1, 2), product(G.swapaxes(1, 2), G))
-    return seen - one, product(delta, inverses(seen))
+    seen = delta + 0.5 * product(inverses(delta).swapaxes(0, 1), product(G.swapaxes(0, 1), G))
+    return tuple(of.transpose(2, 0, 1) for of in (seen - one, product(delta, inverses(seen))))
 
 
 class InertiaForms:
@@ -144,22 +152,25 @@ class InertiaForms:
     def __init__(self, points: FormPoints, of_laws: Sequence[FormPoints], u: fem.Function):
         self.grid, V = points.grid, u.function_space
         grid, d = self.grid, self.grid.dim
-        self._u, self._flight, self._rate = u, fem.Function(V), fem.Constant(grid.mesh, 0.0)
-        self.acceleration = self._rate * (u - self._flight)
-        """Acceleration at u as UFL, in m/s^2."""
+        self._u, self._rate = u, fem.Constant(grid.mesh, 0.0)
+        self._flight = fem.Function(V)
+        self.moved = fem.Function(V)
+        """Displacement minus the inertial predictor at the last call of `move`, in m."""
+        self.acceleration = self._rate * self.moved
+        """Acceleration as UFL, in m/s^2."""
         self.midpoint = fem.Constant(grid.mesh, 0.0)
         """1 in a substep with a midpoint rule, and 0 in other substeps."""
+        shared: Latest[tuple[NDArray, NDArray]] = Latest()
         for seen in dict.fromkeys([points, *of_laws] if not grid.axisymmetric else []):  # axisymmetric bodies: no spin
-            chords: Latest[tuple[NDArray, NDArray]] = Latest()
+            chords = shared if len(of_laws) == 1 else Latest()
             seen.follow("gradient", (d, d), partial(self._seen, chords, 0))
             seen.follow("turn", (d, d), partial(self._seen, chords, 1))
-        a, v = ufl.TrialFunction(V), ufl.TestFunction(V)
         self.pieces = p = FormPoints(grid, spread=(d, d))
-        self._mass = PointForm(
-            (ufl.inner(p.value(a), p.value(v)) + ufl.inner(p.plane_grad(a) * p.spread, p.plane_grad(v))) * p.dx, p
-        )
+        pairs = combinations_with_replacement(p.shapes(), 2)
+        self._mass = CellSums([N * M + ufl.dot(g, p.spread * h) for (N, g), (M, h) in pairs], p)
         self.moving = p = FormPoints(grid, velocity=(d,), turn=(d, d))
-        self._momentum = PointForm((ufl.inner(p.velocity, p.value(v)) + ufl.inner(p.turn, p.plane_grad(v))) * p.dx, p)
+        momenta = [p.velocity * N + ufl.dot(p.turn, g) for N, g in p.shapes()]
+        self._momentum = CellSums([momentum[i] for momentum in momenta for i in range(d)], p)
         self.density = fem.Function(grid.cellwise())
         """Density of the material in the cells, in kg/m^3."""
         self.work = fem.Function(V)
@@ -172,20 +183,27 @@ class InertiaForms:
         if inertia is not None:
             self._flight.x.array[:] = inertia.flight
 
+    def move(self) -> None:
+        """Set the acceleration to that at u."""
+        np.subtract(self._u.x.array, self._flight.x.array, out=self.moved.x.array)
+
     def at(self, cells: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return accelerations, in m/s^2, at places in cells.  `values` are the shape functions at these places."""
-        nodal = self._rate.value * (self._u.x.array - self._flight.x.array).reshape(-1, self.grid.dim)
-        return np.einsum("nk,nkd->nd", values, nodal[self.grid.cell_nodes[cells]])
+        nodal = self.moved.x.array.reshape(-1, self.grid.dim)[self.grid.cell_nodes[cells]]
+        return self._rate.value * (values[:, :, None] * nodal).sum(axis=1)
 
     def _seen(self, chords: Latest[tuple[NDArray, NDArray]], which: int, data: PointData) -> NDArray[np.float64]:
         """Return the gradients for laws, or the rotations of the laws' stresses, see `chord`.
 
-        `chords`: the last result, shared by all forms at the same u.
+        `chords`: the last result, shared by forms with the same points.
         """
-        G, d = data.gradients(self._u.x.array), self.grid.dim
+        d = self.grid.dim
+        if which and not self.midpoint.value:
+            return np.broadcast_to(np.eye(d).ravel(), (len(data.cells), d * d))
+        G = data.gradients(self._u.x.array)
         if self.midpoint.value:
-            return chords(G, lambda: chord(G.reshape(-1, d, d)))[which].reshape(-1, d * d)
-        return np.broadcast_to(np.eye(d).ravel(), G.shape) if which else G
+            return columns(chords(G, lambda: chord(G.reshape(-1, d, d)))[which]).reshape(d * d, -1).T
+        return G
 
     def on(
         self,
@@ -204,18 +222,22 @@ class InertiaForms:
         `unknowns`, `held`: unknown displacements, and displacements that grid boundary conditions fix.
         """
         grid = self.grid
-        rows = cut.pieces_to_cells(cut.pieces.fraction * mass[cut.pieces.point])
+        of_pieces = cut.pieces_to_cells(cut.pieces.fraction * mass[cut.pieces.point])
         places = Places(grid, cut.cells, cut.x, cut.mixed, cut.hoop)
-        pieces = PointData(self.pieces, places, rows, {"spread": cut.pieces_to_cells(cut.pieces.second)})
-        content = sum_by(cut.cells, rows, grid.num_local)
+        pieces = PointData(self.pieces, places, of_pieces, {"spread": cut.pieces_to_cells(cut.pieces.second)})
+        content = sum_by(cut.cells, of_pieces, grid.num_local)
         volume = fill * grid.volumes(np.arange(grid.num_local))
         self.density.x.array[:] = np.divide(content, volume, out=np.zeros_like(content), where=volume > 0)
         self.density.x.scatter_forward()
         ghost = self._ghost.on(facets)
-        matrices = []
+        nodes, matrices = 2**grid.dim, []
+        of_cells = np.empty((len(places.filled), nodes, nodes))
+        rows, columns = np.triu_indices(nodes)
+        of_cells[:, rows, columns] = of_cells[:, columns, rows] = self._mass(pieces)
         for of in (unknowns, held):
-            A = matrix(of, unknowns, grid.dim * 3**grid.dim + 2 * grid.dim * 3 ** (grid.dim - 1) * grid.dim)
-            self._mass.assemble_matrix(A, pieces)
+            A = matrix(of, unknowns, 3**grid.dim + 2 * grid.dim * 3 ** (grid.dim - 1))
+            A.setOption(PETSc.Mat.Option.IGNORE_ZERO_ENTRIES, True)  # the mass does not couple the axes
+            insert_for_each_axis(A, grid.cell_nodes[places.filled], grid.dim, of_cells)
             ghost.assemble_matrix(A)
             A.assemble()
             matrices.append(A)
@@ -234,21 +256,36 @@ class Mass:
         self, forms: InertiaForms, cut: CutDomains, pieces: PointData, unknowns: Unknowns, M: PETSc.Mat, held: PETSc.Mat
     ):
         self._forms, self._cut, self._pieces, self.unknowns, self.M, self.held = forms, cut, pieces, unknowns, M, held
+        self._work, self._stiffness = (unknowns.vector(), unknowns.vector()), Latest()
         self._solver = ksp = PETSc.KSP().create(unknowns.comm)
         ksp.setType(PETSc.KSP.Type.CG)
         ksp.getPC().setType(PETSc.PC.Type.JACOBI)
         ksp.setOperators(M)
         ksp.setTolerances(rtol=ROUND_OFF, atol=0.0)
 
+    def forces(self, u: NDArray[np.float64], flight: PETSc.Vec, rate: float) -> PETSc.Vec:
+        """Return the inertia forces at u, in N, see `Inertia`.  The next call reuses the vector."""
+        moved, forces = self._work
+        self.unknowns.gather(u, moved).axpy(-1.0, flight)
+        moved.scale(rate)
+        self.M.mult(moved, forces)
+        return forces
+
+    def stiffness(self, rate: float) -> PETSc.Mat:
+        """Return the derivative of the inertia forces, in N/m, for a `rate` in 1/s^2."""
+        return self._stiffness(rate, lambda: self.M * rate)
+
     def velocity(self, points: MaterialPoints) -> PETSc.Vec:
         """Return the velocities of the unknowns, in m/s, projected from the velocities of the points."""
         cut, forms, pieces, b = self._cut, self._forms, self._pieces, self._forms.work.x.array
-        L = velocity_gradients(points)
-        v = points.data[VELOCITY][cut.pieces.point] + np.einsum("nij,nj->ni", L[cut.pieces.point], self._off)
-        turn = product(L[cut.pieces.point], cut.pieces.second)
+        (off, second), of = self._moments, cut.pieces.point
+        L = columns(velocity_gradients(points)).take(of, axis=2)
+        v = points.data[VELOCITY][of] + (L * off).sum(axis=1).T
+        turn = product(L, second).transpose(2, 0, 1)
         fields = {"velocity": cut.pieces_to_cells(v), "turn": cut.pieces_to_cells(turn)}
-        b[:] = 0.0
-        forms._momentum.assemble_vector(b, PointData(forms.moving, pieces.places, pieces.volume, fields))
+        b[:], (dofs, at) = 0.0, pieces.places.dofs
+        sums = forms._momentum(PointData(forms.moving, pieces.places, pieces.volume, fields))
+        b[dofs] = sum_by(at, sums.ravel(), len(dofs))
         rhs = self.unknowns.gather(sum_ghosts(forms.work), self.unknowns.vector())
         out = self.unknowns.vector()
         self._solver.solve(rhs, out)
@@ -293,31 +330,41 @@ class Mass:
         return work.x.array.copy()
 
     @cached_property
-    def _off(self) -> NDArray[np.float64]:
-        """Vectors, in m, from the centroids of domains to the centroids of their pieces."""
+    def _moments(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Vectors (d, m), in m, from the centroids of domains to those of their pieces, and moments (d, d, m), in m^2.
+
+        The second moments of the m pieces refer to their own centroids.
+        """
         pieces = self._cut.pieces
-        return pieces.x - self._cut.mean(pieces.x)[pieces.point]
+        return columns(pieces.x - self._cut.mean(pieces.x)[pieces.point]), columns(pieces.second)
 
     @cached_property
     def _focus(self) -> NDArray[np.float64]:
-        """Inverses, in 1/m^2, of the second moments of the domains about their centroids."""
-        return inverses(self._cut.mean(self._off[:, :, None] * self._off[:, None] + self._cut.pieces.second))
+        """Inverses (d, d, n), in 1/m^2, of the second moments of the domains about their centroids."""
+        off, second = self._moments
+        return inverses(self._mean(off[:, None] * off + second))
+
+    def _mean(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return for each point the volume mean (..., n) of values (..., m) of its pieces."""
+        pieces = self._cut.pieces
+        return sum_by(pieces.point, pieces.fraction * values, len(self._cut.points))
 
     def _at_points(self, points: MaterialPoints, v: PETSc.Vec) -> dict[str, NDArray[np.float64]]:
         """Return the affine velocity field in each domain that is nearest to the grid's velocities."""
         cut, grid, places, nodal = self._cut, self._forms.grid, self._pieces.places, self.local(v)
         d, of_cells = grid.dim, grid.over_edges(grid.monomials @ nodal.take(places.nodal), places.filled)
         at, slope = polynomial(of_cells, places.offset.T, places.slots).T, self._pieces.gradients_of(nodal)
-        at, slope = (cut.to_pieces(values) for values in (at, slope.reshape(-1, d, d)))
-        mean = cut.mean(at)
-        moment = (at - mean[cut.pieces.point])[:, :, None] * self._off[:, None] + product(slope, cut.pieces.second)
-        return {VELOCITY: mean, RATE: product(product(cut.mean(moment), self._focus), points.F[:, :d, :d])}
+        at, slope = (columns(cut.to_pieces(values)) for values in (at, slope.reshape(-1, d, d)))
+        mean, (off, second) = self._mean(at), self._moments
+        moment = (at - mean.take(cut.pieces.point, axis=1))[:, None] * off + product(slope, second)
+        rate = product(product(self._mean(moment), self._focus), columns(points.F[:, :d, :d]))
+        return {VELOCITY: mean.T, RATE: rate.transpose(2, 0, 1)}
 
 
 def velocity_gradients(points: MaterialPoints) -> NDArray[np.float64]:
     """Return the velocity gradients (n, d, d) of the points, in 1/s, without a circumferential component."""
     d = points.x.shape[1]
-    return product(points.data[RATE], inverses(points.F[:, :d, :d]))
+    return product(columns(points.data[RATE]), inverses(columns(points.F[:, :d, :d]))).transpose(2, 0, 1)
 
 
 class Inertia(Loads):
@@ -346,7 +393,7 @@ class Inertia(Loads):
 
     def inertia(self, at: At) -> PETSc.Vec:
         """Return the inertia forces at u, in N."""
-        return self._mass.M * self.acceleration(at)
+        return self._mass.forces(at.u, self._flight, self.rate)
 
     @cached_property
     def rounding_at_unknowns(self) -> NDArray[np.float64]:
@@ -360,15 +407,9 @@ class Inertia(Loads):
         if on is not self._mass.unknowns:
             residual += self._mass.held * self.acceleration(at)
 
-    @cached_property
-    def _slope(self) -> PETSc.Mat:
-        slope = self._mass.M.copy()
-        slope.scale(self.rate)
-        return slope
-
     def coupling(self, at: At) -> PETSc.Mat:
         """See `Loads`."""
-        return self._slope
+        return self._mass.stiffness(self.rate)
 
 
 class Flight(NamedTuple):

@@ -527,6 +527,14 @@ class MomentumProblem:
             out["external"] += more
         return out
 
+    @cached_property
+    def _rounding(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Rounding errors at the unknowns, and the least force scales, see `out_of_balance`, in N."""
+        system, parts = self.system, self.system.of_parts
+        more = sum(one.rounding_at_unknowns for one in self.loads)
+        whole = system.of_whole.array_r + more * np.sqrt(parts.sizes)[parts.of]
+        return system.rounding.array_r + more, whole / self._tolerance
+
     def out_of_balance(
         self, r: PETSc.Vec, scales: NDArray[np.float64], first: bool
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -540,13 +548,9 @@ class MomentumProblem:
         """
         system, parts = self.system, self.system.of_parts
         both = np.zeros((2, system.unknowns.size))
-        size = np.abs(r.array_r)
-        more = 0.0
-        for one in self.loads:
-            more = more + one.rounding_at_unknowns
-        both[0] = size if first else np.maximum(size - system.rounding.array_r - more, 0.0)
-        whole = system.of_whole.array_r + more * np.sqrt(parts.sizes)[parts.of]
-        least = np.maximum(scales[parts.of], whole / self._tolerance)
+        size, (rounding, whole) = np.abs(r.array_r), self._rounding
+        both[0] = size if first else np.maximum(size - rounding, 0.0)
+        least = np.maximum(scales[parts.of], whole)
         np.divide(size, least, out=both[1], where=size > 0)
         counts, full = parts.norms(both)
         full[~(full < np.inf)] = np.inf

@@ -16,6 +16,9 @@ preconditioner is the fixed-stress operator `C + beta V`, with cell volumes V an
 alpha is Biot's coefficient, and K_dr is the drained bulk modulus. This operator is filtered: beta V is smaller for
 pressures that alternate from cell to cell (`StorageProblem.assemble_preconditioner`).
 
+With inertia, fluxes depend on accelerations. B then also contains this dependence, and FGMRES replaces conjugate
+gradients.
+
 The scheme `schur-fgmres` uses FGMRES and the full, slightly unsymmetric Jacobian instead. The scheme `fixed-stress` is
 the Richardson iteration of the fixed-stress split: storage solves with `C + beta V` at constant stress alternate with
 momentum solves. Large bodies use multigrid, because a direct solver is too expensive. With multigrid, `schur-cg` and

@@ -78,9 +78,7 @@ class SchurComplement:
         s = self.storage
         s.B_momentum.multTranspose(x, self.f)
         self.solve.solve(self.f, self.v)
-        s.B.mult(self.v, y)
-        for slope in self.slopes:
-            y.array_w[:] += slope(self.v)
+        s.change_by(self.v, y, *self.slopes)
         s.C.multAdd(x, y, y)
 
 
@@ -241,7 +239,8 @@ class LinearSolvers:
             with using(self.scheme.petsc_options):
                 count, kept.factors = self._block.solve(self.du, self.dp, scales, rtol, slopes, kept.factors)
             return count
-        self._set_krylov(self._krylov if slope is None else PETSc.KSP.Type.FGMRES)
+        symmetric = slope is None and not self._storage.moves
+        self._set_krylov(self._krylov if symmetric else PETSc.KSP.Type.FGMRES)
         if slope is not None:
             self._schur.setPythonContext(replace(self._context, slopes=slopes))
         g = self.condense(*slopes)

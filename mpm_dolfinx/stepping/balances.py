@@ -216,13 +216,14 @@ def balances(
     moves = None
     if inertia is not None:
         resists = on_grid.resisting_mass(float(substep.own * dt))
-        moves = FluidInertia(partial(pushed_back, scene, on_grid), resists, scene.fluid.density)
+        forces, of = partial(pushed_back, scene, on_grid), scene.momentum.inertia
+        moves = FluidInertia(of.move, forces, resists, scene.fluid.density, inertia.rate)
     options = (*options, moves, on_grid.scale)
     storage = StorageProblem(scene.storage, matrices.storage, start.data.pieces, *options)
     return Balances(momentum, storage, inertia, ahead)
 
 
-def pushed_back(scene: Scene, on_grid: OnGrid) -> NDArray[np.float64]:
-    """Return the inertia forces (n, d) on the pore fluid in the filled owned cells, in N/m^3."""
+def pushed_back(scene: Scene, on_grid: OnGrid, cells: NDArray[np.int64] | slice) -> NDArray[np.float64]:
+    """Return the inertia forces (n, d) on the pore fluid in some of the filled owned cells, in N/m^3."""
     contents = on_grid.contents
-    return -scene.fluid.density * scene.momentum.inertia.at(contents.filled, contents.shape_values)
+    return -scene.fluid.density * scene.momentum.inertia.at(contents.filled[cells], contents.shape_values[cells])

@@ -117,7 +117,9 @@ class Scene:
             weight = fluid.density * self.gravity if weighs else None
             symmetric = scheme.coupling != "schur-fgmres"
             moves = self.momentum.inertia
-            inertial = None if moves is None else -fem.Constant(grid.mesh, fluid.density) * moves.acceleration
+            inertial = None
+            if moves is not None:
+                inertial = moves.moved, -fem.Constant(grid.mesh, fluid.density) * moves.acceleration
             pieces = self.pieces.pieces
             feeding = [Sources(sources, pieces, p.now, self.t)] if sources else []
             of_fluid = (scene, weight, symmetric, feeding, inertial)
