@@ -13,7 +13,8 @@ with the angular frequency w, the thickness H, the wave velocity c and the densi
 and the density of the ground are c_g and rho_g. The energy balance includes the work of the incoming wave and of the
 absorbing base.
 
-**Bank.** A bank of undrained clay, 5 m high with a slope of 1:1, stands on a rough base. The base moves horizontally
+**Bank.** A bank of undrained clay, 5 m high with a slope of 1:1, stands on a rough base. Its strength increases with
+depth. The base moves horizontally
 with three periods of a harmonic acceleration. The bank fails under the acceleration k g, at which its factor of safety
 is one. The amplitude is 2 k g, so the bank slides in each period, and comes to rest again. The reference is the sliding
 block of Newmark (1965, Geotechnique 15, 139). The outward velocity V of the block follows
@@ -39,8 +40,9 @@ LAYER, GROUND = 10.0, 5.0  # m: thickness of the layer, and of the ground in the
 SPEEDS, DENSITIES, POISSON = (300.0, 100.0), (2100.0, 1900.0), 0.3  # ground, layer: m/s, kg/m³; both: -
 PULSE, CENTRE, LENGTH = 3.0, 0.4, 3.0  # Hz, s, s: frequency and middle of Ricker's wavelet, duration of the run
 BAND = (0.5, 6.5)  # Hz: range in which spectra are compared
-HEIGHT, CREST, TOE, SPEED = 5.0, 14.0, 3.0, 200.0  # m: of the bank; widths of crest and of base beside it; m/s
-STRENGTH, DENSITY, GRAVITY = 27e3, 2000.0, 9.81  # Pa, kg/m³, m/s²: undrained clay
+HEIGHT, CREST, TOE, SPEED = 5.0, 10.0, 3.0, 200.0  # m: of the bank; widths of crest and of base beside it; m/s
+STRENGTH, STRONGER = 10e3, 5e3  # Pa, Pa/m: undrained strength at the crest, and its increase with depth
+DENSITY, GRAVITY = 2000.0, 9.81  # kg/m³, m/s²
 NEAR = (0.2, 0.28)  # horizontal accelerations / g, for which the factor of safety is computed
 LOUD, PERIOD, PERIODS = 2.0, 1.0, 3  # amplitude / (k g), s, -: acceleration of the base
 BOUNDS = {"amplification": 0.03, "energy": 0.01, "bank": 0.1, "bank_energy": 0.01}
@@ -106,7 +108,7 @@ def bank(cells: int, lateral: float) -> mpm.Simulation:
         shear=shear,
         friction=0.0,
         dilation=0.0,
-        cohesion=STRENGTH,
+        cohesion=lambda X: STRENGTH + STRONGER * (HEIGHT - X[:, 1]),
         porosity=0.4,
         grain_density=DENSITY / 0.6,
     )

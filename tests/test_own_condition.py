@@ -44,9 +44,9 @@ class SpringsOfStage(mpm.Acting):
     def placed(self, place):
         p, grid, forms = place.cut.surface(self.faces), self.setting.grid, self.setting.forms(Forms)
         moved = p.now(place.points) - p.origin(place.points)
-        rows = np.concatenate([np.linalg.norm(p.area(place.points), axis=1)[:, None], moved], axis=1)
-        cell, x, values = grid.gathered([(p.cell, p.x, rows)], 1 + grid.dim)
-        return SpringLoads(self, forms, forms.points.at(cell, x, values[:, 0], before=values[:, 1:]))
+        fields = {"size": np.linalg.norm(p.area(place.points), axis=1), "before": moved}
+        cell, x, fields = grid.gathered([(p.cell, p.x, fields)])
+        return SpringLoads(self, forms, forms.points.at(cell, x, fields["size"], before=fields["before"]))
 
 
 class SpringLoads(mpm.Loads):
@@ -113,9 +113,9 @@ class SkinOfStage(mpm.Feeding):
 
     def placed(self, wet):
         p = wet.cut.surface(self.faces)
-        cell, x, area = self.grid.gathered([(p.cell, p.x, p.area(wet.points))], self.grid.dim)
+        cell, x, fields = self.grid.gathered([(p.cell, p.x, {"area": p.area(wet.points)})])
         reach = x - self.grid.midpoints[cell] - wet.contents.centroid[cell]
-        return SkinFeeds(self, wet.contents.slot(cell), area, reach)
+        return SkinFeeds(self, wet.contents.slot(cell), fields["area"], reach)
 
     def fed(self, cut, pieces):
         return cut.surface(self.faces).at

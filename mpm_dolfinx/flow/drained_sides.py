@@ -101,11 +101,13 @@ class DrainedSides(Feeding):
         patches = wet.cut.surfaces(self.surfaces)
         for i, ((outlet, _), p) in enumerate(zip(self._outlets, patches, strict=True)):
             given = together(grid.comm, partial(outlet.through, wet.t, p.positions(wet.points)))
-            fields = [np.broadcast_to(np.asarray(values, dtype=float), len(p.x)) for values in (i, *given)]
-            names = "number", "pressure", "flux", "one_way", "driest"
-            rows.append((p.cell, p.x, dict(zip(names, fields, strict=True)) | {"area": p.area(wet.points)}))
+            values = np.empty((5, len(p.x)))
+            for row, value in zip(values, (i, *given), strict=True):
+                row[:] = value
+            rows.append((p.cell, p.x, {"values": values.T, "area": p.area(wet.points)}))
         cell, x, fields = grid.gathered(rows)
-        number, pressure, flux, one_way, driest, area = fields.values()
+        number, pressure, flux, one_way, driest = fields["values"].T
+        area = fields["area"]
         number = number.astype(np.int64)
         drains = np.isfinite(pressure)
         size, offset, shape = wet.contents.shapes(cell, x, area)

@@ -743,7 +743,8 @@ class Grid:
 
         `parts`: for each part, lexicographic cells (n,), positions (n, d), in m, and values (n, ...) by name.
         """
-        cell, x = (np.concatenate([part[k] for part in parts]) for k in (0, 1))
+        cell = np.concatenate([cell for cell, *_ in parts])
+        x = np.concatenate([x for _, x, _ in parts])
         shapes = {name: values.shape[1:] for name, values in parts[0][2].items()}
         columns = [
             np.concatenate([values[name].reshape(len(values[name]), prod(shape)) for *_, values in parts])
@@ -751,9 +752,11 @@ class Grid:
         ]
         travel = Exchange(self.comm, self.owner(cell))
         cell, x, sent = map(travel.send, (cell, x, np.concatenate(columns, axis=1)))
-        columns = np.split(sent, np.cumsum([prod(shape) for shape in shapes.values()])[:-1], axis=1)
-        named = zip(shapes.items(), columns, strict=True)
-        return self.locals[cell], x, {name: values.reshape(len(x), *shape).copy() for (name, shape), values in named}
+        fields, stop = {}, 0
+        for name, shape in shapes.items():
+            start, stop = stop, stop + prod(shape)
+            fields[name] = sent[:, start:stop].reshape(len(x), *shape).copy()
+        return self.locals[cell], x, fields
 
     def node_places(self, nodes: NDArray[np.integer]) -> NDArray[np.int64]:
         """Return the indices (n, d + 1) of local nodes (n,) along the axes.  Column d is the index of the copy."""

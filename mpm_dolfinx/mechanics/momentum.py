@@ -531,7 +531,9 @@ class MomentumProblem:
     def _rounding(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Rounding errors at the unknowns, and the least force scales, see `out_of_balance`, in N."""
         system, parts = self.system, self.system.of_parts
-        more = sum(one.rounding_at_unknowns for one in self.loads)
+        more = 0.0
+        for one in self.loads:
+            more = more + one.rounding_at_unknowns
         whole = system.of_whole.array_r + more * np.sqrt(parts.sizes)[parts.of]
         return system.rounding.array_r + more, whole / self._tolerance
 
