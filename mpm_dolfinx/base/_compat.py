@@ -144,6 +144,14 @@ class Timer:
         seconds[self._part] += perf_counter() - self._start
 
 
+def expanded(form: ufl.Form) -> ufl.Form:
+    """Return a form with expanded derivatives.
+
+    In forms over faces, dolfinx 0.9 also packs coefficients that vanish in derivatives, although the kernel omits them.
+    """
+    return ufl.algorithms.expand_derivatives(form)
+
+
 class CompiledForm:
     """A UFL form over cells or interior facets, compiled once and integrated over any list of entities.
 

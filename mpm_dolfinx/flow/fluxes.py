@@ -501,7 +501,8 @@ class FluxForms:
             self.gravity = FacetForm(flux, grid.comm)
             if inertial is not None:
                 conductance = T if relative is None else T * density
-                self.by_motion = FacetForm(conductance * ufl.dot(by_motion, offset) * ufl.jump(q) * dS, grid.comm)
+                form = conductance * ufl.dot(by_motion, offset) * ufl.jump(q) * dS
+                self.by_motion = FacetForm(_compat.expanded(form), grid.comm)
             if relative is not None:
 
                 def by_k(k):
