@@ -14,7 +14,7 @@ fan about the crest of the wall, and Rankine's zone. Without wall friction, K is
 
 The moment about the toe also gives K. A tilting wall opens no gap at its toe. A translating wall opens a gap at its
 toe, in which no force acts. Without the force on the lowest of ten cells, the active thrust is a tenth too small. The
-sand is stiff, so that it flows at a small tilt. At two and a half times this tilt, the active thrust is 2.5 to 3 %
+sand is so stiff that it yields at a small tilt. At two and a half times this tilt, the active thrust is 2.5 to 3 %
 larger.
 """
 

@@ -12,7 +12,7 @@ stiffness of the grains, so the run fails at this time.
 The references for q/E = 0.25 are results of Taylor-Hood elements, extrapolated in time, and in the cell size from 20,
 40 and 80 cells. The extrapolated settlements differ from the settlements on 40 cells by 0.6 % at T = 0.01, and by 0.2 %
 at T = 0.1. All errors are relative to the displacement of the strip's middle. `settlement` is the largest error of the
-middle from T = 0.1 on, and `at_once` is the error of the middle at T = 0.01. `edge` is the largest error from T = 0.1
+middle's settlement from T = 0.1 on, and `at_once` is this error at T = 0.01. `edge` is the largest error from T = 0.1
 on at the strip's edge, where the load jumps. `beside` is the largest error from T = 0.1 on at the far end of the
 drained surface. --reference also runs Taylor-Hood elements on the same cells. The demo runs on one process.
 """

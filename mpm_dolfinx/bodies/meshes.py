@@ -189,7 +189,7 @@ def _divided(grid: Grid, mesh: Mesh, part: str | None, per_cell: int, name: str)
 def _domains(mesh: Mesh, cells: Mapping[str, NDArray[np.int64]]) -> list[tuple[NDArray, NDArray, NDArray]]:
     """Return the corners of the particle domains, the mesh facet of each face, and the cell of each domain.
 
-    The row of a facet contains its nodes, and starts with -1 for a triangle.  The row of a face inside a cell is -1.
+    The row of a facet contains its nodes, and starts with -1 for a triangle.  Faces between cells have the row -1.
     """
     d = mesh.x.shape[1]
     start = 0

@@ -295,7 +295,8 @@ class Inflow(Flux):
     side
         Side of the bodies, as for `Traction`.
     flux : float or callable (t, X, x) -> float, m/s
-        Inflow per current area and time, as a volume at zero pressure.  The flux is finite, and negative for outflow.
+        Volume of inflow per current area and time.  The volume refers to zero pressure.  The flux is finite, and
+        negative for outflow.
     region : ((d,), (d,)), m
         Box of reference positions.  Fluid enters through the parts of faces inside the box.
 
@@ -330,8 +331,8 @@ class Rain(Flux):
     side
         Side of the bodies, as for `Traction`.
     flux : float or callable (t, X, x) -> float, m/s
-        Rain per current area of the side, as a volume at zero pressure.  The flux is finite, and negative for potential
-        evaporation.  Vertical rain of rate r on a slope of angle b has the flux r cos(b).
+        Volume of rain per current area and time.  The volume refers to zero pressure.  The flux is finite, and negative
+        for potential evaporation.  Vertical rain of rate r on a slope of angle b has the flux r cos(b).
     ponding
         Largest pressure >= 0 of ponded water, in Pa: depth times unit weight.  The pond has one depth for the whole
         side.  Water runs off once the pond is full.  Ponded water infiltrates or evaporates later.

@@ -716,7 +716,7 @@ class StorageProblem:
             Multiple of beta, >= 0.
         share
             Weight of the filter L, in [0, 1].  The weight 0 gives the fixed-stress operator.  For a checkerboard
-            pressure, `beta V - L` vanishes like `B K^-1 B^T`, with the stiffness K.  L is the sum of
+            pressure, `beta V - L` vanishes, as `B K^-1 B^T` does (K: stiffness).  L is the sum of
             `min(beta V+, beta V-) / (4 d) [p][q]` over the faces.
         """
         system = self.system

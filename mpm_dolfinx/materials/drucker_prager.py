@@ -31,7 +31,7 @@ MATCHES = {
     "compression": lambda t, s, c: (6 * s / np.sqrt(3) / (3 - s), 6 * c / np.sqrt(3) / (3 - s)),
     "extension": lambda t, s, c: (6 * s / np.sqrt(3) / (3 + s), 6 * c / np.sqrt(3) / (3 + s)),
 }
-"""Functions of tan phi, sin phi and cos phi that return eta and xi, for each match to Mohr and Coulomb's law."""
+"""Functions of tan phi, sin phi and cos phi that return eta and xi, for each fit to the Mohr-Coulomb law."""
 LEAST = 1e-20
 """Constant added to the squared deviatoric strain under a square root, so that the root is differentiable at zero.
 Plateau (scene "soil" of tests/plateaus.py): half this value changes the result by 2.3e-11, twice this value by 1.0e-11,
@@ -54,8 +54,8 @@ class DruckerPrager(Frictional):
     hardening
         Linear hardening modulus H, Pa, >= 0: c = c_0 + H kappa, with the accumulated plastic strain kappa.
     match
-        Stress states in which the cone coincides with Mohr and Coulomb's yield surface.  "plane strain" gives the
-        collapse load of Mohr and Coulomb's law in plane strain, exactly for associated flow.  "compression" is the
+        Stress states in which the cone coincides with the Mohr-Coulomb yield surface.  "plane strain" gives the
+        collapse load of the Mohr-Coulomb law in plane strain, exactly for associated flow.  "compression" is the
         outer cone of triaxial compression, and "extension" is the inner cone of triaxial extension.  In axisymmetry no
         cone coincides in all stress states: a circular footing bears 10 % less on von Mises's soil than on Tresca's.
 

@@ -82,7 +82,7 @@ def renew(A: PETSc.Mat) -> None:
 def solved(ksp: PETSc.KSP, name: str) -> int:
     """Return the number of iterations of a solver's last solve. Raise NotConverged if this solve failed.
 
-    An indefinite tangent, or the largest number of iterations, is no failure: the line search tests the result.
+    An indefinite tangent is no failure, nor is the end of all iterations: the line search tests the result.
     """
     count, reason = ksp.getIterationNumber(), ksp.getConvergedReason()
     if reason < 0 and reason not in TOLERABLE:

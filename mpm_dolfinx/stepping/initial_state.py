@@ -324,7 +324,7 @@ def _warn_moved_on(scene: Scene, before: Stage, after: Stage) -> None:
 def _filled(
     scene: Scene, points: MaterialPoints, standing: Sequence[int], add: Sequence[int], gravity: NDArray | None
 ) -> tuple[MaterialPoints, MaterialPoints]:
-    """Return all points, and the points of added bodies."""
+    """Return all points with those of added bodies, and the points of added bodies alone."""
     standing = list(standing)
     waiting = list(add)
     new = scene.materials.seeded.of(np.empty(0, np.int64))
