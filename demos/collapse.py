@@ -117,11 +117,8 @@ def collapsed(aspect: float, cells: int, steps: float, grain: float = GRAIN, ren
     k = np.flatnonzero(depth > GRAIN).max()
     front = x[k] + (depth[k] - GRAIN) / (depth[k] - depth[k + 1]) * (x[k + 1] - x[k])
     e = result.energies
-    total = e["kinetic"] + e["elastic"] + e["dissipated"] + e["viscous"] - e["external"]
-    if renewal:
-        total = total + e["renewal"]
     work = e["external"][-1]
-    shares = np.abs(total - total[0]).max() / work, e["kinetic"][-1] / work
+    shares = common.unbalanced(e) / work, e["kinetic"][-1] / work
     return Heap(front - 1, depth.max(), *shares, before, s.points.corners, profiles, result)
 
 

@@ -170,6 +170,13 @@ def viscous(viscosity: float) -> Callable:
     return viscous
 
 
+def unbalanced(energies: dict[str, np.ndarray]) -> float:
+    """Return the largest error of the energy balance, in J, of the `energies` of a result."""
+    names = ("kinetic", "elastic", "dissipated", "viscous", "renewal")
+    total = sum(energies[name] for name in names if name in energies) - energies["external"]
+    return float(np.abs(total - total[0]).max())
+
+
 def domains(ax, corners: np.ndarray, values: np.ndarray | None = None, **style):
     """Draw particle domains with corners (n, 4, 2), coloured by values (n,)."""
     from matplotlib.collections import PolyCollection

@@ -131,6 +131,7 @@ def yield_acceleration(cells: int) -> float:
 class Slide(NamedTuple):
     """Motion of the bank: times (n,) in s, and sliding displacements (n,) of the crest and of Newmark's block, in m.
 
+    base: displacement (n,) of the base, in m.
     corners, moved: final corners of the particle domains, and their displacements relative to the base, in m.
     energy: largest error of the energy balance, divided by the largest work.
     """
@@ -164,14 +165,12 @@ def sliding(cells: int, steps: int, k: float) -> Slide:
     shape = (mass @ phi[:, 0]) / (mass @ (phi**2).sum(axis=1))
     fine = np.linspace(0, end, 50 * len(result.t))
     velocity = np.array([record.velocity(time)[0] for time in fine])
-    speed, rate = [0.0], shape * (-np.diff(velocity) - k * GRAVITY * fine[1])
-    for change in rate:
-        speed.append(max(0.0, speed[-1] + change))
+    speed = shape * (-velocity - k * GRAVITY * fine)
+    speed -= np.minimum.accumulate(speed)  # a block that would slide inwards rests
     block = np.interp(result.t, fine, np.cumsum(speed) * fine[1])
-    e = result.energies
-    total = e["kinetic"] + e["elastic"] + e["dissipated"] + e["viscous"] - e["external"]
-    energy = np.abs(total - total[0]).max() / np.abs(e["external"] - e["external"][0]).max()
-    return Slide(result.t, slid, block, base[:, 0], s.points.corners, np.linalg.norm(moved, axis=1), float(energy))
+    work = result.energies["external"]
+    energy = common.unbalanced(result.energies) / np.abs(work - work[0]).max()
+    return Slide(result.t, slid, block, base[:, 0], s.points.corners, np.linalg.norm(moved, axis=1), energy)
 
 
 def main(argv: list[str] | None = None) -> dict:
@@ -194,8 +193,7 @@ def main(argv: list[str] | None = None) -> dict:
         band = (BAND[0] <= f) & (f <= BAND[1])
         out["amplification"] = float(np.abs(found[band] / exact(f[band]) - 1).max())
         e = result.energies
-        total = e["kinetic"] + e["elastic"] + e["dissipated"] + e["viscous"] - e["external"]
-        out["energy"] = float(np.abs(total - total[0]).max() / e["external"][-1])
+        out["energy"] = common.unbalanced(e) / float(e["external"][-1])
         out["left"] = float((e["kinetic"] + e["elastic"])[-1] / e["external"][-1])
         rows = [["amplification, largest error", f"{out['amplification']:.2%}"]]
         rows += [["error of the energy balance / work of the wave", f"{out['energy']:.2%}"]]

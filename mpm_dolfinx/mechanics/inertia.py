@@ -232,8 +232,8 @@ class InertiaForms:
         ghost = self._ghost.on(facets)
         nodes, matrices = 2**grid.dim, []
         of_cells = np.empty((len(places.filled), nodes, nodes))
-        rows, columns = np.triu_indices(nodes)
-        of_cells[:, rows, columns] = of_cells[:, columns, rows] = self._mass(pieces)
+        i, j = np.triu_indices(nodes)
+        of_cells[:, i, j] = of_cells[:, j, i] = self._mass(pieces)
         for of in (unknowns, held):
             A = matrix(of, unknowns, 3**grid.dim + 2 * grid.dim * 3 ** (grid.dim - 1))
             A.setOption(PETSc.Mat.Option.IGNORE_ZERO_ENTRIES, True)  # the mass does not couple the axes
