@@ -12,19 +12,19 @@ with associated flow.  P_0 is the pressure at F = I, G is the shear modulus, M i
 P_c is the size of the yield surface, and e_v^p is the plastic volume strain.  The logarithm of the specific volume is
 linear in ln P (bilogarithmic law), with the slope lambda in first loading and the slope kappa in unloading.
 
-A step starts from the trial stresses P_t and Q_t, and from the size P_c,n of the yield surface.  The unknowns are the
-plastic compaction divided by kappa, a, and the plastic multiplier dgamma.  With 6G dgamma / M^2 = exp(h) - 1 and
-w = (Q_t / (M P_t))^2, the stress at the end of the step is given by
+A step starts from the trial stresses P_t and Q_t, and from the size P_c,n of the yield surface.  The unknowns are a,
+which is the plastic compaction divided by kappa, and the plastic multiplier dgamma.  With 6G dgamma / M^2 = exp(h) - 1
+and w = (Q_t / (M P_t))^2, the stress at the end of the step is given by
 
     P = P_t exp(-a),   Q = Q_t exp(-h),   P_c = P_c,n exp(rho a),   rho = kappa / (lambda - kappa),
     (6G kappa / M^2) a = (exp(h) - 1) (2P - P_c).
 
 The local unknown d = 2 (h - a) determines the stress ratio at the end of the step, Q / (M P) = sqrt(w) exp(-d/2).  On
 the yield surface a = (ln(P_t / P_c,n) + ln(1 + w exp(-d))) / (1 + rho).  The equation for d is smooth and monotone,
-even at isotropic stresses and at the critical state (a = 0).
+also at isotropic stress and at the critical state, where a = 0.
 
 If M^2 P_c > 6G (lambda - kappa), soil on the dry side of the critical state softens faster than it unloads elastically.
-The stress then jumps, or the equation for d has no solution.  Without a solution, the time step is reduced.
+The stress then jumps, or the equation for d has no solution and the time step is reduced.
 """
 
 from __future__ import annotations
@@ -53,21 +53,21 @@ GIVEN = {
 
 
 class _Follows(float):
-    """Bulk modulus P_0 / kappa, derived from other constants."""
+    """Initial bulk modulus P_0 / kappa, computed from the other constants of the clay."""
 
     follows = True
 
 
 @dataclass(frozen=True)
 class _FollowsByPlace:
-    """The bulk modulus P_0 / kappa as a function of position."""
+    """Initial bulk modulus P_0 / kappa as a function of position."""
 
     stress: object
     kappa: object
     follows: ClassVar[bool] = True
 
     def __call__(self, X: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the bulk moduli, in Pa, at reference positions X (n, d), in m."""
+        """Return the initial bulk moduli, in Pa, at reference positions X (n, d), in m."""
         at = [f(X) if callable(f) else np.asarray(f) for f in (self.stress, self.kappa)]
         return np.broadcast_to(-np.mean(at[0], axis=-1) / at[1], len(X))
 
@@ -82,17 +82,18 @@ class ModifiedCamClay(Skeleton):
         Slope of the critical state line Q = M P, -, > 0.
     lambda_, kappa
         Slopes of ln v against ln P, -, 0 < kappa < lambda_, with the specific volume v.  lambda_ applies to first
-        loading, kappa to unloading.  P is a Kirchhoff stress.  If v has the slope C against the logarithm of the Cauchy
-        stress, the slope of ln v against ln P is C / (v - C).
+        loading, kappa to unloading.  P is a Kirchhoff stress.  The slope C of v against the logarithm of a Cauchy
+        stress gives the slope C / (v - C) of ln v against ln P.
     initial_stress : (3,), Pa
-        Normal effective stresses at F = I, tension positive, with a mean < 0.  The last stress is out of plane in 2D,
-        and circumferential in axisymmetry.  These stresses must be in equilibrium with the loads.
+        Normal effective stresses at F = I, tension positive.  Their mean must be < 0.  The last stress is out of plane
+        in 2D, and circumferential in axisymmetry.  These stresses must be in equilibrium with the loads.
     OCR
-        Overconsolidation ratio, -, >= 1: initial P_c, divided by P_c of the yield surface through the initial stress.
+        Overconsolidation ratio, -, >= 1: initial size P_c of the yield surface, divided by the size of the yield
+        surface that passes through the initial stress.
     shear
         Shear modulus G, Pa, > 0.
     bulk
-        Must not be given: the bulk modulus at the start is P_0 / kappa.
+        Must not be given: the initial bulk modulus is P_0 / kappa.
 
     Other parameters: see `Skeleton`.  All parameters are passed by name.  The state variable `plastic` in `points.data`
     is the inverse plastic metric C_p^-1 (3, 3).  The state variable `consolidated` is ln(P_c / initial P_c).  Source:
@@ -165,14 +166,14 @@ class ModifiedCamClay(Skeleton):
 
     @staticmethod
     def trial(F, prestretch, plastic):
-        """Return the trial strain, its volume strain e_v, and its squared deviatoric strain 2/3 e : e."""
+        """Return the trial elastic strain, its trace e_v, and 2/3 e : e with its deviator e."""
         strain = Trial(F, plastic, prestretch)
         e = strain.deviatoric
         return {"volume": strain.volumetric, "distortion": 2 / 3 * ufl.inner(e, e), "strain": strain}
 
     @staticmethod
     def residual(trial, shear, M, lambda_, kappa, pressure, yield_pressure, consolidated, steeper):
-        """Return the residual of the equation for d."""
+        """Return the residual of the equation for the local unknown d."""
         to = _Return(trial, shear, M, lambda_, kappa, pressure, yield_pressure, consolidated, steeper)
         c, P = 6 * shear * kappa / M**2, to.trial_pressure * ufl.exp(-to.compaction)
         rule = (c * to.compaction - (ufl.exp(to.flow) - 1) * (1 - to.steepness) * P) / (c + P)
@@ -210,7 +211,7 @@ LC = {"r": "> kappa / lambda_, <= 1", "beta": ">= 0 1/Pa and finite", "reference
 
 
 def _dried(function: Callable) -> Callable:
-    """Return the function of Modified Cam Clay, evaluated with lambda(s) and P_c(s) at the suction s."""
+    """Return a function that evaluates `function` of Modified Cam Clay with lambda and P_c at the present suction."""
     arguments = Skeleton.arguments_of(function)
 
     def of(**given):
@@ -256,7 +257,8 @@ class BarcelonaBasic(ModifiedCamClay):
     lambda_
         Slope lambda(0) of saturated soil.
     OCR
-        Overconsolidation ratio, -, >= 1: initial P_c, divided by P_c of the yield surface through the initial stress.
+        Overconsolidation ratio, -, >= 1: initial size P_c of the yield surface, divided by the size of the yield
+        surface that passes through the initial stress.
     initial_stress : (3,), Pa
         Bishop's effective stresses at F = I.
     r
@@ -313,7 +315,7 @@ class _Return:
     `flow`: h.
     `steepness`: w exp(-d), the square of Q / (M P) at the end of the step.
     `trial_pressure`: P_t, in Pa.
-    `rho`: ln(P_c / P_c,n) / a.
+    `rho`: kappa / (lambda - kappa).
     `yields`: whether the trial stress is outside the yield surface.
     """
 

@@ -31,7 +31,7 @@ MATCHES = {
     "compression": lambda t, s, c: (6 * s / np.sqrt(3) / (3 - s), 6 * c / np.sqrt(3) / (3 - s)),
     "extension": lambda t, s, c: (6 * s / np.sqrt(3) / (3 + s), 6 * c / np.sqrt(3) / (3 + s)),
 }
-"""Functions of tan phi, sin phi and cos phi that return eta and xi, for each fit to the Mohr-Coulomb law."""
+"""Functions that return eta and xi for tan phi, sin phi and cos phi: one for each fit to the Mohr-Coulomb law."""
 LEAST = 1e-20
 """Constant added to the squared deviatoric strain under a square root, so that the root is differentiable at zero.
 Plateau (scene "soil" of tests/plateaus.py): half this value changes the result by 2.3e-11, twice this value by 1.0e-11,
@@ -55,9 +55,9 @@ class DruckerPrager(Frictional):
         Linear hardening modulus H, Pa, >= 0: c = c_0 + H kappa, with the accumulated plastic strain kappa.
     match
         Stress states in which the cone coincides with the Mohr-Coulomb yield surface.  "plane strain" gives the
-        collapse load of the Mohr-Coulomb law in plane strain, exactly for associated flow.  "compression" is the
-        outer cone of triaxial compression, and "extension" is the inner cone of triaxial extension.  In axisymmetry no
-        cone coincides in all stress states: a circular footing bears 10 % less on von Mises's soil than on Tresca's.
+        collapse load of the Mohr-Coulomb law in plane strain, exactly for associated flow.  "compression" is the outer
+        cone of triaxial compression, and "extension" is the inner cone of triaxial extension.  In axisymmetry no cone
+        coincides in all stress states: a circular footing bears 10 % less with von Mises's law than with Tresca's.
 
     Other parameters: see `Skeleton`.  All parameters are passed by name.  The state variable `plastic` in `points.data`
     is the inverse plastic metric C_p^-1 (3, 3), and `hardened` is kappa.  Source: de Souza Neto, Peric and Owen (2008),
@@ -130,9 +130,9 @@ def metric(trial: Trial, to: dict, bulk, plastic):
 
 
 def returned(trial: Trial, bulk, shear, eta, xi, eta_flow, cohesion, hardening, hardened, drag=0.0) -> dict:
-    """Return the stress and the hardening after the return to the yield surface.
+    """Return the stress and the hardening that the return mapping gives for a trial strain.
 
-    `drag`: viscosity divided by the time step, in Pa.
+    `drag`: viscosity of Perzyna's law divided by the time step, in Pa.
 
     Returns
     -------

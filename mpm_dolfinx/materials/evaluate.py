@@ -29,7 +29,7 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 
 
 class LawAtPoints:
-    """A law at its material points.
+    """A constitutive law, evaluated at its material points.
 
     Parameters
     ----------
@@ -61,7 +61,7 @@ class LawAtPoints:
 
     @cached_property
     def points(self) -> FormPoints:
-        """Integration points with F, and with the parameters and state of the law."""
+        """Integration points with the fields F, parameters and state of the law."""
         return FormPoints(self.grid, F=(self._stretches, self._stretches), **self._shapes)
 
     @cached_property
@@ -86,7 +86,7 @@ class LawAtPoints:
         return {**self._given, **own}
 
     def _evaluate(self, expression: PointExpression, data: PointData, dt: float = 0.0) -> NDArray[np.float64]:
-        """Return the values of an expression at the points, after a solve for local unknowns."""
+        """Solve for the local unknowns of the law, and return the values of an expression at the points."""
         self._by_scene["dt"].value = dt
         given = NONE if self._local is None else self._local.solve(data, derive=False)
         return expression.evaluate(data, live=expression.live(data, given))
@@ -94,9 +94,9 @@ class LawAtPoints:
     def data(
         self, points: MaterialPoints, rows: NDArray[np.int64], values: dict[str, NDArray[np.float64]]
     ) -> PointData:
-        """Return form data at the points `rows`.
+        """Return the values that forms need at the points with the indices `rows`.
 
-        `values`: F, parameters and state (n, ...) of all points, by name.
+        `values`: arrays (n, ...) of F, parameters and state at all points, by name.
         """
         x = points.x[rows]
         cells = self.grid.locals[self.grid.number(self.grid.index_from_base(x))]
@@ -140,7 +140,7 @@ class LawAtPoints:
 
     @cached_property
     def _update(self) -> tuple[PointExpression, dict[str, tuple[int, ...]]]:
-        """Expression of the new state as one vector, and the shapes of the state variables."""
+        """UFL expression of all new state variables as one vector, and the shapes of the state variables."""
         what, shapes = f"{self.law.__name__}.update", {name: np.shape(value) for name, value in self.law.state.items()}
         new = named(what, call(self.law.update, F=self._F, **self._values), shapes, some=True)
         parts = [f[i] if i else f for f in new.values() for i in np.ndindex(f.ufl_shape)]
@@ -165,7 +165,7 @@ class LawAtPoints:
 def knows_space(grid: Grid, m: Skeleton) -> bool:
     """Return whether a material's law accepts F (3, 3) in plane strain.
 
-    Some user-defined laws accept F (2, 2) only.  The result is True for laws with local unknowns.
+    Some user-defined laws accept F (2, 2) only.  Laws with local unknowns are assumed to accept F (3, 3).
 
     `m`: material with constants as arrays for one point.
     """
@@ -192,7 +192,7 @@ def knows_space(grid: Grid, m: Skeleton) -> bool:
 def by_scene(
     grid: Grid, cell_size: float | None = None, law: type[Skeleton] | None = None, points: FormPoints | None = None
 ) -> dict[str, Any]:
-    """Return the arguments `BY_SCENE` of laws as UFL: the time since the start of the step, and the cell size.
+    """Return the time since the start of the step and the cell size as UFL, by name.
 
     `points`: integration points of the law.  If cells have several sizes, each point stores the size of its cell.
     """
@@ -223,10 +223,10 @@ class SoftnessAtPoints:
     In plastic flow, volume strains and pressures may alternate from cell to cell.  The damping coefficient tau of
     pressure jumps must then grow with the softness of the soil.
 
-    The strain of a step is e = dev sym dF F^-1, with the change dF of F.  With the Kirchhoff stress T(s) at
-    F - (1 - s) dF, the tangent shear modulus is G_t = (dT/ds) : e / (2 e : e) at s = 1.  At rest the direction of e is
-    random.  G_t is therefore a weighted mean of two moduli: the modulus of the step has the weight e : e, and the old
-    modulus has the weight `NEAR`^4.  The forms use the softness of the previous step, because Newton's method may not
+    The strain of a step is e = dev sym dF F^-1, with the change dF of F.  With the Kirchhoff stress T(s) at F - (1 - s)
+    dF, the tangent shear modulus is G_t = (dT/ds) : e / (2 e : e) at s = 1.  In soil at rest, the direction of e is
+    random.  G_t is therefore a weighted mean of this modulus, with the weight e : e, and of the modulus of the previous
+    step, with the weight `NEAR`^4.  The forms use the softness of the previous step, because Newton's method may not
     converge with the softness of the current iterate.
 
     `grid`, `law`, `shapes`, `stretches`: see `LawAtPoints`.
@@ -254,10 +254,10 @@ class SoftnessAtPoints:
     def __call__(self, at: PointData, dF: NDArray, shear: NDArray, dt: float, before: NDArray) -> NDArray[np.float64]:
         """Return the softness of points, in [1, `MOST`].
 
-        `at`: data with F, parameters and state of n points.
-        `dF` (n, d, d): change of F in a step of dt, in s.
+        `at`: F, parameters and state of n points.
+        `dF` (n, d, d): change of F in a step of length dt, in s.
         `shear` (n,), in Pa: elastic shear modulus.
-        `before` (n,): softness before the step.
+        `before` (n,): softness of the previous step.
         """
         self._by_scene["dt"].value = dt
         fields = {name: at[name] for name in ("F", *self._shapes)}
@@ -279,7 +279,7 @@ class ConductivityAtPieces:
     laws
         Distinct conductivity laws of the materials.
     pieces
-        Integration points of the pieces.  `laws` need the fields F, position, conductivity and porosity0.
+        Integration points of the pieces, with the fields F, position, conductivity and porosity0 if there are `laws`.
     displacement
         Increment of the displacement since the start of the step.
     pressure
@@ -343,7 +343,7 @@ class ConductivityAtPieces:
 
 
 def sampled(law: Callable) -> list[float | None]:
-    """Return the conductivities of a law in three states of deformation, which identify the law."""
+    """Return the conductivities of a law in three states of deformation, which a checkpoint stores."""
     out = []
     for J in (0.75, 1.0, 1.25):
         F = ufl.as_matrix([[J, J / 8], [0.0, 1.0]])

@@ -38,7 +38,7 @@ RESERVED = frozenset(
     "F dF softness owed due storage storage_at_one density position displacement porosity0 gradient drainage retention "
     "pores".split()
 )
-"""Names of data at quadrature points that parameters and state variables cannot have."""
+"""Names of data at quadrature points.  Parameters and state variables must have other names."""
 WHAT_IS_NAMED = "parameters, state and unknowns"
 EVOLVED = 1e-3
 """Soil has yielded if a state variable differs from its initial value by more than this number.  Plateau (scene "soil"
@@ -88,7 +88,7 @@ class SceneMaterials:
         places = {i: _places(bodies, i, points.id[own]) for i, own in rows.items()}
 
         def at_points() -> list[tuple[Skeleton, Skeleton]]:
-            """Return each material at the points of this process, and at its first point on all processes."""
+            """Return each material with its values at the points of this process, and at one point of the scene."""
             return [_evaluated(grid, materials[i], places[i], points.id[rows[i]]) for i in self._used]
 
         evaluated, at_first = zip(*at_points(), strict=True)
@@ -132,13 +132,13 @@ class SceneMaterials:
             for i, m in zip(self._used, used, strict=True)
             if m.conductivity_law
         }
-        """Checksums of fields, and values of laws of flow, for comparison of a checkpoint with the scene."""
+        """Checksums of fields, and values of laws of flow, to compare a checkpoint with the scene."""
         for i, m in zip(self._used, used, strict=True):
             if m.retention is not None:
                 self.checksums[f"retention of material {i}"] = drained(m.retention)
         self.check_cells()
         self.shapes: dict[str, tuple[int, ...]] = {}
-        """Shape of each parameter and each state variable."""
+        """Shapes of parameters and state variables at a point, by name."""
         for i, m in zip(self._used, evaluated, strict=True):
             values = {name: getattr(m, name) for name in self._fields[i]}
             count, own = max(1, len(rows[i])), rows[i]
@@ -162,14 +162,14 @@ class SceneMaterials:
                     shapes = {name: self.shapes[name] for name in _takes(law)}
                     self._softness[number] = SoftnessAtPoints(grid, law, shapes, self._stretches_of(law))
         self.seeded = replace(points, data=seeded)
-        """The material points with their initial data: state, and parameters that are functions of position."""
+        """Material points with their initial state, and with the parameters that are functions of position."""
         self._at_points = [
             LawAtPoints(grid, law, {name: self.shapes[name] for name in _takes(law)}, self._stretches_of(law))
             for law in self.laws
         ]
 
     def seeds_no_more(self) -> None:
-        """Delete the seeded points, which only bodies that are added later need."""
+        """Delete the seeded points, which are needed only to add bodies."""
         self.seeded = self.seeded.of(np.empty(0, dtype=np.int64))
 
     def check_cells(self) -> None:
@@ -179,7 +179,7 @@ class SceneMaterials:
 
     @property
     def across(self) -> bool:
-        """Whether laws in plane strain use an out-of-plane stretch from F-bar."""
+        """Whether a law in plane strain receives the out-of-plane stretch of F-bar."""
         return self.stretches > self.grid.stretches
 
     def _stretches_of(self, law: type[Skeleton]) -> int:
@@ -228,11 +228,11 @@ class SceneMaterials:
             raise ValueError(f"{law.__name__}: {name} has shape {shape}, in another law {other}; must be equal")
 
     def parts(self, pieces: FormPoints, common: Sequence[str]) -> list[tuple[type[Skeleton], FormPoints, bool]]:
-        """Return the law and the integration points of each part, and whether Q1 cells would lock.
+        """Return the law and the integration points of each part of the soil, and whether Q1 cells would lock.
 
-        A part of the points has one law.  If only some materials of a law are nearly incompressible, the law has two
-        parts.  A single part has the integration points `pieces`.  Each of several parts has its own integration
-        points, with the fields `common` and the parameters and state of the law.
+        The materials of a part have one law, and are either all nearly incompressible or all compressible.  A single
+        part has the integration points `pieces`.  Each of several parts has its own integration points, with the fields
+        `common` and the parameters and state of the law.
         """
         if len(self._parts) == 1:
             return [(law, pieces, locks) for law, locks, _ in self._parts]
@@ -265,10 +265,7 @@ class SceneMaterials:
         return np.array([known for *_, known in self._parts])[self.part_of(points)]
 
     def conducting(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the conductivity, in m/s, and the number of the conductivity law of each point, with shape (n, 2).
-
-        Points with equal rows conduct equally.
-        """
+        """Return an array (n, 2): the conductivity of each point, in m/s, and a number of its laws of flow."""
         laws, known = [m.conductivity_law for m in self.materials], self.conductivity_laws
         law = np.array([known.index(law) if law in known else -1 for law in laws])[points.material]
         by_place = np.array([law is not None and _names_place(law) for law in laws])[points.material]
@@ -300,11 +297,11 @@ class SceneMaterials:
         return SaturationAt(self.grid, self.retentions)
 
     def saturations(self, rows: NDArray[np.float64], p: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
-        """Return the results of `saturation` at pressures p, in Pa, for rows of the field `retention`."""
+        """Return saturation S, dS/dp, chi and relative permeability.  `rows`: values of `retention_rows`; p in Pa."""
         return self._saturation(rows, p)
 
     def retention_scale(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the suction, in Pa, at which the pores of each point drain."""
+        """Return the characteristic suction of the retention curve at each point, in Pa."""
         scales = [np.inf if m.retention is None else scale_of(m.retention) for m in self.materials]
         return np.array(scales)[points.material]
 
@@ -323,7 +320,7 @@ class SceneMaterials:
         The function is called as `value(material, *columns)` and returns values (n, ...) or one number.  For a uniform
         material without `columns`, the function may also return one value (...) for all points.
 
-        `columns` (n,): further point data.
+        `columns` (n,): further arguments of the function, with one value for each point.
         """
         each, shapes = [], set()
         for i in self._used:
@@ -378,7 +375,7 @@ class SceneMaterials:
 
     @property
     def constants(self) -> dict[str, Skeleton]:
-        """Names of material constants, each with a material that has this constant."""
+        """Names of all material constants in the scene, each with a material that has the constant."""
         return {name: self.materials[i] for i in self._used for name in constants_of(self.materials[i])}
 
     @cached_property
@@ -388,7 +385,7 @@ class SceneMaterials:
 
     @property
     def evolves(self) -> bool:
-        """Whether a law has a state."""
+        """Whether any law has state variables."""
         return any(law.state for law in self.laws)
 
     @cached_property
@@ -410,7 +407,7 @@ class SceneMaterials:
 
     @property
     def drains(self) -> bool:
-        """Whether pores drain as the phreatic surface falls."""
+        """Whether the scene has drainable pores, which empty as the phreatic surface falls."""
         return any(getattr(law, "specific_yield", 0.0) > 0 for law in self.conductivity_laws)
 
     def drainage(self, points: MaterialPoints) -> NDArray[np.float64]:
@@ -450,7 +447,7 @@ class SceneMaterials:
         return {name: points.data[name] for name in self.state_names}
 
     def evolved(self, points: MaterialPoints) -> NDArray[np.bool_]:
-        """Return for each point whether a state variable, except suction, has changed by more than `EVOLVED`."""
+        """Return for each point whether a state variable other than suction has changed by more than `EVOLVED`."""
         out, law_of = np.zeros(len(points), dtype=bool), self.law_of(points)
         for number, law in enumerate(self.laws):
             rows = (law_of == number).nonzero()[0]
@@ -472,7 +469,7 @@ class SceneMaterials:
         return np.array([not m.state for m in self.materials])[points.material]
 
     def soil_rows(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the index and the varying constants of the material of each point, without the initial stress."""
+        """Return for each point the index of its material, and all constants that vary except the initial stress."""
         fields = [points.data[name] for name in self.field_names if name != "seeded_stretch"]
         fields = [rows.reshape(len(rows), int(np.prod(rows.shape[1:]))) for rows in fields]
         return np.column_stack([points.material, *fields])
@@ -523,7 +520,7 @@ class SceneMaterials:
         return out
 
     def total_stress(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the total Cauchy stress, in Pa, shaped like `effective_stress`.  All processes must call this."""
+        """Return the total Cauchy stress, in Pa, like `effective_stress`.  All processes must call this method."""
         return self.effective_stress(points) - self.pore_stress(points)[:, None, None] * np.eye(self.grid.stretches)
 
     def updated_state(
@@ -564,7 +561,7 @@ class SceneMaterials:
         return out
 
     def _placed(self, points: MaterialPoints) -> list[tuple[LawAtPoints, NDArray[np.int64], PointData]]:
-        """Return each law with the indices and the form data of its points."""
+        """Return for each law the indices of its points, and the values that its forms need at these points."""
         number, values = self.law_of(points), {**self.parameters(points), **self.state(points)}
         values["F"] = points.F_of_laws
         rows = [(number == k).nonzero()[0] for k in range(len(self.laws))]
@@ -572,7 +569,7 @@ class SceneMaterials:
 
 
 def _known(name: str, value) -> NDArray[np.float64]:
-    """Return a parameter or state variable as an array, or raise ValueError for NaN."""
+    """Return a parameter or state variable as an array.  Raise ValueError if it contains NaN."""
     out = numbers(name, value, None, allowed="numbers", test=np.isreal)
     if np.isnan(out).any():
         raise ValueError(f"{name} = nan, must be numbers")
@@ -589,7 +586,7 @@ def _takes(law: type[Skeleton]) -> list[str]:
 
 
 def _used(bodies: Sequence[Body], count: int) -> list[int]:
-    """Return the indices of the materials that bodies have, in ascending order."""
+    """Return the indices of the materials of all bodies, in ascending order."""
     for body in bodies:
         if not 0 <= body.material < count:
             raise ValueError(f"body: material = {body.material!r}, must be an index of the {count} materials")
@@ -602,7 +599,7 @@ def _by_place(m: Skeleton) -> list[str]:
 
 
 def _evaluated(grid: Grid, m: Skeleton, X: NDArray[np.float64], ids: NDArray[np.int64]) -> tuple[Skeleton, Skeleton]:
-    """Return a material at this process's points, and at the point with the lowest id on all processes.
+    """Return a material with its values at the points of this process, and at the scene's point with the lowest id.
 
     `X` (n, d), in m: reference positions of this process's points with the material.
     `ids` (n,): ids of these points.
@@ -624,7 +621,7 @@ def _evaluated(grid: Grid, m: Skeleton, X: NDArray[np.float64], ids: NDArray[np.
 
 
 def _check_local(all_points: Skeleton, half: Skeleton, names: Sequence[str]) -> None:
-    """Raise ValueError if fields at points depend on other points."""
+    """Raise ValueError if the value of a field at a point depends on the positions of other points."""
     for name in names:
         value, alone = getattr(all_points, name)[::2], getattr(half, name)
         if np.abs(value - alone).max() > SAME * np.abs(value).max():

@@ -38,8 +38,8 @@ class K0:
     are K0 times the vertical effective stress.  In axisymmetry, the horizontal stresses are radial and circumferential.
     The stresses are exact for level ground with level layers.  In other ground, the stresses are changed until they
     balance the weight, without motion of the points.  A warning is given if balancing changes a stress by more than 5 %
-    of the largest initial stress, as on slopes.  Another warning is given for vertical tension, where the
-    pore pressure exceeds the overburden, as under open water without a surcharge.
+    of the largest initial stress, as on slopes.  Another warning is given if the pore pressure exceeds the overburden,
+    for example below open water without a surcharge.
 
     Parameters
     ----------
@@ -93,7 +93,7 @@ def hydrostatic(level: float, unit_weight: float | None = None) -> Callable[[NDA
 
 @dataclass(frozen=True)
 class OfWater:
-    """A water pressure with a unit weight."""
+    """Base of water pressures that have a unit weight."""
 
     @property
     def unit_weight(self) -> float:
@@ -163,7 +163,8 @@ class InitialStresses:
         return stressed(materials, points, rows, target)
 
     def lifted(self, materials: SceneMaterials, points: MaterialPoints) -> str:
-        """Return a point with vertical tension by K0, and this tension, or an empty string.  `points`: result of `of`.
+        """Return the stress and the position of a point where K0 gives vertical tension, as text.  It is empty without
+        tension.
 
         All processes must call this method.
         """
@@ -199,7 +200,7 @@ class InitialStresses:
         return normal[:, :, None] * np.eye(3)
 
     def _above(self, materials: SceneMaterials, points: MaterialPoints, present, gravity) -> list[NDArray]:
-        """Return the overburden, the height of the surface, and alpha chi p at each point."""
+        """Return the overburden (Pa), the height of the ground surface (m), and alpha chi p (Pa) at each point."""
         if not any(isinstance(stress, K0) for stress in self.given.values()):
             return [points.pressure] * 3
         if gravity is None or np.any(gravity[:-1]) or not gravity[-1] <= 0:
@@ -222,7 +223,7 @@ def _in_columns(
     unit_weight: NDArray[np.float64],
     above: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the corners and unit weights of all particle domains above and below given domains.
+    """Return the corners and unit weights of all particle domains in the columns of given domains.
 
     `ids` (n,), `corners` (n, 2^d, d), in m, `unit_weight` (n,), in N/m^3: particle domains of this process.
     `above` (k, 2^d, d), in m: corners of the given domains of this process.
@@ -323,7 +324,7 @@ class _ElasticStrains:
         return now, self.of(stress - self.target)
 
     def step(self, strain: NDArray[np.float64], missing: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the strains after a Newton step with finite differences, from strains and residual stresses."""
+        """Return the strains after a Newton step.  Finite differences give the tangent."""
         count = strain.shape[1]
         free = self.free
         (_, shear) = self.moduli()
@@ -338,7 +339,7 @@ class _ElasticStrains:
         return np.clip(strain - change, -1, 1)
 
     def solved(self) -> tuple[MaterialPoints, NDArray[np.bool_]]:
-        """Return the points with elastic strains, and for each point whether it misses its target stress."""
+        """Return the points with elastic strains, and for each point whether its stress differs from the target."""
         comm, strain = self.materials.grid.comm, self.linear()
         largest = over_all(comm, float(np.abs(self.target).max(initial=0.0)), MPI.MAX)
         close = CLOSE * largest + ROUND_OFF * np.maximum(*self.moduli())  # the second term is for very small strains
@@ -358,7 +359,7 @@ class _ElasticStrains:
 
 
 def strained(materials: SceneMaterials, points: MaterialPoints, moved: MaterialPoints) -> MaterialPoints:
-    """Return `points` with the elastic strains of `moved`, the same points after deformation."""
+    """Return `points`, with the elastic strains that they have in the deformed state `moved`."""
     law = materials.law_of(points)
     own = {name: points.data[name] for name in MaterialPoints.INTERNAL if name in points.data}
     data = {**moved.data, **own}
@@ -390,7 +391,7 @@ def _kappa(m) -> NDArray[np.float64]:
 
 
 def _friction(m) -> NDArray[np.float64]:
-    """Return the friction angle of a material, in degrees, or nan without friction."""
+    """Return the friction angle of a material, in degrees, or nan if its law has no friction angle."""
     return getattr(m, "friction", np.full(np.shape(m.bulk), np.nan))
 
 
@@ -399,7 +400,7 @@ def _prestretch(m) -> NDArray[np.float64]:
 
 
 def _no_constants(points: MaterialPoints, target: NDArray[np.float64], given: NDArray[np.bool_]) -> str:
-    """Return the reason why Modified Cam Clay does not allow a target stress, or an empty string."""
+    """Return an error message if Modified Cam Clay does not allow a target stress, and an empty string otherwise."""
     shear = np.abs(target - np.diagonal(target, axis1=1, axis2=2)[:, :, None] * np.eye(3)).max(axis=(1, 2), initial=0.0)
     invalid = given & ((shear > 0) | ~(np.trace(target, axis1=1, axis2=2) < 0))
     what = "must have no shear and a compressive mean for ModifiedCamClay"

@@ -7,10 +7,10 @@ Newton's method solves f = 0 at all points together, up to round-off.  With the 
     y = y* + Y (z(F) - z*),     Y = -(df/dy)^-1 df/dz  at (y*, z*).
 
 This y has the right value and the right derivative with respect to F.  UFL's derivative of a stress is therefore the
-consistent tangent, although the forms contain no iterations.  y*, z* and Y are coefficients at the points.
+consistent tangent, although the forms contain no iterations.  The points store y*, z* and Y as coefficients.
 
 If the law has an energy, the tangent is the second derivative of the energy, and the expression for y has a
-second-order term.  A law in numpy returns y(z) and dy/dz.
+second-order term.  A law in numpy computes y(z) and dy/dz itself.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class Derived(NamedTuple):
 
 
 class LocalUnknowns:
-    """The local unknowns of a law at some points, as coefficients of forms.
+    """The local unknowns of a law at its points, as coefficients of forms.
 
     `law`: class of the law.
     `points`: the points, with the law's parameters and state.
@@ -61,9 +61,9 @@ class LocalUnknowns:
     Attributes
     ----------
     values
-        The unknowns by name, as UFL that depends on F; also `trial`.
+        UFL of the unknowns, by name, as functions of F; also the trial values, as `trial`.
     known
-        The unknowns as coefficients, independent of F.  For laws with an energy, `known` equals `values`.
+        Like `values`, but the unknowns do not depend on F.  For laws with an energy, `known` equals `values`.
     """
 
     def __init__(self, law: type[Skeleton], points: FormPoints, F, values: Mapping[str, object]):
@@ -97,8 +97,9 @@ class LocalUnknowns:
     def solve(self, data: PointData, derive: bool = True, motion: tuple = ()) -> Given:
         """Solve for the unknowns at the present F, and return values for the forms.  All processes must call this.
 
-        `derive`: whether to compute the derivatives with respect to the trial values, which `values` needs.
-        `motion`: key of the present displacement.  Results are reused while `data`, `motion` and dt are the same.
+        `derive`: whether to compute the derivatives dy/dz too.  Forms with `values` need them.
+        `motion`: values that change with the displacement.  Results are reused while `data`, `motion` and dt are the
+        same.
         """
         key = data.key, motion, float(self._dt.value)
         solved = self._solved(key, lambda: self._equations.solve(data, self._trial.evaluate(data)), self._comm)
@@ -110,7 +111,7 @@ class LocalUnknowns:
 
 
 class _Equations:
-    """The equations f(y, z) = 0 of a law at points."""
+    """The local equations f(y, z) = 0 of a law at its points."""
 
     def __init__(
         self,
@@ -152,7 +153,7 @@ class _Equations:
             self._bends = PointExpression(ufl.as_vector([_along(by_y, by_z, Y, m, (i, j), l) for i, j, l in each]), own)
 
     def _with_trial(self, values: dict) -> dict:
-        """Return the trial values as arguments of the law's equations, by name."""
+        """Return the arguments of `residual` or `solution` that contain the trial values, by name."""
         return {"trial": values} if self._law.trial is not None else values
 
     def solve(self, data: PointData, trial: NDArray[np.float64]) -> Solved:
@@ -222,7 +223,7 @@ class _Equations:
         return f"{self._law.__name__}.solution"
 
     def _checked(self, found, n: int) -> dict:
-        """Return the unknowns and their derivatives in the result of `solution`, or raise ValueError."""
+        """Return the checked unknowns and derivatives from the result of `solution`, or raise ValueError."""
         instance(f"{self._title}: its result", found, dict)
         for of, pair in found.items():
             if not (isinstance(pair, (tuple, list)) and len(pair) == 2 and isinstance(pair[1], dict)):
@@ -251,7 +252,7 @@ class _Equations:
     def _slopes_of(self, of: str, given: Mapping[str, object], n: int) -> NDArray[np.float64]:
         """Return the derivatives (n, m, k) of one unknown with respect to all trial values.
 
-        `given`: derivatives by name of the trial value.  Missing derivatives are zero.
+        `given`: derivatives, by name of the trial value.  A missing derivative is zero.
         """
         m, parts = _size(self._unknowns[of]), []
         for by, shape in self._trial.items():
@@ -261,7 +262,7 @@ class _Equations:
 
 
 def _along(by_y, by_z, Y, m: int, i: tuple[int, ...], j: int):
-    """Return the derivative of component i of f(y* + Y (z - z*), z) with respect to component j of z, as UFL."""
+    """Return the total derivative of f_i(y(z), z) with respect to z_j, with dy/dz = Y, as UFL."""
     return by_z[(*i, j)] + sum(by_y[(*i, a)] * Y[a, j] for a in range(m))
 
 

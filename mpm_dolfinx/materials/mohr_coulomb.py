@@ -11,10 +11,10 @@ with the friction angle phi, the cohesion c and the tensile strength T.  The dir
 e_i are the principal directions.
 
 The final stress lies on one of ten faces, edges and vertices of the yield surface.  On each face, edge and vertex, the
-final stress is linear in the trial stress (de Souza Neto, Peric and Owen 2008, 8.2, without the cut-off).  A final
-stress must be admissible, in the order of the trial stresses, and have plastic multipliers >= 0.  The return mapping
-chooses the face, edge or vertex with the least violation of these conditions.  Derivatives are exact, even for equal
-eigenvalues.
+final stress is linear in the trial stress (de Souza Neto, Peric and Owen 2008, 8.2, without the cut-off).  Three
+conditions hold: the final stress is admissible, its principal stresses keep the order of the trial stresses, and
+plastic multipliers are >= 0.  The return mapping chooses the face, edge or vertex that violates these conditions least.
+Derivatives of the stress are exact, also for equal eigenvalues.
 """
 
 from __future__ import annotations
@@ -132,7 +132,7 @@ class MohrCoulomb(Frictional):
 
 
 def _returned(e: NDArray, bulk: NDArray, shear: NDArray, sine: NDArray, sine_flow: NDArray, *limits: NDArray) -> tuple:
-    """Return principal stresses, their derivatives with respect to e, and flags of plastic flow.
+    """Return principal stresses, their derivatives with respect to e, and whether flow is plastic (1 or 0).
 
     `e` (n, 3): principal trial strains, in descending order.
     """
@@ -155,7 +155,7 @@ def _returned(e: NDArray, bulk: NDArray, shear: NDArray, sine: NDArray, sine_flo
 
 
 class _Surface:
-    """Yield surface of ordered principal stresses."""
+    """Yield surface in the space of ordered principal stresses."""
 
     def __init__(self, sine: NDArray, strength: NDArray, cutoff: NDArray):
         self.p = 1 + sine
@@ -164,12 +164,12 @@ class _Surface:
         self.T = cutoff
 
     def outside(self, t: NDArray) -> NDArray:
-        """Return the largest yield function at stresses t, > 0 outside the yield surface."""
+        """Return the largest yield function at principal stresses t (n, 3).  It is > 0 outside the yield surface."""
         return np.maximum(self.p * t[:, 0] - self.q * t[:, 2] - self.k, t[:, 0] - self.T)
 
 
 class _Return:
-    """Return mapping of ordered principal trial stresses outside the yield surface."""
+    """Return mapping for ordered principal trial stresses outside the yield surface."""
 
     def __init__(self, t, elastic, bulk, shear, sine, sine_flow, strength, cutoff):
         self._trial = t
@@ -194,9 +194,9 @@ class _Return:
         )
 
     def end(self, few: slice) -> tuple[NDArray, NDArray, NDArray]:
-        """Return the final stresses, their derivatives with respect to the trial stresses, and their violation.
+        """Return final stresses, their derivatives with respect to trial stresses, and the violated amounts, in Pa.
 
-        `few`: slice of the faces and edges that are tried.  `ALL` also includes the vertices.
+        `few`: the faces and edges of the yield surface that are tried.  `ALL` also includes the vertices.
         """
         with np.errstate(all="ignore"):  # vertices at infinity
             ends = [self._on(faces) for faces in self._faces[few]]
@@ -210,7 +210,7 @@ class _Return:
         return stresses, slopes, violation[best, n]
 
     def _violation(self, t: NDArray, multipliers: Sequence[NDArray]) -> NDArray:
-        """Return the largest violation, in Pa, of the conditions for a final stress."""
+        """Return how far, in Pa, a stress t violates the conditions for a final stress."""
         multipliers = [-2 * self._G * m for m in multipliers]
         return np.max([self._surface.outside(t), t[:, 1] - t[:, 0], t[:, 2] - t[:, 1], *multipliers], axis=0)
 
@@ -234,16 +234,16 @@ class _Return:
         return t, np.zeros((len(t), 3, 3)), self._violation(t, conditions(plastic))
 
     def _in_apex(self, x: NDArray) -> list[NDArray]:
-        """Return numbers that are >= 0 if the apex is the final stress."""
+        """Return three numbers, which are all >= 0 if the apex is the final stress."""
         total, difference = x.sum(axis=1), self._p - self._q
         return [total, self._q * total + difference * x[:, 2], self._q * total + difference * (x[:, 1] + x[:, 2])]
 
     def _in_triaxial(self, x: NDArray) -> list[NDArray]:
-        """Return numbers that are >= 0 if the final stress is the vertex with t_1 at the cut-off and t_2 = t_3."""
+        """Return numbers, which are all >= 0 if the final stress is the vertex t_1 = T, t_2 = t_3."""
         return [-x[:, 1], -x[:, 2], x[:, 0] + self._p / self._q * (x[:, 1] + x[:, 2])]
 
     def _in_extension(self, x: NDArray) -> list[NDArray]:
-        """Return numbers that are >= 0 if the final stress is the vertex with t_1 = t_2 at the cut-off."""
+        """Return numbers, which are all >= 0 if the final stress is the vertex t_1 = t_2 = T."""
         return [x[:, 0], x[:, 1], -x[:, 2], x[:, 0] + x[:, 1] + self._p / self._q * x[:, 2]]
 
 

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Laws of soil with an initial stress.
 
-The law is evaluated at F F_i, with the deformation gradient F relative to the seeded state.  The initial stretch F_i
-(3, 3) of a point causes its initial stress.  Volumes, porosities and conductivities refer to the seeded state.  In laws
-with the state variable `plastic`, the inverse plastic metric C_p^-1 replaces F_i.
+The initial stretch F_i (3, 3) of a point causes its initial stress.  The law is evaluated at F F_i, where F is the
+deformation gradient relative to the seeded state.  Volumes, porosities and conductivities refer to the seeded state.
+Laws with the state variable `plastic` need no F_i, because the inverse plastic metric C_p^-1 stores the initial strain.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from mpm_dolfinx.forms.axes import block, embedded, planar
 from mpm_dolfinx.materials.skeleton import Field, Skeleton
 
 AT_REST = " at rest"
-"""Suffix of the names of point data that contain the state variables at seeding."""
+"""Suffix of the names of point data that store state variables at the start."""
 
 
 def stressed(m: Skeleton, knows_space: bool) -> Skeleton:
-    """Return a material with a point field for its initial stress or initial strain.
+    """Return a material whose initial stress or stretch is a field at the points.
 
     `knows_space`: whether the material's law accepts F (3, 3).
     """
@@ -43,7 +43,7 @@ def _everywhere(value) -> Callable:
 
 @cache
 def prestressed(law: type[Skeleton], knows_space: bool) -> type[Skeleton]:
-    """Return the law with F_i as the additional field `seeded_stretch`."""
+    """Return a law that is evaluated at F F_i, with the additional parameter `seeded_stretch` for F_i."""
     names = ("energy", "kirchhoff", "update", "trial")
     used = {name: f for name in names if (f := getattr(law, name)) is not None}
     given = {name: staticmethod(_from_seeded(f, name, knows_space)) for name, f in used.items()}

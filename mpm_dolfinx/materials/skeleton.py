@@ -25,15 +25,14 @@ from mpm_dolfinx.pores.retention import check_retention
 Field = float | Sequence[float] | Callable[[NDArray[np.float64]], ArrayLike]
 """A constant (number or vector), or a function of the reference positions X (n, d), in m, that returns values (n, ...).
 
-X are the points of one process.  On several processes, a function whose values depend on other points, such as a mean,
-raises ValueError.
+X are the points of one process.
 """
 
 BY_SCENE = ("dt", "cell_size")
-"""Arguments that laws receive from the scene: time since the start of the step, s; mean edge length of a cell, m."""
+"""Arguments that laws receive from the scene: the time since the start of the step, s, and the cell size, m."""
 
 DRIED = ("suction", "suction_at_start")
-"""State variables that the scene sets: suction max(-p, 0), in Pa, at the end of a substep, and suction at seeding."""
+"""State variables that the scene sets: the suction max(-p, 0), Pa, at the end of a substep and at seeding."""
 
 LOCKING = 0.43
 """Poisson's ratio nu above which cells use F-bar, which doubles the run time of a step.
@@ -105,12 +104,12 @@ class Skeleton:
         Alternative to `residual` in numpy, for return mappings with many cases, and for existing codes.  The function
         takes arrays (n, ...) of the law's fields, state and `trial`.  The function returns a dict with a pair for each
         unknown: the values (n, ...), and a dict of derivatives (n, ..., ...) by name of the trial value.  A derivative
-        may be a function without arguments, called when a tangent is assembled.  A missing derivative is zero.  Without
-        a solution, return NaN or infinity; the time step is then reduced.  Newton's method is slow if `energy` is not
-        stationary in the unknowns.
+        may also be a function without arguments.  This function is called only if a tangent is assembled.  A missing
+        derivative is zero.  Without a solution, return NaN or infinity; the time step is then reduced.  With an
+        `energy` that is not stationary in the unknowns, Newton's method is slow.
     trial
         Function (F, ...) -> {name: UFL}.  Residuals depend on F through these trial values only.  In a law without
-        `trial`, residuals have F itself as argument.  Values other than UFL are for `kirchhoff` and `update` only.
+        `trial`, residuals have F itself as argument.  Only `kirchhoff` and `update` receive values that are not UFL.
 
     All these functions may have the argument `dt`, the time since the start of the step, s, for rate-dependent laws.
     With the new state and dt = 0, a law must return the stress at the end of the step.  The argument `cell_size`, the
@@ -158,14 +157,14 @@ class Skeleton:
     residual: ClassVar[Callable | None] = None
     solution: ClassVar[Callable | None] = None
     dilates: ClassVar[bool] = False
-    """Whether the law has an angle of `dilation`."""
+    """Whether the law has the parameter `dilation`."""
     elastic_hencky: ClassVar[bool] = False
-    """Whether the stresses follow from the elastic strains by Hencky's law."""
+    """Whether Hencky's law relates stresses and elastic strains."""
     linear: ClassVar[bool] = False
     """Whether the stress is linear in F, so that factors of the stiffness matrix can be reused."""
     state: ClassVar[Mapping[str, ArrayLike]] = {}
     by_scene: ClassVar[tuple[str, ...]] = ()
-    """Names in `BY_SCENE` that are arguments of the law's functions."""
+    """Which of `dt` and `cell_size` are arguments of the law's functions."""
     parameters: ClassVar[tuple[str, ...]] = ()
     """Names of fields and properties that are arguments of the law's functions."""
 
@@ -255,7 +254,7 @@ class Skeleton:
 
     @classmethod
     def _kirchhoff(cls, F, values: Mapping[str, object], shape: tuple[int, int]):
-        """Return the Kirchhoff stress, in Pa, as UFL of this shape."""
+        """Return the Kirchhoff stress, in Pa, as UFL of the given shape or of shape (3, 3)."""
         return expression(cls.kirchhoff, [shape, (3, 3)], "" if cls.unknowns else "F", F=F, **values)
 
     @classmethod
@@ -300,9 +299,9 @@ class Skeleton:
         """Return the coefficient tau, in 1/Pa, that damps alternating increments of the pressure.
 
         For laws with a state, tau is half of the value for macroelements of 2 x 2 cells, 3 alpha^2 / (8 (lambda + 3G))
-        (Silvester and Kechkar 1990; Camargo, White and Borja 2021).  For other laws tau is a quarter of this value, for
-        better conditioning and less smearing.  In 3D, the value for 2 x 2 x 2 cells would be too small to damp
-        pressures that alternate along two axes only.
+        (Silvester and Kechkar 1990; Camargo, White and Borja 2021).  For other laws tau is a quarter of the value for
+        macroelements, which improves conditioning and smears pressures less. 3D scenes use the same value, because the
+        value for 2 x 2 x 2 cells does not damp pressures that alternate along two axes.
         """
         return (0.5 if self.state else 0.25) * self.biot**2 * 3 / (8 * self.macroelement)
 
@@ -449,9 +448,9 @@ def filled(p, suction):
 class unsaturated:
     """Conductivity law for flow below a free surface, as `conductivity_law` of a material.
 
-    The conductivity falls from k at p = `suction` to `least` * k at p = -`suction`, by a smooth cubic (Bathe and
-    Khoshgoftaar 1979).  The drainable porosity empties along the same cubic; other pores stay full.  The soil's weight
-    is computed with full pores.  The law uses the pressure at the start of each substep.  Steady flow therefore needs
+    A smooth cubic reduces the conductivity from k at p = `suction` to `least` * k at p = -`suction` (Bathe and
+    Khoshgoftaar 1979).  Drainable pores empty along the same cubic, and other pores stay full.  The soil's weight is
+    computed with full pores.  The law uses the pressure at the start of each substep.  Steady flow therefore needs
     steps of about h^2 / c_v, with the cell size h and the coefficient of consolidation c_v.
 
     Parameters
@@ -461,8 +460,8 @@ class unsaturated:
     least
         Conductivity of drained soil, divided by the conductivity of saturated soil, in (0, 1).
     specific_yield
-        Drainable porosity, in [0, 1), at most the porosity.  With 0, a free surface falls at once, so that only steady
-        flow is meaningful.
+        Drainable porosity, in [0, 1), at most the porosity.  If it is 0, a free surface moves to its steady position at
+        once, so only steady flow is meaningful.
     """
 
     suction: float
@@ -492,9 +491,9 @@ class Fluid:
         Density rho_w at zero pressure, kg/m^3, > 0.  Weights are computed with rho_w.  Flowing fluid has the density
         rho_w exp(p / K_w).
     gravity
-        Acceleration g that defines hydraulic conductivities, m/s^2, > 0.  The default is the scene's gravity if this
-        gravity is a constant vector other than zero, and 9.81 otherwise. With units other than m and s, scenes without
-        gravity, or with gravity as a function of time, require this argument.
+        Acceleration g that defines hydraulic conductivities, m/s^2, > 0.  By default g is the magnitude of the scene's
+        gravity.  If this gravity is absent, zero or a function of time, g is 9.81. With units other than m and s,
+        scenes without gravity, or with gravity as a function of time, require this argument.
 
     Raises
     ------

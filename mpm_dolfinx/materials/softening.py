@@ -38,8 +38,8 @@ class SofteningDruckerPrager(DruckerPrager):
     residual
         Residual cohesion c_r, Pa, in [0, cohesion]; c_r = c_0 means no softening.
     slip
-        Slip s along a shear band, m, > 0, at which the cohesion has fallen to c_r.  The scene raises ValueError if
-        cells are so large that the soil would soften faster than it unloads.
+        Slip s along a shear band, m, > 0, at which the cohesion has fallen to c_r.  Soil in large cells would soften
+        faster than it unloads.  The scene then raises ValueError.
     viscosity
         Viscosity eta of Perzyna's law f = eta dgamma/dt, Pa s, >= 0, with the yield function f of `DruckerPrager`.
 
@@ -70,7 +70,7 @@ class SofteningDruckerPrager(DruckerPrager):
 
     @property
     def cone(self):
-        """Coefficients (..., 3): eta and xi of the yield function, and eta of the plastic potential."""
+        """Coefficients (..., 3): eta and xi in the yield function, and eta in the plastic potential."""
         return np.stack(np.broadcast_arrays(self.eta, self.xi, self.eta_flow), axis=-1)
 
     def check_cells(self, cell_size: float) -> None:
@@ -99,7 +99,7 @@ class SofteningDruckerPrager(DruckerPrager):
 
 
 def _softened(trial: Trial, bulk, shear, cone, hardened, cohesion, residual, strain, drag) -> dict:
-    """Return the results of `drucker_prager.returned` for a cohesion that decreases to c_r at the strain `strain`."""
+    """Return the result of `drucker_prager.returned` with softening.  At the plastic strain `strain`, c = c_r."""
     end = cone[1] * strain  # in terms of `hardened`
     moduli = trial, bulk, shear, *cone
     falling = returned(*moduli, cohesion, (residual - cohesion) / end, hardened, drag)

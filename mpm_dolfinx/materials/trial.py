@@ -3,7 +3,7 @@
 
 In UFL, isotropic functions of a tensor are Newton's interpolation polynomials at its eigenvalues.  The polynomials are
 exact for smooth functions of each eigenvalue, and remain smooth at equal eigenvalues.  In numpy, `Coaxial` computes the
-exact derivatives of return mappings, which depend on all three eigenvalues.
+exact derivatives of return mappings, where each stress depends on all three eigenvalues.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from mpm_dolfinx.forms.axes import embedded, planar
 from mpm_dolfinx.materials.skeleton import _eigenvalues
 
 PLANE, SPACE = ((0, 0), (1, 1), (2, 2), (0, 1)), ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-"""Components of a symmetric tensor in plane strain or axisymmetry, and in 3D."""
+"""Indices of the components of a symmetric tensor, in plane strain or axisymmetry, and in 3D."""
 
 
 class Isotropic:
@@ -100,7 +100,7 @@ def eigen(b: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float
 
 
 class Coaxial:
-    """Tensors with the principal axes of n given tensors.
+    """Tensors (n, 3, 3) with the principal axes of n given tensors.
 
     `x` (n, 3), `axes` (n, 3, 3): eigenvalues and axes of the given tensors, see `eigen`.
     `y` (n, 3): principal values.

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """User-defined functions that return UFL.
 
-The package passes each argument by its name; the names are listed below.  Laws and conductivities belong to materials:
-see `skeleton.Skeleton`.  `Simulation` takes terms of the balances, integrated over the configuration at the start of
+The package passes each argument by its name; the names are listed below.  `skeleton.Skeleton` describes functions for
+laws and conductivities.  `Simulation` takes terms of the balances, integrated over the configuration at the start of
 the step.  Their arguments are:
 
 points
@@ -13,7 +13,7 @@ points
     `points.displacement` is the displacement since the start of the run, or since a stage that reset it to zero.  Other
     attributes are the laws' state variables, and parameters that are functions of position.
 t
-    Time at which the balances hold, s, as a UFL constant: the end of the step or of its first substep.
+    Time, s, as a UFL constant: the end of the substep.
 
 A function in `terms` is added to the balance of momentum, `int P : grad v dV - loads + term = 0`.  Further possible
 arguments of this function are:
@@ -74,7 +74,7 @@ def expression(function: Callable, shapes: Sequence[tuple[int, ...]], of: str = 
     """Return the result of a user-defined function as a UFL expression with one of the given shapes.
 
     ValueError is raised if the function fails, or if the result is not UFL.  ValueError is also raised if the result
-    has a wrong shape, or does not depend on the argument `of`.
+    has a wrong shape or does not depend on the argument named `of`.
     """
     value = call(function, **available)
     allowed = f"UFL of shape {' or '.join(map(str, shapes))}{f' that depends on {of}' if of else ''}"
@@ -106,7 +106,7 @@ def _check_parts(what: str, out: ufl.core.expr.Expr) -> None:
 
 
 def named(what: str, given, shapes: Mapping[str, tuple[int, ...]], some: bool = False) -> dict:
-    """Return the dict from a user-defined function as UFL with the given shapes, or raise ValueError.
+    """Return the dict `value` of a user-defined function with UFL of the given shapes, or raise ValueError.
 
     `some`: whether names may be missing.
     """
@@ -157,7 +157,7 @@ def term_of(term: Callable, unknown: ufl.Coefficient, test: ufl.Argument, **avai
 
 @contextmanager
 def compiling(what: str, allowed: str) -> Iterator[None]:
-    """Turn errors of UFL and its compiler into a ValueError that names the object."""
+    """Replace errors of UFL and its compiler by a ValueError with the name of the object."""
     try:
         yield
     except (Exception, ArityMismatch) as error:  # UFL and FFCx raise many kinds; one is no Exception
