@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Wrappers of every function of dolfinx that differs between the supported releases (0.5.2 and 0.9 to 0.11).
 
-No other module of the package depends on the release.  Branches marked OLD serve release 0.5 only.
+No other module of the package depends on the release.  Branches marked OLD are for release 0.5 only.
 """
 
 from __future__ import annotations
@@ -44,11 +44,12 @@ def box_mesh(
     Parameters
     ----------
     cells : (n, 2^d)
-        Global indices of the nodes of this process's cells.  Along the nodes of a cell, the first axis varies fastest.
+        Global indices of the nodes of this process's cells.  In the order of the nodes of a cell, the first coordinate
+        varies fastest.
     x : (m, d), m
         Positions of the nodes that this process contributes.  Nodes are numbered globally in the order of the ranks.
     ranks, offsets
-        The ranks that hold cell i are `ranks[offsets[i] : offsets[i + 1]]`, with the owner first.
+        The owner of cell i, and the other ranks with this cell, are `ranks[offsets[i] : offsets[i + 1]]`.
     """
     kind = {4: "quadrilateral", 8: "hexahedron"}[cells.shape[1]]
     where = (ranks, offsets)
@@ -127,11 +128,11 @@ def scatter_reverse_add(u: fem.Function) -> None:
 
 
 seconds: Counter[str] = Counter()
-"""Wall time, s, of each part of a run on this process, summed by `Timer`."""
+"""Total wall time, s, of each part of a run on this process, measured by `Timer`."""
 
 
 class Timer:
-    """Context that adds its wall time to an entry of `seconds`.  Timers of dolfinx 0.9 resolve only 10 ms."""
+    """Context that adds its wall time to an entry of `seconds`.  The timers of dolfinx 0.9 resolve only 10 ms."""
 
     def __init__(self, part: str):
         self._part = part
@@ -147,7 +148,7 @@ class Timer:
 def expanded(form: ufl.Form) -> ufl.Form:
     """Return a form with expanded derivatives.
 
-    In forms over faces, dolfinx 0.9 also packs coefficients that vanish in derivatives, although the kernel omits them.
+    In forms over faces, dolfinx 0.9 packs coefficients that vanish in derivatives, but the kernel omits them.
     """
     return ufl.algorithms.expand_derivatives(form)
 
@@ -158,7 +159,7 @@ class CompiledForm:
     The kernel is called once for each entry of the list, so a cell may occur several times.  Ghost cells are not
     allowed, because dolfinx 0.5 silently skips them.
 
-    `form`: form whose integrals are all of one type, and have the subdomain id `SUBDOMAIN`.
+    `form`: form whose integrals have one type, and the subdomain id `SUBDOMAIN`.
     """
 
     def __init__(self, form: ufl.Form):
@@ -182,11 +183,11 @@ class CompiledForm:
 
     @property
     def form(self):
-        """The form with the entities of the last call of `bind`."""
+        """Dolfinx's form over the entities of the last call of `bind`."""
         return self._last if OLD else self._last._cpp_object
 
     def bind(self, entities: NDArray[np.int32]):
-        """Set the cells or interior facets of the integral, and return the form for them.
+        """Return dolfinx's form with an integral over the given cells or interior facets.
 
         Later calls do not change the returned form.  `assemble_vector` and `assemble_matrix` accept it.
         """
@@ -222,23 +223,23 @@ class CompiledForm:
         return self.form
 
     def packed(self, form=None) -> dict:
-        """Return the coefficients as dolfinx packs them, with one row for each entity."""
+        """Return dolfinx's array of coefficients, with one row for each entity."""
         form = form or self.form
         return cpp.fem.pack_coefficients(form)
 
     def assemble_vector(self, b: NDArray[np.float64], rows: NDArray[np.float64] | None = None, form=None) -> None:
-        """Add the vector to `b`, without communication.
+        """Add the assembled vector to `b`, without communication.
 
-        `rows`: coefficients of the entities, by default `packed()`.
+        `rows`: coefficients, one row for each entity, by default `packed()`.
         """
         form = form or self.form
         packed = self.packed(form) if rows is None else dict.fromkeys(self._keys, rows)
         cpp.fem.assemble_vector(b, form, cpp.fem.pack_constants(form), packed)
 
     def assemble_matrix(self, A: PETSc.Mat, rows: NDArray[np.float64] | None = None, form=None) -> None:
-        """Add the matrix, in unrolled dofs, to `A` without final assembly.
+        """Add the assembled matrix, in unrolled dofs, to `A`.  The caller must assemble `A`.
 
-        `rows`: coefficients of the entities, by default `packed()`.
+        `rows`: coefficients, one row for each entity, by default `packed()`.
         """
         form = form or self.form
         packed = self.packed(form) if rows is None else dict.fromkeys(self._keys, rows)
@@ -246,7 +247,7 @@ class CompiledForm:
 
     @cached_property
     def _keys(self) -> list[tuple]:
-        """Keys of the coefficients: indices of the integrals in dolfinx 0.11, else subdomain ids."""
+        """Keys of dolfinx's coefficients: indices of the integrals in dolfinx 0.11, else subdomain ids."""
         return [(fem.IntegralType.cell, key) for _, key in self.packed()] or [(fem.IntegralType.cell, SUBDOMAIN)]
 
 
@@ -258,7 +259,7 @@ def _mesh_of(form: ufl.Form):
 
 
 def links(msh: mesh.Mesh) -> list[NDArray[np.int32]]:
-    """Return the arrays of all connectivities that a mesh has computed."""
+    """Return the arrays of all computed connectivities of a mesh."""
     found = []
     for pair in np.ndindex(*[msh.topology.dim + 1] * 2):
         with suppress(RuntimeError):  # from dolfinx 0.9 on, for others
@@ -267,7 +268,7 @@ def links(msh: mesh.Mesh) -> list[NDArray[np.int32]]:
 
 
 def _facet_cells(msh, facets, dim: int) -> NDArray[np.int32]:
-    """Return the flat list (cell0, local facet0, cell1, local facet1, ...) of interior facets."""
+    """Return two cells and local facets of each interior facet: (cell0, local facet0, cell1, local facet1, ...)."""
     adjacency = msh.topology.connectivity(dim, dim + 1)
     cells = adjacency.array[adjacency.offsets[facets][:, None] + np.arange(2)]
     cell_facets = msh.topology.connectivity(dim + 1, dim).array.reshape(-1, 2 * (dim + 1))  # boxes only

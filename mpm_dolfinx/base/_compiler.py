@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Compilation of dolfinx's forms and function spaces, without log lines, and with errors in one line.
+"""Compilation of dolfinx's forms and function spaces into libraries, with errors in one line.
 
-FFCx marks a library by a `.c` file in the cache before compiling it.  Other programs wait ten seconds for a marked
-library.  After an aborted run the mark remains, and all later runs fail.  This module therefore compiles each library
-in a separate folder, and moves the complete library into the cache.  Incomplete or broken libraries in the cache are
-compiled again.
+Before FFCx compiles a library, it marks the library by a `.c` file in the cache.  Other programs wait ten seconds for a
+marked library, and then fail.  The mark of an aborted run would therefore stop all later runs.  This module therefore
+compiles each library in a separate folder, and moves the complete library into the cache.  Incomplete or broken
+libraries in the cache are compiled again.
 """
 
 from __future__ import annotations
@@ -38,15 +38,15 @@ from mpm_dolfinx.parallel.exchange import at_root, first
 WORKSHOP = ".mpm_dolfinx-"
 """Prefix of the folders in which libraries are compiled."""
 ABANDONED = 600.0
-"""Age, in s, above which a mark of another program is ignored.  A mark is a `.c` file without a `.c.cached` file."""
+"""Age, in s, of an aborted program's mark, which is ignored.  A mark is a `.c` file without a `.c.cached` file."""
 DAY = 86400.0  # Source: definition
 logger = logging.getLogger("mpm_dolfinx")
 _settings = jit.get_options if hasattr(jit, "get_options") else jit.get_parameters  # OLD
 _ffcx_settings = ffcx.get_options if hasattr(ffcx, "get_options") else ffcx.get_parameters  # OLD
 _replacements: dict[Path, Path] = {}
-"""Temporary folder of this run in place of each cache folder that is not writable."""
+"""Temporary folders that replace cache folders which are not writable."""
 _warnings: dict[Path, str] = {}
-"""Pending warnings by temporary folder.  The first compilation in a folder issues its warning."""
+"""Warnings about temporary folders.  The first compilation in such a folder issues its warning."""
 
 
 @contextmanager
@@ -111,7 +111,7 @@ def _of_this_run(cache: Path, why: OSError) -> Path:
 
 
 def _complete(make: Callable, folder: Path, messages: list[str]) -> Callable:
-    """Return a version of FFCx's compiling function `make` that leaves only complete libraries in `folder`.
+    """Return FFCx's function `make`, changed so that `folder` only contains complete libraries.
 
     Errors of the compiler and of the disk are appended to `messages`.
     """
@@ -152,7 +152,7 @@ def _complete(make: Callable, folder: Path, messages: list[str]) -> Callable:
 
 @cache
 def _loaded(name: str, library: Path) -> ModuleType:
-    """Return the module of a library.  FFCx's loader would list the whole cache for each form."""
+    """Return the module of a library.  FFCx's loader is slower, because it lists the whole cache."""
     spec = spec_from_file_location(name, library)
     module = module_from_spec(spec)
     spec.loader.exec_module(module)
@@ -165,9 +165,9 @@ def _library(place: Path, name: str) -> Path | None:
 
 
 def _is_complete(place: Path, name: str) -> bool:
-    """Return whether the cache holds a complete library, and its files `.c` and `.c.cached`.
+    """Return whether the cache contains a complete library and its files `.c` and `.c.cached`.
 
-    Python's loader does not detect a truncated library.  A run that uses this library would end with a bus error.
+    Python's loader does not detect a truncated library, whose use would end the run with a bus error.
     """
     library = _library(place, name)
     if library is None or not all((place / f"{name}{end}").exists() for end in (".c", ".c.cached")):
@@ -199,7 +199,7 @@ def _publish(workshop: Path, folder: Path) -> None:
 
 @contextmanager
 def _replaced(**functions: Callable) -> Iterator[None]:
-    """Replace functions of FFCx's module within this context."""
+    """Context in which other functions replace functions of FFCx's module."""
     before = {name: getattr(libraries, name) for name in functions}
     for name, function in functions.items():
         setattr(libraries, name, function)
@@ -212,7 +212,7 @@ def _replaced(**functions: Callable) -> Iterator[None]:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Context without setuptools' log lines about compiler calls."""
+    """Context in which setuptools logs no compiler calls."""
     root = logging.getLogger()
     level, handlers = root.level, root.handlers[:]
     root.addFilter(_is_wanted)

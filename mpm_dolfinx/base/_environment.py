@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Check of the environment before other imports. An error names the missing packages and the remedy."""
+"""Check of required packages, before other imports.  An error names missing packages and how to install them."""
 
 from __future__ import annotations
 

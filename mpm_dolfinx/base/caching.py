@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Cache of a single value, the last one, together with its key.  Keys are compared by value."""
+"""Cache of the last value of a function, with its key.  Keys are compared by value."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ T = TypeVar("T")
 class Latest(Generic[T]):
     """Cache of the last value.
 
-    The cache is empty during the computation of a value, so an exception leaves no incomplete value behind.
+    The cache is empty while a value is computed, so an exception leaves no incomplete value in the cache.
 
     `derived`: caches of values that depend on this value; `clear` also empties these caches.
     """
@@ -33,7 +33,7 @@ class Latest(Generic[T]):
 
         `key`: all data on which the value depends: numbers, objects, arrays that never change, or tuples of these.
         `make`: function that computes the value.
-        `comm`: processes that compute the value together.  If one of them needs a new value, all compute it.
+        `comm`: processes that compute the value together.  If one process needs a new value, all processes compute it.
         """
         other = self._entry is None or not (self._entry[0] is key or same(self._entry[0], key))
         if other if comm.size == 1 else over_all(comm, other) > 0:
@@ -58,7 +58,7 @@ class Latest(Generic[T]):
 
 
 class Keyed:
-    """Base class of objects with a token for cache keys, so that caches do not keep the objects alive."""
+    """Base class of objects with a unique token for keys.  A cache with the token does not keep the object alive."""
 
     @cached_property
     def key(self) -> object:
@@ -67,7 +67,7 @@ class Keyed:
 
 
 def same(a: Any, b: Any) -> bool:
-    """Return whether two keys are equal.  Arrays are compared by shape and values, tuples entry by entry."""
+    """Return whether two keys are equal.  Equal arrays have equal shapes and values."""
     if a is b:
         return True
     if isinstance(a, tuple) and isinstance(b, tuple):

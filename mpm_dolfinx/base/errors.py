@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 @dataclass
 class Report:
-    """Report of a converged time step.  Pressures are cell pressures.  `motion_error` defines `moves`."""
+    """Report of a converged time step.  All pressures are cell pressures."""
 
     newton: int = 0  # Newton iterations
     coupling: int = 0  # iterations of the coupled linear solver
@@ -58,7 +58,7 @@ class NotConverged(StepFailed):
 
 
 class CannotFollow(NotConverged):
-    """A time step in which bodies cannot follow a prescribed displacement, however short the step."""
+    """A time step in which bodies cannot follow a prescribed displacement, for any step length."""
 
 
 class LeftGrid(StepFailed):
@@ -67,7 +67,7 @@ class LeftGrid(StepFailed):
     Attributes
     ----------
     report
-        Report of the step.  A shorter step helps only if the estimated error in this report is too large.
+        Report of the step.  A shorter step may succeed only if the estimated error in the report is too large.
     """
 
     def __init__(self, message: str, report: Report | None = None):
@@ -76,7 +76,7 @@ class LeftGrid(StepFailed):
 
 
 def raise_interrupt(error: BaseException) -> None:
-    """Raise the KeyboardInterrupt that caused an error, if any.  Some PETSc releases hide it in a solver error."""
+    """Raise the KeyboardInterrupt that caused an error, if any.  Some PETSc releases replace it by a solver error."""
     cause = error
     while cause is not None and not isinstance(cause, KeyboardInterrupt):
         cause = cause.__cause__ or cause.__context__

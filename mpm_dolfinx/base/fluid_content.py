@@ -8,9 +8,9 @@ is a linear function a J + b of J, where a is the value of S at n = 1, and
 
     d zeta = (alpha / rho) d[(J + b / a) rho],    rho = exp(a p / alpha).
 
-The bracket is the mass of a fluid of density rho that fills the volume J + b / a.  The change of zeta in a step is
-alpha times the change of this mass, divided by rho at the mean pressure of the step.  This formula is
-second-order accurate for any path.  If no fluid flows, the change is exactly zero in a step of any size.
+The term in brackets is the mass of a fluid of density rho that fills the volume J + b / a.  The change of zeta in a
+step is alpha times the change of this mass, divided by rho at the mean pressure of the step.  This formula is
+second-order accurate for any path.  If no fluid flows, the change of zeta is exactly zero in a step of any size.
 
 Fluxes between cells conserve mass.  The density of the fluid is rho_w exp(p / K_w).  The mass flux is -rho_w kappa grad
 pi.  The mobility kappa is the conductivity divided by the unit weight.  Kirchhoff's transformation gives the mass
@@ -75,12 +75,12 @@ def mass_potential_form(p, compliance):
 
 
 def density_between(p0, p1, compliance):
-    """Return the mean density between two pressures as a UFL expression, divided by the density at p = 0."""
+    """Return as UFL the mean density between two pressures, in Pa, divided by the density at p = 0."""
     return ufl.exp(compliance * (p0 + p1) / 2) * _sinhc(compliance * (p0 - p1) / 2)
 
 
 def mean_density(p0, p1, bulk: float) -> NDArray[np.float64]:
-    """Return the mean densities (n,) between pressures (n,), Pa, divided by that at p = 0.  `bulk` is K_w, in Pa."""
+    """Like `density_between`, for numbers: arrays (n,) of pressures, in Pa.  `bulk` is K_w, in Pa."""
     z = (p0 - p1) / (2 * bulk)
     small = np.abs(z) < SERIES
     away = np.where(small, 1.0, z)

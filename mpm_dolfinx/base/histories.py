@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Histories of a run: quantities at each output time, in arrays that all results of the run share."""
+"""Histories of a run: quantities at each output time, in arrays which all results of the run share."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def _none(*shape: int) -> NDArray[np.float64]:
 
 
 class Row(NamedTuple):
-    """Quantities at one output time.  The array of a quantity that was not recorded is empty."""
+    """Quantities at one output time.  Quantities that were not recorded have empty arrays."""
 
     t: float  # time, s
     displacement: NDArray[np.float64] = _none(0, 0)  # of the probes (m, d), m
@@ -30,11 +30,11 @@ class Row(NamedTuple):
 
 
 COLUMNS = tuple(name for name in Row._fields if name != "outcome")
-"""Names of the array quantities."""
+"""Names of the quantities of a `Row` that are arrays."""
 
 
 class _Columns:
-    """Storage of the histories: one array for each quantity, and the outcomes."""
+    """Storage of histories: an array for each quantity, and a list of outcomes (reactions, outflows and others)."""
 
     def __init__(self, arrays: dict[str, NDArray[np.float64]], outcomes: list[Any]):
         self.arrays, self.outcomes = arrays, outcomes
@@ -44,7 +44,7 @@ class _Columns:
         return len(self.outcomes)
 
     def reshaped(self, count: int, capacity: int, shapes: dict[str, tuple[int, ...]]) -> _Columns:
-        """Copy the first rows into new, larger arrays, which are filled up with nan."""
+        """Return copies of the first `count` rows in larger arrays, which contain nan elsewhere."""
         out = {}
         for name, shape in shapes.items():
             out[name] = np.full((capacity, *shape), np.nan)
@@ -57,13 +57,13 @@ class _Columns:
 class Rows(Sequence[Row]):
     """Immutable sequence of one `Row` for each output time of a run.
 
-    The result of `more` shares its arrays with this object.  The time to append a row therefore does not grow with the
-    number of rows.  If a quantity has different shapes in two rows, the smaller array is padded with nan.
+    The method `more` returns a new object that shares its arrays with this object.  It therefore takes equal time for
+    any number of rows.  If a quantity has different shapes in two rows, the smaller array is padded with nan.
 
     Attributes
     ----------
     run
-        Token shared by all histories that `more` derived from the same object.
+        Token of the run.  The method `more` copies the token into the new object.
     """
 
     def __init__(self, rows: Iterable[Row] = ()):
@@ -76,7 +76,7 @@ class Rows(Sequence[Row]):
 
     @classmethod
     def of_columns(cls, columns: dict[str, NDArray[np.float64]], outcomes: Sequence[Any]) -> Rows:
-        """Return n rows from the values (n, ...) of each quantity, and n outcomes.  Other lengths raise ValueError."""
+        """Return n rows from n outcomes and from arrays (n, ...) of each quantity.  Other lengths raise ValueError."""
         if columns.keys() != set(COLUMNS):
             raise ValueError(f"the columns are {', '.join(columns)}, must be {', '.join(COLUMNS)}")
         if {len(values) for values in columns.values()} != {len(outcomes)}:
@@ -100,7 +100,7 @@ class Rows(Sequence[Row]):
 
     @property
     def outcomes(self) -> list[Mapping[str, Mapping[str, NDArray[np.float64]]]]:
-        """Reactions, outflows and other effects of the conditions at each output time, as a new list."""
+        """List of reactions, outflows and other effects of the conditions at each output time."""
         return self._columns.outcomes[: self._count]
 
     def column(self, name: str) -> NDArray[np.float64]:
@@ -112,7 +112,7 @@ class Rows(Sequence[Row]):
         return out
 
     def more(self, row: Row) -> Rows:
-        """Return histories with one row appended."""
+        """Return new histories with one more row."""
         columns, n = self._columns, self._count
         values = {name: np.asarray(value, dtype=np.float64) for name, value in zip(COLUMNS, row, strict=False)}
         old = {name: rows.shape[1:] if n else values[name].shape for name, rows in columns.arrays.items()}

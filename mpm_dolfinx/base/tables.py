@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 SYMMETRIC = {"xx": (0, 0), "yy": (1, 1), "zz": (2, 2), "xy": (0, 1), "xz": (0, 2), "yz": (1, 2)}
-"""Indices of the components of a symmetric tensor.  Tables of plane strain have only the first four components."""
+"""Indices of the components of a symmetric tensor.  Tables in plane strain and axisymmetry omit xz and yz."""
 
 Outcome = Mapping[str, Mapping[str, NDArray[np.float64]]]
 
 
 class Histories(Protocol):
-    """Results at the probes at one output time, or at all output times, with time as the first axis of arrays."""
+    """Results at the probes, at one output time, or at all output times (first axis of the arrays)."""
 
     t: Any
     displacement: NDArray[np.float64]
@@ -29,7 +29,7 @@ class Histories(Protocol):
 
 
 def components(tensors: NDArray[np.float64], dim: int) -> dict[str, NDArray[np.float64]]:
-    """Return the components of symmetric tensors (..., 3, 3) by name.  In 2D, xz and yz are left out."""
+    """Return the components of symmetric tensors (..., 3, 3) by name, in 2D without xz and yz."""
     return {name: tensors[..., i, j] for name, (i, j) in list(SYMMETRIC.items())[: 4 if dim == 2 else 6]}
 
 
@@ -60,7 +60,7 @@ def columns(of: Histories, outcome: Outcome) -> dict[str, tuple[Any, str]]:
 
 
 def _axes(dim: int, size: int) -> list[str]:
-    """Return the suffixes of the components of a force, and of its moments."""
+    """Return suffixes of column names for the components of a force and for its moments."""
     axes = ["_x", "_y", "_z"][:dim]
     return axes + {0: [], 1: ["_moment"], 3: [f"_moment{axis}" for axis in axes]}[size - dim]
 
@@ -113,7 +113,7 @@ def data_set(of: Histories, outcome: Outcome, about: dict[str, Any]):
 
 
 def _library(name: str) -> ModuleType:
-    """Return an optional library, or raise ImportError with a message of one line."""
+    """Import an optional library, or raise ImportError with a message of one line."""
     try:
         return import_module(name)
     except ImportError as error:

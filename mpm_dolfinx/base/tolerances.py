@@ -10,22 +10,21 @@ ROUND_OFF = 64 * EPSILON
 SAME = EPSILON**0.5
 """Relative difference below which two numbers are considered equal: half of their digits agree.
 
-`SAME` is also the increment of one-sided differences.  Newton's method squares the error, so only rounding errors
-remain after a Newton step of relative size `SAME`.  Source: Dennis and Schnabel (1983), sections 5.4 and 2.4.
+`SAME` is also the increment of one-sided differences.  Newton's method squares the relative error, so a step of
+relative size `SAME` leaves only rounding errors.  Source: Dennis and Schnabel (1983), sections 5.4 and 2.4.
 """
 CENTRAL = EPSILON ** (1 / 3)
 """Increment of central differences, relative to the variable.  Source: Dennis and Schnabel (1983), 5.6."""
 SECOND = EPSILON**0.25
 """Increment of second differences, relative to the variable.  Source: Dennis and Schnabel (1983), 5.6."""
 NEAR = 8 * float(np.finfo(np.float32).eps)
-"""Relative distance, 1e-6, below which positions coincide.  Mesh files have seven digits, and maps add rounding errors.
+"""Relative distance, 1e-6, below which positions are considered equal.
 
-Source: epsilon of single precision (IEEE 754), times 8 for a few operations.
+Source: epsilon of single precision (IEEE 754), as in mesh files, times 8 for a few operations.
 """
 TINY = float(np.finfo(float).tiny) / EPSILON
-"""Lower bound of divisors, or a number added to divisors.  Quotients of numbers below (1 / epsilon) are then finite.
+"""Lower bound of divisors, or a number added to divisors, so that quotients of numbers below (1 / epsilon) are finite.
 Source: IEEE 754.
 """
 FOREVER = 1 / EPSILON**2
-"""Time step, in s, so long that rates vanish: a change of (1 / epsilon) has the rate epsilon.  Source: epsilon squared.
-"""
+"""Length of a time step, in s, in which a change by (1 / epsilon) has the rate epsilon.  Source: epsilon squared."""

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Validation of values that users give, as numbers or as functions of time and position.
+"""Validation of values in a scene, which are numbers or functions of time and position.
 
-An error message has one line.  The message names the object, the value, and the allowed values.
+An error message has one line, with the object, its value, and the allowed values.
 
 The parameter names of a function decide its arguments:
 
@@ -12,13 +12,14 @@ X : (n, d), m
 x : (n, d), m
     Positions of the n places at the start of the step, for example to prescribe a water level.
 
-If a function has a single parameter with another name, this parameter receives the time.  In functions of several
-parameters, other names raise an error.  If all parameters have defaults, all receive arguments.  Otherwise, parameters
-with a default receive no argument.  Material constants may be functions of X.  Initial pressures and stresses may be
-functions of x, the seeded positions.
+If a function has a single parameter with another name, this parameter receives the time.  Other names among several
+parameters raise an error.  Parameters with a default value receive an argument only if all parameters have default
+values.  Material constants may be functions of X.  Initial pressures and stresses may be functions of x, the seeded
+positions.
 
 A function of position returns a number or an array (n,).  Where vectors are allowed, the function may also return a
-vector (d,) or an array (n, d).  Places are repeated until n exceeds d, so that the array's shape is unambiguous.
+vector (d,) or an array (n, d).  If n <= d, the function receives positions several times, so that n > d distinguishes
+the two shapes.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ from numpy.typing import NDArray
 
 LONGEST = 160  # most characters of a value in a message
 _known: WeakKeyDictionary[Callable, list[Parameter]] = WeakKeyDictionary()
-"""Parameters of each function that has been called."""
+"""Parameters of functions that have been called, by function."""
 
 
 def line(value) -> str:
@@ -88,7 +89,7 @@ def numbers(
 
 
 def whole(name: str, value, least: int = 1) -> int:
-    """Return the value as an integer >= `least`.  Raise ValueError for other values."""
+    """Return the value as an integer.  Raise ValueError if it is not an integer >= `least`."""
     allowed = f"an integer >= {least}"
     return int(numbers(name, value, allowed=allowed, test=lambda v: (least <= v) & (v < inf) & (v == np.floor(v))))
 
@@ -136,7 +137,7 @@ def functions(name: str, values) -> None:
 
 
 def asked(name: str, allowed: str, function: Callable, *values):
-    """Return the value of a user's function.  Exceptions become a ValueError that names the object."""
+    """Return the value of a user's function.  Replace its exceptions by a ValueError with the name of the object."""
     try:
         return function(*values)
     except Exception as error:
@@ -144,7 +145,7 @@ def asked(name: str, allowed: str, function: Callable, *values):
 
 
 def path(name: str, value) -> Path:
-    """Return a value as a path.  Raise ValueError for values that are neither text nor a path."""
+    """Return a value as a path.  Raise ValueError if the value is neither text nor a path."""
     if not isinstance(value, (str, os.PathLike)):
         raise ValueError(f"{name} = {line(value)}, must be a path")
     return Path(value)
@@ -152,7 +153,7 @@ def path(name: str, value) -> Path:
 
 @contextmanager
 def on_disk(name: str, allowed: str) -> Iterator[None]:
-    """Context that adds an object's name and the remedy to the message of an OSError."""
+    """Context that adds the name of the object, and allowed values, to the message of an OSError."""
     try:
         yield
     except OSError as error:
@@ -161,7 +162,7 @@ def on_disk(name: str, allowed: str) -> Iterator[None]:
 
 
 Places = Callable[[str], NDArray[np.float64]]
-"""Function of "X" or "x" that returns the reference or the current positions (n, d), in m, of n places."""
+"""Function that returns reference positions for "X", and current positions for "x", both (n, d), in m."""
 PLACES = ("X", "x")
 NAMES = ("t", *PLACES)
 PLAIN = (FunctionType, MethodType)
@@ -169,7 +170,7 @@ LIBRARIES = ("numpy", "scipy")  # in their functions, an argument named x need n
 
 
 def _plain(function: Callable) -> bool:
-    """Return whether the author of the scene chose the parameter names of the function."""
+    """Return whether the function is defined in the scene or in this package, and not in a library."""
     while isinstance(function, partial):
         function = function.func
     library = str(getattr(function, "__module__", None)).partition(".")[0] in LIBRARIES
@@ -178,7 +179,7 @@ def _plain(function: Callable) -> bool:
 
 
 def _parameters(function: Callable) -> list[Parameter] | None:
-    """Return the parameters that receive arguments, or None if the parameters are unknown."""
+    """Return the parameters that receive arguments.  Return None if Python does not know them."""
     try:
         return _known[function]
     except (KeyError, TypeError):  # some objects have no hash
@@ -197,7 +198,7 @@ def _parameters(function: Callable) -> list[Parameter] | None:
 
 
 def takes(function: Callable) -> tuple[str, ...] | None:
-    """Return which of the arguments t, X and x a function takes, or None if it has other parameters."""
+    """Return the names among t, X and x that a function takes as arguments, or None if it has other parameters."""
     return _names(function, _parameters(function))
 
 
@@ -217,7 +218,7 @@ def by_place(value) -> bool:
 
 
 def check_names(what: str, function: Callable, among: Sequence[str]) -> tuple[str, ...]:
-    """Return which of the arguments t, X and x a function takes.
+    """Return the names among t, X and x that a function takes as arguments.
 
     Raises
     ------
@@ -237,7 +238,7 @@ def check_names(what: str, function: Callable, among: Sequence[str]) -> tuple[st
 
 
 def called(function: Callable, values: dict) -> object:
-    """Call a function with its arguments among t, X and x in `values`, and return the result."""
+    """Call a function, and return its result.  `values` contains arguments by name: t, X or x."""
     parameters = _parameters(function)
     if parameters is None:
         return function(values["t"])
@@ -277,7 +278,7 @@ def given(
     t
         Time, s.
     side
-        Function that returns positions of places, or None without places.
+        Function that returns the positions of m places, or None if the value may only depend on time.
     dim
         Number of components of a vector value, or 0 if only scalars are allowed.
     among

@@ -2,9 +2,9 @@
 """Pressures of cells from the water content of their pieces, in unsaturated soil.
 
 A piece is the part of a particle domain in one cell.  The piece has the storage s, in m^d/Pa, and the pore volume n, in
-m^d.  Its fluid content at the pressure p, minus the content at p = 0, is `c(p) = s pi(p) + n (S(p) - 1) rho(p)`.  Here
-`pi = K_w (exp(p / K_w) - 1)` and `rho = exp(p / K_w)`, with the bulk modulus K_w of the fluid, and S is the saturation.
-The pressure of a piece differs from the pressure of its cell by an offset.
+m^d.  The fluid content of a piece at the pressure p, minus its content at p = 0, is `c(p) = s pi(p) + n (S(p) - 1)
+rho(p)`.  Here `pi = K_w (exp(p / K_w) - 1)` and `rho = exp(p / K_w)`, with the bulk modulus K_w of the fluid, and S is
+the saturation.  The pressure of a piece differs from the pressure of its cell by an offset.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ MOST = 2200  # Source: exact bound, twice the number of halvings of a bracket of
 
 @dataclass(frozen=True)
 class PoreWater:
-    """Water storage of the k pieces of particle domains in n cells."""
+    """Water storage of n cells, which contain k pieces of particle domains."""
 
     # function of pressures (k,), in Pa, that returns S (k,), dS/dp (k,), in 1/Pa, and possibly other values
     saturation: Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], ...]]
@@ -37,11 +37,11 @@ class PoreWater:
     scale: NDArray[np.float64]  # (n,) suction at which the pores of each cell drain, Pa
 
     def emptied(self, p: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return (S - 1) rho of the pieces at pressures p, and its derivative."""
+        """Return (S - 1) rho (k,) of the pieces at pressures p, in Pa, and its derivative with respect to p."""
         return emptied(p, self.bulk, *self.saturation(p)[:2])
 
     def of_cells(self, p: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the fluid contents of the cells, in m^d, for pressures p of their pieces, in Pa."""
+        """Return the fluid contents of the cells, in m^d, if their pieces have the pressures p, in Pa."""
         return self.sums(mass_potential(p, self.bulk), self.emptied(p)[0])
 
     def sums(self, pi: NDArray[np.float64], empty: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -56,7 +56,7 @@ class PoreWater:
         Newton's method solves for the logarithm of the suction, within a bracket.
 
         `content` (n,), in m^d: prescribed fluid contents.
-        `p` (n,), in Pa: initial pressures.  Pressures that already give the fluid contents remain unchanged.
+        `p` (n,), in Pa: initial guesses.  Guesses that give the prescribed fluid contents remain unchanged.
         `offset` (k,), in Pa: pressure of each piece minus the pressure of its cell.
         """
         count, scale = len(p), self.scale

@@ -11,7 +11,7 @@ coefficient chi (Richards 1931; Bishop 1959).  By default chi is the effective s
 S_e = (S - S_r) / (1 - S_r), with the residual saturation S_r.
 
 A user-defined curve is any object with the methods `saturation(p)` and `relative_permeability(p)`, which return UFL.  A
-method `bishop(p)` may return chi; without this method, chi = S.
+curve may have a method `bishop(p)` that returns chi; otherwise chi = S.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ class Retention:
 
 @dataclass(frozen=True)
 class VanGenuchten(Retention):
-    """Retention curve of van Genuchten (1980), with the permeability of Mualem (1976).
+    """Retention curve of van Genuchten (1980), with the relative permeability of Mualem (1976).
 
     `S_e = (1 + x^n)^-m` and `k_r = S_e^l [1 - x^(n-1) S_e]^2`, with `x = s / entry` and `m = 1 - 1 / n`.
 
@@ -93,13 +93,12 @@ class VanGenuchten(Retention):
     residual
         Residual saturation S_r, in [0, 1).
     n
-        Exponent that increases with the uniformity of the pore sizes, in (1, 20].
+        Exponent, in (1, 20]; large if the pores have similar sizes.
     l
         Exponent for the connectivity of the pores.
     air_entry
         Suction below which all pores are saturated, Pa, >= 0 (Ippisch, Vogel and Bastian 2006).  A usual value is the
-        pressure of a few centimetres of water.  If n < 2 and `air_entry` is zero, the permeability has an infinite
-        slope at s = 0.
+        pressure of a few centimetres of water.  If n < 2 and `air_entry` is zero, dk_r/ds is infinite at s = 0.
     """
 
     n: float = 2.0
@@ -113,7 +112,7 @@ class VanGenuchten(Retention):
         _number(self, "air_entry", lambda v: v >= 0, ">= 0 and finite")
 
     def _wide(self, x):
-        """Return q = x^(n-1) (1 + x^n)^-m, which gives Mualem's factor (1 - q)^2."""
+        """Return q = x^(n-1) (1 + x^n)^-m.  Mualem's relative permeability contains the factor (1 - q)^2."""
         return x ** (self.n - 1) * (1 + x**self.n) ** (1 / self.n - 1)
 
     def _least(self):
@@ -161,7 +160,7 @@ class BrooksCorey(Retention):
     residual
         Residual saturation S_r, in [0, 1).
     index
-        Exponent that increases with the uniformity of the pore sizes, in (0, 20].
+        Exponent, in (0, 20]; large if the pores have similar sizes.
     """
 
     index: float = 2.0
@@ -206,7 +205,7 @@ def check_retention(what: str, law) -> None:
 
 
 def sampled(law) -> list[float]:
-    """Return S and k_r of a law at some suctions, and these suctions in Pa."""
+    """Return values of S and k_r, and the suctions, in Pa, for which a law gives these values."""
     suctions = scale_of(law) * np.exp2(np.arange(-2, 3))
     return [_value(getattr(law, name), -s) for name in METHODS for s in suctions] + suctions.tolist()
 
@@ -222,7 +221,7 @@ def chi_at(law, p: float) -> float:
 
 
 def _empty(function: Callable, suction: float) -> bool:
-    """Return whether a function is at most 0.5, or not a number, at a suction."""
+    """Return whether a function (S or k_r) is at most 0.5, or nan, at a suction in Pa."""
     try:
         return not _value(function, -suction) > 0.5
     except OverflowError:
@@ -250,12 +249,12 @@ def scale_of(law) -> float:
 
 
 class Retentions:
-    """Retention curves of the materials, as UFL expressions of data at the integration points.
+    """Retention curves of a scene, as UFL expressions of fields at the integration points.
 
     The points have the field `retention`.  The first entry of this field is the number of the law (1, 2, ...), or 0 if
-    the pores stay saturated.  The other entries are the constants of the law.  Pieces also have the field `lever`: the
-    vector from the centroid of the material in their cell to the piece.  The pressure of a piece is the pressure of its
-    cell plus the hydrostatic difference along `lever`.
+    the pores stay saturated.  The other entries are the constants of the law.  Pieces also have the field `lever`, the
+    vector to the piece from the centroid of the material in its cell.  The pressure of a piece is the cell pressure
+    plus the hydrostatic difference along `lever`.
 
     `laws`: distinct retention curves of the scene's materials.
     `everywhere`: whether every material has a retention curve.
@@ -269,7 +268,7 @@ class Retentions:
         self._kinds = list(dict.fromkeys(type(law) if isinstance(law, Retention) else law for law in self.laws))
         self._first = [next(law for law in self.laws if self._kind(law) == i) for i in range(len(self._kinds))]
         self.width = 1 + max(len(_constants(law)) for law in self.laws)
-        """Length of the vector `retention`."""
+        """Number of entries of the field `retention`."""
 
     def _kind(self, law) -> int:
         return self._kinds.index(type(law) if isinstance(law, Retention) else law)
@@ -284,7 +283,7 @@ class Retentions:
         return out
 
     def number(self, law) -> int:
-        """Return the number of a law (1, 2, ...), or 0 for None."""
+        """Return the index of a law among `laws`, counted from 1, or 0 for saturated soil (None)."""
         return 0 if law is None else 1 + self.laws.index(law)
 
     def heads(self, lever: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -292,7 +291,7 @@ class Retentions:
         return lever @ self.weight.value
 
     def at(self, p, points: FormPoints):
-        """Return the pressures of the points, in Pa, as UFL, from the pressures p of their cells."""
+        """Return the pressures of the points as UFL. p: pressures of their cells, both in Pa."""
         return p + ufl.dot(self.weight, points.lever) if "lever" in points.sizes else p
 
     def of(self, name: str, p, points: FormPoints):
@@ -349,7 +348,7 @@ def _called(law, name: str, p):
 
 
 class SaturationAt:
-    """Saturation, its derivative, Bishop's coefficient and relative permeability as numbers."""
+    """Numerical values of saturation, its derivative, Bishop's coefficient and relative permeability."""
 
     def __init__(self, grid: Grid, retentions: Retentions):
         self._points = points = FormPoints(grid, p=(), retention=(retentions.width,))
@@ -363,7 +362,7 @@ class SaturationAt:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Return S, dS/dp, chi and k_r at pressures p (n,), in Pa.
 
-        `rows` (n, width): field `retention` of the points.
+        `rows` (n, width): values of the field `retention` at n points.
         """
         data = anywhere(self._points, p=p, retention=rows)
         S, slope, chi, k = self._values.evaluate(data).T
@@ -371,7 +370,7 @@ class SaturationAt:
 
 
 def anywhere(points: FormPoints, **fields: NDArray[np.float64]) -> PointData:
-    """Return points in an arbitrary cell, for expressions that depend only on the fields of the points."""
+    """Return points with the given fields, for expressions of these fields only.  Their positions are arbitrary."""
     count = len(next(iter(fields.values())))
     cells = np.zeros(count, dtype=np.int32)
     return points.at(cells, points.grid.midpoints[cells], np.ones(count), **fields)
@@ -380,7 +379,7 @@ def anywhere(points: FormPoints, **fields: NDArray[np.float64]) -> PointData:
 class Conductance:
     """Integral of the relative permeability with respect to pressure, the potential of flow (Kirchhoff 1894).
 
-    Cubic Hermite polynomials interpolate a table of the integral at suctions with equal steps of the logarithm.
+    Cubic Hermite polynomials interpolate between tabulated values, which are equidistant in the logarithm of suction.
     """
 
     def __init__(self, grid: Grid, law):
@@ -422,7 +421,7 @@ class Conductance:
 
 
 REACH = (1e-8, 1e8)
-"""Range of tabulated suctions, divided by the law's scale.  Source: k_r outside is constant, exact to 1e-8."""
+"""Smallest and largest tabulated suction, over the law's scale.  Source: k_r outside is constant, exact to 1e-8."""
 ROWS = 4000
 """Number of tabulated suctions.  Plateau (scene "dry" of tests/plateaus.py): half this value changes the result by
 2.1e-08, twice this value by 2.6e-09, and finer cells by 6.6e-03.
@@ -434,20 +433,20 @@ changes the result by 8.2e-10, twice this value by 1.5e-09, and finer cells by 6
 
 
 def logarithm(p: NDArray[np.float64], scale: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the dimensionless pressures `p / scale`, with a logarithmic scale for suctions: `arcsinh(p / scale)`."""
+    """Return `arcsinh(p / scale)` at negative pressures p, and `p / scale` at positive pressures, both in Pa."""
     return np.where(p < 0, np.arcsinh(p / scale), p / scale)
 
 
 def pressure_at(y: NDArray[np.float64], scale: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the pressures, in Pa, at which `logarithm` has the values y."""
+    """Return the pressures, in Pa, for values y of `logarithm`."""
     return np.where(y < 0, scale * np.sinh(y), scale * y)
 
 
 FARTHEST = np.log(10)
 """Largest change of the natural logarithm of the suction in a Newton step.
 
-Without this limit, fronts in dry soil do not converge.  With the limit 2, Celia's column takes 310 Newton steps with 25
-cells, and 500 with 100 cells.  The limit 4 gives 330 Newton steps with 25 cells, and 920 with 100 cells.
+Without this limit, fronts in dry soil do not converge.  With the limit 2, Celia's column takes 310 Newton steps in 25
+cells, and 500 in 100 cells.  With the limit 4, it takes 330 Newton steps in 25 cells, and 920 in 100 cells.
 
 Plateau (scene "dry" of tests/plateaus.py): half this value changes the result by 7.6e-10, twice this value by 9.8e-10,
 and finer cells by 6.6e-03.
@@ -460,14 +459,14 @@ def restrained(
     scale: NDArray[np.float64] | float,
     previous: NDArray[np.float64] | float = 0.0,
 ) -> NDArray[np.float64]:
-    """Limit the pressure decreases (n,) of a Newton step, and return the limited decreases, in Pa.
+    """Return the pressure decreases (n,) of a Newton step, in Pa, after limitation.
 
     A step across the characteristic suction ends at this suction.  On each side of the characteristic suction the
     saturation is convex or concave, so that Newton's method converges (Wang and Tchelepi 2013).  The logarithm of the
-    suction changes by at most `FARTHEST`.  A change that reverses its direction is at most half of the previous change.
+    suction changes by at most `FARTHEST`.  A change of opposite sign to the previous change is at most half as large.
 
     `p` (n,), in Pa: pressures.
-    `dp` (n,), in Pa: decreases of the pressures in Newton's method.
+    `dp` (n,), in Pa: decreases of the pressures before limitation.
     `scale` (n,), in Pa: characteristic suctions.
     `previous` (n,): changes of `logarithm` in the previous Newton step.
     """
