@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Second-order tensors whose third axis, out of plane or circumferential, is principal."""
+"""Second-order tensors with a principal third axis, which is out of plane or circumferential."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ def block(T):
 def planar(F) -> bool:
     """Return whether the third axis of a UFL deformation gradient is principal.
 
-    The result is True for a tensor (2, 2), and for a result of `block`.
+    Tensors (2, 2) and results of `block` give True, and all other tensors give False.
     """
     if isinstance(F, ufl.classes.Variable):
         F = F.ufl_operands[0]

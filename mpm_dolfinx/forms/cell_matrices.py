@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Nodal forces and element matrices of Q1 vectors.  The sum over the points of a cell is inserted once."""
+"""Nodal forces and element matrices of Q1 vectors, summed over the points of a cell before they are inserted."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from mpm_dolfinx.grid.grid import Grid, sum_by
 
 
 def shape_gradients(points: FormPoints) -> list:
-    """Return the gradients of the Q1 shape functions at the points as UFL; in 3D, their means over each piece."""
+    """Return the gradients of the Q1 shape functions at the points as UFL.  In 3D they are means over each piece."""
     grid, xi = points.grid, points.offset
     h = grid.edge_in_forms()
     out = []
@@ -37,7 +37,7 @@ def shape_gradients(points: FormPoints) -> list:
 
 
 def shape_over_radius(points: FormPoints) -> list:
-    """Return the means of N / r over each piece as UFL, for the shape functions N."""
+    """Return N / r as UFL, averaged over each piece, for each Q1 shape function N and the radius r."""
     grid, hoop = points.grid, points.functions["hoop"]
     h, out = grid.edge_in_forms(), []
     for s in grid.signs.tolist():
@@ -47,7 +47,7 @@ def shape_over_radius(points: FormPoints) -> list:
 
 
 def along_shapes(T, points: FormPoints) -> list:
-    """Return T : grad v as UFL for each shape function v along each axis."""
+    """Return T : grad v as UFL, for each Q1 shape function v and each of its components."""
     gradients, d = shape_gradients(points), points.grid.dim
     if not points.grid.axisymmetric:
         return [ufl.dot(T, g)[i] for g in gradients for i in range(d)]
@@ -59,7 +59,7 @@ def along_shapes(T, points: FormPoints) -> list:
 
 
 def element_dofs(grid: Grid, cells: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Return the local dofs (cells, n) of Q1 vectors in cells, with one dof for each component."""
+    """Return the unrolled local dofs (cells, n) of Q1 vectors in the given cells."""
     dofs = grid.cell_nodes[cells][:, :, None] * grid.dim + np.arange(grid.dim, dtype=grid.cell_nodes.dtype)
     return dofs.reshape(len(cells), dofs.shape[1] * grid.dim)
 
@@ -72,14 +72,14 @@ def insert(A: PETSc.Mat, grid: Grid, cells: NDArray[np.int32], matrices: NDArray
 
 
 def insert_rows(A: PETSc.Mat, grid: Grid, cells: NDArray[np.int32], rows: NDArray[np.float64]) -> None:
-    """Add rows (cells, n) to `A` without final assembly.  `A` has a row for each cell and a column for each dof."""
+    """Add rows (cells, n) to a matrix with a row for each cell and a column for each dof.  The caller assembles `A`."""
     if len(cells):
         dofs = element_dofs(grid, cells).astype(PETSc.IntType)
         A.setValuesLocalRCV(cells[:, None].astype(PETSc.IntType), dofs, rows[:, None], addv=True)
 
 
 def _entries(count: int, symmetric: bool) -> tuple[NDArray, NDArray, NDArray]:
-    """Return row, column and storage index of each entry of a matrix."""
+    """Return row and column of each stored entry of a matrix, and the storage index (count, count) of each entry."""
     rows, columns = np.triu_indices(count) if symmetric else np.divmod(np.arange(count**2), count)
     place = np.empty((count, count), dtype=np.int64)
     if symmetric:
@@ -98,13 +98,13 @@ class ElementForces:
         self._sums = CellSums(along_shapes(stress, points), points)
 
     def assemble_vector(self, b: NDArray[np.float64], data: PointData, given: Given = NONE) -> None:
-        """Add the assembled vector to the local array `b`, ghost entries included."""
+        """Add the assembled vector to the local array `b`, which includes ghosts."""
         dofs, at = data.places.dofs
         b[dofs] += sum_by(at, self._sums(data, given).ravel(), len(dofs))
 
 
 class Beside(NamedTuple):
-    """Further integrals over each cell, computed together with an element matrix."""
+    """Integrals over each cell that are computed together with an element matrix."""
 
     # UFL tensors T[i, k] (d, d), multiplied by grad v (or by grad v F) for each dof of v
     along: Sequence[ufl.core.expr.Expr] = ()
@@ -115,10 +115,10 @@ NOTHING = Beside()
 
 
 class ElementMatrices:
-    """The bilinear form grad v : A : grad u of Q1 vectors, summed in each cell before insertion.
+    """The bilinear form grad v : A : grad u of Q1 vectors, with one insertion for each cell.
 
-    The assembler sums the entries of an element matrix over the points of its cell, through DG0 test functions.  Each
-    element matrix is then inserted once.
+    DG0 test functions make the assembler of dolfinx sum each entry of an element matrix over the points of the cell.
+    Each element matrix is then inserted once.
 
     Parameters
     ----------
@@ -150,7 +150,7 @@ class ElementMatrices:
         self._sums = CellSums([*entries, *along, *beside.scalars], points)
 
     def assemble_matrix(self, A: PETSc.Mat, data: PointData, given: Given = NONE) -> NDArray[np.float64]:
-        """Add the matrix to `A`, without final assembly, and return the further integrals (cells, quantities)."""
+        """Add the matrix to `A`, which the caller assembles.  Return the integrals `beside` (cells, quantities)."""
         sums = self._sums(data, given)
         insert(A, self._grid, data.places.filled, sums[:, self._entry])
         return sums[:, self._count :]
@@ -159,7 +159,7 @@ class ElementMatrices:
 def _circumferential(tangent, gradients: list, over_radius: list, row: tuple[int, int], column: tuple[int, int]):
     """Return the contribution of circumferential strains to one entry of an element matrix, as UFL.
 
-    `row`: node and axis of v.  `column`: node and axis of u.
+    `row`, `column`: node and axis of v, and of u.
     """
     (v, i) = row
     (u, j) = column
@@ -176,9 +176,10 @@ def _circumferential(tangent, gradients: list, over_radius: list, row: tuple[int
 class StackedElementMatrices:
     """The bilinear form (grad v F) : A : (grad u F) of Q1 vectors, with products by BLAS.
 
-    In 3D, cells contain many points, so that products by BLAS are faster than products in the kernel.  The gradients of
-    the shape functions, multiplied by F, are stacked for the n points of a cell.  The element matrix is then the
-    product of an 8 x 3n and a 3n x 72 matrix.  Each batch consists of cells with about the same number of points.
+    In 3D, cells contain many points, so that products by BLAS are faster than products in the kernel.  A matrix
+    contains the gradients of the shape functions, multiplied by F, at the n points of a cell.  The element matrix is
+    then the product of an 8 x 3n and a 3n x 72 matrix.  Cells with about the same number of points are computed
+    together.
 
     Parameters: see `ElementMatrices`.  The points must have the field F (d, d).
     """
@@ -198,7 +199,7 @@ class StackedElementMatrices:
         self._sorted: Latest[list] = Latest()
 
     def assemble_matrix(self, A: PETSc.Mat, data: PointData, given: Given = NONE) -> NDArray[np.float64]:
-        """Add the matrix to `A`, without final assembly, and return the further integrals (cells, quantities)."""
+        """Add the matrix to `A`, which the caller assembles.  Return the integrals `beside` (cells, quantities)."""
         live, filled = self._values.live(data, given), data.places.filled
         sums = np.empty((len(filled), self._along * 2**self._d * self._d + self._scalars))
         for cells, points, missing in self._sorted(data.places.key, lambda: batches(data.places)):
@@ -207,7 +208,7 @@ class StackedElementMatrices:
         return sums
 
     def _of_batch(self, data: PointData, live, chosen: NDArray[np.int64], missing: NDArray) -> tuple[NDArray, NDArray]:
-        """Return the element matrices and the further integrals of a batch of cells."""
+        """Return the element matrices of a batch of cells, and the integrals `beside`."""
         d, (cells, most) = self._d, missing.shape
         g = data.places.shape_gradients(chosen)
         g = g @ data["F"][chosen].reshape(-1, d, d)
@@ -233,9 +234,8 @@ def batches(places: Places) -> list[tuple[NDArray[np.int64], NDArray[np.int64], 
 
     Returns for each batch
     ----------------------
-    Indices (c,) of the cells in `Places.filled`.
-    Indices (c, most) in `Places.cells` of the points in each cell.
-    Mask (c, most) of entries after the last point of a cell.
+    Indices (c,) of its cells in the array `Places.filled`.  Indices (c, most) of the points in each cell, filled up to
+    equal length.  Mask (c, most) of the indices that only fill up.
     """
     cells = places.cells
     filled = places.filled

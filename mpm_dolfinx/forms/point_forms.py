@@ -6,8 +6,8 @@ multilinear function v on a box of dimension d equals the first d + 1 terms of i
 
     v(x_p) = v + grad v . xi + 1/2 xi . grad grad v . xi + ...,
 
-with the offset xi = x_p - x_mid of the point p from the midpoint x_mid.  The right side, evaluated at the midpoint, is
-plain UFL, and the one-point rule integrates it.
+with the offset xi = x_p - x_mid of the point p from the midpoint x_mid.  The right side is plain UFL, with v and its
+derivatives at the midpoint, and the one-point rule integrates it.
 
 The list of cells of the integral contains each cell once for each point in the cell.  The assembler therefore calls the
 kernel once for each point.  The offset xi and all other data of the points are DG0 coefficients, with one row for each
@@ -38,7 +38,7 @@ from mpm_dolfinx.grid.grid import Grid, in_chunks
 
 BATCH, MANY = 2**10, 2**12
 """`BATCH`: number of points in a batch of element matrices, which fits into the cache.  `MANY`: number of points in one
-evaluation of an expression.  The last points of an expression are evaluated in batches of `BATCH`.
+evaluation of an expression; for the last points, `BATCH`.
 """
 
 
@@ -54,10 +54,10 @@ class PointMeasure(ufl.Measure):
 
 
 class FormPoints:
-    """The points in forms, as UFL coefficients.  The values of these coefficients are in `PointData`.
+    """UFL coefficients for quantities at the points.  `PointData` contains their values.
 
     `grid`: background grid.
-    `fields`: shape of each quantity at the points, by name.  The coefficient is an attribute with this name.
+    `fields`: shape of each quantity, by name.  The coefficient is the attribute with this name.
     """
 
     def __init__(self, grid: Grid, **fields: tuple[int, ...]):
@@ -67,9 +67,9 @@ class FormPoints:
             for name, shape in {"offset": (grid.dim,), "weight": (), **_moments(grid), **fields}.items()
         }
         self.live: dict[str, Callable[[PointData], NDArray[np.float64]] | None] = {}
-        """Functions that return the values (n, size) of fields that change between assemblies.
+        """Functions that return the values (n, size) of fields that change between assemblies, by name.
 
-        The entry of a field is None if the caller passes its values to each assembly.
+        The value is None if the caller passes the values of a field to each assembly.
         """
         self.dx = PointMeasure(grid.mesh, self.functions["weight"])
         self.sizes = {name: int(np.prod(shape, dtype=int)) for name, shape in fields.items()}
@@ -86,7 +86,7 @@ class FormPoints:
         return PointData(self, Places(self.grid, cells, x), weight, fields)
 
     def shapes(self) -> list:
-        """Return the values and the gradients of the Q1 shape functions at the points, as UFL pairs."""
+        """Return value and gradient of each Q1 shape function at the points, as UFL."""
         h, d = self.grid.edge_in_forms(), self.grid.dim
         out = []
         for signs in self.grid.signs.tolist():
@@ -110,7 +110,7 @@ class FormPoints:
         return ufl.as_matrix([[plane[0, 0], plane[0, 1], 0], [plane[1, 0], plane[1, 1], 0], [0, 0, self.hoop(f)]])
 
     def plane_grad(self, f):
-        """Return the gradient at the points, in axisymmetry without the circumferential component."""
+        """Return the gradient of a Q1 function at the points, in axisymmetry without the circumferential component."""
         return self._taylor(ufl.grad(f), self.grid.dim - 1)
 
     def hoop(self, f):
@@ -120,10 +120,9 @@ class FormPoints:
         return (f[0] + ufl.dot(slope, ufl.as_vector(offset)) + ufl.grad(slope)[0, 1] * product) / radius
 
     def gradient(self, u: fem.Function) -> fem.Function:
-        """Return grad u at the points as a coefficient that numpy evaluates.
+        """Return grad u at the points as a coefficient, whose values numpy computes.
 
-        All forms with the same u share the values.  UFL would otherwise expand u as a Taylor polynomial, with many
-        terms in 3D.
+        All forms with the same u share these values.  In 3D, the Taylor polynomial of `grad` would have many terms.
         """
         if "gradient" not in self.live:
             values = u.x.array
@@ -147,14 +146,14 @@ class FormPoints:
         return ufl.Identity(self.grid.stretches) + (self.grad(u) if self.grid.axisymmetric else self.gradient(u))
 
     def moved_by(self, u: fem.Function):
-        """Return u at the points as UFL.  For unequal cells, u is a coefficient, so one kernel fits all cells."""
+        """Return u at the points as UFL, or for unequal cells as a coefficient with values from numpy."""
         if self.grid.even:
             return self.value(u)
         d = self.grid.dim
         return self.follow("displaced", (d,), lambda data: self.grid.at(data.cells, data.x, u.x.array.reshape(-1, d)))
 
     def deformation(self, u: fem.Function):
-        """Return the deformation gradient at the points as a UFL variable, from u and the field `F`."""
+        """Return the deformation gradient (I + grad u) F at the points as a UFL variable, with the field `F`."""
         F = self.increment(u) * self.F
         return ufl.variable(block(F) if self.grid.axisymmetric else F)
 
@@ -183,10 +182,10 @@ class Places(Keyed):
     x : (n, d), m
         Positions of the points.
     mixed : (n, d), m^2
-        In 3D: mean products of the offsets from the centroid of each piece, see `Pieces`.  None for points without
+        In 3D: means over each piece of products of two offsets from its centroid, see `Pieces`.  None if points have no
         extent.
     hoop : (n, 4)
-        In axisymmetry: moments of the pieces in the plane, see `Pieces`.  None for points without extent.
+        In axisymmetry: moments of the pieces in the plane, see `Pieces`.  None if points have no extent.
     """
 
     def __init__(
@@ -206,7 +205,7 @@ class Places(Keyed):
             hoop = np.column_stack([offset, offset.prod(axis=1), x[:, 0]])
         self.hoop = hoop
         self.filled, self.slots = np.unique(cells, return_inverse=True)
-        """Two arrays: the cells that contain points, and for each point the index of its cell among these cells."""
+        """Two arrays: the cells that contain points, and the index of each point's cell in the first array."""
 
     @cached_property
     def nodal(self) -> NDArray[np.intp]:
@@ -216,7 +215,7 @@ class Places(Keyed):
 
     @cached_property
     def dofs(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Two arrays: dofs of Q1 vectors in cells with points, and indices of each cell's dofs in the first array."""
+        """Two arrays: all dofs of Q1 vectors in cells with points, and the indices of each cell's dofs among them."""
         d = self.grid.dim
         nodes, at = np.unique(self.grid.cell_nodes[self.filled], return_inverse=True)
         return tuple((rows.reshape(-1, 1) * d + np.arange(d)).astype(np.intp).ravel() for rows in (nodes, at))
@@ -227,16 +226,16 @@ class Places(Keyed):
         return Places(self.grid, self.cells[rows], self.x[rows], mixed, hoop)
 
     def shape_gradients(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the gradients, in 1/m, of the shape functions at points, or the means of the gradients over pieces."""
+        """Return the gradients, in 1/m, of the Q1 shape functions at points, or for pieces in 3D the mean gradients."""
         mixed = None if self.mixed is None else self.mixed[chosen]
         return self.grid.shape_gradients(self.cells[chosen], self.x[chosen], mixed)
 
     @cached_property
     def products(self) -> list[list[tuple[int, NDArray[np.float64] | float]]]:
-        """List of pairs of `bits` and `product` for each axis.
+        """For each axis, the monomials in the other coordinates, as pairs of `bits` and `product`.
 
-        The number `bits` selects some of the other axes, see `Grid.monomials`.  The array `product` (n,) is the product
-        of the offsets from the midpoint of the cell along these axes.  For pieces, `product` is a mean over the piece.
+        The bits of `bits` select coordinates, see `Grid.monomials`.  The array `product` (n,) contains the products of
+        these coordinates, relative to the midpoint of the cell, in 3D as means over pieces.
         """
         along = []
         for axis in range(self.grid.dim):
@@ -249,7 +248,7 @@ class Places(Keyed):
         return along
 
     def stretch(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return 1 + u_r / r at the points for nodal displacements u, in m."""
+        """Return the circumferential stretch 1 + u_r / r at the points for nodal displacements u, in m."""
         grid, (*offset, product, radius) = self.grid, self.hoop.T
         h = grid.h if grid.even else grid.sizes(self.cells).T[..., None]
         hats = [0.5 + x[:, None] * grid.signs[:, a] / h[a] for a, x in enumerate(offset)]
@@ -269,7 +268,7 @@ class PointData(Keyed):
     weight : (n,), m^d
         Volumes that the points represent.
     fields
-        Values (n, ...) of the fields by name.  Names that the forms do not use are ignored.
+        Values (n, ...) of quantities, by name.  Quantities that are not fields of `points` are ignored.
     """
 
     def __init__(self, points: FormPoints, places: Places, weight: NDArray[np.float64], fields: dict[str, NDArray]):
@@ -301,12 +300,12 @@ class PointData(Keyed):
         return self.rows[name]
 
     def gradients(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the gradients (n, d^2) of a Q1 vector with the nodal values u, and store them."""
+        """Return the gradients (n, d^2) of a Q1 vector with the nodal values u, and store them for the next call."""
         nodal = u.take(self.places.nodal)
         return self._stored(nodal, partial(self._of_nodal, nodal))
 
     def forget(self) -> None:
-        """Delete the gradients that `gradients` has stored."""
+        """Delete the stored gradients."""
         self._stored = Latest()
 
     def increments(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -337,15 +336,15 @@ class PointData(Keyed):
 
 
 Given = Mapping[str, NDArray[np.float64]]
-"""Values (n, size) by name that a caller passes to the forms of n points, see `FormPoints.follow`."""
+"""Values (n, size) of fields that the caller passes to an assembly, by name, see `FormPoints.follow`."""
 NONE: Given = MappingProxyType({})
 
 Packed = tuple[NDArray[np.float64], list[tuple[slice, NDArray[np.float64], NDArray[np.intp]]]]
-"""Coefficients with a row for each point, and for each grid function its columns, its values and the dofs of rows."""
+"""Array with a row of coefficients for each point, and columns, values and dofs of each function on the grid."""
 
 
 class Rows:
-    """Coefficients of a compiled form, with one row for each point."""
+    """Array of the coefficients of a compiled form, with one row for each point."""
 
     def __init__(self, compiled: _compat.CompiledForm, points: FormPoints):
         names = {f: name for name, f in points.functions.items()}
@@ -374,14 +373,14 @@ class Rows:
         return out
 
     def room(self, size: int) -> NDArray[np.float64]:
-        """Return a buffer for at least `size` rows.  The buffer is kept, because allocation is slow."""
+        """Return an array with at least `size` rows.  Later calls return the same array, because allocation is slow."""
         buffer = self._room.value
         if buffer is None or size > len(buffer):
             buffer = self._room(size, lambda: np.zeros((size, self._width)))
         return buffer
 
     def __call__(self, data: PointData, chosen: slice | NDArray[np.int64], live: Given) -> NDArray[np.float64]:
-        """Return the rows of the chosen points.  The argument `live` is the result of the method `live`."""
+        """Return the coefficients of the chosen points.  `live`: result of the method `live`."""
         if isinstance(chosen, slice):
             key = (data.key, chosen.start) if chosen.start else data.key
         else:
@@ -394,7 +393,7 @@ class Rows:
         return rows
 
     def _pack(self, data: PointData, chosen: slice | NDArray[np.int64]) -> Packed:
-        """Return rows with the constant fields, and the dofs of grid functions."""
+        """Return rows with the values of constant fields, and the dofs of functions on the grid."""
         cells = data.cells[chosen]
         rows, dofs = self.room(len(cells))[: len(cells)], []
         for columns, name in self._fixed:
@@ -409,8 +408,8 @@ class PointForm:
     """A form with the measure `points.dx`, compiled once and assembled for any positions of the points.
 
     `form`: linear or bilinear UFL form, with integrals over `points.dx` only.
-    `dense`: whether the values of a DG0 test function are numbered over the cells with points, not over all cells. If
-    True, kernels are called for arbitrary cells, as in `PointExpression`, so all cells must be equal.
+    `dense`: whether a DG0 test function has values only for cells with points, numbered in ascending order.  If True,
+    all cells must be equal, because kernels are called for arbitrary cells.
     """
 
     def __init__(self, form: ufl.Form, points: FormPoints, dense: bool = False):
@@ -418,7 +417,7 @@ class PointForm:
         self._rows, self._bound = Rows(self.compiled, points), Latest()
 
     def _parts(self, data: PointData) -> list[tuple]:
-        """Return the chunks of points, each with the form bound to its cells."""
+        """Return slices of the points, each with dolfinx's form over the cells of these points."""
         cells, bind = data.places.slots if self._dense else data.cells, self.compiled.bind
         return self._bound(cells, lambda: [(rows, bind(cells[rows])) for rows in in_chunks(len(cells))])
 
@@ -429,16 +428,16 @@ class PointForm:
             self.compiled.assemble_vector(b, self._rows(data, part, live), form)
 
     def assemble_matrix(self, A: PETSc.Mat, data: PointData) -> None:
-        """Add the matrix to `A`, with unrolled local dofs and without final assembly."""
+        """Add the matrix, in unrolled local dofs, to `A`.  The caller must assemble `A`."""
         live = self._rows.live(data, NONE)
         for part, form in self._parts(data):
             self.compiled.assemble_matrix(A, self._rows(data, part, live), form)
 
 
 class FacetForm:
-    """A form over active cells, or over faces between them.
+    """A form over active cells, or over faces between active cells.
 
-    The form is compiled when any process has such cells or faces.
+    The form is compiled as soon as some process has such cells or faces.
     """
 
     def __init__(self, form: ufl.Form, comm: MPI.Intracomm):
@@ -447,11 +446,11 @@ class FacetForm:
 
     @property
     def used(self) -> bool:
-        """Whether the form has been compiled so far."""
+        """Whether the form has been compiled."""
         return "compiled" in vars(self)
 
     def on(self, facets: NDArray[np.int32]) -> FacetSum:
-        """Return the form over these facets of this process.  All processes must call this method."""
+        """Return the form over the given facets or cells of this process.  All processes must call this method."""
         make = partial(FacetSum, self, facets)
         return self._last(facets, lambda: make(self._comm.allreduce(len(facets)) > 0), self._comm)
 
@@ -462,9 +461,9 @@ class FacetForm:
 
 
 class FacetSum:
-    """A form over `facets` of this process.
+    """A form over given facets or cells of this process.
 
-    `some`: whether any process has such facets.
+    `some`: whether `facets` is not empty on some process.
     """
 
     def __init__(self, form: FacetForm, facets: NDArray[np.int32], some: bool):
@@ -478,7 +477,7 @@ class FacetSum:
         return compiled.bind(self._facets) if len(self._facets) else None
 
     def assemble_matrix(self, A: PETSc.Mat) -> None:
-        """Add the matrix to `A`, with unrolled local dofs and without final assembly."""
+        """Add the matrix, in unrolled local dofs, to `A`.  The caller must assemble `A`."""
         if self._bound is not None:
             self._of.compiled.assemble_matrix(A, None, self._bound)
 
@@ -489,13 +488,12 @@ class FacetSum:
 
 
 class PointExpression:
-    """A UFL expression of the fields of points, evaluated at every point.
+    """A UFL expression of quantities at the points, evaluated at every point.
 
-    Kernels are called for arbitrary cells, one cell for each point, so that a DG0 test function yields one value for
-    each point.  The result is divided by the volume of the cell.  Gradients of grid functions are allowed only if all
-    cells are equal.
+    The kernel of a form with a DG0 test function is called for one arbitrary cell for each point.  Its result is
+    divided by the volume of this cell.  Gradients of functions on the grid are allowed only if all cells are equal.
 
-    `expression`: UFL expression of any shape in the fields of `points`.
+    `expression`: UFL expression of any shape, with coefficients of `points`.
     """
 
     def __init__(self, expression: ufl.core.expr.Expr, points: FormPoints):
@@ -547,7 +545,7 @@ class CellSums:
         self._form = PointForm(ufl.inner(ufl.as_vector(quantities), q) * points.dx, points, dense)
 
     def __call__(self, data: PointData, given: Given = NONE) -> NDArray[np.float64]:
-        """Return the sums (cells, quantities) in the cells that contain points."""
+        """Return the sums (cells, quantities) for the cells that contain points."""
         even, filled = self._grid.even, data.places.filled
         sums = np.zeros((len(filled) if even else self._grid.num_local, self._count))
         self._form.assemble_vector(sums.reshape(-1), data, given)

@@ -20,13 +20,12 @@ from mpm_dolfinx.base import _compat
 
 
 class Unknowns:
-    """Numbering of a subset of the degrees of freedom of a function's space.
+    """Numbering of the unknowns, a subset of the degrees of freedom of a function space.
 
     `function`: any function of the space, with ghosts.
     `dofs`: unrolled local degrees of freedom that are unknowns, ghosts included.
-    `at`: positions (entities, d), in m, of the nodes or cells of this process, and a mask of entities.  Only the matrix
-    rows of masked entities may have entries in columns of other processes.  Without `at`, all rows may have such
-    entries, and the space computes the positions.
+    `at`: positions (entities, d), in m, of this process's nodes or cells, and a mask.  Only where the mask is True,
+    matrix rows may have entries in columns of other processes.  Without `at`, all rows may have such entries.
     """
 
     def __init__(self, function: fem.Function, dofs: NDArray[np.int64], at: tuple[NDArray, NDArray] | None = None):
@@ -37,7 +36,7 @@ class Unknowns:
         owned = dofmap.index_map.size_local * dofmap.bs
         number = np.full(len(function.x.array), -1, dtype=np.int32)
         self.owned = dofs[dofs < owned]
-        """Unrolled local degree of freedom of each entry of a vector."""
+        """Unrolled local degree of freedom of each entry of a vector of unknowns."""
         self.size = len(self.owned)
         self.near = True if near is None else near[self.owned // dofmap.bs]
         start = 0
@@ -59,23 +58,23 @@ class Unknowns:
 
     @property
     def nodes(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Node and component of each entry of a vector."""
+        """Node (or cell) and component of each entry of a vector of unknowns."""
         return np.divmod(self.owned, self.dim)
 
     @property
     def positions(self) -> NDArray[np.float64]:
-        """Positions (n, d), in m, of the entries of a vector."""
+        """Position (n, d), in m, of each entry of a vector of unknowns."""
         x = self._space.tabulate_dof_coordinates() if self._x is None else self._x
         return x[self.owned // self.dim, : self._space.mesh.geometry.dim]
 
     def gather_owned(self, values: NDArray[np.float64]) -> PETSc.Vec:
-        """Return a new vector with these values on this process."""
+        """Return a new vector of unknowns, with the given values on this process."""
         v = self.vector()
         v.array_w[:] = values
         return v
 
     def vector(self) -> PETSc.Vec:
-        """Return a new vector of zeros."""
+        """Return a new vector of unknowns, with zeros."""
         if self.comm.size == 1:
             v = PETSc.Vec().createSeq(self.size, comm=self.comm)
         else:
@@ -84,12 +83,12 @@ class Unknowns:
         return v
 
     def gather(self, values: NDArray[np.float64], out: PETSc.Vec) -> PETSc.Vec:
-        """Copy the values of the unknowns from a local array into `out`, and return `out`."""
+        """Copy the unknowns from an array of all local dofs into `out`, and return `out`."""
         out.array_w[:] = values[self.owned]
         return out
 
     def add(self, function: fem.Function, scale: NDArray[np.float64] | float, v: PETSc.Vec) -> None:
-        """Add scale * v to a function, and update its ghosts."""
+        """Add scale * v to a function, with a vector v of unknowns, and update the function's ghosts."""
         values = function.x
         values.array[self.owned] += scale * v.array_r
         values.scatter_forward()
@@ -109,9 +108,9 @@ def matrix(rows: Unknowns, columns: Unknowns, row_length: int | NDArray[np.int64
 
 
 def petsc_matrix(rows: scipy.sparse.csr_matrix, columns: int, comm: MPI.Intracomm, own: bool = False) -> PETSc.Mat:
-    """Return the PETSc matrix with `rows` on this process and `columns` local columns.
+    """Return the PETSc matrix with the given rows and number of columns on this process.
 
-    `own`: whether column indices are local.
+    `own`: whether `rows` has local column indices, and not global ones.
     """
     rows.sort_indices()  # PETSc requires it
     start = int(comm.exscan(columns) or 0) if own and comm.size > 1 else 0
@@ -129,7 +128,7 @@ def insert_for_each_axis(A: PETSc.Mat, nodes: NDArray[np.int32], dim: int, matri
 
 
 def zero(A: PETSc.Mat) -> None:
-    """Set a matrix to zero before assembly.  The matrix may never have been assembled."""
+    """Set a matrix to zero before assembly, also if it has never been assembled."""
     if A.assembled:
         A.zeroEntries()
 
@@ -137,23 +136,22 @@ def zero(A: PETSc.Mat) -> None:
 def collect_garbage(comm: MPI.Intracomm) -> None:
     """Free the PETSc objects that Python has released on all processes.  All processes must call this function.
 
-    PETSc keeps released objects, because the order of release may differ between processes.  Versions of PETSc before
-    about 3.20 also keep released objects on a single process.  Without this function, a run keeps the matrices of all
-    its steps.
+    PETSc keeps released objects in memory, because the order of release may differ between processes.  PETSc before
+    about 3.20 also does so on a single process.  Without this function, the matrices of all steps would stay in memory.
     """
     PETSc.garbage_cleanup(comm)
     PETSc.garbage_cleanup(PETSc.COMM_SELF)
 
 
 def sum_ghosts(function: fem.Function) -> NDArray[np.float64]:
-    """Add the ghost entries to the owned entries, and return the local array."""
+    """Add the values at ghosts to the values of their owners, and return the local array."""
     if function.function_space.mesh.comm.size > 1:
         _compat.scatter_reverse_add(function)
     return function.x.array
 
 
 def with_ghosts(space, rows: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return `rows` with the entries of ghosts replaced by the values of their owners.
+    """Return `rows`, in which ghosts have the values of their owners.
 
     `rows` (n, k): values at the n local dofs.
     """

@@ -13,8 +13,8 @@ class Velocity:
     """Velocity `(u - past) / own` at the end of a substep.
 
     `u`, in m: displacement increment of the step.
-    `own`, in s: time weight of the rate in the substep; in backward Euler, the length of the step.
-    `past`, in m: part of u that is due to the rate of the previous substep; in backward Euler, zero.
+    `own`, in s: weight a_ii dt of the velocity at the end of the substep; in backward Euler, the length of the step.
+    `past`, in m: part of u that is due to the velocity in the previous substep; in backward Euler, zero.
     """
 
     def __init__(self, u: fem.Function):
@@ -33,6 +33,6 @@ class Velocity:
         return self._past in form.coefficients()
 
     def set(self, own: float, past: float, dofs: NDArray[np.int64]) -> None:
-        """Set `own`, in s, and set the field `past` to the argument `past` times the present u."""
+        """Set `own`, in s.  Set the field `past` to the present u, multiplied by the argument `past`."""
         self._own.value = own
         self._past.x.array[dofs] = past * self._u.x.array[dofs]
