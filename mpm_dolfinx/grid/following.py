@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Grid lines that follow a tool or a function, from one reset of the grid to the next.
 
-The number of lines never changes, and the sides of the grid do not move.  Points carry the whole state over a reset of
-the grid, so lines may move between any two steps.
+The number of lines never changes, and the sides of the grid do not move.  The points store the whole state when the
+grid is reset, so lines may move between any two steps.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from mpm_dolfinx.base.validation import asked, called, check_names, line
 from mpm_dolfinx.grid.lines import checked, equal, rounding
 
 PLACES = ("t", "x")
-"""Allowed parameters of a function that returns grid lines."""
+"""Names of allowed parameters of a function that returns grid lines."""
 
 
 def check_follow(follow: Any, lines: Sequence[ArrayLike] | None) -> None:
-    """Raise ValueError for an object that lines cannot follow, and for a grid without lines."""
+    """Raise ValueError if grid lines cannot follow an object, or if a grid has no lines."""
     if hasattr(follow, "pose"):
         if lines is not None and all(map(equal, checked(lines))):
             raise ValueError(f"grid: follow = {line(follow)}: all cells are equal, must be smaller around the tool")
@@ -38,10 +38,10 @@ def check_follow(follow: Any, lines: Sequence[ArrayLike] | None) -> None:
 def lines_at(
     follow: Any, given: Sequence[NDArray[np.float64]], t: float, x: NDArray[np.float64] | None
 ) -> list[NDArray[np.float64]]:
-    """Return the lines (m) along each axis from a function `follow` of time t (s) and positions x (n, d), in m.
+    """Return the lines (m) along each axis that a user's function `follow` gives at time t (s) and positions x (n, d),
+    in m.
 
-    `given` are the lines with which the grid was created.  The number of lines along each axis, the first coordinate
-    and the last coordinate must not change.
+    Number of lines, first and last coordinate along each axis must be as in `given`, the lines at the start.
     """
     what, count = f"grid: follow at t = {t:g} s", [len(of) for of in given]
     allowed = f"{' and '.join(map(str, count))} coordinates along the axes"
@@ -60,14 +60,14 @@ def lines_at(
 def carried(lines: Sequence[NDArray[np.float64]], shift: NDArray[np.float64]) -> list[NDArray[np.float64]]:
     """Return the lines (m) along each axis after the smallest cells have moved by `shift` (d,), in m.
 
-    The smallest cells move by a whole number of cells, rounded towards zero.  A tool therefore moves through the
-    smallest cells as through fixed cells.  On each side of the smallest cells, the size of the k-th cell (k = 1, 2,
-    ...) is multiplied by the k-th power of a common factor.
+    The smallest cells move by a whole number of cells, rounded towards zero.  Relative to these cells, a tool therefore
+    moves as in a fixed grid.  On each side of the smallest cells, the size of the k-th cell (k = 1, 2, ...) is
+    multiplied by the k-th power of a common factor.
 
     Raises
     ------
     ValueError
-        The smallest cells touch a side and move along its normal, or would no longer be the smallest cells.
+        The smallest cells touch a side and move along its normal, or other cells would become smaller.
     """
     out = []
     for letter, x, step in zip("xyz", lines, shift.tolist(), strict=False):

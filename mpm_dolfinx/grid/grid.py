@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: MIT
 """Background grid: a box of quadrilaterals or hexahedra between lines along the axes.
 
-Grids of equal cells locate points by arithmetic.  All other grids search along each axis.  Methods such as `sizes` and
-`volumes` return a value for each cell.  For equal cells these methods return a single row (`h`) or a single number.
+A grid of equal cells computes the cells of points by division.  Other grids search along each axis.  Methods such as
+`sizes` and `volumes` return a value for each cell, but for equal cells a single row (`h`) or a single number.
 
-The mesh is created at its first use.  Before that, a simulation distributes the cells to processes by numbers of
-points.
+The mesh is created at its first use.  Before its first use, a simulation distributes the cells to processes by numbers
+of points.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ REACH = 1e-4  # distance, in cell sizes, by which bodies may lie outside the gri
 TURN = 2 * np.pi
 """Angle of a whole revolution.  Axisymmetric volumes, forces and outflows refer to this angle.  Source: definition."""
 CHUNK = 2**14
-"""Number of rows of an array that are processed together, a limit for the size of temporary arrays."""
+"""Largest number of rows of an array that are processed together.  It limits the size of temporary arrays."""
 SNAP = 1e-10
-"""A vertex closer to a grid plane than this distance, in cell sizes, counts as on the plane; see `Grid.snap`."""
+"""Distance, in cell sizes, below which a vertex is considered to lie on a plane of the grid; see `Grid.snap`."""
 ORDER = "the order is Grid(lower, upper, cells)"
 MANY = "grid: h is undefined for unequal cells, must be replaced by sizes"
 
@@ -54,24 +54,24 @@ def cross_in_plane(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np
 
 
 def corner_bits(dim: int) -> NDArray[np.int64]:
-    """Return the ends (2^d, d), 0 or 1, at which the corners of a box lie along each axis."""
+    """Return coordinates (2^d, d), 0 or 1, of the corners of the unit box."""
     return (np.arange(2**dim)[:, None] >> np.arange(dim)) & 1
 
 
 def _faces(dim: int) -> NDArray[np.int64]:
-    """Return the corner indices of a box's faces.  Face `2 a + e` is at end `e` of axis `a`."""
+    """Return the corner indices of the faces of a box.  Face `2 a + e` is at end `e` (0 or 1) of axis `a`."""
     bits = corner_bits(dim)
     return np.stack([(bits[:, axis] == end).nonzero()[0] for axis in range(dim) for end in (0, 1)])
 
 
 FACES = {d: _faces(d) for d in (2, 3)}
-"""Corner indices (2d, 2^(d-1)) of the faces of a box.  The box is a cell or a particle domain."""
+"""Corner indices (2d, 2^(d-1)) of the faces of a cell or a particle domain."""
 FACE_SIGNS = (-1, 1, 1, -1, -1, 1)
-"""Orientation (6,) of faces with corners in the order of `FACES`: 1 outward, -1 inward.  In 2D only the first four
-apply.
+"""Direction of the normals (6,) of faces with corners in the order of `FACES`: 1 outward, -1 inward.  In 2D there are
+only the first four.
 """
 ABOUT_MIDDLE = ((0, 1, 4), (1, 3, 4), (3, 2, 4), (2, 0, 4))
-"""Triangles of a face in 3D.  Each triangle has two corners and the middle of the face, so no diagonal is preferred."""
+"""Triangles that divide a face in 3D symmetrically.  Each triangle has two corners and the middle of the face."""
 
 
 def side(name: str, dim: int) -> tuple[int, int]:
@@ -82,12 +82,12 @@ def side(name: str, dim: int) -> tuple[int, int]:
 
 
 def in_chunks(count: int) -> list[slice]:
-    """Divide `count` rows into consecutive slices of at most `CHUNK` rows.  Without rows the list is empty."""
+    """Divide `count` rows into consecutive slices of at most `CHUNK` rows.  For 0 rows the list is empty."""
     return [slice(start, min(start + CHUNK, count)) for start in range(0, count, CHUNK)]
 
 
 def sum_by(index: NDArray, values: NDArray[np.float64], size: int) -> NDArray[np.float64]:
-    """Return the sums (..., size) of values (..., n) with equal index (n,).  Sums are floats."""
+    """Return the sums (..., size) of all values (..., n) with equal index (n,), as floats."""
     shape = values.shape[:-1]
     if shape and len(index) > CHUNK:  # the index of all rows together would take as much memory as the values
         return np.array([sum_by(index, row, size) for row in values])
@@ -98,21 +98,21 @@ def sum_by(index: NDArray, values: NDArray[np.float64], size: int) -> NDArray[np
 
 
 def sums_of_rows(index: NDArray, rows: NDArray[np.float64], size: int) -> NDArray[np.float64]:
-    """Return the sums (size, ...) of rows (n, ...) with equal index (n,).  Sums are floats."""
+    """Return the sums (size, ...) of all rows (n, ...) with equal index (n,), as floats."""
     return np.ascontiguousarray(np.moveaxis(sum_by(index, np.moveaxis(rows, 0, -1), size), -1, 0))
 
 
 def means_of_rows(index: NDArray, weight: NDArray, rows: NDArray[np.float64], size: int) -> NDArray[np.float64]:
-    """Return the means (size, ...), with a weight (n,), of rows (n, ...) with equal index (n,); 0 without weight."""
+    """Return weighted means (size, ...) of rows (n, ...) with equal index (n,), or 0 where the weights (n,) are 0."""
     whole = sum_by(index, weight, size)
     sums = sum_by(index, weight * np.moveaxis(rows, 0, -1), size)
     return np.ascontiguousarray(np.moveaxis(sums / np.where(whole == 0, 1.0, whole), -1, 0))
 
 
 def linked(count: int, one: NDArray[np.int64], other: NDArray[np.int64]) -> tuple[NDArray[np.int64], int]:
-    """Return the group (count,) of each object, and the number of groups of objects that links connect.
+    """Return the group (count,) of each object, and the number of groups.  Links connect the objects of a group.
 
-    `one`, `other` (m,): both objects of each link.
+    `one`, `other` (m,): the two objects of each link.
     """
     links = coo_matrix((np.ones(len(one)), (one, other)), shape=(count, count))
     number, group = connected_components(links, directed=False)
@@ -124,10 +124,10 @@ def polynomial(
 ) -> NDArray[np.float64]:
     """Return the values (d, n) of a multilinear vector field in cells.
 
-    `coefficients` (d, k, cells): factors of the monomials, in the order of `Grid.monomials`.
+    `coefficients` (d, k, cells): coefficients of the field, in the order of `Grid.monomials`.
     `y` (d, n), m: offsets from the midpoints of the cells.
-    `slot` (n,): index of each value's cell.
-    `without`: an axis along which the field is constant, or None.
+    `slot` (n,): index of the cell in which a value is computed.
+    `without`: axis along which the field is constant, or None.
     """
     rows = [row for row in range(2 ** len(y)) if without is None or not row >> without & 1]
     total = np.zeros(y.shape)
@@ -141,13 +141,13 @@ def polynomial(
 
 
 def ranges(first: NDArray[np.int64], count: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return two arrays (n,) for all integers in the ranges: the index of the range, and the integer."""
+    """Return all integers (n,) in the ranges `first` to `first + count - 1`, after the index (n,) of their range."""
     of = np.arange(len(count)).repeat(count)
     return of, np.arange(len(of)) + np.repeat(first - (np.cumsum(count) - count), count)
 
 
 def among(numbers: NDArray[np.integer], chosen: NDArray[np.integer]) -> NDArray[np.bool_]:
-    """Return which numbers (...) occur in the sorted array `chosen` (m,)."""
+    """Return for each of the `numbers` (...) whether the sorted array `chosen` (m,) contains the number."""
     if not len(chosen):
         return np.zeros(numbers.shape, dtype=bool)
     return chosen[np.minimum(chosen.searchsorted(numbers), len(chosen) - 1)] == numbers
@@ -156,9 +156,9 @@ def among(numbers: NDArray[np.integer], chosen: NDArray[np.integer]) -> NDArray[
 def values_at(
     chosen: NDArray[np.int64], numbers: NDArray[np.int64], values: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the values (n, k) of the numbers `chosen` (n,), or 0 for numbers without values.
+    """Return the values (n, k) that belong to the numbers `chosen` (n,), or 0 for a number without values.
 
-    `numbers` (m,): sorted numbers that have the `values` (m, k).
+    `numbers` (m,): sorted numbers, to which the `values` (m, k) belong.
     """
     at = numbers.searchsorted(chosen)
     found = np.append(numbers, -1)[at] == chosen
@@ -166,7 +166,7 @@ def values_at(
 
 
 def across_faces(grid: Grid, n: Any) -> tuple[Any, Any, Any]:
-    """Return three UFL lengths along the normal n of a face: of the "+" cell, of the "-" cell, and their mean."""
+    """Return as UFL the lengths of the "+" and "-" cells along the normal n of their face, and the mean length."""
     h = grid.edge_in_forms()
     if grid.even:
         return (sum(abs(n[a]) * h[a] for a in range(grid.dim)),) * 3
@@ -183,7 +183,7 @@ class CellPlaces(NamedTuple):
 
 
 class Spacing(NamedTuple):
-    """The lines of a grid, and quantities that depend on the lines.  `Grid` documents the attributes."""
+    """Lines of a grid, and quantities that depend on the lines.  `Grid` documents these attributes."""
 
     lines: tuple[NDArray[np.float64], ...]
     widths: tuple[NDArray[np.float64], ...]
@@ -194,9 +194,9 @@ class Spacing(NamedTuple):
 
 
 class LocalCells:
-    """Local indices of cells by lexicographic indices: `self[number]`.  Cells of other processes have the index -1.
+    """Table that converts lexicographic indices of cells to local indices: `self[number]`, -1 on other processes.
 
-    `number` (cells,): lexicographic indices of the local cells.  The table covers the box around these cells only.
+    `number` (cells,): lexicographic indices of the local cells.
     """
 
     def __init__(self, grid: Grid, number: NDArray[np.int64]):
@@ -230,13 +230,13 @@ class Cells:
     cell_number
         Lexicographic index of each local cell.
     partition
-        The box of cells of each process.
+        The boxes of cells that the processes own.
     locals
-        Local index of each cell in all copies of the box (`Grid.copies`).  Cells of other processes have -1.
+        Local index of each cell in all copies of the box (`Grid.copies`), or -1 if the cell is on another process.
     cell_facets : (cells, 2d)
         Facets of each cell.
     facet_cells : (facets, 2)
-        The two cells at each facet.  At the boundary the second cell is -1.
+        The two cells at each facet, or one cell and -1 at the boundary.
     """
 
     def __init__(self, grid: Grid, mesh: Any, partition: Partition):
@@ -277,13 +277,13 @@ class Cells:
         self.facet_cells[two, 1] = adjacency.array[first[two] + 1]
         self.facets_owned = topology.index_map(d - 1).size_local
         self.cellwise = cache(partial(_compat.function_space, mesh, "DG", 0))
-        """Function space of each value shape, created once."""
+        """Function that returns the DG0 space for a value shape, and creates each space only once."""
         self.memory = cache(lambda shape, space=self.cellwise: fem.Function(space(shape)))
         self.move(grid)
 
     @cached_property
     def near_others(self) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Two masks: local nodes at most two cells away from shared nodes, and local cells with shared nodes."""
+        """Masks of local nodes within two cells of nodes that processes share, and of local cells with such nodes."""
         holders = fem.Function(self._nodes)
         holders.x.array[:] = 1.0
         _compat.scatter_reverse_add(holders)
@@ -345,12 +345,12 @@ class Grid:
         Ascending coordinates of all grid lines, instead of `lower`, `upper` and `cells`; see `graded`.  Equally spaced
         lines along all axes give a grid of equal cells.
     follow : Tool, or callable -> (n,) along each axis, m
-        Object that the lines follow, at each reset of the grid.  With a tool, the smallest cells of `lines` move with
-        one point: the centre of a ball, the tip of a cone, or the mean of the corners.  If the tool's shape is a
-        function, the smallest cells move with `Tool.centre`.  The other cells widen or narrow.  The tool must be a
-        condition of the first stage.  Lines do not move in stages without this tool.  A function depends on time t (s),
-        the positions x (n, d) of all points, or both.  The function returns all lines.  Along each axis, the number of
-        lines and the first and last coordinate must be as in `lines`.
+        Object that the lines follow, at each reset of the grid.  The smallest cells of `lines` move with one point of a
+        tool: the centre of a ball, the tip of a cone, or the mean of the corners.  If the tool's shape is a function,
+        the smallest cells move with `Tool.centre`.  All other cells become wider or narrower.  The tool must be a
+        condition of the first stage.  Lines do not move in stages without this tool.  A function of time t (s), of the
+        positions x (n, d) of all points, or of both returns all lines.  Along each axis, the number of lines and the
+        first and last coordinate must be as in `lines`.
     axisymmetric
         Whether the first axis is the radius r >= 0, and the second axis is the axis of revolution.  There is no
         torsion.  Volumes (m^3), forces (N) and outflows (m^3/s) refer to the whole revolution.  If the grid begins at r
@@ -381,19 +381,18 @@ class Grid:
     least, most : m
         Shortest and longest edge of all cells.
     snap
-        Distances (d,) along the axes, in cell sizes.  Vertices that are nearer to a grid plane count as on the plane.
+        Distances (d,) along the axes, in cell sizes, below which a vertex is considered to lie on a plane of the grid.
     base : (d,), m
-        Origin of all internal positions: the lower corner of the grid, in axisymmetry at the radius 0.  This origin
-        reduces rounding errors of positions far from the true origin.
+        Origin of all internal positions: the lower corner of the grid, in axisymmetry at the radius 0.  A near origin
+        reduces rounding errors.
     low, high : (d,), m
         Lower and upper corner relative to `base`.
     stretches
         Dimension of deformation gradients: d, or 3 in axisymmetry, because of the circumferential stretch.
     mesh
         The dolfinx mesh, created at its first use.  The coordinates of the mesh are relative to `base`.  On several
-        processes, a second scene with another distribution of points has a separate mesh and grid, `Simulation.grid`.
-        A scene that distributes its cells anew also has a separate mesh and grid.  Scenes with terms or sources always
-        keep this mesh, because terms may be defined on it.
+        processes, a scene whose cells are distributed in another way has a separate mesh and grid, `Simulation.grid`.
+        Scenes with terms or sources always use this mesh, because terms may be defined on it.
     """
 
     def __init__(
@@ -439,7 +438,7 @@ class Grid:
         self.low, self.high = self.lower - self.base, self.upper - self.base
         self._h = (self.upper - self.lower) / self.shape if self.even else None
         self.seeded: tuple[NDArray[np.float64], ...] | None = None if self.even else self.from_base(lines)
-        """Given lines (n,) along each axis, in m, relative to the base.  Bodies are seeded on these lines."""
+        """Initial lines (n,) along each axis, in m, relative to the base.  Bodies are seeded on these lines."""
         self._spacing = self._spaced(self.seeded)
         self.comm = comm
         self._cells: Cells | None = None
@@ -449,7 +448,7 @@ class Grid:
         return tuple(x - start for x, start in zip(lines, self.base, strict=True))
 
     def _spaced(self, lines: tuple[NDArray[np.float64], ...] | None) -> Spacing:
-        """Return the spacing of the grid, with lines relative to the base, or with equal cells."""
+        """Return the `Spacing` for lines relative to the base, or for equal cells."""
         finest, most = self._h, self._h
         if lines is None:
             lines = tuple(low + np.arange(n + 1) * h for low, n, h in zip(self.low, self.shape, self._h, strict=True))
@@ -462,8 +461,8 @@ class Grid:
     def move(self, lines: Mapping[str, NDArray[np.float64]] | None) -> None:
         """Move the lines of a grid with `follow` to coordinates (n,) under the keys "x", "y", "z", in m from the base.
 
-        With None, the lines return to their initial coordinates.  Afterwards all coordinates of nodes, cells and mesh
-        are exactly as in a new grid with these lines.
+        With None, the lines return to their initial coordinates.  All coordinates of nodes, cells and mesh then equal
+        exactly the coordinates in a new grid with these lines.
         """
         new = self.seeded if lines is None else tuple(lines[letter] for letter in "xyz"[: self.dim])
         if self.follow is not None and any((x != old).any() for x, old in zip(new, self.lines, strict=True)):
@@ -483,43 +482,43 @@ class Grid:
 
     @cached_property
     def cell_volume(self) -> float:
-        """Volume of equal cells, m^d.  In axisymmetry: area of a cell in the plane."""
+        """Volume of equal cells, m^d, or in axisymmetry the area of a cell in the plane."""
         return float(np.prod(self.h))
 
     def sizes(self, cells: Any) -> NDArray[np.float64]:
-        """Return the edge lengths (n, d) of local cells, in m.  Equal cells give one row (d,)."""
+        """Return the edge lengths (n, d) of local cells, in m."""
         return self._h if self.even else self._of_process.at.sizes[cells]
 
     def along(self, cells: Any, axis: Any) -> NDArray[np.float64]:
-        """Return the edge lengths (n,) of local cells along an axis, in m.  `axis` may differ between cells."""
+        """Return the edge lengths (n,) of local cells along an axis, or along one axis for each cell, in m."""
         return self.h[axis] if self.even else self._of_process.at.sizes[cells, axis]
 
     def between(self, cells: Any, others: Any, axis: Any) -> NDArray[np.float64]:
-        """Return the distances (n,) from midpoints of local cells to their neighbours along an axis, in m."""
+        """Return the distances (n,) of midpoints of local cells from midpoints of neighbours along an axis, in m."""
         return self.h[axis] if self.even else (self.along(cells, axis) + self.along(others, axis)) / 2
 
     def volumes(self, cells: Any) -> NDArray[np.float64] | float:
-        """Return the volumes (n,) of local cells in m^d, or their areas in axisymmetry.  Equal cells give a number."""
+        """Return the volumes (n,) of local cells in m^d, or in axisymmetry the areas of cells in the plane."""
         return self.cell_volume if self.even else self._of_process.at.sizes[cells].prod(axis=-1)
 
     def smallest_faces(self, cells: Any) -> NDArray[np.float64] | float:
-        """Return the areas (n,) of the smallest faces of local cells, in m^(d-1).  Equal cells give one number."""
+        """Return the area (n,) of the smallest face of each local cell, in m^(d-1)."""
         return self.volumes(cells) / self.sizes(cells).max(axis=-1)
 
     def sizes_of(self, number: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the edge lengths (n, d) of cells by lexicographic indices, in m.  Equal cells give one row."""
+        """Return the edge lengths (n, d) of the cells with the lexicographic indices `number`, in m."""
         if self.even:
             return self._h
         return self.widths_of(np.stack(np.unravel_index(number % self.cells, tuple(self.shape)), axis=-1))
 
     def sizes_at(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the edge lengths (..., d) of cells at positions x, in m from the base.  Equal cells give one row."""
+        """Return the edge lengths (..., d) of the cells at positions x, in m from the base."""
         if self.even:
             return self._h
         return self.widths_of(self.index_from_base(x.reshape(-1, self.dim))).reshape(x.shape)
 
     def in_cells(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Convert positions x (..., d), in m from the base, to cell index plus fraction of the cell along each axis."""
+        """Convert positions x (..., d), in m from the base, to units of cells: cell index plus fraction of the cell."""
         if self.even:
             return (x - self.low) / self._h
         out = np.empty(x.shape)
@@ -529,15 +528,15 @@ class Grid:
         return out
 
     def cells_between(self, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the distances (..., d) between x and y along the axes, in cells, see `in_cells`."""
+        """Return the distances (..., d) between positions x and y along the axes, in units of cells (`in_cells`)."""
         if self.even:
             return np.abs((y - x) / self._h)
         return np.abs(self.in_cells(y) - self.in_cells(x))
 
     def places(self, index: NDArray[np.integer], share: NDArray[np.float64] | float = 0.0) -> NDArray[np.float64]:
-        """Return positions (n, d) in m from the base: lower corners of cells plus a fraction `share` of their edges.
+        """Return positions (n, d) in m from the base, at the fraction `share` of the edges of cells.
 
-        `index` (n, d): indices of cells along the axes.  Cells beyond a side have the size of the outermost cell.
+        `index` (n, d): indices of cells along the axes.  Beyond a side, cells are as large as the outermost cell.
         """
         if self.even:
             return self.low + (index + share) * self._h
@@ -549,25 +548,25 @@ class Grid:
         return out
 
     def edge_in_forms(self) -> Any:
-        """Edge lengths (d,) of a cell as a UFL coefficient, in m, or as a constant if cells are equal."""
+        """Return the edge lengths (d,) of a cell, in m, as a UFL coefficient, or as a constant if cells are equal."""
         return fem.Constant(self.mesh, self._h) if self.even else self._of_process.edges
 
     def nodes_along(self, x: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the indices (..., d) along the axes of nodes at positions x, in m from the base."""
+        """Return the indices (..., d), along the axes, of the nodes at positions x, in m from the base."""
         return np.rint(self.in_cells(x)).astype(np.int64)
 
     def widths_of(self, index: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the edge lengths (n, d) of cells with indices (n, d), in m.  Equal cells give one row."""
+        """Return the edge lengths (n, d) of the cells with indices (n, d) along the axes, in m."""
         if self.even:
             return self._h
         return np.stack([w[i] for w, i in zip(self.widths, index.T, strict=True)], axis=-1)
 
     def next_plane(self, axis: int, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the next line (n,) above coordinates x (n,) along an axis of unequal cells, in m; inf if none."""
+        """Return the next line (n,) above coordinates x (n,), both in m, along an axis of unequal cells, or inf."""
         return np.append(self.lines[axis], np.inf)[self.lines[axis].searchsorted(x, side="right")]
 
     def cells_along(self, axis: int, x: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the indices of cells in the grid nearest to coordinates x (m) along an axis of unequal cells."""
+        """Return indices along an axis of unequal cells: the cells with coordinates x (m), or the outermost cells."""
         return np.minimum(np.maximum(self.lines[axis].searchsorted(x, side="right") - 1, 0), self.shape[axis] - 1)
 
     mesh = of_cells("mesh")
@@ -586,21 +585,21 @@ class Grid:
 
     @property
     def _of_process(self) -> Cells:
-        """The cells of this process.  By default each process gets an equal number of cells."""
+        """The cells of this process.  Without loads, each process has an equal number of cells."""
         if self._cells is None:
             self.share(np.zeros(int(np.prod(self.shape))))
         return self._cells
 
     def share(self, load: NDArray[np.float64]) -> None:
-        """Create the mesh, if it does not exist, with an even distribution of the loads (cells,) among processes."""
+        """Create the mesh, if it does not exist, with equal sums of the loads (cells,) on all processes."""
         if self._cells is None:
             self._cells = self._made(boxes(load.reshape(self.shape), self.comm.size))
 
     def shared(self, load: NDArray[np.float64], keep: bool) -> Grid:
-        """Return this grid, or an equal grid with another mesh, whose loads are evenly distributed among processes.
+        """Return a grid in which loads are evenly distributed among processes: this grid, or a copy with another mesh.
 
         `load` (cells,): load >= 0 of each cell, such as its number of points.
-        `keep`: whether to return this grid in any case, because other objects were created on its mesh.
+        `keep`: whether to return this grid in any case, because other objects use its mesh.
         """
         new = boxes(load.reshape(self.shape), self.comm.size)
         if self._cells is None:
@@ -610,10 +609,10 @@ class Grid:
         return self
 
     def better(self, x: NDArray[np.float64]) -> NDArray[np.int64] | None:
-        """Return boxes (ranks, 2, d) that distribute points at x more evenly than the present boxes, or None.
+        """Return boxes (ranks, 2, d) that distribute the points of all processes more evenly than the present boxes.
 
-        The points of all processes are counted.  If the imbalance of the present boxes is at most `IMBALANCE`, the
-        result is None.
+        The result is None if the imbalance is at most `IMBALANCE`, or if new boxes are not better.  `x`: positions of
+        points.
         """
         number = self.number(self.index_from_base(x))
         counts = over_all(self.comm, np.bincount(self.owner(number), minlength=self.comm.size))
@@ -623,11 +622,11 @@ class Grid:
         return better(over_all(self.comm, load).reshape(self.shape), self.partition.boxes)
 
     def check_boxes(self, boxes: NDArray[np.int64]) -> None:
-        """Raise ValueError for boxes (ranks, 2, d) that do not fill the grid exactly once."""
+        """Raise ValueError if boxes (ranks, 2, d) do not fill the grid exactly once."""
         Partition(boxes, tuple(self.shape))
 
     def distributed(self, boxes: NDArray[np.int64]) -> Grid:
-        """Return an equal grid, with the present lines, whose mesh is distributed by the boxes (ranks, 2, d)."""
+        """Return a copy of this grid and its present lines, with the boxes (ranks, 2, d) of the processes."""
         other = self._again()
         other.seeded, other._spacing = self.seeded, self._spacing
         other._cells = other._made(boxes)
@@ -662,7 +661,7 @@ class Grid:
 
     @property
     def copies(self) -> int:
-        """Number of copies of the box in the mesh: one, or in `GridOfGroups` the number of contact groups."""
+        """Number of copies of the grid's box in the mesh: one, or in `GridOfGroups` one for each contact group."""
         return 1
 
     @property
@@ -681,20 +680,20 @@ class Grid:
         return int(np.prod(self.shape + 1))
 
     def copy(self, ids: NDArray[np.int64]) -> NDArray[np.int64] | int:
-        """Return, for material points `ids` (n,), the index of the first cell in their copy of the box."""
+        """Return for each of the material points `ids` (n,) the index of the first cell in its copy of the box."""
         return 0
 
     def cellwise(self, shape: tuple[int, ...] = ()):
-        """Return the space of cellwise constant functions (DG0) with this value shape.  Each space is created once."""
+        """Return the space of cellwise constant functions (DG0) with a value shape."""
         return self._of_process.cellwise(shape)
 
     def coefficient(self, shape: tuple[int, ...] = ()) -> fem.Function:
-        """Return a cellwise coefficient of forms.  All coefficients of the same value shape share one array."""
+        """Return a cellwise coefficient for forms.  All coefficients with the same value shape share one array."""
         return fem.Function(self.cellwise(shape), self._of_process.memory(shape).x)
 
     @property
     def given(self) -> dict[str, Any]:
-        """Arguments of an equal grid: corners and numbers of cells, or lines; then all other arguments."""
+        """Arguments with which `Grid` creates an equal grid, by name."""
         rest = {"axisymmetric": self.axisymmetric, "comm": self.comm}
         if self.even:
             return {"lower": self.lower, "upper": self.upper, "cells": self.shape, **rest}
@@ -712,7 +711,7 @@ class Grid:
         return self.axisymmetric and bool(self.lower[0] <= SAME * self.finest[0])
 
     def around(self, x: NDArray[np.float64]) -> NDArray[np.float64] | float:
-        """Return the factor from plane to volume integrals at x (n, d): 1, or in axisymmetry `2 pi r` (n,) in m."""
+        """Return the weight of volume integrals at x (n, d): `2 pi r` (n,), in m, in axisymmetry, and 1 otherwise."""
         return TURN * x[:, 0] if self.axisymmetric else 1.0
 
     def number(self, index: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -739,9 +738,9 @@ class Grid:
     def gathered(
         self, parts: Sequence[tuple[NDArray[np.int64], NDArray[np.float64], Mapping[str, NDArray]]]
     ) -> tuple[NDArray[np.int32], NDArray[np.float64], dict[str, NDArray[np.float64]]]:
-        """Send positions and their values to the owners of cells.  Return the local cells, positions and values.
+        """Send positions and values to the processes that own their cells.  Return local cells, positions and values.
 
-        `parts`: for each part, lexicographic cells (n,), positions (n, d), in m, and values (n, ...) by name.
+        `parts`: tuples of lexicographic indices of cells (n,), positions (n, d), in m, and values (n, ...) by name.
         """
         cell = np.concatenate([cell for cell, *_ in parts])
         x = np.concatenate([x for _, x, _ in parts])
@@ -759,27 +758,27 @@ class Grid:
         return self.locals[cell], x, fields
 
     def node_places(self, nodes: NDArray[np.integer]) -> NDArray[np.int64]:
-        """Return the indices (n, d + 1) of local nodes (n,) along the axes.  Column d is the index of the copy."""
+        """Return the indices (n, d + 1) of local nodes (n,): along each axis, and of the copy of the box."""
         copy = np.zeros(len(self.node_x), dtype=np.int64)
         if self.copies > 1:
             copy[self.cell_nodes] = (self.cell_number // self.cells)[:, None]
         return np.column_stack([self.nodes_along(self.node_x[nodes]), copy[nodes]])
 
     def node_numbers(self) -> NDArray[np.int64]:
-        """Return the lexicographic indices (nodes,), copy by copy, of the local nodes."""
+        """Return the lexicographic indices (nodes,) of the local nodes, counted over all copies of the box."""
         *index, copy = self.node_places(np.arange(len(self.node_x))).T
         return np.ravel_multi_index(tuple(index), tuple(self.shape + 1)) + copy * self.nodes
 
     def from_other(self, other: Grid, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Convert nodal values (unknowns,) from an equal grid with another partition to this grid."""
+        """Return nodal values (unknowns,) on this grid from nodal values on an equal grid with another partition."""
         rows = nodal.reshape(-1, self.dim)
         some = rows.any(axis=1)
         return self.from_rows(other.node_numbers()[some], rows[some])
 
     def from_rows(self, nodes: NDArray[np.int64], rows: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return nodal values (unknowns,) from rows (n, d) of values.  The nodes of a row may be on any process.
+        """Return nodal values (unknowns,) from rows (n, d) of values, whose nodes may be on any process.
 
-        `nodes` (n,): lexicographic indices.  The values of all other nodes are zero.
+        `nodes` (n,): lexicographic indices of the nodes of the rows.  All other nodes have zero values.
         """
         new = self.node_numbers()
         store, fetch = (Exchange(self.comm, (node % self.comm.size).astype(np.int32)) for node in (nodes, new))
@@ -787,13 +786,13 @@ class Grid:
         return fetch.back(values_at(fetch.send(new), node, store.send(rows)[first])).ravel()
 
     def cell_places(self, cells: NDArray[np.integer]) -> NDArray[np.int64]:
-        """Return the indices (n, d + 1) of local cells (n,) along the axes.  Column d is the index of the copy."""
+        """Return the indices (n, d + 1) of local cells (n,): along each axis, and of the copy of the box."""
         copy, number = np.divmod(self.cell_number[cells].astype(np.int64), self.cells)
         return np.array([*np.unravel_index(number, tuple(self.shape)), copy]).T.copy()
 
     def neighbours(self, cells: NDArray[np.integer]) -> NDArray[np.int64]:
-        """Return the local indices (n, d, 2) of neighbours of local cells, by axis and end.  Cells of other processes
-        have -1.
+        """Return the local indices (n, d, 2) of the two neighbours of local cells along each axis, or -1 for a
+        neighbour that is not on this process.
         """
         index = self.cell_places(cells)
         out = np.full((len(cells), self.dim, 2), -1, dtype=np.int64)
@@ -804,7 +803,7 @@ class Grid:
         return out
 
     def outside(self, x: NDArray[np.float64], tolerance: float = SAME) -> NDArray[np.bool_]:
-        """Return whether positions x, from the base, are outside the grid by more than `tolerance` cells."""
+        """Return whether positions x, in m from the base, are outside the grid by more than `tolerance` cells."""
         least = self.h if self.even else np.array([w[[0, -1]].min() for w in self.widths])  # at the sides
         tolerance = tolerance + rounding(np.array([self.lower, self.upper])) / least
         inside, cells = np.ones(len(x), dtype=bool), None if self.even else self.in_cells(x)
@@ -818,8 +817,8 @@ class Grid:
     ) -> NDArray[np.float64]:
         """Return the gradients (n, 2^d, d) of the Q1 shape functions of local cells at points x, in 1/m.
 
-        In 3D with `mixed`, gradients are means over subdomains about the points. `mixed` (n, 3), m^2: means, over each
-        subdomain, of the products of two offsets from the point.
+        In 3D with `mixed`, gradients are means over pieces with centroids x.  `mixed` (n, 3), m^2: means over each
+        piece of products of two offsets from its centroid.
         """
         hats, h = self._hats(cells, x), self.sizes(cells).T[..., None] if not self.even else self.h
         dN = np.empty((*hats[0].shape, self.dim))
@@ -834,23 +833,23 @@ class Grid:
 
     @cached_property
     def monomials(self) -> NDArray[np.float64]:
-        """Coefficients (2^d, 2^d) of the Q1 shape functions about the midpoint of a cell, one in each column.
+        """Coefficients of the Q1 shape functions: a row for each of 2^d monomials, a column for each of 2^d functions.
 
-        Row s belongs to the monomial s, the product of the offsets along the axes whose bits are set in s.  For
+        Monomial s is the product of the offsets from the cell's midpoint along the axes whose bits are set in s.  For
         unequal cells, the offsets are divided by the edge lengths, see `over_edges`.
         """
         bits = corner_bits(self.dim)[:, None]
         return np.where(bits, self.signs / (self.h if self.even else 1.0), 0.5).prod(axis=2)
 
     def over_edges(self, coefficients: NDArray[np.float64], cells: NDArray[np.int32]) -> NDArray[np.float64]:
-        """Divide coefficients (d, 2^d, cells) of `monomials` by edge lengths if cells are unequal, for offsets in m."""
+        """Convert coefficients (d, 2^d, cells) in the order of `monomials` to coefficients for offsets in m."""
         if self.even:
             return coefficients
         bits = corner_bits(self.dim)[:, None]
         return coefficients / np.where(bits, self.sizes(cells), 1.0).prod(axis=2)
 
     def shape_values(self, cells: NDArray[np.int32], x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the Q1 shape functions (n, 2^d) of local cells at points x."""
+        """Return the values (n, 2^d) of the Q1 shape functions of local cells at points x."""
         return reduce(np.multiply, self._hats(cells, x))
 
     def at(self, cells: NDArray[np.int32], x: NDArray[np.float64], u: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -862,14 +861,14 @@ class Grid:
         return out
 
     def _hats(self, cells: NDArray[np.int32], x: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-        """Return the factors of the shape functions, one for each axis.  Each factor is linear along its axis."""
+        """Return the factors of the Q1 shape functions, one for each axis.  A factor is linear along its axis."""
         y = (x - self.midpoints[cells]) / self.sizes(cells)
         return [0.5 + y[:, a, None] * self.signs[:, a] for a in range(self.dim)]
 
     def interior_facets(self, active: NDArray[np.bool_], cells: NDArray[np.int32]) -> NDArray[np.int32]:
         """Return the owned facets between two active cells.
 
-        `cells`: indices of the active cells, where the mask `active` is True.
+        `active`, `cells`: mask and indices of the active cells.
         """
         facets = np.unique(self.cell_facets[cells])
         facets = facets[facets < self.facets_owned]
@@ -884,8 +883,8 @@ class Grid:
 
 
 def begin_with(name: str, grid: Any) -> None:
-    """Move the lines of a grid with `follow` back to their initial coordinates, for new bodies and scenes. Raise
-    ValueError if `grid` is not a Grid.
+    """Reset moved lines of a grid to their initial coordinates, for new bodies and scenes.  Raise ValueError if `grid`
+    is not a Grid.
     """
     instance(name, grid, Grid)
     grid.move(None)
@@ -894,7 +893,7 @@ def begin_with(name: str, grid: Any) -> None:
 class GridOfGroups(Grid):
     """A grid with a separate copy of the box for each contact group, so that groups share no nodes.
 
-    The copies coincide in space.  Cells at the same place in all copies belong to the same process.
+    All copies occupy the same space.  Cells at the same place in all copies belong to the same process.
 
     `grid`: grid of the bodies.
     `group` (bodies,): index, from 0, of the group of each body.
@@ -918,5 +917,5 @@ class GridOfGroups(Grid):
         return GridOfGroups(self, self._group, self._starts)
 
     def copy(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return, for material points `ids` (n,), the index of the first cell in their copy of the box."""
+        """Return for each of the material points `ids` (n,) the index of the first cell in its copy of the box."""
         return self._group[self._starts.searchsorted(ids, side="right") - 1] * np.int64(self.cells)

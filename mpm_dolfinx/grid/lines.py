@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Grid lines: checks of given lines, and lines for cells that grow with the distance from fine boxes."""
+"""Grid lines: checks of lines, and lines of graded grids, whose cells grow with the distance from fine boxes."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ MOST = 2**31 - 1
 
 
 def rounding(x: NDArray[np.float64]) -> float:
-    """Return the largest rounding error, in m, of coordinates up to the largest absolute value in x, in m."""
+    """Return the largest rounding error, in m, of coordinates of the magnitude of x, in m."""
     return 8 * EPSILON * float(np.abs(x).max(initial=0.0))
 
 
 def checked(lines: Sequence[ArrayLike], what: str = "grid") -> list[NDArray[np.float64]]:
-    """Return the grid lines (n,), in m, along each of two or three axes.  Raise ValueError for invalid lines."""
+    """Return grid lines (n,), in m, along two or three axes as arrays.  Raise ValueError for invalid lines."""
     if not isinstance(lines, Sequence | np.ndarray) or len(lines) not in (2, 3):
         raise ValueError(f"{what}: lines = {line(lines)}, must be 2 or 3 lists of coordinates, one for each axis")
     out = []
@@ -39,7 +39,7 @@ def checked(lines: Sequence[ArrayLike], what: str = "grid") -> list[NDArray[np.f
 
 
 def equal(x: NDArray[np.float64]) -> bool:
-    """Return whether lines (n,), m, are equally spaced within rounding."""
+    """Return whether lines (n,), m, are equally spaced except for rounding errors."""
     return bool(np.abs(x - np.linspace(x[0], x[-1], len(x))).max() <= rounding(x))
 
 
@@ -51,9 +51,9 @@ def graded(
     ratio: float = 1.1,
     largest: float = np.inf,
 ) -> list[NDArray[np.float64]]:
-    """Return grid lines with small cells in fine boxes.  Cells outside grow with the distance from the boxes.
+    """Return grid lines with small cells in fine boxes.  Other cells grow with the distance from these boxes.
 
-    Lines cross the whole grid, so cells in the rows and columns of a fine box are as narrow as the cells in the box.
+    Lines cross the whole grid, so cells in the rows and columns of a fine box are as narrow as cells in the box.
 
     Parameters
     ----------
@@ -61,12 +61,13 @@ def graded(
         Lower and upper corner of the grid; d = 2 or 3.
     fine : (boxes, 2, d), m
         Lower and upper corners of at least one fine box.  Boxes must be inside the grid.  Small cells also fill gaps
-        that are narrower than a cell along an axis.  Such gaps lie between two boxes, or between a box and a side.
+        narrower than one cell, between two boxes, or between a box and a side.
     size : number or (d,), m
         Largest edge lengths > 0 of the small cells.  Cells may be smaller, because each box contains a whole number of
         cells.
     ratio
-        Largest ratio > 1 of edge lengths of neighbouring cells.  This ratio is exceeded if there is not enough space.
+        Largest ratio > 1 of edge lengths of neighbouring cells.  If there is too little space between boxes, the ratio
+        is larger.
     largest : m
         Largest edge length of a cell, >= size.
 
@@ -102,7 +103,7 @@ def graded(
 def _along(
     low: float, high: float, fine: NDArray[np.float64], size: float, ratio: float, largest: float
 ) -> NDArray[np.float64]:
-    """Return the lines from low to high along an axis, with small cells in the intervals `fine`."""
+    """Return the lines from `low` to `high` along an axis, with small cells in the intervals `fine`."""
     joined: list[list[float]] = []
     for start, stop in sorted(fine.tolist()):
         if joined and start - joined[-1][1] <= size * (1 + SAME):
@@ -129,9 +130,9 @@ def _along(
 
 
 def _growing(gap: float, size: float, ratio: float, largest: float) -> NDArray[np.float64]:
-    """Return edge lengths that fill a gap, and grow from `size` by a common factor.
+    """Return edge lengths that together fill a gap, and grow from `size` by a common factor.
 
-    The factor is at most `ratio` if possible.
+    If possible, the factor is at most `ratio`.
     """
     if gap <= 0:
         return np.empty(0)

@@ -12,19 +12,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 IMBALANCE = 1.2
-"""Largest allowed imbalance: largest number of points of a process, divided by the mean.
+"""Largest allowed imbalance: largest number of points of a process, divided by the mean number.
 
-With a larger imbalance, cells are distributed anew.  The results of a scene do not depend on this limit.  Source:
-definition, the documented limit of the imbalance.
+If the imbalance is larger, cells are distributed again.  Results do not depend on this limit.  Source: definition, the
+documented limit of the imbalance.
 """
 EMPTY = 1e-2
-"""Weight of an empty cell divided by the mean weight of a filled cell.  Empty cells need memory and time."""
+"""Weight of an empty cell, divided by the mean weight of a filled cell.  It represents memory and time."""
 
 
 class Partition:
     """Boxes of cells, one for each process.
 
-    `boxes` (ranks, 2, d): first index of cells along each axis in each box, and last index plus one.
+    `boxes` (ranks, 2, d): first index of the cells in each box along each axis, and last index plus one.
     `shape` (d,): number of cells of the grid along each axis.
 
     Raises
@@ -43,7 +43,7 @@ class Partition:
             raise ValueError("partition: boxes of cells do not fill the grid exactly once")
 
     def _overlap(self) -> bool:
-        """Return whether two boxes share a cell."""
+        """Return whether any two boxes share a cell."""
         low, high = self.boxes[self.count.all(axis=1)].transpose(1, 0, 2)
         return any(((low[k] < high[:k]) & (low[:k] < high[k])).all(axis=1).any() for k in range(1, len(low)))
 
@@ -59,7 +59,7 @@ class Partition:
         return out.reshape(index.shape[1:])
 
     def cells(self, rank: int) -> NDArray[np.int64]:
-        """Return the lexicographic indices (n,) of the cells of a process, ascending."""
+        """Return the lexicographic indices (n,) of the cells of a process, in ascending order."""
         return self.numbered(np.full(self.count[rank].prod(), rank), np.arange(self.count[rank].prod()))
 
     def numbered(self, rank: NDArray[np.int64], k: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -88,7 +88,7 @@ def boxes(load: NDArray[np.float64], processes: int) -> NDArray[np.int64]:
 def better(load: NDArray[np.float64], of: NDArray[np.int64]) -> NDArray[np.int64] | None:
     """Return the boxes (ranks, 2, d) of a new bisection, or None if the boxes `of` are almost as good.
 
-    New boxes are returned if their imbalance is below `IMBALANCE`, or below the imbalance of the boxes `of` divided by
+    The imbalance of new boxes must be below `IMBALANCE`, or below the imbalance of the boxes `of` divided by
     `IMBALANCE`.
     """
     new = boxes(load, len(of))
@@ -96,15 +96,15 @@ def better(load: NDArray[np.float64], of: NDArray[np.int64]) -> NDArray[np.int64
 
 
 def imbalance(load: NDArray[np.float64], of: NDArray[np.int64]) -> float:
-    """Return the largest load of the boxes `of`, divided by the mean load, or 1 without loads."""
+    """Return the largest sum of loads in a box, divided by the mean sum.  The result is 1 if all loads are 0."""
     each = np.array([load[tuple(map(slice, *box))].sum() for box in of])
     return float(each.max() / each.mean()) if each.any() else 1.0
 
 
 def _bisect(weight: NDArray[np.float64], filled: NDArray[np.bool_], low: NDArray[np.int64], out: NDArray[np.int64]):
-    """Distribute a box of cells among ranks, and set the boxes `out` of the ranks.
+    """Divide a box of cells into a box for each rank, written to `out`.
 
-    If there are enough cells, each rank gets at least one cell.  This rule has priority over equal loads.
+    If there are enough cells, each rank gets at least one cell, even if loads are then less equal.
     """
     count = len(out)
     if count == 1 or weight.size == 1:
@@ -134,9 +134,9 @@ def _extent(filled: NDArray[np.bool_], axis: int) -> int:
 
 
 def destinations(partition: Partition, cells: NDArray[np.int64]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Return one list with the ranks that hold each cell, the owner first, and the start of each cell in the list.
+    """Return the ranks with each cell in one list, the owner first, and the start of each cell in the list.
 
-    `cells` (n,): lexicographic indices.  Processes that own a neighbour across a face hold the cell as a ghost.
+    `cells` (n,): lexicographic indices.  A cell is a ghost on the processes that own its neighbours across faces.
     """
     index, shape = np.array(np.unravel_index(cells, partition.shape)), np.array(partition.shape)[:, None]
     ranks = [partition.owner(index)]
