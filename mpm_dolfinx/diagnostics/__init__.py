@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""Warnings and refusals about a scene."""
+"""Warnings and errors about a scene."""

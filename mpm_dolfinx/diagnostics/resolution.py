@@ -23,11 +23,11 @@ from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
 from mpm_dolfinx.points.material_points import body_of
 
 FULL = 1.2
-"""Volume fraction above which a cell causes a warning.  Under a deep footing, intact domains fill cells to 1.08."""
+"""Volume fraction above which a cell causes a warning.  Below a deep footing, undamaged domains fill cells to 1.08."""
 
 
 def warn_overlaps(cut: CutDomains, bodies: Sequence[Body]) -> Callable[..., Any] | None:
-    """Warn about the fullest cell if particle domains overlap, and return this function, or None after a warning."""
+    """Warn about the fullest cell if particle domains overlap.  Return this function, or None after a warning."""
     grid, points = cut.grid, cut.points
     volume = cut.to_cells(points.volume0 * points.J) * cut.pieces_to_cells(cut.pieces.fraction)
     fill = sum_by(cut.cells, cut.plane(volume)[0], grid.num_owned)[cut.cells] / grid.volumes(cut.cells)
@@ -49,7 +49,7 @@ def warn_overlaps(cut: CutDomains, bodies: Sequence[Body]) -> Callable[..., Any]
 
 
 def bodies_in(cut: CutDomains, bodies: Sequence[Body], cell: int) -> tuple[list[int], NDArray[np.float64]]:
-    """Return the bodies in a cell, and the cell's midpoint (d,), in m.  All processes must call this."""
+    """Return the bodies in a cell, and the cell's midpoint (d,), in m.  All processes must call this function."""
     grid, ids = cut.grid, cut.points.id[cut.pieces.point[cut.pieces.cell == cell]]
     own = body_of(ids, np.cumsum([0, *map(len, bodies)]))
     found = sorted({int(i) for rows in grid.comm.allgather(own) for i in rows})
@@ -57,19 +57,19 @@ def bodies_in(cut: CutDomains, bodies: Sequence[Body], cell: int) -> tuple[list[
 
 
 LOSS = 0.03
-"""A warning is issued if a soft material loses this fraction of its deformation in cells with stiffer materials."""
+"""Lost fraction of the deformation of a soft material in cells with stiffer materials that causes a warning."""
 AGAIN = 2.0
-"""Factor by which the lost fraction must grow before the next warning.  Moving interfaces change the lost fraction."""
+"""Factor by which the lost fraction must grow before the next warning, as interfaces move through cells."""
 FINE = 0.1
-"""Fraction of a cell's deformation below which a loss is ignored.  Stiffness ratios below 2.1 cause smaller losses."""
+"""Lost fraction in one cell below which the loss is ignored.  Stiffness ratios below 2.1 cause smaller losses."""
 
 
 def warn_mixed(
     cut: CutDomains, bodies: Sequence[Body], materials: SceneMaterials, least: float = LOSS
 ) -> Callable[..., Any]:
-    """Warn about the soft material that loses the largest fraction of its deformation in cells with stiffer materials.
+    """Warn about the soft material whose deformation is reduced most in cells with stiffer materials.
 
-    `least`: smallest lost fraction, in [0, 1], for which the function warns.
+    `least`: lost fraction of the deformation, in [0, 1], above which the function warns.
 
     Returns
     -------
@@ -107,9 +107,9 @@ def warn_mixed(
 def _losses(cut: CutDomains, volume: NDArray[np.float64], modulus: NDArray[np.float64]) -> tuple[NDArray, ...]:
     """Return the loss times volume (m^d), the ratio of moduli, and the softest piece of each owned cell.
 
-    With moduli M and volume fractions s in a cell, layers in series have the compliance `sum (s / M)`.  With equal
-    strain in the cell the compliance is `1 / sum (s M)`.  The loss is the difference of both compliances, divided by
-    the largest `1 / M`.  For two moduli of ratio r < 1, the loss is at most `(1 - sqrt(r))^2`.
+    Let M be the moduli and s the volume fractions in a cell.  Layers in series have the compliance `sum (s / M)`, but
+    equal strain in the cell gives the compliance `1 / sum (s M)`.  The loss is the difference of both compliances,
+    divided by the largest `1 / M`.  If two moduli have the ratio r < 1, the loss is at most `(1 - sqrt(r))^2`.
     """
     n, order = cut.grid.num_owned, np.argsort(-modulus, kind="stable")
     softest, hardest = (np.zeros(n, dtype=np.int64) for _ in range(2))
@@ -134,10 +134,10 @@ SLENDER_WET = 2  # length divided by thickness from which on a wet body counts a
 def warn_thin(grid: Grid, bodies: Sequence[Body], walls: Mapping[str, str], wet: bool) -> None:
     """Warn about each slender body that can bend, and has one point per cell and too few points over its thickness.
 
-    The increment of stress is constant in a cut domain.  In a single step, n points over the thickness therefore give
-    `1 - 1/n^2` of the bending stiffness.  In several steps the fraction is larger (`domain_slopes`).  A body with one
-    point over its thickness carries no moment.  The body creeps from step to step, because only the stress increment of
-    a step resists bending.  Saturated bodies (`wet`) lose more stiffness, and continue to creep.
+    The stress increment of a step is constant in a cut domain.  In a single step, n points over the thickness therefore
+    give `1 - 1/n^2` of the bending stiffness.  In several steps the fraction is larger (`domain_slopes`).  A body with
+    one point over its thickness carries no moment.  It creeps from step to step, because only the stress increments
+    resist bending.  Saturated bodies (`wet`) lose more stiffness, and also creep with more points.
     """
     few, slender = (FEW_WET, SLENDER_WET) if wet else (FEW, SLENDER)
     for i, body in enumerate(bodies):
@@ -157,9 +157,9 @@ def warn_thin(grid: Grid, bodies: Sequence[Body], walls: Mapping[str, str], wet:
 def check_stiff(grid: Grid, bodies: Sequence[Body]) -> None:
     """Raise ValueError for 3D bodies with one domain in each cell, if domains end at grid lines along two axes.
 
-    Displacements that alternate from node to node along both axes then have no mean gradient in any piece.  Such
-    displacements have no stiffness, however they vary along the third axis.  In 2D each component has a single field of
-    this kind, and walls prevent this field.
+    Displacements that alternate from node to node along both axes then have zero mean gradients in all pieces, and no
+    stiffness.  They may vary in any way along the third axis.  In 2D each component has a single displacement field of
+    this kind, and walls prevent it.
     """
     for i, body in enumerate(bodies if grid.dim == 3 else ()):
         low, between = np.array([[np.inf], [-np.inf]]) * np.ones(grid.dim)  # of domains; the highest end inside a cell
@@ -190,7 +190,7 @@ def _edge(grid: Grid, body: Body, axis: int) -> float:
 
 
 def _bends(grid: Grid, bodies: Sequence[Body], i: int, axis: int, walls: Mapping[str, str], slender: float) -> bool:
-    """Return whether a body is thin along an axis, and free to bend along this axis."""
+    """Return whether a body is thin along an axis, and neither walls nor other bodies prevent bending along it."""
     body = bodies[i]
     size = body.bounds[1] - body.bounds[0]
     if size.max() < slender * size[axis]:

@@ -25,15 +25,15 @@ def check_held(
 
     `active`: cells of this process that contain pieces of domains.
     `free` (nodes, d): whether no wall fixes a displacement component.
-    `holds`: constraints by prescribed displacements, tools and contact. Each is a tuple of four arrays: constrained
-    cells (n,), opposite cells (n,) in a contact, positions (n, d) in m, and directions (n, d). Opposite cells are
-    lexicographic indices, or None without a contact between parts. A fixed part fixes the part in contact with it.
-    `each`: whether to check each connected part alone. Otherwise all parts are checked together.
+    `holds`: constraints by prescribed displacements, tools and contact. Each is a tuple of arrays: constrained cells
+    (n,), lexicographic indices of the opposite cells (n,) in a contact or None, positions (n, d) in m, and directions
+    (n, d).  A fixed part fixes the parts in contact with it.
+    `each`: whether to check each connected part alone, and not all parts together as one body.
 
     Raises
     ------
     ValueError
-        If a part can move as a rigid body. The message gives the place and the number of rigid-body modes of the part.
+        A part can move as a rigid body.  The message gives its position and its number of free rigid-body modes.
     """
     grid = active.grid
     part, count = active.parts_of_cells if each else (active.contains.astype(np.int64), 1)

@@ -38,7 +38,7 @@ def check_options(
     sources: Sequence[Callable],
     quadrature: str,
 ) -> None:
-    """Raise an error for invalid terms, sources or quadrature, and for pressures and sources without fluid."""
+    """Raise an error if terms, sources or quadrature are invalid, or if pressure or sources are given without fluid."""
     rotated = [i for i, body in enumerate(bodies) if not body.aligned]
     if quadrature == "point" and rotated:
         raise ValueError(f"quadrature = 'point': body {rotated[0]} is mapped or a mesh, must be a box along the grid")
@@ -75,9 +75,9 @@ def check_axisymmetry(grid: Grid, bodies: Sequence[Body], quadrature: str) -> No
 
 
 def initial_velocity(grid: Grid, quadrature: str, inertia: bool | Moving | None) -> ArrayLike | Callable | None:
-    """Return the initial velocity, or None without inertia in all stages.
+    """Return the initial velocity, or None if no stage has inertia.
 
-    Raise ValueError if the scene does not allow inertia or this velocity.
+    Raise ValueError if the scene does not allow inertia or the velocity.
     """
     if inertia is None:
         return None
@@ -94,14 +94,14 @@ def initial_velocity(grid: Grid, quadrature: str, inertia: bool | Moving | None)
 
 
 def check_masses(materials: Sequence[Skeleton], fluid: Fluid | None) -> None:
-    """Raise ValueError for dry bodies without mass, whose velocities are undetermined."""
+    """Raise ValueError if a dry body has no mass, because its velocity would be undetermined."""
     for number, one in enumerate(materials):
         if fluid is None and one.grain_density == 0:
             raise ValueError(f"material {number}: grain_density = 0, must be > 0 for bodies with inertia")
 
 
 def _functions_of(terms):
-    """Return the functions of terms in bodies and on sides."""
+    """Return the functions of all terms, in bodies and on sides."""
     if isinstance(terms, str) or not isinstance(terms, Sequence):
         return terms
     return [term.term if isinstance(term, OnSide) else term for term in terms]

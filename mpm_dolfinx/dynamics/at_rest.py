@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Tractions that replace the reactions of sides at rest when a body is released."""
+"""Tractions that replace the reactions of fixed sides when they become quiet sides."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ def balancing_tractions(
     forces: NDArray[np.float64],
     held: NDArray[np.bool_],
 ) -> dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]:
-    """Return the points and the tractions that replace the reactions of each side at rest.
+    """Return the points and the tractions that replace the reactions of each side of bodies at rest.
 
-    Tractions are forces per reference area, computed from the stresses.  Rigid-body fields of tractions are added, so
-    that each connected part receives the resultant and the moment of its reactions.
+    Tractions are forces per reference area, computed from the stresses.  Additional tractions, which vary like
+    rigid-body displacements, make resultant and moment equal to the reactions of each connected part.
 
     `stresses`: total stresses (faces, k, k), in Pa, on each side.
     `parts`: connected parts of the bodies.
     `forces` (nodes, d), in N: reactions of the sides at the owned nodes of this process, zero at other nodes.
-    `held` (nodes, d): which displacement components remain fixed.
+    `held` (nodes, d): whether displacement components remain fixed.
 
     Returns for each side the ids (n,) of its points and the tractions (n, d), in Pa.
     """
@@ -74,9 +74,9 @@ def balancing_tractions(
 
 
 def _rigid(arm: NDArray[np.float64], free: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return the rigid-body fields (k, n, d) for the lever arms of n points.
+    """Return the rigid-body displacements (k, n, d) of n points with lever arms (n, d).
 
-    If any axis is fixed, the fields contain no rotations.
+    Rotations are omitted if the displacement along any axis is fixed.
     """
     n, d = arm.shape
     fields = [np.broadcast_to(e, (n, d)) for e in np.eye(d)[free]]

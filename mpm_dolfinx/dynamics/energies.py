@@ -32,11 +32,11 @@ def stored(materials: SceneMaterials, points: MaterialPoints) -> dict[str, NDArr
 
 
 def drift(materials: SceneMaterials, points: MaterialPoints, held: NDArray[np.bool_]) -> list[float]:
-    """Return the mean velocity of all bodies, in m/s, with zeros along axes that have a frame of their own.
+    """Return the mean velocity of all bodies, in m/s.  It is zero along axes with supports, and along the radius.
 
-    These are the axes along which supports hold bodies, and the radius.  All processes must call this function.
+    All processes must call this function.
 
-    `held` (d,): along which axes supports hold bodies of this process.
+    `held` (d,): whether supports hold bodies of this process along each axis.
     """
     mass = materials.present_density(points) * points.volume0 * points.J
     held = held | (np.arange(len(held)) < materials.grid.axisymmetric)
@@ -69,7 +69,7 @@ def after(
 
     `kinetic`: kinetic energy of free tools, in J.
     `seconds`: time weights of the substeps, in s.
-    `powers`: powers in each substep on this process, in W, see `MomentumProblem.powers`.
+    `powers`: powers of this process's forces in each substep, in W, see `MomentumProblem.powers`.
     """
     counted = seconds[-len(powers) :] @ np.array([list(of.values()) for of in powers])
     work = zip(powers[0], over_all(materials.grid.comm, counted), strict=True)
@@ -83,7 +83,7 @@ def after(
 def after_renewal(
     materials: SceneMaterials, energy: Mapping, old: MaterialPoints, new: MaterialPoints, renewed: int
 ) -> Mapping[str, NDArray[np.float64]]:
-    """Return the energies after a renewal of domains, in J.  The entry `renewal` is the total loss."""
+    """Return the energies after a renewal of domains, in J.  The energy `renewal` is the total loss by renewal."""
     if not renewed:
         return energy
     now = stored(materials, new)

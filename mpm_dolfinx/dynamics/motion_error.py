@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Error estimate of a step with inertia: its difference from a first-order step."""
+"""Error estimate of a step with inertia: the difference from a first-order step."""
 
 from __future__ import annotations
 
@@ -27,14 +27,13 @@ def motion_error(
 
     The substeps end with the velocities v1, v2 and accelerations a1, a2.  A first-order step would give a velocity that
     differs by `seconds * (a2 - a1)`, and a displacement that differs by `seconds * (v2 - v1)`.  The estimate is `ERROR`
-    times the difference of the two steps.  For a resolved mode of angular frequency omega, the true error is 0.081
-    omega dt times this difference, with the step dt.  A solve with the matrix of the substep bounds the estimate for
-    unresolved modes (Hosea and Shampine 1996).
+    times the difference between the two steps.  In a resolved mode of angular frequency omega, the true error is 0.081
+    omega dt times this difference, with the step length dt.  In unresolved modes, a solution with the matrix of the
+    substep limits the estimate (Hosea and Shampine 1996).
 
     `K`, `mass`: momentum tangent and mass of the last substep.
-    `flights`: states of motion after the two substeps.
-    `seconds`: weight of the first substep's rate in the last substep, in s.
-    `own`: weight of the last substep's rate in the last substep, in s.
+    `flights`: velocities and accelerations after the two substeps.
+    `seconds`, `own`: time weights, in s, of the rates of the first and of the last substep in the last substep.
     `drift`: mean velocity of free bodies at the start of the run, in m/s, see `energies.drift`.
     """
     first, last = flights

@@ -2,9 +2,9 @@
 """Quiet boundaries that absorb waves.
 
 A quiet side exerts the traction `t = t_0 - Z (v - 2 v_in)`.  Here t_0 is the constant traction at rest, v is the
-velocity of the side, and v_in is the velocity of an incoming wave (Joyner and Chen 1975).  The impedance is
-`Z = rho c_p n n + rho c_s (I - n n)`, with the normal n, the density rho, and the speeds c_p of compression waves and
-c_s of shear waves (Lysmer and Kuhlemeyer 1969).  Impedances use small-strain moduli of undrained soil.
+velocity of the side, and v_in is the velocity of an incoming wave (Joyner and Chen 1975).  The impedance is `Z = rho
+c_p n n + rho c_s (I - n n)`, with the normal n, the density rho, and the speeds c_p of compression waves and c_s of
+shear waves (Lysmer and Kuhlemeyer 1969).  The speeds refer to undrained soil with small-strain moduli.
 """
 
 from __future__ import annotations
@@ -28,15 +28,16 @@ from mpm_dolfinx.grid.grid import Grid
 
 
 def traction_name(name: str) -> str:
-    """Return the name of the point field that holds the traction of a quiet side at rest."""
+    """Return the name of the point field with the traction of a quiet side at rest."""
     return f"{name}_traction"
 
 
 class QuietForms:
-    """Forms at points on quiet sides.
+    """Forms at points on quiet sides, with three fields.
 
-    The field `across` is the tangential impedance, in kg/m^2/s.  The field `along` is the normal impedance minus the
-    tangential impedance.  The field `force` is the traction at rest plus the traction of incoming waves, in Pa.
+    `across`: tangential impedance, in kg/m^2/s.
+    `along`: normal impedance minus tangential impedance, in kg/m^2/s.
+    `force`: traction at rest plus traction of incoming waves, in Pa.
     """
 
     def __init__(self, grid: Grid, u: fem.Function, velocity: Velocity):
@@ -59,8 +60,8 @@ class QuietSides(Acting):
     Raises
     ------
     ValueError
-        Two quiet sides share a part of a face, or prescribed displacements or walls of the grid fix all displacement
-        components on a face.
+        Two quiet sides overlap, or prescribed displacements or walls of the grid fix all displacement components on a
+        face.
     """
 
     conditions, title = (Quiet,), "quiet sides"
@@ -85,7 +86,7 @@ class QuietSides(Acting):
         return [faces for _, faces in self._sides.values()]
 
     def kept(self, n: int) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return initial fields of n points, with zero tractions at rest."""
+        """Return the point fields of tractions at rest, initially zero at n points."""
         return {name: {traction_name(name): np.zeros((n, self._grid.dim))} for name in self._sides}
 
     def placed(self, place: Place) -> Loads:
@@ -119,13 +120,13 @@ class QuietLoads(Loads):
         self._forms, self._data = forms, data
 
     def dead(self, b: NDArray[np.float64]) -> None:
-        """Add the constant tractions and the tractions of incoming waves."""
+        """Add the nodal forces of tractions at rest and of incoming waves."""
         self._forms.stays.assemble_vector(b, self._data)
 
     def resists(self, b: NDArray[np.float64]) -> None:
-        """Add the viscous resistance."""
+        """Add the nodal forces of the viscous resistance."""
         self._forms.resists.assemble_vector(b, self._data)
 
     def tangent(self, K: PETSc.Mat) -> None:
-        """Add the derivative of the viscous resistance."""
+        """Add the derivative of the viscous resistance to the momentum tangent."""
         self._forms.slope.assemble_matrix(K, self._data)

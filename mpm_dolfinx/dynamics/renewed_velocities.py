@@ -18,7 +18,7 @@ MOTION = VELOCITY, RATE
 
 
 class Momenta(NamedTuple):
-    """Momenta of groups of pieces, as arrays over the groups."""
+    """Masses, momenta and moments of inertia of groups of pieces, as arrays over the groups."""
 
     mass: NDArray[np.float64]  # (groups,), kg
     centre: NDArray[np.float64]  # centre of mass (groups, 2), m
@@ -30,11 +30,10 @@ class Momenta(NamedTuple):
     def of(
         cls, pieces: Pieces, piece: NDArray, group: NDArray, mass: NDArray, v: NDArray, L: NDArray, count: int
     ) -> Momenta:
-        """Return the momenta of `count` groups.
+        """Return the momenta of `count` groups of pieces.
 
-        `piece` (k,): index in `pieces` of each piece.
-        `group` (k,): group of each piece.
-        `mass` (k,), in kg: mass of each piece.
+        `piece`, `group` (k,): indices of k pieces in `pieces`, and their groups.
+        `mass` (k,), in kg: masses of these pieces.
         `v` (n, 2), in m/s: velocity of each domain.
         `L` (n, 2, 2), in 1/s: velocity gradient of each domain.
         """
@@ -56,13 +55,13 @@ def velocities(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the velocities and the velocity gradients of new domains.
 
-    The results are means over the overlap with old domains, whose velocity fields are affine.  A rigid motion of each
-    group of domains then restores the momentum and the angular momentum of the group.
+    Each result is a mean over the old domains that overlap the new domain.  A rigid motion added to each group of
+    domains then restores the momentum and the angular momentum of the group.
 
     `corners` (n, 4, 2), in m: corners of each new domain.
     `x` (n, 2), in m: position of each new domain.
     `group` (n,): group of each new domain.
-    `masses`: masses of the old points and masses of the new points, in kg.
+    `masses`: masses of all old domains, and of all new domains, in kg.
     """
     points = work.points
     n, count = len(x), int(group.max()) + 1
@@ -84,14 +83,14 @@ def velocities(
 
 
 def centred(work: RefilledCells, group: NDArray, x: NDArray, mass: NDArray, old: NDArray) -> NDArray[np.float64]:
-    """Return masses of new domains, in kg, that keep the centre of mass of each renewed cell.
+    """Return masses of new domains, in kg, with which each renewed cell keeps its centre of mass.
 
-    Each domain outside renewed cells keeps its mass.  A mass changes by at most half; a cell that reaches this limit
-    does not keep its centre of mass.
+    Domains outside renewed cells keep their masses.  A mass changes by at most half, so some cells keep their centre of
+    mass only approximately.
 
     `group` (n,): group of each new domain.
     `x` (n, 2), in m: position of each new domain.
-    `mass` (n,), in kg: mass of each new domain before the change.
+    `mass` (n,), in kg: mass of each new domain before the correction.
     `old` (points,), in kg: masses of the old domains.
     """
     cells, inside = int(work.chosen.sum()), group < work.chosen.sum()
@@ -111,7 +110,7 @@ def centred(work: RefilledCells, group: NDArray, x: NDArray, mass: NDArray, old:
 
 
 def _received(work: RefilledCells, mass: NDArray[np.float64]) -> tuple[NDArray, NDArray, NDArray]:
-    """Return the pieces of the removed domains, their groups and their masses."""
+    """Return the pieces of the removed domains, with their groups and masses."""
     piece, groups, share = work.into
     return piece, groups, share * mass[work.pieces.point[piece]]
 

@@ -2,7 +2,7 @@
 """Checkpoints: files from which an interrupted run is resumed, on any number of processes.
 
 A checkpoint is a numpy archive with the state between two steps (`State`) and a description of the scene.  The points
-are in the order of their ids.  Each process writes and reads an equal share of the points.
+are in the order of their ids.  Each process writes and reads an equal number of points.
 """
 
 from __future__ import annotations
@@ -55,13 +55,13 @@ NOTE = {"t": float, "resets": int, "begins": bool, "scene": dict, "result": dict
 class Checkpoint:
     """Saves the state of a run at intervals and at the end of the run.
 
-    Pass the object as `checkpoint` to `Simulation.run`.
+    It is the argument `checkpoint` of `Simulation.run`.
 
     Parameters
     ----------
     file
-        Path of the checkpoint, in a folder to which all processes have access.  A complete new checkpoint replaces the
-        old checkpoint.
+        Path of the checkpoint, in a folder to which all processes have access.  When a new checkpoint is complete, it
+        replaces the old one.
     every
         Number of output intervals between two checkpoints, >= 1.
     seconds
@@ -186,9 +186,9 @@ def _arrays(state: State) -> dict[str, NDArray]:
 
 
 def _state(file: Path, arrays: dict[str, NDArray], note: dict[str, Any], simulation: Simulation, count: int) -> State:
-    """Return the state in a file with `count` points; raise ValueError if the file does not fit the simulation.
+    """Return the state in a file with `count` points.  Raise ValueError if the file belongs to another simulation.
 
-    Nodal fields are pairs of node numbers and values.
+    Nodal fields of the state are pairs: node numbers and values.
     """
     now, dim = simulation.state, simulation.grid.dim
     wet = simulation.scene.fluid is not None
@@ -245,7 +245,7 @@ def _state(file: Path, arrays: dict[str, NDArray], note: dict[str, Any], simulat
 
 
 def _outcomes(arrays: dict[str, NDArray], count: int) -> list[dict[str, dict[str, NDArray]]]:
-    """Return the results of the conditions at each of `count` output times."""
+    """Return the results of conditions (reactions, outflows and others) at each of `count` output times."""
     out: list[dict[str, dict[str, NDArray]]] = [{} for _ in range(count)]
     for quantity, names in _nested(arrays).items():
         for name, found in names.items():
@@ -255,9 +255,9 @@ def _outcomes(arrays: dict[str, NDArray], count: int) -> list[dict[str, dict[str
 
 
 def _like(outcome: dict[str, dict[str, NDArray]], now: Outcome) -> dict[str, dict[str, NDArray]]:
-    """Return the stored results of the present conditions; raise ValueError if a result is invalid.
+    """Return the stored results of the present conditions.  Raise ValueError if a result is invalid.
 
-    Conditions without a stored result keep their present result.
+    A condition without a stored result keeps its present result.
     """
     found = {q: {name: outcome.get(q, {}).get(name, value) for name, value in of.items()} for q, of in now.items()}
     if "energy" in outcome:
@@ -276,7 +276,7 @@ def _like(outcome: dict[str, dict[str, NDArray]], now: Outcome) -> dict[str, dic
 
 
 def _nested(arrays: dict[str, NDArray]) -> dict[str, Any]:
-    """Return nested dictionaries of arrays.  Slashes in the name of an array separate the keys."""
+    """Return nested dictionaries of arrays, whose keys are the parts of the arrays' names between slashes."""
     out: dict[str, Any] = {}
     for name, value in arrays.items():
         *folders, last = name.split("/")
@@ -288,7 +288,7 @@ def _nested(arrays: dict[str, NDArray]) -> dict[str, Any]:
 
 
 def _points(arrays: dict[str, NDArray], like: MaterialPoints) -> MaterialPoints:
-    """Return material points from stored arrays; raise ValueError if names, types or shapes differ from `like`."""
+    """Return material points from stored arrays.  Raise ValueError if names, types or shapes differ from `like`."""
     data = _part(arrays, "data/")
     like = with_faces(like) if PARENT in data else like
     like = with_parts(like) if ROOT in data else like
@@ -314,7 +314,7 @@ def _check_ids(points: MaterialPoints, simulation: Simulation, count: int) -> No
 
 
 def _partition(file: Path, given: list, grid: Grid) -> NDArray[np.int64]:
-    """Return the boxes of cells of the processes that wrote a file; raise ValueError for invalid boxes."""
+    """Return the boxes of cells of the processes that wrote a file.  Raise ValueError if the boxes are invalid."""
     with _complete(file):
         boxes = np.array(given, dtype=np.int64).reshape(-1, 2, grid.dim)
         grid.check_boxes(boxes)
@@ -322,7 +322,7 @@ def _partition(file: Path, given: list, grid: Grid) -> NDArray[np.int64]:
 
 
 def _nodal_rows(simulation: Simulation, name: str, nodal: NDArray[np.float64] | None) -> dict[str, NDArray]:
-    """Return the nodes with non-zero values that this process writes, and the values at these nodes."""
+    """Return the nodes that this process writes, and their values.  Nodes with zero values are omitted."""
     if nodal is None:
         return {}
     grid, owned = simulation.grid, simulation.scene.momentum.u.function_space.dofmap.index_map.size_local
@@ -336,7 +336,7 @@ def _nodal_rows(simulation: Simulation, name: str, nodal: NDArray[np.float64] | 
 
 
 def _check_lines(arrays: dict[str, NDArray], grid: Grid) -> None:
-    """Raise ValueError if the arrays are not lines of this grid, or if the grid has fixed lines."""
+    """Raise ValueError if the arrays are not lines of this grid, or if the grid's lines cannot move."""
     shapes = {letter: x.shape for letter, x in zip("xyz", grid.lines, strict=False)}
     if grid.follow is None or {name: x.shape for name, x in arrays.items()} != shapes:
         raise ValueError("lines: these are not lines of the grid")
@@ -347,7 +347,7 @@ def _check_lines(arrays: dict[str, NDArray], grid: Grid) -> None:
 
 
 def _nodal(name: str, arrays: dict[str, NDArray], grid: Grid) -> tuple[NDArray, NDArray] | None:
-    """Return the nodes and the values of a stored nodal field, or None if the field is not stored."""
+    """Return nodes and values of a stored nodal field, or None if the file does not contain the field."""
     if not arrays:
         return None
     node, values = arrays.pop("node"), arrays.pop("values")
@@ -360,7 +360,7 @@ def _nodal(name: str, arrays: dict[str, NDArray], grid: Grid) -> tuple[NDArray, 
 
 
 def _check_trend(trend: Trend, points: MaterialPoints, wet: bool) -> None:
-    """Raise ValueError if the stored motion in the last steps does not belong to the points."""
+    """Raise ValueError if the stored motion of the last steps does not belong to the points."""
     (n, d), k = points.x.shape, len(trend.lengths)
     right = k in (1, 2, 3) and trend.lengths.shape == (k,) and trend.rates.shape == (n, k, d * (1 + d) + wet)
     numbers_only = all(v.dtype == np.float64 and np.isfinite(v).all() for v in vars(trend).values())
@@ -380,7 +380,7 @@ def _check_pieces(arrays: dict[str, NDArray], ids: NDArray[np.int64], dim: int) 
 
 
 def _named(prefix: str, values: dict) -> dict[str, NDArray]:
-    """Return the arrays in nested dictionaries.  Slashes join the keys to the name of an array."""
+    """Return all arrays in nested dictionaries, by keys joined with slashes."""
     out = {}
     for name, value in values.items():
         out |= _named(f"{prefix}{name}/", value) if isinstance(value, Mapping) else {prefix + name: value}
@@ -394,7 +394,7 @@ def _part(arrays: dict[str, NDArray], prefix: str) -> dict[str, NDArray]:
 
 @contextmanager
 def _complete(file: Path) -> Iterator[None]:
-    """Replace an error in reading by a ValueError that reports a damaged checkpoint."""
+    """Context that replaces errors in reading by a ValueError, which reports a damaged checkpoint."""
     try:
         yield
     except (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError, BadZipFile) as error:
@@ -402,12 +402,12 @@ def _complete(file: Path) -> Iterator[None]:
 
 
 def _numbered(name: str) -> str | None:
-    """Return the name of the array that numbers the rows of an array, or None without such an array."""
+    """Return the name of the array that contains the row numbers of an array, or None if there is no such array."""
     return next((numbers for start, numbers in NUMBERED.items() if name.startswith(start)), None)
 
 
 def _ranges(comm: MPI.Intracomm, file: Path, of: dict[str, Member]) -> dict[str, tuple[int, int]]:
-    """Return the range of rows that this process reads from each array; raise ValueError for invalid row numbers."""
+    """Return first row, and last row plus one, that this process reads of each array.  Check stored row numbers."""
     out = {}
     for name in dict.fromkeys(map(_numbered, of)):
         first, last = (of[name].shape[0] * (comm.rank + k) // comm.size for k in (0, 1))
@@ -433,7 +433,7 @@ def _before(file: Path, of: dict[str, Member], row: int) -> int:
 
 
 def _read(file: Path) -> tuple[dict[str, NDArray], dict[str, Member], dict[str, Any]]:
-    """Return the short arrays of a checkpoint, the places of its long arrays in the file, and its metadata."""
+    """Return all short arrays of a checkpoint, the positions of long arrays in the file, and metadata."""
     with open(file, "rb") as f:
         begin = f.read(4)
     what = "is cut short or damaged, must be a whole checkpoint" if begin == ZIP else FOREIGN

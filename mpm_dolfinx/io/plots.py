@@ -19,7 +19,7 @@ from mpm_dolfinx.simulation.simulation import Simulation
 def plot(simulation: Simulation, field: str = "pressure", ax=None, *, bar: bool = True, label: str = "", **style):
     """Draw the particle domains, coloured by a field, and return the axes of matplotlib.
 
-    All processes must call this function.  The first process draws the picture.  All other processes return None.
+    All processes must call this function.  Only the first process draws the picture, and all others return None.
 
     Parameters
     ----------
@@ -41,7 +41,7 @@ def plot(simulation: Simulation, field: str = "pressure", ax=None, *, bar: bool 
     Raises
     ------
     ValueError
-        The scene is in 3D.  The field is unknown; the message lists the fields of the points.
+        The scene is in 3D, or the field is unknown.  The message lists all fields.
     ImportError
         matplotlib is not installed.
     """

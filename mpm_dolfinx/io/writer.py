@@ -38,7 +38,7 @@ if TYPE_CHECKING:  # meshio takes long to import, so functions import it
     import meshio
 
 VTK_CELLS = {2: ("quad", [0, 1, 3, 2]), 3: ("hexahedron", [0, 1, 3, 2, 4, 5, 7, 6])}
-"""Cell type of a particle domain in VTK, and order of its corners in VTK, by dimension."""
+"""VTK's cell type for a particle domain, and VTK's order of the corners, by dimension."""
 WRITABLE = "in a writable folder with free space; `after=simulation.result` continues the run"
 COUNTS = ("steps", "newton", "coupling", "cuts", "reinitialised", "balance", "residual", "wall")
 
@@ -53,13 +53,13 @@ class Writer:
     * `history.csv`: one row for each output time, with counts and errors of `Result`, smallest and largest pressure,
       quantities at probes, forces of prescribed displacements and tools, and outflows;
     * `fields.txt`: meaning and unit of each field in these files;
-    * `tools.pvd`, in scenes with tools: the parts of the grid cells inside the tools, with the forces of the tools;
+    * `tools.pvd`, in scenes with tools: the shapes of the tools (parts of grid cells), with the forces of the tools;
     * `grid.pvd`, with `grid=True`: the fields of the cells (`Simulation.cells`), zero in empty cells.
 
     ParaView and VTK read all files; meshio reads the points.
 
-    If the folder has output of earlier times, the new run continues this output.  After `resume`, the files are
-    therefore equal to the files of an uninterrupted run.  A writer locks its folder until the writer is closed.
+    If the folder contains output of earlier times, the new run continues this output.  An interrupted run with `resume`
+    therefore gives the same files as an uninterrupted run.  A writer locks its folder until the writer is closed.
 
     Parameters
     ----------
@@ -68,15 +68,16 @@ class Writer:
     folder
         Folder of the files.
     every
-        Number of output intervals between two files of points and grid, >= 1.  Start and end are always written.
+        Number of output intervals between two files of points and grid, >= 1.  The first and last output times have
+        files.
     grid
         Whether to write `grid.pvd`.
 
     Raises
     ------
     ValueError
-        An argument has the wrong type.  Files in the folder were not written by a writer, or have other columns.  The
-        writer is closed, or was made for another simulation or for another time.
+        An argument has the wrong type.  Files in the folder are not from a writer, or have other columns.  The writer
+        is closed, or was created for another simulation or another time.
     OSError
         The folder is not writable, or the disk is full.  `run(..., after=simulation.result)` continues the run.
     """
@@ -110,14 +111,14 @@ class Writer:
         self.close()
 
     def close(self) -> None:
-        """Release the lock of the folder.  All files are already complete.  A second call has no effect."""
+        """Release the lock of the folder.  Further calls have no effect.  Files are complete without this method."""
         self._lock, self.closed = None, True
 
     def _hold(self, folder: Path) -> None:
         self._lock = Lock.of(folder)
 
     def __call__(self, simulation: Simulation) -> None:
-        """Write a row of the histories; after every `every` output intervals, also write points and grid."""
+        """Write a row of the histories.  Once in `every` output intervals, also write points and grid."""
         if self.closed:
             raise ValueError(f"writer: {self._points.file.parent} is closed, must be open during a run")
         if simulation is not self._simulation:
@@ -138,7 +139,7 @@ class Writer:
         self._write_indices()
 
     def _start(self, result: Result) -> None:
-        """Remove output later than the start of the run from the index and the table."""
+        """Remove output of times later than the start of the run from all indices and from the table."""
         if (start := result.rows[-2][0]) != self._t:
             what = f"writer: made at t = {self._t:g} s, but the run starts at t = {start:g} s"
             raise ValueError(f"{what}; must be made just before the run")
@@ -193,7 +194,7 @@ def fields_of_points(simulation: Simulation) -> dict[str, NDArray[np.float64]]:
 
 
 def _write_tools(simulation: Simulation, file: Path) -> None:
-    """Write the parts of the grid cells inside the tools, with indices and forces of the tools."""
+    """Write the shapes of all tools as parts of grid cells, with the index and the force of each tool."""
     grid, tools = simulation.grid, simulation.state.stage.of(Tool)
     corners = [
         tool.drawn(grid, simulation.t, motion_by_forces(simulation.state.outcome, name)) for name, tool in tools.items()
@@ -205,7 +206,7 @@ def _write_tools(simulation: Simulation, file: Path) -> None:
 
 
 class Lock:
-    """An exclusive lock of a folder.  The lock ends when the last writer of this process releases it."""
+    """An exclusive lock of a folder.  It ends when all writers of this process have released it."""
 
     _held: ClassVar[WeakValueDictionary[Path, Lock]] = WeakValueDictionary()
 
@@ -220,7 +221,7 @@ class Lock:
 
     @classmethod
     def of(cls, folder: Path) -> Lock:
-        """Return the lock of a folder; raise ValueError if another run has locked the folder."""
+        """Return the lock of a folder.  Raise ValueError if another run has locked the folder."""
         folder.mkdir(parents=True, exist_ok=True)
         folder = folder.resolve()
         lock = cls._held.get(folder)
@@ -245,7 +246,7 @@ def solid(points: MaterialPoints, displacement: NDArray[np.float64], wet: bool) 
 
 
 def _cells(corners: NDArray[np.float64], fields: dict[str, NDArray]) -> meshio.Mesh:
-    """Return a mesh of unconnected cells with these corners and fields."""
+    """Return a mesh of unconnected cells with the given corners and fields."""
     import meshio
 
     kind, order = VTK_CELLS[corners.shape[2]]
@@ -255,12 +256,12 @@ def _cells(corners: NDArray[np.float64], fields: dict[str, NDArray]) -> meshio.M
 
 
 def _padded(vectors: NDArray) -> NDArray:
-    """Return vectors (n, d) with three components, as VTK requires."""
+    """Return vectors (n, 3), as VTK requires, from vectors (n, d)."""
     return np.pad(vectors, ((0, 0), (0, 3 - vectors.shape[1])))
 
 
 def _columns(name: str, rows: NDArray) -> Iterator[tuple[str, NDArray]]:
-    """Yield the name and the values of each VTK field that represents a field of the points."""
+    """Yield names and values of the VTK fields for a field of the points.  Tensors (2, 2) need four VTK fields."""
     if rows.shape[1:] == (2, 2):  # not padded to 3 x 3, because the out-of-plane components are unknown
         for i, j in np.ndindex(2, 2):
             yield f"{name}_{'xy'[i]}{'xy'[j]}", rows[:, i, j]
@@ -271,7 +272,7 @@ def _columns(name: str, rows: NDArray) -> Iterator[tuple[str, NDArray]]:
 
 
 def _grid_fields(simulation: Simulation) -> list[fem.Function]:
-    """Return the fields of the cells as named functions."""
+    """Return the fields of the cells as named dolfinx functions."""
     scene, d = simulation.scene, simulation.grid.dim
     cells = simulation.cells()
     fields = {"fill": scene.momentum.ghost.fill.x.array[cells.cell]}
@@ -293,7 +294,7 @@ def _grid_fields(simulation: Simulation) -> list[fem.Function]:
 
 @contextmanager
 def _true_places(grid: Grid) -> Iterator[None]:
-    """Shift the mesh of a grid to its true position while the context lasts."""
+    """Context in which the mesh of a grid is at its true position, not relative to the base."""
     x = grid.mesh.geometry.x
     own = x.copy()
     x[:, : grid.dim] += grid.base
@@ -314,7 +315,7 @@ def _ends(file: Path) -> bool:
 
 @contextmanager
 def replacing(file: Path) -> Iterator[Path]:
-    """Give a temporary path for a new file.  At the end of the context, the new file replaces `file`."""
+    """Context with a temporary path for a new file, which replaces `file` at the end."""
     part = file.with_name(file.name + ".part")
     yield part
     with open(part, "rb") as f:
@@ -324,7 +325,7 @@ def replacing(file: Path) -> Iterator[Path]:
 
 @contextmanager
 def _ours(file: Path) -> Iterator[None]:
-    """Replace an error in reading by a ValueError that reports a foreign file."""
+    """Context that replaces errors in reading by a ValueError: another program wrote the file."""
     try:
         yield
     except (ElementTree.ParseError, KeyError, TypeError, ValueError) as error:
@@ -332,7 +333,7 @@ def _ours(file: Path) -> Iterator[None]:
 
 
 def kept(entries: Sequence[tuple[float, Any]], t: float) -> list[tuple[float, Any]]:
-    """Return the entries of earlier output up to the time `t`, or no entries for a new run."""
+    """Return the entries (time, ...) up to the time `t`, or no entries if none is before `t`."""
     out = [entry for entry in entries if entry[0] <= t]
     return out if any(entry[0] < t for entry in out) else []
 
@@ -340,7 +341,7 @@ def kept(entries: Sequence[tuple[float, Any]], t: float) -> list[tuple[float, An
 class Series:
     """A time series for ParaView: an index (.pvd), and files in a folder with the same name.
 
-    `entries`: output times so far, with their files.
+    `entries`: all output times so far, with their files.
     `next`: path of the next file, without suffix.
     """
 
@@ -355,7 +356,7 @@ class Series:
         return self.folder / f"{len(self.entries):06d}"
 
     def pieces(self, counts: Sequence[int]) -> dict[int, Path]:
-        """Return the path of the next file of each process that has points."""
+        """Return the path of the next file, by rank, for each process that has points."""
         names = {rank: f"{self.next.name}_p{rank}.vtu" for rank, count in enumerate(counts) if count}
         names = names if len(counts) > 1 else {0: f"{self.next.name}.vtu"}
         return {rank: self.folder / name for rank, name in names.items()}
@@ -370,7 +371,7 @@ class Series:
         return list(times.items())
 
     def write_index(self) -> None:
-        """Write the index of all files that exist so far."""
+        """Write the index, a list of all output times and their files."""
         root = ElementTree.Element("VTKFile", type="Collection", version="1.0")
         collection = ElementTree.SubElement(root, "Collection")
         for t, files in self.entries:
@@ -388,7 +389,7 @@ class Series:
 class Table:
     """A table in a CSV file, to which rows are added.  The first column is the time.
 
-    Columns whose names begin with one of the texts `own` belong to conditions, and may change from stage to stage.
+    Columns of conditions may change from stage to stage.  The names of these columns begin with one of the texts `own`.
     """
 
     def __init__(self, comm: MPI.Intracomm, file: Path, t: float, own: tuple[str, ...] = ()):
@@ -408,7 +409,7 @@ class Table:
             return [(float(row["t"]), row) for row in csv.DictReader(whole)]
 
     def start(self, first: dict[str, float]) -> None:
-        """Write the rows of earlier times, or the row `first` if there are no earlier rows."""
+        """Write all rows of earlier times, or the row `first` if the table is new."""
         rows = [row for _, row in self._rows] or [first]
         self.columns = list(rows[0])
         self._check(first)
@@ -420,7 +421,7 @@ class Table:
         at_root(self.comm, write)
 
     def add(self, row: dict[str, float]) -> None:
-        """Add a row to the file.  New columns have nan in all old rows."""
+        """Add a row to the file.  In new columns, all older rows have nan."""
         self._check(row)
         new = [name for name in row if name not in self.columns]
         self.columns.extend(new)

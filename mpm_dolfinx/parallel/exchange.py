@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Transfer of array rows to other processes, and of answers back to the senders.
 
-A row is the data of one piece of a particle domain, of one corner or of one loaded point.  The process that owns the
-cell of a row receives this row, and assembles the integrals of the cell.
+A row contains the data of one piece of a particle domain, one corner or one loaded point in a cell.  The process that
+owns the cell receives the row, and assembles the integrals of the cell.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ T = TypeVar("T")
 
 @dataclass
 class Traffic:
-    """Total numbers of transfers, non-empty messages and bytes that this process has sent to other processes."""
+    """Numbers of transfers, non-empty messages and bytes that this process has sent so far."""
 
     transfers: int = 0
     messages: int = 0
@@ -35,7 +35,7 @@ traffic = Traffic()
 
 @cache
 def _lasting(handle: int) -> PETSc.Vec:
-    """Return a PETSc object.  PETSc keeps its duplicate of the communicator while the object exists."""
+    """Return a PETSc object that keeps PETSc's duplicate of the communicator alive."""
     return PETSc.Vec().create(MPI.Comm.f2py(handle))
 
 
@@ -70,7 +70,7 @@ class Exchange:
         return self._transfer(rows, 1, self._sf.reduceBegin, self._sf.reduceEnd)
 
     def back(self, rows: NDArray) -> NDArray:
-        """Send back one answer for each received row, and return the answers for this process's rows."""
+        """Send back one answer (a row) for each received row, and return the answers to all sent rows."""
         if self.comm.size == 1:
             return rows
         return self._transfer(rows, 0, self._sf.bcastBegin, self._sf.bcastEnd)
@@ -91,7 +91,7 @@ class Exchange:
 
 
 def over_all(comm: MPI.Intracomm, value: T, op: MPI.Op = MPI.SUM) -> T:
-    """Return the sum of a value over all processes, or another reduction `op`.  Arrays are reduced entry by entry."""
+    """Return the sum over all processes, or another reduction `op`, of a number, or of each entry of an array."""
     if comm.size == 1:
         return value
     if not isinstance(value, np.ndarray):
@@ -107,9 +107,9 @@ def to_root(comm: MPI.Intracomm, rows: int) -> Exchange:
 
 
 def evenly(comm: MPI.Intracomm, numbers: NDArray[np.int64]) -> NDArray[np.int32]:
-    """Return ranks (n,) for ascending numbers (n,) >= 0.  No number occurs twice, not even on two processes.
+    """Return ranks (n,) that divide the ascending numbers (n,) >= 0 of all processes equally among all ranks.
 
-    Each rank gets an equal share of all numbers.  The smallest numbers go to rank 0, the next to rank 1, and so on.
+    All numbers of all processes are distinct.  The smallest numbers get rank 0, the next rank 1, and so on.
     """
     below = over_all(comm, len(numbers)) * np.arange(1, comm.size) // comm.size
     low, high = np.zeros_like(below), np.full_like(below, over_all(comm, int(numbers.max(initial=0)), MPI.MAX) + 1)
@@ -121,13 +121,13 @@ def evenly(comm: MPI.Intracomm, numbers: NDArray[np.int64]) -> NDArray[np.int32]
 
 
 def first(comm: MPI.Intracomm, message: str) -> str:
-    """Return the first non-empty message of all processes, so that all can raise the same error."""
+    """Return the first non-empty message of all processes, so that all processes can raise the same error."""
     return next(filter(None, comm.allgather(message)), "") if comm.size > 1 else message
 
 
 def together(comm: MPI.Intracomm, action: Callable[[], T]) -> T:
-    """Return the result of an action on this process.  If the action fails anywhere, all processes raise the first
-    error.
+    """Return the result of an action on this process.  If the action fails on any process, all processes raise the
+    first error.
     """
     if comm.size == 1:
         return action()
@@ -148,9 +148,9 @@ def at_root(comm: MPI.Intracomm, action: Callable[[], T]) -> T:
 
 
 def by_user(comm: MPI.Intracomm, name: str, action: Callable[[], T]) -> T:
-    """Return the result of a user's function `name`; an error on one process, or Ctrl-C, is raised on all processes.
+    """Return the result of a user's function `name`.  If it fails on one process, all processes raise an error.
 
-    Only the process with the error raises the original error; all other processes raise a RuntimeError.
+    The process where it fails, also by Ctrl-C, raises the original error.  All other processes raise a RuntimeError.
     """
     value = raised = None
     try:

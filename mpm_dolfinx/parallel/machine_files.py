@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Arrays with one copy on each machine, in a temporary file that all processes of the machine map into memory.
 
-A process loads only the pages of the file that it reads.  The operating system may drop these pages again.  Once all
-processes have opened the file, its name is removed.  The space of the file is freed when the last array is deleted.
+A process loads only those parts of the file that it reads, and the operating system may remove them from memory again.
+The name of the file is removed as soon as all processes have opened it.  The disk space is freed when the last array is
+deleted.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ ALIGNED = np.dtype(np.float64).itemsize
 def once_a_machine(comm: MPI.Intracomm, make: Callable[[], dict[Hashable, NDArray]]) -> dict[Hashable, NDArray]:
     """Return on every process the arrays that `make` returns on rank 0.  On several processes the arrays are read-only.
 
-    If `make` raises, all processes raise its error.  No array may be empty.
+    If `make` raises an error, all processes raise this error.  Empty arrays are not allowed.
     """
     made: dict[Hashable, NDArray] = {}
 

@@ -14,11 +14,11 @@ from tqdm import tqdm
 logger = logging.getLogger("mpm_dolfinx")
 
 WITHIN = {"mpm_dolfinx", "contextlib", "functools"}
-"""Packages whose frames a warning skips, so that the warning names a line of the user's script."""
+"""Packages that the origin of a warning skips, so that the warning names a line of the user's script."""
 
 
 class ResultWarning(UserWarning):
-    """Base of all warnings of the package.  A result may be misleading."""
+    """Base of all warnings of the package, which are given if a result may be misleading."""
 
 
 class ResolutionWarning(ResultWarning):
@@ -32,7 +32,7 @@ class ConditionWarning(ResultWarning):
 def set_log_level(level: int | str) -> None:
     """Show log lines at or above a level.  The level "INFO", for example, shows reduced steps and checkpoints.
 
-    If `logging` has no handlers, the lines go to stderr.
+    If Python's `logging` has no handlers, the lines are written to stderr.
 
     Parameters
     ----------
@@ -63,8 +63,8 @@ def log(comm: MPI.Intracomm, message: str, *values, level: int = logging.INFO) -
 def warn(comm: MPI.Intracomm, category: type[ResultWarning], message: str, *values) -> None:
     """Give a warning on the first process, at the line of the script that caused it.  All processes must call this.
 
-    If a filter turns the warning into an error, all processes raise the error.  Callers must therefore warn before they
-    change any data.
+    If a filter of `warnings` makes the warning an error, all processes raise it, so no data may have been changed
+    before.
     """
     raised = None
     if comm.rank == 0:
@@ -80,7 +80,7 @@ def warn(comm: MPI.Intracomm, category: type[ResultWarning], message: str, *valu
 
 
 def _outside() -> int:
-    """Return the number of frames from the caller to the first frame outside the package."""
+    """Return the number of stack frames from the caller to the first frame outside the package."""
     frame, level = sys._getframe(1), 1
     while frame is not None and frame.f_globals.get("__name__", "").partition(".")[0] in WITHIN:
         frame, level = frame.f_back, level + 1

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Numpy archives (.npz) whose arrays several processes write and read together, by rows.
 
-Each process writes its rows at their places in the file, and reads an equal share of all rows.  No process holds an
-array of all rows.  Neither the file nor the reader depends on the number of processes that wrote the file.
+Each process writes its own rows, and reads an equal number of rows.  No process has an array of all rows in memory.
+The file does not depend on the number of processes that wrote it.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ ONE = 1 << 31  # Source: definition of the same order of the powers
 
 
 class Member(NamedTuple):
-    """An array in an archive: position of its entries in the file, their checksums, type and shape."""
+    """An array in an archive: type, shape, position of the entries in the file, and checksums."""
 
     dtype: np.dtype
     shape: tuple[int, ...]
@@ -40,12 +40,12 @@ class Member(NamedTuple):
 
 
 def write(comm: MPI.Intracomm, file: Path, arrays: Mapping[str, NDArray], rows: Mapping[str, NDArray]) -> int:
-    """Write an archive, and return its size in bytes.  The complete archive then replaces `file`.
+    """Write an archive, and return its size in bytes.  An older file is replaced when the archive is complete.
 
     If a process cannot write, all processes raise its error.
 
     `arrays`: arrays by name, on rank 0.
-    `rows`: further arrays by name, as the rows (n, ...) of this process.  The file has the rows of all processes, in
+    `rows`: rows (n, ...) of this process for further arrays, by name.  The file contains the rows of all processes, in
     the order of the ranks.
     """
     part = file.with_name(file.name + ".part")
@@ -99,7 +99,7 @@ def write(comm: MPI.Intracomm, file: Path, arrays: Mapping[str, NDArray], rows: 
 
 
 def members(file: Path, names: Iterable[str]) -> dict[str, Member]:
-    """Return the named arrays in an archive.  Raise ValueError for compressed or incomplete arrays."""
+    """Find named arrays in an archive, by name.  Raise ValueError if an array is compressed or incomplete."""
     out = {}
     with open(file, "rb") as f, ZipFile(f) as archive:
         for name in names:
@@ -129,13 +129,13 @@ def some_rows(file: Path, member: Member, first: int, last: int) -> NDArray:
 def read(
     comm: MPI.Intracomm, file: Path, of: Mapping[str, Member], ranges: Mapping[str, tuple[int, int]]
 ) -> dict[str, NDArray]:
-    """Return this process's rows of arrays in an archive.
+    """Return the rows of arrays in an archive that this process reads, by name.
 
-    Raise ValueError on all processes if the bytes of an array differ from its checksum.
+    Raise ValueError on all processes if the bytes of an array do not have its checksum.
 
-    `of`: the arrays by name.
-    `ranges`: first row of this process, and last row plus one, by name.  All processes together read all rows, in the
-    order of the ranks.
+    `of`: result of `members`.
+    `ranges`: first row, and last row plus one, of this process, by name.  The processes read consecutive rows, and
+    together all rows.
     """
     rows = together(comm, lambda: {name: some_rows(file, of[name], *ranges[name]) for name in of})
     sums = comm.gather([(zlib.crc32(found), found.nbytes) for found in rows.values()])
@@ -172,7 +172,7 @@ def _joined(crc: int, parts: Iterable[tuple[int, int]]) -> int:
 
 @cache
 def _power(k: int) -> int:
-    """Return the factor `x^(8 2^k)` that appends 2^k bytes to a checksum."""
+    """Return the factor `x^(8 2^k)` of a checksum for 2^k following bytes."""
     return _product(_power(k - 1), _power(k - 1)) if k else ONE >> 8
 
 

@@ -18,8 +18,8 @@ from mpm_dolfinx.stepping.state import State
 class CellFields:
     """Fields of the n cells of this process that contain material.
 
-    A mean is a volume average over the material in the cell.  The fields are second-order accurate at the centroid `x`
-    of the material.  The grid lines are in their positions of the next step.
+    Means are volume averages over the material in a cell, second-order accurate at its centroid `x`.  If grid lines
+    move, they are at their positions of the next step.
 
     Attributes
     ----------
@@ -30,14 +30,14 @@ class CellFields:
     volume : (n,), m^d
         Volume of the material in the cell.
     displacement : (n, d), m
-        Mean displacement since the start, or since a stage has reset all displacements.
+        Mean displacement since the start, or since a stage that reset all displacements.
     effective_stress, stress : (n, d, d), in axisymmetry (n, 3, 3), Pa
         Mean effective Cauchy stress and mean total Cauchy stress, positive in tension.
     pressure : (n,), Pa
         Pore pressure, positive in compression; None without fluid.
     water : (n,), m^d
-        Volume that the pore fluid would have at zero pressure, minus the volume defect `owed` of the points.  None
-        without fluid.
+        Volume that the pore fluid would have at zero pressure, minus the volume defect of the points.  None without
+        fluid.
     """
 
     cell: NDArray[np.int64]
@@ -62,7 +62,7 @@ def cell_fields(scene: Scene, state: State) -> CellFields:
     volume = sum_by(places.slots, weight, len(places.filled))
 
     def mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the mean of piece values in each cell."""
+        """Return the mean in each cell of the values of its pieces."""
         return means_of_rows(places.slots, weight, values, len(volume))
 
     effective = mean(cut.to_cells(scene.materials.effective_stress(points)))

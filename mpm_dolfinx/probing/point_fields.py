@@ -29,7 +29,7 @@ class PointFields:
     porosity : (n,)
         Present porosity, `1 - (1 - n_0) / J`, with the initial porosity n_0 and the volume ratio J.
     saturation : (n,)
-        Degree of saturation of the pores; 0 without fluid.
+        Degree of saturation of the pores, 0 in a scene without fluid.
     """
 
     effective_stress: NDArray[np.float64]

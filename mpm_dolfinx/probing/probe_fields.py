@@ -3,9 +3,9 @@
 
 The pressure at a probe is a weighted polynomial fit (`local_fit`) to the pressures of cells.  The fit uses cells of the
 same soil, at most three cells away.  Open faces must connect these cells to the cell of the probe.  The fit also uses
-pressures on faces to excluded cells and on drained sides.  Heads are fitted instead of pressures, so hydrostatic states
-are exact.  The result is limited to the range of heads in the cell of the probe, in neighbouring cells and on drained
-sides.  Towards an undrained side, this range is extended with the gradient of the head.
+pressures on drained sides, and on the faces between these and other cells.  Heads are fitted instead of pressures, so
+hydrostatic states are exact.  The fitted head is limited to the range of heads in the cell of the probe, in
+neighbouring cells and on drained sides.  Towards an undrained side, the gradient of the head extends this range.
 
 The stress at a probe is a fit to the stresses of material points.
 """
@@ -44,12 +44,12 @@ def probe_pressures(scene: Scene, state: State, probes: Probes) -> NDArray[np.fl
 
 
 class _Lattice:
-    """Blocks of cells around the cells of n probes.
+    """Blocks of cells, one around each of n probes.
 
-    `number` (n, cells): lexicographic indices of the cells in the grid, -1 outside the grid.
+    `number` (n, cells): lexicographic indices of the cells in the grid, or -1 outside the grid.
     `middle`: index of the probe's cell in its block.
-    `stride` (d,): increment of the index in the block along each axis.
-    `neighbours`: indices of cells and of their neighbours in the block, by axis and end.
+    `stride` (d,): increment of the index in a block to the next cell along each axis.
+    `neighbours`: indices of cells, and of their neighbours, in a block, by axis and end (0 or 1).
     """
 
     def __init__(self, grid: Grid, cell: NDArray[np.int64]):
@@ -74,7 +74,7 @@ class _Lattice:
 
 
 class _Around:
-    """Data of the cells around n probes, in arrays (n, cells, ...) that are equal on all processes."""
+    """Data of the cells in blocks around n probes, in arrays (n, cells, ...).  All processes have the same arrays."""
 
     def __init__(self, scene: Scene, state: State, on_grid: OnGrid, probes: Probes):
         self._grid = scene.grid
@@ -103,9 +103,10 @@ class _Around:
         self._sides = open_sides([one.placed(wet) for one in state.stage.feeding], d)
 
     def _gathered(self, on_grid: OnGrid, p: NDArray[np.float64], soils: NDArray[np.float64]) -> tuple[NDArray, NDArray]:
-        """Return the local indices of the cells in the blocks, and a table of the data of these cells.
+        """Return arrays (n, cells, ...) with the local indices and with data of the cells in the blocks.
 
-        The index of an empty cell, or of a cell of another process, is -1.
+        An empty cell, or a cell of another process, has the index -1.
+
         `soils` (k, 3): conductivity, index of the conductivity law, and material of each piece.
         """
         grid = self._grid
@@ -133,10 +134,11 @@ class _Around:
     def _connected(self, same: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Return a mask of the cells that the fit uses, and a mask of the cells connected to the cell of the probe.
 
-        The fit uses cells with only the soil of the probe.  Without such cells, the fit uses cells with only the
-        material of the probe, or else all filled cells.
+        The fit uses cells that contain only the soil of the probe.  If there are none, it uses cells with only the
+        material of the probe, or otherwise all filled cells.
 
-        `same` (n, cells, 3): whether all soil in a cell has the probe's conductivity, conductivity law and material.
+        `same` (n, cells, 3): whether conductivity, conductivity law and material of all soil in a cell are as at the
+        probe.
         """
         same = same & self._filled[:, :, None]
         levels = [same.all(axis=2), same[:, :, 2], self._filled]
@@ -154,12 +156,12 @@ class _Around:
         return reached & groups, reached
 
     def _opening(self, axis: int, end: int) -> NDArray[np.bool_]:
-        """Return whether the faces between neighbouring cells along an axis are open."""
+        """Return for each pair of neighbouring cells along an axis whether their common face is open to flow."""
         one, other = self._lattice.neighbours[axis, end]
         return (self._open[:, one, axis, end] > 0) & (self._open[:, other, axis, 1 - end] > 0)
 
     def pressures(self, weight: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the pressures at the probes, for a fluid with this weight per volume, in N/m^3."""
+        """Return the pressures at the probes, in Pa.  `weight` (d,): weight of the fluid per volume, in N/m^3."""
         comm, head = self._grid.comm, self._p - self._centroid @ weight
         base, (low, high) = head[:, self._lattice.middle], self._bounds(head)
         at, offset, value, share, own = self._drained(weight)
@@ -180,7 +182,7 @@ class _Around:
         return np.clip(base + above, low, high)
 
     def _bounds(self, head: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return a lower and an upper bound of the head at each probe."""
+        """Return a lower and an upper bound of the head at each probe, in Pa."""
         i = self._lattice.middle
         low, high = head[:, i].copy(), head[:, i].copy()
         for axis in range(self._grid.dim):
@@ -207,7 +209,7 @@ class _Around:
         return low, high
 
     def _outside_faces(self, head: NDArray[np.float64]) -> list[tuple[NDArray, ...]]:
-        """Return the index of the probe, the position, the head and the weight of each face to an excluded cell."""
+        """Return probe, position, head and weight of each face between cells of the fit and other connected cells."""
         out = []
         for (axis, end), pair in self._lattice.neighbours.items():
             own_cells, other_cells = pair
@@ -228,9 +230,9 @@ class _Around:
         return out
 
     def _drained(self, weight: NDArray[np.float64]) -> tuple[NDArray, ...]:
-        """Return for each drained side: probe index, position, head, weight, and whether the probe's cell has the side.
+        """Return for each drained side of a cell: probe, position, head, weight, and whether the probe is in this cell.
 
-        The head is a mean over all drained faces on one side of a cell.
+        Positions and heads are means over all drained faces on the side.
         """
         sides, d = self._sides, self._grid.dim
         probe, place = np.nonzero(self._counts & (self._local >= 0))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Probes: tracked material particles with recorded displacement, pressure and stress."""
+"""Probes: material particles whose displacement, pressure and stress a run records."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Probes:
     stressed: bool = False  # whether stresses are recorded too
 
     def check(self, bodies: Sequence[Body], present: Sequence[bool]) -> None:
-        """Raise ValueError if the scene has other bodies, or if a probe is in an absent body."""
+        """Raise ValueError if the probes were made for other bodies, or if a probe is in an absent body."""
         if len(bodies) != len(self.bodies) or not all(map(_same, bodies, self.bodies)):
             what = f"made for {len(self.bodies)} bodies, the scene has {len(bodies)}"
             raise ValueError(f"probes: {what}; must be made with all bodies of the scene, in the scene's order")
@@ -42,19 +42,19 @@ class Probes:
             raise ValueError(f"probe at {self.x0[first]}: body {body[first]} is absent, must be present")
 
     def displacement(self, points: MaterialPoints, comm: MPI.Intracomm) -> NDArray[np.float64]:
-        """Return the displacements (n, d) of all probes on every process, in m."""
+        """Return on every process the displacements (n, d) of all probes, in m."""
         known, at = points.find(self.id)
         return self._shared(comm, known, interpolate(points.corners[at] - points.origin[at], self.xi[known]))
 
     def position(self, points: MaterialPoints, comm: MPI.Intracomm) -> NDArray[np.float64]:
-        """Return the present positions (n, d) of all probes on every process, in m."""
+        """Return on every process the present positions (n, d) of all probes, in m."""
         known, at = points.find(self.id)
         return self._shared(comm, known, interpolate(points.corners[at], self.xi[known]))
 
     def _shared(
         self, comm: MPI.Intracomm, known: NDArray[np.int64], values: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return the values of all probes from the values of the probes on each process."""
+        """Return the values of all probes.  `values`: values of the probes `known` on this process."""
         out = np.zeros((len(self.id), *values.shape[1:]))
         out[known] = values
         return over_all(comm, out)
@@ -95,9 +95,9 @@ def probes(bodies: Sequence[Body], x0: ArrayLike, *, stress: bool = False) -> Pr
     bodies
         All bodies, in the order in which the scene lists them.
     x0 : (n, d), m
-        Reference positions inside the bodies or on their surfaces, before the map of `mapped`.  A probe on a common
-        surface of two bodies belongs to the first of these bodies in `bodies`.  To select the second body, move the
-        position into this body.
+        Reference positions inside bodies or on their surfaces; in a `mapped` body, positions before mapping.  A probe
+        on a common surface of two bodies belongs to the first of these bodies in `bodies`.  For the second body, give a
+        position inside this body.
     stress
         Whether the run also records effective stresses.
 
@@ -136,7 +136,7 @@ def _domains_at(
 
 
 def coordinates(corners: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the local coordinates of a position in n domains; inside a domain, coordinates are between -1 and 1."""
+    """Return the local coordinates of a position in each of n domains.  Inside a domain they are from -1 to 1."""
     signs, xi = 2 * corner_bits(len(x)) - 1, np.zeros((len(corners), len(x)))
     for _ in range(20):  # Newton's method; the first step is exact for parallelepipeds
         hats = 0.5 * (1 + signs * xi[:, None, :])
