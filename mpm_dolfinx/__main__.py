@@ -47,7 +47,7 @@ def _version(package: str) -> str:
 
 
 def number(name: str, text: str) -> float | list[float]:
-    """Return the number in a text, or a list of numbers if commas separate several numbers."""
+    """Return the number in a text, or a list if the text contains several numbers separated by commas."""
     try:
         values = [float(part) for part in text.split(",")]
     except ValueError:
@@ -56,7 +56,7 @@ def number(name: str, text: str) -> float | list[float]:
 
 
 def law_of(name: str) -> type[mpm_dolfinx.Skeleton]:
-    """Return the package's law with this name.  For `file.py:name`, return the law `name` of the user's file."""
+    """Return the law with a name: a law of the package, or for `file.py:name` the law `name` in a user's file."""
     file, _, own = name.rpartition(":")
     if not file:
         found = getattr(mpm_dolfinx, name, None)
@@ -76,7 +76,7 @@ def _is_law(value: object) -> bool:
 
 
 def constants_of(law: type[mpm_dolfinx.Skeleton], texts: Sequence[str]) -> dict[str, float | list[float]]:
-    """Return the constants of a law from texts `name=value`.  Each text must name a different constant."""
+    """Return the constants of a law, by name, from texts `name=value`, each for another constant."""
     out, known = {}, [f.name for f in fields(law) if f.init]
     for text in texts:
         name, equals, value = text.partition("=")
@@ -92,7 +92,7 @@ def constants_of(law: type[mpm_dolfinx.Skeleton], texts: Sequence[str]) -> dict[
 
 
 def run_element_test(o: argparse.Namespace) -> None:
-    """Compute a laboratory test of a law, print the results as a table, and draw them."""
+    """Compute a laboratory test of a law, print a table of results, and draw them if an image file is given."""
     if o.draw and not Path(o.draw).parent.is_dir():
         raise ValueError(f"--draw {o.draw}: there is no folder {Path(o.draw).parent}")
     law, strain = law_of(o.law), number("strain", o.strain)

@@ -25,11 +25,11 @@ LOCATED = 1e-3
 """Accuracy of the time of an event, divided by the length of the step.  Source: definition, see `until` of `run`."""
 
 Event = Callable[[Any], float]
-"""A function of the simulation that returns a number or a boolean."""
+"""A user's function of the simulation that returns a number or a boolean."""
 
 
 class Simulated(Protocol):
-    """Interface of a `Simulation` for the time loop."""
+    """The part of a `Simulation` that the time loop needs."""
 
     scene: Scene
     state: State
@@ -82,9 +82,9 @@ class Events:
     def within(self, step: Step, new: State) -> Found | None:
         """Return the first event within a step that ends in the state `new`, or None if there is no event.
 
-        Trial steps locate the event, by Brent's method for numbers and by bisection for booleans.  The returned state
-        follows the event by at most `LOCATED` times the length of the step.  After the search, the simulation has the
-        state at the start of the step.
+        Trial steps locate the event, by Brent's method for numbers and by bisection for booleans.  The state in the
+        result is later than the event by at most `LOCATED` times the length of the step.  After the search, the
+        simulation is in the state at the start of the step.
         """
         if not self._until:
             return None
@@ -112,7 +112,7 @@ class Events:
         return Found(int(_crossed(before, tried[end]).argmax()), end, new, report)
 
     def _at(self, step: Step, dt: float, tried: dict[float, list[float]]) -> list[float]:
-        """Return the values of the functions after a trial step of length `dt`."""
+        """Return the values of the user's functions after a trial step of length `dt`, in s."""
         if dt not in tried:
             self._simulation.state = step.start
             new, _ = self._simulation.advanced(dt, *step.how)
@@ -121,7 +121,7 @@ class Events:
         return tried[dt]
 
     def _values(self) -> list[float]:
-        """Return the values of the functions.  An error on one process is raised on all processes."""
+        """Return the values of the user's functions.  If one fails, all processes raise an error."""
         s, comm = self._simulation, self._simulation.scene.grid.comm
         out = by_user(comm, "until: a function", lambda: [_number(k, of(s)) for k, of in enumerate(self._until)])
         check_alike(comm, {f"until: function {k}": value for k, value in enumerate(out)})
@@ -139,13 +139,13 @@ def check_alike(comm: MPI.Intracomm, given: Mapping[str, Any]) -> None:
 
 
 def _crossed(before: Sequence[float], now: Sequence[float]) -> NDArray[np.bool_]:
-    """Return which values have changed their sign since the start of a step."""
+    """Return for each value whether its sign has changed since the start of a step."""
     sign = np.sign(before)
     return (sign != 0) & (np.sign(now) != sign)
 
 
 def _number(k: int, value) -> float:
-    """Return the value of a function as a number: 1 for True, and -1 for False."""
+    """Return the value of a user's function as a number: 1 for True, and -1 for False."""
     if isinstance(value, (bool, np.bool_)):
         return 1.0 if value else -1.0
     try:

@@ -64,7 +64,7 @@ class Simulation:
     fluid
         Pore fluid; None for a dry scene.
     gravity : (d,) or callable t -> (d,), m/s^2
-        Acceleration of gravity. In axisymmetry gravity acts along the axis.
+        Acceleration of gravity, in axisymmetry along the axis.
     pressure
         Initial pore pressure, Pa: a number, or a function of positions x (n, d) such as `hydrostatic`. A nonzero
         pressure requires a fluid.
@@ -75,13 +75,13 @@ class Simulation:
         the stress into equilibrium with loads and initial pore pressures. Under constant loads the first step then
         causes no displacement.
     terms
-        User-defined terms in UFL. Functions are terms of the momentum balance, see `user_functions`; `OnSide` applies
-        such a function to a side. A `Source` is a term of the fluid balance.
+        User-defined terms in UFL. A function is a term of the momentum balance (see `user_functions`), `OnSide` such a
+        term on a side, and `Source` a term of the fluid balance.
     numerics
         Quadrature, coupling, tolerance and time integration, see `Numerics`.
     inertia
-        True: bodies have inertia, and need no walls. `Moving`: bodies also have an initial velocity. False: only later
-        stages may have inertia. None: all stages are quasi-static. Inertia requires `quadrature="domain"`.
+        True: bodies have inertia, and need no walls.  `Moving`: they also have an initial velocity.  False: later
+        stages may have inertia.  None: no stage has inertia. Inertia requires `quadrature="domain"`.
 
     Attributes
     ----------
@@ -94,7 +94,7 @@ class Simulation:
     Raises
     ------
     ValueError
-        Invalid input; the message names the object, its value and the allowed values.
+        The input is invalid.  The message names the object, its value and the allowed values.
     """
 
     def __init__(
@@ -148,7 +148,7 @@ class Simulation:
         """Wall time for compiling or loading the forms, in s."""
 
     def __str__(self) -> str:
-        """Return a table of terms and solvers, with the reason why the scene uses, or does not use, each of them."""
+        """Return a table of all terms and solvers.  It shows whether the scene uses them, and why."""
         return summary.table(self.scene, self.state)
 
     # ---- results --------------------------------------------------------------------------------
@@ -213,8 +213,8 @@ class Simulation:
         """Force (d,) of each wall of the grid on the bodies in the last step, by name, in N.
 
         In plane strain the unit is N/m.  Components that the wall does not fix are zero.  If two walls fix the same
-        component of a node, the wall normal to this component carries the force.  If neither wall is normal to the
-        component, each wall carries half of the force.
+        component of a node, its force acts on the wall that is normal to this component.  If neither wall is normal to
+        the component, half of the force acts on each wall.
         """
         return self.outcome("wall_reactions")
 
@@ -222,7 +222,7 @@ class Simulation:
     def outflows(self) -> ByName[NDArray[np.float64]]:
         """Outflow through each drained side and each side with inflow, by name, in m^3/s (m^2/s in plane strain).
 
-        A `Contact` that conducts has the flow from its bodies `one` to its bodies `other`.
+        For a `Contact` that conducts, the outflow is the flow from its bodies `one` to its bodies `other`.
         """
         return self.outcome("outflows")
 
@@ -242,12 +242,12 @@ class Simulation:
     def outcome(self, quantity: str) -> ByName[NDArray[np.float64]]:
         """Return one result of all conditions at the end of the last step, for example "reactions", by name.
 
-        User-defined conditions are included.  If no condition of the stage has this result, the dictionary is empty.
+        User-defined conditions are included.  The dictionary is empty if no condition of the stage has this result.
 
         Raises
         ------
         KeyError
-            The quantity is unknown; the message lists the known quantities.
+            The quantity is unknown.  The message lists the known quantities.
         """
         known = dict.fromkeys([*self.state.stage.quantities, *self.state.outcome])
         if quantity not in known:
@@ -305,13 +305,13 @@ class Simulation:
             add the condition `more`.  Every `Contact` remains in force, even if it is not listed.
         add
             Indices of bodies that are `Later`, for example a fill.  Added bodies have no velocity.  Added bodies have
-            an initial stress only if `initial_stress` lists them.  A fill is placed on the present surface of the
-            bodies that it touched at seeding.  The free side of the fill remains where it was seeded.
+            an initial stress only if `initial_stress` lists them.  A fill is added to the present surface of the bodies
+            that it touched at seeding.  Its free sides remain at their seeded positions.
         remove
             Indices of bodies to be removed, for example by an excavation.
         reset_displacement
-            Whether displacements are measured from the present positions from now on. The values of conditions are not
-            adapted: a `Displacement` of value d that remains in force moves its side by d again.
+            Whether displacements are measured from the present positions from now on. Values of conditions do not
+            change: a present `Displacement` with the value d then moves its side by d again.
         fields
             New values of entries of `points.data`, by name.  A value is an array (n, ...) for the n points of this
             process, or one value for all points.  An entry is a state variable of a law, a material constant that
@@ -332,7 +332,7 @@ class Simulation:
         Raises
         ------
         NotConverged, LeftGrid
-            The step fails; a shorter step may succeed.
+            The step fails, but a shorter step may succeed.
         ValueError
             A function of time returns an invalid value.
         """
@@ -341,7 +341,7 @@ class Simulation:
         return report
 
     def advanced(self, dt: float, *how: tuple) -> tuple[State, Report]:
-        """Return the state after a step of length `dt`, in s, and the report of the step; `state` does not change."""
+        """Return the state after a step of length `dt`, in s, and the report of the step.  `state` does not change."""
         numbers("dt", dt, test=lambda v: (0 < v) & (v < np.inf), allowed="> 0 and finite")
         try:
             return step(self.scene, self._state, dt, *how)

@@ -31,7 +31,7 @@ Adaptive steps may have grown by several powers of ten before a slide begins, an
 FINEST = NEAR**2
 """Smallest adaptive step, divided by the time.
 
-Source: epsilon, a smaller step changes only the last four digits of the time.
+Source: epsilon, smaller steps change only the last four digits of the time.
 """
 SAFETY, SHRINKS, GROWS, KEEPS = 0.9, 0.2, 5.0, 1.2
 """Constants for the ratio of an adaptive step to the previous step.
@@ -41,16 +41,16 @@ between 1 and `KEEPS`, the step keeps its length.  Source: Hairer, Norsett and W
 Hairer and Wanner (1996), IV.8.
 """
 RINGS = 5e-3
-"""Sudden pressure change above which a step is halved, divided by the largest pressure change so far.
+"""Sudden pressure change for which a step is halved, divided by the largest pressure change so far.
 
 SDIRK2 overshoots a jump by at most 0.21 times the jump.
 """
 AGAIN = 2.0
-"""A pressure change is sudden if its rate is more than `AGAIN` times the rate at the start of the last step."""
+"""Smallest ratio of the rate of a sudden pressure change to the rate of pressure at the start of the last step."""
 MOST = SAME / EPSILON
-"""Largest number of output intervals.  Source: exact; in more intervals `SAME` times an interval is below rounding."""
+"""Largest number of output intervals.  Source: exact; `SAME` times a shorter interval is below rounding errors."""
 RESOLVED = 10
-"""Smallest `rtol`, divided by the solver's tolerance.  With a smaller `rtol`, solver errors dominate."""
+"""Smallest `rtol`, divided by the solver's tolerance.  If `rtol` is smaller, errors of the solver dominate."""
 FIRST = 1e-3
 """Smallest default length of the first adaptive step, divided by the first output interval."""
 
@@ -64,9 +64,9 @@ class Adaptive:
     rtol
         Tolerance, see `run`.
     first_step : s
-        First trial step of a new run, > 0.  The default is 18 `rtol` times the diffusion time of a cell.  This default
-        is at least 0.001 times the first output interval, and at most this interval.  With inertia, the default is also
-        at most the time in which a wave crosses a cell.
+        First trial step of a new run, > 0.  The default is 18 `rtol` times the diffusion time of a cell, but at least
+        0.001 times the first output interval, and at most this interval.  With inertia, it is also at most the time in
+        which a wave crosses a cell.
     max_step : s
         Longest step, > 0.
 
@@ -119,7 +119,7 @@ class StepSize:
         return max(MIN_CUT_BY_ERROR * size, FINEST * abs(t)) if self.by_error else MIN_CUT * size
 
     def preferred(self, size: float) -> float:
-        """Return the nominal step length of a step whose first trial has the length `size`."""
+        """Return the nominal length of a step whose first trial has the length `size`, both in s."""
         return size if self.by_error else self.longest
 
     def fitted(self, left: float, small: float) -> float:
@@ -138,7 +138,7 @@ class StepSize:
         return 1.0 if self._excess(report, control) <= 1 else self._factor(report, control, 1.0)
 
     def next(self, size: float, report: Report, control: StepControl, failed: bool) -> float:
-        """Return the length of the next trial step; `failed` means that a longer trial did not converge."""
+        """Return the length of the next trial step, in s.  `failed`: whether a longer trial did not converge."""
         if not self.by_error:
             grows = report.easy and not self._rings(size, report, control)  # twice the step would be rejected
             return max(control.small, min(2 * size, self.longest)) if grows else control.small
@@ -158,9 +158,9 @@ class StepSize:
     def grown(self, size: float, report: Report, control: StepControl, failed: bool) -> StepControl:
         """Return the step control after a completed step.
 
-        After a reduction, equal steps are doubled again as soon as `waits` steps have converged.  At first `waits` is
-        0.  When a doubled step fails, `waits` increases to 2 `waits` + 1.  When a doubled step converges, `waits` is
-        halved.
+        After a reduction, the length of equal steps doubles again as soon as `waits` steps have converged.  The initial
+        value of `waits` is 0.  When a doubled step fails, `waits` increases to 2 `waits` + 1.  When it converges,
+        `waits` is halved.
         """
         small, whole = self.next(size, report, control, failed), size > (1 - SAME) * control.small
         if self.by_error:
@@ -174,21 +174,21 @@ class StepSize:
     def _rings(self, size: float, report: Report, control: StepControl) -> bool:
         """Return whether the step may have overshot a jump of the loads.
 
-        A sudden pressure change is no jump if pressures also changed suddenly in the last step.
+        A sudden pressure change is not a jump if pressures also changed suddenly in the last step.
         """
         excess = report.sudden - AGAIN * size * np.asarray(control.first)
         return bool((excess > np.maximum(RINGS * np.asarray(control.change), NEAR * max(control.change))).any())
 
     def _factor(self, report: Report, control: StepControl, power: float) -> float:
-        """Return the ratio of the next step to the computed step, from the error of the computed step."""
+        """Return the length of the next step, divided by the length of the computed step, from its error."""
         excess = self._excess(report, control)
         return min(GROWS, max(SHRINKS, SAFETY / excess**power if excess > 0 else GROWS))
 
     def _excess(self, report: Report, control: StepControl) -> float:
         """Return the largest ratio of an error to its tolerance, for the pressure, the motion and the water content.
 
-        If pressures drain freely within a step, their error in time does not affect the motion.  The tolerance of the
-        pressure is therefore at least `rtol` times the undrained pressure change of the step.
+        If pressures dissipate within a step, their error does not affect the motion.  The tolerance of the pressure is
+        therefore at least `rtol` times the pressure change in the same step without flow.
         """
         error, motion = report.moves
         motion = max(control.motion or 0.0, motion)
@@ -231,7 +231,7 @@ class Times:
     Raises
     ------
     ValueError
-        An argument is invalid, no time is left, or the output intervals are too short for floating-point times.
+        An argument is invalid, t_end is not after the present time, or output intervals are below rounding errors.
     """
 
     def __init__(self, start: float, now: float, end, interval, given, rtol, goes_on: bool):
@@ -245,7 +245,7 @@ class Times:
                 f"dt = {line(interval)}, must be left out with rtol and t_eval, because t_eval are the output times"
             )
         self.interval, self.each = 0.0, given is None and interval is None
-        """Output interval, in s (0 without equal intervals), and whether every step is an output."""
+        """Output interval, in s (0 if intervals are unequal), and whether every step is an output."""
         if interval is not None:
             allowed = f"> 0, and not below {(self.end - now) / MOST:g} s"
             test = lambda v: (v > 0) & (v * MOST >= self.end - now)  # noqa: E731
@@ -271,12 +271,12 @@ class Times:
         return [start + k * dt for k in range(done + 1, count)] + [self.end] * (count > done)
 
     def next(self, t: float) -> float:
-        """Return the first output time after the time `t`, plus a margin for rounding."""
+        """Return the first output time after the time `t`, in s, plus a margin for rounding errors."""
         return max([*self.after(t)[:1], t]) + SAME * self.interval
 
 
 def diffusion_time(scene: Scene, points: MaterialPoints) -> float:
-    """Return the shortest diffusion time of a cell, in s, or 0 without conductivity."""
+    """Return the shortest diffusion time of all cells, in s, or 0 if no soil conducts."""
     if scene.fluid is None:
         return 0.0
     stored = scene.materials.table(points, lambda m: m.biot**2 / m.oedometric)
@@ -290,7 +290,7 @@ def diffusion_time(scene: Scene, points: MaterialPoints) -> float:
 
 
 def cell_time(scene: Scene, points: MaterialPoints) -> float:
-    """Return the shortest time in which a wave crosses a cell, in s."""
+    """Return the shortest time, in s, in which a wave crosses any cell."""
     density = scene.materials.density(points)
     at = density > 0
     grid = scene.grid
@@ -301,7 +301,7 @@ def cell_time(scene: Scene, points: MaterialPoints) -> float:
 
 
 def step_rule(times: Times, rtol: float | Adaptive | None, scene: Scene, points: MaterialPoints) -> StepSize:
-    """Return the rule for the steps of a run; raise ValueError for invalid arguments."""
+    """Return the rule for the steps of a run.  Raise ValueError if arguments of the run are invalid."""
     if rtol is None:
         return StepSize(times.interval, times.interval)
     given = rtol if isinstance(rtol, Adaptive) else Adaptive(rtol)

@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: MIT
 """Factor of safety: the largest number by which the strength of the soil can be divided before the bodies fail.
 
-Trials with different factors bracket this number.  A factor divides cohesion, tensile strength and the tangents of the
-angles of friction and dilation (Griffiths and Lane 1999).  Newton's method may also fail in soil that is strong enough,
-so its failure is no criterion.  Instead, a trial adds a viscous stress to the soil, and computes the motion in time.
-The criterion is the overload, the ratio of the viscous stress to the shear stress.  If the soil is strong enough, the
-bodies come to rest, and the overload vanishes.  In a slide the overload remains, and equals the missing strength for
-any viscosity and cell size.
+Trials with different factors give bounds of this number.  The factor divides cohesion, tensile strength and the
+tangents of the angles of friction and dilation (Griffiths and Lane 1999).  Failure of Newton's method is no criterion,
+because it may also fail in soil that is strong enough.  Instead, a trial adds a viscous stress to the soil, and
+computes the motion in time.  The criterion is the overload, the ratio of the viscous stress to the shear stress.  If
+the soil is strong enough, the bodies come to rest, and the overload vanishes.  In a slide the overload remains.  For
+any viscosity and cell size, it equals the missing strength.
 
 All trials start after one step with soil that cannot yield.  In this step, bodies in equilibrium keep their stresses.
-Bodies that cannot stand get elastic stresses in this step.
+All other bodies get elastic stresses.
 """
 
 from __future__ import annotations
@@ -45,17 +45,17 @@ if TYPE_CHECKING:
     from mpm_dolfinx.simulation.simulation import Simulation
 
 WIDER, WIDEST = 2**0.5, 16.1
-"""`WIDER` is the ratio of two successive factors in the search for bounds; `WIDEST` is the largest factor."""
+"""Ratio of two successive factors in the search for bounds, and the largest factor."""
 LACKS = 0.25
 """Largest overload of a trial that comes to rest, divided by `rtol`.
 
-With half this value the factor of safety of a slope changes by 1.1 %, with twice this value by 0.5 %.
+Half this value changes the factor of safety of a slope by 1.1 %, and twice this value by 0.5 %.
 """
 STRAINS = 4.0
-"""Strain in a trial that barely slides, divided by the smaller of the overload and the elastic strain at yield.
+"""Strain in a trial that barely slides, divided by the overload, or by the elastic strain at yield if it is smaller.
 
-With half or twice this value the factor of safety of a slope changes by 0.5 %.  With twice the number of steps the
-factor of safety changes by less than 0.1 %.
+Half or twice this value changes the factor of safety of a slope by 0.5 %.  Twice the number of steps changes the factor
+of safety by less than 0.1 %.
 """
 STRENGTHS = ("cohesion", "residual", "hardening", "tension", "friction", "dilation")
 ANGLES = ("friction", "dilation")
@@ -70,8 +70,8 @@ class Safety:
     bounds
         Largest factor of a trial that came to rest, and smallest factor of a trial that did not.
     overloads
-        Overloads (n,) in the n steps of each trial, by factor of the trial.  The overload of a step is the work of the
-        viscous stress, divided by the work of the shear stress.
+        Overloads (n,) in the n steps of each trial, by the factor of the trial.  The overload of a step is the work of
+        the viscous stress, divided by the work of the shear stress.
     newton
         Number of Newton steps of all trials.
     """
@@ -87,14 +87,14 @@ def factor_of_safety(
 ) -> Safety:
     """Return the factor of safety: the largest number by which the strength can be divided before the bodies fail.
 
-    The simulation does not change.  If the bodies cannot stand, no earlier run is necessary.  Suction contributes to
-    the strength through the effective stress.  The friction of tools is not divided.  If a thin weak layer slides on
-    the surface, the factor depends on `rtol`.  All processes must call this function.
+    The simulation does not change.  Bodies that are not in equilibrium need no earlier run.  Suction contributes to the
+    strength through the effective stress.  The factor does not divide the friction of tools.  It depends on `rtol` if
+    only a thin weak layer at the surface slides.  All processes must call this function.
 
     Parameters
     ----------
     simulation
-        Scene under its loads, which must be constant in time from now on.
+        Scene with its loads, which must be constant in time from now on.
     dt
         Length of a step, in s, > 0.  The step must be long compared with viscous time scales of laws and terms.  If
         fluid flows, `dt` is required.  Choose a short step for undrained failure, and a long step for drained failure.
@@ -109,7 +109,7 @@ def factor_of_safety(
     ------
     ValueError
         An argument is invalid, the strength of a soil cannot be divided, or the bodies have no stress.  The bodies
-        still rest with 1/16 of their strength, or still slide with 16 times their strength.
+        still come to rest with 1/16 of their strength, or still slide with 16 times their strength.
     GaveUp
         Even the shortest step of a trial does not converge.
     """
@@ -145,7 +145,7 @@ def factor_of_safety(
 
 
 class _Bar:
-    """Progress bar that shows the trials on a terminal."""
+    """Progress bar for the trials on a terminal."""
 
     def __init__(self, shown: bool):
         self._bar = tqdm(bar_format="{desc}, {n_fmt} steps, {elapsed}{postfix}", disable=None if shown else True)
@@ -162,13 +162,13 @@ class _Bar:
         self._bar.close()
 
     def show(self, factor: float, count: int, overload: float) -> None:
-        """Show the number and the overload of a step in a trial."""
+        """Show the factor of a trial, and the number and overload of its last step."""
         self._bar.update()
         known = "".join(f", {what} at {at}" for what, at in self._known.items() if at)
         self._bar.set_postfix_str(f"strength over {factor:.4g}: step {count}, overload {overload:.1e}{known}")
 
     def tried(self, factor: float, judged: str) -> None:
-        """Store the result of a trial: "rests" or "slides"."""
+        """Store the result `judged` of a trial, "rests" or "slides"."""
         self._known[judged] = f"{factor:.4g}"
 
 
@@ -185,10 +185,10 @@ def _bracket(rests: Callable[[float], bool]) -> tuple[float, float]:
 
 
 def _ends(overloads: Sequence[float], steps: int, least: float) -> bool:
-    """Return whether the overloads of the first steps determine the result of a trial.
+    """Return whether the overloads of the first steps already determine the result of a trial.
 
-    The overload decreases ever more slowly.  If the overload would not vanish in the remaining steps at its present
-    rate of decrease, the bodies slide.
+    The overload decreases more and more slowly.  If its present rate of decrease is too small for it to vanish in the
+    remaining steps, the bodies slide.
     """
     *before, last = overloads
     rate = min(1.0, last / before[-1]) if before else 0.0
@@ -197,14 +197,14 @@ def _ends(overloads: Sequence[float], steps: int, least: float) -> bool:
 
 @dataclass
 class _Trial:
-    """Trial for the time loop, which counts its Newton steps in a list."""
+    """Scene and state of a trial for the time loop, with a list of Newton steps."""
 
     scene: Scene
     state: State
     newton: list[int]
 
     def advanced(self, dt: float) -> tuple[State, Report]:
-        """Return the state after a step of length `dt`, and the report of the step."""
+        """Return the state after a step of length `dt`, in s, and the report of the step."""
         state, report = step(self.scene, self.state, dt)
         self.newton.append(report.newton)
         return state, report
@@ -254,7 +254,7 @@ class _Weakened:
         self._viscosity.value = steps / STRAINS * max(least * modulus, stress) * dt
 
     def overloads(self, factor: float, tell: Callable[[int, float], None]) -> NDArray[np.float64]:
-        """Return the overloads in the steps of a trial, and call `tell` after each step."""
+        """Return the overloads in the steps of a trial.  `tell`: function that is called after each step."""
         trial, out = self._trial(self._start, lambda name, value: _over(name, value, factor)), []
         while len(out) < self._steps and not (out and _ends(out, self._steps, self._least)):
             before = trial.state.points
@@ -264,27 +264,27 @@ class _Weakened:
         return np.array(out)
 
     def _unyielding(self, initial: State) -> State:
-        """Return the state after a step in which the soil is too strong to yield."""
+        """Return the state after a step with soil that cannot yield."""
         moduli = self._scene.materials.table(initial.points, lambda m: m.oedometric)
         trial = self._trial(initial, lambda name, value: value if name in ANGLES else np.maximum(value, moduli))
         self._go_on(trial, "soil that cannot yield")
         return replace(trial.state, t=initial.t)
 
     def _trial(self, start: State, strength: Callable[[str, NDArray[np.float64]], NDArray[np.float64]]) -> _Trial:
-        """Return a trial that starts from a state, with strengths from the function `strength`."""
+        """Return a trial that starts from a state.  The function `strength` gives its strengths."""
         data = {name: strength(name, value) for name, value in self._strengths.items()}
         points = replace(start.points, data={**start.points.data, **data})
         return _Trial(self._scene, replace(start, points=points, velocity=None, result=None, control=None), self.newton)
 
     def _go_on(self, trial: _Trial, what: str) -> None:
-        """Take a step of a trial; `what` describes the soil in an error message."""
+        """Compute a step of a trial.  `what`: description of the soil for an error message."""
         try:
             run(trial, trial.state.t + self._dt, self._dt, progress=False)
         except GaveUp as error:
             raise GaveUp(f"factor_of_safety: {what}: {error}", error.result, error.history) from error
 
     def _overload(self, before: MaterialPoints, now: MaterialPoints) -> float:
-        """Return the overload of a step.  Points that moved to another process are excluded."""
+        """Return the overload of a step, without points that have moved to another process."""
         _, old, new = np.intersect1d(before.id, now.id, assume_unique=True, return_indices=True)
         d = before.F.shape[1]
         increment = now.F[new] @ np.linalg.inv(before.F[old]) - np.eye(d)
@@ -303,7 +303,7 @@ def _deviator(tensors: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _mean_stress(scene: Scene, points: MaterialPoints) -> float:
-    """Return the mean norm of the effective stress, in Pa; raise ValueError if there is no stress."""
+    """Return the mean norm of the effective stress, in Pa.  Raise ValueError if bodies have no stress."""
     grid = scene.grid
     size = np.linalg.norm(scene.materials.effective_stress_3d(points), axis=(1, 2))
     moduli, volume = scene.materials.table(points, lambda m: m.oedometric), points.volume0 * points.J
@@ -316,7 +316,7 @@ def _mean_stress(scene: Scene, points: MaterialPoints) -> float:
 
 
 def _shear_modulus(scene: Scene, points: MaterialPoints) -> float:
-    """Return the harmonic mean of the shear moduli of soil that may yield, in Pa."""
+    """Return the harmonic mean of the shear modulus, in Pa, over soil that may yield."""
     softness = scene.materials.table(points, lambda m: 1 / m.shear if isinstance(m, Frictional) else 0 * m.shear)
     volume = points.volume0 * points.J
     total, whole_volume = over_all(scene.grid.comm, np.array([softness @ volume, (softness > 0) @ volume]))
@@ -332,7 +332,7 @@ def _of(m: Skeleton) -> list[str]:
 
 
 def _as_fields(m: Skeleton) -> Skeleton:
-    """Return a material whose strengths are functions of position."""
+    """Return a copy of a material whose strengths are functions of position."""
     carried = {name: partial(_constant, value=getattr(m, name)) for name in _of(m) if not callable(getattr(m, name))}
     if isinstance(m, Frictional) and m.symmetric:
         carried |= {"dilation": carried.get("friction", m.friction)}
@@ -344,7 +344,7 @@ def _constant(X: NDArray[np.float64], value: float) -> NDArray[np.float64]:
 
 
 def _strengths(scene: Scene, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
-    """Return the values of each strength at the points, by name.  Materials without this strength have zeros."""
+    """Return the values of each strength at the points, by name, with zeros for materials without this strength."""
     out = {}
     for i, m in enumerate(scene.materials.materials):
         rows = np.flatnonzero(points.material == i)

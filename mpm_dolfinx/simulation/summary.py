@@ -29,7 +29,7 @@ class Part:
 
 
 def parts(scene: Scene, state: State) -> list[Part]:
-    """Return the terms and solvers of a scene at present."""
+    """Return all terms and solvers, with their present use in a scene."""
     return [*_momentum(scene, state), *_storage(scene, state), *_solvers(scene, state)]
 
 
@@ -115,9 +115,9 @@ def table(scene: Scene, state: State) -> str:
 
 
 def imbalance(scene: Scene, state: State) -> dict[str, float]:
-    """Return the imbalance of points, pieces and active cells over the processes.
+    """Return the imbalance of points, pieces and active cells over the processes, by name.
 
-    The imbalance is the largest number on a process, divided by the mean over all processes.  Before the first step,
+    An imbalance is the largest number on any process, divided by the mean over all processes.  Before the first step,
     the imbalance of pieces and cells is 1.  All processes must call this function.
     """
     comm, (on_grid, _) = scene.grid.comm, scene.last

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Tangent of the momentum balance and the fluid balance, as sparse matrices for modes and sensitivities."""
+"""Tangent of both balances as sparse matrices, for example for modes of vibration and sensitivities."""
 
 from __future__ import annotations
 
@@ -87,6 +87,6 @@ def tangent(simulation: Simulated, dt: float) -> Tangent:
 
 
 def _csr(A: PETSc.Mat) -> csr_matrix:
-    """Return a matrix of one process as a SciPy matrix."""
+    """Return a PETSc matrix of one process as a SciPy matrix."""
     rows, columns, values = A.getValuesCSR()
     return csr_matrix((values.copy(), columns.copy(), rows.copy()), shape=A.getSize())

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Time loop of a run, which takes steps and records histories."""
+"""Time loop of a run, which computes steps and records histories."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def run(
 ) -> Result:
     """Advance to t_end, in steps of dt or in adaptive steps.
 
-    A step that does not converge is halved; later steps grow again.
+    A step that does not converge is halved.  Later steps become longer again.
 
     Parameters
     ----------
@@ -80,35 +80,36 @@ def run(
         Length of a step, and output interval, s, > 0; limited to t_end - t. With `rtol`, `dt` is only the output
         interval. With `rtol`, but without `dt` and `t_eval`, every step is an output.
     rtol
-        Tolerance of adaptive steps, or `Adaptive`: the tolerance with limits of the steps. The estimated error of the
+        Tolerance of adaptive steps, or `Adaptive`, which adds limits of the step length. The estimated error of the
         pore pressures stays below about `rtol` times the larger of two pressure changes: the largest change since the
         start of the run, and the undrained change in the step. `rtol` is at least ten times `tolerance`, and < 1. If no
-        fluid flows, each step is one output interval. A term or law that depends on velocity then raises ValueError,
-        because the error of such a term or law cannot be estimated. With inertia the error of the motion is limited
-        too, relative to the largest motion since the start, see `motion_error`. In unsaturated soil the error of the
-        water content is limited too, relative to its largest change in a step so far. The estimated error of a pressure
-        is the fraction `solve.newton.ERROR` of the error of a first-order step. In tests, the largest true error of a
-        run was 0.7 to 5 times the largest estimate. The ratio was 5 directly after a jump of the load.
+        fluid flows, each step is one output interval.  Terms and laws that depend on velocity then raise ValueError,
+        because their error cannot be estimated.  With inertia, `rtol` also limits the error of the motion, relative to
+        the largest motion since the start, see `motion_error`.  In unsaturated soil, `rtol` also limits the error of
+        the water content, relative to the largest change of water content in any step so far.  The estimated error of a
+        pressure is the fraction `solve.newton.ERROR` of the error of a first-order step.  In tests, the largest true
+        error of a run was 0.7 to 5 times the largest estimate, with 5 after a jump of the load.
     t_eval : (n,), s
-        Output times, increasing, in (t, t_end]; t_end is always an output time. Steps end at output times.
+        Output times, increasing, in (t, t_end].  The time t_end is always an output time. Steps end at output times.
     until
         One function of the simulation, or several, that end the run before t_end. An event occurs within a step when a
-        returned number changes its sign, or a returned boolean changes. A number that is zero at the start is no event.
-        Example of a number: `lambda s: -s.points.displacement[:, 1].min() - 0.1`. Trial steps locate the event.
-        The run ends after the event, by at most a thousandth of the step. The state at the end is an output;
-        `Result.event` has the function's index and the time. The functions must return equal values on all processes.
-        An event completes the histories, as t_end does. A later run without `until` may continue these histories.
+        returned number changes its sign, or a returned boolean changes. A number that is zero at the start of a step
+        causes no event.  Example of a number: `lambda s: -s.points.displacement[:, 1].min() - 0.1`.  The run ends at
+        most a thousandth of the step after the event.  The final state is an output, and `Result.event` contains the
+        function's index and the time. The functions must return equal values on all processes.  An event ends the run
+        like t_end.  A later run without `until` may continue its histories.
     probes
         Material particles at which results are recorded.
     observe
-        Functions of the simulation, called at each output time, such as a `Writer`; `result` has the histories so far.
+        Functions of the simulation, called at each output time, such as a `Writer`.  `result` contains the histories so
+        far.
     checkpoint
         Function called after all observers, such as a `Checkpoint`.
     after
-        Histories that this run continues: the result of `resume`, or `result` of an interrupted run. `dt` must be the
-        same.
+        Histories that this run continues: the result of `resume`, or `Simulation.result` after an interrupted run. `dt`
+        must be the same.
     energies
-        Whether to record the energies of bodies with inertia, and the work since the start, in `Result.energies`.
+        Whether to record energies of bodies with inertia, and the work of forces since the start, in `Result.energies`.
     progress
         Whether to show a progress bar on a terminal, and to warn of the first reduced step. The logger `mpm_dolfinx`
         reports the other reduced steps at level INFO.
@@ -122,8 +123,8 @@ def run(
     ValueError
         An argument is invalid, or a function of time returns an invalid value.
     GaveUp
-        The shortest allowed step failed. The exception has the histories so far; `state` is the end of the last good
-        step.
+        The shortest allowed step failed. The exception contains the histories so far, and the simulation is in the
+        state after the last good step.
     """
     comm = simulation.scene.grid.comm
     simulation.scene.check(simulation.state)
@@ -190,7 +191,7 @@ def _bar(start: float, now: float, end: float, shown: bool) -> tqdm:
 
 
 def _show(bar: tqdm, state: State, before: float) -> None:
-    """Update the progress bar, which shows the time `before`."""
+    """Update the progress bar of a run, which has shown the time `before` until now."""
     result = state.result
     bar.update(state.t - before)
     counts = {"t": f"{state.t:.4g} s", "steps": result.steps, "newton": result.newton, "coupling": result.coupling}
@@ -199,7 +200,7 @@ def _show(bar: tqdm, state: State, before: float) -> None:
 
 
 def _note(simulation: Simulated, result: Result, control: StepControl | None = None) -> Result:
-    """Store histories in the state, and also a step control if one is passed."""
+    """Store histories, and optionally a step control, in the state of the simulation.  Return the histories."""
     simulation.state = replace(simulation.state, result=result, control=control or simulation.state.control)
     return result
 
@@ -245,7 +246,7 @@ def _histories(
 
 
 def _counting(scene: Scene, state: State, energies: bool, goes_on: bool) -> State:
-    """Return the state with the energies at the start of a run, or without energies."""
+    """Return the state at the start of a run, with its energies if `energies` is True."""
     if energies and not state.stage.inertia:
         raise ValueError("energies = True: bodies have no inertia, must be in a stage with inertia=True")
     if energies and goes_on and "energy" in state.outcome:
@@ -258,20 +259,20 @@ def _counting(scene: Scene, state: State, energies: bool, goes_on: bool) -> Stat
 
 
 class _Stopwatch:
-    """Wall time and profile of a run, and of the runs that it continues."""
+    """Wall time and profile of a run, including the runs that it continues."""
 
     def __init__(self, result: Result):
         self._start = time.perf_counter() - result.wall
         self._timed = {part: _compat.seconds[part] - result.profile.get(part, 0.0) for part in PARTS}
 
     def read(self, result: Result) -> Result:
-        """Return the result with the wall time and profile up to now."""
+        """Return the result with the present wall time and profile."""
         profile = {part: _compat.seconds[part] - self._timed[part] for part in PARTS}
         return replace(result, wall=time.perf_counter() - self._start, profile=profile)
 
 
 def _take_step(simulation: Simulated, rule: StepSize, target: float, verbose: bool, events: Events) -> bool:
-    """Take one step towards the time `target`, and return whether an event ends the run."""
+    """Compute one step towards the time `target`, in s, and return whether an event ends the run."""
     distribute(simulation)
     step, new = _advance(simulation, rule, target, verbose)
     found = events.within(step, new)
@@ -295,9 +296,9 @@ def _accepted(
 
 
 def _advance(simulation: Simulated, rule: StepSize, target: float, verbose: bool) -> tuple[Step, State]:
-    """Return a step towards the time `target`, and the state at the end of this step.
+    """Return a step towards the time `target`, in s, and the state at its end.
 
-    The step is shortened until it converges and meets the tolerances.
+    The step is shortened until it converges and its errors are within the tolerances.
     """
     comm = simulation.scene.grid.comm
     preferred = whole = None
@@ -341,9 +342,9 @@ def _advance(simulation: Simulated, rule: StepSize, target: float, verbose: bool
 
 
 def _by_euler(simulation: Simulated, dt: float, failed: StepFailed) -> tuple[State, Report] | None:
-    """Return the state and the report after a step by backward Euler, or None if this step fails too.
+    """Return the state and the report after a step by backward Euler, or None if this step also fails.
 
-    After a jump of the loads, SDIRK2 overshoots, and the soil may be too weak for the overshoot.
+    After a jump of the loads, SDIRK2 may fail: it overshoots, and the soil may be too weak for the overshoot.
     """
     if isinstance(failed, LeftGrid) or len(simulation.scene.substeps) == 1:
         return None
@@ -358,7 +359,7 @@ def _by_euler(simulation: Simulated, dt: float, failed: StepFailed) -> tuple[Sta
 
 
 def _has_left(failed: StepFailed, rule: StepSize, size: float, state: State) -> bool:
-    """Return whether points leave the grid in a step that meets the tolerances."""
+    """Return whether points leave the grid in a step whose errors are within the tolerances."""
     if not isinstance(failed, LeftGrid) or failed.report is None:
         return False
     return rule.refused(size, failed.report, measured(state.control, failed.report)) == 1
@@ -394,7 +395,7 @@ def _row(simulation: Simulated, probes: Probes | None) -> Row:
 
 
 def _measured(simulation: Simulated) -> Result:
-    """Return the histories with the memory and the load balance of the processes."""
+    """Return the histories with the memory use and the load balance of the processes."""
     comm, state = simulation.scene.grid.comm, simulation.state
     points, memory = comm.allreduce(np.array([len(state.points), peak_memory()])).tolist()
     even = imbalance(simulation.scene, state) if comm.size > 1 else {}

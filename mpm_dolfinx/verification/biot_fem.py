@@ -16,10 +16,10 @@ and the mass potential pi.  In saturated soil chi = 1.
 In unsaturated soil, kappa is multiplied by the relative permeability k_r.  With the saturation S and the porosity n_n
 in state n, rho [zeta - zeta_n] becomes S rho [zeta - zeta_n] + (S - S_n) J_n n_n exp(p_n/K_w).
 
-If the pressure is constant in each cell, two-point fluxes replace the last integral.  A two-point flux is kappa J (F^-T
-N)^2 / h times the jump of pi and of the potential of gravity.  N is the normal of the face between two cells, and h is
-the distance of their centres.  The mean of k_r between the two pressures multiplies kappa.  Two-point fluxes are not
-consistent under shear.
+If the pressure is constant in each cell, two-point fluxes replace the last integral, over kappa.  A two-point flux is
+kappa J (F^-T N)^2 / h times the jump of pi and of the potential of gravity.  N is the normal of the face between two
+cells, and h is the distance of their centres.  The mean of k_r between the two pressures multiplies kappa.  Two-point
+fluxes are not consistent under shear.
 
 In axisymmetry F contains the circumferential stretch, and integrals extend over the full circumference.  Materials,
 retention, user-defined terms and time integration use the code of the material point method.  The two methods therefore
@@ -71,13 +71,13 @@ CUT_DEGREE = 20  # quadrature degree on a partly loaded side, because an edge of
 
 
 class Space:
-    """Space of the unknowns w = (u, p/scale), without fluid w = u, and functions in it.
+    """Space of the unknowns w = (u, p/scale), or w = u without fluid, and functions in this space.
 
     `old`: w at the start of the step.
-    `past`: change of w due to the rate of the previous substep.
+    `past`: change of w in the step due to the rate in the previous substep.
     `b`, `f`: residual and loads.
-    `same`: copy of w that is not differentiated.
-    `u`, `p`: displacement and pressure in w.
+    `same`: copy of w, which is constant in derivatives.
+    `u`, `p`: displacement and scaled pressure, the parts of w.
     `p_dofs`: degrees of freedom of the pressures.
     `of_p`: space of the pressures alone.
     """
@@ -95,7 +95,7 @@ class Space:
 
 
 class Forms(NamedTuple):
-    """Compiled residual, tangent, flux and loads, and their constants."""
+    """Compiled forms (residual, tangent, flux and loads) and their constants."""
 
     residual: Any
     tangent: Any
@@ -114,15 +114,15 @@ class BiotFEM:
     Parameters
     ----------
     grid
-        The body, a box: `Grid` with equal cells, whose forms the model owns.
+        Mesh of the body, which is a box: a `Grid` with equal cells, used by this model only.
     material, fluid
-        Skeleton without state, and pore fluid.  Steps may not converge for steep retention curves (n > 2.5, or with
-        an air entry).
+        Skeleton without state, and pore fluid.  With steep retention curves (n > 2.5, or with an air entry), steps may
+        fail to converge.
     walls
         Sides of the box, each with the displacement components that are zero there, such as {"left": "xy"}.
     conditions
-        `Traction`, `Pressure`, `RigidPlate` and `Drained` on sides.  With "taylor-hood", `Drained` acts on facets that
-        lie wholly in its region.  All other sides are free of loads, and undrained.
+        `Traction`, `Pressure`, `RigidPlate` and `Drained` on sides.  With "taylor-hood", `Drained` acts only on facets
+        that are completely in its region.  All other sides are free of loads, and undrained.
     pressure : Pa
         Initial pore pressure, or a function of positions x (n, d), in m.  The initial effective stress is zero.  Loads
         or strains must therefore balance the initial pressure.
@@ -135,8 +135,8 @@ class BiotFEM:
         "taylor-hood" has Q2 displacements and Q1 pressures.  "q1-dg0" has Q1 displacements, cellwise pressures and
         two-point fluxes.
     numerics
-        Time integration, and tolerance of the residual.  The tolerance is relative to the loads, or to the first
-        residual of a step if this residual is larger.
+        Time integration, and tolerance of the residual.  The tolerance is relative to the larger of the loads and the
+        first residual of a step.
     """
 
     def __init__(
@@ -185,10 +185,10 @@ class BiotFEM:
         self.tolerance, self._t = numerics.tolerance, fem.Constant(self.grid.mesh, 0.0)
         self._substeps = substeps(numerics.method, fluid is not None or bool(terms))  # terms may depend on the velocity
         self.scale = float(np.max(material.at(self.grid.midpoints + self.grid.base).oedometric))
-        """Unit of the unknown pressure, in Pa.  Both equations are divided by this unit."""
+        """Scale of the unknown pressure and of both equations, in Pa."""
         self._pores = Pores(self.grid.mesh, material.retention if fluid else None, self.scale)
         self._whole = fem.Constant(self.grid.mesh, 1.0)
-        """Factor, 0 or 1, of the derivative of k_r in the tangent."""
+        """Factor of the derivative of k_r in the tangent: 0 omits it, and 1 includes it."""
         self._space = Space(self.grid, fluid is not None, *ELEMENTS[element])
         if fluid is not None:
             start = fem.Function(self._space.of_p)
@@ -218,7 +218,7 @@ class BiotFEM:
 
     @property
     def _places(self):
-        """Reference positions in the coordinates of the scene, as UFL."""
+        """Reference positions, not relative to the base of the grid, as UFL."""
         return ufl.SpatialCoordinate(self.grid.mesh) + self._constant(self.grid.base)
 
     def _constant(self, value: ArrayLike) -> fem.Constant:
@@ -227,7 +227,7 @@ class BiotFEM:
     def _field(self, value: Field) -> fem.Constant | fem.Function:
         """Return a parameter as UFL.  A function of position is interpolated quadratically in each cell.
 
-        The interpolation points are slightly inside the cells, because a parameter may jump between cells.
+        Interpolation points are slightly inside the cells, because parameters may jump between cells.
         """
         if not callable(value):
             return self._constant(value)
@@ -254,7 +254,7 @@ class BiotFEM:
         return low, high
 
     def _prescribe(self, space, value: float, name: str, region: Region | None = None):
-        """Return the boundary condition for a value on a side or a part of it."""
+        """Return the boundary condition that prescribes a value on a side or a part of it."""
         msh = self.grid.mesh
         d = self.grid.dim
         (low, high) = np.array(self._box(name, region))[:, :, None]
@@ -278,7 +278,7 @@ class BiotFEM:
         return (1 - 2 * end) * np.eye(self.grid.dim)[axis]
 
     def _area(self, condition: RigidPlate) -> float:
-        """Return the area, in m^(d-1), on which a condition acts."""
+        """Return the area, in m^(d-1), of the loaded part of a side."""
         low, high = self._box(condition.side, condition.region)
         within = np.minimum(high, self.grid.high) - np.maximum(low, self.grid.low)
         area = float(np.delete(within, side(condition.side, self.grid.dim)[0]).prod())
@@ -286,7 +286,7 @@ class BiotFEM:
         return area * float(np.squeeze(self.grid.around(middle[None])))
 
     def _on(self, condition: Traction | Pressure | Drained | RigidPlate, integrand):
-        """Return the integral of `integrand` over the area on which a condition acts, as UFL."""
+        """Return as UFL the integral of `integrand` over the loaded or drained part of a side."""
         low, high = map(self._constant, self._box(condition.side, condition.region))
         for a, x in enumerate(ufl.SpatialCoordinate(self.grid.mesh)):
             integrand = ufl.conditional(ufl.And(ufl.ge(x, low[a]), ufl.le(x, high[a])), integrand, 0.0)
@@ -296,7 +296,7 @@ class BiotFEM:
     def _compile(
         self, loads: Sequence, outlets: Sequence | None, gravity: Callable | None, terms: Sequence, sources: Sequence
     ) -> Forms:
-        """Compile loads, residual and tangent.  If `outlets` (drained sides) is not None, cells have one pressure."""
+        """Compile loads, residual and tangent.  `outlets`: drained sides, or None with nodal pressures."""
         dt, since, t = (self._constant(1.0) for _ in range(3))
         law = self.material
         space = self._space
@@ -368,7 +368,7 @@ class BiotFEM:
         return block(F) if self.grid.axisymmetric else F
 
     def _in_plane(self, T):
-        """Return a tensor without its circumferential components."""
+        """Return a tensor, in axisymmetry without circumferential components."""
         return ufl.as_matrix([[T[i, j] for j in (0, 1)] for i in (0, 1)]) if self.grid.axisymmetric else T
 
     def _begin(self, pressure: float | Callable, x: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -382,7 +382,7 @@ class BiotFEM:
         return self._pores.of("saturation", p) * (J - self._constant(1 - self.material.porosity))
 
     def _storage(self, F, u, J_n, p, p_n, q, dt: fem.Constant, outlets: Sequence[Drained] | None, pull):
-        """Return the change of the fluid content times q, and the flux, as UFL.
+        """Return as UFL the change of the fluid content, multiplied by q, and the flux in the storage equation.
 
         `pull`: acceleration of gravity, in m/s^2.
         """
@@ -419,17 +419,17 @@ class BiotFEM:
 
     @property
     def _seen(self):
-        """Pressure, divided by `scale`, that determines k_r, as UFL.
+        """Scaled pressure in k_r, as UFL.
 
-        The factor `_whole` selects whether the tangent contains the derivative of k_r.
+        The factor `_whole` determines whether the tangent contains the derivative of k_r.
         """
         now, same = (ufl.split(f)[1] for f in (self._space.w, self._space.same))
         return self._whole * now + (1 - self._whole) * same
 
     def _two_point(self, kappa, F, inverse, p, q, outlets: Sequence[Drained], weight):
-        """Return the flux between cells and to drained sides as UFL.
+        """Return as UFL the fluxes between cells and through drained sides.
 
-        `weight`: unit weight divided by `scale`.
+        `weight` (d,), in 1/m: weight of the fluid per volume, divided by `scale`, or None.
         """
         compliance = self._constant(self.scale / self.fluid.bulk)
         pi = mass_potential_form(p, compliance)
@@ -457,7 +457,7 @@ class BiotFEM:
     def _solver(self) -> PETSc.SNES:
         """Return Newton's method with full steps and a direct solver.
 
-        A line search is very slow for a rotating slender body, because a linearised rotation stretches the body.
+        A line search would be very slow for a rotating slender body, because linearised rotations stretch the body.
         """
         options, prefix = PETSc.Options(), "mpm_reference_"
         if not options.hasName(f"{prefix}snes_linesearch_type"):
@@ -514,12 +514,12 @@ class BiotFEM:
         return newton, worst
 
     def _acceleration(self, gravity: Callable[[float], ArrayLike], t: float) -> NDArray[np.float64]:
-        """Return the acceleration of gravity (d,), in m/s^2, at a time."""
+        """Return the acceleration of gravity (d,), in m/s^2, at the time t, in s."""
         d = self.grid.dim
         return numbers("gravity", gravity(t), (d,), allowed=f"{d} finite numbers")
 
     def _solve(self, substep: Substep, dt: float) -> tuple[int, float]:
-        """Solve one substep, and return the number of Newton iterations and the residual."""
+        """Solve one substep, and return the number of Newton iterations and the relative residual."""
         forms = self._forms
         space = self._space
         snes = self._snes
@@ -551,15 +551,15 @@ class BiotFEM:
         return len(norms) - 1, norms[-1] / scale
 
     def _free(self, x: PETSc.Vec) -> tuple[NDArray[np.float64], int]:
-        """Solve by SNES, and return the norms of the residuals and PETSc's reason for ending."""
+        """Solve with SNES.  Return the residual norms of all iterations, and PETSc's reason for the end."""
         self._snes.solve(None, x)
         return self._snes.getConvergenceHistory()[0], self._snes.reason
 
     def _restrained(self, x: PETSc.Vec) -> tuple[list[float], int]:
         """Solve by Newton steps with limited pressure changes, see `retention.restrained`.  Return as `_free` does.
 
-        The first tangent omits the derivative of k_r (Celia, Bouloutas and Zarba 1990).  Tangents after a limited step,
-        or after an increase of the residual, omit this derivative too.  In dry soil under gravity, the derivative may
+        Three tangents omit the derivative of k_r: the first (Celia, Bouloutas and Zarba 1990), a tangent after a
+        limited step, and a tangent after an increase of the residual.  In dry soil under gravity, this derivative may
         reverse the Newton step.
         """
         snes, of_p = self._snes, self._space.p_dofs
@@ -585,7 +585,7 @@ class BiotFEM:
         return [*norms, last], reason
 
     def _traction(self, load: Traction | Pressure, t: float) -> NDArray[np.float64] | float:
-        """Return a traction (d,) or a pressure, in Pa, at a time."""
+        """Return a traction (d,) or a pressure, in Pa, at the time t, in s."""
         if isinstance(load, Pressure):
             return float(load.at(t))
         value = load.at(t, self.grid.dim)
@@ -596,7 +596,7 @@ class BiotFEM:
         return value
 
     def _parts(self, x: PETSc.Vec, scale: float) -> tuple[float, float]:
-        """Return the norms of the residuals of momentum and of storage, relative to `scale`."""
+        """Return the norms of the momentum residual and of the storage residual, divided by `scale`."""
         self._residual(self._snes, x, x.duplicate())
         squares = (self._space.b.x.array / scale) ** 2
         squares[_compat.petsc_vec(self._space.b).getLocalSize() :] = 0.0  # ghosts
@@ -606,7 +606,7 @@ class BiotFEM:
     def run(self, t_end: float, dt: float, *, probes: ArrayLike, progress: bool = False) -> Result:
         """Advance to t_end (s) in equal steps dt (s).
 
-        If a step does not converge, `GaveUp` is raised with the histories up to the step before.
+        If a step does not converge, `GaveUp` is raised, with the histories before this step.
 
         Parameters
         ----------
@@ -634,22 +634,22 @@ class BiotFEM:
         return replace(result, wall=time.perf_counter() - start, converged=True)
 
     def displacement(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the displacements (n, d), in m, at reference positions x (n, d), on every process."""
+        """Return on every process the displacements (n, d), in m, at reference positions x (n, d), in m."""
         return self._at(self._space.u, x, self.grid.dim)
 
     def pressure(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the pore pressures (n,), in Pa, at reference positions x (n, d), on every process."""
+        """Return on every process the pore pressures (n,), in Pa, at reference positions x (n, d), in m."""
         return self.scale * self._at(self._space.p, x, 1)[:, 0]
 
     def water(self) -> float:
-        """Return the present volume, in m^d, of the pore fluid on all processes."""
+        """Return the present volume, in m^d, of the pore fluid in the whole body."""
         u, p = ufl.split(self._space.w)
         dx = ufl.dx(domain=self.grid.mesh, metadata={"quadrature_degree": 2 * self._space.degree})
         held = _compat.compiled(self._around * self._held(ufl.det(self._deformation(u)), p) * dx)
         return self.grid.comm.allreduce(fem.assemble_scalar(held))
 
     def _at(self, f: fem.Function, x: NDArray[np.float64], size: int) -> NDArray[np.float64]:
-        """Return the values of a function at reference positions on every process."""
+        """Return on every process the values of a function at reference positions."""
         grid = self.grid
         out = np.zeros((len(x), size))
         x = x - self.grid.base

@@ -26,7 +26,7 @@ CLOSE, MOST = 1e-10, 60  # largest relative residual, and largest number of Newt
 
 
 class _Rings:
-    """A law at n rings, with radial and circumferential stretches (n, 2)."""
+    """A law at n rings of soil with radial and circumferential stretches (n, 2)."""
 
     def __init__(self, material: Skeleton, count: int, state: Mapping[str, ArrayLike] | None = None):
         law = type(material)
@@ -43,22 +43,22 @@ class _Rings:
         return self._law.points.at(cells, self._law.grid.midpoints[cells], np.ones(len(F)), F=F, **inputs)
 
     def kirchhoff(self, stretches: NDArray[np.float64], state: State, repeat: int = 1) -> NDArray[np.float64]:
-        """Return the radial and circumferential Kirchhoff stresses (n, 2), in Pa.
+        """Return the radial and circumferential Kirchhoff stresses (n, 2), in Pa, for stretches (n, 2).
 
-        `repeat`: number of copies of all rings in the stretches (n, 2).
+        `repeat`: how often `stretches` contains each ring.
         """
         stress = self._law.stress(self._data(stretches, state, repeat))
         return stress[:, [0, 1], [0, 1]] * stretches.prod(axis=1, keepdims=True)
 
     def nominal(self, stretches: NDArray[np.float64], state: State) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the nominal stresses, in Pa, and their derivatives with respect to the stretches."""
+        """Return the nominal stresses (n, 2), in Pa, and their derivatives with respect to the stretches."""
         nudges = SAME * np.array([[0, 0], [1, 0], [0, 1]])
         near = (stretches + nudges[:, None, :]).reshape(-1, 2)
         P = (self.kirchhoff(near, state, len(nudges)) / near).reshape(len(nudges), -1, 2)
         return P[0], (P[1:] - P[0]).transpose(1, 2, 0) / SAME
 
     def updated(self, stretches: NDArray[np.float64], state: State) -> State:
-        """Return the state after a step that ends with these stretches."""
+        """Return the state after a step that ends with the given stretches."""
         return state | dict(self._law.new_state(self._data(stretches, state), 0.0))
 
 
@@ -74,7 +74,7 @@ class Cavity:
     pressure: float  # pressure at the cavity wall, Pa
 
     def widened(self, radius: float) -> Cavity:
-        """Return the cylinder after drained expansion of the cavity to a radius, in m, in one step."""
+        """Return the cylinder after a drained step that expands the cavity to a radius, in m."""
         n, r = len(self.R), self.r.copy()
         r += (radius - r[0]) * r[0] / r  # initial guess, the motion of incompressible soil
         r[0] = radius
@@ -111,7 +111,7 @@ class Cavity:
 def cavity(
     material: Skeleton, outer: float, elements: int = 300, state: Mapping[str, ArrayLike] | None = None
 ) -> Cavity:
-    """Return a cavity in its initial state.
+    """Return a cylinder with a cavity in its initial state.
 
     Parameters
     ----------
@@ -120,7 +120,7 @@ def cavity(
     outer
         Outer radius divided by the initial radius of the cavity; at least 100 to represent infinite soil.
     elements
-        Number of elements; their sizes form a geometric progression.
+        Number of elements, whose sizes form a geometric progression.
     state
         Initial state variables of the law; by default the state of the material.
     """
@@ -133,8 +133,8 @@ def undrained(material: Skeleton, outer: float, radii: Sequence[float], rings: i
     """Return two radial stresses, in Pa, after undrained expansion of a cavity.
 
     The first stress is the total stress at the outer radius minus the total stress at the wall.  The second stress is
-    the effective stress at the wall.  The volume of soil is constant, so that a ring of initial radius R has the radius
-    r with r^2 - a^2 = R^2 - 1.
+    the effective stress at the wall.  The volume of soil is constant.  A ring of initial radius R therefore has the
+    radius r, with r^2 - a^2 = R^2 - 1.
 
     `radii`: successive radii a of the cavity, in small steps.
     """

@@ -42,8 +42,8 @@ class ElementTest:
     F, stress : (n, 3, 3)
         Deformation gradient F, and effective Cauchy stress in Pa, tension positive.
     strain : (n,)
-        Prescribed quantity.  In shear it is F_xy, and in wetting it is the suction, Pa.  In other tests it is the
-        logarithmic axial strain, compression positive.
+        Prescribed quantity: F_xy in shear, and the suction, Pa, in wetting.  In all other tests it is the logarithmic
+        axial strain, compression positive.
     pressure : (n,), Pa
         Excess pore pressure; zero in drained tests.
     state
@@ -115,9 +115,9 @@ def element_test(
         constant normal stress, F_xx = F_zz = 1), "shear undrained" (simple shear at constant volume), "wetting
         isotropic" (constant net stresses), "wetting oedometer" (constant axial net stress, no lateral strain).
     strain
-        Final value, or successive turning points, of the prescribed quantity.  In shear this quantity is F_xy, and in
-        wetting it is the suction, Pa, >= 0.  In all other tests it is the logarithmic axial strain, compression
-        positive.  In an isotropic test, all axes have this strain.
+        Final value, or successive turning points, of the prescribed quantity.  This quantity is F_xy in shear, and the
+        suction, Pa, >= 0, in wetting.  In all other tests it is the logarithmic axial strain, compression positive.  In
+        an isotropic test, the strain is the same along all axes.
     steps
         Number of equal steps to each turning point.
     confinement
@@ -176,7 +176,7 @@ def _not_negative(v) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True)
 class _At:
-    """State of the sample."""
+    """State of the sample in an element test."""
 
     F: NDArray[np.float64]  # (3, 3)
     stress: NDArray[np.float64]  # effective Cauchy stress (3, 3), Pa
@@ -185,7 +185,7 @@ class _At:
 
 
 class _Point:
-    """A law at one point."""
+    """A law at a single point, without a mesh."""
 
     def __init__(self, material: Skeleton, rate: float | None, cell_size: float | None, suction: float):
         self._rate, law = rate or 1.0, type(material)
@@ -201,7 +201,7 @@ class _Point:
         self._bulk = float(material.bulk)
 
     def _data(self, F: NDArray[np.float64], state: dict[str, NDArray[np.float64]]):
-        """Return the form data of the point for several deformation gradients and one state."""
+        """Return form data for several deformation gradients and one state of the law."""
         m, grid = len(F), self._law.grid
         inputs = {name: np.tile(v, (m, *[1] * v.ndim)) for name, v in (self._parameters | state).items()}
         cells = np.arange(m, dtype=np.int32) % 8
@@ -217,7 +217,7 @@ class _Point:
         return _At(F, self._stress(F[None], before.state, dt)[0], strain, before.state | new)
 
     def at_rest(self) -> _At:
-        """Return the initial state of the law."""
+        """Return the sample before the test, with the initial state of the law."""
         return _At(np.eye(3), self._stress(np.eye(3)[None], self._rest)[0], 0.0, self._rest)
 
     def compressed(self, confinement: float) -> _At:
@@ -230,7 +230,7 @@ class _Point:
         return at
 
     def moved(self, at: _At, test: str, start: _At, strain: float) -> _At:
-        """Return the sample at a new strain.  Steps that fail are halved."""
+        """Return the sample at a new strain.  A step that fails is halved."""
         parts, done = [strain], 0
         while parts:
             try:
@@ -263,7 +263,7 @@ class _Point:
         return self._balanced(at, F, free, start.stress[[0, 1], [0, 1]], strain, dt)
 
     def _wetted(self, at: _At, start: _At, suction: float, free: Sequence, dt: float) -> _At:
-        """Return the sample at a new suction, with constant net stresses."""
+        """Return the sample at a new suction, with constant net stresses along the `free` axes."""
         m = self._material
         effective, before = (m.biot * chi_at(m.retention, -s) * s for s in (suction, start.strain))
         goal = [start.stress[i] + before - effective for i in free]
@@ -273,7 +273,7 @@ class _Point:
     def _balanced(
         self, at: _At, F: NDArray[np.float64], free: Sequence, goal: ArrayLike, strain: float, dt: float
     ) -> _At:
-        """Return the sample after dt, in s, with prescribed stresses in the free components."""
+        """Return the sample after a step of dt, in s, with the stresses `goal`, in Pa, in the `free` components."""
         if not free:
             return self._updated(F, strain, at, dt)
         F, rows, columns = F.copy(), *np.array(free).T

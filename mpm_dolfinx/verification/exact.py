@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Exact solutions for comparison: consolidation, columns, beams and rods.  The module needs no dolfinx.
+"""Exact solutions for comparison: consolidation, columns, beams and rods.  This module does not import dolfinx.
 
-Stress is positive in tension, pore pressure in compression, as in the rest of the package.  The dimensionless time of
-consolidation is T = c_v t / length².  The series of exponentials converges slowly for small T. For T < `SWITCH` a
-closed form replaces the series: the inverse Laplace transform of the solution, with 1 in place of tanh sqrt(s) and coth
-sqrt(s).  The errors of the series and of the closed form are at most of the order of erfc(1/sqrt(`SWITCH`)) < 2e-23.
-The series and the closed form are therefore exact to round-off.
+Stress is positive in tension, and pore pressure in compression.  The dimensionless time of consolidation is T = c_v t /
+length².  Solutions are series of exponentials, which converge slowly for small T.  For T < `SWITCH` a closed form
+replaces the series: the inverse Laplace transform of the solution, with 1 in place of tanh sqrt(s) and coth sqrt(s).
+The errors of both are at most of the order of erfc(1/sqrt(`SWITCH`)) < 2e-23, which is below rounding errors.
 """
 
 from __future__ import annotations
@@ -44,7 +43,7 @@ def _within(name: str, value: ArrayLike, upper: float) -> Array:
 
 
 def _by_time(short, long, T: ArrayLike) -> Array:
-    """Return short(T) where T < `SWITCH`, and long(T) elsewhere."""
+    """Return the values of the function `short` where T < `SWITCH`, and of the function `long` elsewhere."""
     T = np.asarray(T)
     return np.where(T < SWITCH, short(np.minimum(T, SWITCH)), long(np.maximum(T, SWITCH)))[()]
 
@@ -54,7 +53,7 @@ def _series(amplitudes: Array, roots: Array, T: Array) -> Array:
 
 
 def _transient(k: complex, z: ArrayLike, T: Array) -> NDArray:
-    """Return the inverse of the transform exp(-z X) / (X (X - k)); Abramowitz & Stegun 29.3.90."""
+    """Return the inverse Laplace transform of exp(-z X) / (X (X - k)), X = sqrt(s); Abramowitz & Stegun 29.3.90."""
     return np.exp(-np.square(z) / (4 * T)) * erfcx(z / (2 * np.sqrt(T)) - k * np.sqrt(T))
 
 
@@ -179,7 +178,7 @@ class Mandel:
         t : (...), s, > 0; times
 
         Returns (u_x, u_y), m; u_x is independent of y, and u_y is independent of x. Source: computed from the pressure
-        and the force on the plate, with zero total stress at the lateral side; agrees with the papers cited above.
+        and the force on the plate, with zero total stress at the lateral side.
         """
         x, y = np.asarray(x, dtype=float), _within("y", y, self.b)
         plane = self.bulk + self.shear / 3  # lambda + G
@@ -228,7 +227,7 @@ def cryer_pressure(t: ArrayLike, radius: float, cv: float, nu: float, p0: float 
 
 
 def _cryer_short(mu: float, T: Array) -> Array:
-    """Return the inverse of the transform (1 - 2 X exp(-X)) / (X² - mu X + mu)."""
+    """Return the inverse Laplace transform of (1 - 2 X exp(-X)) / (X² - mu X + mu), X = sqrt(s)."""
     k = (mu + 1j * np.sqrt(mu * (4 - mu))) / 2
     uniform = (k * _transient(k, 0, T)).imag / k.imag
     gauss = np.exp(-1 / (4 * T)) / np.sqrt(np.pi * T)
@@ -248,7 +247,7 @@ class SelfWeightColumn:
     """Column of Hencky's material without lateral strain, standing at Y = 0 under its own weight.
 
     Without lateral stretch, the Cauchy stress and the first Piola-Kirchhoff stress along the column are both tau /
-    stretch.  This stress balances the weight above Y.  For nu = 0, K + 4G/3 is Young's modulus.
+    stretch.  This stress balances the weight of the column above Y.  For nu = 0, K + 4G/3 equals Young's modulus.
 
     Parameters
     ----------
@@ -271,7 +270,7 @@ class SelfWeightColumn:
         _positive(**vars(self))
 
     def _shortening(self, Y: ArrayLike) -> Array:
-        """Return w = -ln(stretch), the solution of w exp(w) = weight above / (K + 4G/3)."""
+        """Return -ln(stretch) = w, the solution of w exp(w) = (weight above Y) / (K + 4G/3)."""
         return lambertw(-self.stress(Y) / (self.bulk + 4 / 3 * self.shear)).real
 
     def stress(self, Y: ArrayLike) -> Array:
@@ -356,7 +355,7 @@ def shear_flexible_rod(
 
 
 def _rod(loads: Array, axial: float, shear: float):
-    """Solve for (x, y, rotation, moment) of the rod with unit length and stiffness."""
+    """Return a function of arclength: x, y, rotation and moment of a rod with unit length and bending stiffness."""
     s, state = np.linspace(0, 1, 41), np.zeros((4, 41))
     state[0] = s
 

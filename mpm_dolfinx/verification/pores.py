@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Unsaturated pores of the finite element reference, with pressures relative to a unit."""
+"""Unsaturated pores in the finite element reference, whose pressures are scaled."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ class Pores:
             self._drains = fem.Constant(domain, self._scale)
 
     def of(self, name: str, p):
-        """Return a property of the pores at the pressure p as UFL; see `Retentions.of` for the names."""
+        """Return a property of the pores at the scaled pressure p as UFL.  `Retentions.of` lists the names."""
         return ufl.as_ufl(1.0) if self.law is None else property_of(self.law, name, self._unit * p)
 
     def between(self, p0, p1):
-        """Return the mean of k_r between the pressures p0 and p1 as a UFL expression.
+        """Return the mean of k_r between the scaled pressures p0 and p1 as a UFL expression.
 
-        The mean is computed by Gauss quadrature over `retention.logarithm`.  With a quadrature over the pressure, all
+        The mean is computed by Gauss quadrature over `retention.logarithm`.  In a quadrature over the pressure, all
         points between a wet cell and a very dry cell would be dry.
         """
         if self.law is None:
@@ -57,9 +57,9 @@ class Pores:
         return mean / total
 
     def reached(self, p: NDArray[np.float64], dp: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the limited pressure decreases of a Newton step.
+        """Return the pressure decreases of a Newton step after limitation, see `retention.restrained`.
 
-        `p` (n,): pressures.
-        `dp` (n,): pressure decreases without limitation.
+        `p` (n,): scaled pressures.
+        `dp` (n,): scaled pressure decreases before limitation.
         """
         return restrained(p, dp, self._scale)
