@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""Foundations: checks of input, errors, caches, time integration, and the spellings of dolfinx's releases."""
+"""Foundations: checks of input, errors, caches, time integration, and differences between dolfinx's releases."""

@@ -23,11 +23,11 @@ from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
 from mpm_dolfinx.points.material_points import body_of
 
 FULL = 1.2
-"""Volume fraction above which a cell causes a warning.  Below a deep footing, undamaged domains fill cells to 1.08."""
+"""Filled fraction of a cell above which a warning is given.  Below a deep footing, undamaged domains fill 1.08."""
 
 
 def warn_overlaps(cut: CutDomains, bodies: Sequence[Body]) -> Callable[..., Any] | None:
-    """Warn about the fullest cell if particle domains overlap.  Return this function, or None after a warning."""
+    """Warn about the fullest cell if particle domains overlap.  Return the function for the next check, or None."""
     grid, points = cut.grid, cut.points
     volume = cut.to_cells(points.volume0 * points.J) * cut.pieces_to_cells(cut.pieces.fraction)
     fill = sum_by(cut.cells, cut.plane(volume)[0], grid.num_owned)[cut.cells] / grid.volumes(cut.cells)

@@ -30,7 +30,7 @@ def balancing_tractions(
     """Return the points and the tractions that replace the reactions of each side of bodies at rest.
 
     Tractions are forces per reference area, computed from the stresses.  Additional tractions, which vary like
-    rigid-body displacements, make resultant and moment equal to the reactions of each connected part.
+    rigid-body displacements, give each connected part the resultant and the moment of its reactions.
 
     `stresses`: total stresses (faces, k, k), in Pa, on each side.
     `parts`: connected parts of the bodies.

@@ -33,7 +33,7 @@ def motion_error(
 
     `K`, `mass`: momentum tangent and mass of the last substep.
     `flights`: velocities and accelerations after the two substeps.
-    `seconds`, `own`: time weights, in s, of the rates of the first and of the last substep in the last substep.
+    `seconds`, `own`: in the last substep, time weights of the rates of the first and of the last substep, in s.
     `drift`: mean velocity of free bodies at the start of the run, in m/s, see `energies.drift`.
     """
     first, last = flights

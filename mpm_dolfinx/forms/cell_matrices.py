@@ -235,7 +235,7 @@ def batches(places: Places) -> list[tuple[NDArray[np.int64], NDArray[np.int64], 
     Returns for each batch
     ----------------------
     Indices (c,) of its cells in the array `Places.filled`.  Indices (c, most) of the points in each cell, filled up to
-    equal length.  Mask (c, most) of the indices that only fill up.
+    equal length.  Mask (c, most), True for indices that only fill up a row.
     """
     cells = places.cells
     filled = places.filled

@@ -11,8 +11,8 @@ derivatives at the midpoint, and the one-point rule integrates it.
 
 The list of cells of the integral contains each cell once for each point in the cell.  The assembler therefore calls the
 kernel once for each point.  The offset xi and all other data of the points are DG0 coefficients, with one row for each
-entry of the list.  The integral of f w / |cell| over the list is sum_p w_p f(x_p), with the weights w_p of the points
-and the cell volume |cell|.
+entry of the list.  With the cell volume V and the weights w_p of the points, the integral of f w / V over the list is
+sum_p w_p f(x_p).
 """
 
 from __future__ import annotations
@@ -463,7 +463,7 @@ class FacetForm:
 class FacetSum:
     """A form over given facets or cells of this process.
 
-    `some`: whether `facets` is not empty on some process.
+    `some`: whether any process has such facets or cells.
     """
 
     def __init__(self, form: FacetForm, facets: NDArray[np.int32], some: bool):

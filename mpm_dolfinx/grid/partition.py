@@ -18,7 +18,7 @@ If the imbalance is larger, cells are distributed again.  Results do not depend 
 documented limit of the imbalance.
 """
 EMPTY = 1e-2
-"""Weight of an empty cell, divided by the mean weight of a filled cell.  It represents memory and time."""
+"""Weight of an empty cell, which needs some memory and time, divided by the mean weight of a filled cell."""
 
 
 class Partition:

@@ -407,7 +407,7 @@ def _numbered(name: str) -> str | None:
 
 
 def _ranges(comm: MPI.Intracomm, file: Path, of: dict[str, Member]) -> dict[str, tuple[int, int]]:
-    """Return first row, and last row plus one, that this process reads of each array.  Check stored row numbers."""
+    """Return the range of rows that this process reads of each array.  Raise ValueError if row numbers are invalid."""
     out = {}
     for name in dict.fromkeys(map(_numbered, of)):
         first, last = (of[name].shape[0] * (comm.rank + k) // comm.size for k in (0, 1))

@@ -3,7 +3,7 @@
 
 The law describes clay whose yield surface grows with plastic compaction.  Plasticity is multiplicative, in principal
 logarithmic strains.  Let tau be the Kirchhoff stress, e_v the elastic volume strain, and e the elastic deviatoric
-strain (tension positive).  With P = -tr(tau)/3 and Q = sqrt(3/2) |dev tau|, the law is
+strain (tension positive).  With P = -tr(tau)/3 and Q = sqrt(3/2) norm(dev tau), the law is
 
     P = P_0 exp(-e_v / kappa),   dev tau = 2G e,
     f = Q^2 / M^2 + P (P - P_c) <= 0,   dP_c / P_c = -de_v^p / (lambda - kappa),
@@ -81,9 +81,9 @@ class ModifiedCamClay(Skeleton):
     M
         Slope of the critical state line Q = M P, -, > 0.
     lambda_, kappa
-        Slopes of ln v against ln P, -, 0 < kappa < lambda_, with the specific volume v.  lambda_ applies to first
-        loading, kappa to unloading.  P is a Kirchhoff stress.  The slope C of v against the logarithm of a Cauchy
-        stress gives the slope C / (v - C) of ln v against ln P.
+        Slopes of ln v against ln P, -, 0 < kappa < lambda_, with the specific volume v and the Kirchhoff stress P:
+        `lambda_` in first loading, `kappa` in unloading.  If v has the slope C against the logarithm of the Cauchy
+        stress, the slope of ln v against ln P is C / (v - C).
     initial_stress : (3,), Pa
         Normal effective stresses at F = I, tension positive.  Their mean must be < 0.  The last stress is out of plane
         in 2D, and circumferential in axisymmetry.  These stresses must be in equilibrium with the loads.

@@ -343,7 +343,7 @@ class ConductivityAtPieces:
 
 
 def sampled(law: Callable) -> list[float | None]:
-    """Return the conductivities of a law in three states of deformation, which a checkpoint stores."""
+    """Return the conductivities of a law in three states of deformation, as stored in checkpoints."""
     out = []
     for J in (0.75, 1.0, 1.25):
         F = ufl.as_matrix([[J, J / 8], [0.0, 1.0]])

@@ -60,7 +60,7 @@ class SceneMaterials:
     grid
         Background grid.
     materials
-        Materials, in the order of the bodies' material indices.
+        Materials, to which the bodies refer by index.
     bodies
         All bodies.
     points
@@ -265,7 +265,7 @@ class SceneMaterials:
         return np.array([known for *_, known in self._parts])[self.part_of(points)]
 
     def conducting(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return an array (n, 2): the conductivity of each point, in m/s, and a number of its laws of flow."""
+        """Return (n, 2): the conductivity of each point, in m/s, and a number that identifies its laws of flow."""
         laws, known = [m.conductivity_law for m in self.materials], self.conductivity_laws
         law = np.array([known.index(law) if law in known else -1 for law in laws])[points.material]
         by_place = np.array([law is not None and _names_place(law) for law in laws])[points.material]

@@ -25,7 +25,7 @@ from mpm_dolfinx.pores.retention import check_retention
 Field = float | Sequence[float] | Callable[[NDArray[np.float64]], ArrayLike]
 """A constant (number or vector), or a function of the reference positions X (n, d), in m, that returns values (n, ...).
 
-X are the points of one process.
+X are the points of one process.  The value at a point must not depend on other points, as a mean would.
 """
 
 BY_SCENE = ("dt", "cell_size")

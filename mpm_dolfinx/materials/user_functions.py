@@ -93,7 +93,7 @@ def expression(function: Callable, shapes: Sequence[tuple[int, ...]], of: str = 
 
 
 def _check_parts(what: str, out: ufl.core.expr.Expr) -> None:
-    """Raise ValueError for infinite numbers, NaN, and sums over an index of two sizes."""
+    """Raise ValueError if UFL contains infinite numbers, NaN, or a sum over an index of two sizes."""
     for part in unique_pre_traversal(out):
         if isinstance(part, ufl.constantvalue.RealValue) and not np.isfinite(float(part)):
             raise ValueError(f"{what}: contains {float(part)}, must be finite")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Pressures of cells from the water content of their pieces, in unsaturated soil.
+"""Computation of cell pressures from the water content of pieces, in unsaturated soil.
 
 A piece is the part of a particle domain in one cell.  The piece has the storage s, in m^d/Pa, and the pore volume n, in
 m^d.  The fluid content of a piece at the pressure p, minus its content at p = 0, is `c(p) = s pi(p) + n (S(p) - 1)

@@ -3,9 +3,9 @@
 
 The pressure at a probe is a weighted polynomial fit (`local_fit`) to the pressures of cells.  The fit uses cells of the
 same soil, at most three cells away.  Open faces must connect these cells to the cell of the probe.  The fit also uses
-pressures on drained sides, and on the faces between these and other cells.  Heads are fitted instead of pressures, so
-hydrostatic states are exact.  The fitted head is limited to the range of heads in the cell of the probe, in
-neighbouring cells and on drained sides.  Towards an undrained side, the gradient of the head extends this range.
+pressures on drained sides, and on faces between cells of the fit and other cells.  Heads are fitted instead of
+pressures, so hydrostatic states are exact.  The fitted head is limited to the range of heads in the cell of the probe,
+in neighbouring cells and on drained sides.  Towards an undrained side, the gradient of the head extends this range.
 
 The stress at a probe is a fit to the stresses of material points.
 """

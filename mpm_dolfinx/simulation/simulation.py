@@ -75,8 +75,8 @@ class Simulation:
         the stress into equilibrium with loads and initial pore pressures. Under constant loads the first step then
         causes no displacement.
     terms
-        User-defined terms in UFL. A function is a term of the momentum balance (see `user_functions`), `OnSide` such a
-        term on a side, and `Source` a term of the fluid balance.
+        User-defined terms in UFL. A function is a term of the momentum balance, see `user_functions`.  `OnSide` is such
+        a term on a side.  A `Source` is a term of the fluid balance.
     numerics
         Quadrature, coupling, tolerance and time integration, see `Numerics`.
     inertia

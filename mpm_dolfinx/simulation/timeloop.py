@@ -50,7 +50,7 @@ PARTS = (
 """Parts of a run whose wall time is measured."""
 
 Observer = Callable[[Any], None]
-"""A function that is called with the simulation."""
+"""A function that a run calls with the simulation as argument."""
 
 
 def run(

@@ -16,10 +16,10 @@ and the mass potential pi.  In saturated soil chi = 1.
 In unsaturated soil, kappa is multiplied by the relative permeability k_r.  With the saturation S and the porosity n_n
 in state n, rho [zeta - zeta_n] becomes S rho [zeta - zeta_n] + (S - S_n) J_n n_n exp(p_n/K_w).
 
-If the pressure is constant in each cell, two-point fluxes replace the last integral, over kappa.  A two-point flux is
-kappa J (F^-T N)^2 / h times the jump of pi and of the potential of gravity.  N is the normal of the face between two
-cells, and h is the distance of their centres.  The mean of k_r between the two pressures multiplies kappa.  Two-point
-fluxes are not consistent under shear.
+If the pressure is constant in each cell, two-point fluxes replace the last integral of the storage equation.  A
+two-point flux is kappa J (F^-T N)^2 / h times the jump of pi and of the potential of gravity.  N is the normal of the
+face between two cells, and h is the distance of their centres.  The mean of k_r between the two pressures multiplies
+kappa.  Two-point fluxes are not consistent under shear.
 
 In axisymmetry F contains the circumferential stretch, and integrals extend over the full circumference.  Materials,
 retention, user-defined terms and time integration use the code of the material point method.  The two methods therefore
@@ -558,7 +558,7 @@ class BiotFEM:
     def _restrained(self, x: PETSc.Vec) -> tuple[list[float], int]:
         """Solve by Newton steps with limited pressure changes, see `retention.restrained`.  Return as `_free` does.
 
-        Three tangents omit the derivative of k_r: the first (Celia, Bouloutas and Zarba 1990), a tangent after a
+        These tangents omit the derivative of k_r: the first (Celia, Bouloutas and Zarba 1990), a tangent after a
         limited step, and a tangent after an increase of the residual.  In dry soil under gravity, this derivative may
         reverse the Newton step.
         """

@@ -334,9 +334,9 @@ def shear_flexible_rod(
     Parameters
     ----------
     length : m, > 0
-    EA : N (N/m in plane strain), > 0, may be inf
-    GA : N (N/m in plane strain), > 0, may be inf; includes the shear correction factor
-    EI : N m² (N m in plane strain), > 0
+    EA : N (N/m in plane strain), > 0, may be inf; axial stiffness
+    GA : N (N/m in plane strain), > 0, may be inf; shear stiffness, with the shear correction factor
+    EI : N m² (N m in plane strain), > 0; bending stiffness
     end_load : N; force at the end
     line_load : N/m; force per reference length
     points : number of equidistant points from end to end, >= 2, or reference arclengths (n,), m, in [0, length]
