@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Print versions and solvers for a bug report, run laboratory tests of soil laws, join the output files of a run."""
+"""Print versions and solvers for a bug report, run laboratory tests of soil laws, or join the output files of a run."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def number(name: str, text: str) -> float | list[float]:
 
 
 def law_of(name: str) -> type[mpm_dolfinx.Skeleton]:
-    """Return the law with a name: a law of the package, or for `file.py:name` the law `name` in a user's file."""
+    """Return the law `name` of the package, or for `file.py:name` the law in the user's file `file.py`."""
     file, _, own = name.rpartition(":")
     if not file:
         found = getattr(mpm_dolfinx, name, None)

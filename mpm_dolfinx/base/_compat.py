@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Wrappers of every function of dolfinx that differs between the supported releases (0.5.2 and 0.9 to 0.11).
 
-No other module of the package depends on the release.  Branches marked OLD are for release 0.5 only.
+No other module of the package depends on dolfinx's release.  Branches marked OLD are for release 0.5 only.
 """
 
 from __future__ import annotations

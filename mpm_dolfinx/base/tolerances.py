@@ -6,7 +6,7 @@ import numpy as np
 EPSILON = float(np.finfo(float).eps)
 """Relative spacing of floating-point numbers.  Source: machine epsilon of double precision (IEEE 754)."""
 ROUND_OFF = 64 * EPSILON
-"""Largest relative error of a sum of 64 terms.  Source: gamma_n = n epsilon, n = 64 (Higham 2002, eq. 3.1)."""
+"""Largest relative error of a sum of 64 terms.  Source: gamma_n = n epsilon, n = 64 (Higham 2002, equation 3.1)."""
 SAME = EPSILON**0.5
 """Relative difference below which two numbers are considered equal: half of their digits agree.
 

@@ -117,7 +117,7 @@ def chosen(name: str, values, among: Sequence[int], what: str) -> None:
 
 
 def all_of(name: str, values, kind: type | tuple[type, ...], least: int = 0) -> None:
-    """Raise a ValueError if values are not a sequence of at least `least` instances of a class."""
+    """Raise a ValueError if values are not a list of instances of a class, or if there are fewer than `least`."""
     kinds = " or ".join(k.__name__ for k in (kind if isinstance(kind, tuple) else (kind,)))
     allowed = f"a list of {'at least one ' if least else ''}{kinds}"
     if isinstance(values, str) or not isinstance(values, Sequence) or len(values) < least:
@@ -203,7 +203,7 @@ def takes(function: Callable) -> tuple[str, ...] | None:
 
 
 def _names(function: Callable, parameters: list[Parameter] | None) -> tuple[str, ...] | None:
-    """Return the result of `takes` for a function with known parameters."""
+    """Like `takes`, for a function with known parameters."""
     if parameters is None or (len(parameters) == 1 and parameters[0].name not in PLACES):
         return ("t",)
     names = tuple([p.name for p in parameters])
@@ -269,7 +269,7 @@ def given(
     """Return a value at time t.
 
     The result has the shape () or, for m places, (m,).  If `dim` > 0, the shapes (d,) and (m, d) are also possible.  If
-    a function of position returns one vector, the result (m, d) repeats this vector for each place.
+    a function of position returns a single vector (d,), the result (m, d) contains it m times.
 
     Parameters
     ----------

@@ -23,7 +23,7 @@ from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
 from mpm_dolfinx.points.material_points import body_of
 
 FULL = 1.2
-"""Filled fraction of a cell above which a warning is given.  Below a deep footing, undamaged domains fill 1.08."""
+"""Filled fraction of a cell above which a warning is given.  It is 1.08 for undamaged domains below a deep footing."""
 
 
 def warn_overlaps(cut: CutDomains, bodies: Sequence[Body]) -> Callable[..., Any] | None:

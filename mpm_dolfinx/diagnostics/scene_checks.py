@@ -25,9 +25,9 @@ def check_held(
 
     `active`: cells of this process that contain pieces of domains.
     `free` (nodes, d): whether no wall fixes a displacement component.
-    `holds`: constraints by prescribed displacements, tools and contact. Each is a tuple of arrays: constrained cells
-    (n,), lexicographic indices of the opposite cells (n,) in a contact or None, positions (n, d) in m, and directions
-    (n, d).  A fixed part fixes the parts in contact with it.
+    `holds`: constraints by prescribed displacements, tools and contact. Each is a tuple: constrained cells (n,),
+    opposite cells (n,), positions (n, d) in m, and directions (n, d).  In a contact, opposite cells are lexicographic
+    indices, and otherwise None.  A fixed part fixes the parts in contact with it.
     `each`: whether to check each connected part alone, and not all parts together as one body.
 
     Raises

@@ -60,7 +60,7 @@ class QuietSides(Acting):
     Raises
     ------
     ValueError
-        Two quiet sides overlap, or prescribed displacements or walls of the grid fix all displacement components on a
+        Two quiet sides overlap.  Prescribed displacements or walls of the grid fix all displacement components on a
         face.
     """
 

@@ -150,7 +150,7 @@ class ElementMatrices:
         self._sums = CellSums([*entries, *along, *beside.scalars], points)
 
     def assemble_matrix(self, A: PETSc.Mat, data: PointData, given: Given = NONE) -> NDArray[np.float64]:
-        """Add the matrix to `A`, which the caller assembles.  Return the integrals `beside` (cells, quantities)."""
+        """Add the matrix to `A`, which the caller assembles.  Return the values (cells, quantities) of `beside`."""
         sums = self._sums(data, given)
         insert(A, self._grid, data.places.filled, sums[:, self._entry])
         return sums[:, self._count :]
@@ -199,7 +199,7 @@ class StackedElementMatrices:
         self._sorted: Latest[list] = Latest()
 
     def assemble_matrix(self, A: PETSc.Mat, data: PointData, given: Given = NONE) -> NDArray[np.float64]:
-        """Add the matrix to `A`, which the caller assembles.  Return the integrals `beside` (cells, quantities)."""
+        """Add the matrix to `A`, which the caller assembles.  Return the values (cells, quantities) of `beside`."""
         live, filled = self._values.live(data, given), data.places.filled
         sums = np.empty((len(filled), self._along * 2**self._d * self._d + self._scalars))
         for cells, points, missing in self._sorted(data.places.key, lambda: batches(data.places)):
@@ -234,8 +234,8 @@ def batches(places: Places) -> list[tuple[NDArray[np.int64], NDArray[np.int64], 
 
     Returns for each batch
     ----------------------
-    Indices (c,) of its cells in the array `Places.filled`.  Indices (c, most) of the points in each cell, filled up to
-    equal length.  Mask (c, most), True for indices that only fill up a row.
+    Indices (c,) of its cells in the array `Places.filled`.  Indices (c, most) of the points in each cell.  Cells with
+    fewer points have arbitrary indices at the end.  Mask (c, most), True for these arbitrary indices.
     """
     cells = places.cells
     filled = places.filled

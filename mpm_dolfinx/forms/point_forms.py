@@ -9,7 +9,7 @@ multilinear function v on a box of dimension d equals the first d + 1 terms of i
 with the offset xi = x_p - x_mid of the point p from the midpoint x_mid.  The right side is plain UFL, with v and its
 derivatives at the midpoint, and the one-point rule integrates it.
 
-The list of cells of the integral contains each cell once for each point in the cell.  The assembler therefore calls the
+In the list of cells of the integral, a cell occurs once for each of its points.  The assembler therefore calls the
 kernel once for each point.  The offset xi and all other data of the points are DG0 coefficients, with one row for each
 entry of the list.  With the cell volume V and the weights w_p of the points, the integral of f w / V over the list is
 sum_p w_p f(x_p).
@@ -57,7 +57,7 @@ class FormPoints:
     """UFL coefficients for quantities at the points.  `PointData` contains their values.
 
     `grid`: background grid.
-    `fields`: shape of each quantity, by name.  The coefficient is the attribute with this name.
+    `fields`: shape of each quantity, by name.  Its coefficient is the attribute of this name.
     """
 
     def __init__(self, grid: Grid, **fields: tuple[int, ...]):
@@ -490,7 +490,7 @@ class FacetSum:
 class PointExpression:
     """A UFL expression of quantities at the points, evaluated at every point.
 
-    The kernel of a form with a DG0 test function is called for one arbitrary cell for each point.  Its result is
+    For each point, the kernel of a form with a DG0 test function is called for an arbitrary cell.  Its result is
     divided by the volume of this cell.  Gradients of functions on the grid are allowed only if all cells are equal.
 
     `expression`: UFL expression of any shape, with coefficients of `points`.

@@ -24,8 +24,8 @@ class Unknowns:
 
     `function`: any function of the space, with ghosts.
     `dofs`: unrolled local degrees of freedom that are unknowns, ghosts included.
-    `at`: positions (entities, d), in m, of this process's nodes or cells, and a mask.  Only where the mask is True,
-    matrix rows may have entries in columns of other processes.  Without `at`, all rows may have such entries.
+    `at`: positions (entities, d), in m, of this process's nodes or cells, and a mask.  Matrix rows may have entries in
+    columns of other processes only where the mask is True.  Without `at`, all rows may have such entries.
     """
 
     def __init__(self, function: fem.Function, dofs: NDArray[np.int64], at: tuple[NDArray, NDArray] | None = None):
@@ -121,7 +121,7 @@ def petsc_matrix(rows: scipy.sparse.csr_matrix, columns: int, comm: MPI.Intracom
 
 
 def insert_for_each_axis(A: PETSc.Mat, nodes: NDArray[np.int32], dim: int, matrices: NDArray[np.float64]) -> None:
-    """Add element matrices (cells, n, n) of scalars to `A`, for each of `dim` components at the nodes (cells, n)."""
+    """Add scalar element matrices (cells, n, n) to `A` for each of `dim` components at the nodes (cells, n)."""
     for axis in range(dim if len(nodes) else 0):
         dofs = (nodes * dim + axis).astype(PETSc.IntType)
         A.setValuesLocalRCV(dofs, dofs, matrices, addv=True)

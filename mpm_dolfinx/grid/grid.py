@@ -490,7 +490,7 @@ class Grid:
         return self._h if self.even else self._of_process.at.sizes[cells]
 
     def along(self, cells: Any, axis: Any) -> NDArray[np.float64]:
-        """Return the edge lengths (n,) of local cells along an axis, or along one axis for each cell, in m."""
+        """Return the edge length (n,) of each local cell along an axis, in m.  `axis` may be an array (n,)."""
         return self.h[axis] if self.even else self._of_process.at.sizes[cells, axis]
 
     def between(self, cells: Any, others: Any, axis: Any) -> NDArray[np.float64]:
@@ -566,7 +566,7 @@ class Grid:
         return np.append(self.lines[axis], np.inf)[self.lines[axis].searchsorted(x, side="right")]
 
     def cells_along(self, axis: int, x: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return indices along an axis of unequal cells: the cells with coordinates x (m), or the outermost cells."""
+        """Return the indices, along an axis of unequal cells, of the cells nearest to coordinates x, in m."""
         return np.minimum(np.maximum(self.lines[axis].searchsorted(x, side="right") - 1, 0), self.shape[axis] - 1)
 
     mesh = of_cells("mesh")
@@ -791,8 +791,8 @@ class Grid:
         return np.array([*np.unravel_index(number, tuple(self.shape)), copy]).T.copy()
 
     def neighbours(self, cells: NDArray[np.integer]) -> NDArray[np.int64]:
-        """Return the local indices (n, d, 2) of the two neighbours of local cells along each axis, or -1 for a
-        neighbour that is not on this process.
+        """Return the local indices (n, d, 2) of the neighbours of local cells, by axis and end.  The index is -1 if a
+        neighbour is not on this process.
         """
         index = self.cell_places(cells)
         out = np.full((len(cells), self.dim, 2), -1, dtype=np.int64)

@@ -388,7 +388,7 @@ def _named(prefix: str, values: dict) -> dict[str, NDArray]:
 
 
 def _part(arrays: dict[str, NDArray], prefix: str) -> dict[str, NDArray]:
-    """Remove all arrays whose names begin with a prefix, and return these arrays without the prefix."""
+    """Move all arrays whose names begin with a prefix to a new dictionary, by names without the prefix."""
     return {name.removeprefix(prefix): arrays.pop(name) for name in list(arrays) if name.startswith(prefix)}
 
 

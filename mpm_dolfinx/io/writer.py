@@ -325,7 +325,7 @@ def replacing(file: Path) -> Iterator[Path]:
 
 @contextmanager
 def _ours(file: Path) -> Iterator[None]:
-    """Context that replaces errors in reading by a ValueError: another program wrote the file."""
+    """Context in which errors in reading raise a ValueError for a file of another program."""
     try:
         yield
     except (ElementTree.ParseError, KeyError, TypeError, ValueError) as error:

@@ -211,7 +211,7 @@ LC = {"r": "> kappa / lambda_, <= 1", "beta": ">= 0 1/Pa and finite", "reference
 
 
 def _dried(function: Callable) -> Callable:
-    """Return a function that evaluates `function` of Modified Cam Clay with lambda and P_c at the present suction."""
+    """Return a `function` of Modified Cam Clay with lambda and P_c at the present suction."""
     arguments = Skeleton.arguments_of(function)
 
     def of(**given):

@@ -225,7 +225,7 @@ class SoftnessAtPoints:
 
     The strain of a step is e = dev sym dF F^-1, with the change dF of F.  With the Kirchhoff stress T(s) at F - (1 - s)
     dF, the tangent shear modulus is G_t = (dT/ds) : e / (2 e : e) at s = 1.  In soil at rest, the direction of e is
-    random.  G_t is therefore a weighted mean of this modulus, with the weight e : e, and of the modulus of the previous
+    random.  The result is therefore a weighted mean of G_t, with the weight e : e, and of the modulus of the previous
     step, with the weight `NEAR`^4.  The forms use the softness of the previous step, because Newton's method may not
     converge with the softness of the current iterate.
 

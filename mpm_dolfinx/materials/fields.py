@@ -335,7 +335,7 @@ class SceneMaterials:
         return out
 
     def changed(self, what: str, points: MaterialPoints, named: Collection[str]) -> MaterialPoints:
-        """Return the points after a change of named fields and of all fields that depend on them.
+        """Return the points after a change of the fields `named`.  Fields that depend on them are computed again.
 
         Raises
         ------
@@ -357,7 +357,7 @@ class SceneMaterials:
         return replace(points, data=data)
 
     def _at(self, points: MaterialPoints, i: int, rows: NDArray[np.int64]) -> Skeleton:
-        """Return a material with its constants as arrays over the points `rows`."""
+        """Return a copy of a material with arrays of constants, one value for each of the points `rows`."""
         if not self._fields[i]:
             return self.materials[i]
         values = {name: points.data[name][rows] for name in self._fields[i]}

@@ -89,7 +89,7 @@ class MohrCoulomb(Frictional):
 
     @property
     def cutoff(self):
-        """Tensile strength, Pa, limited to a finite value."""
+        """Tensile strength, Pa, limited to a finite multiple of the bulk modulus."""
         return np.minimum(self.tension, NEVER * self.bulk)
 
     @staticmethod

@@ -93,8 +93,8 @@ class Skeleton:
     computes new values at the points after every converged step.  If a new value is not finite, the time step is
     reduced.
 
-    A law whose stress has no closed formula has local unknowns.  `unknowns` contains the values at which Newton's
-    method starts, by name of the unknown.  Unknowns are arguments of `kirchhoff` and `update`.  Unknowns and residuals
+    A law whose stress has no closed formula has local unknowns.  `unknowns` contains the names of the unknowns, and the
+    values at which Newton's method starts.  Unknowns are arguments of `kirchhoff` and `update`.  Unknowns and residuals
     should be scaled to values of about one.
 
     residual
@@ -105,15 +105,15 @@ class Skeleton:
         takes arrays (n, ...) of the law's fields, state and `trial`.  The function returns a dict with a pair for each
         unknown: the values (n, ...), and a dict of derivatives (n, ..., ...) by name of the trial value.  A derivative
         may also be a function without arguments.  This function is called only if a tangent is assembled.  A missing
-        derivative is zero.  Without a solution, return NaN or infinity; the time step is then reduced.  With an
-        `energy` that is not stationary in the unknowns, Newton's method is slow.
+        derivative is zero.  Without a solution, return NaN or infinity; the time step is then reduced.  Newton's method
+        is slow if the derivative of `energy` with respect to the unknowns is not zero.
     trial
-        Function (F, ...) -> {name: UFL}.  Residuals depend on F through these trial values only.  In a law without
-        `trial`, residuals have F itself as argument.  Only `kirchhoff` and `update` receive values that are not UFL.
+        Function of F, which returns trial values as UFL, by name.  Residuals depend on F only through these values.
+        Without `trial`, residuals have F as argument.  Only `kirchhoff` and `update` receive values other than UFL.
 
     All these functions may have the argument `dt`, the time since the start of the step, s, for rate-dependent laws.
-    With the new state and dt = 0, a law must return the stress at the end of the step.  The argument `cell_size`, the
-    mean edge length of a cell, m, can make softening independent of the grid.
+    If a law receives the new state and dt = 0, it must return the stress at the end of the step.  The argument
+    `cell_size`, the mean edge length of a cell, m, can make softening independent of the grid.
 
     A law that depends on suction has the state variable `suction`, and optionally `suction_at_start`, both initially
     0.0.  The scene sets `suction` to max(-p, 0), Pa, at the end of each substep, and `suction_at_start` to the suction
@@ -300,8 +300,8 @@ class Skeleton:
 
         For laws with a state, tau is half of the value for macroelements of 2 x 2 cells, 3 alpha^2 / (8 (lambda + 3G))
         (Silvester and Kechkar 1990; Camargo, White and Borja 2021).  For other laws tau is a quarter of the value for
-        macroelements, which improves conditioning and smears pressures less. 3D scenes use the same value, because the
-        value for 2 x 2 x 2 cells does not damp pressures that alternate along two axes.
+        macroelements, which improves conditioning and smears pressures less. In 3D tau is the same, because the value
+        for 2 x 2 x 2 cells is too small for pressures that alternate along two axes.
         """
         return (0.5 if self.state else 0.25) * self.biot**2 * 3 / (8 * self.macroelement)
 

@@ -107,7 +107,7 @@ def to_root(comm: MPI.Intracomm, rows: int) -> Exchange:
 
 
 def evenly(comm: MPI.Intracomm, numbers: NDArray[np.int64]) -> NDArray[np.int32]:
-    """Return ranks (n,) that divide the ascending numbers (n,) >= 0 of all processes equally among all ranks.
+    """Return a rank (n,) for each of the ascending numbers (n,) >= 0, so that all ranks get equally many numbers.
 
     All numbers of all processes are distinct.  The smallest numbers get rank 0, the next rank 1, and so on.
     """

@@ -63,8 +63,8 @@ def log(comm: MPI.Intracomm, message: str, *values, level: int = logging.INFO) -
 def warn(comm: MPI.Intracomm, category: type[ResultWarning], message: str, *values) -> None:
     """Give a warning on the first process, at the line of the script that caused it.  All processes must call this.
 
-    If a filter of `warnings` makes the warning an error, all processes raise it, so no data may have been changed
-    before.
+    If a filter of `warnings` makes the warning an error, all processes raise it.  Callers must warn before they change
+    data.
     """
     raised = None
     if comm.rank == 0:

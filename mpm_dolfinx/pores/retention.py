@@ -291,7 +291,7 @@ class Retentions:
         return lever @ self.weight.value
 
     def at(self, p, points: FormPoints):
-        """Return the pressures of the points as UFL. p: pressures of their cells, both in Pa."""
+        """Return the pressures of the points, in Pa, as UFL.  `p`: pressures of their cells, in Pa."""
         return p + ufl.dot(self.weight, points.lever) if "lever" in points.sizes else p
 
     def of(self, name: str, p, points: FormPoints):

@@ -188,7 +188,7 @@ class StepSize:
         """Return the largest ratio of an error to its tolerance, for the pressure, the motion and the water content.
 
         If pressures dissipate within a step, their error does not affect the motion.  The tolerance of the pressure is
-        therefore at least `rtol` times the pressure change in the same step without flow.
+        therefore at least `rtol` times the pressure change that the step would cause without flow.
         """
         error, motion = report.moves
         motion = max(control.motion or 0.0, motion)

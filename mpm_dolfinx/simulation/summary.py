@@ -29,7 +29,7 @@ class Part:
 
 
 def parts(scene: Scene, state: State) -> list[Part]:
-    """Return all terms and solvers, with their present use in a scene."""
+    """Return all terms and solvers, and whether and why a scene uses them at present."""
     return [*_momentum(scene, state), *_storage(scene, state), *_solvers(scene, state)]
 
 

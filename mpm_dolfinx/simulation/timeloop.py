@@ -88,7 +88,7 @@ def run(
         the largest motion since the start, see `motion_error`.  In unsaturated soil, `rtol` also limits the error of
         the water content, relative to the largest change of water content in any step so far.  The estimated error of a
         pressure is the fraction `solve.newton.ERROR` of the error of a first-order step.  In tests, the largest true
-        error of a run was 0.7 to 5 times the largest estimate, with 5 after a jump of the load.
+        error of a run was 0.7 to 5 times the largest estimate.  The factor 5 occurred after a jump of the load.
     t_eval : (n,), s
         Output times, increasing, in (t, t_end].  The time t_end is always an output time. Steps end at output times.
     until

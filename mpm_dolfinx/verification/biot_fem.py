@@ -19,7 +19,7 @@ in state n, rho [zeta - zeta_n] becomes S rho [zeta - zeta_n] + (S - S_n) J_n n_
 If the pressure is constant in each cell, two-point fluxes replace the last integral of the storage equation.  A
 two-point flux is kappa J (F^-T N)^2 / h times the jump of pi and of the potential of gravity.  N is the normal of the
 face between two cells, and h is the distance of their centres.  The mean of k_r between the two pressures multiplies
-kappa.  Two-point fluxes are not consistent under shear.
+kappa.  Two-point fluxes are not consistent if cells shear.
 
 In axisymmetry F contains the circumferential stretch, and integrals extend over the full circumference.  Materials,
 retention, user-defined terms and time integration use the code of the material point method.  The two methods therefore

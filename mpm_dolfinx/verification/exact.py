@@ -108,8 +108,8 @@ class Mandel:
     alpha : in (0, 1]; Biot's coefficient
     force : N/m; resultant on the plate of width a, per metre of depth, positive in compression
 
-    Source: Mandel (1953), Géotechnique 3; Cheng & Detournay (1988), Int. J. Numer. Anal. Methods Geomech. 12;
-    Abousleiman et al. (1996), Géotechnique 46. The ratio (1 - nu)/(nu_u - nu) is expressed by K, G, alpha and S.
+    Source: Mandel (1953), Géotechnique 3; Cheng & Detournay (1988), International Journal for Numerical and Analytical
+    Methods in Geomechanics 12; Abousleiman and others (1996), Géotechnique 46.
     """
 
     a: float
@@ -217,7 +217,7 @@ def cryer_pressure(t: ArrayLike, radius: float, cv: float, nu: float, p0: float 
     nu : in (-1, 0.5); drained Poisson ratio
     p0 : Pa; uniform pressure on the surface, equal to the pore pressure at t = 0+
 
-    Returns (...), Pa. Source: Cryer (1963), Q. J. Mech. Appl. Math. 16; Verruijt.
+    Returns (...), Pa. Source: Cryer (1963), Quarterly Journal of Mechanics and Applied Mathematics 16; Verruijt.
     """
     _positive(radius=radius, cv=cv, t=t)
     _check(-1 < nu < 0.5, "nu", nu, "in (-1, 0.5)")
@@ -256,8 +256,8 @@ class SelfWeightColumn:
     density : kg/m³, > 0; density without gravity
     gravity : m/s², > 0; downwards
 
-    Source: tau / stretch = -density gravity (l0 - Y), solved with Lambert's W; Corless et al. (1996), Adv. Comput.
-    Math. 5.
+    Source: tau / stretch = -density gravity (l0 - Y), solved with Lambert's W; Corless and others (1996), Advances in
+    Computational Mathematics 5.
     """
 
     l0: float
@@ -305,7 +305,7 @@ def elastica_tip(load_parameter: float) -> tuple[float, float]:
 
     Returns (shortening u/L, deflection v/L), with absolute errors of 1e-12.
 
-    Source: Bisshopp & Drucker (1945), Q. Appl. Math. 3.
+    Source: Bisshopp & Drucker (1945), Quarterly of Applied Mathematics 3.
     """
     _check(0 <= load_parameter <= 1e5, "load_parameter", load_parameter, "in [0, 1e5]")
     if load_parameter < EPSILON**0.25:
