@@ -13,8 +13,8 @@ the clay at the wall. The equilibrium of the wedge bounds the force F normal to 
 
     F >= ((W - V) sin(theta) - c l) / cos(theta),        F <= ((W + V) sin(theta) + c l) / cos(theta).
 
-The largest lower bound of all planes is Coulomb's active force, and the smallest upper bound is Coulomb's passive
-force. Planes that end on the axis of symmetry are omitted. The computed force lies between the two bounds.
+Coulomb's active force is the largest lower bound of all planes. Coulomb's passive force is the smallest upper bound.
+The computed force lies between the two.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ class Frame:
 
     corners (n, 4, 2): corners of the domains, in m.
     moved (n,): magnitudes of the displacements of the points, in m.
-    force (3,): normal force and shear force on the barrier, in N/m, and moment about the foot of the barrier, in N.
+    force (3,): normal force and shear force on the barrier (N/m) and moment about the foot of the barrier (N).
     bounds: active and passive force on the barrier, in N/m.
     depth: depth of the clay at the barrier, in m.
     """

@@ -6,9 +6,9 @@ feature hardly changes the results. Examples are a gravity of zero, a conductivi
 from yield. `settlement` is the relative difference between the final settlements of the two scenes. In the pair "mean
 dilatation" (F-bar), the two scenes have different Poisson ratios and therefore different settlements.
 
-The two scenes of a pair take one step each in turn, --repeat times. The shortest step of each scene is used, because
-other work on the machine only increases times. All times are processor times. The compile time is the additional time
-of the first step with an empty cache of compiled forms. The memory is the peak memory with a full cache.
+The two scenes of a pair take one step each in turn, --repeat times. The shortest step of each scene counts. All times
+are processor times. The compile time is the additional time of the first step with an empty cache of compiled forms.
+The memory is the peak memory with a full cache.
 """
 
 from __future__ import annotations
@@ -137,17 +137,14 @@ def layered(cells: int, off: float) -> mpm.Simulation:
 
 
 class Watched(mpm.Hencky):
-    """A skeleton with four times the damping tau, so that `conducting` computes pressure jumps without damping."""
+    """Hencky's law with a damping of pressure jumps four times as strong."""
 
     def pressure_damping(self) -> float:
         return 4 * super().pressure_damping()
 
 
 def conducting(cells: int, law: type[mpm.Skeleton]) -> mpm.Simulation:
-    """Return the draining block, with the mobility `kappa = 8 tau h² / dt` for the damping tau of Hencky's law.
-
-    A substep dt computes pressure jumps if `kappa dt < 4 tau h²`, and damps them if `kappa dt < tau h²`.
-    """
+    """Return the draining block, with a conductivity at which `Watched` computes pressure jumps, but damps none."""
     kappa = 8 * soil().pressure_damping() / cells**2 / (GAMMA * DT)
     return block(cells, soil(law, conductivity=kappa * WATER["fluid"].unit_weight), **WATER)
 
@@ -313,7 +310,7 @@ MAKES = [make for pair in PAIRS.values() for make in pair]
 
 
 def take(simulation: mpm.Simulation, folder: str | None) -> tuple[float, mpm.Result]:
-    """Take `STEPS` steps, and return the processor time of a step, in s, and the result."""
+    """Take `STEPS` steps, and return the processor time of a step (s) and the result."""
     probe = mpm.probes(simulation.bodies, [[0.5, 1.0]])
     observe = [mpm.Writer(simulation, folder)] if folder else []
     end, began = simulation.t + STEPS * DT, time.process_time()
@@ -322,7 +319,7 @@ def take(simulation: mpm.Simulation, folder: str | None) -> tuple[float, mpm.Res
 
 
 def first_step(make: Make, cells: int) -> dict[str, float]:
-    """Return the processor time until the end of the first step, in s, and the peak memory, in MB."""
+    """Return the processor time until the end of the first step (s) and the peak memory (MB)."""
     began = sum(os.times()[:4])  # the C compiler's too
     make(cells).step(DT)
     return {"seconds": sum(os.times()[:4]) - began, "memory": peak_memory()}
@@ -330,7 +327,7 @@ def first_step(make: Make, cells: int) -> dict[str, float]:
 
 @cache
 def compiled(make: Make, cells: int) -> tuple[float, float]:
-    """Return the compilation time of a scene, in s, and its peak memory, in MB.
+    """Return the compilation time of a scene (s) and its peak memory (MB).
 
     The compilation time is the difference between two processes: one with an empty cache of compiled forms, and one
     with a full cache. The memory is the peak memory of the second process.

@@ -1,13 +1,12 @@
 # SPDX-License-Identifier: MIT
-"""Thresholds between linear solvers: run times of both solvers below and above each threshold.
+"""Run times of two linear solvers, below and above the size at which the package changes from one to the other.
 
-Each row of the table is a scene with a given number of displacement unknowns. The demo changes the threshold, so that
-both solvers are measured. A time is the processor time of two steps in the shortest of --repeat runs. On several
-processes, the time is the largest of all processes, including waiting. The thresholds are in
-`mpm_dolfinx/solve/solver_choice.py`.
+This size, a number of displacement unknowns, is a threshold. Each row of the table is a scene, computed with both
+solvers. A time is the processor time of two steps, in the fastest of --repeat runs. On several processes, the time is
+the largest of all processes, including waiting. The thresholds are in `mpm_dolfinx/solve/solver_choice.py`.
 
-On one process a second table follows. For each direct solver, this table lists the times of a first factorisation of
-the stiffness, of a repeated factorisation, and of a solve.
+On one process a second table follows. It lists three times for each direct solver: the first factorisation of the
+stiffness matrix, a repeated factorisation, and a solve.
 """
 
 from __future__ import annotations
@@ -56,8 +55,7 @@ CASES: dict[str, tuple[Callable[[int], mpm.Simulation], tuple[int, ...], tuple[i
     "multigrid_2d": (lambda n: block(2, n, ELASTIC, True), (64, 96, 128, 192), (16,)),
     "mumps": (lambda n: block(2, n, YIELDS, True), (64, 128, 192, 256), (12,)),
 }
-"""Scenes for each threshold: a function of the number n of cells along an axis, values of n, and values of n with
---quick.
+"""By threshold: a function that returns a scene with n cells along an axis; values of n; values of n with --quick.
 """
 
 FACTORED = (16, 128, 256)
@@ -65,7 +63,7 @@ FACTORED = (16, 128, 256)
 
 
 def took(make: Callable[[int], mpm.Simulation], n: int, name: str, least: int) -> tuple[float, int, plan.SolverPlan]:
-    """Return the time of the steps, in s, the number of unknowns, and the chosen solvers, for one threshold."""
+    """Return the time of the steps (s), the number of unknowns, and the chosen solvers, for one threshold."""
     usual, plan.THRESHOLDS = plan.THRESHOLDS, replace(plan.THRESHOLDS, **{name: least})
     try:
         s = make(n)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Large deflection of a cantilever under a dead load at its end, until it hangs.
+"""Large deflection of a cantilever under a dead load at its end.
 
 A dry beam, 1 m long and 0.05 m high, is clamped at its left end. A dead load P is spread evenly over its right end. The
 load parameter `alpha = P L² / (E I)` is 1, 2, 5 and 10, with the length L, Young's modulus E and the second moment of
@@ -7,8 +7,8 @@ area I. P and I = height³ / 12 are per unit depth. At alpha = 10 the tip deflec
 0.56 L. Poisson's ratio is zero, so plane strain equals plane stress. The law is neo-Hookean.
 
 There are two references. The elastica (Bisshopp & Drucker 1945) neither stretches nor shears. The geometrically exact
-rod (Reissner 1972, Simo 1985) has the stiffnesses E A, 5/6 G A and E I, with the area A and the shear modulus G. The
-demo runs on one process.
+rod (Reissner 1972, Simo 1985) also stretches, with the stiffness E A, and shears, with the stiffness 5/6 G A. Here A is
+the area of the section and G the shear modulus. The demo runs on one process.
 
 Errors `v_1` to `v_10` are the differences between the tip deflections v of beam and rod at each alpha, divided by L.
 Errors `u_1` to `u_10` are the differences between the shortenings u. The table gives these errors for material points
@@ -51,7 +51,7 @@ PHYSICS = {"walls": {"left": "xy"}, "conditions": [mpm.Traction("right", tractio
 
 @dataclass
 class Outcome:
-    """Results of a run: the axis (k, 2) of the beam for each alpha, in m, and the `mpm.Result`."""
+    """Results of a run: the axis (k, 2) of the beam for each alpha (m), and the `mpm.Result`."""
 
     axis: dict[int, np.ndarray]
     result: mpm.Result

@@ -63,7 +63,7 @@ def scene(cells: int, alpha: float) -> tuple[mpm.Simulation, mpm.surface.Probes]
 
 
 def run(cells: int, steps: int, alpha: float, taken: int | None = None) -> tuple[np.ndarray, mpm.Result, dict]:
-    """Return the tip displacement (3,), in m, the result and the costs of a run.
+    """Return the tip displacement (3,) in m, the result and the costs of a run.
 
     steps: number of steps to the full load.
     taken: number of computed steps; None means all steps.
@@ -88,7 +88,7 @@ def run(cells: int, steps: int, alpha: float, taken: int | None = None) -> tuple
 
 
 def surface(simulation: mpm.Simulation) -> tuple[np.ndarray, np.ndarray]:
-    """Return the outer faces (k, 4, 3) of the body, in m, and the axial stretch (k,) at each face."""
+    """Return the outer faces (k, 4, 3) of the body (m), and the axial stretch (k,) at each face."""
     (corners, F), (body,) = common.whole(simulation, "corners", "F"), simulation.bodies
     bits, faces, stretch = corner_bits(3), [], []
     for axis in range(3):

@@ -5,13 +5,13 @@ The body is a quarter of a ring, with the initial radius a0 of the cavity and th
 the wall of the cavity moves by a fifth of a cell in drained soil, and by a tenth of a cell in undrained soil. Small
 steps are needed because laws with history are first-order accurate in the step.
 
-1. A cavity expands in saturated Modified Cam Clay, so fast that no water flows. The initial pressure acts on the outer
+1. A cavity expands fast in saturated Modified Cam Clay, so no water flows. The initial pressure acts on the outer
    boundary. The soil is incompressible, so the motion is known exactly. When the cavity has grown to radius a, a point
    has moved from radius R to r, with `r^2 - a^2 = R^2 - a0^2`.
 2. The wall is fixed after the expansion, and excess pressures dissipate through the outer boundary.
-3. Drained cavities expand in Modified Cam Clay around a well (Chen and Abousleiman 2013), and in Mohr-Coulomb sand with
-   phi = 30 degrees, without and with associated dilation (Yu and Houlsby 1991). The published solutions are for
-   infinite soil. The outer boundary therefore follows a radial solution (`mpm_dolfinx.verification.cavity`).
+3. Drained cavities expand in Modified Cam Clay (Chen and Abousleiman 2013) and in Mohr-Coulomb sand with phi = 30
+   degrees (Yu and Houlsby 1991). The sand has no dilation, or associated flow. The published solutions are for infinite
+   soil. The outer boundary therefore follows a radial solution (`mpm_dolfinx.verification.cavity`).
 
 Pressures are divided by the initial pressure p_0. Errors are relative errors of the cavity pressure, and in undrained
 clay also of the pore pressure at the wall. In undrained clay errors are evaluated at the radii `MARKS`, and in drained
@@ -108,7 +108,7 @@ def ring(cells: int, soil: mpm.Skeleton, widest: float, outside: Callable | None
 
 
 def widen(s: mpm.Simulation, cells: int, radius: float, push: float) -> float:
-    """Widen the cavity to a radius, in m, by at most `push` cells in a step, and return its `pressure`."""
+    """Widen the cavity to a radius (m) by at most `push` cells in a step, and return its `pressure`."""
     steps = max(1, int(np.ceil((radius - 1 - s.t) * cells / push - 1e-6)))
     s.run(radius - 1, (radius - 1 - s.t) / steps, progress=False)
     return pressure(s, radius)
@@ -141,7 +141,7 @@ class Undrained:
 
     total: computed and exact cavity pressure minus p_0, for each radius.
     water: computed and exact pore pressure at the wall, for each radius.
-    profiles: times after the expansion, in s, with radii of the points, in m, and pore pressures.
+    profiles: times after the expansion (s), with radii of the points (m), and pore pressures.
     balance: error of the fluid balance.
     """
 

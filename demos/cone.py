@@ -3,10 +3,10 @@
 
 The cone has a tip angle of 60 degrees and an adhesion of 0.3 s_u, where s_u is the strength of the clay. The smooth
 shaft behind the cone is a second tool, so that the force on the cone is known separately. The scene is axisymmetric.
-The clay is undrained and follows Tresca's law, or with --mises von Mises's law with the strength s_u in pure shear. The
-shear modulus of the clay is G = 100 s_u. The resistance is F / (pi R^2 s_u), with the force F on the cone and the
-radius R of the shaft. The resistance is compared with a formula for a deep cone in Tresca clay with equal initial
-stresses in all directions (Lu, Randolph, Hu and Bugarski 2004, Geotechnique 54):
+The clay is undrained and follows Tresca's law. The option --mises replaces it by von Mises's law, with the strength s_u
+in pure shear. The shear modulus of the clay is G = 100 s_u. The resistance is F / (pi R^2 s_u), with the force F on the
+cone and the radius R of the shaft. The resistance is compared with a formula for a deep cone in Tresca clay under
+isotropic initial stress (Lu, Randolph, Hu and Bugarski 2004, Geotechnique 54):
 
     N_c = 3.4 + 1.6 ln(G / s_u) + 1.3 alpha,
 
@@ -14,12 +14,12 @@ where alpha = 0.3 is the adhesion divided by s_u. Domains of clay longer than a 
 (renewal). The shaft and the surface of the clay lie in the middle of cells, because renewal does not refill cells that
 a surface crosses several times. The edge between cone and shaft has a radius of one cell.
 
-The cone is also pushed into saturated ("wet") clay, so fast that the clay is undrained. Then the cone stops, and the
-excess pressure at the edge between cone and shaft dissipates. The fraction of the excess pressure that remains is
-compared with the curve of Teh and Houlsby (1991, Geotechnique 41) for a deep cone. The time factor of this curve is
-`T* = c_v t / (R^2 sqrt(G / s_u))`, with the coefficient of consolidation c_v and the time t. Near the surface pressures
-dissipate faster than around a deep cone. Half of the pressure has dissipated at T* = 0.03 if the tip is three radii
-deep, and at T* = 0.08 if the tip is five radii deep.
+The cone is also pushed fast into saturated ("wet") clay, which remains undrained. Then the cone stops, and the excess
+pressure at the edge between cone and shaft dissipates. The fraction of the excess pressure that remains is compared
+with the curve of Teh and Houlsby (1991, Geotechnique 41) for a deep cone. The time factor of this curve is `T* = c_v t
+/ (R^2 sqrt(G / s_u))`, with the coefficient of consolidation c_v and the time t. Near the surface pressures dissipate
+faster than around a deep cone. Half of the pressure has dissipated at T* = 0.03 if the tip is three radii deep, and at
+T* = 0.08 if the tip is five radii deep.
 
 With --follow, the cone is pushed once more into undrained clay, on grid lines that follow the cone.
 """
@@ -65,7 +65,7 @@ class Push:
 
     depth: depth of the tip after each step, divided by R.
     N: resistance after each step.
-    frame: final corners (n, 4, 2) of the domains, in m, a field (n,), and the outline (k, 2) of the cone, in m.
+    frame: final corners (n, 4, 2) of the domains (m), a field (n,), and the outline (k, 2) of the cone (m).
     seeded: number of points at the start.
     cells: number of grid cells, and number of cells if all cells were as small as the smallest.
     """
@@ -163,7 +163,7 @@ class Dissipation:
 
 
 def push_wet(cells: int, depth: float) -> Dissipation:
-    """Push the cone into saturated clay to `depth`, in m, then let the pore pressures dissipate."""
+    """Push the cone into saturated clay to `depth` (m), then let the pore pressures dissipate."""
     out = Dissipation()
     speed = FAST * CV / (2 * R)
     end = depth / speed

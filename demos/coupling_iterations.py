@@ -1,23 +1,22 @@
 # SPDX-License-Identifier: MIT
 """Numbers of iterations that couple displacement and pore pressure, from drained to undrained steps.
 
-The scenes are a cantilever (the poroelastic beam, undeformed and bent) and a footing on a column. The linear systems of
-Newton's first step are solved to a relative true residual of 1e-8. Only the product of conductivity and step length
-matters. The product ranges from 1e-23 m (1e-14 m/s, 1e-9 s) to 1e11 m (1e2 m/s, 1e9 s). The bulk modulus K_w of the
-water ranges from 1e4 Pa to infinity.
+The scenes are a cantilever (the poroelastic beam, undeformed and bent) and a footing on a column. The linear system of
+the first Newton step is solved to a relative residual of 1e-8. Only the product of conductivity and step length
+matters. It ranges from 1e-23 to 1e11 m. The bulk modulus K_w of the water ranges from 1e4 Pa to infinity.
 
 Three schemes are compared. An iteration of each scheme consists of one solve of the storage and one solve of the
 momentum.
 
 1. Conjugate gradients on the Schur complement `S = C + B K^-1 B^T`, as in the package. C is the matrix of storage and
    flow, K is the stiffness matrix, and B is the coupling matrix. The preconditioner is the filtered fixed-stress
-   operator `C + beta (V - 3/4 L)`, with a number beta, the cell volumes V and a five-point Laplacian L.
+   operator `C + beta (V - 3/4 L)`. Here beta is a number, V contains the cell volumes, and L is a five-point Laplacian.
 2. Conjugate gradients with the plain operator `C + beta V` as preconditioner.
 3. The plain fixed-stress (Richardson) iteration with beta = 0.5, 0.75 and 1 times alpha²/K_dr, where alpha is Biot's
    coefficient and K_dr is the drained bulk modulus. With beta = 1/K_w this iteration diverges.
 
-Undrained Q1/DG0 elements have checkerboard modes of the pressure, which the damping of pressure jumps (`storage.py`)
-limits. The second picture shows the pressure with and without damping.
+In undrained bodies, Q1/DG0 elements have checkerboard modes of the pressure. The damping of pressure jumps
+(`mpm_dolfinx/flow/storage.py`) limits these modes. The second picture shows the pressure with and without damping.
 """
 
 from __future__ import annotations
@@ -49,9 +48,9 @@ SCHEMES = {
     "fixed stress, 1": ("richardson", 1.0, 0.0),
     "fixed stress, 1/K_w": ("richardson", None, 0.0),
 }
-"""Krylov method, beta divided by alpha^2/K_dr, and factor of the filter L of each scheme.
+"""By scheme: Krylov method, beta divided by alpha^2/K_dr, and factor of L.
 
-None in place of the second value means beta = 1/K_w.
+A second value of None means beta = 1/K_w.
 """
 MOST = 200  # iterations after which a scheme counts as divergent
 RAMP_STEP = 0.02  # s: all systems have the load increment of this time, for any dt
@@ -145,7 +144,7 @@ def with_water(s: mpm.Simulation, bulk: float) -> mpm.Simulation:
 
 
 def linearise(s: mpm.Simulation, dt: float) -> System:
-    """Return the first Newton system of a step of length dt, in s, with the load increment of a step of `RAMP_STEP`."""
+    """Return the linear system of the first Newton step, for a time step of length dt (s)."""
     start = step.set_up(s.scene, s.state, RAMP_STEP)
     momentum = balances(s.scene, start, start.acting[-1]).momentum
     matrices, pieces, contents = start.matrices, start.data.pieces, start.on_grid.contents
@@ -209,7 +208,7 @@ def cells(s: mpm.Simulation) -> NDArray[np.float64]:
 
 
 def roughness(p: NDArray[np.float64]) -> float:
-    """Return the rms difference of cell pressures (nx, ny) from the mean of four neighbours, over the largest."""
+    """Return the rms difference of pressures (nx, ny) from their neighbours' mean, divided by the largest pressure."""
     deviation = p[1:-1, 1:-1] - (p[:-2, 1:-1] + p[2:, 1:-1] + p[1:-1, :-2] + p[1:-1, 2:]) / 4
     return float(np.sqrt(np.nanmean(deviation**2)) / np.nanmax(np.abs(p)))
 

@@ -34,14 +34,14 @@ OUTER = ("right", "back", "top")  # sides of the lattice that become the surface
 
 
 def ball(x: np.ndarray) -> np.ndarray:
-    """Map positions (n, 3), in m, from the cube [-`CUBE`, `CUBE`]^3 to the ball."""
+    """Map positions (n, 3) in m from the cube [-`CUBE`, `CUBE`]^3 to the ball."""
     a = x / CUBE
     b, c = np.roll(a, -1, axis=1) ** 2, np.roll(a, -2, axis=1) ** 2
     return RADIUS * a * np.sqrt(1 - b / 2 - c / 2 + b * c / 3)
 
 
 def disc(x: np.ndarray) -> np.ndarray:
-    """Map positions (n, 2), in m, from the square [-`SQUARE`, `SQUARE`]^2 to the disc."""
+    """Map positions (n, 2) in m from the square [-`SQUARE`, `SQUARE`]^2 to the disc."""
     a = x / SQUARE
     return RADIUS * a * np.sqrt(1 - a[:, ::-1] ** 2 / 2)
 

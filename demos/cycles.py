@@ -2,16 +2,16 @@
 """Residual stress of an elastic body after load cycles and after a rotation by 360 degrees.
 
 The drained beam of `poroelastic_beam.py` is loaded and unloaded repeatedly. The beam is elastic, so its stress must
-vanish after unloading. Grid displacements have kinks at grid lines. Particle domains must not follow these kinks.
-Otherwise stress would accumulate at every grid line that a domain crosses, as in standard MPM.
+vanish after unloading. Grid displacements have kinks at grid lines. If particle domains followed these kinks, stress
+would accumulate at every grid line that a domain crosses, as in standard MPM.
 
 A block is stretched between two fixed sides and then rotated by 360 degrees. The stresses after and before the rotation
 must be equal.
 
 The undrained beam has singular edges at the clamp. At a distance r from an edge the stress grows as `r^(x - 1)`, where
-x = 0.595 is the root of `cos(pi x / 2) = x` (Williams 1952). Near the edges the rms stress and the residual stress
-therefore decrease with the cell size h as h^x. Results are given for the whole beam, far from the clamp, near the
-clamp, and with springs instead of the clamp.
+x = 0.595 is the root of `cos(pi x / 2) = x` (Williams 1952). Near the edges the residual stress therefore decreases
+with the cell size h as h^x. Results are given for the whole beam, far from the clamp, near the clamp, and with springs
+instead of the clamp.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def conditions(o: Namespace) -> dict:
 
 
 def rms(simulation: mpm.Simulation, away: float = 0.0) -> float:
-    """Return the rms stress of the points, in Pa, with zero stress at distances below `away`, in m, from the wall."""
+    """Return the rms stress of the points (Pa); points closer than `away` (m) to the wall count as stress-free."""
     stress, volume = simulation.effective_stress(), simulation.points.volume0
     counts = simulation.points.reference.mean(axis=1)[:, 0] > away
     squares = (volume * counts * (stress**2).sum(axis=(1, 2))).sum()
@@ -75,15 +75,15 @@ def cycle(
     quadrature: quadrature rule, see `mpm.Numerics`.
     seed: function that returns the body, such as `mpm.box`.
     fluid: pore fluid of an undrained beam, or None.
-    springs: largest stiffness, in Pa/m, of springs that support the beam in place of the clamp. The stiffness decreases
+    springs: largest stiffness (Pa/m) of springs that support the beam in place of the clamp. The stiffness decreases
     to zero at the edges of the wall, so that no stress is singular.
 
     Returns these values by name:
     left: rms stress after each cycle, divided by the rms stress at the first peak.
     away: rms stress after each cycle without points near the wall, divided by the rms stress at the first peak.
-    times, tips: time, in s, and tip deflection, in m, of each step.
+    times, tips: time (s) and tip deflection (m) of each step.
     lost: work of the load in each cycle, divided by the work up to the first peak.
-    volume: volume change of the beam minus the volume change of its water, divided by the volume of the beam.
+    volume: difference between the volume changes of the beam and of its water, divided by the volume of the beam.
     balance: error of the fluid balance.
     """
     o = options(h, load, quadrature)
@@ -175,7 +175,7 @@ def orders(h: list[float], left: list[float]) -> list[float]:
 
 
 def reference(o: Namespace) -> tuple[np.ndarray, np.ndarray]:
-    """Return the tip deflection in a load cycle, in m, by finite elements, and the load, in Pa."""
+    """Return the tip deflection in a load cycle (m) by finite elements, and the load (Pa)."""
     case = options(o.h[-1], o.load)
     size = [0, 0], [beam.LENGTH, beam.HEIGHT], beam.REFERENCE_CELLS
     fem = BiotFEM(mpm.Grid(*size), beam.material(case), **conditions(case))

@@ -14,8 +14,8 @@ Checks:
   `k (H1^2 - H2^2) / (2 L)` (Dupuit, Charny), with the conductivity k. With suction, Kirchhoff's potential replaces the
   head. The potential is the integral of the relative permeability over the head.
 * `steady`: inflow of the dam divided by its outflow, before the reservoir falls.
-* `drained`: outflow of a column, divided by the outflow of finite elements, whose cells have a quarter of the size. The
-  free surface in the column falls from 8 m towards 2 m.
+* `drained`: outflow of a column, divided by the outflow that finite elements on cells a quarter as large give. The free
+  surface in the column falls from 8 m towards 2 m.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class Dam:
     """Results of the dam in steady flow and at each time of `SEEN`.
 
     flows: outflows (2,) through both slopes, in m^2/s.
-    frames: corners (n, 4, 2), in m, and pressures (n,), in Pa, of the domains.
+    frames: corners (n, 4, 2) in m, and pressures (n,) in Pa, of the domains.
     """
 
     flows: list[np.ndarray] = field(default_factory=list)
@@ -73,7 +73,7 @@ class Dam:
 
 
 def run(h: float = 0.5, steps: int = 10) -> Dam:
-    """Run the dam on cells of size h, in m, first to steady flow and then during the drawdown."""
+    """Run the dam on cells of size h (m), first to steady flow and then during the drawdown."""
     grid = mpm.Grid([0, 0], [BASE + 2, HEIGHT + 1], np.rint(np.array([BASE + 2, HEIGHT + 1]) / h).astype(int))
 
     def trapezoid(X: np.ndarray) -> np.ndarray:
@@ -138,7 +138,7 @@ def rectangular(cells: int) -> float:
 
 
 def driving(level: float, top: float) -> float:
-    """Return the integral of Kirchhoff's potential over a hydrostatic side of height `top`, in m^2."""
+    """Return the integral of Kirchhoff's potential over the height `top` (m) of a hydrostatic side, in m^2."""
     law, suction = LOAM.retention, np.linspace(0, top - level, 100001)
     filled = (1 + (suction * WEIGHT / law.entry) ** law.n) ** (1 / law.n - 1)
     k_r = filled**law.l * (1 - (suction * WEIGHT / law.entry) ** (law.n - 1) * filled) ** 2
@@ -148,7 +148,7 @@ def driving(level: float, top: float) -> float:
 
 
 def drained(cells: int, days: float = 100.0) -> tuple[float, float]:
-    """Return the outflow of a column of 10 m, in m, by material points and by finite elements.
+    """Return the outflow of a column of 10 m (m) by material points and by finite elements.
 
     The free surface starts at 8 m, and the head at the base is lowered to 2 m.
     """

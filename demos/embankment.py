@@ -66,9 +66,9 @@ def lift(grid: mpm.Grid, k: int):
 
 @dataclass
 class Bund:
-    """Histories of times, in s, of settlements of axis and toe, in m, and of excess pressures in the clay, in Pa.
+    """Histories: times (s), settlements of axis and toe (m), and excess pressures in the clay (Pa).
 
-    frames: title, corners (n, 4, 2), in m, and excess pressures (n,), in Pa, at some times.
+    frames: title, corners (n, 4, 2) in m, and excess pressures (n,) in Pa at some times.
     carried: fraction of the lifts' weight that the lowest points carry at the end.
     """
 
@@ -83,7 +83,7 @@ class Bund:
 
 
 def run(h: float = 0.5, steps: int = 6) -> Bund:
-    """Build the embankment on cells of size h, in m, in `steps` steps for each lift."""
+    """Build the embankment on cells of size h (m), in `steps` steps for each lift."""
     grid = mpm.Grid([0, 0], [WIDTH, CLAY + LIFTS + 1], np.rint(np.array([WIDTH, CLAY + LIFTS + 1]) / h).astype(int))
     bodies = [mpm.box(grid, [0, 0], [WIDTH, CLAY]), *[lift(grid, k) for k in range(LIFTS)]]
     simulation = mpm.Simulation(

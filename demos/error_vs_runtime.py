@@ -6,8 +6,8 @@ cell, the quadrature and the coupling vary too. Two body-fitted finite element m
 equal size, and Taylor-Hood. The time is the shortest of `--repeat` runs of the time loop. Compile times are separate.
 Reference solutions are converged in space and in time.
 
-* beam: the poroelastic beam. Errors are the largest error of the tip deflection at the output times `beam.TIMES`, and
-  the largest from 0.1 s on. The reference has 67 x 20 Taylor-Hood elements and steps of 0.005 s.
+* beam: the poroelastic beam. Two errors of the tip deflection are given: the largest at all output times, and the
+  largest after 0.1 s. The reference has 67 x 20 Taylor-Hood elements and steps of 0.005 s.
 * drained: the poroelastic beam without water, loaded in ten steps. The tip deflection is compared with that of 67 x 20
   Taylor-Hood elements.
 * terzaghi: the settlement at T_v = 0.5 is compared with the exact settlement.
@@ -70,7 +70,7 @@ class Row:
 
 
 def beam_runs(drained: bool, quick: bool) -> Iterator[tuple[str, str, Run]]:
-    """Yield method, setting and run of the beam, with or without water."""
+    """Yield the runs of the beam, with or without water: the method, the setting, and a function that runs it."""
     time = "--drained --ramp 1 --t-end 1 --dt 0.1" if drained else f"--t-end {0.4 if quick else 1.2}"
     times, truth = np.array(beam.TIMES), np.array(beam.TRUTH)
     if drained:
@@ -130,13 +130,13 @@ def beam_fem(time: str, element: str, cells: tuple[int, int]) -> tuple[mpm.Resul
 def scene_runs(
     physics: dict, material, size: tuple[float, float], width: int, time: tuple[float, int], exact: float, cells, steps
 ) -> Iterator[tuple[str, str, Run]]:
-    """Yield method, setting and run of a box, first for all cell sizes, then for all numbers of steps.
+    """Yield the runs of a box: the method, the setting, and a function that runs it.
 
     width: number of cells over the width, or -1 for as many as over the height.
-    time: end time, in s, and number of steps in runs of different cell size.
+    time: end time (s), and number of steps in the runs that compare cell sizes.
     exact: exact displacement of the top, in m.
     cells: numbers of cells over the height.
-    steps: numbers of steps in runs on the smallest cells.
+    steps: numbers of steps, each in a run on the smallest cells.
     """
 
     def points(n: int, m: int, rtol: float | None = None, **options) -> Run:
@@ -250,7 +250,7 @@ def measure(case: str, quick: bool, repeat: int) -> list[Row]:
 
 
 def time_at(rows: list[Row], error: float) -> float:
-    """Return the shortest time of the runs with at most this error, in s, or nan without such a run."""
+    """Return the shortest time (s) of the runs with at most this error, or nan if there is none."""
     return min((r.wall_s for r in rows if r.error <= error), default=np.nan)
 
 

@@ -4,16 +4,16 @@
 Every scene is tiny and has one extreme property. Scenes with the same extreme property form a family. Each scene has
 one of these outcomes:
 
-* converged: the error is below the bound of the family. The reference is an exact solution, a solution with finite
-  elements, or the same scene with a moderate setting. The residuals of momentum and fluid, and the error of the fluid
-  balance, are below 1e-8.
+* converged: the error is below the bound of the family. The reference is exact, or a solution with finite elements, or
+  the same scene with a moderate property. The residuals of momentum and fluid, and the error of the fluid balance, are
+  below 1e-8.
 * recovered: the run has converged, but some steps were cut.
 * refused: the run ends with an error that gives the reason. A scene without equilibrium must be refused.
 * warned: the error is above the bound, and the package has issued a warning.
 * wrong, nan or hung: a defect, which the exit status reports. An unexpected exception counts as wrong.
 
-An error is divided by the largest exact value, if the docstring of its family defines no other error. The condition
-number belongs to the last tangent of the momentum balance, scaled to a unit diagonal. The demo runs on one process.
+Errors are relative to the largest exact value, or as the docstring of the family defines. The condition number is that
+of the last stiffness matrix, scaled to a unit diagonal. The demo runs on one process.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ OUTCOMES = ("converged", "recovered", "refused", "warned", "wrong", "nan", "hung
 
 @dataclass
 class Row:
-    """Outcome of a case, with its largest residual and its total numbers of iterations."""
+    """Outcome of a scene, with its largest residual and its total numbers of iterations."""
 
     family: str
     setting: str
@@ -67,7 +67,7 @@ class Row:
 
 
 class Hung(Exception):
-    """A case that takes longer than the limit."""
+    """Error that ends a scene after the time limit."""
 
 
 def hang(*_) -> None:

@@ -52,7 +52,7 @@ def scene(cells: int) -> tuple[mpm.Simulation, list[np.ndarray]]:
 def fall(s: mpm.Simulation, parts: list[np.ndarray], dt: float) -> tuple[mpm.Result, np.ndarray, list]:
     """Release the bodies, and return the result, the paths (times, 7), and the corners of the domains at some times.
 
-    Each row of the paths has the time, in s, and the positions (x, y) of three centres of mass, in m.
+    Each row of the paths has the time (s) and the positions (x, y) of three centres of mass (m).
     """
     mass = s.scene.materials.density(s.points) * s.points.volume0 * s.points.J
     rows, shapes = [], []

@@ -7,51 +7,37 @@ Drucker and Prager's law with cohesion c, and drains at its free top. The dimens
 `V = v B / c_v`, with the velocity v and the coefficient of consolidation c_v.
 
 A smooth, impervious wall bounds the soil at 8 B from the middle of the footing. With a wall at 16 B, loads change by
-less than 1 % at any depth and rate. With a wall at 4 B, drained loads are up to 8 % too large before the limit load.
-With a layer 5 B thick, loads are 11 % smaller at a settlement of 0.1 B, and 3 % smaller at 0.5 B. In plane strain the
-settlement grows with the logarithm of the thickness of the layer, without bound.
+less than 1 % at any depth and rate. With a wall at 4 B, drained loads are up to 8 % too large.
 
 Limit loads are computed with very stiff soil, which flows before the geometry changes. Without friction the bearing
 capacity is `q = (2 + pi) s_u` (Prandtl 1921), with the undrained strength s_u. With the friction angle phi and
 associated flow the capacity is `q = c N_c`, with `N_c = (exp(pi tan(phi)) tan^2(45 deg + phi/2) - 1) / tan(phi)`.
-The footing has --cells cells over its width, and about twice as many in a second run.
 
-In the deep push the soil does not dilate. The undrained strength is s_u = xi c, with the coefficient xi of the cohesion
-in the yield function. A footing at depth D carries (1 + 0.27 sqrt(D/B)) times the undrained load of a footing at the
-surface (fit to bounds of limit analysis, Salgado, Lyamin, Sloan and Yu 2004). The drained capacity at the surface lies
-between the capacity for the reduced friction of Davis (1968) and c N_c.
+In the deep push the soil does not dilate. An undrained footing at depth D carries (1 + 0.27 sqrt(D/B)) times the load
+at the surface (Salgado, Lyamin, Sloan and Yu 2004). The drained capacity at the surface is at most c N_c, and at least
+the capacity for the reduced friction of Davis (1968).
 
 The undrained limit load converges from below, with order 1.5: its error is -5.9 % with 5 cells, -2.4 % with 9 cells and
--0.85 % with 17 cells. The outermost node of the footing also carries the half cell outside this node. With an odd
-number of cells the effective width is therefore the true width. With 4, 8 or 16 cells, the outermost node lies at the
-edge of the footing, and the effective width exceeds the true width by a cell.
+-0.85 % with 17 cells. Use an odd number of cells over the width. With an even number, the effective width of the
+footing exceeds the true width by a cell.
 
-In associated flow the dilation of each point is proportional to its shear, but with F-bar a cell has a single
-dilatation. The load would therefore increase without limit (de Borst and Groen 1995). In this demo the error of the
-load would be +4.4 % with 9 cells and +3.4 % with 17 cells. In fully yielding cells, laws therefore use half of the
-deviation of the gradient from its mean. The error is then -0.5 % with 5 cells, +0.5 % with 9 cells and +0.9 % with 17
-cells.
+In associated flow, the error of the limit load is -0.5 % with 5 cells, +0.5 % with 9 cells and +0.9 % with 17 cells.
 
 The limit load of a rough circular footing on Tresca's soil, in axisymmetry, is 6.05 s_u (Cox, Eason and Hopkins 1961).
 
-With --graded, cells are fine in a region of 2 B x 0.75 B below the footing. Outside this region, the length of cells
-increases by a tenth from cell to cell, up to eight times the smallest length. A box of 20 B x 10 B then has hardly more
-cells than a box of 4 B x 2.5 B with equal cells.
+With --graded, cells are fine in a region of 2 B x 0.75 B below the footing. Outside this region, each cell is a tenth
+longer than its finer neighbour, up to eight times the smallest length.
 
 With --square, square and circular footings, rough and smooth, are pushed into Tresca's soil, on graded cells. The
-footings are tools, because below a smooth prescribed displacement the faces of the soil would move outward and enlarge
-the footing. A quarter of the square is computed in 3D, also on several processes. N_c is the limit load, divided by
-area and c. The bounds of N_c are 5.52 and 6.22 for a rough square (Salgado, Lyamin, Sloan and Yu 2004), and 2 + pi and
-5.71 for a smooth square (Shield and Drucker 1955). Circles are computed in axisymmetry, with about twice as many cells
-over the width. The exact N_c is 6.05 for a rough circle (Cox, Eason and Hopkins 1961), and 5.69 for a smooth circle
-(Shield 1955).
+footings are tools. A quarter of the square is computed in 3D. N_c is the limit load, divided by area and c. The bounds
+of N_c are 5.52 and 6.22 for a rough square (Salgado, Lyamin, Sloan and Yu 2004), and 2 + pi and 5.71 for a smooth
+square (Shield and Drucker 1955). Circles are computed in axisymmetry, with about twice as many cells over the width.
+The exact N_c is 6.05 for a rough circle (Cox, Eason and Hopkins 1961), and 5.69 for a smooth circle (Shield 1955).
 
-With non-associated flow the solution is not unique. Shear bands are one cell wide and change their position between
-steps, more often on finer cells (Rudnicki and Rice 1975). On fine grids many steps are therefore cut. The option
---viscosity adds a viscous stress, small compared with the cohesion, which makes the solution unique (Needleman 1988).
-With --explicit-friction, the strength by friction is computed from the mean stress at the start of each step. Flow is
-then associated within a step (Krabbenhoft, Karim, Lyamin and Sloan 2012). With 9 cells over the width, this option
-changes the load by 0.8 % in a run of 4 steps, and by 0.3 % in a run of 16 steps.
+With non-associated flow the solution is not unique (Rudnicki and Rice 1975). Shear bands change their position between
+steps, and on fine grids many steps are cut. The option --viscosity adds a small viscous stress, which makes the
+solution unique (Needleman 1988). With --explicit-friction, friction follows from the mean stress at the start of each
+step. Flow is then associated within the step (Krabbenhoft, Karim, Lyamin and Sloan 2012).
 """
 
 from __future__ import annotations
@@ -128,8 +114,8 @@ def embedded(depth):
 class ExplicitFriction(mpm.DruckerPrager):
     """Drucker-Prager soil whose friction follows from the mean stress at the start of each step.
 
-    Within a step, the friction angle equals the dilation angle, so flow is associated. The strength at zero mean stress
-    contains the rest of the friction (Krabbenhoft, Karim, Lyamin and Sloan 2012). Two state variables are added:
+    Within a step, the friction angle equals the dilation angle, so flow is associated. The cohesion of the step
+    contains the remaining friction (Krabbenhoft, Karim, Lyamin and Sloan 2012). Two state variables are added:
     mean: mean Kirchhoff stress, in Pa.
     strength: strength at zero mean stress in the last step, in Pa.
     """
@@ -166,8 +152,8 @@ class Frame:
 
     t: time divided by the duration of the push.
     settlement: settlement of the footing, divided by B.
-    corners (n, 4, 2), pressure (n,): corners, in m, and pore pressures, in Pa, of the domains.
-    top (k, 2): positions of the soil's surface, in m, from the middle outward.
+    corners (n, 4, 2), pressure (n,): corners (m) and pore pressures (Pa) of the domains.
+    top (k, 2): positions of the soil's surface (m) from the middle outward.
     """
 
     t: float
@@ -378,7 +364,7 @@ def main(argv: list[str] | None = None) -> dict:
 def of_many_sizes(cells: int, folder: Path) -> dict:
     """Compare the undrained limit load on graded cells in a large box with that on equal cells in a small box.
 
-    Returns the load, the number of points and the processor time, in s, for both boxes, and their ratios.
+    Returns the load, the number of points and the processor time (s) for both boxes, and their ratios.
     """
     out, runs = {}, {}
     for how, box in FAR.items():

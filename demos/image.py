@@ -7,8 +7,8 @@ stiff as black tissue, and less permeable. A rigid permeable plate compresses th
 eighth of its height. No water flows into the holes. The demo runs on one process.
 
 `modulus` is the error of the drained modulus (stress / strain under a small load). The reference has one Taylor-Hood
-element per pixel. The elements in holes have a millionth of the stiffness of black tissue. `drained` is the difference
-of the final settlement of the saturated tissue from that of dry tissue. The errors `modulus` and `drained` decrease
+element per pixel. The elements in holes have a millionth of the stiffness of black tissue. `drained` is the relative
+difference between the final settlements of saturated and of dry tissue. The errors `modulus` and `drained` decrease
 with the size of the pixels.
 """
 
@@ -53,7 +53,7 @@ class Tissue:
         return self.grey[tuple(np.floor(x / EDGE * len(self.grey)).astype(int).clip(0, len(self.grey) - 1).T)]
 
     def inside(self, x: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return whether positions (n, 2), in m, are in the tissue."""
+        """Return whether positions (n, 2) in m are in the tissue."""
         return (x[:, 1] < EDGE) & (self.at(x) >= HOLES)
 
     def law(self, holes: float = 1.0) -> mpm.Hencky:
@@ -66,7 +66,7 @@ class Tissue:
         return mpm.Hencky(**constants, porosity=POROSITY)
 
     def scene(self, load: float, wet: bool) -> tuple[mpm.Simulation, mpm.Probes]:
-        """Return the tissue under a load, in Pa, with or without pore water, and a probe on its top."""
+        """Return the tissue under a load (Pa), with or without pore water, and a probe on its top."""
         n = len(self.grey)
         grid = mpm.Grid([0, 0], [EDGE, EDGE * (n + 2) / n], [n, n + 2])
         body = mpm.shape(grid, self.inside)
@@ -87,9 +87,9 @@ class Tissue:
 
 @dataclass
 class Outcome:
-    """Histories of times, in s, of settlements divided by `EDGE`, and of the highest pore pressures, in Pa.
+    """Histories: times (s), settlements divided by `EDGE`, and highest pore pressures (Pa).
 
-    frames: time, in s, and corners, in m, pressures, in Pa, and grey values of the points.
+    frames: time (s), and corners (m), pressures (Pa) and grey values of the points.
     drained: settlement of dry tissue divided by `EDGE`.
     """
 

@@ -38,8 +38,8 @@ TIMES = np.geomspace(1e-4, 10, 21)  # times at which the force is recorded, divi
 class Contact:
     """State of the contact at one time, with the force in N/m.
 
-    x, p: positions, in m, and pressures, in Pa, of points at the gel's surface.
-    most, half: largest pressure, in Pa, and half-width, in m, of the ellipse fitted to these pressures.
+    x, p: positions (m) and pressures (Pa) of points at the gel's surface.
+    most, half: largest pressure (Pa) and half-width (m) of the ellipse fitted to these pressures.
     """
 
     force: float

@@ -27,7 +27,7 @@ STIFF = {"bulk": 1e10, "shear": 5e9}  # Pa: soil that hardly deforms
 ALPHA, K = 5.0, 1e-5  # 1/m, m/s, of the exponential soil
 HOURS = (1, 6, 12)
 FRONT = {6: (0.2544, 0.017406), 12: (0.375096, 0.026335)}
-"""By hour: depth at which the head is -5 m, and infiltrated water, both in m, extrapolated from 1600 finite volumes."""
+"""By hour: depth (m) at which the head is -5 m, and infiltrated water (m), extrapolated from 1600 finite volumes."""
 DRY = {
     "soil": mpm.LinearElastic(
         **STIFF,
@@ -38,7 +38,7 @@ DRY = {
     "pressure": -10 * WEIGHT,
     "sides": [mpm.Drained("bottom", pressure=-10 * WEIGHT), mpm.Drained("top", pressure=-0.75 * WEIGHT)],
 }
-"""Arguments of `column` for the front."""
+"""Arguments of `column` for the scene with a wetting front."""
 
 
 def column(cells: int, soil: mpm.Skeleton, pressure, sides) -> mpm.Simulation:
@@ -51,7 +51,7 @@ def column(cells: int, soil: mpm.Skeleton, pressure, sides) -> mpm.Simulation:
 
 
 def series(z: np.ndarray, t: float, before: float = 0.1, after: float = 0.9) -> np.ndarray:
-    """Return the exact heads at heights z, in m, and time t, in s, from the roots l of `tan(l L) + 2 l = 0`."""
+    """Return the exact heads (m) at heights z (m) and time t (s), as a series over roots of `tan(l L) + 2 l = 0`."""
     Z, L, T = ALPHA * z, ALPHA, ALPHA * K * t / 0.35
     low = (np.arange(1, 200) - 0.5) * np.pi / L
     high = np.arange(1, 200) * np.pi / L
@@ -99,7 +99,7 @@ def front(cells: int, dt: float) -> tuple[list, list[float], list[float], bool]:
 
 
 def by_elements(cells: int, dt: float) -> tuple[list[float], list[float]]:
-    """Return the errors of the front, in m, and the relative errors of the water, for `cells` finite elements."""
+    """Return the errors of the front (m) and the relative errors of the water, for `cells` finite elements."""
     walls, pull = {"left": "x", "right": "x", "bottom": "y"}, lambda t: (0, -9.81)
     scene = {"conditions": DRY["sides"], "pressure": DRY["pressure"], "walls": walls, "gravity": pull}
     size = [0, 0], [1 / cells, 1], [1, cells]

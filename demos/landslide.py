@@ -7,8 +7,7 @@ inertia. The factor of safety of the slope is 1.4. Then the strength of the soil
 
 With inertia the slope accelerates until its shape is stable, and then moves on until friction stops it. Without
 inertia, as in the demo `slope`, a viscous stress controls the motion. The slope then stops at the first stable shape,
-so the run-out is shorter than with inertia. Friction dissipates the work of gravity, except for the part that is stored
-elastically.
+so the run-out is shorter than with inertia. Friction dissipates the work of gravity that is not stored elastically.
 """
 
 from __future__ import annotations

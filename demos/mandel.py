@@ -11,7 +11,7 @@ Mandel (1953); Abousleiman, Cheng, Cui, Detournay and Roegiers (1996), Géotechn
 
 Errors:
 
-* `p_0.01` to `p_1`: largest error of the pressure at the centroids of all cells, times a / force, at T = 0.01 to 1.
+* `p_0.01` to `p_1`: largest error of the pressure at T = 0.01 to 1, multiplied by a / force.
 * `p_max`: relative error of the highest pressure in the innermost cell, which occurs at T = 0.07.
 * `p_rise`: relative error of the difference between the highest pressure and p0.
 * `settlement`: largest relative error of the plate's settlement at T = 0.01, 0.1, 0.5 and 1.
@@ -44,7 +44,7 @@ class Outcome:
     """Results of a run, with an entry for each step.
 
     time: reduced time T.
-    x, p (columns, rows): positions, in m, and pressures, in Pa, of the cells.
+    x, p (columns, rows): positions (m) and pressures (Pa) of the cells.
     settlement: settlements at eleven positions on the top, from the middle to the side, in m.
     """
 

@@ -11,11 +11,10 @@ The clay is a block, eight diameters wide and high, between smooth walls. Half o
 the top keeps the gap behind the bar closed. In a narrower block the resistance is lower. In a block four diameters
 wide, N of a rough bar is 10.9 with 8 cells over the diameter, and 10.8 with 16 cells.
 
-Clay ahead of the bar flows around the bar and stretches exponentially, by a factor of about e^4 for each diameter of
-depth. After each quarter of a diameter, new points are therefore seeded around the bar, with the present stresses
-(remeshing and interpolation, Hu and Randolph 1998). After each new seeding, N is lower for one or two steps. Errors
-refer to the mean of N in the last steps of each quarter. `spread` is the range of N in these steps, divided by their
-mean.
+Clay that flows around the bar stretches by a factor of about e^4 for each diameter of depth. After each quarter of a
+diameter, the clay is therefore seeded with new points, which take over the stresses (Hu and Randolph 1998). After each
+new seeding, N is lower for one or two steps. Errors refer to the mean of N before each new seeding. `spread` is the
+range of N in these steps, divided by their mean.
 
 A smooth bar is also pushed through saturated ("wet") clay by one diameter, at three rates `V = v D / c_v`, with the
 velocity v and the coefficient of consolidation c_v. Water exerts the pressure on the top, so the clay starts without
@@ -62,7 +61,7 @@ def exact(alpha: float) -> float:
 
 
 def clay(cells: int, y: float = 0.0, follow: mpm.Tool | None = None) -> tuple:
-    """Return the grid, half of the block around a bar at the height y, in m, and the region of the block's top.
+    """Return the grid, half of the block around a bar at the height y (m), and the region of the block's top.
 
     cells: number of cells over the diameter.
     follow: bar that grid lines follow, or None.
@@ -97,7 +96,7 @@ class Push:
     N: resistance, for each step.
     excess: excess pressure divided by s_u, for each step.
     steady: whether a step counts in the error of N.
-    frame: final corners (n, 4, 2), in m, a field (n,), and the shape of the bar (k, 4, 2), in m.
+    frame: final corners (n, 4, 2) in m, a field (n,), and the shape of the bar (k, 4, 2) in m.
     lines: final grid lines along both axes, in m.
     """
 
@@ -152,7 +151,7 @@ def leg(out: Push, stress: Callable | None, alpha: float, cells: int, y: float, 
 
 
 def kept(simulation: mpm.Simulation) -> Callable:
-    """Return a function that interpolates the effective stress (n, 3, 3), in Pa, at positions x (n, 2), in m.
+    """Return a function that interpolates the effective stress (n, 3, 3) in Pa at positions x (n, 2) in m.
 
     Interpolated stresses beyond the strength are reduced to the strength.
     """

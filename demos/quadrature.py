@@ -3,7 +3,7 @@
 
 The beam of `poroelastic_beam.py` without water takes its whole load in n equal steps. The material is elastic, so the
 deflection must not depend on n. With integration over the exact pieces of the domains, the deflection is independent of
-n. With integration at the points, as in standard MPM, every cell that a point crosses adds to the error. The finite
+n. With integration at the points, as in standard MPM, the error grows each time a point enters another cell. The finite
 element reference takes the load in ten steps.
 """
 
@@ -23,7 +23,7 @@ PROBE = np.array([[beam.LENGTH, beam.HEIGHT / 2]])
 
 
 def tip(h: float, steps: int, quadrature: str) -> tuple[float, float]:
-    """Return the deflection of the tip, in m, and the run time, in s; the deflection of a failed run is nan."""
+    """Return the deflection of the tip (m) and the run time (s); the deflection of a failed run is nan."""
     o = options(h, steps, quadrature)
     simulation, bottom = beam.scene(o)
     try:

@@ -70,7 +70,7 @@ def column(cells: int) -> mpm.Simulation:
 
 
 class Shot(NamedTuple):
-    """State of the bank: time, in s, corners, in m, and saturations of the domains, and largest speed, in m/s."""
+    """State of the bank: time (s), corners (m) and saturations of the domains, and largest speed (m/s)."""
 
     t: float
     corners: np.ndarray
@@ -198,13 +198,13 @@ def animate(path: Path, film: list[Shot], rained: int) -> None:
 
 
 def exact(depth: np.ndarray, share: float) -> np.ndarray:
-    """Return the exact factors of safety (n,) at depths (n,), in m, for rain of `share` times the conductivity."""
+    """Return the exact factors of safety (n,) at depths (n,) in m for rain of `share` times the conductivity."""
     filled = share + (1 - share) * np.exp(-ALPHA * (TABLE - depth) * np.cos(SLOPE) ** 2)
     return safety(depth, -filled * np.log(filled) / ALPHA * WATER)
 
 
 def safety(depth: np.ndarray, suction_stress: np.ndarray) -> np.ndarray:
-    """Return the factors of safety (n,) at depths (n,), in m, for suction stresses (n,), in Pa."""
+    """Return the factors of safety (n,) at depths (n,) in m for suction stresses (n,) in Pa."""
     angles = np.tan(SLOPE) + 1 / np.tan(SLOPE)
     held = 2 * COHESION / (UNIT * depth * np.sin(2 * SLOPE)) + np.tan(FRICTION) / np.tan(SLOPE)
     return held + suction_stress / (UNIT * depth) * angles * np.tan(FRICTION)

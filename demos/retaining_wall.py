@@ -12,10 +12,7 @@ where the upper sign is for passive pressure (Prandtl, Sokolovskii). The flowing
 fan about the crest of the wall, and Rankine's zone. Without wall friction, K is Rankine's
 `(1 ± sin(phi)) / (1 ∓ sin(phi))`. Coulomb's solution is the critical wedge with a plane slip surface.
 
-The moment about the toe also gives K. A tilting wall opens no gap at its toe. A translating wall opens a gap at its
-toe, in which no force acts. Without the force on the lowest of ten cells, the active thrust is a tenth too small. The
-sand is so stiff that it yields at a small tilt. At two and a half times this tilt, the active thrust is 2.5 to 3 %
-larger.
+The moment about the toe also gives K. The sand is so stiff that it yields at a small tilt.
 """
 
 from __future__ import annotations
@@ -65,9 +62,9 @@ def slip_line(delta: float, way: int) -> np.ndarray:
 
 @dataclass
 class Tilted:
-    """Results of a run: tilts (n,), in rad, K (n,) from the thrust, and K (n,) from the moment.
+    """Results of a run: tilts (n,) in rad, K (n,) from the thrust, and K (n,) from the moment.
 
-    frame: final corners of the domains, in m, plastic shear strains, and shape of the wall.
+    frame: final corners of the domains (m), plastic shear strains, and shape of the wall.
     """
 
     tilt: np.ndarray

@@ -3,31 +3,24 @@
 
 Two saturated bodies move slowly through the grid. The first body is the beam of `poroelastic_beam.py` in 2D, with
 direct solvers, in a background box six times as large. The second body is a cube of 1 m in 3D, sheared and compressed,
-with multigrid. Each run is a new process, or several processes under mpirun (--processes 1 2). The first step compiles
-and fills the caches. Then single steps are measured, and the fastest step is used, because other work on the machine
-only adds time. Time is processor time, divided among the parts of a step in proportion to their wall time. On several
-processes, the time is the largest time of all processes, including waiting. Memory is the peak since the start of the
-process. If the demo itself is started by mpirun, all runs share its processes, and memory is the peak of all runs so
-far.
+with multigrid. Each run is a new process, or several processes under mpirun (--processes 1 2). The time is the
+processor time of the fastest step after the first. On several processes, the time is the largest time of all processes,
+including waiting. Memory is the peak since the start of the process.
 
-The exponent of a part is the slope of log(time) against log(points), fitted by least squares to the larger half of the
-sizes. `kB a point` is the slope of the memory against the number of points, fitted to all sizes by least squares of
-relative errors. Runs on several processes also print the load balance and the messages of a step. The load balance
-(`imbalance`) is the largest number of pieces of a process divided by the mean. Messages are counted on the process with
-the most messages. `exchange` are the messages of the package (pieces, corners, points). `solvers` are the messages that
-PETSc counts in set-up and solution of its Krylov solvers. Messages of MUMPS and of dolfinx are not counted.
+The exponent of a part of the step is the slope of log(time) against log(points), fitted to the larger half of the
+sizes. `kB a point` is the slope of the memory against the number of points. Runs on several processes also print the
+load balance and the messages of a step. The load balance (`imbalance`) is the largest number of pieces of a process
+divided by the mean. Messages are counted on the process with the most messages. `exchange` counts the messages of the
+package, and `solvers` the messages of PETSc's Krylov solvers. Messages of MUMPS and of dolfinx are not counted.
 
-If there are runs on one process and on several, a cost model is fitted. The time T of a step, in s, with n points on P
+If there are runs on one process and on several, a cost model is fitted. The time T of a step (s), with n points on P
 processes is
 
     T = e + a n / P + b H + c log2 P,
 
-where e is a fixed cost, a n / P is the work for the points, b H is the work for points at faces between processes, and
-c log2 P is a cost of messages that does not depend on their size. In a measured run, a n / P is multiplied by the
-imbalance. H is the number of points along the faces that a process shares with others, for a cube that is halved
-repeatedly. The coefficients, all >= 0, are fitted by least squares of relative errors. If a run has more processes than
-the machine has processors, its times are not used. In 2D the model excludes the solvers, because the cost of
-factorisations is not proportional to n / P.
+where H is the number of points along the faces that a process shares with others. The cost e is fixed. The other terms
+are the work for all points, the work for points at shared faces, and the number of messages. In 2D the model excludes
+the solvers, because the cost of factorisations is not proportional to n / P.
 """
 
 from __future__ import annotations
@@ -143,12 +136,12 @@ def measure(dim: int, points: float) -> dict:
 
 
 def held(root: object, buffers: bool = True) -> tuple[dict[str, int], set[int]]:
-    """Return two results for the arrays of an object on this process: bytes by kind, and lengths of axes.
+    """Return the bytes of all arrays of an object on this process, by kind, and the lengths of their axes.
 
     Shared memory counts once. Arrays in files that are mapped into memory have the kind "files", and no lengths of
     axes.
 
-    buffers: whether to count the buffers of integrands too, which have a fixed largest number of rows.
+    buffers: whether to count the buffers of integrands too.
     """
     objects, seen = [root], set()
     arrays: dict[int, NDArray] = {}
@@ -201,7 +194,7 @@ def in_own_process(dim: int, points: float, processes: int) -> dict:
 
 
 def exponents(rows: list[dict]) -> dict[str, float]:
-    """Return the exponents of the parts, and the memory: initial memory, in MB, and kB per point."""
+    """Return the exponents of the parts, and the memory: initial memory (MB) and kB per point."""
     upper = rows[(len(rows) - 1) // 2 :]
     n, memory = (np.array([row[name] for row in rows], dtype=float) for name in ("points", "memory_MB"))
     slope, base = np.polyfit(n, memory, 1, w=1 / memory)
@@ -232,7 +225,7 @@ def modelled(row: dict) -> float:
 
 
 def fit(rows: list[dict]) -> dict[str, float]:
-    """Return the coefficients of the cost model, in s, and the largest relative error for the runs."""
+    """Return the coefficients of the cost model (s) and the largest relative error for the runs."""
     timed = [row for row in rows if row["processes"] <= (os.cpu_count() or 1)]
     A = np.array([terms(row["dim"], row["points"], row["processes"], row["imbalance"]) for row in timed])
     T = np.array([modelled(row) for row in timed])

@@ -9,10 +9,9 @@ stretch follows from Lambert's W function. Source: the column of AMPLE (Coombs &
 doi:10.1016/j.advengsoft.2019.102748), here with a hundredth of its stiffness. The demo runs on one process.
 
 `stress` is the mean error of the stress over the points, divided by rho0 g l0 and weighted by volume. `height` is the
-relative error of the column's height. With 16 cells over the initial height, `stress` is 3.4e-4, and the published
-error of GIMP is 3.7e-3. With 64 cells, `stress` is 6.4e-6, and the published error of GIMP is 4.4e-4.
-`--quadrature point` integrates at the points instead of over the pieces of their domains. The error is then about 8 %
-with any number of cells.
+relative error of the column's height. With 64 cells over the initial height, `stress` is 6.4e-6, and the published
+error of GIMP is 4.4e-4. `--quadrature point` integrates at the points instead of over the pieces of their domains. The
+error is then about 8 % with any number of cells.
 """
 
 from __future__ import annotations

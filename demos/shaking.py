@@ -49,7 +49,7 @@ BOUNDS = {"amplification": 0.03, "energy": 0.01, "bank": 0.1, "bank_energy": 0.0
 
 
 def soil(speed: float, density: float) -> mpm.LinearElastic:
-    """Return a soil with this velocity of shear waves, in m/s, and this density, in kg/m³."""
+    """Return a soil with this velocity of shear waves (m/s) and this density (kg/m³)."""
     shear = density * speed**2
     bulk = 2 * shear * (1 + POISSON) / (3 - 6 * POISSON)
     return mpm.LinearElastic(bulk=bulk, shear=shear, porosity=0.4, grain_density=density / 0.6)

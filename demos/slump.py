@@ -10,22 +10,17 @@ runs on one process.
 1. Critical strength. The soil has no friction and does not drain. The strength c of the soil is reduced by 1 % in each
    step. A vertical side of height H is stable while gamma' H / c < 3.78. Limit analysis gives 3.76 to 3.79 (Pastor,
    Thai and Francescato 2000), and the critical slip circle 3.83 (Fellenius 1927). The bank has failed when the crest
-   settles 20 times as much in a step as in each of the first steps. With a factor of 10 or 40 instead of 20, the result
-   changes by 1 %. With 10 cells over the height the bank fails at gamma' H / c = 3.94, which is 4.2 % too large. With
-   20 cells it fails at 3.86, which is 2.0 % too large. The error is of first order in the cell size, and the
-   extrapolated value is 3.78.
+   settles 20 times as much in a step as in each of the first steps. With 10 cells over the height the bank fails at
+   gamma' H / c = 3.94, which is 4.2 % too large. With 20 cells it fails at 3.86, which is 2.0 % too large.
 2. Run-out. The consolidated bank, with friction, loses its cohesion within T = 10 minutes, far faster than it drains.
    The bank slumps. In front of the initial toe, the water carries more than half of the soil's weight. At rest the bank
-   is twice as long as before. Then the excess pressure drains. The final inclination of the slope is 23.5 degrees, and
-   29.3 degrees in its steepest part of length H / 3. The friction angle is 25 degrees. Without dilation a
-   Drucker-Prager cone mobilises only 24.2 degrees, the arcsine of the cone's slope. The remaining cohesion, a hundredth
-   of gamma' H, makes the slope slightly steeper. Twice the number of cells or steps, or half the viscosity, changes
-   run-out and height by less than 2 %.
+   is twice as long as before. Then the excess pressure drains. The final inclination of the slope is 23.5 degrees. The
+   friction angle is 25 degrees, but without dilation the soil mobilises only 24.2 degrees. Twice the number of cells or
+   steps, or half the viscosity, changes run-out and height by less than 2 %.
 
 The points carry the cohesion (`points.data["cohesion"]`), because it is a function of position. A function in `observe`
 reduces the cohesion after each step. A viscous stress of 2 eta times the strain rate, also a term in UFL, limits the
-velocity of the bank in part 2. Steps that do not converge are repeated with half the length. With the viscous stress
-these short steps converge. The ratio eta / T is a hundredth of gamma' H.
+velocity of the bank in part 2.
 """
 
 from __future__ import annotations
@@ -116,8 +111,8 @@ class Frame:
 
     corners: corners of the domains, in m.
     surface (k, 2): positions from the crown to the toe, in m.
-    pressure, strain: excess pore pressures, in Pa, and plastic strains of the points.
-    volume, cohesion: volume, in m², and cohesion, in Pa, of the bank.
+    pressure, strain: excess pore pressures (Pa) and plastic strains of the points.
+    volume, cohesion: volume (m²) and cohesion (Pa) of the bank.
     """
 
     t: float
@@ -312,7 +307,7 @@ class Panel:
 
 
 def shown(frame: Frame) -> tuple[np.ndarray, np.ndarray]:
-    """Return the drawn values of the points: pressures, in kPa, and plastic strains."""
+    """Return the drawn values of the points: pressures (kPa) and plastic strains."""
     return frame.pressure / 1e3, np.maximum(frame.strain, 1e-3)
 
 

@@ -4,23 +4,20 @@
 Terzaghi's column (demo `terzaghi`) consolidates until the reduced time `T_v = c_v t / height²` is 0.1, with the
 coefficient of consolidation c_v and the time t. The column takes 1, 10, ..., 10 000 equal steps. The error is the root
 mean square of (p - exact) / p0 at the centroids of all cells, with the pressure p and its initial value p0. With many
-steps, the remaining error must be the spatial error. The spatial error is known, because the semi-discrete equations
-have an exact solution in time. Three columns are computed:
+steps, the remaining error must be the spatial error. The spatial error follows from exact integration in time. Three
+columns are computed:
 
 * column at rest on the grid.
 * moving column: during consolidation the base moves down by half the height, through half of all cells.
 * moving column with soft water: the storage coefficient of the water is 1/M, with the oedometric modulus M of the
-  skeleton. The pressure of soft water is remapped from grid to grid. The pressure of stiff water follows from the
-  strain of the points.
+  skeleton.
 
-Motion adds an error, because all points of a cell have equal strain increments in a step. The error due to motion is
-largest at the drained top, in cells that contain little of the column. The error of the remap is smaller than the
-spatial error, and of second order in the cell size.
+Motion adds an error, which is largest at the drained top, in cells that contain little of the column.
 
 The overshoot, the largest p / p0 - 1 in all steps, is zero for the column at rest, with steps of any length. In 2D and
-3D, small steps cause checkerboard modes of the pressure; damping of the pressure jumps (`storage.py`) removes these
-modes. The demo shows the first step after a strip load on a layer, with and without damping. The demo runs on one
-process.
+3D, small steps cause checkerboard modes of the pressure; damping of the pressure jumps (`mpm_dolfinx/flow/storage.py`)
+removes these modes. The demo shows the first step after a strip load on a layer, with and without damping. The demo
+runs on one process.
 """
 
 from __future__ import annotations

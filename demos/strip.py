@@ -9,12 +9,11 @@ the unit weight gamma_w of water. The load increases until T = 0.01. Source: Car
 Abaqus' benchmark 1.14.3. With q = E/2 (--load 0.5) the pores under the strip close at T = 0.37. The law has no
 stiffness of the grains, so the run fails at this time.
 
-The references for q/E = 0.25 are results of Taylor-Hood elements, extrapolated in time, and in the cell size from 20,
-40 and 80 cells. The extrapolated settlements differ from the settlements on 40 cells by 0.6 % at T = 0.01, and by 0.2 %
-at T = 0.1. All errors are relative to the displacement of the strip's middle. `settlement` is the largest error of the
-middle's settlement from T = 0.1 on, and `at_once` is this error at T = 0.01. `edge` is the largest error from T = 0.1
-on at the strip's edge, where the load jumps. `beside` is the largest error from T = 0.1 on at the far end of the
-drained surface. --reference also runs Taylor-Hood elements on the same cells. The demo runs on one process.
+The references for q/E = 0.25 are results of Taylor-Hood elements, extrapolated in the step length and the cell size.
+All errors are relative to the displacement of the strip's middle. `settlement` is the largest error of the middle's
+settlement from T = 0.1 on, and `at_once` is this error at T = 0.01. `edge` is the largest error from T = 0.1 on at the
+strip's edge, where the load jumps. `beside` is the largest error from T = 0.1 on at the far end of the drained surface.
+--reference also runs Taylor-Hood elements on the same cells. The demo runs on one process.
 """
 
 from __future__ import annotations

@@ -8,7 +8,7 @@ pressure p at depth z and time t follows `dp/dt = c_v d²p/dz²`. The coefficien
 skeleton by 1e-5, so small-strain theory is accurate. The reduced time is `T_v = c_v t / height²`. Source: Terzaghi
 (1923); series in Verruijt, Theory and Problems of Poroelasticity (2016). The demo runs on one process.
 
-Errors of the pressure are the largest errors at the centroids of all cells, divided by p0, at T_v = 0.1, 0.5 and 1.
+Errors of the pressure are given at T_v = 0.1, 0.5 and 1. Each is the largest error of all cells, divided by p0.
 `settlement` is the relative error of the settlement at T_v = 0.5. Steps are equal, or adaptive with --rtol.
 """
 

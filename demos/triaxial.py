@@ -6,7 +6,7 @@ The parameters of Modified Cam Clay are M, lambda and kappa. The mean and the de
 The mean and the deviatoric Cauchy stress are p and q. The size of the yield surface is P_c. During yield,
 `Q = M sqrt(P (P_c - P))`. In an undrained test the volume is constant, so the test ends at
 `P = P_cs = p_0 (R/2)^(1 - kappa/lambda)` and `Q = M P_cs`. In a drained test the stress path is `q = 3 (p - p_0)`, and
-ends at `q = M p`. Tests of Mohr-Coulomb sand, in compression and in extension, end at
+ends at `q = M p`. Mohr-Coulomb sand is tested in compression and in extension. These tests end at
 `t_1 (1 + sin(phi)) - t_3 (1 - sin(phi)) = 2 c cos(phi)`, with the friction angle phi, the cohesion c, and the largest
 and smallest principal Kirchhoff stresses t_1 and t_3. Errors are relative, and refer to the final states.
 
@@ -71,8 +71,7 @@ def block(soil: mpm.Skeleton, cells: int) -> mpm.Simulation:
 def costs(cells: int, steps: int = 30) -> dict[str, float]:
     """Return the processor time of a step of each law, divided by the time with Drucker and Prager's law.
 
-    The laws are timed in turn, so that a varying load of the machine affects all laws alike. Sands have associated
-    flow, because otherwise shear bands form in the block.
+    Sands have associated flow, because otherwise shear bands form in the block.
     """
     sand = replace(SAND, dilation=SAND.friction)
     same = {name: getattr(sand, name) for name in ("bulk", "shear", "friction", "dilation", "cohesion")}

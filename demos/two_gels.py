@@ -7,7 +7,7 @@ gel passes over the top of the lower gel, the contact surface inclines. The rati
 then less than the friction coefficient.
 
 A second scene is the contact of a curved and a flat elastic body. Largest pressure and half-width are compared with
-Hertz's solution for the computed force. The errors are due to the small number of cells over the half-width.
+Hertz's solution for the computed force.
 """
 
 from __future__ import annotations

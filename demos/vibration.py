@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Vibration of a beam and of a bar: frequencies and energy loss against exact values.
 
-1. A clamped beam, 1 m x 0.3 m, in plane strain, receives a transverse and an axial impulse, so small that small-strain
-   theory is accurate. The reference of the first bending frequency is 3.24419 Hz, computed with spectral elements that
-   are graded towards the corners of the clamp. The first axial frequency is exactly c / (4 L) = 17.67767 Hz, with the
-   axial wave velocity c and the length L. The computed frequencies are fitted to the motion of the tip over three
-   periods.
+1. A clamped beam, 1 m x 0.3 m, in plane strain, receives a small transverse and a small axial impulse. The reference of
+   the first bending frequency is 3.24419 Hz, computed with spectral elements that are graded towards the corners of the
+   clamp. The first axial frequency is exactly c / (4 L) = 17.67767 Hz, with the axial wave velocity c and the length L.
+   The computed frequencies are fitted to the motion of the tip over three periods.
 2. A free bar of length L has the law `P = E (F - 1)`, with the first Piola-Kirchhoff stress P. The bar vibrates with
    strains of A = 5 % and moves over fifty cells in 25 periods. In the exact solution the ends oscillate about the
    uniform motion by `(A L / pi) sin(pi c t / L)`, without loss of energy. In each step dt, SDIRK2 loses the fraction
@@ -41,7 +40,7 @@ class Bar(mpm.LinearElastic):
 
 
 def struck(h: float, way: str, steps: int = 80) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return times, displacements of the tip, and the frequency, in Hz, of a beam after an impulse."""
+    """Return times, displacements of the tip, and the frequency (Hz) of a beam after an impulse."""
     grid = mpm.Grid([0, 0], [LENGTH + 3 * h, DEPTH + 4 * h], [round(LENGTH / h) + 3, round(DEPTH / h) + 4])
     beam, axis = mpm.box(grid, [0, 2 * h], [LENGTH, DEPTH + 2 * h]), ("along", "across").index(way)
 
@@ -62,7 +61,7 @@ def struck(h: float, way: str, steps: int = 80) -> tuple[np.ndarray, np.ndarray,
 
 
 def flown(cells: int, periods: int, steps: int) -> dict[str, np.ndarray]:
-    """Move the free bar, and return times in periods, oscillation of its end, in m, and energy divided by initial
+    """Move the free bar. Return times (in periods), the oscillation of its end (m), and its energy over the initial
     energy.
     """
     h, count = 1 / cells, 3 * cells + 8 + round(2.5 * cells)

@@ -72,7 +72,7 @@ def sudden(cells: int, base: str) -> dict[str, np.ndarray]:
 
 
 def harmonic(w: float, conductivity: float, z: np.ndarray) -> tuple[complex, np.ndarray]:
-    """Return the exact amplitudes of settlement, in m, and pressures, in Pa, at depths z, in m, for a load of 1 Pa."""
+    """Return the exact amplitudes of settlement (m) and pressures (Pa) at depths z (m), for a load of 1 Pa."""
     k = conductivity / (WATER * GRAVITY)
     # u, p ~ exp(i w t + l z), x = l²
     A = np.array([-k * MODULUS, 0, 0], dtype=complex)
@@ -91,7 +91,7 @@ def harmonic(w: float, conductivity: float, z: np.ndarray) -> tuple[complex, np.
 def swinging(
     cells: int, steps: int, periods: int, w: float, conductivity: float, growth: float = GROWTH
 ) -> tuple[complex, np.ndarray, np.ndarray]:
-    """Return computed amplitudes of settlement, in m, and pressures, in Pa, and their depths, for a load of 1 Pa."""
+    """Return the computed amplitudes of settlement (m) and pressures (Pa), and depths, for a load of 1 Pa."""
     soil = SOIL(grain_density=GRAINS, conductivity=conductivity)
     load = mpm.Traction("top", lambda t: (0, -np.cos(w * t)))
     foot = mpm.Displacement("bottom", (0, 0), "y")
@@ -106,7 +106,7 @@ def swinging(
 
 
 def hard_exact(t: np.ndarray) -> np.ndarray:
-    """Return the exact settlement of the half-space at times t, in s, with incompressible water and grains, in m."""
+    """Return the exact settlement (m) of a half-space of incompressible water and grains at times t (s)."""
     young, n, k = HARD["young"], HARD["porosity"], HARD["conductivity"]
     M = young * 0.7 / 1.3 / 0.4
     a, b = (1 - n) * (HARD["grains"] - WATER) / M, 1e4 / (k * M)
@@ -116,7 +116,7 @@ def hard_exact(t: np.ndarray) -> np.ndarray:
 
 
 def hard(cells: int, steps: int, growth: float = GROWTH) -> dict[str, np.ndarray]:
-    """Return times, in s, and computed and exact settlements of a saturated column under a sudden load, in m."""
+    """Return times (s) and computed and exact settlements of a saturated column under a sudden load (m)."""
     soil = mpm.LinearElastic(
         bulk=HARD["young"] / 1.2,
         shear=HARD["young"] / 2.6,

@@ -65,21 +65,21 @@ def decades(low: int, high: int, step: int = 1) -> list[float]:
 
 @family(0.01)
 def conductivity():
-    """Beam that drains at its free end, k = 1e-14 to 1e2 m/s: tip against finite elements."""
+    """Compare a beam that drains at its free end with finite elements, for k = 1e-14 to 1e2 m/s."""
     for k in decades(-14, 2):
         yield f"k = {k:.0e} m/s", Beam(soil(conductivity=k), WATER)
 
 
 @family(0.02)
 def time_step():
-    """Terzaghi's layer, dt = 1e-9 to 1e9 s: mean pressure and settlement against the exact solution."""
+    """Compare Terzaghi's layer with the exact solution, for dt = 1e-9 to 1e9 s."""
     water = {"fluid": INCOMPRESSIBLE, "conditions": [mpm.Drained("top")], "load": 1e-5 * M}
     for dt in decades(-9, 9):
         yield f"dt = {dt:.0e} s", column(partial(terzaghi, 0.05), (SOIL, 1.0), end=10 * dt, steps=10, **water)
 
 
 def terzaghi(h: float, s: mpm.Simulation, r: mpm.Result) -> float:
-    """Return the error of the pressures or the error of the settlement, whichever is larger.
+    """Return the larger of two errors: of the pressures, and of the settlement.
 
     The error of the pressures is the mean absolute error over the points, divided by the load. The error of the
     settlement is divided by the final settlement.
@@ -95,14 +95,14 @@ def terzaghi(h: float, s: mpm.Simulation, r: mpm.Result) -> float:
 
 @family(0.01)
 def time_step_of_a_beam():
-    """Beam that drains at its free end, dt = 1e-9 to 1e9 s: tip against finite elements."""
+    """Compare a beam that drains at its free end with finite elements, for dt = 1e-9 to 1e9 s."""
     for dt in decades(-9, 9, 3):
         yield f"dt = {dt:.0e} s", Beam(SOIL, WATER, end=8 * dt)
 
 
 @family(0.01)
 def fluid_bulk():
-    """No-flow column and beam, K_w = 1e4 Pa to infinity: column against exact values, beam against finite elements."""
+    """Compare an undrained column with exact values and an undrained beam with FEM, for K_w = 1e4 Pa to infinity."""
     load = 1e-5 * M
     for bulk in [*decades(4, 12), inf]:
         p = load / (1 + SOIL.storage(bulk, SOIL.porosity) * M)
@@ -116,7 +116,7 @@ def fluid_bulk():
 
 @family(0.02)
 def combined():
-    """Beam near its undrained or drained limit, three K_w, two nu: tip against finite elements in this limit."""
+    """Compare a nearly undrained or drained beam with finite elements in this limit, for three K_w and two nu."""
     for bulk in (1e4, 2.2e9, inf):
         for nu in (0.0, 0.499):
             sealed = Beam(soil(nu=nu, conductivity=0), mpm.Fluid(bulk), drained=())
@@ -132,7 +132,7 @@ def beside(beam: Beam, limit: Beam) -> Scene:
 
 @family(0.02)
 def poisson():
-    """Beam with and without water, nu = 0 to 0.499: tip against finite elements."""
+    """Compare a beam with and without water with finite elements, for nu = 0 to 0.499."""
     for nu in (0.0, 0.2, 0.3, 0.4, 0.45, 0.48, 0.49, 0.499):
         truth = (80, 32) if nu > 0.45 else (40, 16)
         yield f"drained, nu = {nu}", Beam(soil(nu=nu), truth=truth)
@@ -141,7 +141,7 @@ def poisson():
 
 @family(0.01)
 def steps():
-    """Beam loaded in 1 to 640 steps, drained and undrained: tip against finite elements."""
+    """Compare a drained and an undrained beam with finite elements, for 1 to 640 load steps."""
     for n in (1, 2, 5, 10, 20, 40, 80, 160, 320, 640):
         yield f"drained, {n} steps", Beam(SOIL, steps=n, ramp=1.0)
         if n <= 160:
@@ -154,7 +154,7 @@ DROP = 1e-2  # pressure difference, Pa, too small to move the layers
 
 @family(0.02)
 def contrast_of_conductivity():
-    """Steady flow through two layers, ratio of k 1e-8 to 1e8: pressures against exact pressures."""
+    """Compare steady flow through two layers with exact pressures, for ratios of k from 1e-8 to 1e8."""
     for name, cut in CUTS.items():
         for ratio in decades(-8, 8, 1 if cut == 0.5 else 2):
             layers = (SOIL, cut), (soil(conductivity=SOIL.conductivity * ratio), 1.0)
@@ -173,7 +173,7 @@ def series(cut: float, ratio: float, s: mpm.Simulation, r: mpm.Result) -> float:
 
 @family(0.02)
 def contrast_of_stiffness():
-    """Two layers under large and tiny loads, ratio of E 1e-6 to 1e6: settlement against the exact settlement."""
+    """Compare two layers under large and tiny loads with exact settlements, for ratios of E from 1e-6 to 1e6."""
     for name, cut in CUTS.items():
         for ratio in decades(-6, 6, 1 if cut == 0.5 else 2):
             for strain in (1e-2, 1e-6, 1e-10) if ratio in (1e-6, 1e6) else (1e-2,):
@@ -186,7 +186,7 @@ def contrast_of_stiffness():
 
 @family(0.01)
 def offset():
-    """Beam at 20 random positions on the grid, with its end within a cell: tip against finite elements."""
+    """Compare a beam at 20 random positions on the grid with finite elements."""
     for i, (x, y) in enumerate(np.random.default_rng(0).random((20, 2))):
         place = {"offset": float(y), "h": (1 / (19 + float(x)), 0.05)}
         yield f"{i}: {x:.3f}, {y:.3f} of a cell", Beam(soil(conductivity=1e-5), WATER, **place)
@@ -194,7 +194,7 @@ def offset():
 
 @family(0.02)
 def rotation():
-    """Loaded square, rotated by 0 to 90 degrees: against exact values if undrained, else against a finer grid."""
+    """Compare a square, rotated by 0 to 90 degrees, with exact values if undrained, else with a finer grid."""
     K, S = SOIL.drained_modulus(2), SOIL.storage(WATER.bulk, SOIL.porosity)
     J = stretch(1e5 / (2 * K)) ** 2
     a = brentq(lambda a: 2 * K * log(a) / a - (1 - a * a) / (S * a) + 1e5, 0.5, 1)
@@ -229,14 +229,14 @@ def draining_error(s: mpm.Simulation, r: mpm.Result) -> float:
 
 @family(0.02)
 def rotation_of_a_beam():
-    """Beam rotated by 5 to 90 degrees, with a prescribed displacement at its end: tip against finite elements."""
+    """Compare a beam, rotated by 5 to 90 degrees and fixed by a prescribed displacement, with finite elements."""
     for angle in (5, 15, 30, 45, 60, 75, 90):
         yield f"{angle} degrees", Beam(soil(conductivity=1e-5), WATER, angle=angle, h=(0.025, 0.025))
 
 
 @family(0.01)
 def points_per_cell():
-    """Beam with 1 to 5 points per cell and direction: tip against finite elements."""
+    """Compare a beam with 1 to 5 points per cell and direction with finite elements."""
     for n in range(1, 6):
         for y in (0.0, 0.3):
             many = {"per_cell": n, "offset": y, "h": (0.025, 0.025)}
@@ -245,7 +245,7 @@ def points_per_cell():
 
 @family(0.01)
 def filling():
-    """Beam and column, outermost cells filled to 1e-10 to 0.5: tip against finite elements, exact settlement."""
+    """Compare a beam with FEM and a column with exact values, for outermost cells filled to 1e-10 to 0.5."""
     for f in (*decades(-10, -1), 0.5):
         yield f"beam, {f:.0e} of a cell", Beam(soil(conductivity=1e-5), WATER, offset=1 - f)
         top = 1 + 0.05 * f
@@ -254,14 +254,14 @@ def filling():
 
 @family(0.01)
 def few_points():
-    """Columns of one cell or less, or of one point: exact settlement."""
+    """Compare columns of at most one cell, or of one point, with the exact settlement."""
     for name, h, n in (("1 cell, 1 point", 1, 1), ("1 cell, 2 x 2 points", 1, 2), ("0.1 of a cell, 1 point", 10, 1)):
         yield name, column(settled(stretch(0.1) - 1), (SOIL, 1.0), h=h, per_cell=n, load=0.1 * M)
 
 
 @family(1.0)
 def thin():
-    """Beam half a cell, one or two cells high: error of the tip, divided by that of Q1 elements on as many cells.
+    """Compare beams half a cell, one and two cells high with Q1 elements on as many cells.
 
     The thinnest beam has at least two points over its height. With one point the beam would creep, and the package
     would warn.
@@ -282,7 +282,7 @@ def beside_q1(beam: Beam, cells: tuple[int, int]) -> Scene:
 
 @family(0.01)
 def weight():
-    """Weight of a wet or dry column (rho g H / E = 1e-6 to 10): exact height.  Weight of a beam: tip against FEM."""
+    """Compare bodies under their weight, a column with exact heights (rho g H / E = 1e-6 to 10), a beam with FEM."""
     density = (1 - SOIL.porosity) * SOIL.grain_density
     for ratio in decades(-6, 1):
         E = density * 10 / ratio
@@ -298,7 +298,7 @@ def weight():
 
 @family(0.01)
 def suction():
-    """Column, p = -10 to 0.5 times the modulus: exact settlement, or refusal if pores close or without equilibrium."""
+    """Compare a column under pore pressures of -10 to 0.5 times the modulus with exact values, or expect a refusal."""
     for ratio in (*(-x for x in decades(-6, 1)), 0.01, 0.1, 0.3, 0.4, 0.5):
         a = stretch(-ratio) if ratio < exp(-1) else nan
 
@@ -315,7 +315,7 @@ def suction():
 
 @family(0.02)
 def buckling():
-    """Slender cantilever under 0.5 to 2 times its buckling load: tip against finite elements in 40 steps."""
+    """Compare a slender cantilever under 0.5 to 2 times its buckling load with finite elements."""
     # under a larger load the beam would curl back behind its clamp, where the grid ends
     critical = np.pi**2 * M * 0.1**2 / 12 / 4
     slender = Beam(load=200.0, size=(1.0, 0.1), truth=(40, 4), truth_steps=40, h=(0.0125, 0.0125), ramp=1.0)
@@ -325,7 +325,7 @@ def buckling():
 
 @family(0.01)
 def overload():
-    """Column under loads of -1 to 100 times the modulus: exact settlement, or refusal without equilibrium."""
+    """Compare a column under loads of -1 to 100 times the modulus with exact values, or expect a refusal."""
     for law in (mpm.Hencky, mpm.NeoHookean, mpm.LinearElastic):
         for ratio in (0.1, 1, 10, 100, -0.1, -0.3, -0.4, -1):
             error = pressed(soil(law=law), ratio * M)
@@ -348,7 +348,7 @@ def pressed(material, load: float) -> Error | None:
 
 @family(0.01)
 def units():
-    """Beam of 1e-6 to 1e6 m, or E = 1 to 1e15 Pa: tip against finite elements for 1 m and 10 MPa."""
+    """Compare beams of 1e-6 to 1e6 m, and of E = 1 to 1e15 Pa, with finite elements for 1 m and 10 MPa."""
     exact = Beam().elements()
     for x in decades(-6, 6, 3):
         beam = Beam(size=(x, 0.4 * x), h=(0.05 * x, 0.05 * x))
@@ -360,9 +360,9 @@ def units():
 
 @family(1e-4)
 def rain():
-    """Column under rain, k = 1e-12 to 1 m/s, alpha h = 1e-3 to 1e3: error against exact heads.
+    """Compare a column under rain with exact heads, for k = 1e-12 to 1 m/s and alpha h = 1e-3 to 1e3.
 
-    The rain increases from (k / 20) to (k / 2). Here alpha is Gardner's constant, in 1/m, and h is the cell size, in m.
+    The rain increases from (k / 20) to (k / 2). Here alpha is Gardner's constant (1/m) and h is the cell size (m).
     """
     for k in [*decades(-12, 0, 4), 0.1]:
         for steep in decades(-3, 3):
@@ -370,7 +370,7 @@ def rain():
 
 
 def rained(k: float, steep: float) -> Scene:
-    """Return the column under rain until heads are steady, with `steep` = alpha h."""
+    """Return a column under steady rain, for `steep` = alpha h."""
 
     def steady(share: float, alpha: float, z: np.ndarray) -> np.ndarray:
         return np.log(share + (1 - share) * np.exp(-alpha * z)) / alpha
@@ -386,7 +386,7 @@ def rained(k: float, steep: float) -> Scene:
 
 @family(1e-4)
 def evaporation():
-    """Drying column above a water table, k = 1e-12 to 1 m/s, alpha h = 1e-3 to 1e2: error against exact heads.
+    """Compare a drying column with exact heads, for k = 1e-12 to 1 m/s and alpha h = 1e-3 to 1e2.
 
     The pressure head at the surface does not fall below -1.5 m. `rain` defines alpha h.
     """
@@ -409,7 +409,7 @@ def dried(k: float, steep: float, driest: float = -1.5) -> Scene:
 
 @family(1e-4)
 def layered_rain():
-    """Two layers under rain, ratio of k 1e-3 to 1e3, alpha h = 1e-2 to 1e2: error against exact heads.
+    """Compare two layers under rain with exact heads, for ratios of k from 1e-3 to 1e3 and alpha h = 1e-2 to 1e2.
 
     `rain` defines alpha h. The interface is off the grid lines.
     """
@@ -495,7 +495,7 @@ def exponential(
 
 @family(1e-3)
 def ponding():
-    """Ponded column of van Genuchten's soil, n = 1.2 to 7, initial heads of -1 to -100 m: exact steady heads."""
+    """Compare a ponded column of van Genuchten's soil with exact steady heads, for initial heads of -1 to -100 m."""
     for n in (1.2, 2.0, 7.0):
         for head in (-1.0, -10.0, -100.0):
             for alpha in (0.5, 15.0):

@@ -146,7 +146,7 @@ def halves(one: float, other: float) -> np.ndarray:
 
 @family(1e-3)
 def inertia_time_step():
-    """Column with inertia, sudden load or weight, dt = 1e-12 to 1e12 s: bar of finite elements."""
+    """Compare a column under a sudden load or weight with a bar of finite elements, for dt = 1e-12 to 1e12 s."""
     for dt in decades(-12, 12, 2):
         load, weight = -SMALL * YOUNG, -SMALL * YOUNG / DENSITY
         exact = bar(YOUNG, DENSITY, [H] * N, dt, 4, load=load)
@@ -157,7 +157,7 @@ def inertia_time_step():
 
 @family(1e-3)
 def inertia_stiffness():
-    """Column of two halves with inertia, stiffness ratio 1e-8 to 1e8: bar of finite elements."""
+    """Compare a column of two halves with a bar of finite elements, for stiffness ratios from 1e-8 to 1e8."""
     for ratio in decades(-8, 8, 2):
         young, load = (YOUNG, YOUNG * ratio), -SMALL * YOUNG * min(1.0, ratio)
         dt = CROSSES / np.sqrt(min(1.0, ratio))
@@ -167,7 +167,7 @@ def inertia_stiffness():
 
 @family(1e-3)
 def inertia_density():
-    """Column of two halves with inertia, density ratio 1e-8 to 1e8: bar of finite elements."""
+    """Compare a column of two halves with a bar of finite elements, for density ratios from 1e-8 to 1e8."""
     for ratio in decades(-8, 8, 2):
         density, dt = (DENSITY, DENSITY * ratio), CROSSES * np.sqrt(max(1.0, ratio))
         load = -SMALL * YOUNG
@@ -177,7 +177,7 @@ def inertia_density():
 
 @family(1e-3)
 def inertia_units():
-    """Column with inertia in units of 1e-6 to 1e6 m, kg and s: bar of finite elements."""
+    """Compare a column with a bar of finite elements, in units of 1e-6 to 1e6 m, kg and s."""
     load = -SMALL * YOUNG
     exact = np.array(bar(YOUNG, DENSITY, [H] * N, CROSSES, 8, load=load))
     for k, name in enumerate(("m", "kg", "s")):
@@ -195,7 +195,7 @@ def inertia_units():
 
 @family(0.01)
 def inertia_filling():
-    """Column with inertia and weight, whose top fills a part 1e-10 to 0.9 of a cell: finite elements that end there."""
+    """Compare a column whose top fills a cell to 1e-10 to 0.9 with a bar of finite elements of equal length."""
     weight = -10 * SMALL * YOUNG / DENSITY
     for part in (1e-10, 1e-8, 1e-6, 1e-4, 1e-3, 1e-2, 0.1, 0.5, 0.9):
         exact = bar(YOUNG, DENSITY, [H] * N + [part * H], CROSSES, 8, weight=weight)
@@ -204,7 +204,7 @@ def inertia_filling():
 
 @family(0.01)
 def inertia_flight():
-    """Bar that vibrates and flies by 0 to 100 cells a step: free bar of finite elements at rest."""
+    """Compare a vibrating bar that flies by 0 to 100 cells a step with a bar of finite elements that does not fly."""
     amplitude = SMALL * np.sqrt(YOUNG / DENSITY)
     shape = amplitude * np.cos(np.pi * np.arange(N + 1) / N)
     exact = bar(YOUNG, DENSITY, [H] * N, CROSSES, 4, v=shape, held=False)
@@ -213,7 +213,7 @@ def inertia_flight():
 
 
 def flying(speed: float, shape: np.ndarray, exact: Motion) -> Scene:
-    """Return a bar that flies along x at a speed, m/s, and vibrates with initial nodal velocities."""
+    """Return a bar that flies along x at a speed (m/s) and vibrates."""
     cells = N + 2 + round(4 * speed * CROSSES / H)
     grid = mpm.Grid([0, 0], [cells * H, H], [cells, 1])
     body = mpm.box(grid, [H, 0], [(N + 1) * H, H])
@@ -233,13 +233,13 @@ def flying(speed: float, shape: np.ndarray, exact: Motion) -> Scene:
 
 @family(1e-3)
 def inertia_base():
-    """Block whose side accelerates, in steps of 1e-6 to 1e3 crossing times of a cell: exact motion of the side."""
+    """Compare a block whose side accelerates with the exact motion of the side, for short and long steps."""
     for steps in decades(-6, 3):
         yield f"dt = {steps:.0e} h/c", partial(driven, steps * CROSSES)
 
 
 def driven(dt: float, steps: int = 4) -> Scene:
-    """Return a block off the grid lines whose left side accelerates by a strain of `SMALL` in all steps."""
+    """Return a block off the grid lines, whose left side accelerates."""
     grid = mpm.Grid([0, 0], [N * H, N * H], [N, N])
     body = mpm.box(grid, [0.23, 0.23], [0.63, 0.63])
     way = H * min(0.1, SMALL * dt / CROSSES)  # m
@@ -257,7 +257,7 @@ def driven(dt: float, steps: int = 4) -> Scene:
 
 @family(0.01)
 def inertia_water():
-    """Undrained column with inertia and weight, K_w = 1e4 to 1e12 Pa: finite elements with the undrained modulus."""
+    """Compare an undrained column with finite elements of the undrained modulus, for K_w = 1e4 to 1e12 Pa."""
     for bulk in decades(4, 12):
         law = mpm.Hencky(bulk=YOUNG / 3, shear=YOUNG / 2, porosity=0.5)
         young = YOUNG + 1 / law.storage(bulk, law.porosity)

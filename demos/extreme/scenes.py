@@ -47,7 +47,7 @@ Make = Callable[[], Scene]
 
 
 def off(measured, exact, scale: float | None = None) -> float:
-    """Return the largest difference, divided by `scale` or by the largest exact value."""
+    """Return the largest difference from the exact values, divided by `scale` or by the largest exact value."""
     return float(np.abs(np.subtract(measured, exact)).max() / (np.abs(exact).max() if scale is None else scale))
 
 
@@ -145,7 +145,7 @@ def finite_elements(beam: Beam, element: str) -> np.ndarray:
 def column(error: Error | None, *layers, h=0.05, end=1.0, steps=1, per_cell=2, load=0.0, room=2, **physics) -> Make:
     """Return a function that makes a column, one cell wide, between smooth walls.
 
-    layers: material, and height of the top, in m, of each layer, from below.
+    layers: material and height of the top (m) of each layer, from the lowest layer up.
     h: cell size, in m.
     load: load on the top, in Pa.
     room: number of empty cells above the column.
