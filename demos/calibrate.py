@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Run times of two linear solvers, below and above the size at which the package changes from one to the other.
 
-This size, a number of displacement unknowns, is a threshold. Each row of the table is a scene, computed with both
-solvers. A time is the processor time of two steps, in the fastest of --repeat runs. On several processes, the time is
-the largest of all processes, including waiting. The thresholds are in `mpm_dolfinx/solve/solver_choice.py`.
+Each threshold is a number of displacement unknowns. Each row of the table is a scene, computed with both solvers. A
+time is the processor time of two steps, in the fastest of --repeat runs. On several processes, the time is the largest
+of all processes, including waiting. The thresholds are in `mpm_dolfinx/solve/solver_choice.py`.
 
 On one process a second table follows. It lists three times for each direct solver: the first factorisation of the
 stiffness matrix, a repeated factorisation, and a solve.

@@ -13,8 +13,7 @@ shortening. `w` is the displacement of the tip normal to the plane of bending. `
 tip from its position in the run with the most steps.
 
 The tip deflection is too large because the stress is constant in each domain. With n domains over the height the error
-is about 1/n². In 10 steps, `v` is 0.0129 with 2 cells over the height, 0.0034 with 4 cells, and 0.0010 with 8 cells. In
-plane strain, `v` is 0.0127 with 2 cells, 0.0033 with 4 cells, and 0.0010 with 8 cells.
+is about 1/n². In 10 steps, `v` is 0.0129 with 2 cells over the height, 0.0034 with 4 cells, and 0.0010 with 8 cells.
 """
 
 from __future__ import annotations

@@ -3,8 +3,8 @@
 
 The footing is rough and rigid, and has the width B. By symmetry half of the footing is computed, as a prescribed
 displacement on a part of the soil's top. The soil is a weightless layer, 2.5 B thick, on rough rock. The soil follows
-Drucker and Prager's law with cohesion c, and drains at its free top. The dimensionless velocity of the footing is
-`V = v B / c_v`, with the velocity v and the coefficient of consolidation c_v.
+Drucker and Prager's law with cohesion c, and drains at its free top. The rate is the dimensionless velocity
+`V = v B / c_v`, with the velocity v of the footing and the coefficient of consolidation c_v.
 
 A smooth, impervious wall bounds the soil at 8 B from the middle of the footing. With a wall at 16 B, loads change by
 less than 1 % at any depth and rate. With a wall at 4 B, drained loads are up to 8 % too large.
@@ -13,15 +13,15 @@ Limit loads are computed with very stiff soil, which flows before the geometry c
 capacity is `q = (2 + pi) s_u` (Prandtl 1921), with the undrained strength s_u. With the friction angle phi and
 associated flow the capacity is `q = c N_c`, with `N_c = (exp(pi tan(phi)) tan^2(45 deg + phi/2) - 1) / tan(phi)`.
 
-In the deep push the soil does not dilate. An undrained footing at depth D carries (1 + 0.27 sqrt(D/B)) times the load
-at the surface (Salgado, Lyamin, Sloan and Yu 2004). The drained capacity at the surface is at most c N_c, and at least
-the capacity for the reduced friction of Davis (1968).
+In the push to the depth B the soil does not dilate. An undrained footing at depth D carries (1 + 0.27 sqrt(D/B)) times
+the load at the surface (Salgado, Lyamin, Sloan and Yu 2004). The drained capacity at the surface is at most c N_c, and
+at least the capacity for the reduced friction of Davis (1968).
 
 The undrained limit load converges from below, with order 1.5: its error is -5.9 % with 5 cells, -2.4 % with 9 cells and
 -0.85 % with 17 cells. Use an odd number of cells over the width. With an even number, the effective width of the
 footing exceeds the true width by a cell.
 
-In associated flow, the error of the limit load is -0.5 % with 5 cells, +0.5 % with 9 cells and +0.9 % with 17 cells.
+The error of the drained limit load is -0.5 % with 5 cells, +0.5 % with 9 cells and +0.9 % with 17 cells.
 
 The limit load of a rough circular footing on Tresca's soil, in axisymmetry, is 6.05 s_u (Cox, Eason and Hopkins 1961).
 

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Rain on slopes that suction stabilises: factors of safety against time, and a bank that slides.
 
-A slope of b = 35 degrees is much longer than deep, so the problem is one-dimensional, normal to the slope. The computed
-column reaches from the surface to a water table at a depth of 5 m. Only the component of gravity normal to the slope
-acts on the column. Vertical rain of nine tenths of the conductivity falls until the flow is steady. At a vertical depth
-d the factor of safety is
+A slope of b = 35 degrees is much longer than deep, so a column normal to the slope is computed. The column reaches from
+the surface to a water table at a depth of 5 m. Only the component of gravity normal to the slope acts on the column.
+Vertical rain of nine tenths of the conductivity falls until the flow is steady. At a vertical depth d the factor of
+safety is
 
     FS = tan phi / tan b + 2 c / (gamma d sin 2b) + chi s (tan b + cot b) tan phi / (gamma d)
 

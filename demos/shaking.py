@@ -14,16 +14,16 @@ and the density of the ground are c_g and rho_g. The energy balance includes the
 absorbing base.
 
 **Bank.** A bank of undrained clay, 5 m high with a slope of 1:1, stands on a rough base. Its strength increases with
-depth. The base moves horizontally
-with three periods of a harmonic acceleration. The bank fails under the acceleration k g, at which its factor of safety
-is one. The amplitude is 2 k g, so the bank slides in each period, and comes to rest again. The reference is the sliding
-block of Newmark (1965, Geotechnique 15, 139). The outward velocity V of the block follows
+depth. The base moves horizontally with three periods of a harmonic acceleration. The bank fails under the acceleration
+k g, at which its factor of safety is one. The amplitude is 2 k g, so the bank slides in each period, and comes to rest
+again. The reference is the sliding block of Newmark (1965, Geotechnique 15, 139). The outward velocity V of the block
+follows
 
     dV/dt = C (a - k g)    while a > k g or V > 0,
 
-with the acceleration a of the base towards the bank. The coefficient C is one for a block on a horizontal plane. For a
-mechanism with the displacements s phi, the balance of power gives C = sum(m phi_x) / sum(m phi.phi). Here m is the
-mass of a particle, s the displacement of the crest, and phi the computed final displacement divided by s.
+with the acceleration a of the base towards the bank. The coefficient C is one for a block on a horizontal plane. For
+the bank, the balance of power gives C = sum(m phi_x) / sum(m phi.phi). Here m is the mass of a point, and phi is its
+final displacement divided by that of the crest.
 """
 
 from __future__ import annotations

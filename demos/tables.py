@@ -7,8 +7,8 @@ format:
     | Terzaghi's column, pressure at T_v = 0.5 | 0.004 % <!-- terzaghi --cells 50; errors/p_0.5; % --> |
 
 demos/results contains the output of the demos, with the run time in `seconds` and the release of dolfinx.
-demos/pictures contains the pictures of each demo, from the run that the pages name first.  A table that a demo writes
-to a file is copied between comments such as `<!-- error_vs_runtime; comparison.md -->` and `<!-- end -->`.
+demos/pictures contains the pictures of each demo. They come from the run that the pages name first. A table that a demo
+writes to a file is copied between comments such as `<!-- error_vs_runtime; comparison.md -->` and `<!-- end -->`.
 
 `bash demos/run.sh tables` writes the numbers from demos/results.  With `--run terzaghi mandel`, it first runs these
 demos; `--run all` takes hours.
