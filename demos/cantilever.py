@@ -53,7 +53,7 @@ class Outcome:
 def run(cells: int = 8, steps: int = 40, last: int = 10) -> tuple[dict[str, float], Outcome]:
     """Bend the beam to alpha = `last` in increments of 10 / `steps`.
 
-    Returns the errors that the module's docstring defines, and the results of the run.
+    Returns the errors by name, and the results of the run.
     """
     h = HEIGHT / cells
     grid = mpm.Grid([0, 0], BOX, np.rint(BOX / h).astype(int))
@@ -75,7 +75,7 @@ def rod(alpha: float) -> np.ndarray:
 
 
 def errors(out: Outcome) -> dict[str, float]:
-    """Return the errors that the module's docstring defines."""
+    """Return the errors by name; the docstring of this file explains the names."""
     off = {alpha: np.abs(axis[-1] - rod(alpha)[-1]) / LENGTH for alpha, axis in out.axis.items()}
     return {f"{name}_{alpha}": float(e[i]) for i, name in ((1, "v"), (0, "u")) for alpha, e in off.items()}
 

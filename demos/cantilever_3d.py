@@ -130,7 +130,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def errors(tips: np.ndarray, alpha: float) -> dict[str, float]:
-    """Return the errors that the module's docstring defines, for the run with the most steps."""
+    """Return the errors of the run with the most steps, by name; the docstring of this file explains the names."""
     u, v = rod(alpha)
     tip = tips[-1]
     drift = np.linalg.norm(tips - tip, axis=1).max()

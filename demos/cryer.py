@@ -76,7 +76,7 @@ class Outcome:
 def run(
     cells: int = 20, steps: int = 100, axisymmetric: bool = False, grid: mpm.Grid | None = None
 ) -> tuple[dict[str, float], Outcome]:
-    """Run to the reduced time `END` in equal steps, and return the errors that the module's docstring defines."""
+    """Run to the reduced time `END` in equal steps, and return the errors by name."""
     simulation, history = scene(cells, axisymmetric, grid), []
 
     def observe(s: mpm.Simulation) -> None:
@@ -99,7 +99,7 @@ def exact(T: np.ndarray) -> np.ndarray:
 
 
 def errors(out: Outcome) -> dict[str, float]:
-    """Return the errors that the module's docstring defines."""
+    """Return the errors by name; the docstring of this file explains the names."""
     late = out.T >= 0.02
     highest = exact(np.linspace(0.04, 0.06, 2001)).max()
     return {

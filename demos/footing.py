@@ -407,7 +407,7 @@ def draw_cells(ax, frame: Frame) -> None:
 
 
 def viscous(viscosity: float, seconds: float) -> mpm.DruckerPrager:
-    """Return the soil with a viscosity: `viscosity` times the cohesion times the duration `seconds` of a push."""
+    """Return the soil with a viscosity: the product of `viscosity`, the cohesion and the duration of a push."""
     if viscosity == 0:
         return SOIL
     own = OF_SOIL | {"residual": COHESION, "slip": WIDTH}  # no softening

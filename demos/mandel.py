@@ -62,7 +62,7 @@ class Outcome:
 def run(cells: int = 40, steps: int = 30, method: str = "sdirk2") -> tuple[dict[str, float], Outcome]:
     """Consolidate the quarter until T = 1, with `steps` equal steps up to each time in `SAMPLES`.
 
-    Returns the errors that the module's docstring defines, and the histories.
+    Returns the errors by name, and the histories.
     """
     rows = max(1, cells // 4)  # the solution is linear in y
     grid = mpm.Grid([0, 0], [WIDTH + WIDTH / cells, HEIGHT], [cells + 1, rows])  # the slab bulges into the last column
@@ -98,7 +98,7 @@ def exact_peak(x: float) -> float:
 
 
 def errors(out: Outcome) -> dict[str, float]:
-    """Return the errors that the module's docstring defines."""
+    """Return the errors by name; the docstring of this file explains the names."""
     found, settlement = {}, []
     for k in map(out.at, SAMPLES):
         t = out.time[k] * WIDTH**2 / EXACT.cv

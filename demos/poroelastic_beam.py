@@ -31,9 +31,7 @@ REFERENCE_CELLS = (67, 20)
 TIMES = (0.02, 0.04, 0.06, 0.1, 0.2, 0.4, 0.6, 0.8, 1.0, 1.2)  # s
 TRUTH = (-0.0665718, -0.1444268, -0.2306306, -0.2652579, -0.3085867)
 TRUTH += (-0.3378547, -0.3453412, -0.3474797, -0.3481624, -0.3484207)
-"""u_y of the tip at `TIMES` (m) from `REFERENCE_CELLS` Taylor-Hood elements in steps of 0.005 s (see --reference).
-
-"""
+"""Vertical displacement of the tip (m) at `TIMES`, with `REFERENCE_CELLS` Taylor-Hood elements and steps of 0.005 s."""
 
 
 def arguments(argv: list[str] | None = None) -> Namespace:

@@ -63,7 +63,7 @@ def run(cells: int = 64, steps: int = 40, quadrature: str = "domain") -> Outcome
 
 
 def errors(out: Outcome) -> dict[str, float]:
-    """Return the errors that the module's docstring defines."""
+    """Return the errors by name; the docstring of this file explains the names."""
     scale = EXACT.density * EXACT.gravity * EXACT.l0
     stress = np.average(np.abs(out.stress - EXACT.stress(out.Y)), weights=out.volume) / scale
     return {"stress": float(stress), "height": abs(out.height / EXACT.height - 1)}

@@ -7,7 +7,7 @@ from layer and surface leave through it. The sides have no vertical displacement
 is the motion of the ground's free surface without a layer, which is twice the incoming wave. The spectrum of the
 surface motion, divided by the spectrum of the reference motion, is
 
-    1 / |cos(w H / c) + i a sin(w H / c)|,        a = rho c / (rho_g c_g),
+    1 / abs(cos(w H / c) + i a sin(w H / c)),    a = rho c / (rho_g c_g),
 
 with the angular frequency w, the thickness H, the wave velocity c and the density rho of the layer. The wave velocity
 and the density of the ground are c_g and rho_g. The energy balance includes the work of the incoming wave and of the

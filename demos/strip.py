@@ -128,7 +128,7 @@ def elements(cells: int, load: float, a_decade: int) -> NDArray[np.float64]:
 
 
 def errors(out: Outcome) -> dict[str, float]:
-    """Return the errors that the module's docstring defines."""
+    """Return the errors by name; the docstring of this file explains the names."""
     at = [int(np.argmin(np.abs(np.array(out.T) - T))) for T in TIMES]
     wrong = np.abs((np.array(out.moved)[at] - ELEMENTS) / ELEMENTS[:, :1])
     late = dict(zip(("settlement", "edge", "beside"), wrong[1:].max(axis=0).tolist(), strict=True))

@@ -81,7 +81,7 @@ def run(
 
 
 def errors(out: Outcome) -> dict[str, float]:
-    """Return the errors that the module's docstring defines."""
+    """Return the errors by name; the docstring of this file explains the names."""
     found = {}
     for time in (0.1, 0.5, 1.0):
         k = out.at(time)
