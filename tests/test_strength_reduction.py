@@ -60,6 +60,22 @@ def test_a_block_carries_what_its_strength_over_the_factor_does(materials):
     assert s.state is state, "the simulation is what it was"
 
 
+def test_stresses_in_bodies_that_cannot_yield_do_not_change_the_factor():
+    """Earlier, the viscosity of the trials followed the mean stress of all bodies: the bounds were 1.19 and 1.22."""
+    grid = mpm.Grid([0, 0], [5.0, 1.75], [20, 7])
+    far = mpm.box(grid, [4, 0], [4.5, 1.5], material=1)
+    bodies = [mpm.box(grid, [0, 0], [3, 0.5]), mpm.box(grid, [0, 0.5], [1.5, 1.5]), far]
+    soil = replace(CLAY, bulk=1e7, shear=5e6, friction=10.0, cohesion=5e3, grain_density=3300.0)
+    side = mpm.Displacement("right", (0, 0), "x", region=((2.9, 0), (3.1, 1)))
+    found = []
+    for heavier in (1e-3, 300.0):
+        rock = mpm.Hencky(bulk=1e10, shear=5e9, grain_density=3300.0 * heavier)
+        walls = {"left": "x", "bottom": "xy"}
+        s = mpm.Simulation(grid, bodies, [soil, rock], walls=walls, gravity=(0, -9.81), conditions=[side])
+        found.append(mpm.factor_of_safety(s, rtol=0.03).bounds)
+    assert found[1] == pytest.approx(found[0], rel=1e-9)
+
+
 def test_a_block_that_is_too_weak_has_a_factor_below_one():
     strong = replace(CLAY, cohesion=lambda X: 2 * C + 0 * X[:, 0], friction=lambda X: PHI + 0 * X[:, 0])
     s = block([strong], load=strength(0.9))

@@ -71,7 +71,7 @@ class Safety:
         Largest factor of a trial that came to rest, and smallest factor of a trial that did not.
     overloads
         Overloads (n,) in the n steps of each trial, by the factor of the trial.  The overload of a step is the work of
-        the viscous stress, divided by the work of the shear stress.
+        the viscous stress, divided by the work of the shear stress, in soil that may yield.
     newton
         Number of Newton steps of all trials.
     """
@@ -290,7 +290,7 @@ class _Weakened:
         increment = now.F[new] @ np.linalg.inv(before.F[old]) - np.eye(d)
         strain = np.pad((increment + increment.transpose(0, 2, 1)) / 2, ((0, 0), (0, 3 - d), (0, 3 - d)))
         stress = self._scene.materials.effective_stress_3d(now)[new]
-        volume, size = (now.volume0 * now.J)[new], partial(np.linalg.norm, axis=(1, 2))
+        volume, size = _yielding_volume(self._scene, now)[new], partial(np.linalg.norm, axis=(1, 2))
         viscous = 2 * float(self._viscosity.value) / self._dt * size(strain) ** 2
         work = np.array([volume @ viscous, volume @ (size(_deviator(stress)) * size(_deviator(strain)))])
         viscous_work, whole_work = over_all(self._scene.grid.comm, work)
@@ -302,11 +302,16 @@ def _deviator(tensors: NDArray[np.float64]) -> NDArray[np.float64]:
     return tensors - np.trace(tensors, axis1=1, axis2=2)[:, None, None] / 3 * np.eye(3)
 
 
+def _yielding_volume(scene: Scene, points: MaterialPoints) -> NDArray[np.float64]:
+    """Return the volume (n,) of each point, or 0 for points that cannot yield."""
+    return points.volume0 * points.J * scene.materials.table(points, lambda m: isinstance(m, Frictional) + 0 * m.shear)
+
+
 def _mean_stress(scene: Scene, points: MaterialPoints) -> float:
-    """Return the mean norm of the effective stress, in Pa.  Raise ValueError if bodies have no stress."""
+    """Return the mean norm of the effective stress in soil that may yield, in Pa.  Raise ValueError without stress."""
     grid = scene.grid
     size = np.linalg.norm(scene.materials.effective_stress_3d(points), axis=(1, 2))
-    moduli, volume = scene.materials.table(points, lambda m: m.oedometric), points.volume0 * points.J
+    moduli, volume = scene.materials.table(points, lambda m: m.oedometric), _yielding_volume(scene, points)
     far = 2**grid.dim * grid.reach / grid.least  # a gradient is a sum over the corners
     sums = np.array([size @ volume, np.finfo(float).eps * far * moduli @ volume, volume.sum()])
     total, rounding, whole_volume = over_all(grid.comm, sums)
@@ -317,9 +322,8 @@ def _mean_stress(scene: Scene, points: MaterialPoints) -> float:
 
 def _shear_modulus(scene: Scene, points: MaterialPoints) -> float:
     """Return the harmonic mean of the shear modulus, in Pa, over soil that may yield."""
-    softness = scene.materials.table(points, lambda m: 1 / m.shear if isinstance(m, Frictional) else 0 * m.shear)
-    volume = points.volume0 * points.J
-    total, whole_volume = over_all(scene.grid.comm, np.array([softness @ volume, (softness > 0) @ volume]))
+    softness, volume = scene.materials.table(points, lambda m: 1 / m.shear), _yielding_volume(scene, points)
+    total, whole_volume = over_all(scene.grid.comm, np.array([softness @ volume, volume.sum()]))
     return float(whole_volume / total)
 
 
