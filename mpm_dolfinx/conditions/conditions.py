@@ -338,7 +338,7 @@ class Rain(Flux):
         side.  Water runs off once the pond is full.  Ponded water infiltrates or evaporates later.
     driest
         Lowest pressure at the side, in Pa, < 0 and finite: the pore pressure in equilibrium with the air.  By
-        Kelvin's equation, -1e7 Pa corresponds to air of 93 % humidity at 20 °C.
+        Kelvin's equation, -1e7 Pa corresponds to air of 93 % humidity at 20 °C.  In other units, give a value.
     region : ((d,), (d,)), m
         Box of reference positions.  Rain falls on the parts of faces inside the box.
 
