@@ -603,3 +603,18 @@ def test_a_body_far_away_changes_nothing():
             s.step(0.05)
         found.append(s.points.x[: len(bodies[0])])
     assert found[1] == pytest.approx(found[0], abs=1e-9)
+
+
+@pytest.mark.parametrize("off", [0.0, 0.4])
+def test_stresses_do_not_oscillate_at_surfaces_on_grid_lines(off):
+    """Shear of a layer between rollers: the normal stress vanishes. On lines, it was 7 % of the shear stress."""
+    grid = mpm.Grid([0, 0], [2.5, 2.0], [10, 8])
+    body = mpm.box(grid, [0.5, 0.25 * (1 + off)], [2.0, 0.25 * (7 + off)])
+    soil = mpm.Hencky(bulk=2e6, shear=1e6, grain_density=2600.0, porosity=0.4)
+    base = mpm.Displacement("bottom", lambda t: (5e-4 * (1 - np.cos(20 * np.pi * t)), 0))
+    rollers = [mpm.Displacement(side, (0, 0), "y") for side in ("left", "right")]
+    s = mpm.Simulation(grid, [body], [soil], walls={}, conditions=[base, *rollers], inertia=True)
+    seen = []
+    s.run(0.2, 5e-3, observe=lambda s: seen.append(s.effective_stress()), progress=False)
+    normal, shear = (np.sqrt(np.mean(np.array(seen)[..., 0, axis] ** 2)) for axis in (0, 1))
+    assert normal < 0.035 * shear

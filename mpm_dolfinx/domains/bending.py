@@ -11,7 +11,8 @@ from 0 to 1.  D_a is a second difference of nodal displacements along axis a.  T
 displacements, equal to Q1 at the nodes, and continuous.
 
 D_a belongs to the cell edge along axis a that ends at node i.  D_a is the minmod limiter of the second differences at
-both ends of the edge.  If only one end has a second difference, D_a is this difference.  If cell sizes vary, a second
+both ends of the edge.  If only one end has a second difference, D_a is this difference.  For bodies
+with inertia D_a is then zero, because stresses would oscillate at surfaces on grid lines.  If cell sizes vary, a second
 difference is the squared edge length times the second derivative of a parabola through three nodes.
 """
 
@@ -24,7 +25,12 @@ from mpm_dolfinx.grid.grid import Grid, corner_bits, in_chunks, polynomial
 
 
 def followed(
-    grid: Grid, cells: NDArray[np.int32], x: NDArray[np.float64], u: NDArray[np.float64], filled: NDArray[np.bool_]
+    grid: Grid,
+    cells: NDArray[np.int32],
+    x: NDArray[np.float64],
+    u: NDArray[np.float64],
+    filled: NDArray[np.bool_],
+    one_sided: bool = True,
 ) -> NDArray[np.float64]:
     """Return two fields (2, n, d), in m: the Q1 displacement of the corners, and its quadratic correction.
 
@@ -32,12 +38,13 @@ def followed(
     `x` (n, d), in m: positions of the corners.
     `u` (nodes, d), in m: nodal displacements.
     `filled` (cells,): whether local cells contain material.
+    `one_sided`: whether a second difference at one end of an edge is enough for a correction.
     """
     used = np.bincount(cells, minlength=1).nonzero()[0]
     slot = np.zeros(used.max(initial=0) + 1, dtype=np.intp)
     slot[used] = np.arange(len(used))
     field = grid.over_edges(grid.monomials @ _at(u, grid.cell_nodes[used]), used)
-    bends = _second_differences(grid, used, u, filled)
+    bends = _second_differences(grid, used, u, filled, one_sided)
     out = np.empty((2, *x.shape))
     # the last axis is the corner: numpy takes six times as long for rows of a few numbers each
     for part in in_chunks(len(x)):
@@ -55,7 +62,7 @@ def _at(u: NDArray[np.float64], nodes: NDArray[np.int32]) -> NDArray[np.float64]
 
 
 def _second_differences(
-    grid: Grid, cells: NDArray[np.int32], u: NDArray[np.float64], filled: NDArray[np.bool_]
+    grid: Grid, cells: NDArray[np.int32], u: NDArray[np.float64], filled: NDArray[np.bool_], one_sided: bool
 ) -> list[NDArray[np.float64]]:
     """Return the second differences along the edges of owned cells, for each axis.
 
@@ -83,7 +90,8 @@ def _second_differences(
                 ends.append(2 * h / (h + g) * (h / g * (_at(u, beyond) - value) - (2 * k - 1) * along))
         first, last = np.where(known[0], *ends), np.where(known[1], *ends[::-1])
         smaller = np.where(np.abs(first) < np.abs(last), first, last)
-        bend = np.where((first * last > 0) & (known[0] | known[1]), smaller, 0.0)
+        enough = known[0] | known[1] if one_sided else known[0] & known[1]
+        bend = np.where((first * last > 0) & enough, smaller, 0.0)
         across = grid.monomials[np.arange(2**d) >> a & 1 == 0]  # the same at both ends
         bend = (across[:, low] + across[:, high]) @ bend
         if not grid.even:  # coefficients for offsets in m

@@ -237,13 +237,15 @@ class CutDomains(Keyed):
         exchange, cells = self._followed
         return exchange.back(self.grid.at(cells, exchange.send(self._tracked), u))
 
-    def followed(self, u: NDArray[np.float64], filled: NDArray[np.bool_]) -> Iterator[NDArray[np.float64]]:
+    def followed(
+        self, u: NDArray[np.float64], filled: NDArray[np.bool_], one_sided: bool = True
+    ) -> Iterator[NDArray[np.float64]]:
         """Yield the Q1 field u (nodes, d) at the corners (n, 2^d, d), then its quadratic correction, both in m.
 
-        `filled` (cells,): whether local cells contain material.
+        `filled`, `one_sided`: see `bending.followed`.
         """
         exchange, cells = self._followed
-        moved = followed(self.grid, cells, exchange.send(self._tracked), u, filled)
+        moved = followed(self.grid, cells, exchange.send(self._tracked), u, filled, one_sided)
         return (exchange.back(v).reshape(self.points.corners.shape) for v in moved)
 
     @property

@@ -125,7 +125,7 @@ class Motion:
             nodal = self._momentum.u.x.array.reshape(-1, d)
             deformed = cache(partial(self._deformed, cut, data, nodal))
             if cut.domains:
-                followed = cut.followed(nodal, on_grid.active.contains)
+                followed = cut.followed(nodal, on_grid.active.contains, not state.stage.inertia)
                 points, keeps, folded = self._shaped(state, loads, on_grid, followed, deformed)
             else:
                 x, F = state.points.x + cut.displacement(nodal), deformed()
