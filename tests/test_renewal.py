@@ -476,6 +476,11 @@ def test_polygons_are_cut_and_divided():
     on_a_side = np.array([[[0.5, 0.0], [1.0, 0.0], [1.0, 4e-4], [1.0, 0.5], [0.504, 0.5]]])
     for edge, count in (([0, 1, 1, 2, 3], 4), ([0, 1, 2, 3, 4], 5)):
         assert Polygons.rings(on_a_side, np.array([edge])).simplified(1e-9).count.tolist() == [count]
+    sliver = np.array([[0.0, 0.0], [1.0, 0.3], [1.0, 0.9], [0.0, 1e-4]])
+    for k, sign in np.ndindex(4, 2):  # earlier, a mirror image kept the other one of two vertices that nearly coincide
+        x = np.roll(sliver * [2 * sign - 1, 1], k, axis=0)[None, :: 2 * sign - 1]
+        (found,) = Polygons.rings(x).simplified(1e-3).x * [2 * sign - 1, 1]
+        assert found[np.argsort(found[:, 1])] == pytest.approx(np.array([[0, 5e-5], [1, 0.3], [1, 0.9]]), abs=1e-15)
     other = np.array([[[1.0, -1.0], [3, 1], [1, 3], [-1, 1]]])
     within = ring.within(other)
     row, quads, _ = within.quadrilaterals()

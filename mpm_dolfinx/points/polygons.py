@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mpm_dolfinx.grid.grid import means_of_rows
+
 NONE = -1
 """Value in `Polygons.edge` for edges without an identifier."""
 
@@ -89,9 +91,14 @@ class Polygons:
         return out
 
     def simplified(self, near: float) -> Polygons:
-        """Return the polygons without vertices on straight edges, or within `near`, in m, of the next vertex."""
-        used = np.arange(self.edge.shape[1]) < self.count[:, None]
-        out = _packed(self.x, self.edge, used & (np.abs(self.after - self.x).max(axis=2) > near))
+        """Return the polygons without vertices on straight edges.  Vertices within `near`, in m, become their mean."""
+        n, most = self.edge.shape
+        used = np.arange(most) < self.count[:, None]
+        kept = used & (np.abs(self.after - self.x).max(axis=2) > near)
+        number = np.cumsum(kept, axis=1) - kept  # vertices after the last kept vertex merge with the first one
+        number = number % np.maximum(kept.sum(axis=1), 1)[:, None] + most * np.arange(n)[:, None]
+        means = means_of_rows(number[used], np.ones(used.sum()), self.x[used], n * most)  # alike in mirror images
+        out = _packed(means[number], self.edge, kept)
         k, last = np.arange(out.edge.shape[1]), np.maximum(out.count - 1, 0)[:, None]
         before = np.roll(out.x, 1, axis=1)  # vertices are padded by the last one
         same = out.edge == np.where(k == 0, np.take_along_axis(out.edge, last, axis=1), np.roll(out.edge, 1, axis=1))
