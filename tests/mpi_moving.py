@@ -8,6 +8,9 @@ Arguments: file of the results, and a checkpoint, which the first run writes and
 import sys
 from pathlib import Path
 
+from mpi4py import MPI
+from petsc4py import PETSc
+
 import numpy as np
 from helpers import gathered
 
@@ -24,9 +27,9 @@ def carried():
     """Return a wet block with friction under a disc; its bottom and the disc move."""
     grid = mpm.Grid([0, 0], [2, 1], [10, 5])
     law = mpm.DruckerPrager(2e5, 1e5, friction=25, dilation=5, cohesion=3e3, porosity=0.4, conductivity=1e-4)
-    hold = mpm.Displacement("bottom", lambda t: (1.3 * t, 0.0))
-    disc = mpm.Tool(mpm.Ball((0.6, 0.902), 0.3), displacement=lambda t: (1.3 * t, -0.1 * t), name="disc")
-    body = mpm.box(grid, [0.1, 0.1], [1.1, 0.6])
+    hold = mpm.Displacement("bottom", lambda t: (1.5 * t, 0.0))
+    disc = mpm.Tool(mpm.Ball((0.6, 1.002), 0.3), displacement=lambda t: (1.5 * t, -0.1 * t), name="disc")
+    body = mpm.box(grid, [0.1, 0.1], [1.1, 0.7])
     acting = {"conditions": [hold, disc, mpm.Drained("top")], "fluid": mpm.Fluid()}
     return mpm.Simulation(grid, [body], [law], walls={}, **acting, numerics=TIGHT)
 
@@ -34,8 +37,8 @@ def carried():
 def dug():
     """Return a block on a longer block, with inertia and friction, after an excavation at one end."""
     grid = mpm.Grid([0, 0], [2, 1], [10, 5])
-    bodies = [mpm.box(grid, [x, 0], [x + 0.8, 0.2]) for x in (0.2, 1.0)] + [mpm.box(grid, [0.3, 0.2], [0.7, 0.6])]
-    push = mpm.Traction("left", lambda t: (2e3 * t, 0), region=((0.25, 0.25), (0.35, 0.6)))
+    bodies = [mpm.box(grid, [x, 0], [x + 0.8, 0.2]) for x in (0.2, 1.0)] + [mpm.box(grid, [0.2, 0.2], [0.8, 0.4])]
+    push = mpm.Traction("left", lambda t: (2e3 * t, 0), region=((0.15, 0.21), (0.25, 0.4)))
     acting = {"conditions": [mpm.Contact([0, 1], [2], friction=0.3), push], "inertia": True}
     acting["gravity"] = lambda t: (0, -9.81 * min(t / 0.1, 1))
     laws, walls = [mpm.Hencky(2e6, 1e6)], {"bottom": "xy"}
@@ -43,6 +46,25 @@ def dug():
     run(simulation, DT)
     simulation.stage(remove=[1])
     return simulation
+
+
+def reproduce():
+    """Select factors without contributions in the order of messages, which MUMPS adds."""
+    options = PETSc.Options()
+    options["mpm_momentum_pc_type"] = "lu"
+    options["mpm_momentum_pc_factor_mat_solver_type"] = "superlu_dist"
+
+
+def difference(one, other):
+    """Return the largest relative difference of two states."""
+    least = {n: CONTENT if n.startswith("outflows") else 1e-300 for n in one}
+    return max(np.abs(one[n] - other[n]).max() / max(np.abs(other[n]).max(), least[n]) for n in one)
+
+
+def equal(one, other, but=frozenset()):
+    """Return whether two states have equal bits, except for some names."""
+    names = one.keys() - but
+    return one.keys() == other.keys() and all(np.array_equal(one[n], other[n], equal_nan=True) for n in names)
 
 
 def run(simulation, t_end, **options):
@@ -62,6 +84,8 @@ def state(simulation):
 if __name__ == "__main__":
     out, file = map(Path, sys.argv[1:])
     make = {"carried": carried, "dug": dug}[out.stem.split("-")[0]]
+    if MPI.COMM_WORLD.size == 2:
+        reproduce()
     simulation = make()
     comm = simulation.grid.comm
     if file.exists():  # of another number of processes
@@ -73,19 +97,22 @@ if __name__ == "__main__":
     before = simulation.grid
     run(simulation, T_END - DT, checkpoint=mpm.Checkpoint(file, every=100))
     assert (simulation.grid is before) == (comm.size == 1), "no process distributes anew, or one alone does"
+    saved = state(simulation)
     result = run(simulation, T_END, after=simulation.result)
     whole = state(simulation)
     again = make()
-    run(again, T_END, after=mpm.resume(again, file))
+    after = mpm.resume(again, file)
+    read = state(again)
+    run(again, T_END, after=after)
     resumed = state(again)
     grids.IMBALANCE = np.inf
     still = make()
     fixed = run(still, T_END)
     left = state(still)
     if not comm.rank:
-        same = all(np.array_equal(whole[name], resumed[name], equal_nan=True) for name in whole)
-        least = {n: CONTENT if n.startswith("outflows") else 1e-300 for n in whole}
-        off = {n: np.abs(whole[n] - left[n]).max() / max(np.abs(left[n]).max(), least[n]) for n in whole}
+        # stresses are computed from the state, and their last bits depend on the order of points on a process
+        same = {"read": equal(saved, read, {"stress"}), "end": equal(whole, resumed)}
+        off = {"resumed": difference(resumed, whole), "off": difference(whole, left)}
         print(result.imbalance, fixed.imbalance, same, off)
         ratios = [one.imbalance.get("points", 1.0) for one in (result, fixed)]
-        np.savez(out, **whole, same=same, off=max(off.values()), imbalance=ratios[0], fixed=ratios[1])
+        np.savez(out, **whole, **same, **off, imbalance=ratios[0], fixed=ratios[1])

@@ -113,14 +113,16 @@ def test_imbalance_memory_and_traffic_are_those_of_the_processes(tmp_path):
 @pytest.mark.parametrize("scene", ["carried", "dug"])
 @pytest.mark.parametrize("processes", [2, *(pytest.param(n, marks=pytest.mark.slow) for n in (3, 4))])
 def test_bodies_that_leave_their_processes_are_distributed_anew_with_the_same_answer(scene, processes, tmp_path):
-    """Earlier, the scene kept the initial cells. Resumed runs end with equal bits, and on one process with equal
-    results.
+    """Earlier, the scene kept the initial cells. A resumed run begins with equal bits. On two processes it also ends
+    with equal bits: a sum then has a contribution of one other process, and the order of messages does not matter.
     """
     files = [tmp_path / f"{scene}-{n}.npz" for n in (processes, 1)]
     for n, file in zip((processes, 1), files, strict=True):
         mpirun(n, "mpi_moving.py", str(file), str(tmp_path / "checkpoint"))
     several, one = map(np.load, files)
-    assert several["same"] and several["off"] < 1e-11, "more than the tolerance of Newton's method"
+    print(f"difference of a resumed run: {several['resumed']:.1e}")
+    assert several["read"] and (several["end"] or processes > 2)
+    assert max(several["resumed"], several["off"]) < 1e-11, "more than the tolerance of Newton's method"
     assert several["imbalance"] < 1.3 < 1.5 < several["fixed"]
     for name in set(one.files) - {"imbalance"}:
         assert several[name] == pytest.approx(one[name], abs=1e-8 * np.abs(one[name]).max(), nan_ok=True), name
