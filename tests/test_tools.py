@@ -217,6 +217,17 @@ def test_a_smooth_plate_gives_back_what_it_took(steps, error):
     assert abs(total) < error * gross
 
 
+@pytest.mark.parametrize(("steps", "error"), [(5, 6.7e-4), (20, 1.7e-4)])
+def test_a_load_without_a_tool_leaves_a_displacement_of_first_order_in_the_step(steps, error):
+    """The block of the smooth plate is loaded and unloaded by a traction.  Contact is not the only cause of errors."""
+    grid = mpm.Grid([0, 0], [1.5, 0.75], [12, 6])
+    body = mpm.box(grid, [0.25, 0], [1.25, 0.53])
+    load = mpm.Traction("top", lambda t: (0, -100 * min(t, 2 - t)))
+    s = mpm.Simulation(grid, [body], [GEL], walls={"bottom": "xy"}, conditions=[load])
+    moved = s.run(2.0, 1 / steps, probes=mpm.probes([body], [[0.75, 0.53]])).displacement[:, 0, 1]
+    assert abs(moved[-1]) < error * np.abs(moved).max()
+
+
 def test_friction_takes_energy_and_slips_at_its_coefficient():
     total, gross, force = work(0.3, to_and_fro, 6.0, 6)
     assert total > 0.2 * gross
