@@ -1,18 +1,16 @@
 # SPDX-License-Identifier: MIT
 """Flow of pore fluid through the closed parts of contacts between groups.
 
-A pair of opposite positions on two surfaces (`pairs`) conducts fluid between the cells of both positions while its gap
-is closed (`ContactProblem.closed`).  The two cells conduct in series, as in the two-point fluxes between cells
-(`flow/fluxes.py`), so the pressure is continuous across the surface:
+A pair consists of two opposite positions on the surfaces in contact (`pairs`).  While the gap of a pair is closed,
+fluid flows between the cells of both positions.  The flow is a two-point flux, as between neighbouring cells
+(`flow/fluxes.py`), so the pressure is continuous across the contact:
 
     Q = r [p_1 - p_2 + rho_w g . (x_2 - x_1)] / (d_1 / (A kappa_1) + d_2 / (A kappa_2)).
 
-A is the area of the pair's point, kappa is the mobility of a cell across the surface, and d is the distance from the
-centroid x of the cell's material to the surface.  The factor r is the relative density of the fluid, see `storage`.
-All quantities refer to the last reset of the grid, and mobilities are pulled back (`Conduction.across`).
-
-The pressures of both cells are implicit.  The closed pairs are an active set, which is updated between Newton steps.
-After `ROUNDS` changes in a substep, the active set remains fixed.
+A is the contact area of the pair, and kappa is the mobility of a cell normal to the surface.  The distance d is
+measured from the centroid x of the material in a cell to the surface.  The factor r is the density of the fluid,
+divided by its reference density.  The set of closed pairs is updated between Newton steps, at most `ROUNDS` times in a
+substep.
 """
 
 from __future__ import annotations
@@ -34,10 +32,7 @@ from mpm_dolfinx.parallel.exchange import Exchange, over_all
 
 
 class ConductingContacts(Feeding):
-    """The contacts of a stage that conduct fluid.
-
-    `conducts`: whether each contact of the stage conducts fluid, by name.
-    """
+    """The contacts of a stage that conduct fluid.  `conducts` maps each name to True if the contact conducts."""
 
     title = "contacts that conduct"
     varies = True  # the closed pairs change
@@ -47,7 +42,7 @@ class ConductingContacts(Feeding):
         self.count = sum(conducts.values())
 
     def unknown(self, value: float) -> dict[str, NDArray[np.float64]]:
-        """Return the flows before the first step, all equal to `value`."""
+        """Return a flow of `value` for each contact."""
         return {name: np.array(value) for name, conducts in self._conducts.items() if conducts}
 
     def placed(self, wet: Wet) -> Feeds:
@@ -57,7 +52,7 @@ class ConductingContacts(Feeding):
 
 
 class Links(NamedTuple):
-    """The closed pairs with their points in cells of this process, and the opposite sides of closed pairs."""
+    """The closed pairs on this process."""
 
     law: Any  # contact law of the pairs
     closed: NDArray[np.bool_]  # whether each pair of the law is closed (m,)
@@ -108,17 +103,17 @@ class ContactFeeds(Feeds):
 
     @property
     def _now(self) -> Links:
-        """The closed pairs, which are determined again after the contact has updated its pairs."""
+        """The closed pairs of the current contact law."""
         if self._contact.now.law is not self._links.law:
             self._links = self._linked(self._links.changes)
         return self._links
 
     def conducting(self, flow: Conduction) -> Conduction:
-        """Return the conductivity and motion of the cells."""
+        """Return the argument."""
         return flow
 
     def begin(self, at: Conduction, fluid: Fluid, difference: NDArray[np.float64]) -> None:
-        """Store the non-orthogonal corrections of the pressure differences, by place of the pair, see `Feeds`."""
+        """Store the non-orthogonal corrections of the pressure differences."""
         links = self._links
         near, far = np.split(difference, [len(links.near.at)])  # as in `sides`
         self._correction = self._contact.pairs.place[links.closed], near - links.exchange.back(far)
@@ -149,14 +144,14 @@ class ContactFeeds(Feeds):
         return Flows(links, conductance * difference, conductance * (np.abs(p) + np.abs(other)), np.stack(slopes))
 
     def leaving(self, at: Conduction, fluid: Fluid) -> Leaving:
-        """Return the outflow of the cells to cells of other groups."""
+        """Return the flow from each cell to cells of other groups."""
         links, flux, scale, _ = self._flows(at, fluid)
         rows = np.stack([flux, scale])
         own, other = links.near.total(rows), links.far.total(links.exchange.send(rows.T).T)
         return Leaving(own[0] - other[0], own[1] + other[1])
 
     def coupling(self, at: Conduction, fluid: Fluid, unknowns: Any) -> PETSc.Mat:
-        """Return the derivative of the outflow with respect to the pressures of both sides."""
+        """Return the derivative of `leaving` with respect to the pressures."""
         links, *_, slopes = self._flows(at, fluid)
         return self._contact.pairs.conducting(unknowns, links.closed, slopes)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Groups of bodies that may touch without sticking, because each group has its own copy of the grid."""
+"""Contact between groups of bodies.  Each group has its own copy of the grid, so groups can slide and separate."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from mpm_dolfinx.grid.grid import Grid, GridOfGroups
 class Contact:
     """Two groups of bodies in contact, with slip and separation.
 
-    Bodies of one group stick where they touch.  Groups cannot penetrate each other, but may slide and separate.
-    Fluid passes between groups only with `conducts`.  In a scene with contacts, each body must belong to a group, and
-    each pair of groups must have one contact.  `tool_forces` of the simulation are the forces on the bodies of `one`.
+    Bodies of one group are bonded where they touch.  Groups cannot penetrate each other, but may slide and separate.
+    In a scene with contacts, each body must belong to a group, and each pair of groups must have one contact.
+    `Simulation.tool_forces` contains the forces on the bodies of `one`.
 
     Parameters
     ----------
@@ -32,12 +32,11 @@ class Contact:
     adhesion
         Additional shear strength of the contact, Pa, >= 0, as for a `Tool`.
     conducts
-        Whether pore fluid passes where the contact is closed.  The pressure is then continuous across the contact.  No
-        fluid passes where the contact is open.  A gap of at most 5e-4 cell sizes counts as closed.  `outflows` of the
-        simulation contain the flow from `one` to `other`.  Friction depends on the total pressure with and without
-        `conducts`.
+        Whether pore fluid flows through closed parts of the contact.  The pore pressure is then continuous across these
+        parts.  A gap of at most 5e-4 cell sizes counts as closed.  `Simulation.outflows` contains the flow from `one`
+        to `other`.  Friction always depends on the total normal stress.
     name
-        Name of the results; by default "contact".
+        Name of the contact in results; by default "contact".
 
     Raises
     ------
@@ -103,7 +102,7 @@ def groups_of(contacts: Sequence[Contact], count: int) -> list[tuple[int, ...]]:
 def grouped(
     grid: Grid, bodies: Sequence[Body], contacts: Sequence[Contact], quadrature: str, other: dict[str, Any]
 ) -> Grid:
-    """Return the grid of a scene, which has a copy for each group if there are contacts.
+    """Return the grid of a scene.  With contacts, the grid has a copy for each group.
 
     Parameters
     ----------

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Contact history of material points: pressures and shear tractions that are kept from step to step."""
+"""Contact pressures and shear tractions that material points store from step to step."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def shear_name(name: str) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Origin:
-    """The material point and the contact of each contact pair, on the process of the point."""
+    """The material point and the contact of each contact pair."""
 
     exchange: Exchange  # sends the pairs to the owners of their cells
     point: NDArray[np.int64]  # index of the material point on this process (n,)
@@ -45,7 +45,7 @@ class Origin:
     def means(
         self, contacts: Mapping[str, Rough], points: MaterialPoints, push: NDArray, shear: NDArray
     ) -> MaterialPoints:
-        """Return the points with the mean contact pressures and shear tractions of their pairs, in Pa."""
+        """Store the mean contact pressures and shear tractions of the pairs at their points."""
         push = self.exchange.back(push)
         shear = self.exchange.back(shear)
         data = dict(points.data)
@@ -60,7 +60,7 @@ class Origin:
 
 
 def joined(both: Sequence[Origin], kept: Sequence[NDArray[np.bool_]]) -> tuple[Origin, NDArray[np.int64]]:
-    """Merge the flagged pairs of two `Origin`, and return the order (n,) in which the exchange delivers the pairs."""
+    """Merge the flagged pairs of two `Origin`.  Return the result, and the new order of the pairs (n,)."""
     columns, start = [], 0
     comm = both[0].exchange.comm
     for of, rows in zip(both, kept, strict=True):

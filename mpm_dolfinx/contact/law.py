@@ -1,27 +1,26 @@
 # SPDX-License-Identifier: MIT
-"""Contact law: pressure, Coulomb friction and adhesion, with one condition for each contact and cell.
+"""Contact law: pressure, Coulomb friction and adhesion.
 
-At a position with gap g, the contact pressure p and its energy psi per area are
+A *contact pair* is a quadrature point on a surface with its opposite position.  All pairs of one contact in one cell
+form a *condition*.  At a pair with gap g, the contact pressure p and its energy psi per area are
 
     p = <lambda - k g>,     psi = p^2 / (2 k).
 
-<...> is the positive part, and k is a penalty stiffness.  The stiffness is limited so that a Q1 field can follow curved
-surfaces.  The multiplier lambda has one value for each contact and cell.  The multiplier starts from the pressure after
-the previous step.  Augmentation (Uzawa's method) updates lambda until the penetrated volume in each cell is below
-`DEPTH` cell volumes.
+<...> is the positive part, and k is a penalty stiffness.  Each condition has one multiplier lambda.  In the first
+iteration, lambda is the pressure after the previous step.  Augmentation (Uzawa's method) updates lambda until the
+penetrated volume in each cell is below `DEPTH` cell volumes.
 
-The shear traction t depends on means over the pairs in a cell: the slip s in the step, and the shear traction t_n after
-the previous step.  Radial return gives
+Each condition has one shear traction t.  Radial return gives
 
     t = P (t_n - k_t s),     |t| <= mu p + min(adhesion, 10 p).
 
-P is the projection on the tangent plane, mu is Coulomb's coefficient, and k_t is the elastic stiffness in stick.
+The mean slip of the pairs in the step is s, and t_n is their mean shear traction after the previous step.  P is the
+projection on the tangent plane, mu is Coulomb's coefficient, and k_t is the elastic stiffness in stick.
 
-The set of slipping cells is updated after Newton steps (active-set method).  An update in each residual would make
-cells alternate between stick and slip, because slip has no stiffness.  All cells start in stick.  A cell with reversed
-slip returns to stick only near equilibrium, and may slip again later.  A sticking cell that opens is set to slip.  A
-cell that has returned to stick once and then opens slips until the pairs are updated or the substep ends.  Without this
-rule, shear could open and close cells again and again at first contact under a round tool.
+At the start of a substep, all conditions stick.  The set of slipping conditions is updated between Newton steps
+(active-set method).  A condition returns to stick if its slip reverses and the forces are near equilibrium.  A
+condition without pressure slips.  If a condition has returned to stick and then opens, the condition slips until the
+pairs are updated or the substep ends.
 """
 
 from __future__ import annotations
@@ -42,37 +41,31 @@ from mpm_dolfinx.grid.grid import means_of_rows, sum_by, sums_of_rows
 from mpm_dolfinx.parallel.exchange import first, over_all
 
 STIFF = 100.0
-"""The stiffness k is this factor times the modulus from `resistance`, divided by the cell size.  Plateau (scene
+"""The stiffness k is this factor times the modulus `Pairs.resistance`, divided by the cell size.  Plateau (scene
 "contact" of tests/plateaus.py): half this value changes the result by 1.9e-03, twice this value by 3.2e-03, and finer
-cells by 1.1e-02.
-
-With inertia, `rho h^2 / (GAMMA dt)^2` is added to the modulus, as in the matrix of a substep.  With the modulus alone,
-the correction of a penetration within `DEPTH` would cause large forces in short steps.  If two bars collide, with steps
-of a quarter of the time of a wave through a cell, contact forces then alternate between 0 and twice their value.
+cells by 1.1e-02.  With inertia, `rho h^2 / (GAMMA dt)^2` is added to the modulus.
 """
 GRIP = 6.0
-"""The stiffness k_t is this factor times the modulus from `resistance`, divided by the cell size.
-
-With a larger k_t, spurious shear tractions would alternate between cells without any resistance from the nodes. Plateau
-(scene "contact" of tests/plateaus.py): half this value changes the result by 3.6e-03, twice this value by 2.6e-03, and
-finer cells by 1.1e-02.
+"""The stiffness k_t is this factor times the modulus `Pairs.resistance`, divided by the cell size.  Plateau (scene
+"contact" of tests/plateaus.py): half this value changes the result by 3.6e-03, twice this value by 2.6e-03, and finer
+cells by 1.1e-02.
 """
 DEPTH = 5e-4
 """Allowed mean penetration, divided by the cell size.  Plateau (scene "contact" of tests/plateaus.py): half this value
 changes the result by 2.6e-03, twice this value by 2.4e-03, and finer cells by 1.1e-02.
 """
 ROUNDS = int(-np.log2(DEPTH * DEPTH))
-"""Largest number of augmentations, and of updates of pairs: twice the halvings that reduce a cell size to `DEPTH`."""
+"""Largest number of augmentations, and of updates of the pairs, in a substep."""
 BEGIN = 1.0, np.inf, 0.0, 0.0  # initial values of `ContactState.updates`
 STIFFER = 10.0
-"""The stiffness is multiplied by this factor if an augmentation leaves more than half of the previous penetration."""
+"""The stiffness k is multiplied by this factor if an augmentation does not halve the penetration."""
 RAMP = 10.0
-"""Largest ratio of adhesion to normal pressure.  Source: definition, the documented limit of adhesion in `Tool`."""
+"""Largest ratio of adhesion to normal pressure.  Source: definition in the documentation of `Tool`."""
 
 
 @dataclass(frozen=True, eq=False)
 class ContactState:
-    """State of the contact iterations, except displacements."""
+    """State of the contact iterations in a substep, for the k conditions."""
 
     pressure: NDArray[np.float64]  # multiplier lambda (k,), Pa
     slip: NDArray[np.float64]  # direction of slip, zero in stick (k, d)
@@ -90,7 +83,7 @@ class ContactState:
 
 @dataclass(frozen=True, eq=False)
 class Touch:
-    """Contact forces and their derivatives at given displacements."""
+    """Contact forces on m pairs and k conditions, and derivatives of these forces."""
 
     force: NDArray[np.float64]  # force on the points (m, d), N
     push: NDArray[np.float64]  # pressure (m,), Pa
@@ -126,7 +119,7 @@ class ContactLaw:
         self.frictional = any(contact.frictional for contact in contacts)
 
     def begins(self) -> ContactState:
-        """Return the initial state: pressures of the previous step, and stick everywhere."""
+        """Return the state at the start of a substep: pressures of the previous step, and stick everywhere."""
         k, d = len(self.key), self.grid.dim
         none, zero = np.zeros(k, dtype=bool), np.zeros((k, d))
         return ContactState(self.mean(self.pairs.pressure), zero, none, none, zero, np.full((k, 4), BEGIN))
@@ -163,7 +156,7 @@ class ContactLaw:
     def _friction(
         self, state: ContactState, n: NDArray, slip: NDArray, old: NDArray, pressure: NDArray, on: NDArray
     ) -> tuple:
-        """Return the fields of `Touch` from `sticks` to `by_pressure`, from means over the pairs of each condition."""
+        """Return the fields of `Touch` from `sticks` to `by_pressure`."""
         P = np.eye(n.shape[1]) - n[:, :, None] * n[:, None, :]
         hold = np.where(self.strength.any(axis=1), self._hold, 0.0) * on
         (mu, adhesion), slips = self.strength.T, state.slips
@@ -179,7 +172,7 @@ class ContactLaw:
         return ~slips & on, trial, shear, most, grip, by_pressure
 
     def tangent(self, touch: Touch, at: Geometry) -> scipy.sparse.csr_matrix:
-        """Return the matrix D (m d, m d), minus the derivative of the contact forces with respect to w."""
+        """Return the matrix D (m d, m d): minus the derivative of forces with respect to relative displacements."""
         pairs = self.pairs
         d = self.grid.dim
         m = len(self.pairs.cell)
@@ -203,7 +196,7 @@ class ContactLaw:
         return (D + wide.T @ (grip @ wide + by_pressure @ (mean @ slope))).tocsr()
 
     def slope(self, touch: Touch, at: Geometry, v: NDArray, adjoint: bool = False) -> NDArray[np.float64]:
-        """Return the product `D v` of the matrix D of `tangent` with v (m, d), or `D^T v` if `adjoint`."""
+        """Return `D v` for vectors v (m, d) and the matrix D of `tangent`, or `D^T v` if `adjoint`."""
         area, across = self.pairs.area[:, None], (touch.stiff * (at.n * v).sum(axis=1))[:, None]
         out = across * at.n
         if at.curvature is not None:
@@ -218,9 +211,9 @@ class ContactLaw:
         return area * out
 
     def choose(self, state: ContactState, touch: Touch, sticks: bool) -> tuple[ContactState, bool]:
-        """Update which conditions slip, and return the new state and whether any condition changed.
+        """Update the set of slipping conditions.  Return the new state, and whether a condition changed.
 
-        `sticks`: whether slipping conditions may return to stick.
+        If `sticks`, slipping conditions may return to stick.
         """
         before = state.slips
         left = ~before & ~touch.sticks & state.stuck.any(axis=1)
@@ -238,11 +231,10 @@ class ContactLaw:
         return replace(state, slip=slip, resticks=resticks, parts=parts, stuck=stuck), changed
 
     def augmented(self, state: ContactState, touch: Touch, largest: Callable[[NDArray], NDArray]) -> ContactState:
-        """Return the state after an augmentation, or raise NotConverged after too many augmentations.
+        """Return the state after an augmentation in connected parts of the bodies with too large penetrations.
 
-        Only connected parts of the bodies with too large penetrations are augmented.
-
-        `largest`: function that returns the largest of values (k,) in the connected part of each condition.
+        `largest` returns the largest of values (k,) in the connected part of each condition.  More than `ROUNDS`
+        augmentations raise NotConverged.
         """
         # penetrations count by volume: small parts of faces follow their neighbours, and correct no penetration alone
         x = self.pairs.x
@@ -268,7 +260,7 @@ class ContactLaw:
         return replace(state, pressure=np.where(most > DEPTH, touch.pressure, state.pressure), updates=updates)
 
     def rounding(self, state: ContactState) -> NDArray[np.float64]:
-        """Return the rounding errors (m,), in N, of the forces of the pairs."""
+        """Return the rounding errors (m,), in N, of the forces on the pairs."""
         of_gap = 4 * EPSILON * self.pairs.largest_coordinate
         return of_gap * self.stiffness(state) * self.pairs.area
 
@@ -277,20 +269,15 @@ class ContactLaw:
         return over_all(self.grid.comm, sums_of_rows(self.pairs.number, values, len(self.contacts)))
 
     def forces(self, touch: Touch, at: Geometry) -> NDArray[np.float64]:
-        """Return the forces, in N, and moments, in N m, of each contact on the bodies, as sums over all processes.
+        """Return the forces (N) and moments (N m) on the bodies: (contacts, 3) in 2D, and (contacts, 6) in 3D.
 
-        The shape is (contacts, 3) in 2D, and (contacts, 6) in 3D.  In axisymmetry, moments are zero, and the radial
-        force is the integral of the outward traction.
+        In axisymmetry, the radial force is the integral of the radial traction, and moments are zero.
         """
         force, arm = self.pairs.sign[:, None] * touch.force, at.arm * (not self.grid.axisymmetric)
         cross = np.cross(arm, force) if arm.shape[1] == 3 else arm[:, :1] * force[:, 1:] - arm[:, 1:] * force[:, :1]
         return self.by_contact(np.hstack([force, cross]))
 
     def tractions(self, touch: Touch, at: Geometry) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the pressures (m,) and shear tractions (m, d), in Pa, of the pairs.
-
-        In stick, a pair keeps its deviation from the mean shear traction in its cell.  Repeated averaging would cause
-        creep.
-        """
+        """Return the pressures (m,) and shear tractions (m, d), in Pa, of the pairs."""
         off = (at.shear - self.mean(at.shear)[self.of]) * touch.sticks[self.of, None]
         return touch.push, touch.shear[self.of] + off

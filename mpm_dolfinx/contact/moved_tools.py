@@ -1,26 +1,25 @@
 # SPDX-License-Identifier: MIT
-"""Tools that forces move: load-controlled tools, and free tools, which have a mass and weight.
+"""Tools that forces move: load-controlled tools without mass, and free tools with mass and weight.
 
-The motion q of a tool in a step is its displacement and, in 2D, its rotation.  The equation of motion has the form of
-that for nodes (`mechanics/inertia.py`): `m (q - q^) / (g dt)^2 = l - sum A^T f`.  Here m contains the mass and the
-moment of inertia, and q^ is the motion without forces in the step.  The length of the step is dt, and g is the time
-weight of the substep's rate.  The vector l contains loads and weight, and f are the contact forces on the points.  The
-product `A q` is the displacement of the contact positions on the tool.  The columns of A are e_x, e_y, and `e_z x r`
-with the lever arm r.  Load-controlled tools have no mass.  They move along their load only, so that the reaction equals
-the load.
+The vector q contains the displacement of a tool in a step and, in 2D, its rotation.  The equation of motion is
+`m (q - q^) / (g dt)^2 = l - sum A^T f`, as for nodes (`mechanics/inertia.py`).  The matrix m contains the mass and the
+moment of inertia.  The predictor q^ is the motion without forces.  The step has the length dt, and g is the coefficient
+of the time integration.  Loads and weight are l, and the contact forces on the points are f.  The vector `A q` is the
+displacement of the contact positions on the tool.  The columns of A are e_x, e_y, and `e_z x r` with the lever arm r.
+A load-controlled tool moves along its load, until the reaction equals the load.
 
-The unknowns q are eliminated (static condensation).  Let w be the displacements of the points, and let dw be their
-increment.  D is minus the derivative of f with respect to w.  Forces rotate with the tool, so f changes by
-`(D A + E) dq`, where E has the columns 0, 0, `e_z x f`.  The force on the tool changes by the product of dq with
+The unknowns q are eliminated (static condensation).  Let w be the relative displacements of the pairs, and dw their
+increment.  D is minus the derivative of f with respect to w.  Forces rotate with the tool, so an increment dq changes f
+by `(D A + E) dq`.  The columns of E are 0, 0, and `e_z x f`.  The force on the tool changes by the product of dq with
 
     A^T D A + [[0, e_z x F], [(e_z x F)^T, sum r . f]],     F = sum f.
 
-Let S be the sum of this matrix and `m / (g dt)^2`.  Newton's method then gives
+S is the sum of this matrix and `m / (g dt)^2`.  Newton's method gives
 
     dq = S^-1 (l - sum A^T f - m (q - q^) / (g dt)^2 + sum (A^T D + E^T) dw).
 
-The forces on the points are therefore `f + (D A + E) S^-1 (...)`.  Minus the derivative of these forces is
-`D - (D A + E) S^-1 (A^T D + E^T)`.
+With this dq, the forces on the points are `f + (D A + E) dq`.  The negative derivative of these forces with respect to
+w is `D - (D A + E) S^-1 (A^T D + E^T)`.
 """
 
 from __future__ import annotations
@@ -47,7 +46,7 @@ from mpm_dolfinx.parallel.exchange import over_all
 
 
 class Moved(NamedTuple):
-    """Tools of a contact that forces move, with zeros for all other tools."""
+    """Data of the k tools of a stage.  Tools that forces do not move have zeros."""
 
     mass: NDArray[np.float64]  # masses (k, q), kg, and moments of inertia, kg m^2; 0 for load-controlled tools
     guides: NDArray[np.float64]  # projections (k, q, q) on the motions that each tool can perform, see `motion_count`
@@ -67,11 +66,7 @@ class MotionEquation(NamedTuple):
 
 
 class MovedTools(ContactProblem):
-    """Base class that adds the motion of tools by forces to `ToolLoads`.
-
-    `placed`: arguments of `ToolLoads`.
-    `moved`: the tools.
-    """
+    """Base class that adds the motion of tools by forces to `ToolLoads`."""
 
     couples = True
 
@@ -90,7 +85,7 @@ class MovedTools(ContactProblem):
             self.now = self.now._replace(linear=self._first())
 
     def _first(self) -> Found:
-        """Return the contact at a guess of tool displacements.  Tools move at most until a point bears the load."""
+        """Return the contact at the initial guess of the tool displacements."""
         motion, still = self.still, np.zeros_like(self.pairs.x)
         for _ in range(ROUNDS):
             found = self._find_at(still, motion)
@@ -136,7 +131,7 @@ class MovedTools(ContactProblem):
         return np.where(free, self._carried(self.found(at), self._after(at).velocity), super().tool_velocity(at))
 
     def rubbing(self, at: At, v: NDArray[np.float64]) -> tuple[float, float]:
-        """See `Loads`.  Contact forces change the energy of free tools, and loads do work on free tools."""
+        """See `Loads`."""
         rubs, more = super().rubbing(at, v)
         free = self._moves[self.pairs.number]
         more -= float((self.found(at).touch.force * self.tool_velocity(at))[free].sum())
@@ -149,7 +144,7 @@ class MovedTools(ContactProblem):
         return self.flight.after(acceleration, self.shares.own, self.shares.before)
 
     def _find_at(self, w: NDArray[np.float64], motion: NDArray[np.float64]) -> Found:
-        """Return the contact, with forces on points after the Newton increment of the tools."""
+        """See `ContactProblem`.  The result includes the equation of motion of the tools."""
         found = super()._find_at(w, motion)
         equation = self._equation(found)
         pulled = self._pulled(found, equation.shift)
@@ -161,7 +156,7 @@ class MovedTools(ContactProblem):
         return of[:, :d] + of[:, d:] * across(found.at.arm) if d == 2 else of
 
     def _pulled(self, found: Found, q: NDArray[np.float64], adjoint: bool = False) -> NDArray[np.float64]:
-        """Return the forces `(D A + E) q` for motions q of the tools, with `D^T` in place of D if `adjoint`."""
+        """Return the forces `(D A + E) q` for motions q of the tools, or `(D^T A + E) q` if `adjoint`."""
         out = self.now.law.slope(found.touch, found.at, self._carried(found, q), adjoint)
         d = self.grid.dim
         return out + q[self.pairs.number, d:] * across(found.touch.force) if d == 2 else out
@@ -173,12 +168,12 @@ class MovedTools(ContactProblem):
         return np.hstack([force, (across(found.at.arm) * force).sum(axis=1, keepdims=True)])
 
     def _sizes(self, found: Found, force: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return upper bounds of the generalised forces on the tools, with lever arm times force for a moment."""
+        """Return upper bounds of the generalised forces on the tools."""
         moment = np.linalg.norm(found.at.arm, axis=1) * np.linalg.norm(force, axis=1)
         return np.hstack([force, moment[:, None][:, : self.grid.dim == 2]])
 
     def _motion(self, w: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the motions of tools at relative displacements w, from the last linearisation."""
+        """Return the motions of tools at relative displacements w, by static condensation."""
         last, law = self.now.linear, self.now.law
         d = self.grid.dim
         dw = w - last.w
@@ -192,14 +187,14 @@ class MovedTools(ContactProblem):
         return self._limited(last.motion + equation.shift + np.einsum("kij,kj->ki", equation.inverse, on[:, 1:]))
 
     def _limited(self, motion: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return motions along the loads that are at most one cell long in a step, or all motions with inertia."""
+        """Limit the motion of load-controlled tools to one cell in a step."""
         if self._rate:
             return motion
         h, e = self.grid.least, self._moved.direction
         return np.clip((motion * e).sum(axis=1, keepdims=True), -h, h) * e
 
     def _bearing_displacement(self, found: Found) -> NDArray[np.float64]:
-        """Return the displacements (k,), in m, at which a single point would bear the load of a tool, or infinity."""
+        """Return the displacements (k,), in m, at which a single point would carry the load of a tool, or infinity."""
         law, state = self.now.law, self.now.state
         of = self.pairs.number
         along = (found.at.n * self._moved.direction[of, : self.grid.dim]).sum(axis=1)
@@ -272,7 +267,7 @@ class MovedTools(ContactProblem):
         return changed
 
     def augment(self, at: At) -> bool:
-        """See `Loads`.  The augmentation ends only if the tools are in equilibrium too."""
+        """See `Loads`.  Augmentation continues until the tools are in equilibrium."""
         if super().augment(at):
             return True
         found = self.found(at)
@@ -287,10 +282,7 @@ class MovedTools(ContactProblem):
         return True
 
     def _check_bears(self, found: Found, wrong: NDArray[np.bool_]) -> None:
-        """Raise NotConverged if no motion of a load-controlled tool gives its load.
-
-        `wrong` (k,): whether the reaction differs from the load.
-        """
+        """Raise NotConverged if no motion of a load-controlled tool gives its load.  `wrong` (k,) flags such tools."""
         load, e = self._moved.load, self._moved.direction
         far = (found.motion * e).sum(axis=1) >= (1 - SAME) * self.grid.least
         for k in np.flatnonzero(wrong & (far | found.equation.slides))[:1]:
@@ -301,7 +293,7 @@ class MovedTools(ContactProblem):
             raise NotConverged(f"{line(self.now.law.contacts[k])}: load {load[k]:.6g} N, but {why}")
 
     def outcome(self, at: At) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """See `Loads`.  Free tools also have velocities (d,) (m/s), rotations (rad), and angular velocities (rad/s)."""
+        """See `Loads`.  Free tools also have a velocity (m/s), rotation (rad), and angular velocity (rad/s)."""
         out = super().outcome(at)
         if not self._rate:
             return out
@@ -317,5 +309,5 @@ class MovedTools(ContactProblem):
 
 
 def across(v: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return e_z x v (m, 2) for vectors v (m, 2)."""
+    """Return the cross products of e_z with vectors v (m, 2)."""
     return np.stack([-v[:, 1], v[:, 0]], axis=1)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Contacts between groups in a stage: pairs of opposite positions on the surfaces of two groups."""
+"""Search of contact pairs: opposite positions on the surfaces of two groups."""
 
 from __future__ import annotations
 
@@ -36,16 +36,16 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.points.parts import parts_of_domains
 
 REACH = 2.0
-"""Largest gap, divided by the cell size, that may close in a step.  Source: definition, a cell for each body."""
+"""Largest gap, divided by the cell size, that may close in a step.  Source: each body may move by one cell."""
 DEEP = 0.25
-"""Penetration behind a thin body, and gap that stays open until the next update of the pairs, divided by cell size."""
+"""Largest penetration of an opposite position, and smallest gap that counts as open, divided by the cell size."""
 BESIDE = 0.6
-"""Distance from another group, divided by the cell size, below which domain corners follow the Q1 field alone.
+"""Distance from another group, divided by the cell size, below which domain corners move by the Q1 field alone.
 Plateau (scene "contact" of tests/plateaus.py): half this value changes the result by 1.1e-03, twice this value by
 6.3e-04, and finer cells by 1.1e-02.
 """
 PLACES = 1 << 32
-"""Upper bound of the number of quadrature points of a process on a surface."""
+"""Upper bound of the number of quadrature points on a surface, on one process."""
 
 
 class Facets(NamedTuple):
@@ -110,7 +110,7 @@ class Contacts(Touching):
         present: MaterialPoints,
         cell_pairs: Callable[[], NDArray[np.int64]],
     ) -> tuple[ContactLaw, Origin]:
-        """Return the contact law and the origin of pairs that were found for the points `seen`."""
+        """Return the contact law, and the material points of its pairs.  The pairs were found for the points `seen`."""
         grid = self.grid
         d = self.grid.dim
         rows = []
@@ -164,7 +164,7 @@ class Contacts(Touching):
         return [self._opposite(cut, own, other, points) for _, own, other, _ in self._faces]
 
     def _cells_within_reach(self, cut: CutDomains, found: Sequence[tuple[Facets, Pairs]]) -> NDArray[np.int64]:
-        """Return all pairs of cells that contact pairs may join in the step, as integers `first * cells + second`."""
+        """Return all pairs of cells between which contact is possible in the step, as `first * cells + second`."""
         grid = self.grid
         keys = []
         count = self.grid.all_cells
@@ -182,7 +182,7 @@ class Contacts(Touching):
         return np.unique(np.concatenate(keys))
 
     def _facets(self, cut: CutDomains, faces: Surface, points: MaterialPoints) -> Facets:
-        """Return the quadrature points of all processes on the faces."""
+        """Return the quadrature points on the faces, of all processes."""
         patches, d = cut.surface(faces), self.grid.dim
         index = FACES[d][faces.face[patches.face]]
         now, then = (
@@ -203,7 +203,7 @@ class Contacts(Touching):
     def _opposite(
         self, cut: CutDomains, faces: Surface, others: Surface, points: MaterialPoints
     ) -> tuple[Facets, Pairs]:
-        """Pair the points on `faces` with facets of the group of `others`, and return the facets and the pairs."""
+        """Return the facets on `others`, and the pairs of points on `faces` with these facets."""
         patches = cut.surface(faces)
         facets = self._facets(cut, others, points)
         d = self.grid.dim
@@ -229,17 +229,14 @@ class Contacts(Touching):
         return facets, Pairs(row[order], other[order], t[order], gap[order])
 
     def _under(self, facets: Facets, chosen: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the cells just inside the chosen facets at positions x, or the cells of the facets' own points."""
+        """Return the cells below positions x on the chosen facets."""
         grid, inside = self.grid, x - NEAR * self.grid.least * facets.outward[chosen]
         number = grid.number(grid.index_from_base(inside)) + facets.cell[chosen] // grid.cells * grid.cells
         keys = np.unique(facets.face * grid.all_cells + facets.cell)
         return np.where(np.isin(facets.face[chosen] * grid.all_cells + number, keys), number, facets.cell[chosen])
 
     def near(self, cut: CutDomains, points: MaterialPoints, corners: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return which moved corners (n, 2^d, d) are near another group, whose corners have also moved.
-
-        `points`: points before the step.
-        """
+        """Return which corners (n, 2^d, d) are near another group after the step.  `points`: points before the step."""
         present = replace(points, corners=corners)
         out, largest = np.zeros(corners.shape[:2], dtype=bool), BESIDE * self.grid.sizes_at(corners).max(axis=-1)
         largest = np.broadcast_to(largest, corners.shape[:2])
@@ -301,7 +298,7 @@ class ContactLoads(ContactProblem):
         return between_cells(unknowns, self.grid, pairs, np.zeros((2, len(pairs))))
 
     def within_reach(self) -> NDArray[np.int64]:
-        """Return the pairs of cells of bodies that may touch in the step."""
+        """Return the pairs of cells between which contact is possible in the step."""
         return np.stack(np.divmod(self._cell_pairs(), self.grid.all_cells), axis=1)
 
     def near(self, points: MaterialPoints, corners: NDArray[np.float64]) -> NDArray[np.bool_] | bool:
@@ -314,7 +311,7 @@ class ContactLoads(ContactProblem):
 
 
 def _ranks(setting: Setting) -> NDArray[np.int64]:
-    """Return the rank of the connected part of each point, by surface area and extent, the same in all stages."""
+    """Return the rank of the connected part of each point, sorted by surface area and extent."""
     grid, bodies = setting.grid, setting.sides.bodies
     corners = np.concatenate([body.corners() for body in bodies])
     copy = np.asarray(grid.copy(np.arange(len(corners))))
@@ -330,7 +327,7 @@ def _ranks(setting: Setting) -> NDArray[np.int64]:
 
 
 def _rotated(shear: NDArray[np.float64], n: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return shear tractions, rotated by the smallest angle into the planes with normals n."""
+    """Rotate shear tractions into the planes with normals n."""
     flat = shear - np.einsum("md,md->m", shear, n)[:, None] * n
     size = np.maximum(np.linalg.norm(flat, axis=1), TINY)
     return flat * (np.linalg.norm(shear, axis=1) / size)[:, None]
@@ -344,7 +341,7 @@ def _on(corners: NDArray[np.float64], t: NDArray[np.float64]) -> NDArray[np.floa
 
 
 def _along(corners: NDArray, x: NDArray, n: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return where lines from x along n intersect faces: face coordinates, and distances from x in m."""
+    """Return the intersections of lines from x along n with faces: face coordinates, and distances from x in m."""
     if corners.shape[2] == 2:  # as in `Faces`, with unit width along a third axis
         corners = np.dstack([corners[:, BITS[:, 0]], np.broadcast_to(BITS[:, 1], (len(x), 4))])
         x, n = np.column_stack([x, np.full(len(x), 0.5)]), np.column_stack([n, np.zeros(len(x))])

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Contact pairs: a quadrature point on a surface, and the opposite position on a tool or another group of bodies.
 
-The displacement w of the point relative to the opposite position is `w = B u`, where u are the nodal displacements.
-The columns of B belong to the nodes of the point's cell.  In pairs between groups, the columns also belong to the nodes
-of the cell with the opposite position.  A position on a tool moves with the tool.
+The displacement of the point relative to the opposite position is `w = B u`.  The vector u contains the nodal
+displacements.  B interpolates u in the cell of the point.  Between groups, B subtracts the displacement in the cell
+with the opposite position.
 """
 
 from __future__ import annotations
@@ -55,13 +55,13 @@ class Pairs:
     def at(self, w: NDArray[np.float64], motion: NDArray[np.float64]) -> Geometry:
         """Return the geometry at the relative displacements w (m, d), in m.
 
-        `motion` (contacts, q), in m and rad: motions of tools that forces cause in the step, see `motion_count`.
+        `motion` (contacts, q), in m and rad: displacements and rotations of tools due to forces in the step.
         """
         raise NotImplementedError
 
     @property
     def largest_coordinate(self) -> NDArray[np.float64] | float:
-        """Largest coordinates, in m, which determine the rounding errors of gaps."""
+        """Largest coordinates, in m."""
         return self.grid.reach
 
     def other_side(self) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
@@ -69,7 +69,7 @@ class Pairs:
         return None
 
     def operator(self, unknowns: Unknowns) -> PETSc.Mat:
-        """Return the matrix B, which maps the unknowns to w (m d,), in m."""
+        """Return the matrix B, which maps nodal displacements to relative displacements w (m d,)."""
         value, other = self.grid.shape_values(self.cell, self.x), self.other_side()
         if other is None:
             return at_nodes(self.grid, unknowns, self.cell, value)
@@ -118,14 +118,14 @@ class ToolPairs(Pairs):
 
     @property
     def largest_coordinate(self) -> NDArray[np.float64]:
-        """See `Pairs`.  User functions are evaluated at true positions."""
+        """See `Pairs`."""
         true = np.array([callable(tool.shape) for tool in self.tools])[self.number]
         return np.where(true, np.abs([self.grid.lower, self.grid.upper]).max(), self.grid.reach)
 
 
 @dataclass(frozen=True, eq=False)
 class FacePairs(Pairs):
-    """Contact pairs of points on one group with positions on another group, along the normals of the points."""
+    """Contact pairs between two groups: a point on one group, and the position on the other group along the normal."""
 
     other: NDArray[np.int64]  # lexicographic cell of the other side (m,)
     y: NDArray[np.float64]  # opposite position in the undeformed grid (m, d), m
@@ -145,10 +145,7 @@ class FacePairs(Pairs):
         return self.other, shape_values_in(self.grid, self.other, self.y)
 
     def conducting(self, unknowns: Unknowns, closed: NDArray[np.bool_], slopes: NDArray[np.float64]) -> PETSc.Mat:
-        """Return the result of `between_cells` for the closed pairs.
-
-        `closed` (m,): whether each pair is closed.
-        """
+        """Return the result of `between_cells` for the pairs flagged by `closed` (m,)."""
         cells = np.column_stack([self.grid.cell_number[self.cell], self.other])
         return between_cells(unknowns, self.grid, cells[closed], slopes)
 
@@ -172,9 +169,10 @@ def at_nodes(
     value: NDArray[np.float64],
     other: NDArray[np.int64] | None = None,
 ) -> PETSc.Mat:
-    """Return the matrix (m d, unknowns) with entries `value` (m, 2^d) at the nodes of a cell, for each component.
+    """Return the matrix that maps the unknowns to weighted sums (m d,) of nodal displacements.
 
-    With a second lexicographic cell `other` (m,), `value` (m, 2 * 2^d) includes the nodes of this cell.
+    `value` (m, 2^d): weights at the nodes of the local cells `cell` (m,).  With lexicographic cells `other` (m,), the
+    shape (m, 2 * 2^d) includes the nodes of these cells.
     """
     d = grid.dim
     numbers = unknowns.map.indices.reshape(-1, d)
@@ -192,11 +190,11 @@ def at_nodes(
 
 
 def between_cells(unknowns: Unknowns, grid: Grid, pairs: NDArray[np.int64], slopes: NDArray[np.float64]) -> PETSc.Mat:
-    """Return the derivative of the outflow of cells with respect to cell pressures, for flows between pairs of cells.
+    """Return the derivative of the outflow of cells with respect to cell pressures.
 
-    `pairs` (m, 2): lexicographic cells of any process.
-    `slopes` (2, m), m^d/(Pa s): derivative of the flow from the first to the second cell with respect to the pressure
-    of the first cell, and minus the derivative with respect to the pressure of the second cell.
+    `pairs` (m, 2): lexicographic cells.  Fluid flows from the first to the second cell of each pair.
+    `slopes` (2, m), m^d/(Pa s): derivative of the flow with respect to the first pressure, and minus the derivative
+    with respect to the second pressure.
     """
     (one, other), (own, far) = pairs.T, slopes
     rows, columns = np.concatenate([one, one, other, other]), np.concatenate([one, other, one, other])
@@ -212,7 +210,7 @@ def between_cells(unknowns: Unknowns, grid: Grid, pairs: NDArray[np.int64], slop
 
 
 def _check_distance(tool: Tool, x: NDArray, gap: NDArray, n: NDArray, h: float) -> None:
-    """Raise an error if a user's function is no signed distance, because its slope near the tool is not 1."""
+    """Raise an error if a user's distance function has a slope other than 1 near the tool."""
     size = np.linalg.norm(n, axis=1)
     wrong = np.flatnonzero((np.abs(gap) < h) & (np.abs(size - 1) > DISTANCE))
     if len(wrong):

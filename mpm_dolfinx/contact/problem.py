@@ -2,12 +2,9 @@
 """Contact problem of a substep, with tools or between groups of bodies.
 
 A pair consists of a quadrature point on a surface and the opposite position on a tool or another group (`pairs`).  The
-pairs have the relative displacements `w = B u` and the forces `f(w)`.  The nodal forces are `B^T f(w)`.  Forces on both
-bodies are therefore equal and opposite within rounding.  If both sides deform, the pairs are first determined at the
-start of the step.  After convergence, the pairs are updated at the new positions, and the step is solved again.  The
-updates end when gaps change by less than `DEPTH` cells.
-
-Forces may also move the tools, see `moved_tools`.
+pairs have the relative displacements `w = B u`.  The contact law gives the forces `f(w)`.  The nodal forces are
+`B^T f(w)`.  Between groups, the pairs are first determined at the start of the step.  After convergence, the pairs are
+updated at the new positions, and the step is solved again.  The updates end if gaps change by less than `DEPTH` cells.
 """
 
 from __future__ import annotations
@@ -46,7 +43,7 @@ class Found(NamedTuple):
 
 
 class Current(NamedTuple):
-    """Current contact pairs with their law, material points, and state of the iterations."""
+    """Contact law, material points of its pairs, and state of the iterations."""
 
     law: ContactLaw
     origin: Origin
@@ -63,7 +60,7 @@ class SubstepMotion(NamedTuple):
 
 
 class Touching(Acting):
-    """Contact conditions of one kind in a stage: tools, or contacts between groups."""
+    """Base class of the tools of a stage, and of its contacts between groups."""
 
     linear = False
 
@@ -78,7 +75,7 @@ class Touching(Acting):
         return np.column_stack([self._materials.table(points, resistance), self._materials.present_density(points)])
 
     def kept(self, n: int) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return zero contact pressures of n points, and zero shear tractions for contacts that resist slip."""
+        """Return the initial contact pressures and shear tractions of n points, all zero."""
         out = {name: {pressure_name(name): np.zeros(n)} for name in self.names}
         for name, frictional in zip(self.names, self._frictional, strict=True):
             out[name] |= {shear_name(name): np.zeros((n, self.grid.dim))} if frictional else {}
@@ -91,17 +88,16 @@ class Touching(Acting):
 
 
 class ContactProblem(Loads):
-    """Contact forces in a substep.  The attribute `now` is replaced during the solution.
+    """Contact forces in a substep.
 
     Parameters
     ----------
     law, origin
         Contact law at the start of the step, and the material points of its pairs.
     again
-        Function of displacements (a local array, in m), which finds the pairs at these displacements.  The function
-        returns the law and the origin of the pairs, see `FacePairs`.
+        Function that returns `law` and `origin` at given nodal displacements (local array, in m).
     cell_pairs
-        Function that returns all pairs of cells, as integers `first * cells + second`, that contact pairs may join.
+        Function that returns all pairs of cells between which contact is possible, as `first * cells + second`.
     """
 
     linear, smooth, touches = False, False, True
@@ -128,12 +124,12 @@ class ContactProblem(Loads):
 
     @property
     def couples(self) -> bool:
-        """Whether the contact couples nodes of different cells."""
+        """Whether the contact couples nodes of different cells, as between groups."""
         return self._cell_pairs is not None
 
     @property
     def still(self) -> NDArray[np.float64]:
-        """Motions of tools (k, q) without forces, in m and rad.  Between groups there are no tools, and q is 0."""
+        """Displacements and rotations (k, q) of tools by forces, all zero.  Between groups, q is 0."""
         return np.zeros((len(self.now.law.contacts), 0))
 
     def found(self, at: At) -> Found:
@@ -168,11 +164,11 @@ class ContactProblem(Loads):
         return Found(w, at, touch, motion, touch.force)
 
     def _motion(self, w: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the motions of tools that forces cause at relative displacements w."""
+        """Return the motions (k, q) of tools by forces at relative displacements w."""
         return self.still
 
     def closed(self, at: At) -> NDArray[np.bool_]:
-        """Return which pairs (m,) of contacts that conduct are closed at u: their gap is at most `DEPTH` cells."""
+        """Return which pairs (m,) are closed: their gap is at most `DEPTH` cells, and their contact conducts fluid."""
         conducts = np.array([contact.conducts for contact in self.now.law.contacts])
         gap, pairs = self.found(at).at.gap, self.pairs
         return conducts[pairs.number] & (gap <= DEPTH * self.grid.sizes(pairs.cell).min(axis=-1))
@@ -185,7 +181,7 @@ class ContactProblem(Loads):
         B.multTransposeAdd(w, residual, residual)
 
     def pattern(self, unknowns: Unknowns) -> PETSc.Mat | None:
-        """Return a zero matrix with the entries that `coupling` adds to the pattern of cells, or None."""
+        """Return a zero matrix with the sparsity pattern of `coupling`, or None if each pair acts on one cell."""
         out = self._pattern_of_pairs(unknowns) if self._cell_pairs is not None else None
         for cells in self.key:  # a tool that forces move couples the nodes of all cells under it
             B, own = at_nodes(self.grid, unknowns, cells, np.ones((len(cells), 2**self.grid.dim))), unknowns.vector()
@@ -199,7 +195,7 @@ class ContactProblem(Loads):
         return out
 
     def _pattern_of_pairs(self, unknowns: Unknowns) -> PETSc.Mat:
-        """Return a matrix with all entries that pairs between groups may have in the step."""
+        """Return a matrix with the sparsity pattern of all possible pairs between groups in the step."""
         grid, d = self.grid, self.grid.dim
         cell, other = np.divmod(self._cell_pairs(), grid.all_cells)
         exchange = Exchange(grid.comm, grid.owner(cell))
@@ -230,7 +226,7 @@ class ContactProblem(Loads):
         return out
 
     def settle(self, at: At, sticks: bool) -> bool:
-        """See `Loads`.  Each condition, one for each contact and cell, may change between stick and slip."""
+        """See `Loads`.  Each contact may change between stick and slip in each cell."""
         if not self.now.law.frictional:
             return False
         state, changed = self.now.law.choose(self.now.state, self.found(at).touch, sticks)
@@ -238,7 +234,7 @@ class ContactProblem(Loads):
         return changed
 
     def augment(self, at: At) -> bool:
-        """Augment the contact pressures if mean penetrations are too large, and return whether forces changed."""
+        """Augment the contact pressures where mean penetrations are too large.  Return whether forces changed."""
         law, state = self.now.law, self.now.state
         part = at.parts.cells[law.cell]
         new = law.augmented(state, self.found(at).touch, lambda of: at.parts.largest(self.grid.comm, part, of)[part])
@@ -246,7 +242,7 @@ class ContactProblem(Loads):
         return new is not state
 
     def follow(self, at: At) -> bool:
-        """Update the pairs at u, and return whether the update changes the equilibrium."""
+        """Update the pairs, and return whether gaps changed by more than `DEPTH` cells."""
         if self._again is None:
             return False
         new, late = self._continued(Current(*self._again(at.u), self.now.state), at)
@@ -261,7 +257,7 @@ class ContactProblem(Loads):
         return bool(late.any())
 
     def _continued(self, new: Current, at: At) -> tuple[Current, NDArray[np.bool_]]:
-        """Return the contact with updated pairs, and in which parts of the bodies gaps change by more than `DEPTH`."""
+        """Return the contact with updated pairs, and the connected parts with gap changes above `DEPTH` cells."""
         found = self.found(at)
         law, state = self.now.law, self.now.state
         pairs = new.law.pairs
@@ -287,18 +283,14 @@ class ContactProblem(Loads):
         return Current(now, new.origin, fresh), (most > DEPTH) & (updates[:, 3] < ROUNDS)
 
     def gripped(self, at: At, points: MaterialPoints) -> MaterialPoints:
-        """Return the points with updated contact pressures and shear tractions at u."""
+        """Return the points with the contact pressures and shear tractions at the end of the step."""
         law, origin, *_ = self.now
         contacts = dict(zip(law.names, law.contacts, strict=True))
         found = self.found(at)
         return origin.means(contacts, points, *law.tractions(found.touch, found.at))
 
     def rubbing(self, at: At, v: NDArray[np.float64]) -> tuple[float, float]:
-        """See `Loads`.  Only tools do external work.  The work of elastic slip counts as dissipation.
-
-        This dissipation is negative on unloading.  The work of contact pressures does not count as dissipation, because
-        velocities of substeps jump where a gap closes.
-        """
+        """See `Loads`.  Dissipation is the work of shear tractions, including elastic slip."""
         law = self.now.law
         found = self.found(at)
         B, relative = self._B(law, at.unknowns)
@@ -315,10 +307,7 @@ class ContactProblem(Loads):
         return 0.0
 
     def outcome(self, at: At) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """See `Loads`.  Results are forces (N) and moments (N m) on bodies.
-
-        The forces and moments of each contact are one array: (3,), or (6,) in 3D.
-        """
+        """See `Loads`.  Each contact has an array of forces (N) and moments (N m) on bodies: (3,) in 2D, (6,) in 3D."""
         found, where = self.found(at), self.found(at).at
         if self.pairs.other_side() is not None:  # arms to present positions: moments of a body at rest sum to zero
             where = where._replace(arm=where.arm + self.grid.at(self.pairs.cell, self.pairs.x, at.nodal))
@@ -338,7 +327,7 @@ class ContactProblem(Loads):
         return self.pairs.cell[rows], None if other is None else other[0][rows], self.pairs.x[rows], along
 
     def rounding(self, of_cells: NDArray[np.float64]) -> NDArray[np.float64]:
-        """See `Loads`.  Gaps are differences of large coordinates."""
+        """See `Loads`."""
         if self.pairs.other_side() is not None:
             return of_cells
         out, cells = of_cells.copy(), self.pairs.cell
@@ -347,7 +336,7 @@ class ContactProblem(Loads):
 
     @property
     def rounding_beside(self) -> float:
-        """Rounding error, in N, of forces in the cells with the opposite positions."""
+        """Rounding error of forces in the cells with the opposite positions, in N."""
         if self.pairs.other_side() is None:
             return 0.0
         return over_all(self.grid.comm, float(self.now.law.rounding(self.now.state).max(initial=0.0)), MPI.MAX)

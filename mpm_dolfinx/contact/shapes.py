@@ -17,7 +17,7 @@ from mpm_dolfinx.base.validation import asked, line, numbers
 
 ROUNDED = SAME  # penetration, divided by the cell size, below which a position lies on the surface
 DISTANCE = 0.1
-"""Largest deviation of the slope of a user's distance function from 1."""
+"""A user's distance function must have a slope between 1 minus and 1 plus this value."""
 
 
 DistanceField = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
@@ -38,12 +38,12 @@ class Shape(Protocol):
 
 
 def _flat(y: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the second derivatives of the distance from planes, which are zero."""
+    """Return zero second derivatives (n, d, d)."""
     return np.zeros((*y.shape, y.shape[1]))
 
 
 def _across(offset: NDArray[np.float64]) -> DistanceField:
-    """Return the lengths of vectors, their directions, and the second derivatives of the lengths."""
+    """Return the lengths of vectors, with first and second derivatives."""
     r = np.maximum(np.linalg.norm(offset, axis=1), TINY)
     e = offset / r[:, None]
     return r, e, (np.eye(offset.shape[1]) - e[:, :, None] * e[:, None, :]) / r[:, None, None]
@@ -88,7 +88,7 @@ class Placed:
         raise NotImplementedError
 
     def normal(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the gradients (n, d) of the distance, or a mean normal where several parts are equally near."""
+        """Return the gradients (n, d) of the distance."""
         return self.geometry(y)[1]
 
 
@@ -156,8 +156,8 @@ class Ball(Placed):
 class Convex(Placed):
     """The convex hull of corners: a polygon in 2D, a polyhedron in 3D.
 
-    The signed distance is the largest distance from the planes of the surface.  The distance is exact inside the hull.
-    Outside the hull, the distance is too small near edges and corners, but no contact occurs there.
+    The signed distance is the largest signed distance from the planes of the faces.  Outside the hull, this value is
+    too small near edges and corners.
 
     Parameters
     ----------
@@ -193,7 +193,7 @@ class Convex(Placed):
         return self._each(y).max(axis=1)
 
     def geometry(self, y: NDArray[np.float64]) -> DistanceField:
-        """See `Placed`.  Where planes are equally near, the gradient is their mean normal."""
+        """See `Placed`.  If several faces are equally near, the gradient is their mean normal."""
         each = self._each(y)
         gap = each.max(axis=1)
         near = each >= gap[:, None] - ROUNDED * np.abs(each).max(axis=1, keepdims=True)
@@ -252,7 +252,7 @@ class Cone(Placed):
         return np.linalg.norm(offset, axis=1) * np.cos(beta) - z * np.sin(beta)
 
     def geometry(self, y: NDArray[np.float64]) -> DistanceField:
-        """See `Placed`.  On the axis, the gradient is the mean of the flank's normals."""
+        """See `Placed`.  On the axis, the gradient is the mean normal of the flank."""
         z, offset = self._polar(y)
         r, away, second = _across(offset)
         beta = np.radians(self.angle_deg)
@@ -269,8 +269,7 @@ class Cone(Placed):
 class Distance:
     """A shape given by a user's signed distance function.
 
-    The function is evaluated at true positions, not at positions relative to the base of the grid.  Derivatives are
-    finite differences over powers of two, because adding a power of two to a position causes almost no rounding error.
+    Derivatives are finite differences.  Their increments are powers of two, for small rounding errors.
     """
 
     function: Callable[[NDArray[np.float64]], ArrayLike]  # signed distance, m

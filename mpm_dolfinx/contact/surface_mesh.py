@@ -42,7 +42,7 @@ class Nearest(NamedTuple):
 class Facets:
     """Facets with their normals, for the search of nearest positions.
 
-    Side k of a triangle is the edge from vertex k to the next vertex.  Side k of a segment is vertex k.
+    Side k of a triangle is the edge from vertex k to the next vertex.  In 2D, side k of a segment is its vertex k.
     """
 
     def __init__(self, x: NDArray[np.float64], facets: NDArray[np.int64]):
@@ -75,7 +75,7 @@ class Facets:
         return FacetTree(self.corners)
 
     def inside(self, y: NDArray[np.float64], at: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return which positions y (d, m) project into facets (m,), up to rounding errors."""
+        """Return which positions y (d, m) have their orthogonal projections inside facets (m,)."""
         corners, out, _ = self._columns
         return (((y - corners.take(at, 2)) * out.take(at, 2)).sum(axis=1) <= self._margin).all(axis=0)
 
@@ -84,7 +84,7 @@ class Facets:
         return ((y - self._columns[0][0].take(at, 1)) * self._normal.take(at, 1)).sum(axis=0)
 
     def _from_sides(self, y: NDArray[np.float64], at: NDArray[np.int64]) -> tuple[NDArray, NDArray]:
-        """Return parameters (d, m) along the sides of facets, and vectors (d, d, m) from nearest positions on sides."""
+        """Return the nearest positions on the sides of facets: parameters (d, m), and vectors to y (d, d, m)."""
         corners, _, along = (of.take(at, 2) for of in self._columns)
         offset = y - corners
         share = np.clip((offset * along).sum(axis=1) / self._squares.take(at, 1), 0, 1)
@@ -119,7 +119,7 @@ class Facets:
         return Nearest(facet, part, offset.T)
 
     def part_at(self, y: NDArray[np.float64], at: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the parts of facets (m,), see `Nearest`, at positions y (m, d) on them, up to `rounded`."""
+        """Return the parts of facets (m,), see `Nearest`, that contain positions y (m, d)."""
         d, rows = y.shape[1], np.arange(len(at))
         to_corners = np.linalg.norm(y[:, None] - self.corners[at], axis=2)
         vectors = self._from_sides(np.ascontiguousarray(y.T), at)[1]
@@ -133,24 +133,21 @@ class Facets:
 class SurfaceMesh(Placed):
     """A solid inside a closed surface of triangles in 3D, or inside closed polygons in 2D, convex or not.
 
-    The distance is exact.  The gradient of the distance is the normal of the nearest facet.  If an edge or vertex is
-    nearest, the gradient points away from this edge or vertex.  On edges and vertices, the gradient is the mean of the
-    adjacent normals, weighted by angle.  Facets are flat, so the second derivatives are zero where a facet is nearest.
+    Vertices at a distance below 10^-6 times the size of the mesh are merged.  Facets of zero area are ignored.  The
+    order of the vertices in a facet has no effect.  A surface inside another surface bounds a cavity.  In axisymmetry,
+    the section must extend over both sides of the axis.
 
-    Vertices nearer than 10^-6 times the size of the mesh are merged, as STL files repeat them.  Facets without extent
-    are left out.  The orientation of facets in the input has no effect: normals point out of the solid.  A surface
-    inside another one bounds a cavity.  In axisymmetry, the section must extend over both sides of the axis.
-
-    Contact has one pressure and one normal in each cell.  Contact in a concave edge, or on a part of the solid that is
-    thinner than a cell, is therefore inaccurate.  `volume` and `centroid` of the solid give mass and centre of a tool.
+    Contact has one pressure and one normal in each cell.  Contact is therefore inaccurate in concave edges, and on
+    parts of the solid that are thinner than a cell.  `volume` and `centroid` help to compute the mass and centre of a
+    tool.
 
     Parameters
     ----------
     vertices : (n, d), m
         Positions of the vertices.
     facets : (m, d)
-        Indices of the vertices of each facet, from 0.  By default, in 2D, the vertices follow each other around one
-        polygon.
+        Indices of the vertices of each facet, from 0.  The default, in 2D only, is one polygon through all vertices in
+        the given order.
 
     Raises
     ------
@@ -191,8 +188,8 @@ class SurfaceMesh(Placed):
         Parameters
         ----------
         mesh
-            A file, or a mesh object of meshio.  In 3D its triangles and quadrilaterals are the surface.  If all of
-            them have equal z, its lines are the surface of a solid in 2D.
+            A file, or a mesh object of meshio.  The triangles and quadrilaterals of the mesh are the surface.  In a
+            plane mesh, the lines are the surface of a 2D solid.
         scale
             Unit of length of the mesh, in m, > 0; 1e-3 for a mesh in mm.
 
@@ -248,7 +245,7 @@ class SurfaceMesh(Placed):
 
     @cached_property
     def _normals(self) -> NDArray[np.float64]:
-        """Mean normals (m, 1 + 2 d, d) of the parts of each facet, see `Nearest`."""
+        """Normals (m, 1 + 2 d, d) of the parts of each facet (`Nearest`).  Edges and vertices have mean normals."""
         table, d = self._table, self.vertices.shape[1]
         n = table.normal
         out = np.repeat(n[:, None], 1 + 2 * d, axis=1)
@@ -280,7 +277,7 @@ class SurfaceMesh(Placed):
         return self._near(y)[2]
 
     def distance_up_to(self, y: NDArray[np.float64], limit: float) -> NDArray[np.float64]:
-        """Return the signed distances (n,), in m.  Above `limit`, in m, they may be lower bounds of the distance."""
+        """Return the signed distances (n,), in m, or a lower bound for distances above `limit`, in m."""
         low, high = self._bounds
         out = np.linalg.norm(np.maximum(0, np.maximum(low - y, y - high)), axis=1)
         near = out <= limit
@@ -340,7 +337,7 @@ class SurfaceMesh(Placed):
 
 
 def _merged(x: NDArray[np.float64], facets: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Merge vertices that coincide, and return the vertices and the facets that have extent."""
+    """Merge coincident vertices.  Return the vertices, and the facets that do not degenerate."""
     used, facets = np.unique(facets, return_inverse=True)
     x, same = np.unique(x[used], axis=0, return_inverse=True)
     facets = same.ravel()[facets.reshape(-1, x.shape[1])]
@@ -356,7 +353,7 @@ def _merged(x: NDArray[np.float64], facets: NDArray[np.int64]) -> tuple[NDArray[
 
 
 def _sides(facets: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
-    """Return the distinct sides (q, d - 1) of facets, the side of each facet, and the sense in which it is passed."""
+    """Return the distinct sides (q, d - 1) of facets, and for each facet the indices and orientations of its sides."""
     d = facets.shape[1]
     if d == 2:
         vertex, side = np.unique(facets, return_inverse=True)
@@ -368,9 +365,9 @@ def _sides(facets: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int
 
 
 def _closed(x: NDArray[np.float64], facets: NDArray[np.int64]) -> tuple[NDArray, NDArray]:
-    """Return pairs (q, 2) of facets with a common side, and whether they pass this side in opposite senses.
+    """Return pairs (q, 2) of facets with a common side, and whether both facets have the same orientation.
 
-    Raises ValueError for a side that does not belong to two facets, and for solids that touch in a vertex.
+    Raise ValueError for a side that does not belong to two facets, and for solids that touch in a vertex.
     """
     d = facets.shape[1]
     sides, side, sense = _sides(facets)
@@ -392,7 +389,7 @@ def _closed(x: NDArray[np.float64], facets: NDArray[np.int64]) -> tuple[NDArray,
 
 
 def _outward(x: NDArray[np.float64], facets: NDArray[np.int64], pairs: tuple[NDArray, NDArray]) -> NDArray[np.int64]:
-    """Return the facets with normals out of the solid.  Surfaces inside other surfaces bound cavities."""
+    """Return the facets, oriented so that normals point out of the solid."""
     (one, other), agree = pairs[0].T, pairs[1]
     m = len(facets)
     part, number = linked(m, one, other)
@@ -417,12 +414,12 @@ def _outward(x: NDArray[np.float64], facets: NDArray[np.int64], pairs: tuple[NDA
 
 
 def _flipped(facets: NDArray[np.int64], which: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Return the facets, some of them with the opposite orientation."""
+    """Reverse the orientation of the flagged facets."""
     return np.where(which[:, None], facets[:, ::-1], facets)
 
 
 def _winding(x: NDArray[np.float64]) -> float:
-    """Return how often facets with the vertices x (m, d, d) enclose the origin.
+    """Return the winding number about the origin of the surface with facets x (m, d, d).
 
     Source: van Oosterom and Strackee (1983), for the solid angle of a triangle.
     """

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Tied sides: two opposite sides of a box have equal displacements, as if the ground repeated itself beyond the box.
+"""Tied sides: two opposite sides of a box have equal displacements (periodic boundary condition).
 
-The energy `k/2 int (u_one - u_other)^2 dA` resists differences between the displacements u_one and u_other of both
-sides at equal heights.  The penalty stiffness is k.  Displacements are measured from the seeded positions, so errors do
-not accumulate.  Forces on both sides are equal and opposite.
+The penalty energy is `k/2 int (u_one - u_other)^2 dA`.  Here u_one and u_other are the displacements at opposite
+positions of the two sides, and k is the penalty stiffness.  Displacements are measured from the initial positions of
+the bodies, so errors do not accumulate.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ from mpm_dolfinx.grid.grid import Grid
 
 
 class Tie:
-    """Two opposite tied sides, and their pairs of faces at equal heights.
+    """Two opposite tied sides, and their pairs of opposite faces.
 
-    `partner` (n,): index of the opposite face of each face of one side.
-    `offset` (n, d), in m: vector to the opposite face.
+    `partner` (n,): index of the face on the other side, for each face on the first side.
+    `offset` (n, d), in m: vector to this opposite face.
     `axis`: axis normal to the sides.
     """
 
@@ -133,7 +133,7 @@ class TieLoads(Loads):
         self._operator: Latest[PETSc.Mat] = Latest()
 
     def _B(self, unknowns: Unknowns) -> PETSc.Mat:
-        """Return the matrix B, which maps the unknowns to differences of displacements."""
+        """Return the matrix that maps the unknowns to differences of displacements between both sides."""
         return self._operator((unknowns,), lambda: self._difference(unknowns), self._grid.comm)
 
     def push(self, at: At, residual: PETSc.Vec, on: Unknowns) -> None:
@@ -146,14 +146,14 @@ class TieLoads(Loads):
         B.multTransposeAdd(w, residual, residual)
 
     def moved(self, u: fem.Function) -> Loads:
-        """Return the ties with u added to the displacements of all nodes."""
+        """Return the ties after an additional displacement u of the nodes."""
         out = copy(self)
         out._rest = u.x.array.copy()
         return out
 
     @property
     def held_cells(self) -> NDArray[np.int32]:
-        """Cells at both tied sides."""
+        """Cells along both tied sides."""
         cell, other = self._cells
         return np.append(cell, on_owners(self._grid, other))
 

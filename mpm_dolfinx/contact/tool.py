@@ -20,14 +20,14 @@ AS_CELL = [0, 1, 2, 2, 0, 1, 2, 2]  # corners of a triangle at the corners of a 
 
 
 class Pose(NamedTuple):
-    """Pose of a tool: a rotation about `centre` (d,), in m, followed by a translation."""
+    """Pose of a tool: a rotation R about `centre` (d,), in m, and then a translation `shift` (d,), in m."""
 
     R: NDArray[np.float64]
     centre: NDArray[np.float64]
     shift: NDArray[np.float64]
 
     def own(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return positions in the frame of the tool, in which the tool is in its initial position."""
+        """Convert current positions x (m, d) to positions in the frame of the tool."""
         y = x - self.shift
         return y + (y - self.centre) @ (self.R - np.eye(len(self.R)))  # exact without rotation
 
@@ -36,7 +36,7 @@ class Pose(NamedTuple):
         return y + self.shift + (y - self.centre) @ (self.R - np.eye(len(self.R))).T
 
     def moved(self, by_forces: NDArray[np.float64]) -> Pose:
-        """Return the pose after a further motion: displacement (d,), in m, and possibly rotation, in rad."""
+        """Return the pose after a further displacement (d,), in m.  A further number is a rotation, in rad."""
         d = len(self.R)
         R = rotation(by_forces[d]) @ self.R if by_forces[d:].any() else self.R
         return Pose(R, self.centre, self.shift + by_forces[:d])
@@ -48,7 +48,7 @@ def rotation(angle: float) -> NDArray[np.float64]:
 
 
 def motion_by_forces(outcome: Mapping[str, Mapping[str, NDArray]], name: str) -> NDArray[np.float64]:
-    """Return the displacement, in m, and possibly the rotation, in rad, of a tool due to forces."""
+    """Return the displacement, in m, of a tool due to forces, and the rotation, in rad, of a free tool."""
     angle = outcome.get("tool_rotation", {})
     by_forces = outcome["tool_travel"][name]
     return np.append(by_forces, angle[name]) if name in angle else by_forces
@@ -56,50 +56,49 @@ def motion_by_forces(outcome: Mapping[str, Mapping[str, NDArray]], name: str) ->
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Tool:
-    """Rigid tool in contact with the surface of the bodies, at any position of the surface.
+    """Rigid tool, for example a footing, pile or indenter, in contact with the bodies.
 
-    Bodies cannot penetrate the tool, but may separate from it.  Sides in contact keep their hydraulic condition.
-    `tool_forces` of the simulation are the forces and moments of the tool on the bodies.
+    Bodies cannot penetrate the tool, but may separate from it.  Contact does not change hydraulic boundary conditions.
+    `Simulation.tool_forces` contains the forces and moments of the tool on the bodies.
 
     Parameters
     ----------
     shape : HalfSpace, Ball, Convex, Cone, SurfaceMesh, or callable y (m, d) -> (m,), m
-        The tool in its initial position.  A function returns the signed distance, positive outside the tool.
+        The tool in its initial position.  A function gives the signed distance from the tool, positive outside.
     displacement : (d,) or callable t (s) -> (d,), m
-        Displacement from the initial position, also in later stages; in axisymmetry only along the axis.
+        Displacement from the initial position.  In axisymmetry, the displacement must be along the axis.
     rotation_rad : float or callable t (s) -> float, rad
-        Counterclockwise rotation about `centre`.  The tool is rotated first, and then displaced.  Tools can rotate only
-        in 2D, and not in axisymmetry.
+        Counterclockwise rotation about `centre`, applied before the displacement.  Tools rotate in plane strain only.
     centre : (d,), m
-        Centre of rotation, reference of moments, and centre of mass of a free tool.  The centre moves with the tool.
-        The default is the centroid of a free disc or polygon, and the origin for other tools.
+        Centre of rotation, at the initial position of the tool.  Moments are about this centre.  In a free tool, it is
+        the centre of mass.  The default is the centroid of a free disc or polygon, and the origin for other tools.
     friction
         Coulomb's coefficient mu, >= 0.
     adhesion
-        Additional shear strength of the contact, Pa, >= 0.  An adhesion above ten times the normal pressure is reduced
-        to ten times this pressure.  For undrained soil, use alpha s_u with friction 0.
+        Additional shear strength of the contact, Pa, >= 0.  The adhesion is at most ten times the normal pressure.  For
+        undrained soil, use the product of the adhesion factor and s_u, with friction 0.
     load : float or callable t (s) -> float, N (N/m in plane strain), >= 0
-        The load acts from the first step on.  The tool moves along `direction` so that the reaction equals the load.
-        This motion is added to `displacement`, and is in `tool_travel` of the simulation.  The tool must start in
-        contact, or less than a cell away.  In axisymmetry, the load acts on the whole circumference.
+        Force on the tool along `direction`.  The tool moves along `direction` until the reaction equals the load.  This
+        motion is added to `displacement`, and `Simulation.tool_travel` contains it.  At the start, the gap between tool
+        and body must be smaller than a cell.  In axisymmetry, the load is the total over the circumference.
     direction : (d,)
         Direction of the load, of any length.  In axisymmetry, it must be along the axis.
     mass
-        Mass of a free tool, kg (kg/m in plane strain), > 0, for bodies with inertia.  The tool starts at its initial
-        position plus `displacement`.  Weight, load and contact forces move the tool along `direction`, by default in
-        any direction.  The tool keeps its position while an initial stress is balanced.  Results are the displacement
-        `tool_travel` (d,), in m, and the velocity `outcome("tool_velocity")` (d,), in m/s.
+        Mass of a free tool, kg (kg/m in plane strain), > 0, for scenes with inertia.  Weight, load and contact forces
+        move a free tool along `direction`, or by default in any direction.  The motion starts at the initial position
+        plus `displacement`.  Results are the displacement `tool_travel` (d,), in m, and the velocity
+        `outcome("tool_velocity")` (d,), in m/s.
     velocity : (d,), m/s
         Initial velocity of a free tool.
     moment
-        Moment of inertia of a free tool about `centre`, kg m^2 (kg m in plane strain), > 0; only in 2D.  The default is
-        the moment of inertia of a uniform disc or polygon.  Other shapes, and tools with `direction`, rotate only if
-        `moment` is specified.  Results are `outcome("tool_rotation")`, in rad, and `outcome("tool_spin")`, in rad/s.
+        Moment of inertia of a free tool about `centre`, kg m, > 0; only in plane strain.  The default for a disc or
+        polygon is the moment of inertia of a uniform solid.  Other shapes, and tools with `direction`, rotate only with
+        a given `moment`.  Results are `outcome("tool_rotation")`, in rad, and `outcome("tool_spin")`, in rad/s.
     spin
         Initial angular velocity of a free tool, rad/s, counterclockwise.
     name
-        Name of the tool in results; by default "tool".  The field NAME_pressure of points is the contact pressure.  In
-        a later stage, a tool of equal name takes over this pressure.
+        Name of the tool in results; by default "tool".  The point field NAME_pressure is the contact pressure.  A tool
+        with the same name in a later stage continues with this pressure.
 
     Raises
     ------
@@ -149,7 +148,7 @@ class Tool:
             self.pushes(0.0)
 
     def _check_free(self) -> None:
-        """Raise an error for an invalid mass, or other invalid arguments of a free tool."""
+        """Raise an error for invalid arguments of a free tool."""
         if self.mass is None:
             of_free = {"velocity": self.velocity is None, "moment": self.moment is None, "spin": self.spin == 0}
             for name in [name for name, absent in of_free.items() if not absent][:1]:
@@ -212,7 +211,7 @@ class Tool:
         return value
 
     def _given(self, name: str, t: float, dim: int = 0) -> NDArray[np.float64]:
-        """Return the value of an attribute at time t, in s: a number, or possibly a vector if `dim` > 0."""
+        """Return the value of an attribute at time t, in s.  A vector has `dim` components."""
         return given(f"{line(self)}: {name} at t = {t:g} s", getattr(self, name), t, None, dim)
 
     def along(self, dim: int) -> NDArray[np.float64]:
@@ -243,7 +242,7 @@ class Tool:
     def gap(self, y: NDArray[np.float64], h: float) -> NDArray[np.float64]:
         """Return the signed distances (n,), in m, of positions y (n, d) in the frame of the tool.
 
-        Distances above the cell size `h`, in m, may be lower bounds.
+        For distances above the cell size `h`, in m, the result may be a lower bound.
         """
         solid = self.solid(h)
         return solid.distance_up_to(y, h) if isinstance(solid, SurfaceMesh) else solid.distance(y)
@@ -289,8 +288,8 @@ class Tool:
     def pose(self, t: float, dim: int, by_forces: NDArray[np.float64] | float = 0.0) -> Pose:
         """Return the pose at time t (s).
 
-        `by_forces`, in m: displacement that the load causes.  For a free tool, `by_forces` is a vector of the
-        displacement (d,), in m, and possibly the rotation, in rad.
+        `by_forces`: displacement along the load, in m, of a tool with a load.  For a free tool, `by_forces` is the
+        displacement (d,), in m.  If the free tool rotates, the rotation, in rad, is appended.
         """
         shift = self._given("displacement", t, dim)
         if shift.ndim == 0 and shift:
@@ -302,8 +301,8 @@ class Tool:
     def drawn(self, grid: Grid, t: float, by_forces: NDArray[np.float64] | float = 0.0) -> NDArray[np.float64]:
         """Return the corners (n, 2^d, d), in m, of the grid cells inside the tool at time t (s), for pictures.
 
-        Corners outside the tool are projected onto its surface, so edges are blunt by a fraction of a cell.  The facets
-        of a `SurfaceMesh` in 3D are drawn instead, as flat cells.  `by_forces`: see `pose`.
+        Corners of partly covered cells are projected onto the surface of the tool.  For a `SurfaceMesh` in 3D, the
+        result contains its facets as flat cells.  `by_forces`: see `pose`.
         """
         pose = self.pose(t, grid.dim, by_forces)
         if isinstance(self.shape, SurfaceMesh) and grid.dim == 3:

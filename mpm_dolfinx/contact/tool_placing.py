@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Tools of a stage: their poses, the contact pairs in a step, and checks for penetration."""
+"""The tools of a stage: poses, contact pairs, and checks for penetration."""
 
 from __future__ import annotations
 
@@ -30,24 +30,24 @@ from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
 from mpm_dolfinx.points.material_points import MaterialPoints, middle
 
 NEAR = 0.1
-"""Distance from a tool, in cell sizes, below which corners follow the Q1 field. Plateau (scene "tool" of
+"""Distance from a tool, in cell sizes, below which domain corners move by the Q1 field. Plateau (scene "tool" of
 tests/plateaus.py): half this value changes the result by 4.1e-03, twice this value by 1.5e-03, and finer cells by
 7.1e-02."""
 FACING = 0.5  # smallest cosine between the normal of a face that faces the tool and the direction to the tool
 
 
 def _box(x: NDArray[np.float64]) -> list[tuple[NDArray[np.float64], MPI.Op]]:
-    """Return both corners of the box around x, each with the MPI operation that combines processes."""
+    """Return both corners of the bounding box of x, each with the MPI operation for the box of all processes."""
     return [(x.min(axis=0, initial=np.inf), MPI.MIN), (x.max(axis=0, initial=-np.inf), MPI.MAX)]
 
 
 def motion_count(dim: int) -> int:
-    """Return the number of motions of a tool: d displacements, and in 2D a rotation."""
+    """Return the number of degrees of freedom of a tool: d displacements, and in 2D a rotation."""
     return dim + (dim == 2)
 
 
 class LoadMotion(NamedTuple):
-    """Motions of tools that forces cause in a step."""
+    """Displacements and rotations of tools by forces, at the start and the end of a step."""
 
     start: float  # start of the step, s
     end: float  # end of the step, s
@@ -98,7 +98,7 @@ class Tools(Touching):
         return [tool.rotates(self.grid.dim) and not self.grid.axisymmetric for tool in self.tools]
 
     def going(self, by_loads: LoadMotion, end: float | None = None) -> Tools:
-        """Return the tools with the motion that loads cause in a step."""
+        """Return the tools with a given motion by loads."""
         tools = copy(self)
         tools.by_loads, tools._end = by_loads, end
         return tools
@@ -108,7 +108,7 @@ class Tools(Touching):
         return self._pose(self.tools[number], t)
 
     def _posed(self, tool: Tool, start: float, t: float) -> Pose:
-        """Return the pose of a tool at the end of a substep, corrected for second-order velocities with inertia."""
+        """Return the pose of a tool at the end of a substep.  With inertia, velocities are of second order."""
         pose = self._pose(tool, t)
         if self._end is None or not start < t < self._end or tool.free:
             return pose
@@ -122,7 +122,7 @@ class Tools(Touching):
         return pose._replace(shift=shift, R=rotation(angle) @ before.R)
 
     def _pose(self, tool: Tool, t: float) -> Pose:
-        """Return the pose of a tool at time t, or raise ValueError for motions that axisymmetry excludes."""
+        """Return the pose of a tool at time t.  Raise ValueError for a motion that is not axisymmetric."""
         pose = tool.pose(t, self.grid.dim, self.by_loads.at(t)[self.tools.index(tool)])
         if self.grid.axisymmetric and (pose.shift[0] or pose.R[0, 1]):
             what = f"moves by {pose.shift}{' and rotates' * bool(pose.R[0, 1])} at t = {t:g} s"
@@ -143,11 +143,11 @@ class Tools(Touching):
         return out | {quantity: values for quantity, values in of_free.items() if values}
 
     def _before(self, place: Place) -> NDArray[np.float64]:
-        """Return the displacements of tools due to loads before a step, with rotations of free tools."""
+        """Return the displacements and rotations of tools by forces before a step."""
         return self._motions(place.before, "tool_travel", "tool_rotation")
 
     def _motions(self, before: Outcome, along: str, around: str) -> NDArray[np.float64]:
-        """Return the displacements and rotations (tools, q) of tools by forces, or the rates of both."""
+        """Return displacements and rotations of tools (tools, q), or their rates, from the results of a step."""
         d = self.grid.dim
         out = np.zeros((len(self.tools), motion_count(d)))
         for row, name, tool in zip(out, self.names, self.tools, strict=True):
@@ -164,10 +164,7 @@ class Tools(Touching):
         return MovedToolLoads(tools, place, moved=moved) if moved.guides.any() else ToolLoads(tools, place)
 
     def _moved(self, place: Place) -> Moved:
-        """Return the tools that forces move: free tools with inertia, and load-controlled tools without inertia.
-
-        No tool moves while an initial stress is balanced.
-        """
+        """Return the data of tools that forces move.  No tool moves while an initial stress is balanced."""
         d, q = self.grid.dim, motion_count(self.grid.dim)
         of = [tool for tool in self.tools if tool.free or (tool.load is not None and place.t > place.start)]
         moves = [tool in of and tool.free == place.inertia for tool in self.tools]
@@ -221,10 +218,10 @@ class Tools(Touching):
     def _edge(
         self, tool: Tool, pose: Pose, x: NDArray[np.float64], unit: NDArray[np.float64], faces: NDArray[np.bool_]
     ) -> NDArray[np.bool_]:
-        """Return which positions that face a tool lie within half a cell of an edge of the tool.
+        """Return which positions below a tool are within half a cell of an edge of the tool.
 
-        The last loaded node also represents half a cell outside the edge, so half a cell inside has no contact.  Edges
-        beyond which the body ends are ignored.  A tool narrower than a cell keeps its whole contact.
+        These positions have no contact, because the last loaded node also represents half a cell outside the edge.
+        Edges of the tool beyond the end of the body are ignored.
         """
         grid, (y, n) = self.grid, (x[faces], unit[faces])
         h = grid.sizes_at(y)
@@ -254,7 +251,7 @@ class Tools(Touching):
         return edge if over_all(grid.comm, int((~edge).sum())) else np.zeros_like(edge)
 
     def _warn_light(self, place: Place) -> None:
-        """Warn of free tools that are lighter than the half cell which a strike stops at once."""
+        """Warn of free tools that are lighter than half a cell of the body."""
         free = [tool for tool in self.tools if tool.free]
         if not (free and place.inertia and place.dt):
             return
@@ -268,10 +265,7 @@ class Tools(Touching):
                 warn(grid.comm, ResolutionWarning, what + "which it strikes; use smaller cells", line(tool), half)
 
     def check_start(self, place: Place) -> None:
-        """Raise an error for tools inside a body at the start.
-
-        A tool that is in contact from earlier steps may be as deep as at the end of a step, see `check_end`.
-        """
+        """Raise an error for tools inside a body at the start of the stage."""
         self._warn_light(place)
         before, t = self._before(place), place.start
         points = place.points
@@ -285,7 +279,7 @@ class Tools(Touching):
                 raise ValueError(f"{what}, must be outside of all bodies, or touch them")
 
     def check_end(self, place: Place, points: MaterialPoints, before: MaterialPoints) -> None:
-        """Raise an error if a tool contains points, touches prescribed sides, or has crossed a body in a step."""
+        """Raise an error if a tool contains points, touches prescribed sides, or has crossed a body in the step."""
         t = place.t
         x, start = (of.within() for of in (points, before))
         for tool in self.tools:
@@ -304,10 +298,7 @@ class Tools(Touching):
                 raise NotConverged(f"{line(tool)}: has passed through a body within a step, at {where}")
 
     def near(self, corners: NDArray[np.float64], t: float) -> NDArray[np.bool_]:
-        """Return which corners (n, 2^d, d) of domains touch tools at time t (s).  Such corners follow the Q1 field.
-
-        The tool would reverse any other motion of these corners in the next step, and pressures would oscillate.
-        """
+        """Return which corners (n, 2^d, d) of domains are within `NEAR` cells of a tool at time t (s)."""
         out, h = np.zeros(corners.shape[:2], dtype=bool), self.grid.least
         for tool in self.tools:
             out |= self._gaps(tool, corners, t) < NEAR * h
@@ -316,15 +307,10 @@ class Tools(Touching):
     def pushed_out(
         self, corners: NDArray[np.float64], t: float, free: NDArray[np.bool_], most: float
     ) -> NDArray[np.float64]:
-        """Return the corners of domains.  Small penetrations into tools are reduced to twice `DEPTH`.
+        """Return the corners (n, 2^d, d) of domains at time t (s), after a correction of penetrations into tools.
 
-        Tools constrain means over cells.  Without this correction, corners of sliding domains would stay inside a tool.
-        A linear penetration with the mean `DEPTH` is at most twice `DEPTH`.  Zero would roughen the stress.
-
-        `corners` (n, 2^d, d), in m: corners of the domains.
-        `t`, in s: time.
-        `free` (n, 2^d, d): whether no other condition prescribes a component.
-        `most`: largest corrected penetration, divided by the cell size.
+        The correction reduces penetrations of at most `most` cell sizes to twice `DEPTH` cell sizes.  Only the
+        components flagged by `free` (n, 2^d, d) change.
         """
         out, h = corners.copy(), self.grid.least
         for tool in self.tools:
@@ -343,9 +329,9 @@ class Tools(Touching):
         return gap.reshape(corners.shape[:2])
 
     def _passed(self, tool: Tool, x: tuple[NDArray[np.float64], ...], times: tuple[float, ...]) -> str:
-        """Return, as text, a position whose path between two times crosses a tool, or "" without a crossing.
+        """Return, as text, a position at which the path from x[0] to x[1] crosses a tool, or "" without a crossing.
 
-        Straight paths from x[0] to x[1] are searched in steps of the distance to the tool (sphere tracing: Hart 1996).
+        Source: Hart (1996), for sphere tracing.
         """
         h, comm = self.grid.least, self.grid.comm
         y, end = (self._pose(tool, t).own(at) for at, t in zip(x, times, strict=True))
@@ -406,7 +392,7 @@ class ToolLoads(ContactProblem):
         return SubstepMotion(self.shares.own, self.pairs.poses)
 
     def tool_velocity(self, at: At) -> NDArray[np.float64] | float:
-        """See `ContactProblem`.  The velocity follows from the time integration of the tool's positions."""
+        """See `ContactProblem`."""
         pairs = self.pairs
         moved = pairs.carried - pairs.now
         if self._earlier is not None:
@@ -426,7 +412,7 @@ class ToolLoads(ContactProblem):
         return out
 
     def outcome(self, at: At) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """See `Loads`.  Results are also displacements (m) by forces: vectors of free tools, else along the load."""
+        """See `Loads`.  Further results are the displacements of tools by forces, in m."""
         d, displacement = self.grid.dim, {}
         motion = (self.before + self.found(at).motion)[:, :d]
         for name, tool, by_forces in zip(self.now.law.names, self.now.law.contacts, motion, strict=True):
@@ -440,7 +426,7 @@ class ToolLoads(ContactProblem):
     def outside(
         self, corners: NDArray[np.float64], free: NDArray[np.bool_], everywhere: bool = False
     ) -> NDArray[np.float64]:
-        """See `Loads`.  Corners are moved out of the tools."""
+        """See `Loads`."""
         return self._tools.pushed_out(corners, self._place.t, free, np.inf if everywhere else NEAR)
 
     def check_end(self, points: MaterialPoints, before: MaterialPoints) -> None:
@@ -449,4 +435,4 @@ class ToolLoads(ContactProblem):
 
 
 class MovedToolLoads(MovedTools, ToolLoads):
-    """Contact loads of tools, of which at least one is moved by forces."""
+    """Contact loads of tools, if forces move at least one tool."""
