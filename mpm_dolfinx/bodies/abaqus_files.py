@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Reader of input files of Abaqus and CalculiX, with placed instances, element sets and surfaces.
+"""Reader of input files of Abaqus and CalculiX, with positions of instances, element sets and surfaces.
 
-meshio's own reader keeps only the nodes of the last part, and ignores the placement of instances.
+The reader of meshio keeps only the nodes of the last part, and ignores the positions of instances.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ class _Scope:
 
 @dataclass
 class _Placed:
-    """Definitions of a part, and the placement of one instance."""
+    """Definitions of a part, and the position and rotation of one instance."""
 
     scope: _Scope
     name: str = ""
@@ -80,7 +80,7 @@ class _Placed:
     rotation: tuple[float, ...] = ()
 
     def places(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the positions of an instance: the part's positions are translated, then rotated."""
+        """Return the node positions of an instance: nodes of the part are translated, and then rotated."""
         x = x + self.shift
         if not self.rotation:
             return x
@@ -100,12 +100,12 @@ def is_abaqus(file: Path) -> bool:
 
 
 def read(file: Path) -> meshio.Mesh:
-    """Return the mesh of an input file, with element sets and instances as parts, and surfaces as sides."""
+    """Return the mesh of an input file.  Element sets and instances become parts, and surfaces become sides."""
     return _assembled(_placed(file))
 
 
 def _keywords(file: Path) -> Iterator[tuple[str, dict[str, str], list[str]]]:
-    """Yield all keywords of a file and of the files it includes."""
+    """Yield all keywords of a file and of its included files."""
     keyword, rows = "", []
     with file.open(errors="replace") as lines:
         for line in map(str.strip, lines):
@@ -260,9 +260,9 @@ def _assembled(placed: list[_Placed]) -> meshio.Mesh:
 def _unique(
     numbers: list[NDArray[np.int64]], what: str, x: NDArray[np.float64] | None = None
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the sorted node or element numbers, and the permutation that sorts these numbers.
+    """Return the sorted node or element numbers, and their permutation.
 
-    A repeated number raises ValueError, except for nodes at equal positions.
+    Repeated numbers raise ValueError.  Two nodes may have the same number if their positions are equal.
     """
     numbers = np.concatenate([np.empty(0, np.int64), *numbers])
     order = np.argsort(numbers, kind="stable")

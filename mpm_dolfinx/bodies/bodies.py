@@ -19,10 +19,10 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Body:
-    """A seeded body: the reference geometry of all its particle domains.  Every process has an equal object.
+    """A seeded body: the reference geometry of all its particle domains, on every process.
 
-    Each domain is the image of a reference domain under `map`: of a box on a lattice, or of a part of a mesh cell.
-    Large bodies are processed in chunks, so no array over all domains is stored.
+    A reference domain is a box of a lattice, or a part of a mesh cell.  The function `map` moves its corners to the
+    seeded domain.
     """
 
     material: int = 0  # index in the scene's list of materials
@@ -93,15 +93,16 @@ class Body:
         return self.facing(*SIDES[self.dim][name]) if name in self.names else (np.empty(0, np.int64),) * 2
 
     def facing(self, axis: int, end: int, least: float = 0.0) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the surface faces at the lower (0) or upper (1) end of an axis, as domains (n,) and face indices (n,).
+        """Return the surface faces with normals along an axis, as domains (n,) and face indices (n,).
 
-        In bodies from meshes, the largest component of a face's unit normal points to this end, and exceeds `least`.
+        `end`: 0 for normals in the negative direction, 1 for the positive direction.
+        `least`: in bodies from meshes, smallest component of the unit normals along the axis.
         """
         row = self._with_face(axis, end)
         return row, np.full(len(row), 2 * axis + end)
 
     def _with_face(self, axis: int, end: int) -> NDArray[np.int64]:
-        """Return the domains whose face at an end of an axis lies on the surface."""
+        """Return the domains with a surface face at the lower (0) or upper (1) end of an axis."""
         rows = [part.start + np.flatnonzero(self.sides_of(part)[:, axis, end]) for part in in_chunks(len(self))]
         return np.concatenate([np.empty(0, np.int64), *rows])
 
@@ -137,7 +138,7 @@ class Body:
         return images.reshape(X.shape)
 
     def bend(self, chosen: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the distances, in m, of straight edges of chosen domains from the curved images of box edges."""
+        """Return the largest distance, in m, between the straight edges of domains and the curved images of edges."""
         out = np.zeros(len(chosen))
         if self.map is None:
             return out
@@ -159,7 +160,7 @@ class Body:
         return sum(float(self.boxes(part).prod(axis=1).sum()) for part in in_chunks(len(self)))
 
     def size(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
-        """Return the edge lengths (n, d), in m, of chosen boxes, scaled uniformly to the volumes of their domains."""
+        """Return the edge lengths (n, d), in m, of boxes with the volumes of the chosen domains."""
         boxes = self.boxes(chosen)
         if self.aligned:
             return boxes
@@ -169,7 +170,7 @@ class Body:
 
 @dataclass(frozen=True, eq=False)
 class Later:
-    """A body that is absent until `Simulation.stage` adds it: `Simulation(grid, [ground, Later(fill)], ...)`."""
+    """A body that `Simulation.stage` adds in a later stage: `Simulation(grid, [ground, Later(fill)], ...)`."""
 
     body: Body
 
@@ -191,10 +192,10 @@ class Moving:
 
 
 def mapped(grid: Grid, body: Body, map: Callable[[NDArray[np.float64]], NDArray[np.float64]]) -> Body:
-    """Return a body deformed by a map: its boxes become quadrilaterals or hexahedra.
+    """Return a body with another initial shape: a map moves the corners of its particle domains.
 
-    Regions, probes, and the positions X in functions for materials and displacements refer to the shape before all
-    maps.  Contact, overlap, loads and the check for flat sides use the mapped shape.  Sides keep their names.
+    Reference positions X refer to the shape before the map, also in regions, probes and functions of X.  Sides keep
+    their names.
 
     Parameters
     ----------
@@ -203,12 +204,13 @@ def mapped(grid: Grid, body: Body, map: Callable[[NDArray[np.float64]], NDArray[
     body
         Body from `box`, `shape`, `from_mesh`, `polygon`, or `mapped`.  An earlier map is applied first.
     map
-        Smooth function from positions (n, d) to positions (n, d) in the grid, both in m.  It preserves orientation.
+        Smooth function from positions (n, d) to positions (n, d) in the grid, both in m.  The Jacobian determinant must
+        be positive.
 
     Raises
     ------
     ValueError
-        The map raises an exception, returns nan or an array of a wrong shape, leads out of the grid, or inverts a box.
+        The map raises an exception, or returns invalid values.  A mapped domain is inverted, or outside the grid.
     """
     begin_with("body: grid", grid)
     instance("body to map", body, Body)
@@ -281,7 +283,7 @@ def material_points(
 
 
 def _own(grid: Grid, body: Body) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the domains whose centroids lie in cells of this process, and the corners of these domains."""
+    """Return the domains with centroids in cells of this process, and the corners of these domains."""
     rows, corners = [np.empty(0, dtype=np.int64)], [np.empty((0, 2**grid.dim, grid.dim))]
     for part in in_chunks(len(body)):
         of_part = body.corners(part) - grid.base

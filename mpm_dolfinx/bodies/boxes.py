@@ -18,7 +18,7 @@ from mpm_dolfinx.grid.grid import MOST, Grid, among, begin_with, corner_bits, in
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LatticeBody(Body):
-    """A body that consists of all or some boxes of a lattice, whose rows may have different widths."""
+    """A body of boxes on a lattice.  The rows of the lattice may have different widths."""
 
     rows: tuple[NDArray[np.float64], ...]  # coordinates of the rows' boundaries along each axis (count + 1,), m
     widths: tuple[NDArray[np.float64], ...]  # widths of the rows along each axis (count,), m
@@ -71,7 +71,7 @@ class LatticeBody(Body):
     def reference(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
         """Return the reference positions (n, 2^d, d), in m, of corners of the chosen domains, before the map.
 
-        A corner has bitwise equal coordinates in all its domains, so rounding opens no gaps between domains.
+        The coordinates of a common corner are bitwise equal in all its domains.
         """
         return self._at(self._index(chosen)[:, None] + corner_bits(self.dim))
 
@@ -89,7 +89,7 @@ class LatticeBody(Body):
         return out
 
     def _with_face(self, axis: int, end: int) -> NDArray[np.int64]:
-        """Return the domains whose face at an end of an axis lies on the surface."""
+        """See `Body`."""
         if self.filled is not None:
             return super()._with_face(axis, end)
         along = [np.arange(n) for n in self.count]
@@ -111,7 +111,7 @@ class LatticeBody(Body):
         return self._at(low), self._at(high + 1)
 
     def neighbour(self, rows: NDArray[np.int64], step: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the domains (n,) at a number of lattice steps (n, d) from the domains `rows` (n,)."""
+        """Return the neighbours (n,) of domains `rows` (n,) at lattice offsets `step` (n, d)."""
         number = np.ravel_multi_index(tuple((self._index(rows) + step).T), self.count)
         return number if self.filled is None else np.searchsorted(self.filled, number)
 
@@ -160,7 +160,7 @@ def _rounded(rows: NDArray[np.float64]) -> NDArray[np.int64]:
 
 
 def box(grid: Grid, lower: ArrayLike, upper: ArrayLike, per_cell: int = 2, material: int = 0) -> Body:
-    """Seed the box [lower, upper] with a lattice of points whose domains fill it exactly, and return the body.
+    """Return a box-shaped body, seeded with material points on a lattice.
 
     Parameters
     ----------
@@ -169,9 +169,8 @@ def box(grid: Grid, lower: ArrayLike, upper: ArrayLike, per_cell: int = 2, mater
     lower, upper : (d,), m
         Corners of the box, inside the grid.  Corners need not lie on grid lines.
     per_cell
-        Points per cell and direction, >= 1, rounded to fit the box.  In grids of unequal cells, domains end at grid
-        lines.  With 1 point, bodies deflect too much and creep; a warning names slender bodies.  In 3D, a body that
-        ends at grid lines needs more than one domain in each cell.
+        Points per cell and direction, >= 1, rounded so that whole domains fill the box.  With 1 point, bodies are too
+        flexible and creep.  In 3D, use at least 2.
     material
         Index of the material in the scene's list, >= 0.
 
@@ -195,10 +194,10 @@ def box(grid: Grid, lower: ArrayLike, upper: ArrayLike, per_cell: int = 2, mater
 def shape(
     grid: Grid, inside: Callable[[NDArray[np.float64]], NDArray[np.bool_]], per_cell: int = 2, material: int = 0
 ) -> Body:
-    """Seed a body from a lattice over the whole grid, and return it.
+    """Return a body of arbitrary shape, seeded with material points on a lattice.
 
-    The body consists of all domains of the lattice with centres inside a shape.  The surface of the body has steps of
-    the size of a domain.  `mapped` gives bodies with smooth sides.
+    The body consists of all lattice boxes with centres inside the shape, so its surface has steps.  For smooth sides,
+    use `polygon`, `from_mesh` or `mapped`.
 
     Parameters
     ----------
@@ -214,7 +213,8 @@ def shape(
     Raises
     ------
     ValueError
-        `inside` raises an exception, returns no booleans or is False everywhere; `per_cell` or `material` is invalid.
+        `inside` raises an exception, returns other values than booleans, or is False everywhere.  `per_cell` or
+        `material` is invalid.
     """
     begin_with("body: grid", grid)
     material, per_cell = whole("body: material", material, 0), whole("body: per_cell", per_cell)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Surface of the bodies: faces on a side or in a region, without parts that touch other bodies."""
+"""Surface of the bodies: faces of particle domains on a side or in a region."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ TANGENTIAL = {d: np.array([[a for a in range(d) if a != axis] for axis in range(
 class Surface:
     """Faces of particle domains on one side of the bodies.
 
-    Every process has the same faces.  Parts of faces that touch another body are left out.  The remaining part of a
-    face is divided into polygons of up to four corners.  Arrays have a row for each of m polygons.
+    Every process has the same faces.  Parts of faces in contact with another body are excluded.  The rest of each face
+    is divided into triangles and quadrilaterals.  Arrays have one row for each of these m polygons.
     """
 
     id: NDArray[np.int64]  # identifier of the material point (m,), ascending
@@ -53,7 +53,7 @@ class Surface:
         return len(self.id)
 
     def off_axis(self) -> Surface:
-        """Return the surface without the faces on the axis of revolution, which have no area."""
+        """Return the surface without faces on the axis of revolution."""
         off = self.places()[:, :, 0].max(axis=1, initial=0.0) > SAME * self.whole0
         if off.all():
             return self
@@ -106,7 +106,7 @@ class Surface:
         return np.stack([self.corners.min(axis=1), self.corners.max(axis=1)], axis=1)
 
     def check_apart(self, others: Surface, conditions: tuple[Any, Any]) -> None:
-        """Raise an error if two conditions that exclude each other act on the same part of a face."""
+        """Raise an error if two incompatible conditions act on the same part of a face."""
         first, stop = (np.searchsorted(others.id, self.id, end) for end in ("left", "right"))
         a, b = ranges(first, stop - first)  # all pairs of faces of the same domain
         same = self.face[a] == others.face[b]
@@ -124,10 +124,7 @@ Region = tuple[ArrayLike, ArrayLike]
 
 
 def limits(region: Region | None, dim: int) -> NDArray[np.float64]:
-    """Return the lower and upper corners (2, d) of a region, in m, or infinite corners without a region.
-
-    Equal regions give equal bytes (`tobytes`), so that the bytes can serve as a cache key.
-    """
+    """Return the lower and upper corners (2, d) of a region, in m, or infinite corners for None."""
     if region is None:
         return np.repeat([[-np.inf], [np.inf]], dim, axis=1)
     allowed = f"two corners of {dim} coordinates each, the lower first"
@@ -138,16 +135,14 @@ def limits(region: Region | None, dim: int) -> NDArray[np.float64]:
 def surface(
     bodies: Sequence[Body], name: str | None, region: Region | None = None, present: Sequence[bool] | None = None
 ) -> Surface:
-    """Return the faces on a side of the active bodies, without the parts that touch other bodies.
-
-    The seeded shapes after the maps determine the parts in contact, because bodies in contact stick permanently.
+    """Return the faces on a side of the active bodies, without parts in contact with other bodies at seeding.
 
     Parameters
     ----------
     name
         Side: "left", "right", "bottom", "top", in 3D also "front", "back", or a name from a mesh.  None: all sides.
     region : ((d,), (d,)), m
-        Box of reference positions.  Faces are limited to their parts inside this box.
+        Box of reference positions that limits the faces.
     present
         Whether each body is active; by default all bodies are.
     """
@@ -209,7 +204,7 @@ def _limited(
     t: NDArray[np.float64],
     region: NDArray[np.float64],
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Limit parts of faces to a region, and return each limited part with its face."""
+    """Clip parts of faces to a region.  Return the index of the face of each clipped part, and its corners."""
     dim, three = body.dim, (t[:, 2] == t[:, 3]).all(axis=1)
     X = _face_corners(body, row[part], face[part])
     bent = np.zeros(len(X), dtype=bool)
@@ -242,7 +237,7 @@ def _along_axes(X: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 
 def _interval(X: NDArray[np.float64], region: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the face coordinates that bound the part of each face inside a region."""
+    """Return the lower and upper face coordinates of the part of each face inside a region."""
     low, high = np.zeros((len(X), 2)), np.ones((len(X), 2))
     for k in range(X.shape[2] - 1):
         edge = X[:, 1 << k] - X[:, 0]
@@ -272,7 +267,7 @@ def _clipped(
 
 
 def _free(own: Faces, others: Sequence[Faces]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the parts of faces that touch no other body, as rectangles or as triangles with a repeated last corner."""
+    """Return the parts of faces without contact to other bodies.  Triangles repeat their last corner."""
     on = [covers(own, other) for other in others]
     if not on:
         return np.arange(len(own.row)), np.tile(BITS, (len(own.row), 1, 1)).astype(float)
@@ -297,7 +292,7 @@ def interpolate(corners: NDArray[np.float64], xi: NDArray[np.float64]) -> NDArra
 def on_face(
     corners: NDArray[np.float64], face: NDArray[np.int64], x: NDArray[np.float64], xi: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return local coordinates xi (n, 3) with tangential components from positions x (n, 3), in m, on faces."""
+    """Return the local coordinates xi (n, 3) of positions x (n, 3), in m, on faces."""
     quads = np.take_along_axis(corners, FACES[3][face][:, :, None], axis=1)
     normal = face_vectors(corners, face)
     t, _ = local(quads, x[:, None], normal)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Fills: bodies that are added in a later stage, onto the displaced surface of their neighbours."""
+"""Fills: bodies that are added in a later stage, on the displaced surface of other bodies."""
 
 from __future__ import annotations
 
@@ -68,23 +68,23 @@ def touches(bodies: Sequence[Body], others: Sequence[int], fill: int) -> bool:
 def put(
     grid: Grid, bodies: Sequence[Body], others: Sequence[int], fill: int, points: MaterialPoints, new: MaterialPoints
 ) -> MaterialPoints:
-    """Return the material points of a fill, placed onto the active bodies.
+    """Return the material points of a fill on the displaced surface of the active bodies.
 
-    Sides of the fill that touched a neighbour when seeded follow the neighbour's displacement.  The side opposite to
-    the largest contact keeps its seeded position.  Displacements between these sides are interpolated.  The fill has no
-    velocity.  The displaced shape determines the initial volumes of its domains.
+    Sides of the fill that touched another body at seeding have the present displacement of this body.  The side
+    opposite to the largest contact is not displaced.  Displacements between these sides are interpolated.  The fill has
+    no velocity and no strain.
 
     Parameters
     ----------
     bodies, others, fill
         All bodies, indices of the active bodies, and index of the fill.
     points, new
-        Points of the active bodies, and points of the fill as seeded, on this process.
+        Points of the active bodies, and seeded points of the fill, on this process.
 
     Raises
     ------
     ValueError
-        An active body has moved into the fill.  The message gives place and depth.
+        An active body has moved into the space of the fill.
     """
     body = bodies[fill]
     corners = bodies[fill].corners() - grid.base
@@ -138,7 +138,7 @@ def _contacts(grid: Grid, bodies: Sequence[Body], other: int, fill: Body, points
 
 
 def _follow(grid: Grid, body: Body, corners: NDArray[np.float64], contacts: Sequence[Contact]) -> NDArray[np.float64]:
-    """Return the displacements, in m, with which a fill's corners follow its neighbours."""
+    """Return the displacements, in m, of the corners of a fill."""
     number = body.nodes(np.arange(len(body)))
     nodes, node = np.unique(number, return_inverse=True)
     node = node.reshape(number.shape)
@@ -175,7 +175,7 @@ def _springs(body: Body, node: NDArray[np.int64], count: int) -> csr_array:
 
 
 def _between(K: csr_array, fixed: NDArray[np.bool_], u: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the displacements of a network of springs along an axis, with u prescribed at `fixed` nodes."""
+    """Return the displacements of a network of springs, with displacements u prescribed at `fixed` nodes."""
     out, free = u.copy(), np.flatnonzero(~fixed)
     if len(free):
         held = np.flatnonzero(fixed)
@@ -199,7 +199,7 @@ def _between(K: csr_array, fixed: NDArray[np.bool_], u: NDArray[np.float64]) -> 
 
 
 def _check_shape(grid: Grid, fill: int, corners: NDArray, u: NDArray) -> None:
-    """Raise an error if a displaced domain of the fill is nearly flat, or leaves the grid."""
+    """Raise an error if a domain of the displaced fill is nearly flat, or outside the grid."""
     now = corners + u
     ratio = volumes(now) / volumes(corners)
     k = int(np.argmin(ratio))
@@ -219,7 +219,7 @@ def _check_shape(grid: Grid, fill: int, corners: NDArray, u: NDArray) -> None:
 def _penetration(
     grid: Grid, bodies: Sequence[Body], other: int, corners: NDArray, points: MaterialPoints, misfit: float
 ) -> tuple[float, float, NDArray[np.float64]]:
-    """Return the depth of a body in the fill, in m, their gap, in cells, and the position of either."""
+    """Return the overlap of a body and the fill, in m, or else their gap, in cells, and its position."""
     start = _start(bodies, other)
     rows = np.flatnonzero((points.id >= start) & (points.id < start + len(bodies[other])))
     both = [(c, np.full(len(c), MISFIT / 2 * grid.least + misfit)) for c in (points.corners[rows], corners)]

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Reader of gmsh files of format 4.1, with all physical groups of each entity.
 
-meshio's own reader keeps only the first group of an entity, and fails for entities without a group.
+The reader of meshio keeps only the first group of an entity, and fails for entities without a group.
 """
 
 from __future__ import annotations

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Cell types of meshes: their facets, and their division into particle domains.
 
-A triangle is divided into three quadrilaterals.  A tetrahedron is divided into four hexahedra with plane faces.  Each
-vertex of such a cell thus has one domain, whose corners are means of vertices.  A wedge is divided like its triangular
-facets.  A pyramid is divided like two tetrahedra.  Hexahedra are not divided.  Neighbouring cells divide a common facet
-in the same way; only hexahedra do not divide their facets.
+A triangle is divided into three quadrilaterals, and a tetrahedron into four hexahedra.  Each of these domains has a
+vertex of the cell as a corner.  Its other corners are midpoints of edges, facets and the cell.  A wedge is divided like
+an extruded triangle, and a pyramid like two tetrahedra.  Quadrilaterals and hexahedra are not divided.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ KINDS = {2: {"triangle": 3, "quad": 4}, 3: {"tetra": 4, "hexahedron": 8, "wedge"
 SIDES_OF = {2: {"line": 2}, 3: {"triangle": 3, "quad": 4}}
 """Types of the facets that form sides, and their numbers of vertices."""
 AS_LATTICE = {"quad": [0, 1, 3, 2], "hexahedron": [0, 1, 3, 2, 4, 5, 7, 6]}
-"""Indices that sort meshio's vertices so that the first axis varies fastest."""
+"""Permutation of meshio's vertices to tensor-product order, in which the first axis varies fastest."""
 SECOND_ORDER = {
     **{"line3": "line", "triangle6": "triangle", "triangle7": "triangle", "quad8": "quad", "quad9": "quad"},
     **{"tetra10": "tetra", "hexahedron20": "hexahedron", "hexahedron24": "hexahedron", "hexahedron27": "hexahedron"},
@@ -38,24 +37,24 @@ LOOPS = {
     "wedge": [(0, 1, 2), (3, 4, 5), (0, 1, 4, 3), (1, 2, 5, 4), (2, 0, 3, 5)],
     "pyramid": [(0, 1, 2, 3), (0, 1, 4), (1, 2, 4), (2, 3, 4), (3, 0, 4)],
 }
-"""Vertices around each facet of a cell type.  In quadrilaterals and hexahedra the first axis varies fastest."""
+"""Vertices around each facet of a cell type.  Quadrilaterals and hexahedra have tensor-product order."""
 
 
 class Block(NamedTuple):
-    """Cells of one type.  meshio's own class for cells lacks some second-order types."""
+    """Cells of one type: name of the type, and nodes (n, k)."""
 
     type: str
     data: NDArray[np.int64]
 
 
 def edges(kind: str) -> list[tuple[int, int]]:
-    """Return both vertices of each edge of a cell type, with vertex indices as in `LOOPS`."""
+    """Return the vertices of each edge of a cell type."""
     around = [pair for loop in LOOPS[kind] for pair in zip(loop, (*loop[1:], loop[0]), strict=True)]
     return sorted({tuple(sorted(pair)) for pair in around})
 
 
 def distinct(rows: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Group the equal rows of an array (n, k), and return the first row of each group and the group of each row.
+    """Group equal rows of an array (n, k).  Return the index of the first row of each group, and the group of each row.
 
     The groups are sorted by the values of their rows.
     """
@@ -91,7 +90,7 @@ def _of_simplices(kind: str, *simplices: tuple[int, ...]) -> list[Part]:
 
 
 def _wedge() -> list[Part]:
-    """Return the particle domains of a wedge, which are the extruded domains of a triangle."""
+    """Return the particle domains of a wedge."""
     out, quads = [], LOOPS["wedge"][2:]
     for part in _of_simplices("triangle", (0, 1, 2)):
         corners = [tuple(v + end for v in of) for end in (0, 3) for of in part.corners]
@@ -101,7 +100,7 @@ def _wedge() -> list[Part]:
 
 
 def _whole(dim: int) -> list[Part]:
-    """Return the only particle domain of a quadrilateral or hexahedron: the whole cell."""
+    """Return the particle domain of a quadrilateral or hexahedron: the whole cell."""
     return [Part(tuple((k,) for k in range(2**dim)), tuple(map(tuple, FACES[dim].tolist())))]
 
 

@@ -46,13 +46,11 @@ def from_mesh(
     per_cell: int = 2,
     material: int = 0,
 ) -> MeshBody:
-    """Seed a body from a mesh whose cells become particle domains, and return the body.
+    """Return a body seeded from a mesh.  Each cell of the mesh is divided into one or more particle domains.
 
-    Sides have the names of groups of facets in the mesh.  Groups of facets are Abaqus surfaces, facet tags, or gmsh's
-    physical groups of lines (in 2D) or surfaces (in 3D).  Bodies from two parts of a mesh share the faces between the
-    parts.  While both bodies are active, shared faces are not part of the surface.  Vertices of the mesh are reference
-    positions.  The points form no lattice, so the filter of short waves does not act on them.  On several processes,
-    the first process reads the mesh, and each machine has a copy of the domains in a temporary file.
+    The sides of the body are the named groups of facets in the mesh: Abaqus surfaces, facet tags, or physical groups of
+    gmsh.  Two parts of a mesh can become two bodies.  Faces between two active bodies do not belong to the surface.
+    The filter of short waves (`domains/lattice.py`) does not act on bodies from meshes.
 
     Parameters
     ----------
@@ -60,16 +58,16 @@ def from_mesh(
         Background grid.
     mesh
         A file that meshio reads, an Abaqus input file, a meshio mesh or a dolfinx mesh.  Cells are triangles and
-        quadrilaterals in 2D, and tetrahedra, hexahedra, wedges and pyramids in 3D.  Second-order cells are reduced to
-        their corners.  A warning then gives the distance of edge nodes from edge midpoints.  2D cells must lie in a
-        plane of equal z.  A dolfinx mesh may be distributed over the processes of the grid.
+        quadrilaterals in 2D, and tetrahedra, hexahedra, wedges and pyramids in 3D.  Second-order cells are replaced by
+        cells with straight edges, with a warning.  2D cells must lie in a plane z = constant.  A dolfinx mesh may be
+        distributed over the processes of the grid.
     part
-        Name of a group of cells; by default the body has all cells.  A group is a physical group, an Abaqus part,
-        instance or set, or a tag in cell data such as "MaterialIDs".
+        Name of a group of cells: a physical group, an Abaqus part, instance or set, or a tag in cell data such as
+        "MaterialIDs".  By default, the body consists of all cells.
     cell_tags, facet_tags
         Tags of a dolfinx mesh.  For a file, `cell_tags` is the name of the cell data with the tags of parts and sides.
     names
-        Tags by name, such as {"top": 3}.  A tag without a name is named by its digits, such as "3".
+        Tags by name, such as {"top": 3}.  The default name of a tag is its number, such as "3".
     per_cell
         Desired points per grid cell and direction, >= 1.  Domains with an edge longer than 1.5 / `per_cell` times the
         cell size are divided.
@@ -79,8 +77,9 @@ def from_mesh(
     Raises
     ------
     ValueError
-        The file is missing or unreadable, the kind of mesh is not supported, or the part is unknown.  Cells are flat,
-        inverted, non-convex, repeated or overlapping.  Vertices are outside the grid.  Nodes are hanging or duplicate.
+        The file is missing or unreadable, the type of mesh is not supported, or the part is unknown.  Cells are flat,
+        inverted, non-convex, repeated or overlapping.  Vertices are outside the grid.  There are hanging or duplicate
+        nodes.
     OSError
         A temporary file cannot be written.  Only runs on several processes write temporary files.
     """
@@ -156,9 +155,9 @@ def _of_meshio(grid: Grid, mesh: meshio.Mesh | Path, names: Mapping[str, int], t
 
 
 def surface_of(mesh: str | os.PathLike | meshio.Mesh) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Return the vertices (n, d) of a mesh and its facets: triangles (m, 3), or lines (m, 2) if the mesh is plane.
+    """Return the vertices (n, d) and the facets of a surface mesh: triangles (m, 3), or lines (m, 2) in a plane mesh.
 
-    Quadrilaterals are divided into two triangles, and second-order facets are reduced to their corners.
+    Quadrilaterals are divided into two triangles.  Second-order facets are replaced by their corners.
     """
     import meshio
 
@@ -196,10 +195,10 @@ def _positions(dim: int, points: Any) -> NDArray[np.float64]:
 def _first_order(
     name: str, x: NDArray[np.float64], mesh: meshio.Mesh, known: Mapping[str, int], counted: Collection[str]
 ) -> list[tuple[str, NDArray[np.int64]]]:
-    """Return the type and the corners of the cells of each block of known types.  Warn of second-order cells.
+    """Return the type and the corners of the cells of each block.  Blocks of unknown types are omitted.
 
     `known`: number of corners of each type.
-    `counted`: types of which second-order cells cause the warning.
+    `counted`: types whose second-order cells cause a warning.
     """
     blocks = []
     curved, off = 0, 0.0
@@ -235,7 +234,7 @@ def _edge_node_distance(x: NDArray[np.float64], rows: NDArray[np.int64], kind: s
 
 
 def _warn_curved(name: str, count: int, off: float) -> None:
-    """Warn on one process that second-order cells are reduced to their corners."""
+    """Warn that second-order cells are replaced by their corners."""
     what = "%s: %d cells are of second order; only their corners are used, with straight edges; edge nodes lie "
     warn(MPI.COMM_SELF, ResolutionWarning, what + "up to %.2g m off the midpoints", name, count, off)
 
@@ -243,7 +242,7 @@ def _warn_curved(name: str, count: int, off: float) -> None:
 def _merged(
     cells: dict[str, NDArray[np.int64]], parts: dict[str, dict[str, NDArray[np.int64]]]
 ) -> tuple[dict[str, NDArray[np.int64]], dict[str, dict[str, NDArray[np.int64]]]]:
-    """Return the cells without gmsh's repetitions for several physical groups, and the cells of each part."""
+    """Return all cells, and the cells of each part.  Repeated cells of several physical groups of gmsh are merged."""
     cells = dict(cells)
     for kind, rows in cells.items():
         first, same = distinct(np.sort(rows, axis=1))
@@ -270,7 +269,7 @@ def _groups(
     names: Mapping[str, int],
     tags: str | None,
 ) -> Iterator[tuple[str, NDArray[np.bool_]]]:
-    """Yield each group of cells with its name, and which cells of a block belong to the group."""
+    """Yield the name of each group, and which cells of a block belong to the group."""
     known = {name: int(tag) for name, (tag, d) in _pairs(mesh.field_data) if int(d) == dim} | dict(names)
     families = getattr(mesh, "cell_tags", None) or {}  # in MED files: names of groups for each number
     for key in (tags,) if tags is not None else TAGS:
@@ -333,10 +332,7 @@ def _plane(dim: int, x: NDArray[np.float64], cells: Mapping[str, NDArray[np.int6
 
 
 def _of_dolfinx(grid: Grid, mesh, cell_tags, facet_tags, names: Mapping[str, int]) -> Callable[[], Mesh]:
-    """Gather a dolfinx mesh on rank 0, and return a function that converts the mesh there.
-
-    Cells are sorted by position, so the result does not depend on the partition of the mesh.
-    """
+    """Gather a dolfinx mesh on rank 0, and return a function that converts the gathered mesh."""
     dim = grid.dim
     topology = mesh.topology
     kind = _compat.cell_kind(mesh)
@@ -384,7 +380,7 @@ def _of_rows(dim: int, kind: str, rows: list[tuple], curved: bool, names: Mappin
 
 
 def _as_meshio(nodes: NDArray[np.int32], kind: str) -> NDArray[np.int32]:
-    """Return the nodes of dolfinx cells, with vertices in meshio's order."""
+    """Return the nodes of dolfinx cells, sorted as in meshio."""
     order = AS_LATTICE.get(kind, [])
     return np.concatenate([nodes[:, order], nodes[:, len(order) :]], axis=1)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Reader of mesh files with meshio.  Data that meshio loses or misplaces are corrected, or raise an error."""
+"""Reader of mesh files with meshio.  Known errors of meshio are corrected, or raise ValueError."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mpm_dolfinx.bodies import abaqus_files, gmsh_files
 
 
 def read(file: Path) -> meshio.Mesh:
-    """Return the mesh of a file.  Known errors of meshio are corrected, or raise ValueError."""
+    """Return the mesh of a file."""
     if abaqus_files.is_abaqus(file):
         return abaqus_files.read(file)
     version = gmsh_files.version(file) if file.suffix.lower() == ".msh" else ""
@@ -56,7 +56,7 @@ def check_systems(mesh: meshio.Mesh) -> None:
 
 
 def sets_of(mesh: meshio.Mesh) -> dict[str, list]:
-    """Return the cell indices of sets, which start at 0 in each block."""
+    """Return the cell indices of sets, counted from 0 in each block."""
     flac = {name: rows for name, rows in mesh.cell_sets.items() if re.match("(zone|face):", name)}
     count = [len(block.data) for block in mesh.cells]
     start = np.cumsum([0, *count[:-1]])

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Bodies from meshes: each mesh cell becomes one or more particle domains.
 
-`mesh_cells` divides cells into domains.  Domains that are too large for the grid are divided again, evenly in local
-coordinates.  The first process reads and divides a mesh, and each machine has one file with all domains.  The processes
-of a machine map the file into memory, and load only the domains that they need.
+Cells are divided into domains (`mesh_cells`).  Large domains are divided again, evenly in local coordinates.  The first
+process reads and divides a mesh.  On several processes, each machine has one temporary file with all domains.
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ SMALL = 0.2  # fraction of the desired domain size; smaller domains cause a warn
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """A mesh on one process, with the nodes of quadrilaterals and hexahedra such that the first axis varies fastest."""
+    """A mesh on one process.  In quadrilaterals and hexahedra, the nodes have tensor-product order."""
 
     x: NDArray[np.float64]  # positions of nodes (nodes, d), m
     cells: Mapping[str, NDArray[np.int64]]  # cell type -> nodes (n, k)
@@ -57,7 +56,7 @@ class Mesh:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class MeshBody(Body):
-    """A body seeded from a mesh.  The boxes of its domains are bounding boxes."""
+    """A body seeded from a mesh.  Its `boxes` are the bounding boxes of the domains."""
 
     vertices: NDArray[np.float64]  # corners of the domains before all maps (n, 2^d, d), m
     surface: NDArray[np.bool_]  # whether a face lies on the surface of the body (n, d, 2)
@@ -95,7 +94,7 @@ class MeshBody(Body):
         return np.nonzero(self.tagged[name].reshape(len(self), 2 * self.dim))
 
     def facing(self, axis: int, end: int, least: float = 0.0) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the surface faces at an end of an axis; see `Body.facing`."""
+        """See `Body`."""
         row, face = self.outer()
         outward = face_vectors(self.corners(row), face)
         along = np.abs(outward).argmax(axis=1) == axis
@@ -136,7 +135,7 @@ def seeded(
     """Return the body of a part of a mesh, or of the whole mesh; see `from_mesh`.
 
     `mesh`: function that returns the mesh on rank 0.
-    `warns`: whether to warn about domains that are too small.
+    `warns`: whether to warn of small domains.
     """
     per_cell, material = whole("body: per_cell", per_cell), whole("body: material", material, 0)
 
@@ -189,7 +188,7 @@ def _divided(grid: Grid, mesh: Mesh, part: str | None, per_cell: int, name: str)
 def _domains(mesh: Mesh, cells: Mapping[str, NDArray[np.int64]]) -> list[tuple[NDArray, NDArray, NDArray]]:
     """Return the corners of the particle domains, the mesh facet of each face, and the cell of each domain.
 
-    The row of a facet contains its nodes, and starts with -1 for a triangle.  Faces between cells have the row -1.
+    A facet is a row of its nodes, with -1 before the nodes of a triangle.  Faces inside a cell have rows of -1.
     """
     d = mesh.x.shape[1]
     start = 0
@@ -208,7 +207,7 @@ def _domains(mesh: Mesh, cells: Mapping[str, NDArray[np.int64]]) -> list[tuple[N
 
 
 def _check_repeated(mesh: Mesh, cells: Mapping[str, NDArray[np.int64]], name: str) -> None:
-    """Raise an error for repeated cells, because their weight and stiffness would count twice."""
+    """Raise an error for repeated cells."""
     for kind, nodes in cells.items():
         first, same = distinct(np.sort(nodes, axis=1))
         count = np.bincount(same)
@@ -226,7 +225,7 @@ def _check_sides(
     shared: NDArray[np.bool_],
     name: str,
 ) -> None:
-    """Raise an error if both cells of a `shared` facet lie on the same side of this facet."""
+    """Raise an error if two cells lie on the same side of a common facet."""
     d, size = domains.shape[2], len(facets)
     outward = np.stack([face_vectors(domains, face) for face in range(2 * d)], axis=1).reshape(-1, d)
     of = facet.ravel()
@@ -246,10 +245,7 @@ def _check_overlaps(
     neighbours: NDArray[np.int64],
     name: str,
 ) -> None:
-    """Raise an error for overlapping cells.
-
-    The number of cells that cover a position changes only across the surface of the mesh.  If any cells overlap, at
-    least one of them is at the surface, so only the cells `outer` at the surface are checked.
+    """Raise an error for overlapping cells.  It is sufficient to check the cells `outer` at the surface.
 
     `domains` (n, 2^d, d): corners of the particle domains.
     `cell` (n,): cell of each domain.
@@ -274,7 +270,7 @@ def _check_overlaps(
 def _box_overlaps(
     domains: NDArray[np.float64], outer: NDArray[np.int64], slack: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return pairs of domains with overlapping bounding boxes.  The first domain of a pair is one of `outer`."""
+    """Return pairs of domains with overlapping bounding boxes.  The first domain of each pair belongs to `outer`."""
     low, high = domains.min(axis=1), domains.max(axis=1)
     size, middle = high - low, (low + high) / 2
     octave = np.frexp(size.max(axis=1))[1]
@@ -292,7 +288,7 @@ def _box_overlaps(
 
 
 def _oriented(domains: NDArray[np.float64], keys: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Make left-handed domains right-handed, and return all domains with the facets of their faces."""
+    """Return the domains with right-handed order of corners, and the facets of their faces."""
     d, left = domains.shape[2], volumes(domains) < 0
     bits, face = corner_bits(d), np.arange(2 * d)
     swapped = (bits[:, [1, 0, *range(2, d)]] << np.arange(d)).sum(axis=1)
@@ -338,9 +334,9 @@ def _in_side(facets: NDArray[np.int64], named: Sequence[NDArray[np.int64]]) -> N
 def _split(
     grid: Grid, domains: NDArray[np.float64], per_cell: int
 ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.bool_]]:
-    """Divide domains that are too large.  Return the new domains, their original domains, and their outer faces.
+    """Divide domains that are large compared with the cells.
 
-    Outer faces of a new domain lie on faces of the original domain.
+    Return the new domains, the index of the original domain of each, and which faces lie on faces of the original.
     """
     d = grid.dim
     bits = corner_bits(grid.dim)
@@ -365,7 +361,7 @@ def _split(
 
 
 def _check_conforming(body: MeshBody, name: str) -> None:
-    """Raise an error if surface faces of a body touch each other, because conditions would act there."""
+    """Raise an error if surface faces of a body touch each other."""
     own = Faces.around(body)
     cover = covers(own, own)
     if len(cover.face):
@@ -375,7 +371,7 @@ def _check_conforming(body: MeshBody, name: str) -> None:
 
 
 def _warn_small(grid: Grid, body: MeshBody, per_cell: int, name: str) -> None:
-    """Warn on one process about domains that are much smaller than the grid resolves."""
+    """Warn of domains that are much smaller than the cells of the grid."""
     cell = grid.sizes_at(body.centre - grid.base).prod(axis=-1)
     size = (volumes(body.vertices) / cell) ** (1 / grid.dim) * per_cell
     small = np.flatnonzero(size < SMALL)

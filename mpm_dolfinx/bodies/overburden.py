@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Overburden: weight of the domains vertically above positions in the bodies.
 
-Vertical lines enter and leave domains through faces.  In 3D, each face is divided into triangles about its middle.
-Domains that share a face therefore leave no gap, and do not overlap.
+Vertical lines are intersected with the faces of domains.  In 3D, each face consists of four triangles about its middle.
 """
 
 from __future__ import annotations
@@ -20,10 +19,9 @@ from mpm_dolfinx.grid.grid import ABOUT_MIDDLE, FACE_SIGNS, FACES, corner_bits, 
 def overburden(
     corners: NDArray[np.float64], unit_weight: NDArray[np.float64], x: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the overburden stress (k,), in Pa, at positions x, and the level (k,), in m, of the ground above them.
+    """Return the overburden stress (k,), in Pa, and the ground level (k,), in m, above positions x.
 
-    Two domains may meet exactly above a position.  Both results are therefore means over vertical lines close to the
-    position, on all sides.
+    Both results are means over several vertical lines close to the position.
 
     `corners` (n, 2^d, d), in m: corners of the particle domains of all bodies; the last axis is vertical.
     `unit_weight` (n,), in N/m^3: unit weights of the domains.
@@ -38,7 +36,7 @@ def overburden(
 
 
 def _along(corners: NDArray, unit_weight: NDArray, x: NDArray, places: NDArray) -> tuple[NDArray, NDArray]:
-    """Return overburden stresses at the heights of positions x, and ground levels, for vertical lines at `places`."""
+    """Return overburden stresses at the heights of x, and ground levels, on the vertical lines through `places`."""
     low, high = corners[..., :-1].min(axis=1), corners[..., :-1].max(axis=1)
     half = (high - low).max(initial=0.0) / 2
     across, line = np.unique(places, axis=0, return_inverse=True)
@@ -68,10 +66,9 @@ def _along(corners: NDArray, unit_weight: NDArray, x: NDArray, places: NDArray) 
 
 
 def _hits(corners: NDArray, at: NDArray) -> Iterator[tuple[NDArray, NDArray, NDArray]]:
-    """Yield the crossings of vertical lines with faces.  Line i is tested against domain i only.
+    """Yield, for each face, the crossings of line i with domain i: indices of lines, heights in m, and signs.
 
-    Each face yields the lines that cross the face, the heights of the crossings, in m, and signs.  The sign is 1 where
-    a rising line leaves the domain, and -1 where the line enters.
+    The sign is 1 if an upward line leaves the domain, and -1 if the line enters the domain.
     """
     d = corners.shape[2]
     for face, turn in zip(FACES[d], FACE_SIGNS, strict=False):

@@ -29,10 +29,9 @@ def polygon(
     per_cell: int = 2,
     material: int = 0,
 ) -> MeshBody:
-    """Seed a polygon, such as a slope or a soil layer, with material points, and return the body.
+    """Return a polygonal body, such as a slope or a soil layer, seeded with material points.  This function needs gmsh.
 
-    Each layer is a separate polygon.  Polygons in contact stick without a surface between them, even if their
-    quadrilaterals differ in size.  The function needs gmsh.
+    Each soil layer is a separate polygon.  Adjacent polygons are bonded, and may have quadrilaterals of different size.
 
     Parameters
     ----------
@@ -128,7 +127,7 @@ def _inside(x: NDArray[np.float64], outline: NDArray[np.float64]) -> bool:
 
 @contextmanager
 def _gmsh() -> Iterator:
-    """Provide gmsh with a separate model, and restore the user's gmsh state afterwards."""
+    """Provide gmsh with a new model.  Restore the user's gmsh state on exit."""
     main = current_thread() is main_thread()  # other threads may not set handlers
     handler = signal.getsignal(signal.SIGINT)
     try:

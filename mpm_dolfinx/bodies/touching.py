@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Contact between seeded bodies: covered parts of faces, and distances between domains.
+"""Contact between seeded bodies: parts of faces in contact, and distances between domains.
 
-Faces are quadrilaterals in space.  In plane strain, a face is an edge with unit width along the third axis.
+Faces are quadrilaterals in 3D.  A face in 2D is an edge, extended by unit width along the third axis.
 """
 
 from __future__ import annotations
@@ -22,11 +22,7 @@ from mpm_dolfinx.points.cutting import cut_at, kuhn_simplices
 
 BITS = corner_bits(2)  # Source: definition
 MISFIT = 1e-2
-"""Distance, divided by the cell size, by which surfaces that should touch may overlap or miss each other.
-
-This holds for tools and groups of bodies, and for bodies that are placed on others.  In a step, points may pass through
-thinner tools without notice.
-"""
+"""Largest gap or overlap of surfaces in contact, divided by the cell size."""
 
 
 @dataclass
@@ -57,7 +53,7 @@ class Faces:
         return cls.of(body, *body.outer())
 
     def edge(self) -> NDArray[np.float64]:
-        """Return the length (n,), in m, of the shortest edge of each face, without the unit width in plane strain."""
+        """Return the length (n,), in m, of the shortest edge of each face."""
         c = self.corners
         pairs = [(1, 0), (3, 2), (2, 0), (3, 1)] if (self.index[:, 0] != self.index[:, 2]).any() else [(1, 0)]
         return np.min([np.linalg.norm(c[:, i] - c[:, j], axis=1) for i, j in pairs], axis=0)
@@ -65,7 +61,7 @@ class Faces:
 
 @dataclass
 class Cover:
-    """Pairs of faces in contact: a covered face, and a covering face that lies on the covered face.
+    """Pairs of faces in contact: the covered face of one body, and the covering face of another body.
 
     Face coordinates run from 0 to 1 along two edges of the covered face.
     """
@@ -102,7 +98,7 @@ def weights(t: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def near(a: NDArray[np.float64], b: NDArray[np.float64], distance: float = 0.0) -> tuple[NDArray, NDArray]:
-    """Return pairs of polytopes a (k, c, d) and b (l, c, d) with bounding boxes within about `distance`, in m."""
+    """Return pairs of polytopes a (k, c, d) and b (l, c, d) with bounding boxes nearer than `distance`, in m."""
     if not (len(a) and len(b)):
         return (np.empty(0, dtype=np.int64),) * 2
     low, high = np.maximum(a.min(axis=(0, 1)), b.min(axis=(0, 1))), np.minimum(a.max(axis=(0, 1)), b.max(axis=(0, 1)))
@@ -157,7 +153,7 @@ def covers(own: Faces, other: Faces) -> Cover:
 
 
 def _parallelograms(corners: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return faces whose last corners are moved so that all faces are parallelograms."""
+    """Return parallelograms with the first three corners of each face."""
     return np.stack([*(corners[:, k] for k in range(3)), corners[:, 1] + corners[:, 2] - corners[:, 0]], axis=1)
 
 
@@ -191,7 +187,7 @@ def covered(count: int, cover: Cover) -> NDArray[np.float64]:
 def uncovered_triangles(
     own: Faces, cover: Cover, faces: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Divide the uncovered parts of `faces` into triangles, and return the face and corners (n, 3, 2) of each."""
+    """Divide the uncovered parts of `faces` into triangles.  Return the face and corners (n, 3, 2) of each triangle."""
     corners = own.corners[faces]
     normal = own.outward[faces] / np.linalg.norm(own.outward[faces], axis=1, keepdims=True)
     whole, _ = local(_parallelograms(corners), corners, normal)
@@ -231,7 +227,7 @@ def uncovered_triangles(
 
 
 def within(s: NDArray, owner: NDArray, low: NDArray, high: NDArray) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Clip triangles (3, 2, n) to boxes from `low` to `high`.  Return the clipped parts, and the owner of each part."""
+    """Clip triangles (3, 2, n) to boxes from `low` to `high`.  Return the clipped triangles and their owners."""
     low, high = (np.broadcast_to(x, (s.shape[2], 2)) for x in (low, high))
     index = np.arange(s.shape[2])
     for axis in (0, 1):
@@ -241,7 +237,7 @@ def within(s: NDArray, owner: NDArray, low: NDArray, high: NDArray) -> tuple[NDA
 
 
 def _triangles(quads: NDArray, owner: NDArray) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Divide each quadrilateral into two triangles, and return the triangles with their faces."""
+    """Divide each quadrilateral into two triangles.  Return the triangles and their owners."""
     both = [quads[:, list(simplex)].transpose(1, 2, 0) for simplex in kuhn_simplices(2)]
     return np.concatenate(both, axis=2).astype(float), np.tile(owner, 2)
 
@@ -252,7 +248,7 @@ def _areas(s: NDArray) -> NDArray[np.float64]:
 
 
 def split(s: NDArray, owner: NDArray, axis: int, plane) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-    """Divide triangles (3, e, n) at a plane normal to an axis.  Return parts and owners below, then above the plane."""
+    """Divide triangles (3, e, n) at a plane.  Return triangles and owners below the plane, and then above the plane."""
     plane = np.broadcast_to(plane, len(owner))
     low, high = s[:, axis].min(axis=0) < plane, s[:, axis].max(axis=0) > plane
     both = np.flatnonzero(low & high)
@@ -265,12 +261,12 @@ def split(s: NDArray, owner: NDArray, axis: int, plane) -> tuple[NDArray, NDArra
 def uncovered(
     count: int, face: NDArray[np.int64], low: NDArray[np.float64], high: NDArray[np.float64], slack: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    """Divide the uncovered parts of faces into rectangles, and return their faces and corners.
+    """Divide the uncovered parts of faces into rectangles.  Return the face and the corners of each rectangle.
 
     `count`: number of faces.
-    `face` (n,): index of the face that each box covers in part.
+    `face` (n,): index of the face that each box covers.
     `low`, `high` (n, 2): corners of the boxes, in face coordinates from 0 to 1.
-    `slack` (n,): largest difference between two ends of boxes that count as equal.
+    `slack` (n,): tolerance of the face coordinates.
     """
     touched, row = np.unique(face, return_inverse=True)
     whole = np.setdiff1d(np.arange(count), touched)
@@ -330,8 +326,7 @@ def uncovered(
 def separation(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the gaps (n,), in m, between convex domains a and b (n, 2^d, d).  Overlapping domains have negative gaps.
 
-    Two domains overlap if no plane separates them.  It is sufficient to try planes parallel to a face of either domain.
-    In 3D, planes parallel to one edge of each domain must also be tried.
+    The method is the separating axis theorem.
     """
     d = a.shape[2]
     out = _between_planes(a, b, (face_vectors(c, face) for c in (a, b) for face in range(2 * d)))
@@ -345,7 +340,7 @@ def separation(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.flo
 
 
 def _between_planes(a: NDArray, b: NDArray, normals: Iterable[NDArray]) -> NDArray[np.float64]:
-    """Return the largest distance, in m, between parallel planes that separate a and b, over all given normals."""
+    """Return the largest gap, in m, between a and b along any of the given normals."""
     out, size = np.full(len(a), -np.inf), np.ptp(a, axis=1).max(axis=1)
     for n in normals:
         length = np.linalg.norm(n, axis=1)
@@ -357,7 +352,7 @@ def _between_planes(a: NDArray, b: NDArray, normals: Iterable[NDArray]) -> NDArr
 
 
 def solids(body: Body) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the convex domains (n, 2^d, d) of a body, and the tolerances (n,) of their overlaps, both in m."""
+    """Return the domains (n, 2^d, d) of a body, and the tolerances (n,) of their overlaps, both in m."""
     low, high = body.bounds
     size, edge = high - low, body.spacing.min()
     if body.aligned and np.isclose(size.prod(), body.volume_of_boxes, rtol=SAME, atol=0):
@@ -387,10 +382,10 @@ def meeting(
     b: tuple[NDArray[np.float64], NDArray[np.float64]],
     in_cells: Callable[[NDArray[np.float64]], NDArray[np.float64]],
 ) -> tuple[float, float, NDArray[np.float64]]:
-    """Return the largest overlap of two bodies, in m, their smallest gap, in cells, and the position of either, in m.
+    """Return the largest overlap of two bodies, in m, or their smallest gap, in cells, and its position, in m.
 
-    Touching bodies have overlap 0 and gap 0.  The gap of distant bodies is inf.  `a` and `b` are the domains of the
-    bodies with their tolerances, see `solids`.  `in_cells` divides positions by the cell size.
+    `a`, `b`: results of `solids` for both bodies.
+    `in_cells`: function that divides positions by the cell size.
     """
     i, j = near(a[0], b[0])
     separations, slack = separation(a[0][i], b[0][j]), a[1][i] + b[1][j] + rounding(a[0])
@@ -411,7 +406,7 @@ def meeting(
 
 
 def check_apart(grid: Grid, bodies: Sequence[Body], present: Sequence[bool]) -> None:
-    """Raise an error for seeded bodies that overlap.  Warn about separate bodies that share nodes and will stick."""
+    """Raise an error for overlapping bodies.  Warn of gaps smaller than a cell."""
     indices = [i for i in range(len(bodies)) if present[i]]
     found = {i: solids(bodies[i]) for i in indices} if len(indices) > 1 else {}
     first = np.cumsum([0, *(len(body) for body in bodies[:-1])])  # first point of each body
@@ -432,7 +427,7 @@ def _inside(x: NDArray[np.float64], domains: NDArray[np.float64]) -> bool:
 
 
 def warn_near(grid: Grid, names: str, gap: float, x: NDArray[np.float64]) -> None:
-    """Warn about bodies with a gap smaller than a cell, because such bodies share nodes and stick."""
+    """Warn of bodies with a gap smaller than a cell.  These bodies share nodes and are bonded."""
     if 0 < gap < 1:
         where = "%s: %.2g cells apart at %s, but they stick, because they share nodes of the grid"
         warn(
