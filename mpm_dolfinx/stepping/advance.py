@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""End of a step: particle domains move with the grid, F follows from their corners, and their pieces store pressures.
+"""End of a step: material points and their domains move, and their state is updated.
 
-The grid is reset at the start of the next step, see `grid_reset`.
+The grid is reset at the start of the next step (`grid_reset`).
 """
 
 from __future__ import annotations
@@ -49,26 +49,20 @@ from mpm_dolfinx.stepping.stage import Stage
 from mpm_dolfinx.stepping.state import State, Stay, Trend
 
 TAKES_IN = 0.1
-"""Rate at which the volume defects `owed` of points are corrected, for a motion by one cell size.
+"""Rate r of the correction of volume defects: a motion by n cells corrects the fraction 1 - exp(-r n) of the defect.
 
-In an undrained connected part without sources, the mean defect is corrected at once, so that the part keeps its volume.
-In drained parts the mean defect is not corrected. With this correction, a column under varying gravity would converge
-with order 1.2 in the time step. After twenty undrained cycles of a beam of 5 cells, spurious stresses are 7.7 % with a
-rate of 0, 3.8 % with 0.1, 3.7 % with 0.2, and 3.6 % with 0.4. On finer grids a larger share of the defect is corrected.
-The order of pressures in the cell size is therefore below 2, and with rates of 0.2 or more below 1.75. The order in the
-time step does not change.
-
-Plateau (scene "beam" of tests/plateaus.py): half this value changes the result by 1.7e-03, twice this value by 2.8e-03,
-and finer cells by 1.5e-02.
+The defect is the difference between the volume of a domain and the volume that its fluid content implies. Plateau
+(scene "beam" of tests/plateaus.py): half this value changes the result by 1.7e-03, twice this value by 2.8e-03, and
+finer cells by 1.5e-02.
 """
 
 
 class Motion:
-    """Motion of a scene's material points in a step.
+    """Update of the material points at the end of a step.
 
     `materials`, `bodies`: all materials and bodies of the scene.
-    `momentum`, `storage`: forms of the two balances, with u and p of a solved step. `storage` is None without fluid.
-    `keeps_volumes`: whether yielded domains keep the volumes of their points, see `kept_volumes`.
+    `momentum`, `storage`: forms of the two balances. `storage` is None without fluid.
+    `keeps_volumes`: whether corners are corrected so that yielded domains have the volumes of their points.
     """
 
     def __init__(
@@ -103,17 +97,16 @@ class Motion:
         `state`: state at the start of the step.
         `on_grid`, `data`: the bodies on the grid, and their integration points at the start of the step.
         `loads`: loads at the end of the step.
-        `net_inflow` (n,), m^d: net inflow of fluid into the filled owned cells in the step. Without a net inflow the
-        volume defects do not change.
-        `report`: report of the step, for the exception if a point leaves the grid.
-        `stays`: whether points that hardly move may keep their pieces.
-        `carried`: function that returns new velocities, see `Mass.carried`. Its argument (n,) is the motion of the
-        points in cell sizes; 0 for points that keep their pieces.
+        `net_inflow` (n,), m^d: net inflow of fluid into the filled owned cells in the step. None: no change of volume
+        defects.
+        `report`: report of the step, for error messages.
+        `carried`: function that returns the new velocities of the points (`Mass.carried`).
+        `stays`: whether points that hardly move may keep their pieces until the next step.
 
         Raises
         ------
         NotConverged
-            A point is inverted, or its pores are closed.
+            A point is inverted, or its porosity is zero.
         LeftGrid
             A point has left the grid.
         """
@@ -185,13 +178,9 @@ class Motion:
         return Trend(np.array([dt, *before.lengths[:2]]), np.concatenate([rates, before.rates[:, :2]], axis=1))
 
     def ahead(self, on_grid: OnGrid, state: State, seconds: float, first: float, implicit: bool) -> list[NDArray]:
-        """Return the expected displacements (m) of active dofs, and with fluid also the expected pressures (Pa) of
-        active cells.
+        """Return extrapolated displacements (m) of active dofs, and with fluid also pressures (Pa) of active cells.
 
-        Displacements and pressures are extrapolated from the trend over `seconds` (s), see `Trend.over`. If `first` >
-        0, the change in a first substep of this length (s), times `seconds / first`, is added. Domains move affinely.
-        The value of a cell is the volume mean of its pieces, and the value of a node is the volume mean of its cells.
-        Ten load steps of a drained beam take 50 Newton steps from rest, and 29 Newton steps from these values.
+        These values are the initial guess of Newton's method. The arguments are those of `Trend.over`.
         """
         cut, points = on_grid.cut, state.points
         grid, pieces = cut.grid, on_grid.data.pieces
@@ -217,7 +206,7 @@ class Motion:
         return out
 
     def _at_rest(self, stage: Stage, t: float, nodal: NDArray[np.float64] | None) -> AtPlaces | None:
-        """Return a function for the hydrostatic pressures up to a constant, or None without gravity."""
+        """Return a function for hydrostatic pressures, or None without gravity."""
         gravity, grid = stage.gravity_at(t), self._momentum.grid
         if gravity is None:  # also without conductivity: conductivity of a distant body must not change pressures
             return None
@@ -227,7 +216,7 @@ class Motion:
     def _kept(
         self, values: NDArray[np.float64] | None, on_grid: OnGrid, keeps: NDArray[np.bool_]
     ) -> NDArray[np.float64] | None:
-        """Return the values at nodes of cells whose points keep their pieces, and zeros at all other nodes."""
+        """Return the nodal values, with zeros outside cells where points keep their pieces."""
         if values is None:
             return None
         cut = on_grid.cut
@@ -245,14 +234,14 @@ class Motion:
         return on_grid.cut.in_plane(on_grid.pressures_up_to_surface(self._reconstruction, stage, t, at_rest))
 
     def strained(self, points: MaterialPoints, on_grid: OnGrid, data: QuadratureData) -> MaterialPoints:
-        """Return the points with F and state after a solved step of zero length, at unchanged positions."""
+        """Return the points with new F and state, at unchanged positions."""
         nodal = self._momentum.u.x.array.reshape(-1, on_grid.cut.grid.dim)
         after = self._dried(points.strained(self._deformed(on_grid.cut, data, nodal)), on_grid, data)
         self._check_volumes(after, on_grid.cut)
         return replace(after, data=self._materials.updated_state(after, points, 0.0))
 
     def _dried(self, points: MaterialPoints, on_grid: OnGrid, data: QuadratureData) -> MaterialPoints:
-        """Return the points with their mean suctions, if laws depend on suction."""
+        """Return the points with their mean suctions, for laws that depend on suction."""
         if self._storage is None or "suction" not in self._materials.state_names:
             return points
         cut, pieces = on_grid.cut, data.pieces
@@ -261,11 +250,7 @@ class Motion:
         return replace(points, data=points.data | {"suction": mean})
 
     def _deformed(self, cut: CutDomains, data: QuadratureData, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return F of the points after a step.
-
-        F is the mean of `(increment of F) F_n` over the pieces of the point, scaled so that det F is the mean of det F
-        over the pieces.
-        """
+        """Return F of the points after a step: the mean over their pieces, scaled so that det F is a mean too."""
         pieces = data.pieces
         grid = cut.grid
         n = len(cut.points)
@@ -297,11 +282,9 @@ class Motion:
         followed: Iterable[NDArray[np.float64]],
         deformed: Callable[[], NDArray[np.float64]],
     ) -> tuple[MaterialPoints, NDArray[np.bool_], int]:
-        """Return the points with new F and corners, a mask of points that keep their pieces, and the number of inverted
-        domains.
+        """Return the points with new corners and F, which points keep their pieces, and the number of inverted domains.
 
-        If Q1 cells would lock, F is scaled so that det F equals the determinant of `deformed`. In yielded soil F is
-        `deformed`, because corners of domains that contain a permanent kink of the motion would give a wrong F.
+        F of elastic points follows from the corners of their domains. F of yielded points is `deformed`.
         """
         cut, stage = on_grid.cut, state.stage
         grid, folded = cut.grid, 0
@@ -344,7 +327,7 @@ class Motion:
     def _corrected(
         self, points: MaterialPoints, state: State, loads: Sequence[Loads], keeps: NDArray[np.bool_]
     ) -> MaterialPoints:
-        """Return the points after `with_volumes` has corrected the yielded domains whose pieces are not reused."""
+        """Return the points after a correction of the volumes of yielded domains (`kept_volumes`)."""
         grid, stage = self._momentum.grid, state.stage
         yielded = self._materials.evolved(points) & ~keeps
         if not over_all(grid.comm, int(yielded.sum())):
@@ -374,9 +357,9 @@ class Motion:
     ) -> dict[str, NDArray[np.float64]]:
         """Return the volume defects of the points after a step, per reference volume, and their corrections.
 
-        The step adds `(c - q) / alpha` to the defect. Here c is the increase of the fluid content, computed from
-        volumes and cell pressures, and q is the net inflow. Both are fluid masses divided by the density at zero
-        pressure. Soil with a free surface has no defect, because its fluid content excludes drained water.
+        The step adds `(c - q) / alpha` to the defect.  Here c is the increase of the fluid content according to volumes
+        and cell pressures, q is the net inflow, and alpha is Biot's coefficient.  Soil with a free surface has no
+        defect.
         """
         before = state.points
         cut = on_grid.cut
@@ -412,10 +395,7 @@ class Motion:
     def _undrained(
         self, state: State, on_grid: OnGrid, data: QuadratureData, loads: Sequence[Loads]
     ) -> NDArray[np.bool_]:
-        """Return a mask of connected parts without open sides and without sources.
-
-        Parts between which contacts may conduct fluid are undrained together.
-        """
+        """Return a mask of connected parts without open sides and without sources."""
         cut, (part, count) = on_grid.cut, on_grid.parts
         fed = [one.fed(cut, data.of_points) for one in state.stage.feeding]
         at = np.concatenate([np.zeros(0, dtype=np.int64), *fed])
@@ -427,7 +407,7 @@ class Motion:
         return closed[over_all(cut.grid.comm, of, MPI.MAX)]
 
     def of_bodies(self, on_grid: OnGrid, cells: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the largest values (k, bodies) in each body, from values (k, n) in the active owned cells."""
+        """Return the largest values (k, bodies) in each body. `values` (k, n): values in the active owned cells."""
         (part, count), points = on_grid.active.parts_of_cells, on_grid.cut.points
         inside = np.zeros((len(self._bodies), count), dtype=bool)
         inside[self._body(points), on_grid.parts[0]] = True
@@ -445,7 +425,7 @@ class Motion:
         return size * (points.volume0 / size.prod(axis=1))[:, None] ** (1 / size.shape[1])
 
     def _check_volumes(self, points: MaterialPoints, cut: CutDomains) -> None:
-        """Raise NotConverged for inverted points and for closed pores."""
+        """Raise NotConverged for inverted points and for zero porosity."""
         wet, J = self._storage is not None, points.J
         least = 1 - self._materials.table(points, lambda m: m.porosity) if wet else np.zeros(len(J))
         bad = (~(J > least)).nonzero()[0]
@@ -455,14 +435,14 @@ class Motion:
             raise NotConverged(f"{what}, J <= {least.max(initial=0):.3g}: {', '.join(shown) or 'elsewhere'}")
 
     def left_grid(self, state: State, on_grid: OnGrid) -> State:
-        """Return a state for a reset of the grid, in which points store the pressures of their pieces."""
+        """Return the state for a reset of the grid, with the pressures of pieces."""
         pieces = state.pieces and self._left(state.pieces, state.points, state.stage, state.t, on_grid, False)
         return replace(state, pieces=pieces, stay=None)
 
     def _left(
         self, carried: PiecePressures, points: MaterialPoints, stage: Stage, t: float, on_grid: OnGrid, some: bool
     ) -> PiecePressures:
-        """Return the pieces, with the pressures for the transfer to the next grid."""
+        """Return the pressures of pieces for the transfer to the next grid."""
         with _compat.Timer("remap"):
             pieces = on_grid.cut.pieces
             store = self._materials.storage(points) * points.volume0 * points.J
@@ -501,7 +481,7 @@ def untangled(
     grid: Grid,
     loads: Sequence[Loads],
 ) -> NDArray[np.float64]:
-    """Return the corners (m) after the inverted domains `bad` are re-initialised from F."""
+    """Return the corners, in m. Inverted domains, flagged by `bad`, have new corners that follow from F."""
     at = bad.nonzero()[0]
     X = points.reference[bad]
     d = grid.dim

@@ -38,7 +38,7 @@ class Acting(NamedTuple):
 
 
 class Start(NamedTuple):
-    """Start of a step: the state on the grid, with integration points, matrices and loads."""
+    """Data at the start of a step: state, integration points, matrices and loads."""
 
     state: State
     on_grid: OnGrid
@@ -50,10 +50,7 @@ class Start(NamedTuple):
     renewed: int = 0  # number of renewed particle domains
 
     def begun(self, acting: Acting, earlier: Sequence[Any] | None) -> Acting:
-        """Return the loads at the beginning of a substep.
-
-        `earlier`: data of the loads in the previous substep.
-        """
+        """Return the loads at the beginning of a substep. `earlier`: data of the loads in the previous substep."""
         if not self.state.stage.inertia:
             return acting
         shares = Shares(acting.substep.own * self.dt, acting.substep.before * self.dt, acting.gravity)
@@ -61,16 +58,15 @@ class Start(NamedTuple):
         return acting._replace(loads=[one.begun(shares, of) for one, of in zip(acting.loads, before, strict=True)])
 
     def carrying(self, flight: Flight | None) -> Callable[[NDArray[np.float64]], dict[str, NDArray[np.float64]]] | None:
-        """Return a function for the points' velocities after the step (see `Mass.carried`), or None without inertia."""
+        """Return the function `carried` of `Motion.advanced`, or None without inertia."""
         if flight is None:
             return None
         return partial(self.matrices.mass.carried, self.state.points, (flight.start, flight.velocity))
 
     def moves(self, flights: Sequence[Flight | None], substep: Substep) -> tuple[float, float]:
-        """Return the error and the size of the motion in the step, see `motion_error`.  Both are zero if the run does
-        not need them.
+        """Return the error and the size of the motion in the step (`motion_error`), or zeros if the run needs neither.
 
-        `flights`: velocities after each substep, or none for bodies at rest, which need no Newton step and no tangent.
+        `flights`: velocities after each substep.  The list is empty for bodies at rest.
         """
         control = self.state.control
         if control is None or control.motion is None or len(flights) < 2:
@@ -99,13 +95,13 @@ class Balances(NamedTuple):
         return flight.after(acceleration, float(substep.own * dt), float(substep.before * dt))
 
     def passing(self) -> list[Mapping[str, NDArray[np.float64]]]:
-        """Return the flow through open sides at the end of the substep, see `StorageProblem.passing`."""
+        """Return the flow through open sides at the end of the substep."""
         return self.storage.passing() if self.storage else []
 
     def outcome(self, state: State, passed: Sequence[Sequence[Mapping]], seconds: NDArray[np.float64]) -> Outcome:
-        """Return the results of conditions at the end of a step, by quantity and name, see `State`.
+        """Return the results of conditions at the end of a step, by quantity and name.
 
-        `passed`: flow in each substep, see `passing`.
+        `passed`: results of `passing` for each substep.
         `seconds`, s: time weights of the substeps.
         """
         stage, out = state.stage, {quantity: {} for quantity in QUANTITIES} | self.momentum.outcome()
@@ -116,19 +112,19 @@ class Balances(NamedTuple):
         return out | (self.storage.volumes(passed, seconds[-len(passed) :]) if self.storage else {})
 
     def net_inflow(self, rates: Rates | None) -> NDArray[np.float64] | None:
-        """Return the net inflow into the cells in the step (see `StorageProblem.net_inflow`), or None without fluid."""
+        """Return the net inflow of fluid into the cells in the step, or None without fluid."""
         return self.storage and self.storage.net_inflow(rates)
 
 
 def joined(loads: list[list[Loads]]) -> list[list[Loads]]:
-    """Return the loads of each substep.  The matrix pattern of contacts includes the contacts of all substeps."""
+    """Return the loads of each substep.  All contacts have the matrix pattern of all substeps."""
     if not any(map(attrgetter("couples"), chain.from_iterable(loads))):
         return loads
     return [[one.joined(of) for one, of in zip(now, zip(*loads, strict=True), strict=True)] for now in loads]
 
 
 def at_rest(scene: Scene, state: State, loads: list[list[Loads]]) -> list[list[Loads]]:
-    """Return the loads of each substep.  If the state has `rest`, reactions of supports include the initial stress."""
+    """Return the loads of each substep.  Reactions of supports include the nodal displacement `State.rest`."""
     if state.rest is None:
         return loads
     scene.momentum.u.x.array[:] = state.rest
@@ -136,7 +132,7 @@ def at_rest(scene: Scene, state: State, loads: list[list[Loads]]) -> list[list[L
 
 
 def left(loads: Sequence[Loads], at: At, before: MaterialPoints, after: MaterialPoints) -> MaterialPoints:
-    """Return the points after a step, with the data of the loads.  Raise an error if a load forbids new positions."""
+    """Return the points with the data that loads store.  Raise an error if a load does not allow the new positions."""
     for one in loads:
         one.check_end(after, before)
     for one in loads:
@@ -154,16 +150,13 @@ def flight_of(start: Start) -> Flight | None:
 
 
 def leads(scene: Scene, loads: Sequence[Loads]) -> bool:
-    """Return whether Newton's method may start from extrapolated motion: with yield, or with quasi-static contact."""
+    """Return whether Newton's method starts from extrapolated displacements: with yield, or quasi-static contact."""
     momentum = scene.momentum
     return not momentum.elastic or (momentum.inertia is None and any([one.touches for one in loads]))
 
 
 def going_on(scene: Scene, start: Start, acting: Acting) -> NDArray[np.float64] | None:
-    """Return the displacements (m) extrapolated from the previous substep or step, as a local array.
-
-    The result is None without previous motion, or if `leads` rejects extrapolated motion.
-    """
+    """Return displacements (m) extrapolated from the previous substep or step, or None if `leads` is False."""
     substep = acting.substep
     if substep.before > 0.0 and leads(scene, acting.loads):
         return substep.end / substep.own * scene.momentum.u.x.array

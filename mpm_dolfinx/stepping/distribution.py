@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""New distribution of the cells among processes at a reset of the grid, after bodies have moved, arrived or left.
+"""New distribution of the cells among processes (load balancing), at a reset of the grid.
 
-The scene is created again on a grid with other owners, but its forms are not compiled again.  The state is transferred
-as from a checkpoint.  Points and pieces move to the owners of their cells, and nodal data move to the nodes of each
-process.  The faces of all conditions are determined again.
+The scene is created again on the new partition of the grid.  Points, pieces and nodal data are sent to the owners of
+their cells and nodes.
 """
 
 from __future__ import annotations
@@ -19,17 +18,16 @@ from mpm_dolfinx.stepping.state import State
 
 
 class Distributed(Protocol):
-    """Interface of a simulation, whose scene and state are replaced together."""
+    """Interface of a simulation with a scene and a state."""
 
     scene: Scene
     state: State
 
 
 def distribute(simulation: Distributed) -> None:
-    """Distribute the cells anew if this makes the numbers of points on the processes more equal.
+    """Distribute the cells anew, if the numbers of points on the processes then become more equal.
 
-    The function acts only before a step that resets the grid.  If no cell changes its owner, points are still sent to
-    the owners of their cells.  On a grid with `follow`, the lines move before the distribution.
+    This happens only before a step that resets the grid.
     """
     grid = simulation.scene.grid
     if grid.comm.size == 1 or (state := simulation.state).stays:
@@ -43,7 +41,7 @@ def distribute(simulation: Distributed) -> None:
 
 
 def distribute_by(simulation: Distributed, boxes: NDArray[np.int64]) -> bool:
-    """Distribute the cells by boxes (ranks, 2, d) (see `Partition`).  Return False if this is impossible."""
+    """Distribute the cells by boxes (ranks, 2, d), see `Partition`.  Return False if the scene does not allow it."""
     new = simulation.scene.distributed(boxes)
     if new is not None:
         simulation.scene, simulation.state = new, new.adopted(simulation.state)

@@ -1,13 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Division and merging of elastic particle domains where grid cells become finer or coarser.
 
-A domain is bisected along a local axis if each half is at least as long, in cells, as the whole domain was at seeding.
-Stretch makes a domain longer in cells, so stretched domains may be divided too. Two halves merge if the merged domain
-is at most as long, in cells, as one domain at seeding. Whole domains on the lattice of a box merge too, except at the
-surface. Domains are not replaced if they yield, contain probes, or have a side whose displacement a condition needs.
-
-The corners of elastic domains determine F, so a division adds no error: both halves have the mapping of the whole
-domain. After merging, F follows from the outer corners. Masses, and the volume implied by the fluid, do not change.
+Lengths of domains are divided by the cell size. A domain is bisected along a local axis if each half is at least as
+long as the domain was at seeding. Two halves merge if the merged domain is at most as long as a domain at seeding. In
+the interior of a box, neighbouring domains of the lattice may merge too. Domains are never divided or merged if they
+have yielded, contain probes, or have a side with prescribed displacement.
 """
 
 from __future__ import annotations
@@ -29,11 +26,7 @@ from mpm_dolfinx.stepping.state import State
 
 
 class Division:
-    """Division and merging of the particle domains in a scene.
-
-    `faces`: faces of the bodies.
-    `materials`: materials of the scene.
-    """
+    """Division and merging of the particle domains in a scene with given faces and materials."""
 
     def __init__(self, faces: SeededFaces, materials: SceneMaterials):
         self._grid = materials.grid
@@ -134,7 +127,7 @@ class Division:
     def _intervals(self, points: MaterialPoints, axis: int) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """Return a key of each domain, and whether the domain is an upper half.
 
-        The two halves of a divided domain have equal keys. The key of a domain without a second half contains nan.
+        The two halves of a divided domain have equal keys. Keys of other domains contain nan.
         """
         root, part = roots(points)
         place, size = self._domains.places(root), np.ptp(part, axis=2)
@@ -182,10 +175,10 @@ class Division:
 
 
 def _divides(now: NDArray[np.float64], seeded: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return for each domain and axis whether its length in cells is at least twice the length of its seeded domain."""
+    """Return for each domain and axis whether the length is at least twice the seeded length."""
     return now >= 2 * seeded * (1 - SAME)
 
 
 def _merges(now: NDArray[np.float64], seeded: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return for each domain and axis whether its length in cells is at most half the length of its seeded domain."""
+    """Return for each domain and axis whether the length is at most half the seeded length."""
     return 2 * now <= seeded * (1 + SAME)

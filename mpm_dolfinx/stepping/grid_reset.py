@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Reset of the grid: domains are cut into pieces, active cells are found, and matrices are created.
 
-Pieces and matrices are reused until the next reset. A step begins with a reset (`Scene.on_grid`) if any corner has
-moved by more than a small fraction of a cell since the last reset. At the end of a step the points move (`advance`),
-and their pieces store the pressures.
+A step begins with a reset if any corner of a domain has moved by more than a small fraction of a cell. Other steps
+reuse the pieces and matrices.
 """
 
 from __future__ import annotations
@@ -43,15 +42,14 @@ from mpm_dolfinx.stepping.stage import Stage
 from mpm_dolfinx.stepping.state import State
 
 AtPlaces = Callable[[NDArray[np.integer], NDArray[np.float64]], NDArray[np.float64]]
-"""Function of local cells (n,) and of positions (n, d), in m, in these cells, which returns values (n,)."""
+"""Function of local cells (n,) and positions (n, d), in m, in these cells. The function returns values (n,)."""
 
 
 class OnGrid(Keyed):
-    """The bodies on the grid since its last reset.
+    """The bodies on the grid, as cut at the last reset.
 
     `quadrature`: integration points of the scene.
-    `momentum`, `storage`: forms; their coefficients are set from the material in the cells. `storage` is None without
-    fluid.
+    `momentum`, `storage`: forms of the two balances. `storage` is None without fluid.
     `cut`: the cut particle domains.
     `of_fluid`: whether the fixed-stress coefficient beta is 1/K_w, see `Scheme`.
     """
@@ -123,10 +121,10 @@ class OnGrid(Keyed):
                     self._borders = Borders(self.contents, cut.cells, alike, law, self.facets, self._mixed)
 
     def resisting_mass(self, seconds: float) -> NDArray[np.float64]:
-        """Return the resistance of the mass of cells over that of their stiffness, (n,) in the filled owned cells.
+        """Return the ratio of inertial to elastic resistance (n,) in the filled owned cells.
 
-        Over a time t, the middle node of 2 x 2 cells resists a displacement in proportion to `lambda + 3G + rho h^2 /
-        (3 t^2)`, from the consistent mass and the stiffness of Q1 elements.  `seconds`: t, in s.
+        In 2 x 2 cells of Q1 elements with a consistent mass, a displacement of the middle node over the time t has a
+        resistance proportional to `lambda + 3G + rho h^2 / (3 t^2)`.  `seconds`: t, in s.
         """
         filled, cut = self.contents.filled, self.cut
         density = cut.to_cells(self._quadrature.materials.present_density(cut.points))
@@ -136,7 +134,7 @@ class OnGrid(Keyed):
 
     @property
     def mixes(self) -> bool:
-        """Whether a cell contains several soils, and the ratio of their conductivities depends on the pressure."""
+        """Whether a cell contains several soils, and the ratio of their conductivities varies with pressure."""
         return self._mixed is not None and self._storage.fluxes.relative is not None
 
     @cached_property
@@ -185,10 +183,9 @@ class OnGrid(Keyed):
         return p[self.contents.filled]
 
     def _carried(self, state: State, pi: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the pressures at which the pieces contain the pore water of their points.
+        """Return the pressures (Pa) of the pieces from their mass potentials pi (Pa), see `fluid_content`.
 
-        The transferred mass potentials pi (Pa) reproduce linear fields (`fluid_content`). A constant is then added to
-        the pressures of the pieces of each point, so that the water of the point does not change.
+        The pore water of each point is conserved.
         """
         materials = self._quadrature.materials
         points = self.cut.points
@@ -217,7 +214,7 @@ class OnGrid(Keyed):
 
     @contextmanager
     def as_reset(self, state: State) -> Iterator[QuadratureData]:
-        """Yield the integration points at the last reset. In this context u is 0 and p is the pressure at the reset."""
+        """Yield the integration points at the last reset, with u = 0 and the pressure p at the reset."""
         at = [(self._u.x.array, self._momentum.active.now.dofs)]
         if self._storage is not None:
             at += [(f.x.array, self.cells) for f in (self._storage.p, self._storage.p_n)]
@@ -246,8 +243,7 @@ class OnGrid(Keyed):
     def _means(self, at_pieces: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the mean potentials of the pieces in the filled owned cells.
 
-        Means are weighted by the storage of the points, so that fluid is conserved. In cells without storage, means are
-        weighted by volume.
+        Means are weighted by storage, or by volume in cells without storage.
         """
         contents, points = self.contents, self.cut.points
         pieces = self.cut.pieces
@@ -268,12 +264,13 @@ class OnGrid(Keyed):
     ) -> list[NDArray[np.float64]]:
         """Return pressures (m,), slopes (m, d) and bounds (m, 2) in the pieces, from the pressures of the cells.
 
-        In each cell, the mean of the mass potentials of the pieces is the potential of the cell. Means are weighted by
-        storage, or by volume in cells without storage. With `water`, the pore water of a cell is conserved instead.
-        With water and gravity, the reconstruction acts on differences from the hydrostatic pressures `at_rest`.
+        The mean mass potential of the pieces equals the potential of their cell. In unsaturated scenes, the pore water
+        of a cell is conserved instead.
 
-        `store` (m,), m^d/Pa: storage of the pieces.
+        `store` (m,), m^d/Pa: storage of the pieces, the weights of the means.
         `t`, s: time of the pressures on open sides.
+        `water`: pore water of the pieces, in unsaturated scenes.
+        `at_rest`: hydrostatic pressures, with gravity. The reconstruction acts on differences from these pressures.
         """
         pieces = self.data.pieces
         contents = self.contents
@@ -306,9 +303,7 @@ class OnGrid(Keyed):
         return [self.cut.to_pieces(rows) for rows in values]
 
     def softness(self, state: State) -> NDArray[np.float64] | float:
-        """Return the elastic shear modulus of the pieces (m,) at the start of the step, divided by the tangent shear
-        modulus.
-        """
+        """Return the ratio (m,) of the elastic to the tangent shear modulus of the pieces at the start of the step."""
         data = state.points.data
         return self.cut.to_cells(data["softness"]) if "softness" in data else 1.0
 
@@ -323,8 +318,7 @@ class OnGrid(Keyed):
     ) -> NDArray[np.float64]:
         """Return the pressures (m,) at the centroids of the pieces, in Pa.
 
-        The volume mean of the pressures in a cell is the pressure of the cell. The reconstruction acts on differences
-        from hydrostatic pressures. In axisymmetry centroids and means refer to the meridional section.
+        The mean pressure over the pieces of a cell equals the cell pressure.
 
         `t`, s: time of the pressures on drained sides.
         `at_rest`: hydrostatic pressures, or None without gravity.
@@ -406,7 +400,7 @@ class OnGrid(Keyed):
 
     @cached_property
     def scale(self) -> NDArray[np.float64] | None:
-        """Suctions (Pa) at which filled owned cells drain (1 without retention curve), or None in saturated scenes."""
+        """Suctions (Pa) at which filled owned cells drain, or None in saturated scenes."""
         if self._quadrature.materials.retentions is None:
             return None
         scale = np.full(len(self.contents.filled), np.inf)
@@ -421,34 +415,31 @@ class OnGrid(Keyed):
         return Mobility(mean) if self._mixed is None else self._mixed.mobility(at_pieces, mean, None)
 
     def rests(self, state: State) -> NDArray[np.int64] | None:
-        """Return the filled owned cells in which all points keep their pieces, or None without such points."""
+        """Return the filled owned cells in which all points keep their pieces, or None if no point keeps its pieces."""
         if not state.stay:
             return None
         moves = self.cut.to_cells(~state.stay.keeps).astype(float)
         return (self.contents.total(moves) == 0).nonzero()[0]
 
     def valid(self, points: MaterialPoints, loads: Sequence[Loads]) -> NDArray[np.bool_]:
-        """Return a mask (n,) of points in connected parts that hardly move, and touch no part that moves."""
+        """Return a mask (n,) of points that may keep their pieces, because their connected part hardly moves."""
         part, count = self.parts if self.cut.grid.copies == 1 else self.parts_of_points(loads)
         return self.cut.valid(points, part, count)[part]
 
     def parts_of_cells(self, loads: Sequence[Loads]) -> tuple[NDArray[np.int64], int]:
-        """Return the parts of cells, see `ActiveSet.parts_of_cells`. Parts that may touch form one part."""
+        """Return the index of the connected part of each cell, and the number of parts. Contact connects parts."""
         if self.cut.grid.copies == 1:
             return self.active.parts_of_cells
         pairs = np.concatenate([one.within_reach() for one in loads])
         return joined_parts(self.cut.grid, *self.active.parts_of_cells, pairs)
 
     def parts_of_points(self, loads: Sequence[Loads]) -> tuple[NDArray[np.int64], int]:
-        """Return `parts`, with parts that may touch as one part."""
+        """Return `parts`, but with contact as a connection between parts."""
         return self._of_points(*self.parts_of_cells(loads))
 
     @cached_property
     def parts(self) -> tuple[NDArray[np.int64], int]:
-        """Index of the connected part of each point, from 0, and the number of parts.
-
-        The unknowns of a part are independent of all other parts.
-        """
+        """Index of the connected part of each point, from 0, and the number of parts."""
         return self._of_points(*self.active.parts_of_cells)
 
     def _of_points(self, part: NDArray[np.int64], count: int) -> tuple[NDArray[np.int64], int]:
@@ -470,8 +461,8 @@ class System:
     `momentum`, `storage`: compiled forms. `storage` is None without fluid.
     `dofs`: local indices of the unknown components of displacement.
     `stiff`: whether plates or prescribed displacements have a penalty.
-    `symmetric`: whether the tangent of the momentum is symmetric.
-    `loads`: loads at the positions at which domains were cut.
+    `symmetric`: whether the tangent of the momentum balance is symmetric.
+    `loads`: loads at the last reset.
     """
 
     def __init__(
@@ -504,18 +495,14 @@ class System:
         return LinearSolvers(self.plan, self._scheme, self.momentum, self.storage)
 
     def end_step(self) -> None:
-        """Delete multigrid's coarse grids, unless a tangent is reused. This frees memory for the motion of the
-        points."""
+        """Delete the coarse grids of multigrid to free memory, unless a tangent is reused."""
         if "solvers" in vars(self) and self.plan.iterative and self.solvers.tangent.value is None:
             del self.solvers
             collect_garbage(self.momentum.unknowns.comm)
 
 
 class Assembled(Keyed):
-    """Data that are reused until pieces or stage change: penalties and fluxes, in the matrices of a system.
-
-    `loads`: loads at the positions at which domains were cut.
-    """
+    """Penalties and fluxes, which are reused until the next reset or stage. `loads`: loads at the last reset."""
 
     def __init__(
         self,
@@ -563,11 +550,7 @@ class Assembled(Keyed):
         return self._system.solvers
 
     def _rounding(self, momentum: MomentumForms, loads: Sequence[Loads]) -> NDArray[np.float64]:
-        """Return the rounding errors of the residual at the active local nodes, in N.
-
-        A rounding error has two terms: one is proportional to the stiffness of the cells at the node, and one to the
-        penalties at the node.
-        """
+        """Return the rounding errors of the residual at the active local nodes, in N, from stiffness and penalties."""
         grid, on_grid = self._on_grid.cut.grid, self._on_grid
         cells, of_cells = on_grid.cells, np.zeros(grid.num_local)
         of_cells[cells] = ROUND_OFF * on_grid.stiffness[cells] * grid.volumes(cells) / grid.sizes(cells).min(axis=-1)
@@ -587,10 +570,9 @@ class Assembled(Keyed):
         loads: Sequence[Loads],
         present: At,
     ) -> tuple[list[Feeds], Callable[[bool], Outflow]]:
-        """Return the fluid conditions, and a function `outflow(begins)` that returns the fluxes at u. `begins`: see
-        `mobility`.
+        """Return the fluid conditions, and a function `outflow(begins)` for the fluxes at u.
 
-        Without a conductivity law, cells whose points all keep their pieces have the flux geometry of the last reset.
+        With `begins`, invalid values raise ValueError.
 
         `state`: state at the start of the step.
         `weight` (d,), N/m^3: unit weight of the fluid, or None without gravity.

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""State at the start of each stage: the initial state, and the state after changes of bodies, conditions or point data.
+"""State at the start of each stage.
 
-Initial stresses, and discretisation errors, cause out-of-balance forces. Steps of the momentum balance at constant
-pressures remove these forces. These steps change the elastic strains of the points, but not their positions.
+Initial stresses are not exactly in equilibrium. The momentum balance is therefore solved at constant pressures. This
+changes the elastic strains of the points, but not their positions.
 """
 
 from __future__ import annotations
@@ -51,21 +51,19 @@ from mpm_dolfinx.stepping.state import State, Stay
 from mpm_dolfinx.stepping.step import set_up
 
 DEPTH = 40
-"""Anderson mixing of `DEPTH` iterations ends if half as many iterations do not halve the square of the least residual.
+"""Number of previous iterations in Anderson mixing. Twice this value gives the same number of iterations.
 
-The tests are a wet bank, elastic or frictional, and blocks on a rough base; one block is half supported. Depth 40 takes
-as many iterations as depth 80. The relative out-of-balance forces are then 4e-5 to 3e-9. If the iterations end after 8
-without such a decrease, they end at 6e-3.
+Iterations end if half as many further iterations do not halve the square of the smallest residual.
 """
 REMARKABLE = 0.05
-"""Change of an initial stress above which a warning is issued, divided by the largest initial stress.
+"""A change of the initial stress by more than this fraction of the largest initial stress causes a warning.
 
 This value is also the largest allowed relative residual of the forces.
 """
 
 
 def first_state(scene: Scene, conditions: Mapping[str, Any], later: Sequence[int]) -> State:
-    """Return the state of a scene in its first stage. Its initial stresses are not balanced yet."""
+    """Return the state of a scene in its first stage, before its initial stresses are balanced."""
     present = [body not in later for body in range(len(scene.bodies))]
     check_apart(scene.grid, scene.bodies, present)
     first = scene.stage(conditions, present, later)
@@ -177,10 +175,10 @@ def begin_stage(
 def _released(
     scene: Scene, state: State, after: Stage, quiet: Mapping[str, Quiet]
 ) -> tuple[State, dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]]:
-    """Return the state on the grid of the next step, and the tractions on quiet sides.
+    """Return the state on the grid of the next step, and the static tractions on sides that become quiet.
 
-    The tractions are a dict by name of point data. Each value has the ids of points on a side, and their tractions. The
-    stresses are in equilibrium with these tractions, the loads of the previous stage, and the remaining supports.
+    Tractions balance the stresses, the loads of the previous stage, and the remaining supports. For each name of point
+    data, the result has ids of points and tractions.
     """
     start = set_up(scene, state, 0.0)
     state, momentum = start.state, scene.momentum
@@ -212,11 +210,10 @@ def _released(
 
 
 def _kept_at_rest(scene: Scene, state: State) -> State:
-    """Return the state on the grid of the next step, with forces that keep its bodies at rest.
+    """Return the state on the grid of the next step, with forces `held` that keep its bodies at rest.
 
-    Bodies are in equilibrium under the loads of the present stage. A reset of the grid causes small out-of-balance
-    forces. Forces stored in the state cancel them. With contact, no forces are stored, because contact removes
-    penetrations of the last step.
+    These forces cancel the small out-of-balance forces that a reset of the grid causes.  Scenes with contact have no
+    such forces.
     """
     start, forms = set_up(scene, state, 0.0), scene.momentum
     state, system = start.state, start.matrices.momentum
@@ -252,7 +249,7 @@ def _without_data(points: MaterialPoints, names: Collection[str]) -> MaterialPoi
 
 
 def _holds_as(after: Stage, before: Stage) -> bool:
-    """Return whether the conditions that support faces, and these faces, are the same in two stages."""
+    """Return whether the same conditions support the same faces in two stages."""
     return len(after.held) == len(before.held) and all(
         hold is was and np.array_equal(faces.id, then.id) and np.array_equal(faces.xi, then.xi)
         for (hold, faces, _), (was, then, _) in zip(after.held, before.held, strict=True)
@@ -260,7 +257,7 @@ def _holds_as(after: Stage, before: Stage) -> bool:
 
 
 def _check_weight(after: Stage, before: Stage | None, t: float) -> None:
-    """Raise ValueError if a stage with quiet sides changes the weight: their tractions would not balance it."""
+    """Raise ValueError if a stage with quiet sides changes gravity."""
     quiet = after.of(Quiet)
     now = after.gravity_at(t) if quiet else None
     was = None if before is None else before.gravity_at(t)
@@ -272,7 +269,7 @@ def _check_weight(after: Stage, before: Stage | None, t: float) -> None:
 
 
 def _warn_dammed(scene: Scene, stage: Stage, t: float) -> None:
-    """Warn of gravity that drives water towards tied sides, which would flow on in ground that repeats itself."""
+    """Warn of gravity with a component along the normal of tied sides, which drives pore fluid."""
     tied = stage.of(Tied)
     gravity = stage.gravity_at(t) if tied and scene.fluid and scene.materials.conducts else None
     for name, one in tied.items() if gravity is not None else ():
@@ -287,7 +284,7 @@ def _warn_dammed(scene: Scene, stage: Stage, t: float) -> None:
 def _prestressed(
     scene: Scene, points: MaterialPoints, present: Sequence[bool], gravity: NDArray | None
 ) -> MaterialPoints:
-    """Return new points with their initial stress, see `InitialStresses.of`."""
+    """Return new points with their initial stress."""
     points = scene.initial.of(scene.materials, points, present, gravity)
     if scene.initial.given and (where := scene.initial.lifted(scene.materials, points)):
         what = "initial_stress: K0 gives vertical tension, such as %s, because the pore pressure exceeds the overburden"
@@ -296,7 +293,7 @@ def _prestressed(
 
 
 def _with_contacts(before: Stage, conditions: Sequence[Condition]) -> list[Condition]:
-    """Return the conditions with the scene's contacts."""
+    """Return the conditions together with the contacts of the scene."""
     standing, given = contacts_of(before.given.values()), contacts_of(checked(conditions))
     if given and str([vars(one) for one in given]) != str([vars(one) for one in standing]):
         raise ValueError(f"stage: conditions: {line(given[0])}, must be the contacts of the scene, or left out")
@@ -304,7 +301,7 @@ def _with_contacts(before: Stage, conditions: Sequence[Condition]) -> list[Condi
 
 
 def _warn_moved_on(scene: Scene, before: Stage, after: Stage) -> None:
-    """Warn of each unchanged condition that now also acts on faces exposed by an excavation."""
+    """Warn of unchanged conditions that also act on faces exposed by an excavation."""
     stop = np.cumsum([len(body) for body in scene.bodies])
     for name, condition in after.given.items():
         if not hasattr(condition, "side") or before.given.get(name) is not condition:
@@ -324,7 +321,7 @@ def _warn_moved_on(scene: Scene, before: Stage, after: Stage) -> None:
 def _filled(
     scene: Scene, points: MaterialPoints, standing: Sequence[int], add: Sequence[int], gravity: NDArray | None
 ) -> tuple[MaterialPoints, MaterialPoints]:
-    """Return all points with those of added bodies, and the points of added bodies alone."""
+    """Return all points, including added bodies, and the points of added bodies alone."""
     standing = list(standing)
     waiting = list(add)
     new = scene.materials.seeded.of(np.empty(0, np.int64))
@@ -344,7 +341,7 @@ def _filled(
 def _without_extra(
     scene: Scene, points: MaterialPoints, add: Sequence[int], fields: Mapping[str, ArrayLike]
 ) -> MaterialPoints:
-    """Return the points without data that added bodies lack, or raise ValueError."""
+    """Return the points without point data that added bodies lack. Raise ValueError unless `fields` gives these data."""
     extra = points.data.keys() - scene.materials.seeded.data.keys()
     for name in sorted(extra - fields.keys()):
         what = f"stage: add: body {add[0]}: its points have no {name!r}"
@@ -375,7 +372,7 @@ def _changed(scene: Scene, points: MaterialPoints, fields: Mapping[str, ArrayLik
 
 
 def pieces_at_start(scene: Scene, points: MaterialPoints) -> PiecePressures:
-    """Return the pressures of the pieces for a pressure field. Each cell has the value of the field at its centroid."""
+    """Return the initial pressures of the pieces. Each cell has the value of the pressure field at its centroid."""
     on_grid = scene.on_grid(points)
     grid = scene.grid
     pressure = scene.initial.pressure
@@ -402,13 +399,11 @@ def pieces_at_start(scene: Scene, points: MaterialPoints) -> PiecePressures:
 
 
 def balanced(scene: Scene, state: State) -> State:
-    """Return a state with stresses in equilibrium with the loads at its time and with its pore pressures.
+    """Return a state with stresses in equilibrium with its loads and pore pressures.
 
-    If points have the strain of a displacement w, a step of the momentum balance gives a further displacement u(w).
-    Points store only mean strains of their domains, so `w + u(w)` is not in equilibrium yet. Therefore the fixed-point
-    iteration `w <- w + u(w)` follows, with Anderson mixing (Walker and Ni 2011). Mean strains cannot balance all nodal
-    forces. The forces `State.held` balance the remainder. Support forces are evaluated at the displacement w
-    (`State.rest`). Sides therefore stay at their seeded positions for any displacement prescribed at the start.
+    Let points have the strain of a displacement w. The solution of the momentum balance is then a further displacement
+    u(w). The fixed-point iteration `w <- w + u(w)` with Anderson mixing (Walker and Ni 2011) finds w with the smallest
+    u(w). Points store mean strains, so small nodal forces remain. The forces `State.held` balance them.
 
     Raises
     ------
@@ -465,10 +460,7 @@ def balanced(scene: Scene, state: State) -> State:
 
 
 def _report(scene: Scene, seeded: State, points: MaterialPoints, count: int, left: float, touches: bool) -> None:
-    """Log the changes of the stresses, and raise ValueError for a large relative residual.
-
-    With contact, a large residual causes only a warning, because contact is detected in the first step.
-    """
+    """Log the changes of the stresses. Raise ValueError for a large relative residual, or warn with contact."""
     materials, comm = scene.materials, scene.grid.comm
     if left > REMARKABLE and not touches:
         scene.forget()
@@ -485,7 +477,7 @@ def _report(scene: Scene, seeded: State, points: MaterialPoints, count: int, lef
 
 
 def _problem(scene: Scene, start: Start, state: State) -> MomentumProblem:
-    """Return the momentum balance with zero displacement and rates, for points with the present strain."""
+    """Return the momentum balance at zero displacement and zero rates."""
     matrices, data = start.matrices, start.on_grid.data_of(state)
     at = start.on_grid.cut, start.on_grid.fill, state.points, data
     place = Place(*at, state.t, 0.0, state.t, state.outcome)
@@ -495,7 +487,7 @@ def _problem(scene: Scene, start: Start, state: State) -> MomentumProblem:
 
 
 def _as_reset(scene: Scene, start: Start) -> State:
-    """Return the state as after a reset of the grid without motion."""
+    """Return the state after a reset of the grid without motion."""
     cut, pieces = start.on_grid.cut, None
     if scene.storage is not None:
         p = cut.to_pieces(scene.storage.p_n.x.array[start.data.pieces.cells])

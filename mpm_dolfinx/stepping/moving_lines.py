@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Grid lines that move with a body or tool.  A reset of the grid computes the lines from the state."""
+"""Grid lines that move with a body or tool, at resets of the grid."""
 
 from __future__ import annotations
 
@@ -20,11 +20,9 @@ from mpm_dolfinx.stepping.state import State
 
 
 def with_lines(grid: Grid, state: State, left: Callable[[State], State]) -> State:
-    """Return the state for its next step, and move the grid to the lines of that step.
+    """Move the grid lines for the next step.  Return the state, in which all domains are cut anew if lines have moved.
 
-    All domains are cut anew if any line moves by more than `STILL` cells.
-
-    `left`: function that adds pressures of pieces to a state, and is called before the grid moves.
+    `left`: function that adds pressures of pieces to a state, called before the lines move.
     """
     grid.move(state.lines)
     before = grid.lines
@@ -46,7 +44,7 @@ def with_lines(grid: Grid, state: State, left: Callable[[State], State]) -> Stat
 
 
 def _wanted(grid: Grid, state: State, before: Sequence[NDArray[np.float64]]) -> Sequence[NDArray[np.float64]]:
-    """Return the wanted coordinates of the grid lines along each axis."""
+    """Return the new coordinates of the grid lines along each axis."""
     if hasattr(grid.follow, "pose"):
         moved = state.stage.moved(grid, state.t, state.outcome)
         return before if moved is None else carried(grid.seeded, moved)

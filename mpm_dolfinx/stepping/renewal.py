@@ -1,21 +1,17 @@
 # SPDX-License-Identifier: MIT
 """Renewal: replacement of distorted particle domains of flowing soil by new ones, at a reset of the grid.
 
-F of yielded soil is updated by increments, so domains serve for integration only. New domains may replace these domains
-if they fill the same region, and keep its surface and contents. Cells with a piece of a domain longer than `LONGEST`
-are filled anew:
+F of yielded soil is updated by increments, so its domains serve for integration only. Cells with a piece of a domain
+longer than `LONGEST` are filled anew:
 
 * A full cell is divided into four equal domains.
-* A cell that the surface crosses once is filled with quadrilaterals about the centroid of the filled part. `EDGES`
-edges replace the surface in the cell. Ends and sharp corners of the surface, and the filled area (in axisymmetry
-volume), do not change.
+* A cell that the surface crosses once is filled with quadrilaterals about the centroid of the filled part. The surface
+in the cell becomes a polyline of `EDGES` edges. The filled area does not change.
 
-Remainders of old domains outside these cells become new domains. Masses, volumes and the mass of the fluid are exact in
-each cell. Mass-weighted sums of other point data, such as the logarithm of the elastic left Cauchy-Green tensor, are
-exact too. Point data of a new domain are means over its overlaps with old domains. Fitted slopes extrapolate these
-means to the new centroid, within the range of the old values. With inertia, the centre of mass, the momentum and the
-angular momentum of each cell are exact too. Cells are unchanged if they contain elastic soil, several bodies, several
-crossings of the surface, or domains on a side whose displacement a condition needs.
+The parts of old domains outside these cells become new domains. Each cell conserves mass, volume, mass of fluid, and
+mass-weighted sums of other point data. With inertia, each cell also conserves momentum and angular momentum. Point data
+of a new domain are means over the old domains in its area, corrected to first order for its centroid. Cells are not
+filled anew if they contain elastic soil, several bodies, several crossings of the surface, or a prescribed side.
 """
 
 from __future__ import annotations
@@ -43,15 +39,11 @@ from mpm_dolfinx.points.material_points import ACROSS, MaterialPoints, body_of, 
 from mpm_dolfinx.stepping.state import State, Stay
 
 LONGEST = 1.0
-"""Largest length of a domain, in cell sizes. Longer domains would need curved edges. Source: definition."""
+"""Largest length of a domain, in cell sizes, without renewal. Source: definition."""
 
 
 class Renewal:
-    """Renewal of the particle domains in a scene.
-
-    `faces`: faces of the bodies.
-    `materials`: materials of the scene.
-    """
+    """Renewal of the particle domains in a scene with given faces and materials."""
 
     def __init__(self, faces: SeededFaces, materials: SceneMaterials):
         self._grid = materials.grid
@@ -66,7 +58,7 @@ class Renewal:
         return misshapen(self._grid, points.corners, LONGEST)
 
     def flowed(self, points: MaterialPoints) -> NDArray[np.bool_]:
-        """Return a mask (n,) of yielded or renewed points: False for laws without the state `plastic`."""
+        """Return a mask (n,) of points that have yielded or have been renewed."""
         if "plastic" not in points.data:
             return np.zeros(len(points), dtype=bool)
         known = np.array(["plastic" in law.state for law in self._materials.laws])[self._materials.law_of(points)]
@@ -82,7 +74,7 @@ class Renewal:
     def renewed(self, state: State) -> tuple[State, int]:
         """Return the state with renewed domains, and the number of replaced domains. All processes must call it.
 
-        After a renewal the first process has all points. A failure raises NotConverged on all processes.
+        After a renewal, the first process has all points. A failure raises NotConverged.
         """
         comm = self._grid.comm
         needs = self.long(state.points)
@@ -138,10 +130,7 @@ class Renewal:
     def _pressures(
         self, old: PiecePressures, points: MaterialPoints, work: RefilledCells, made: MaterialPoints, group: NDArray
     ) -> NDArray[np.float64]:
-        """Return the pressures of new domains, so that their cells contain the fluid of the old domains.
-
-        All domains of a group have one pressure: the mean of the old pressures, weighted by storage, or else by volume.
-        """
+        """Return the pressures of the new domains: means of the old pressures, weighted by storage or volume."""
         materials, pieces = self._materials, work.pieces
         bulk = materials.fluid.bulk
         potential = transport(old.potentials(bulk), points, pieces)
@@ -196,7 +185,7 @@ class Renewal:
         ratio = volume / volume0
 
         def kept(values: NDArray) -> NDArray:
-            """Return means within the range of the values, with the exact mass-weighted sum."""
+            """Return means within the range of the values, with conserved mass-weighted sum."""
             means = mean(values).reshape(n, -1)
             for column, of in zip(means.T, values.reshape(len(values), means.shape[1]).T, strict=True):
                 missing = sum_by(groups, part * (mass * of)[source], count) - sum_by(group, volume0 * column, count)
@@ -259,7 +248,7 @@ def _joined(points: MaterialPoints, made: MaterialPoints, kept: NDArray[np.bool_
 
 
 def _of_tensors(function: np.ufunc, b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the value of a function, such as np.log, for symmetric tensors."""
+    """Return a function of symmetric tensors, such as their logarithm."""
     value, axes = np.linalg.eigh(b)
     return (axes * function(value)[:, None]) @ axes.swapaxes(1, 2)
 

@@ -17,15 +17,15 @@ from mpm_dolfinx.conditions.acting import MOTIONS, QUANTITIES
 from mpm_dolfinx.conditions.names import ByName
 
 OUTCOMES = (*QUANTITIES, *MOTIONS, "energy", "runoff", "flowed", "ran_off", "ponded")
-"""Quantities of the package's conditions. User-defined conditions may have other quantities."""
+"""Names of the results of the package's conditions. User-defined conditions may have other results."""
 
 
 @dataclass(frozen=True)
 class Result:
     """Histories of a run, with one row for each output time, including the start.
 
-    Histories are read-only arrays (n, ...) for n output times. Quantities that were not recorded have an axis of length
-    0: without probes, displacements have the shape (n, 0, d).
+    Histories are read-only arrays (n, ...) for n output times.  Without probes, arrays of probes have an axis of length
+    0.
 
     Parameters
     ----------
@@ -34,8 +34,8 @@ class Result:
     steps, newton, coupling
         Numbers of steps, of Newton iterations and of coupling iterations so far.
     cuts, rejected
-        Numbers of reduced steps. `cuts` counts steps without convergence. `rejected` counts steps with a large error.
-        In runs with equal steps, `rejected` counts steps with a jump of pressure.
+        Numbers of steps that were repeated with a shorter length: `cuts` without convergence, `rejected` for a large
+        error. In runs with equal steps, `rejected` counts jumps of pressure.
     reinitialised
         Number of inverted domains that were re-initialised from F.
     renewed
@@ -47,17 +47,17 @@ class Result:
     residual
         Largest relative residual of the momentum and fluid equations so far.
     wall, profile
-        Wall times, s, of the whole run, and of each part of the run on this process.
+        Wall times, s, of the whole run, and of each task on this process.
     converged
         Whether the run has reached `t_end`, or an event has ended it.
     event
-        Index in `until` (from 0) of the function that ended the run, and the time (s). None without an event.
+        The event that ended the run: index in `until`, from 0, and time, s. None without an event.
     points
         Number of material points at the end of the run.
     memory
         Peak memory (MB) of all processes, including libraries.
     imbalance
-        Largest number of points, of pieces and of cells on a process, divided by the mean, see `summary.imbalance`.
+        Largest numbers of points, pieces and cells on a process, each divided by the mean over processes.
     """
 
     rows: Rows = field(default_factory=Rows, repr=False)
@@ -145,18 +145,22 @@ class Result:
     def energies(self) -> ByName[NDArray[np.float64]]:
         """Energies and works (times,), in J (J/m in plane strain), of a `run(energies=True)`, by name.
 
-        `kinetic` and `elastic` are energies of bodies and free tools. `elastic` is 0 for laws of unknown elastic
-        energy. Works are summed from the start of the run. `external` is the work of all loads. `viscous` is the work
-        of quiet sides and of the user's terms. `friction` is the work of slip at tools and between groups. `internal`
-        is the work of the stresses. `dissipated` is `internal` minus `elastic`; in wet bodies it includes the work of
-        flow and storage of water. With `Numerics(renewal=True)`, `renewal` is the kinetic and elastic energy that
-        renewed domains have lost. The sum `kinetic` + `elastic` + `dissipated` + `viscous` + `friction` + `renewal` -
-        `external` is constant, up to numerical dissipation.
+        `kinetic`: kinetic energy of bodies and free tools.
+        `elastic`: elastic energy, or 0 for laws without a known elastic energy.
+        `external`: work of all loads.
+        `internal`: work of the stresses.
+        `dissipated`: `internal` minus `elastic`. In wet bodies, it includes the work of flow and storage of water.
+        `viscous`: work of quiet sides and user-defined terms.
+        `friction`: work of slip at tools and contacts.
+        `renewal`: kinetic and elastic energy that renewed domains have lost.
+
+        Works are summed from the start of the run. The sum `kinetic` + `elastic` + `dissipated` + `viscous` +
+        `friction` + `renewal` - `external` is constant, up to numerical dissipation.
         """
         return self.outcome("energy")
 
     def outcome(self, quantity: str) -> ByName[NDArray[np.float64]]:
-        """Return the results (n, ...) of conditions at the output times, by name; nan at times without the condition.
+        """Return the results (n, ...) of conditions, by name. Results are nan at times without the condition.
 
         `quantity`: name of the results, such as "reactions".
         """
@@ -172,11 +176,10 @@ class Result:
         return data_frame(self, {name: self.outcome(name) for name in OUTCOMES})
 
     def to_xarray(self):
-        """Return the histories as an xarray data set, with units as attributes of its variables.
+        """Return the histories as an xarray data set with the dimensions time, probe, axis, row and column.
 
-        Dimensions are time, probe and axis. Stresses at probes have the dimensions row and column instead of axis.
-        Variables of conditions have the conditions' names. Attributes of the data set are the numbers of steps and
-        iterations. Raise ImportError if xarray is not installed.
+        Each variable has its unit as an attribute. Attributes of the data set are the numbers of steps and iterations.
+        Raise ImportError if xarray is not installed.
         """
         counts = {name: getattr(self, name) for name in ("steps", "newton", "cuts", "balance", "residual", "wall")}
         return data_set(self, {name: self.outcome(name) for name in OUTCOMES}, counts)
@@ -200,7 +203,7 @@ class Result:
         )
 
     def shares(self) -> str:
-        """Return a table: time (s) and share of each part of the run, memory, and imbalance."""
+        """Return a table with the time (s) of each task, its share of the run time, the memory, and the imbalance."""
         rows = [*self.profile.items(), ("rest", self.wall - sum(self.profile.values()))]
         lines = [f"{name:18} {s:8.2f} s {100 * s / max(self.wall, 1e-9):5.1f} %" for name, s in rows]
         if self.points:  # measured at the end of a run
@@ -213,15 +216,14 @@ class Result:
 
 
 class GaveUp(RuntimeError):
-    """Error that ends a run because a step fails, even after it is shortened.
+    """Error that ends a run, because a step does not converge for any step length.
 
-    The simulation is in the state of the last good step. A new run may continue from this state with other conditions
-    or steps.
+    The simulation has the state after the last successful step. A new run continues from this state.
 
     Attributes
     ----------
     result
-        Histories up to the last good output time.
+        Histories up to the last successful step.
     history
         Relative residuals (momentum, storage) in the iterations of the failed step, if any.
     """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A compiled scene: grid, bodies, materials and forms that do not change between steps."""
+"""A scene with compiled forms: grid, bodies and materials."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class When(NamedTuple):
 
 
 class Scene:
-    """A compiled scene, which does not change between steps.  Data that change are in the `State`.
+    """A scene with compiled forms.  The `State` contains all data that change from step to step.
 
     `grid`, `bodies`, `materials`, `fluid`, `numerics`: see `Simulation`.
     `weighs`: whether the scene has gravity.
@@ -136,7 +136,7 @@ class Scene:
 
     @property
     def flows(self) -> bool:
-        """Whether fluid flows, or sources add fluid."""
+        """Whether the scene has flow of fluid, or sources of fluid."""
         return self.storage is not None and (self.materials.conducts or bool(self.storage.feeding))
 
     @cached_property
@@ -151,7 +151,7 @@ class Scene:
 
     @property
     def extended(self) -> bool:
-        """Whether the scene has user-defined terms or sources, which may be defined on the mesh."""
+        """Whether the scene has user-defined terms or sources."""
         return any(map(len, self.extensions))
 
     @property
@@ -170,12 +170,11 @@ class Scene:
         u: NDArray[np.float64] | float | None = None,
         **options,
     ) -> MomentumProblem:
-        """Return the balance of momentum at the end of a substep, with all coefficients of its forms set.
+        """Return the balance of momentum at the end of a substep, after setting the coefficients of its forms.
 
         `when`: the substep.
         `system`, `data`, `loads`, `options`: see `MomentumProblem`.
-        `u` (unknowns,), m: displacements at which the iterations begin, as a local array.  By default these are the
-        present displacements.
+        `u` (unknowns,), m: initial guess of the displacements, as a local array.  Default: present displacements.
         """
         self.t.value, self.dt.value = when.t, when.since
         if when.gravity is not None:
@@ -190,11 +189,11 @@ class Scene:
 
     @cached_property
     def _warned(self) -> set[str]:
-        """Subjects of earlier warnings, which are not repeated."""
+        """Texts of earlier warnings, which are not repeated."""
         return set()
 
     def look_at(self, gravity: Sequence[NDArray[np.float64] | None]) -> None:
-        """Warn once if the gravity of a step differs from the gravity that defines the conductivities."""
+        """Warn once if conductivities refer to another gravity than that of a step."""
         if self.fluid is None or not self.materials.conducts or gravity[0] is None or "gravity" in self._warned:
             return
         if strength := other_gravity(self.fluid, gravity):
@@ -204,21 +203,16 @@ class Scene:
             self._warned.add("gravity")
 
     def rests_at(self, stage: Stage, t: float) -> None:
-        """Set the unit weight of the fluid, with which `Retentions` computes hydrostatic pressures in unsaturated
-        cells.
-
-        If gravity varies, each step resets the grid.  `t`, s: start of a step, at which the gravity of `stage` is
-        evaluated.
-        """
+        """Set the unit weight of the fluid in unsaturated cells, with the gravity of `stage` at time t (s)."""
         if self.materials.retentions is not None:
             gravity = stage.gravity_at(t) if self.materials.conducts else None
             self.materials.retentions.weight.value = 0.0 if gravity is None else self.fluid.density * gravity
 
     def distributed(self, boxes: NDArray[np.int64]) -> Scene | None:
-        """Return an equal scene, or None.  The boxes (ranks, 2, d) distribute its grid, see `Partition`.
+        """Return the scene on another partition of the grid, by boxes (ranks, 2, d), see `Partition`.
 
-        The result is None for user-defined terms, because these may be defined on the present mesh.  The result is also
-        None if a second call of a function of position returns other values, as for a random field.
+        The result is None for user-defined terms, and if a function of position, such as a random field, returns other
+        values in a second call.
         """
         if self.extended:
             return None
@@ -234,7 +228,7 @@ class Scene:
         return out
 
     def adopted(self, state: State) -> State:
-        """Convert a state of an equal scene with another distribution to this scene."""
+        """Convert a state of the same scene on another partition."""
         before = state.stage
         given = {**before.conditions, "conditions": tuple(before.given.values())}
         nodal = {name: rows for name in NODAL if (rows := getattr(state, name)) is not None}
@@ -248,7 +242,7 @@ class Scene:
         return stage(self.bodies, self.materials, self.momentum, fed, conditions, present, later)
 
     def check(self, state: State) -> None:
-        """Raise ValueError if an object is not a state of this scene with the materials of this scene."""
+        """Raise ValueError if an object is not a state of this scene."""
         if not isinstance(state, State) or state.stage.materials is not self.materials:
             raise ValueError(f"state = {line(state)}, must be a state of this simulation")
 
@@ -269,13 +263,13 @@ class Scene:
         return self._on_grid((points.arrays, lines), make, grid.comm)
 
     def check_followed(self, first: Stage) -> None:
-        """Raise ValueError if grid lines follow a tool that is absent from the first stage: they would never move."""
+        """Raise ValueError if grid lines follow a tool that is absent from the first stage."""
         follow = self.grid.follow
         if hasattr(follow, "pose") and first.followed(self.grid) is None:
             raise ValueError(f"grid: follow = {line(follow)}, not in the first stage, must be one of its conditions")
 
     def followed(self, state: State) -> State:
-        """Return the state for its next step, and move the grid to the lines of that step."""
+        """Move the grid lines for the next step.  Return the state on these lines."""
         if self.grid.follow is None:
             return state
         state = with_lines(self.grid, state, lambda at: self.motion.left_grid(at, self.on_grid(at.stay.points)))
@@ -284,7 +278,7 @@ class Scene:
 
     @cached_property
     def _replacing(self) -> Sequence[Callable[[State], tuple[State, int]]]:
-        """Functions that replace particle domains at a reset of the grid, by division and merging, or by renewal."""
+        """Functions for division and merging, or for renewal, of particle domains at a reset of the grid."""
         grid = self.grid
         if not self.numerics.renewal:
             return ()
@@ -314,10 +308,7 @@ class Scene:
     def for_reset(self, state: State, renew: bool) -> tuple[State, int]:
         """Return a state for a reset of the grid, and the number of renewed domains.
 
-        In the returned state, points are on the owners of their cells.  If all points keep their pieces, the state is
-        unchanged.
-
-        `renew`: whether renewal is allowed.
+        The points are on the owners of their cells.  `renew`: whether renewal is allowed.
         """
         if state.stays:
             return state, 0
@@ -344,13 +335,13 @@ class Scene:
         """Return the matrices for a stage of the bodies on the grid.
 
         `now`: present loads.
-        `as_cut`: function that returns the loads at the positions at which domains were cut.
-        `begins`: whether all parts of the bodies must have supports.
+        `as_cut`: function that returns the loads at the last reset.
+        `begins`: whether this is the first step of a stage.  Then all parts of the bodies must have supports.
 
         Raises
         ------
         ValueError
-            A body, or at the start of a stage a connected part of a body, has a free rigid-body mode.
+            A body has a free rigid-body mode.  At the start of a stage, a connected part has such a mode.
         """
 
         def make() -> Assembled:
@@ -370,19 +361,19 @@ class Scene:
     def _system(
         self, on_grid: OnGrid, stage: Stage, dofs: NDArray[np.int32], loads: Sequence[Loads], begins: bool
     ) -> System:
-        """Return vectors, matrices and solvers for the active cells, see `assembled`.  `dofs`: see `System`."""
+        """Return vectors, matrices and solvers for the active cells."""
         if not stage.inertia and not any(one.holding for one in loads):
             check_held(on_grid.active, stage.free, [held for one in loads if (held := one.touching())], begins)
         stiff, symmetric = any(one.stiff for one in loads), self.momentum.symmetric and stage.symmetric
         return System(self.momentum, self.storage, self.scheme, on_grid, dofs, stiff, symmetric, loads)
 
     def seeded(self, chosen: Sequence[bool]) -> MaterialPoints:
-        """Return the points of the chosen bodies on this process, as seeded."""
+        """Return the seeded points of the chosen bodies on this process."""
         return self.materials.seeded.of_bodies(chosen, np.cumsum([0, *map(len, self.bodies)]))
 
     @cached_property
     def description(self) -> dict[str, Any]:
-        """Constants that define the scene, by name.  A checkpoint is identified by these constants."""
+        """Constants that define the scene, by name.  A checkpoint must have the same constants."""
         grid = self.grid
         out = {"grid cells": grid.shape.tolist(), "grid lower": grid.lower.tolist(), "grid upper": grid.upper.tolist()}
         if not grid.even:
@@ -410,10 +401,10 @@ class Scene:
 
     @property
     def last(self) -> tuple[OnGrid | None, Assembled | System | None]:
-        """The bodies as cut at the last reset of the grid, and the matrices of the last step, for inspection."""
+        """The bodies on the grid and the matrices of the last step, for inspection."""
         return self._on_grid.value, self._assembled.value or self._systems.value
 
     def forget(self) -> None:
-        """Delete all data of a step that may have been interrupted."""
+        """Delete all data of a step, for example after an interrupt."""
         for made in (self._systems, self._on_grid):
             made.clear()

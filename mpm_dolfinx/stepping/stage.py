@@ -78,7 +78,7 @@ def contacts_of(conditions: Sequence[Any]) -> list[Contact]:
 
 
 def named(conditions: Sequence[Any]) -> dict[str, Any]:
-    """Return the conditions by name.  Default names consist of kind and side, and of a number if necessary.
+    """Return the conditions by name.  A default name consists of type and side, and of a number if necessary.
 
     Raises
     ------
@@ -103,7 +103,7 @@ def named(conditions: Sequence[Any]) -> dict[str, Any]:
 
 
 def _default(condition: Any) -> str:
-    """Return the default name of a condition, from its kind and side."""
+    """Return the default name of a condition, from its type and side."""
     kind = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", type(condition).__name__).lower()
     side = getattr(condition, "side", None)
     return kind if side is None else f"{kind}_{re.sub(r'[^A-Za-z0-9]+', '_', str(side))}"
@@ -165,16 +165,19 @@ class Stage:
 
     @property
     def symmetric(self) -> bool:
-        """Whether the tangent of all loads is symmetric."""
+        """Whether the tangents of all loads are symmetric."""
         return all(one.symmetric for one in self.acting)
 
     @property
     def held(self) -> list[tuple[Any, Surface, Sequence[int]]]:
-        """Conditions that support faces, each with faces and axes."""
+        """Conditions that support faces, each with its faces and axes."""
         return [one for acting in self.acting for one in acting.held]
 
     def supported(self, corners: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return along which axes (d,) walls hold corners (n, 2^d, d) of domains, or conditions hold sides."""
+        """Return along which axes (d,) walls or conditions support the bodies.
+
+        `corners` (n, 2^d, d): corners of the domains.
+        """
         out = fixed_corners(self.materials.grid, self.conditions["walls"], corners).any(axis=(0, 1))
         out[[axis for _, _, axes in self.held for axis in axes]] = True
         return out
@@ -185,7 +188,7 @@ class Stage:
             return [one.placed(place) for one in self.acting]
 
     def check_start(self, place: Place) -> None:
-        """Raise an error before the stage's first step if the positions of bodies or tools do not allow it."""
+        """Raise an error if the positions of bodies or tools at the start of the stage are invalid."""
         for one in self.acting if place.begins else ():
             one.check_start(place)
 
@@ -198,18 +201,21 @@ class Stage:
         return {data for one in self.acting for name, of in one.kept(0).items() if name in names for data in of}
 
     def same(self, before: Stage) -> set[str]:
-        """Return the names of conditions that are one object in both stages, or have equal user-defined names."""
+        """Return the names of conditions that continue from the stage `before`.
+
+        Such a condition is the same object in both stages, or has the same user-defined name.
+        """
         shared = ((name, one) for name, one in self.given.items() if name in before.given)
         return {name for name, one in shared if one is before.given[name] or getattr(one, "name", None) == name}
 
     @property
     def lasting(self) -> list[Surface]:
-        """Faces at which a condition needs displacements since seeding.  Their domains must not be replaced."""
+        """Faces with conditions on displacements since seeding.  Their domains must not be replaced."""
         return [*(faces for _, faces, _ in self.held), *(faces for one in self.acting for faces in one.seeded)]
 
     @property
     def quantities(self) -> tuple[str, ...]:
-        """Quantities that conditions of the package may return."""
+        """Names of the results of conditions."""
         return QUANTITIES + OF_RAIN + MOTIONS
 
     def unknown(self, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:
@@ -230,7 +236,7 @@ class Stage:
     def initial_outcome(
         self, before: Stage, outcome: Outcome, value: float
     ) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return the results of conditions at the beginning of the stage.  Results of new conditions are `value`."""
+        """Return the results of conditions at the beginning of the stage.  New conditions have the result `value`."""
         same = {name for name, one in self.given.items() if before.given.get(name) is one}
         if self.conditions["walls"] == before.conditions["walls"]:
             same |= SIDES[self.free.shape[1]].keys()
@@ -241,7 +247,7 @@ class Stage:
         return out
 
     def kinetic(self, outcome: Outcome) -> float:
-        """Return the kinetic energy (J) of free tools from the results of conditions."""
+        """Return the kinetic energy (J) of free tools."""
         d, tools = self.free.shape[1], self.of(Tool)
         moving = [(tools[name].mass, v) for name, v in outcome.get("tool_velocity", {}).items() if name in tools]
         moving += [(tools[name].inertia(d), v) for name, v in outcome.get("tool_spin", {}).items() if name in tools]
@@ -269,15 +275,16 @@ def stage(
     """Return a stage.
 
     `bodies`, `materials`: all bodies and materials of the scene.
-    `momentum`, `fed`: forms of the balance of momentum, and terms that act in the balance of fluid in all stages.
+    `momentum`: forms of the balance of momentum.
+    `fed`: terms in the balance of fluid that all stages have in common.
     `conditions`: walls, conditions, gravity and inertia: see `Simulation`.
     `present`: whether each body is present.
-    `later`: indices of bodies still to be added.
+    `later`: indices of bodies that a later stage adds.
 
     Raises
     ------
     ValueError
-        A condition is invalid.  The message has the name, the value and the allowed values of the condition.
+        A condition is invalid.
     """
     grid, fluid = materials.grid, materials.fluid
     given_by_name = named(checked(conditions["conditions"]))

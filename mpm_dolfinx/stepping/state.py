@@ -32,12 +32,12 @@ def _freeze(kept: Mapping[str, Any]) -> None:
 
 @dataclass(frozen=True)
 class StepControl:
-    """Data of a run's step sizes that one step passes to the next, see `simulation/step_size.py`.
+    """Data of the step-size control that one step passes to the next, see `simulation/step_size.py`.
 
     Parameters
     ----------
     interval : s
-        Output interval of the run; 0 for output times without equal intervals.
+        Output interval of the run; 0 if output intervals are not equal.
     small : s
         Next trial step.
     waits, kept
@@ -45,11 +45,11 @@ class StepControl:
     change : (bodies,), Pa
         Largest pressure change of each body since the start of the run.
     first : (bodies,), Pa/s
-        Pressure change in the first substep of the last step (`Report.first`), divided by the length of this step.
+        Pressure change in the first substep of the last step, divided by the length of this step.
     start : (2, bodies), Pa
-        Smallest and largest cell pressures of each body at the start of the run, or None before the first step.
+        Smallest and largest cell pressure of each body at the start of the run; None before the first step.
     motion : J^(1/2)
-        Largest motion since the start of the run, see `motion_error`; None if the run does not limit errors of motion.
+        Largest size of the motion (`motion_error`) since the start of the run; None without a limit on its error.
     drift : m/s
         Mean velocity of free bodies at the start of the run, see `motion_error`.
     filled
@@ -70,7 +70,7 @@ class StepControl:
 
 @dataclass(frozen=True, eq=False)
 class Stay:
-    """Points that have hardly moved since the last reset of the grid, and therefore keep the pieces of their domains.
+    """Points that keep the pieces of their domains, because they have hardly moved since the last reset of the grid.
 
     points
         The material points at the reset of the grid.
@@ -92,7 +92,7 @@ class Trend:
     lengths : (k,)
         Lengths (s) of the steps, beginning with the last step.
     rates : (n, k, d (1 + d)), with fluid (n, k, d (1 + d) + 1)
-        Mean rates in each of these steps: of x (m/s), of F (1/s), and with fluid also of the pressure (Pa/s).
+        Mean rates of x (m/s), of F (1/s), and with fluid also of the pressure (Pa/s), in each of these steps.
     """
 
     lengths: NDArray[np.float64]
@@ -102,11 +102,10 @@ class Trend:
         _freeze(vars(self))
 
     def over(self, seconds: float, implicit: bool = False, first: float = 0.0) -> NDArray[np.float64]:
-        """Return the changes (n, ...) in a time `seconds` (s), from the polynomial through the last states.
+        """Return the changes (n, ...) in a time `seconds` (s), by polynomial extrapolation.
 
-        `implicit`: whether the rate at the end of the time replaces the mean rate.
-        `first`, s: length of a first substep. If it is positive, the implicit change in this substep, times
-        `seconds / first`, is subtracted.
+        `implicit`: whether the rate at the end of this time replaces the mean rate.
+        `first`, s: length of a first substep, or 0. The change in this substep, times `seconds / first`, is subtracted.
         """
         order, last = np.arange(1, len(self.lengths) + 1), self.lengths[0]
         ends, powers = -self.lengths.cumsum()[:, None] / last, (seconds / last) ** order * (order if implicit else 1)
@@ -125,13 +124,13 @@ NODAL = ("velocity", "held", "rest")
 class State:
     """All data of a scene that one step passes to the next. States are immutable: each step returns a new state.
 
-    A checkpoint stores all of these data, except the stage, which the script defines, and the points `watched`.
+    A checkpoint stores all of these data, except `stage` and `watched`.
 
     t
         Time, s.
     points
-        Material points of this process, with positions relative to the grid's `base`. `Simulation.points` have true
-        positions, and are not accepted; `PlacedPoints.from_base` converts them.
+        Material points of this process. Their positions are relative to `Grid.base`. `Simulation.points` have true
+        positions; `PlacedPoints.from_base` converts these.
     pieces
         Pressures of the pieces of the particle domains, for the transfer to the next grid. None without fluid.
     stay
@@ -139,31 +138,31 @@ class State:
     resets
         Number of resets of the grid.
     lines
-        Coordinates (n,), m, of moving grid lines at the last reset of the grid, by axis "x", "y", "z". These
-        coordinates are relative to the `base` of the grid. None before a reset, and for grids with fixed lines.
+        Coordinates (n,), m, of moving grid lines at the last reset, relative to `Grid.base`, by axis "x", "y", "z".
+        None before the first reset, and for fixed grid lines.
     outcome
         Results of conditions at the end of the last step, by quantity and name. Results of new conditions are nan
         before the first step of a stage. `reactions` (d,), N: forces of prescribed displacements on the bodies.
         `wall_reactions` (d,), N: forces of the grid's walls on the bodies. `outflows`, m^3/s (m^2/s in plane strain):
-        flow through open sides and contacts that conduct, as volumes at zero pressure. `tool_forces` (d + 1,), in 3D
-        (6,): forces (N) and moments (N m) of tools and contacts on the bodies. `tool_travel`, m: displacement of a
-        load-controlled tool in addition to its prescribed displacement. Other keys belong to user-defined conditions.
+        flow through open sides and conducting contacts, as volumes at zero pressure. `tool_forces` (3,), in 3D (6,):
+        forces (N) and moments (N m) of tools and contacts on the bodies. `tool_travel`, m: displacement of a tool due
+        to forces. User-defined conditions may have other quantities.
     stage
         The present stage, with its conditions.
     begins
-        Whether the stage has had no step so far.
+        Whether the next step is the first step of the stage.
     velocity : (unknowns,), m/s
-        Nodal velocities in the last step on this process, with ghosts, for the initial guess of Newton's method with
-        yield or contact. None before the first step, and without yield or contact.
+        Nodal velocities in the last step on this process, with ghosts. In scenes with yield or contact, these give the
+        initial guess of Newton's method. None before the first step, and in other scenes.
     trend
-        Motion in the last steps, for the initial guess in elastic bodies. None in other scenes, and after bodies were
-        added.
+        Motion in the last steps.  In elastic bodies, it gives the initial guess of Newton's method.  None in other
+        scenes, and after bodies were added.
     held : (unknowns,), N
-        Nodal forces on this process, with ghosts. These forces balance an initial stress where loads do not, or keep a
-        body at rest when inertia begins. None without such forces, in other stages, and after a reset of the grid.
+        Additional nodal forces on this process, with ghosts, for equilibrium at the start of a stage. None without such
+        forces, and after a reset of the grid.
     rest : (unknowns,), m
-        Nodal displacement on this process, with ghosts, for which prescribed displacements and plates balance an
-        initial stress. None after a stage that changes these conditions, and after a reset of the grid.
+        Nodal displacement on this process, with ghosts, at which prescribed displacements and plates balance an initial
+        stress. None after a stage that changes these conditions, and after a reset of the grid.
     watched : (m,)
         Ids of the points whose domains contain probes. Renewal does not replace these domains.
     result, control
@@ -199,7 +198,7 @@ class State:
 
     @property
     def as_cut(self) -> MaterialPoints:
-        """Points at the positions where their domains were cut. Points without kept pieces are at present positions."""
+        """Points at the last reset. Points that do not keep their pieces are at present positions."""
         if self.stay is None:
             return self.points
         return self.stay.points if self.stay.keeps is None else self.stay.points.where(self.stay.keeps, self.points)
@@ -219,7 +218,7 @@ class State:
         return out
 
     def migrated(self, destination: NDArray[np.int32], comm: MPI.Intracomm) -> State:
-        """Return the state after every point has moved with its pieces to its process `destination` (n,)."""
+        """Send points and their pieces to the processes `destination` (n,), and return the state."""
         exchange = Exchange(comm, destination)
         pieces = self.pieces
         if pieces is not None:

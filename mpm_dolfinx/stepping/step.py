@@ -46,7 +46,7 @@ def set_up(scene: Scene, state: State, dt: float, how: tuple = ()) -> Start:
 
 
 def step(scene: Scene, state: State, dt: float, how: tuple = ()) -> tuple[State, Report]:
-    """Return the state after a step of length dt (s), and its report.  `state` is unchanged even after an error."""
+    """Return the state after a step of length dt (s), and the report of the step."""
     start = set_up(scene, state, dt, how)
     report, kept = Report(renewed=start.renewed), Kept()
     rates, passed = [], []
