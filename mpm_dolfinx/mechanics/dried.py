@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Derivatives of nodal forces with respect to the pressures of cells, for laws that depend on suction.
 
-The total stress depends on the pressure p through the suction in the law, and through the term chi p of Bishop's
-stress.  In cells with F-bar, the mean stress pi also depends on the pressure.
+The stress depends on the pressure p through the suction in the law, and through the term chi p of Bishop's stress.
 """
 
 from __future__ import annotations
@@ -20,12 +19,12 @@ from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
 
 
 def suction_sums(points: FormPoints, F, slopes: Sequence, locks: bool) -> CellSums | None:
-    """Return the sums over pieces in each cell that `OfSuction` needs, or None for laws without suction.
+    """Return the compiled sums over each cell for `OfSuction`, or None for laws without suction.
 
     `F`: deformation gradient (d, d), a UFL variable.
-    `slopes`: UFL derivatives with respect to the pressure: of the first Piola-Kirchhoff stress (d, d), and with F-bar
-    also of the mean stress pi.  Empty for laws without suction.
-    `locks`: whether the law of the pieces uses F-bar.
+    `slopes`: UFL derivatives of the first Piola-Kirchhoff stress (d, d), and with F-bar also of the mean stress, with
+    respect to the pressure.  Empty for laws without suction.
+    `locks`: whether the law uses F-bar.
     """
     share = 1 / ufl.det(points.F)
     tensors = [share * ufl.diff(ufl.det(F), F)] if locks else []
@@ -37,7 +36,7 @@ def suction_sums(points: FormPoints, F, slopes: Sequence, locks: bool) -> CellSu
 class OfSuction:
     """Derivatives of nodal forces with respect to the pressures of cells, for laws that depend on suction.
 
-    `dilatation`: volume ratios of cells for F-bar, or None if no cell would lock.
+    `dilatation`: volume ratios of cells for F-bar, or None without F-bar.
     `sums`: results of `suction_sums` for each part of the points.
     """
 

@@ -1,20 +1,15 @@
 # SPDX-License-Identifier: MIT
 """Ghost penalty: nearly empty cells follow the deformation of fuller neighbours (Burman 2010, Coombs 2023).
 
-Without a penalty, nearly empty cells would spoil conditioning and accuracy.  The ghost penalty adds the term
-`gamma s 2G h/3 int [d_n u].[d_n v] dS` over faces, with the displacement increment u of the step and the test function
-v.  Here gamma is `GHOST`, s is the strength of the face, G the shear modulus, h the cell size, and [d_n u] the jump of
-the normal derivative.  The penalty resists motion like a viscosity, so it must not act on load-bearing cells:
+The ghost penalty adds the term `gamma s 2G h/3 int [d_n u].[d_n v] dS` over faces between cells.  Here u is the
+displacement increment of the step, v the test function, and [d_n u] the jump of the normal derivative.  Gamma is
+`GHOST`, G the shear modulus, and h the cell size.  The factor s is between 0 and 1 for each face:
 
-* The strength s has two factors.  The first factor decreases from 1 to 0 as the ratio of the fillings of the emptier
-  and the fuller cell increases from 0 to `RATIO`.  The second factor is the squared ratio of the filling of the fuller
-  cell to the largest filling of the emptier cell's neighbours.  The penalty does not resist kinks of a body between
-  equally filled cells.
-* The factor 2G contains the shear modulus only.  With lambda + 2G, nearly empty cells of nearly incompressible bodies
-  would copy the stretch of the full neighbour, against their own volume constraint.
+    s = max(0, 1 - f_1 / (RATIO f_2)) (f_2 / f_3)^2,     f_1 <= f_2,
 
-With integration at the material points, any cell may hold too few points for its nodes.  All faces of cells that are
-not full then have a penalty of strength 0.2.
+with the volume fractions f_1 and f_2 of the two cells, and the largest volume fraction f_3 of the neighbours of cell 1.
+The penalty therefore acts on nearly empty cells only.  With integration at the material points (`quadrature="point"`),
+s is 0.2 on all faces of cells that are not full.
 """
 
 from __future__ import annotations
@@ -37,12 +32,12 @@ GHOST = 0.05
 9.9e-06, twice this value by 1.9e-05, and finer cells by 1.5e-02.
 """
 YIELDING = 0.02
-"""Smallest reduction factor of the penalty for nearly incompressible laws with a state.  Plateau (scene "flow" of
+"""Smallest factor on the penalty for nearly incompressible laws with a state.  Plateau (scene "flow" of
 tests/plateaus.py): half this value changes the result by 6.4e-04, twice this value by 1.1e-03, and finer cells by
 8.9e-02.
 """
 RATIO = 0.3
-"""A face has the penalty if the filling of its emptier cell is below this fraction of the filling of its fuller cell.
+"""Ratio of the volume fractions of two cells below which their common face has a penalty.
 
 Plateau (scene "soil" of tests/plateaus.py): half this value changes the result by 1.3e-03, twice this value by 5.9e-04,
 and finer cells by 3.0e-02.
@@ -52,11 +47,7 @@ SPARSE, FULL = 0.2, 0.9
 
 
 def stiffness(material: Skeleton) -> NDArray[np.float64]:
-    """Return the modulus of the penalty, in Pa: 2G, reduced for nearly incompressible laws with a state.
-
-    In nearly empty cells of flowing soil, the volume constraint opposes the penalty.  At low Poisson's ratio the
-    penalty is not reduced, because Newton's method would fail in frictional soil at deep penetration.
-    """
+    """Return the modulus of the penalty, in Pa: 2G, or less for nearly incompressible laws with a state."""
     share = np.minimum(1.0, 4 * material.shear / material.oedometric) ** 2 if material.state else 1.0
     return 2 * np.maximum(YIELDING, share) * material.shear
 
@@ -79,11 +70,11 @@ class GhostPenalty:
     Attributes
     ----------
     modulus
-        Mean modulus of the penalty in each cell, Pa, see `stiffness`.
+        Mean modulus of the penalty in each cell, Pa.
     shear
-        Mean shear modulus in each cell, Pa, with zero for laws without a state.
+        Mean shear modulus in each cell, Pa; zero for laws without a state.
     elastic_shear
-        Form that regularises tangents: elastic shear stiffness of the cells times their volume fraction.
+        Form of the elastic shear stiffness, for the regularisation of tangents.
     fill, beside
         Volume fraction of each cell, and the largest volume fraction of its neighbours.
     """
@@ -114,9 +105,7 @@ class GhostPenalty:
     def set_contents(
         self, own: NDArray[np.int64], volume: NDArray[np.float64], *moduli: NDArray[np.float64]
     ) -> NDArray[np.int64]:
-        """Set the volume fractions and moduli of owned cells with material, and return all active local cells.
-
-        `fill` must be zero before the call.
+        """Set the volume fractions and moduli of owned cells with material.  Return all active local cells.
 
         `own` (n,): owned cells that contain material.
         `volume` (n,), in m^d: volume of the material in each cell.
@@ -135,7 +124,7 @@ class GhostPenalty:
         return np.concatenate([own, ghosts])
 
     def on(self, facets: NDArray[np.int32], at_walls: NDArray[np.int32]) -> Loads:
-        """Return the penalty on faces.  The faces `at_walls` belong to cells with nodes that walls fix."""
+        """Return the penalty on `facets`.  The faces `at_walls` are next to walls of the grid."""
         return GhostLoads(self.form.on(facets), self.form.on(at_walls))
 
     def facets(self, facets: NDArray[np.int32]) -> NDArray[np.int32]:

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Prescribed displacements of sides, by penalties on cell means and weaker penalties at points; see `held_cells`.
+"""Prescribed displacements of sides, by penalties (`held_cells`).
 
-A side may lag behind its prescribed displacement.  Each component in each cell then gets a multiplier, by the method of
-multipliers (Hestenes 1969).  With the multipliers, the cell means reach the prescribed displacements if the cells can
-follow the side.
+If a side lags behind its prescribed displacement, each component in each cell gets a multiplier (method of multipliers,
+Hestenes 1969).
 """
 
 from __future__ import annotations
@@ -41,7 +40,7 @@ ARTEFACT = "%s: not at its prescribed position at %s, so %s"
 
 
 class HoldForms:
-    """Forms of penalties at points or on means: stiffness, and force towards the prescribed position."""
+    """Forms of the penalties: stiffness, and force towards the prescribed position."""
 
     def __init__(self, grid: Grid, u: fem.Function):
         d = grid.dim
@@ -65,7 +64,7 @@ class HoldForms:
 class GivenDisplacements(Acting):
     """The prescribed displacements of a stage, by name.
 
-    ValueError is raised if two conditions prescribe the same component on the same part of a face.
+    Two conditions must not prescribe the same component on the same part of a face (ValueError).
     """
 
     conditions, title = (Displacement,), "given displacements"
@@ -94,7 +93,7 @@ class GivenDisplacements(Acting):
         return [faces for _, faces, _ in self._holds]
 
     def check_start(self, place: Place) -> None:
-        """Warn once for each condition whose side must jump at the start of a stage with inertia."""
+        """Warn of sides that jump to a prescribed displacement at the start of a stage with inertia."""
         if not (place.inertia and place.dt):
             return
         for number, (hold, faces, axes) in enumerate(self._holds):
@@ -108,9 +107,9 @@ class GivenDisplacements(Acting):
     def _jump(
         self, place: Place, points: MaterialPoints, hold: Displacement, axes: Sequence[int], p: Patches
     ) -> NDArray[np.float64]:
-        """Return the gaps (n, d), in m, that a side closes at once at the start of a stage, and zeros elsewhere.
+        """Return the gaps (n, d), in m, between a side and its prescribed positions at the start of a stage.
 
-        The strain of such a gap in a cell exceeds the stress divided by the modulus.
+        Gaps that the elastic strain of a cell explains are zero in the result.
         """
         out = np.zeros_like(p.now(points))
         if not place.begins:
@@ -146,10 +145,7 @@ class GivenDisplacements(Acting):
         return HoldLoads(self, forms, data, held, row, own, place)
 
     def _held_points(self, place: Place, ends: Sequence[float]) -> HeldPoints:
-        """Return the integration points on sides, on the processes that own the constraints, see `inner_cells`.
-
-        `ends`: start and end of the step, in s; empty if the displacement is zero.
-        """
+        """Return the integration points on sides.  `ends`: start and end of the step, in s; empty for a zero step."""
         cut, points = place.cut, place.points
         d, t = self._grid.dim, place.t
         rows, bounds = [], []
@@ -192,7 +188,7 @@ class GivenDisplacements(Acting):
         return HeldPoints(number=number, cell=cell, x=x, **fields)
 
     def _check_meeting(self, t: float) -> None:
-        """Raise ValueError if displacements differ where two sides meet, because the stress would be infinite."""
+        """Raise ValueError if prescribed displacements differ where two sides meet."""
         for one, other, axes, X in self._meeting:
             jump = np.abs(self._given(one, t, X) - self._given(other, t, X))[:, axes].max(axis=1)
             if jump.max(initial=0.0) > NEAR * self._grid.least:
@@ -222,7 +218,7 @@ class GivenDisplacements(Acting):
         return dict(zip(self._names, sums, strict=True))
 
     def _warn(self, number: int, what: str, *values) -> None:
-        """Warn of a fault of a condition, once for each condition and fault."""
+        """Warn of a condition, once for each condition and text."""
         if (number, what) not in self._warned:
             warn(self._grid.comm, ConditionWarning, what, line(self._holds[number][0]), *values)
             self._warned.add((number, what))
@@ -245,11 +241,11 @@ class GivenDisplacements(Acting):
     def under_held(
         self, ids: NDArray[np.int64], tracked: NDArray[np.float64], volume: NDArray[np.float64], corners: NDArray
     ) -> NDArray[np.float64]:
-        """Return corners, in m, of re-initialised domains.  Domains at prescribed sides become prisms.
+        """Return the corners of re-initialised domains `ids`, in m.  Domains at prescribed sides become prisms.
 
-        Each prism has the volume of its domain, and keeps the old corners on the side.
+        Each prism has the volume of its domain, and keeps the corners on the side.
 
-        `tracked`, `corners` (n, 2^d, d), in m: corners of the domains `ids` before and after re-initialisation.
+        `tracked`, `corners` (n, 2^d, d), in m: corners before and after re-initialisation from F.
         `volume` (n,): volumes of the domains, in axisymmetry areas of their sections.
         """
         index = np.arange(2**self._grid.dim)
@@ -268,10 +264,10 @@ class GivenDisplacements(Acting):
 class HoldLoads(Loads):
     """Prescribed displacements in a substep, as penalties on k components.
 
-    `data`: points of the forms, one for each component, with stiffness, direction and gap.
+    `data`: integration points, one for each component, with stiffness, direction and gap.
     `held`: geometry and stiffness of all penalties.
     `row` (k,): index in `held` of each component.
-    `share` (k, 2^d): fraction of each component's force on each node, without the fraction that walls of the grid bear.
+    `share` (k, 2^d): fraction of the force of each component on each node; zero at nodes that walls fix.
     `place`: time and cut domains of the substep.
     """
 
@@ -301,10 +297,9 @@ class HoldLoads(Loads):
         self._lacked = np.full(1, np.inf)  # for each side of a part: last sum of gaps in `augment`, at first infinite
 
     def augment(self, at: At) -> bool:
-        """Increase the multipliers of sides that lag behind by their penalty forces.
+        """Add the penalty forces of sides that lag behind to their multipliers.  Return whether any force changed.
 
-        Multipliers are needed if a whole body, such as undrained soil, resists a side more stiffly than one cell.  The
-        updates end when the mean gap of a side over a connected part of the bodies no longer falls by half.
+        The updates end when an update does not halve the mean gap of any side.
         """
         if not self._place.dt:
             return False
@@ -323,7 +318,7 @@ class HoldLoads(Loads):
         return bool(more.any())
 
     def reached(self, at: At) -> NDArray[np.bool_]:
-        """Return whether the lag of each component at u is at most `1 / sqrt(HOLD)` of its prescribed increment."""
+        """Return whether each component has reached its prescribed value, within `1 / sqrt(HOLD)` of its increment."""
         return np.abs(self._asked - self._along(at.nodal)) * np.sqrt(HOLD) <= np.abs(self._asked)
 
     def pulls(self, b: NDArray[np.float64]) -> None:
@@ -336,7 +331,7 @@ class HoldLoads(Loads):
             self._forms.hold.assemble_matrix(A, self.data)
 
     def moved(self, u: fem.Function) -> Loads:
-        """Return these penalties with gaps reduced by a displacement u."""
+        """Return the penalties after an additional displacement u of the nodes."""
         out = copy(self)
         static = (self.held.static[self.row] * self.data["direction"]).sum(axis=1)
         less = static * self._along(u.x.array.reshape(-1, self._d))
@@ -364,9 +359,10 @@ class HoldLoads(Loads):
         return dofs.ravel(), (self.share * self.pull(at.nodal)[:, None]).ravel()
 
     def guess(self, parts: Parts, nodal: NDArray[np.float64]) -> NDArray[np.float64] | None:
-        """Return the nodal displacements of an initial guess, or None if no connected part rotates.
+        """Return an initial guess of the nodal displacements, or None if no connected part rotates.
 
-        Rotated parts get the rigid motion nearest to the prescribed displacements.  Other parts get `nodal`.
+        The guess of a rotated part is the rigid motion nearest to its prescribed displacements.  The guess of other
+        parts is `nodal`.
         """
         grid = self.data.points.grid
         if grid.axisymmetric:
@@ -389,7 +385,7 @@ class HoldLoads(Loads):
         return self.data.cells
 
     def rounding(self, of_cells: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the rounding errors of nodal forces, which the penalty increases."""
+        """Return the rounding errors of the penalty forces."""
         grid = self.data.points.grid
         held = np.zeros(grid.num_local)
         np.maximum.at(held, self.data.cells, self.data["stiffness"][:, 0])

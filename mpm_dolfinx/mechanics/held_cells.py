@@ -1,13 +1,12 @@
 # SPDX-License-Identifier: MIT
-"""Prescribed displacements of sides in cells: a stiff penalty on the mean, a weak penalty on deviations.
+"""Penalties of prescribed displacements in the cells at a side.
 
-A Q1 field has too few nodal displacements in a cell to satisfy constraints at many points of a side.  A stiff penalty
-at each point would lock sides that are curved or inclined to the grid.  A stiff penalty therefore acts on the mean
-displacement in each cell, and a weak penalty acts on deviations from this mean.  The present traction of the body,
-rotated with the side, is applied explicitly, so that the penalties bear only the traction increment of the step.
+In each cell, a stiff penalty acts on the mean displacement of the side, and a weak penalty on the deviations from this
+mean.  A stiff penalty at each point would lock sides that are curved or inclined to the grid.  The traction at the
+start of the step is applied as a load, so the penalties carry only the increment of the traction.
 
-With inertia, a second penalty acts on the difference from the prescribed increment of the step.  The modulus of this
-penalty is rho (h / (gamma dt))^2.  With the elastic modulus alone, the mass of a cell would lag in short steps.
+With inertia, a second penalty with the modulus rho (h / (gamma dt))^2 acts on the increment of the step.  This penalty
+prevents a lag of the side in short steps.
 """
 
 from __future__ import annotations
@@ -26,22 +25,22 @@ from mpm_dolfinx.mechanics.ghost_penalty import RATIO
 from mpm_dolfinx.parallel.exchange import over_all
 
 ALIGNED = 1e-2
-"""Largest slope of a side against a grid axis at which cells can follow all points of the side at constant volume.
+"""Largest slope of a side relative to a grid axis at which the side has a stiff penalty at each point.
 Plateau (scene "held" of tests/plateaus.py): half this value changes the result by 0.0e+00, twice this value by 1.4e-05,
 and finer cells by 4.0e-03.
 """
 WEAK = 8.0
-"""Pointwise penalty stiffness for deviations from the means, in units of (modulus + 10 stress) / cell size.  Plateau
+"""Stiffness of the weak penalty on deviations, divided by (modulus + 10 stress) / cell size.  Plateau
 (scene "soil" of tests/plateaus.py): half this value changes the result by 5.0e-06, twice this value by 7.9e-06, and
 finer cells by 3.0e-02.
 """
 EVERYWHERE = 1e2
-"""Normal penalty stiffness at points of sides with slopes below `ALIGNED`, in units of resistance / cell size. Plateau
+"""Normal stiffness at points of sides with slopes below `ALIGNED`, divided by modulus / cell size.  Plateau
 (scene "soil" of tests/plateaus.py): half this value changes the result by 2.2e-05, twice this value by 1.7e-05, and
 finer cells by 3.0e-02.
 """
 TENSE = 10
-"""Factor on a side's stress in the modulus of the penalty: a side would buckle if its stress exceeded this modulus.
+"""Factor on the stress at a side in the modulus of the penalty.  This term prevents buckling of the side.
 Plateau (scene "soil" of tests/plateaus.py): half this value changes the result by 2.8e-06, twice this value by 4.7e-06,
 and finer cells by 3.0e-02.
 """
@@ -75,11 +74,10 @@ def inner_cells(
     cell: NDArray[np.int32],
     normal: NDArray[np.float64],
 ) -> NDArray[np.int64]:
-    """Return for each of n points on sides the local cell (n,) whose constraint contains this point.
+    """Return the local cell (n,) of the constraint of each of n points on sides.
 
-    A deformed side along a grid line is wavy, so that some of its points lie in nearly empty cells beyond the line.
-    Constraints in these cells would contradict the constraints of inner cells.  The constraints of the inner cells
-    therefore contain these points too (aggregation; Badia, Verdugo and Martin 2018).
+    Points in nearly empty cells belong to the constraint of the next cell inside the body (aggregation; Badia, Verdugo
+    and Martin 2018).
 
     `fill` (cells,): volume fractions.
     `sides`: for each condition, the prescribed components, and the extent (d,), in m, of the prescribed positions.
@@ -102,23 +100,22 @@ def inner_cells(
 
 
 class HeldCells:
-    """Penalties of prescribed displacements: first on means, one for each condition and cell, then at points.
+    """Penalties of prescribed displacements: first the penalties on cell means, then the penalties at points.
 
     Attributes
     ----------
     number, cell
         Index of the condition, and cell, of each penalty.
     x, shape, moments
-        Position, m, shape functions, and products of offsets from the cell's midpoint, of each penalty.  A penalty on a
-        mean has the means of these values over its points.
+        Position, m, shape functions, and products of offsets from the midpoint of the cell, for each penalty.  A
+        penalty on a mean has mean values.
     stiffness
         Stiffness of each penalty and component, N/m.
     static
-        Part of each stiffness that resists gaps; the rest resists increments only.
+        Fraction of each stiffness without the second penalty for inertia.
     limit : (2, k, d)
         Largest plausible force, N, of each of k penalties on means: limit[0] for the skeleton, limit[1] for undrained
-        soil.  limit[1] applies if the side is at its prescribed position.  Larger forces, strains above 1 in a step,
-        are numerical artefacts.
+        soil.  Larger forces would cause strains above 1 in a step.
     path
         Increment (d,) of the prescribed displacement in the step, m, for each penalty.
     """
@@ -179,10 +176,8 @@ class HeldCells:
     def rows(self, axis: int, given: NDArray[np.bool_], free: NDArray[np.bool_]) -> tuple:
         """Return the penalties on one component, with their stiffness, gap and distribution of the force to nodes.
 
-        Where a side ends at a wall, its penalties omit nodes that the wall fixes.  The free nodes of the cell would
-        otherwise oscillate along the side.  The prescribed displacement is also extrapolated to the wall.  A penalty
-        can be omitted if other penalties of its condition hold a free node of the cell.  Such a penalty is omitted if
-        the extrapolated value exceeds half of the cell's mean, at the start or the end of the step.
+        Nodes that a wall fixes have no share of the force.  Some penalties next to walls are omitted, because the
+        prescribed displacement does not tend to zero at the wall.
 
         `given` (conditions,): whether each condition prescribes component `axis`.
         `free` (nodes,): whether no wall fixes the node.
@@ -219,7 +214,7 @@ class HeldCells:
     def _held_beside(
         self, number: NDArray[np.int64], nodes: NDArray[np.int32], N: NDArray[np.float64], stuck: NDArray[np.bool_]
     ) -> NDArray[np.bool_]:
-        """Return which penalties at a wall have a node that other penalties of the condition hold.
+        """Return which penalties at a wall have a free node in common with other penalties of their condition.
 
         `N` (k, 2^d): values of the shape functions of the nodes.
         `stuck` (k, 2^d): whether each node is at a wall.
@@ -239,17 +234,16 @@ class HeldCells:
     def beyond(
         self, row: NDArray, axis: NDArray, force: NDArray, reached: NDArray[np.bool_], reported: Collection[int]
     ) -> list[tuple[int, NDArray[np.float64]]]:
-        """Return the conditions with too large forces, and for each condition the position of its largest force.
+        """Return the conditions with implausibly large forces, each with the position of its largest force.
 
-        A Q1 field cannot always have the prescribed means in two neighbouring cells, as at a side on a grid line.  The
-        forces of the penalties in the two cells then oppose each other.  A force therefore counts as too large only if
-        the sums of the forces at its nodes also exceed their limits.
+        The sum of the forces at a node must also exceed its limit, because penalties in neighbouring cells may oppose
+        each other.
 
         `row` (k,): index of the penalty of each of k prescribed components.
         `axis` (k,): axis of each component.
         `force` (k,), in N: force of each component.
         `reached` (k,): whether each component is at its prescribed position.
-        `reported`: indices of conditions to exclude, because they have been reported already.
+        `reported`: indices of conditions to exclude.
         """
         grid = self.grid
         comm = grid.comm

@@ -1,31 +1,30 @@
 # SPDX-License-Identifier: MIT
 """Inertia: consistent mass, velocities of material points and nodes, and accelerations in the substeps.
 
-In a substep of a step of length dt, the forces balance rho a, with the density rho and a = (u - u^) / (g dt)^2.  u is
-the displacement since the start of the step.  The predictor u^ is the displacement that would occur without forces:
+The inertial force per volume is rho a, with the density rho and the acceleration a = (u - u^) / (g dt)^2.  The
+displacement since the start of the step is u.  The predictor u^ is the displacement without forces:
 
     u^ = b dt v_1 + g dt (v_n + b dt a_1),      v = v_n + dt (b a_1 + g a).
 
-v_n is the velocity at the start of the step, and v is the velocity at the end of the substep.  v_1 and a_1 are velocity
-and acceleration of the previous substep.  The weight g multiplies the rate of the substep, and the weight b multiplies
-the rate of the previous substep (`time_integration`).  In each step SDIRK2 dissipates the fraction
-GAMMA^4 (omega dt)^4 = 0.0074 (omega dt)^4 of the energy of an oscillation of angular frequency omega.  The dissipation
-damps unresolved modes.
+The velocity is v_n at the start of the step, and v at the end of the substep.  The previous substep has the velocity
+v_1 and the acceleration a_1.  The coefficients g and b of the time integration belong to this substep and to the
+previous substep (`time_integration`).  In an oscillation of angular frequency omega, each step of SDIRK2 dissipates the
+fraction GAMMA^4 (omega dt)^4 = 0.0074 (omega dt)^4 of the energy.
 
 The mass is integrated over the pieces of the particle domains.  Piece k has the mass m_k, the centroid x_k, and the
-second moments S_k about x_k.  With the shape functions N and the velocity gradient L,
+second moments S_k about x_k.  With the shape functions N and the velocity gradient L, the nodal velocities v_n follow
+from
 
     (M + G) v_n = sum m_k [N(x_k) v(x_k) + grad N . (L S_k)],    M = sum m_k [N N^T + grad N S_k grad N^T].
 
 The ghost mass `G = c rho h^3 int [[d_n N]] [[d_n N]] dS` acts on faces of cells that are not full.  Here c is
-`GHOST_MASS`, h is the cell size, and [[d_n N]] is the jump of the normal derivative.  For an affine velocity field,
-G v_n vanishes, and M v_n equals the right side.  The transfer to the grid and back therefore conserves linear and
-angular momentum to rounding.
+`GHOST_MASS`, h is the cell size, and [[d_n N]] is the jump of the normal derivative.  The ghost mass has no effect on
+affine velocity fields.  The transfer to the grid and back conserves linear and angular momentum to rounding.
 
-A material point carries the velocity v and the rate F' of F.  The velocity in its domain is v + F' F^-1 (x - x_p), with
-the position x_p of the point.  Increments of v and F' come from the grid (Brackbill and Ruppel 1986; consistent mass:
-Burgess, Sulsky and Brackbill 1992).  The first substep of SDIRK2 is a midpoint rule.  `chord` corrects the error
-of this rule in rotations.
+A material point stores the velocity v and the rate F' of F.  The velocity in its domain is v + F' F^-1 (x - x_p), with
+the position x_p of the point.  Increments of nodal velocities give the increments of v and F' (Brackbill and Ruppel
+1986; consistent mass: Burgess, Sulsky and Brackbill 1992).  The first substep of SDIRK2 is a midpoint rule, corrected
+for rotations (`chord`).
 """
 
 from __future__ import annotations
@@ -57,11 +56,12 @@ from mpm_dolfinx.points.material_points import MaterialPoints, middle
 GHOST_MASS = 0.02
 """Strength c of the ghost mass.  A rotating block has the same energies with 0.002 and 0.2 (tests/test_inertia.py)."""
 RELAXES = 2.0
-"""Relaxation rate of point velocities towards grid velocities, per motion of domain corners by one cell size.
+"""Rate r of relaxation: in a motion by n cells, point velocities approach nodal velocities by the fraction 1 - exp(-r
+n).
 
 Relaxation removes velocity modes of the points that the nodes cannot represent.  In a test, a vibrating bar of 20 cells
-moves across 50 cells, with 40 steps a period.  After 25 periods the velocity error is 1.7 % at the rate 0, and 1.2 % at
-the rates 0.1, 2 and 10.  The energy loss is 1.58 % at the rate 0, 1.60 % at the rates 0.1 and 2, and 1.67 % at 10.
+moves across 50 cells, with 40 steps in each period.  After 25 periods the velocity error is 1.7 % for r = 0, and 1.2 %
+for r = 0.1, 2 and 10.  The energy loss is 1.58 % for r = 0, 1.60 % for r = 0.1 and 2, and 1.67 % for r = 10.
 """
 
 VELOCITY, RATE = "velocity", "F_rate"
@@ -81,10 +81,10 @@ def moving(
 ) -> dict[str, NDArray[np.float64]]:
     """Return the point data `VELOCITY` and `RATE` of a velocity field.
 
-    `velocity`: vector (d,), in m/s, or function of positions x (n, d) with values (n, d).  Each domain stores the
-    affine field nearest to the values at its corners.
-    `base` (d,), in m: origin of the points' coordinates.
-    `rings`: whether the domains are rings (axisymmetry).  The centroids of rings determine their velocities.
+    `velocity`: vector (d,), in m/s, or function of positions x (n, d) with values (n, d).  In each domain, the data
+    represent the affine field nearest to the values at the corners.
+    `base` (d,), in m: origin of the coordinates of the points.
+    `rings`: whether the domains are rings (axisymmetry).
     """
     n, corners, d = points.corners.shape
     places = (points.corners + base).reshape(-1, d)
@@ -105,7 +105,7 @@ def moving(
 
 
 def columns(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return values (n, ...) as an array (..., n).  Operations on such arrays of small tensors are faster."""
+    """Return values (n, ...) as a contiguous array (..., n)."""
     return np.ascontiguousarray(np.moveaxis(values, 0, -1))
 
 
@@ -126,14 +126,15 @@ def product(A: NDArray[np.float64], B: NDArray[np.float64]) -> NDArray[np.float6
 
 
 def chord(G: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return two tensors for a midpoint rule: F~ - 1, where laws are evaluated at F~, and the rotation of their stress.
+    """Return F~ - 1 and F F~^-1 for a midpoint rule without strain in rotations.
 
-    The rule moves F from F_n to F_n + 2 D, with the midpoint F = F_n + D.  The mean of C = F^T F over both ends of the
-    step is F^T F + D^T D, with F of the midpoint.  Laws are evaluated at F~, and give the stress P:
+    The deformation gradient is F_n at the start of the step, F = F_n + D at the midpoint, and F_n + 2 D at the end.
+    The mean of C = F^T F at start and end is F^T F + D^T D, with F at the midpoint.  Laws are evaluated at F~, with
+    nearly this mean, and P is the first Piola-Kirchhoff stress:
 
         F~ = F + F^-T D^T D / 2,     F~^T F~ = F^T F + D^T D + O(D^4),     P = F F~^-1 P(F~).
 
-    A rigid rotation then causes no strain in any body.  P F^T is symmetric, so moments balance.
+    P F^T is symmetric, so moments balance.
 
     `G` (n, d, d): gradient of the displacement since the start of the step.
     """
@@ -177,26 +178,23 @@ class InertiaForms:
         self._ghost = kinks(grid, V, GHOST_MASS * ufl.avg(self.density), 3)
 
     def set_substep(self, inertia: Inertia | None, midpoint: bool) -> None:
-        """Set the acceleration in the forms (zero without inertia), and whether the substep uses a midpoint rule."""
+        """Set the coefficients of a substep.  `midpoint`: whether the substep uses a midpoint rule."""
         self.midpoint.value = float(midpoint and inertia is not None)
         self._rate.value = 0.0 if inertia is None else inertia.rate
         if inertia is not None:
             self._flight.x.array[:] = inertia.flight
 
     def move(self) -> None:
-        """Set the acceleration to that at u."""
+        """Evaluate the acceleration at u."""
         np.subtract(self._u.x.array, self._flight.x.array, out=self.moved.x.array)
 
     def at(self, cells: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return accelerations, in m/s^2, at places in cells.  `values` are the shape functions at these places."""
+        """Return accelerations, in m/s^2, at positions in cells.  `values`: shape functions at these positions."""
         nodal = self.moved.x.array.reshape(-1, self.grid.dim)[self.grid.cell_nodes[cells]]
         return self._rate.value * (values[:, :, None] * nodal).sum(axis=1)
 
     def _seen(self, chords: Latest[tuple[NDArray, NDArray]], which: int, data: PointData) -> NDArray[np.float64]:
-        """Return the gradients for laws, or the rotations of the laws' stresses, see `chord`.
-
-        `chords`: the last result, shared by forms with the same points.
-        """
+        """Return a result of `chord`: the first for `which` = 0, the second for `which` = 1.  `chords`: a cache."""
         d = self.grid.dim
         if which and not self.midpoint.value:
             return np.broadcast_to(np.eye(d).ravel(), (len(data.cells), d * d))
@@ -219,7 +217,7 @@ class InertiaForms:
         `mass` (n,), in kg: masses of the points.
         `fill` (cells,): volume fractions of the local cells.
         `facets`: faces between two active cells, at least one of them not full.
-        `unknowns`, `held`: unknown displacements, and displacements that grid boundary conditions fix.
+        `unknowns`, `held`: unknown displacements, and displacements that walls of the grid fix.
         """
         grid = self.grid
         of_pieces = cut.pieces_to_cells(cut.pieces.fraction * mass[cut.pieces.point])
@@ -264,7 +262,7 @@ class Mass:
         ksp.setTolerances(rtol=ROUND_OFF, atol=0.0)
 
     def forces(self, u: NDArray[np.float64], flight: PETSc.Vec, rate: float) -> PETSc.Vec:
-        """Return the inertia forces at u, in N, see `Inertia`.  The next call reuses the vector."""
+        """Return the inertia forces at u, in N.  The next call overwrites the vector."""
         moved, forces = self._work
         self.unknowns.gather(u, moved).axpy(-1.0, flight)
         moved.scale(rate)
@@ -292,10 +290,9 @@ class Mass:
         return out
 
     def size(self, velocity: PETSc.Vec, drift: ArrayLike) -> float:
-        """Return the size of velocities of the unknowns relative to a uniform velocity `drift` (d,), in J^(1/2).
+        """Return the mass norm, in J^(1/2), of velocities relative to a uniform velocity `drift` (d,).
 
-        The size does not depend on the uniform motion of the frame.  It is at least `NEAR` times the size of the
-        velocities themselves, because smaller relative velocities are rounding errors.
+        The result is at least `NEAR` times the mass norm of the velocities.
         """
         uniform = np.zeros_like(self._forms.work.x.array)
         uniform.reshape(-1, self._forms.grid.dim)[:] = drift
@@ -310,8 +307,7 @@ class Mass:
 
         `points`: material points at the start of the step.
         `velocities`: velocities of the unknowns, in m/s, at the start and at the end of the step.
-        `moved` (n,): largest displacement of a corner in the connected part of the point, in cell sizes.  It is 0 for
-        points that keep their pieces.
+        `moved` (n,): motion of the points in the step, in cell sizes.
         """
         start, end = velocities
         out = {name: points.data[name] + more for name, more in self._at_points(points, end - start).items()}
@@ -331,9 +327,9 @@ class Mass:
 
     @cached_property
     def _moments(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Vectors (d, m), in m, from the centroids of domains to those of their pieces, and moments (d, d, m), in m^2.
+        """Vectors (d, m), in m, from centroids of domains to centroids of pieces, and second moments (d, d, m), in m^2.
 
-        The second moments of the m pieces refer to their own centroids.
+        Second moments of the m pieces are about their centroids.
         """
         pieces = self._cut.pieces
         return columns(pieces.x - self._cut.mean(pieces.x)[pieces.point]), columns(pieces.second)
@@ -350,7 +346,7 @@ class Mass:
         return sum_by(pieces.point, pieces.fraction * values, len(self._cut.points))
 
     def _at_points(self, points: MaterialPoints, v: PETSc.Vec) -> dict[str, NDArray[np.float64]]:
-        """Return the affine velocity field in each domain that is nearest to the grid's velocities."""
+        """Return the affine velocity field in each domain that is nearest to the nodal velocities."""
         cut, grid, places, nodal = self._cut, self._forms.grid, self._pieces.places, self.local(v)
         d, of_cells = grid.dim, grid.over_edges(grid.monomials @ nodal.take(places.nodal), places.filled)
         at, slope = polynomial(of_cells, places.offset.T, places.slots).T, self._pieces.gradients_of(nodal)
@@ -397,7 +393,7 @@ class Inertia(Loads):
 
     @cached_property
     def rounding_at_unknowns(self) -> NDArray[np.float64]:
-        """Rounding errors of the forces, in N: fast bodies move far in comparison with `force / (M rate)`."""
+        """Rounding errors of the inertia forces, in N."""
         moved = self._flight.copy()
         moved.abs()
         return ROUND_OFF * self.rate * np.abs((self._mass.M * moved).array_r)

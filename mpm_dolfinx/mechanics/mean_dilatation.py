@@ -1,23 +1,21 @@
 # SPDX-License-Identifier: MIT
 """F-bar: one volume ratio for each cell, against volumetric locking of nearly incompressible skeletons.
 
-Without F-bar, four volume constraints per cell suppress the bending modes of a Q1 quadrilateral, with errors of up to
-50 % at nu = 0.499.  F-bar scales the deformation gradient F that the law receives.  The scaled gradient Fbar has the
-volume ratio theta in the step, which is a mean over the cell:
+The law is evaluated at a scaled deformation gradient Fbar.  The volume ratio theta of Fbar in the step is a mean over
+the cell:
 
     Fbar = (theta J_n / det F)^(1/3) F,     theta = sum w det(Delta) / sum w   over the locking pieces of the cell.
 
 Here w is the volume of a piece, Delta = I + grad u is the deformation gradient of the step, F = Delta F_n, and
-J_n = det F_n.  The scaling acts along all three axes, so that points in plane strain store an out-of-plane stretch.  In
-a cell of several materials, only the nearly incompressible materials use Fbar (`Skeleton.nearly_incompressible`).  With
-the law's energy psi and Psi = psi(Fbar) / J_n, the energy sum w Psi has the derivative
+J_n = det F_n.  The scaling acts along all three axes, so in plane strain there is an out-of-plane stretch.  Only nearly
+incompressible materials use Fbar (`Skeleton.nearly_incompressible`).  With the energy psi of the law and
+Psi = psi(Fbar) / J_n, the energy sum w Psi has the derivative
 
     sum w [dPsi/dF : dF + pi d(det Delta)],   pi = (sum w dPsi/dtheta) / (sum w).
 
-The tangent of the residual at fixed theta and pi is symmetric.  The derivatives with respect to theta and pi add a
-matrix of rank two in each cell (Simo, Taylor and Pister 1985; incremental F-bar in material points: Coombs et al.
-2018).  For a law without an energy, P(Fbar) : dFbar replaces dPsi.  The points store Fbar.  The next step starts from
-the volume ratios of the particle domains (`cell_ratios`).
+At fixed theta and pi, the tangent is symmetric.  The derivatives with respect to theta and pi add a matrix of rank two
+in each cell (Simo, Taylor and Pister 1985; incremental F-bar in material points: Coombs et al. 2018).  For a law
+without an energy, P(Fbar) : dFbar replaces dPsi.  Points store Fbar at the end of the step.
 """
 
 from __future__ import annotations
@@ -46,7 +44,7 @@ STRESS = "stress of the law"
 
 
 class SumsOfPart(NamedTuple):
-    """Sums over one part of the integration points in each cell, for theta and pi, see `MeanDilatation`."""
+    """Sums over the integration points of one law in each cell, for theta and pi."""
 
     ratio: CellSums
     stress: PointExpression  # components of P for the residual, and the derivative with respect to theta for pi
@@ -92,14 +90,14 @@ class FBar:
         `Fbar`: result of `of`.
         `ratio`: det Delta, with Delta F_n = F.
         `values`: UFL values of the law's parameters, state and local unknowns.
-        `known`: the same values for expressions that are not differentiated, see `LocalUnknowns`.
+        `known`: the same values, for expressions that are not differentiated.
 
         Returns
         -------
         The first Piola-Kirchhoff stress, in Pa, as UFL of F, theta and pi, for the residual.
         The derivative (d, d, d, d) of this stress with respect to F, in Pa, for the tangent.
-        Further integrals over each cell for the tangent (`Beside`).
-        Kernels that sum theta and pi over each cell, for `MeanDilatation`.
+        Further integrals over each cell for the tangent.
+        Kernels for the sums of theta and pi over each cell.
         """
         J_n, J = ufl.det(points.F), ufl.det(F)
         P, slope = self.stresses(law, F, Fbar, known)
@@ -158,7 +156,7 @@ class FBar:
 class MeanDilatation:
     """The volume ratio theta and the mean stress pi of each cell, for F-bar.
 
-    `parts`: sums over each part in which cells would lock, by index of the part, see `QuadratureData`.
+    `parts`: sums for each law with F-bar, by index of the law.
     `dt`: time since the start of the step, s.
     """
 
@@ -176,14 +174,14 @@ class MeanDilatation:
     def total(
         self, data: QuadratureData, sums: Sequence[NDArray[np.float64]]
     ) -> tuple[NDArray[np.int32], NDArray[np.float64], NDArray[np.float64]]:
-        """Return the cells with F-bar, the totals of `sums` over all parts, and the result of `_volume_of`."""
+        """Return the cells with F-bar, the totals of `sums` over all laws, and the volumes of pieces with F-bar."""
         return self._cells(data).filled, self._cells(data).total(sums), self._volume_of(data)
 
     def at(self, data: QuadratureData, motion: tuple, solve: Callable[[], Sequence[Given]]) -> list[Given]:
-        """Set theta and pi, and return values for the forms of each part.  All processes must call this method.
+        """Set theta and pi, and return the values for the forms of each law.  All processes must call this method.
 
-        `motion`: key of the present displacement, see `LocalUnknowns.solve`.
-        `solve`: function that returns these values without stresses, see `LocalUnknowns`.
+        `motion`: key of the present displacement.
+        `solve`: function that solves for local unknowns of the laws.
         """
 
         def given_stresses() -> list[Given]:
@@ -210,14 +208,14 @@ class MeanDilatation:
     def _set_mean(self, f: fem.Function, sums: Sequence[NDArray[np.float64]], data: QuadratureData) -> None:
         """Set f in each cell to a mean over the pieces with F-bar.
 
-        `sums`: for each part of the points, the sums (cells, 1) of the quantity times the volume.
+        `sums`: for each law, the sums (cells, 1) of the quantity times the volume.
         """
         f.x.array[self._cells(data).filled] = self._cells(data).total(sums)[:, 0] / self._volume_of(data)[:, 0]
 
     def assemble_matrix(self, A: PETSc.Mat, data: QuadratureData, sums: Sequence[NDArray[np.float64]]) -> None:
         """Add the contribution of theta and pi to the tangent, without final assembly.
 
-        `sums`: for each part, the integrals (cells, quantities) of `Beside` from `FBar.forms` over each cell.
+        `sums`: for each law, the further integrals (cells, quantities) of `FBar.forms`.
         """
         count, volume = 2**self._grid.dim * self._grid.dim, self._volume_of(data)
         b, c, *other, e = np.split(
@@ -269,7 +267,7 @@ def _dev(tau, F):
 
 
 class Cells:
-    """The cells with pieces that use F-bar, with indices of the cells of each part."""
+    """The cells with pieces that use F-bar, and the indices of the cells of each law."""
 
     def __init__(self, of_parts: Sequence[NDArray[np.int32]]):
         self.filled = np.unique(np.concatenate(of_parts))

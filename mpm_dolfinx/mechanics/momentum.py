@@ -62,8 +62,7 @@ class MomentumForms:
     """Compiled forms of the balance of momentum of a scene.
 
     `pieces`: all integration points.  With gravity, the points have the field `density`, in kg/m^3.
-    `laws`: for each law, its class, its integration points, and whether it uses F-bar.  The points have F, the law's
-    parameters and state, and with fluid `biot`.  With retention curves they have `retention`, `lever`, `pores`.
+    `laws`: for each law, its class, its integration points, and whether the law uses F-bar.
     `pressure`: DG0 pore pressure, or None without fluid.
     `gravity` (d,), in m/s^2: acceleration as a UFL constant, or None.
     `materials`: materials of the scene, and its fluid.
@@ -134,7 +133,7 @@ class MomentumForms:
         symmetric: bool,
         dt: fem.Constant,
     ) -> FormsOfPart:
-        """Return the compiled forms of a law.  `dried`: whether any law depends on suction."""
+        """Return the compiled forms of a law.  `dried`: whether any law of the scene depends on suction."""
         F = points.deformation(self.u)
         values = {name: getattr(points, name) for name in (*law.parameters, *law.state)}
         values |= by_scene(self.grid, None, law, points) | {"dt": dt}
@@ -182,14 +181,14 @@ class MomentumForms:
         return [] if self._of_suction is None else self._of_suction.rows(data, self._given(data, derive=True))
 
     def set_contents(self, own: NDArray[np.int64], *contents: NDArray[np.float64]) -> ActiveSet:
-        """Set the contents of owned cells with material (`GhostPenalty.set_contents`), and return the active set."""
+        """Set the volume fractions and moduli of owned cells with material.  Return the active set."""
         self.active.clear()
         cells = self.ghost.set_contents(own, *contents)
         self.active.set(cells, lambda: self.active_nodes(cells).nonzero()[0])
         return self.active.now
 
     def summed(self, room: int, adders: Sequence[Callable[[NDArray[np.float64]], None]]) -> NDArray[np.float64]:
-        """Return the nodal forces of `adders`, summed over processes, in the buffer with the index `room`."""
+        """Return the sum of nodal forces over processes.  `room`: index of the buffer for the result."""
         carrier, out = self._rooms[room]
         out[self.active.now.dofs] = 0.0
         for add in adders:
@@ -202,7 +201,7 @@ class MomentumForms:
         return self.u.x.array.reshape(-1, self.grid.dim)
 
     def internal(self, data: QuadratureData, loads: Sequence[Loads] = ()) -> NDArray[np.float64]:
-        """Return the nodal forces of the stresses at u and of `Loads.takes_up`, in N."""
+        """Return the nodal forces of the stresses, and of fluid that flows into dilating pores, in N."""
 
         given = self._nothing or self._given(data)
 
@@ -226,7 +225,7 @@ class MomentumForms:
 
     @property
     def _motion(self) -> tuple:
-        """Key of the present displacement and suction, see `LocalUnknowns.solve`."""
+        """Key of the present displacement and suction."""
         p = None if self._suction is None else self._suction.x.array.copy()
         return self.u.x.array[self.active.now.dofs], self.inertia and float(self.inertia.midpoint.value), p
 
@@ -237,7 +236,7 @@ class MomentumForms:
         return [] if some else [NONE] * len(self.law_forms)
 
     def _given(self, data: QuadratureData, derive: bool = False) -> Sequence[Given]:
-        """Set theta and pi, and return values at u for the forms of each part, see `LocalUnknowns`."""
+        """Set theta and pi, and return the values at u for the forms of each law."""
 
         motion = self._motion
 
@@ -307,10 +306,10 @@ class MomentumSystem:
         at_nodes = forms.grid.node_x, forms.grid.near_others[0]
         self.unknowns = Unknowns(forms.u, dofs, at_nodes)
         self.locks = forms.dilatation is not None
-        """Whether some law uses F-bar, because the soil yields or is nearly incompressible."""
+        """Whether any law uses F-bar."""
         active = forms.active.now.dofs
         self.touched = active[active < d * forms.u.function_space.dofmap.index_map.size_local]
-        """Owned degrees of freedom of active cells, fixed or free."""
+        """Owned degrees of freedom of active cells, including fixed ones."""
         self.parts, comm = parts, forms.grid.comm
         self.of_parts, self._touched = (
             OfParts(comm, parts.nodes[at // d], parts.count) for at in (self.unknowns.owned, self.touched)
@@ -322,7 +321,7 @@ class MomentumSystem:
         """Rounding error of each unknown, in N, times the square root of the size of its connected part."""
         self.K = matrix(self.unknowns, self.unknowns, 3**d * d)
         self.mass: PETSc.Mat | None = None
-        """Mass matrix, in kg, or None without inertia.  K has its pattern, even while an initial stress is balanced."""
+        """Mass matrix, in kg, or None without inertia."""
         self.residual, self.step = self.unknowns.vector(), self.unknowns.vector()
         held = active[~among(active, dofs)]
         self.held = Unknowns(forms.u, held, at_nodes)
@@ -399,7 +398,7 @@ class MomentumProblem:
     `data`: integration points.
     `tolerance`: tolerance of the residual, relative to the forces.
     `goes_on` (unknowns,), in m: displacements extrapolated from the last step, or None.
-    `held` (unknowns,), in N: initial residual forces that loads do not balance, or None.
+    `held` (unknowns,), in N: additional forces for equilibrium at the start (`State.held`), or None.
     `yielded`: whether any soil has yielded before this step.
     """
 
@@ -442,17 +441,17 @@ class MomentumProblem:
         return At(self.system.unknowns, self.forms.u.x.array, self.system.parts)
 
     def settle(self, sticks: bool) -> bool:
-        """Update stick and slip at u, and return whether either changed.  `sticks` allows changes to stick."""
+        """Update stick and slip in contacts, and return whether they changed.  `sticks` allows changes to stick."""
         return any([one.settle(self.at, sticks) for one in self.loads])
 
     def augment(self) -> bool:
-        """Update multipliers and contact geometry of converged loads, and return whether any force changed."""
+        """Update multipliers and contact geometry after convergence, and return whether any force changed."""
         return any([one.augment(self.at) for one in self.loads]) or any([one.follow(self.at) for one in self.loads])
 
     def guesses(self) -> list[NDArray[np.float64]]:
         """Return initial guesses of the displacements, in m, for Newton's method.
 
-        Each load may propose a guess, such as a rigid rotation.  A further guess extrapolates the last motion.
+        Each load may have a guess, such as a rigid rotation.  The last motion gives a further guess.
         """
         found = [one.guess(self.system.parts, self.forms.nodal) for one in self.loads]
         found = [values.ravel() for values in (*found, self._goes_on) if values is not None]
@@ -490,7 +489,7 @@ class MomentumProblem:
         return self._unbalanced()[0].copy()
 
     def _unbalanced(self) -> tuple[NDArray[np.float64], list[NDArray[np.float64]]]:
-        """Return the result of `unbalanced`, and the norms of its terms in each part, in N."""
+        """Return the result of `unbalanced`, and the norms of its terms in each connected part, in N."""
         forms, system = self.forms, self.system
         b = forms.internal(self.data, self.loads)
         forces, external = b[system.touched], self._external
@@ -540,13 +539,10 @@ class MomentumProblem:
     def out_of_balance(
         self, r: PETSc.Vec, scales: NDArray[np.float64], first: bool
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return two relative residuals of each connected part.
-
-        For the first result, the rounding error at each node is subtracted from the residual.  With `first`, the error
-        is not subtracted, so that even a load below the error causes a solve.  For the second result, the force scale
-        at an unknown is at least `of_whole` divided by the tolerance.  A residual within rounding has thus converged.
+        """Return two relative residuals of each connected part: without rounding errors, and for the convergence test.
 
         `r`, `scales` (parts,), in N: residuals and force scales.
+        `first`: whether this is the first residual of a step, in which rounding errors are not subtracted.
         """
         system, parts = self.system, self.system.of_parts
         both = np.zeros((2, system.unknowns.size))
@@ -585,10 +581,10 @@ class MomentumProblem:
     def assemble_tangent(
         self, data: QuadratureData | None = None, shift: NDArray[np.float64] | float = 0.0
     ) -> PETSc.Mat:
-        """Return the tangent at u, regularised by a fraction of the elastic shear stiffness.
+        """Return the tangent at u plus the elastic shear stiffness times `shift`.
 
         `data`: integration points, by default the points of the problem.
-        `shift`: this fraction, as one number or as one number for each connected part.
+        `shift`: one number, or one number for each connected part.
         """
         K = self.system.K
         # the first sum gives K its full sparsity pattern, because PETSc does not always notice a later change

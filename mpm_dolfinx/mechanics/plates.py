@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Rigid plates: a uniform traction on a side, and a penalty on the slope of this side, see `RigidPlate`."""
+"""Rigid plates: a uniform traction on a side, and a penalty on the tilt of this side, see `RigidPlate`."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class PlateForms:
 class Plates(Acting):
     """The rigid plates of a stage, by name.
 
-    ValueError is raised if the faces under a plate are not one flat side.
+    The faces under a plate must be one flat side (ValueError).
     """
 
     conditions, title = (RigidPlate,), "rigid plates"
@@ -106,7 +106,7 @@ class PlateLoads(Loads):
         self._forms.bend.assemble_matrix(A, self._data)
 
     def moved(self, u: fem.Function) -> Loads:
-        """Return the plates with their tilt changed by a displacement u."""
+        """Return the plates after an additional displacement u of the nodes."""
         data, d = self._data, self._data.points.grid.dim
         slope = np.einsum("ni,nij->nj", data["normal"], data.gradients(u.x.array).reshape(-1, d, d))
         slope = slope - (slope * data["normal"]).sum(axis=1, keepdims=True) * data["normal"]

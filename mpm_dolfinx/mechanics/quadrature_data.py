@@ -23,25 +23,24 @@ from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.material_points import ACROSS, MaterialPoints, in_plane, in_space
 
 STIFF_DRY = 50
-"""Weight in dry bodies of the volume ratio from the corners of domains (`cell_ratios`), in units of G / (lambda + 2G).
+"""Weight of the volume ratio from corners of domains in dry bodies, divided by G / (lambda + 2G), and at most 1.
 
-The weight is at most 1; the incremental volume ratio of the points has the remaining weight.  With nu = 0.4999 and a
-weight of 1, the stress change at a reset of the grid would exceed the stresses in the bodies.
+The volume ratio at the start of a step is a weighted mean of two values: from the corners of domains (`cell_ratios`),
+and from F of the points.  With nu = 0.4999 and a weight of 1, the stress change at a reset of the grid would exceed the
+stresses in the bodies.
 """
 STIFF_WET = 8
-"""Value of (lambda + 2G) / G above which the volume ratio from the corners loses weight in wet bodies.
+"""Value of (lambda + 2G) / G above which the weight of the volume ratio from corners decreases in wet bodies.
 
-The weight is 1 at nu = 0.43, and 0 at nu = 0.47.  With a weight of 1, the difference between the volume ratios of the
-corners and of the Q1 field expels water in every step, however short.  The extreme pressures of a beam with eight cells
-across its depth then have errors of 43 % at nu = 0.49.  At nu = 0.499 the pressures are six to thirty times too large.
+The weight is 1 at nu = 0.43, and 0 at nu = 0.47.  With a weight of 1, the largest pressures of a beam with eight cells
+over its depth have errors of 43 % at nu = 0.49.  At nu = 0.499 these pressures are six to thirty times too large.
 """
 SHARE = 0.5
-"""Fraction of the gradient's deviation from its cell mean that laws use in cells of flowing, dilatant soil.
+"""In cells of flowing, dilatant soil, the deviation of grad u from its cell mean is multiplied by this factor.
 
-Dilatant flow has a volume strain rate of sin psi times its shear rate.  This condition, imposed at four points,
-over-constrains a Q1 cell, even with F-bar.  With the full deviation, the load of a footing (phi = psi = 20 degrees) is
-4.4 % too large with 9 cells, 3.4 % too large with 17 cells, and does not reach a limit.  With one point per cell, the
-load is constant, but 6.6 % too small with 9 cells, and 3.2 % too small with 17 cells.
+Otherwise dilatancy would lock Q1 cells.  With the factor 1, the load of a footing (phi = psi = 20 degrees) is 4.4 % too
+large with 9 cells over its width, 3.4 % with 17 cells, and does not reach a limit.  With the factor 0, the limit load
+is 6.6 % too small with 9 cells, and 3.2 % with 17 cells.
 """
 
 
@@ -55,7 +54,7 @@ def corner_share(material: Skeleton, wet: bool) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class QuadratureData:
-    """Integration points of a step, with their fields.  A part has the points of one law (`SceneMaterials.parts`)."""
+    """Integration points of a step, with their fields.  A part contains the points of one law."""
 
     pieces: PointData  # all integration points
     parts: tuple[PointData, ...]  # integration points of each part
@@ -63,7 +62,7 @@ class QuadratureData:
     of_points: PointData  # like `pieces`, but volumes and F are not scaled for F-bar; for user-defined terms
 
     def increments(self, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return I + grad u at the positions where laws use grad u."""
+        """Return I + grad u at the integration points of the laws."""
         n, d = self.pieces.x.shape
         out, nodes = np.empty((n, d, d)), self.pieces.points.grid.cell_nodes
         for rows, part in zip(self.rows, self.parts, strict=True):
@@ -94,7 +93,7 @@ class QuadraturePoints:
     pieces
         The integration points.
     laws
-        Each law with its integration points, and whether it uses F-bar, see `SceneMaterials.parts`.
+        Each law with its integration points, and whether the law uses F-bar.
     varies
         Whether mobilities change with the deformation.
     layered
@@ -141,7 +140,7 @@ class QuadraturePoints:
         return PiecePlaces(pieces, tuple(parts))
 
     def _law_places(self, cut: CutDomains, pieces: Places) -> Places:
-        """Return the positions at which laws use grad u, shifted in flowing, dilatant soil (`SHARE`)."""
+        """Return the positions at which laws are evaluated.  The factor `SHARE` moves them towards cell midpoints."""
         if not self.materials.dilates or self._grid.axisymmetric:
             return pieces
         flows = cut.to_cells(self.materials.dilating(cut.points))
@@ -226,7 +225,7 @@ class QuadraturePoints:
         return dict(zip(("F", ACROSS), in_plane(F), strict=True))
 
     def _own(self, cut: CutDomains, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
-        """Return the data that differ between pieces of one material point, for user-defined functions."""
+        """Return the data that differ between pieces of a material point, for user-defined functions."""
         fields = {}
         if self._extended or self.varies:
             fields["position"] = cut.pieces.x + cut.grid.base
@@ -257,7 +256,7 @@ class QuadraturePoints:
     def fixed_stress(self, cut: CutDomains, points: MaterialPoints, of_fluid: bool) -> NDArray[np.float64]:
         """Return the coefficient beta of the fixed-stress operator at the integration points, in 1/Pa.
 
-        `of_fluid`: whether to return 1/K_w in place of beta; then the iteration converges for stiff skeletons only.
+        `of_fluid`: whether to return 1/K_w in place of beta, for stiff skeletons.
         """
         if of_fluid:
             return np.full(len(cut.cells), 1 / self._fluid.bulk)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """The rigid motion nearest to prescribed displacements: initial guess of Newton's method for bodies that rotate.
 
-A linearised rotation by an angle a stretches a body by a^2 / 2.  Soil may yield at this stretch, and Newton's method
-may then fail, even in short steps.  The rigid motion is a better initial guess.
+A linearised rotation by an angle a stretches a body by a^2 / 2.  Soil may yield at this stretch, so the first Newton
+step would be a bad guess.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ def rigid_motion(
 ) -> NDArray[np.float64] | None:
     """Return the displacements, in m, of positions x in the rigid motion nearest to prescribed displacements.
 
-    The result is None if the linearised rotation stretches by less than `NEAR`.  The result is also None if more than
-    half of the squared gaps of the best translation remain.  All processes must call this function.
+    The result is None for small rotations, and for displacements that are far from a rigid motion.  All processes must
+    call this function.
 
     `holds`: penalties of prescribed displacements, with direction, gap, in m, and stiffness, which weights the fit.
     `counts` (k,): whether each penalty is used.
@@ -64,7 +64,8 @@ def rotated(
 ) -> NDArray[np.float64]:
     """Return the rotation nearest to a motion of weighted positions (Kabsch 1976).
 
-    The result is the identity if `rigid_motion` would be None.  All processes must call this function.
+    The result is the identity for small rotations, and for motions that are far from rigid.  All processes must call
+    this function.
     """
     d = x.shape[1]
     sums = over_all(comm, np.concatenate([[weight.sum()], weight @ x, weight @ to]))

@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Loads on sides of the bodies in their present position: dead tractions, and pressures that follow the surface.
+"""Loads on sides of the bodies: dead tractions, and pressures that follow the surface.
 
-A traction t is a force per reference area.  The virtual work of t is `int t . v dA` on the reference faces, with the
-test function v.  The virtual work of a pressure p is `-int p n . v da` on the present area with the normal n.  The
-tangent of the pressure's work is symmetric, except for a contribution `p/2 (v x du) . dx` of the edges dx of the
-surface, with the displacement increment du.  This contribution vanishes where two surfaces of equal pressure meet, and
-on a wall that fixes the normal component of v and du.
+A traction t is a force per reference area A.  With the test function v, the virtual work of t is `int t . v dA`.  The
+virtual work of a pressure p is `-int p n . v da`, with the present area a and its normal n.  The tangent of this work
+is symmetric up to a line integral over the edges of the surface.  The line integral is zero if the surface is closed,
+or ends at walls that fix the normal displacement.
 """
 
 from __future__ import annotations
@@ -142,7 +141,7 @@ class Pressures(SideLoads):
         self.symmetric = closed(self._grid, setting.free, self._loads)
 
     def placed(self, place: Place) -> Loads:
-        """Return the pressures, as forces on the area at the start of the step."""
+        """Return the pressures in a substep."""
         (places, push), forms = self.forces(place), self._forms(PressureForms)
         return PressureLoads(forms, PointData(forms.points, places, np.ones(len(push)), {"push": push}))
 
@@ -173,9 +172,7 @@ class PressureLoads(Loads):
 
 
 def closed(grid: Grid, free: NDArray[np.bool_], pressures: Sequence[tuple[Pressure, Surface]]) -> bool:
-    """Return whether each surface of equal pressure is closed, or ends on walls that fix the normal displacement.
-
-    Corners of a face must not lie on edges of other faces.
+    """Return whether each surface of equal pressure is closed, or ends at walls that fix the normal displacement.
 
     `free` (nodes, d): whether walls leave each displacement component free.
     """

@@ -46,7 +46,7 @@ class OwnTerms:
         self.symmetric = True
         self.holding = False
         self.rates = False
-        """`symmetric`: all tangents are symmetric.  `holding`, `rates`: a term depends on u, or on velocity."""
+        """Whether any term depends on velocity."""
         u = forms.u
         more = {"t": t, "dt": dt, "velocity": forms.velocity.value}
         v, du = ufl.TestFunction(u.function_space), ufl.TrialFunction(u.function_space)

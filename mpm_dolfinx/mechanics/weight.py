@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Weight of the bodies, `int rho g . v dV`, and of the pore fluid that flows into dilating pores in the step."""
+"""Weight of the bodies, `int rho g . v dV`, and weight of the pore fluid that flows into the bodies in the step."""
 
 from __future__ import annotations
 
@@ -57,6 +57,6 @@ class WeightLoads(DeadLoads):
         self._taken_up = taken_up
 
     def takes_up(self, b: NDArray[np.float64]) -> None:
-        """Subtract the weight of the fluid that flows into dilating pores at u."""
+        """Subtract the weight of the pore fluid that flows into the bodies."""
         if self._taken_up is not None:
             self._taken_up.assemble_vector(b, self.data)
