@@ -1,19 +1,16 @@
 # SPDX-License-Identifier: MIT
 """Displacement of the corners of particle domains: the Q1 field of the grid with a quadratic correction.
 
-In bending the true strain varies linearly over a cell, but the strain of a Q1 field jumps at the grid lines.  Particle
-domains that follow the Q1 field acquire a sawtooth strain.  The displacement u of a corner at x is therefore
+The strain of a Q1 field jumps at the grid lines.  The correction removes these jumps.  The displacement u of a corner
+at x is
 
     u(x) = sum_i N_i(x) [u_i - 1/2 sum_a t_a (1 - t_a) D_a],
 
 where N_i are the shape functions, u_i are the nodal displacements, and t_a is the position along axis a in the cell,
-from 0 to 1.  D_a is a second difference of nodal displacements along axis a.  The field u is exact for quadratic
-displacements, equal to Q1 at the nodes, and continuous.
-
-D_a belongs to the cell edge along axis a that ends at node i.  D_a is the minmod limiter of the second differences at
-both ends of the edge.  If only one end has a second difference, D_a is this difference.  For bodies
-with inertia D_a is then zero, because stresses would oscillate at surfaces on grid lines.  If cell sizes vary, a second
-difference is the squared edge length times the second derivative of a parabola through three nodes.
+from 0 to 1.  D_a is a limited second difference of nodal displacements along axis a: the minmod of the second
+differences at both ends of the cell edge at node i.  If only one end has a second difference, D_a is this difference.
+With inertia D_a is then zero, because stresses would oscillate at surfaces on grid lines.  The field u is continuous,
+and exact for quadratic displacements.
 """
 
 from __future__ import annotations

@@ -23,10 +23,10 @@ from mpm_dolfinx.points.cutting import Pieces, cut, cut_faces
 from mpm_dolfinx.points.material_points import MaterialPoints, middle
 
 STILL = 3e-4
-"""Largest motion of corners, divided by the cell size, for which a cut remains valid.
+"""Largest motion of corners, divided by the cell size, without a new cut of the domains.
 
-In a consolidating column of ten cells, a new cut in every step changes pressures by 7e-5 of the load.  The settlement
-changes by 3e-5 of its value.
+With a new cut in every step, pressures in a consolidating column of ten cells change by 7e-5 of the load.  The
+settlement changes by the fraction 3e-5.
 """
 
 
@@ -38,7 +38,7 @@ class Patches:
     grid
         Background grid.
     faces, row : (n,)
-        Surface faces of the bodies, or parts of them, and the index of each point's face among these faces.
+        Surface faces of the bodies, or parts of these faces, and for each point the index of its face.
     face, at : (n,)
         Index of the face in its domain, and index of the material point.
     cell : (n,)
@@ -89,7 +89,7 @@ class Patches:
         return interpolate(points.corners[self.at], self.xi)
 
     def positions(self, points: MaterialPoints) -> Callable[[str], NDArray[np.float64]]:
-        """Return a function that maps "X" to the reference positions, and "x" to the current positions."""
+        """Return a function of a name: "X" gives the reference positions, and "x" the current positions."""
         return lambda name: self.X if name == "X" else self.now(points) + self.base
 
     def area(self, points: MaterialPoints) -> NDArray[np.float64]:
@@ -103,8 +103,8 @@ class Patches:
 class CutDomains(Keyed):
     """Particle domains cut by the cells, and the exchange of their data with the owners of the cells.
 
-    The cut is valid until corners have moved by more than `STILL`.  Until then, shape functions are evaluated at the
-    positions that the pieces had when the domains were cut.
+    The cut is valid until corners have moved by more than `STILL` cells.  Until then, shape functions are evaluated at
+    the positions of the pieces at the cut.
 
     Parameters
     ----------
@@ -113,7 +113,8 @@ class CutDomains(Keyed):
     points
         Material points of this process.  All points must be inside the grid.
     domains
-        Whether to integrate over the exact pieces of the domains.  Otherwise each point is one piece, as in MPM.
+        Whether to integrate over the exact pieces of the domains.  Otherwise each point is one piece, as in standard
+        MPM.
     second, faces
         Whether to compute second moments and face areas of the pieces.
     """
@@ -130,9 +131,9 @@ class CutDomains(Keyed):
         self.pieces_to_cells = exchange.send
         """Function that sends values of the pieces to the owners of their cells."""
         self.to_pieces = exchange.back
-        """Function that returns values of the pieces from the owners of their cells to the processes of the points."""
+        """Function that sends values of the pieces from the owners of their cells to the processes of the points."""
         self.cells, self.x = grid.locals[exchange.send(pieces.cell)], exchange.send(pieces.x)
-        """For each of m pieces: the owned cell (m,) that contains it, and its centroid (m, d), in m."""
+        """Owned cells (m,) and centroids (m, d), in m, of m pieces."""
         self.mixed = exchange.send(pieces.mixed) if grid.dim == 3 and domains else None
         """In 3D: mean products of coordinates in each piece, see `Pieces`."""
         self.hoop = exchange.send(pieces.hoop) if grid.axisymmetric else None
@@ -140,7 +141,7 @@ class CutDomains(Keyed):
         self._faces = exchange.send(pieces.faces) if faces else None
         pieces.faces, pieces.mixed = pieces.faces[:0].copy(), pieces.mixed[:0].copy()
         self.pieces = pieces
-        """Pieces of this process's points, without areas and mean products."""
+        """Pieces of the points on this process, without areas and mean products."""
 
     def faces(self) -> NDArray[np.float64]:
         """Return areas (m, d, 2), in m^(d-1), of pieces on cell faces."""
@@ -163,11 +164,11 @@ class CutDomains(Keyed):
         return self.moved(points, part, count) <= STILL
 
     def to_cells(self, values: NDArray) -> NDArray:
-        """Send values (n, ...) of points to the owners of the cells, and return the values (m, ...) of owned pieces."""
+        """Send values (n, ...) of points to the owners of cells.  Return values (m, ...) of pieces in owned cells."""
         return self.pieces_to_cells(values[self.pieces.point])
 
     def plane(self, volume: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the volumes (m,) and centroids (m, d) of pieces, or areas and centroids of sections in axisymmetry."""
+        """Return volumes (m,) and centroids (m, d) of pieces, or in axisymmetry of their meridional sections."""
         if not self.grid.axisymmetric:
             return volume, self.x
         return volume / (TURN * self.hoop[:, 3]), self.grid.midpoints[self.cells] + self.hoop[:, :2]
@@ -179,7 +180,7 @@ class CutDomains(Keyed):
         return means.T.copy().reshape(len(self.points), *values.shape[1:])
 
     def in_plane(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return for each point the volume mean over its pieces, in axisymmetry the area mean over their sections."""
+        """Return for each point the mean over its pieces, weighted by volume or, in axisymmetry, by meridional area."""
         if not self.grid.axisymmetric:
             return self.mean(values)
         area = self.pieces.fraction / self.pieces.hoop[:, 3]
@@ -187,14 +188,14 @@ class CutDomains(Keyed):
         return total / whole
 
     def surface(self, faces: Surface) -> Patches:
-        """Return the quadrature points on a surface, for faces whose points are on this process.
+        """Return the quadrature points on a surface, for faces of points on this process.
 
-        The cell of a quadrature point contains a piece of the point's domain, so loads act on nodes with stiffness.
+        The cell of each quadrature point contains a piece of the domain.
         """
         return self.surfaces([faces])[0]
 
     def surfaces(self, several: Sequence[Surface]) -> list[Patches]:
-        """Return the quadrature points of several surfaces, which are cut together to save time."""
+        """Return the quadrature points of several surfaces."""
         if new := [faces for faces in dict.fromkeys(several) if faces not in self._patches]:
             self._patches.update(zip(new, self._cut_surfaces(new), strict=True))
         return [self._patches[faces] for faces in several]
@@ -233,14 +234,14 @@ class CutDomains(Keyed):
         return out
 
     def displacement(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the values (n, d) of a Q1 field u (nodes, d) at the points of a cut without `domains`."""
+        """Return the values (n, d) of a Q1 field u (nodes, d) at the points."""
         exchange, cells = self._followed
         return exchange.back(self.grid.at(cells, exchange.send(self._tracked), u))
 
     def followed(
         self, u: NDArray[np.float64], filled: NDArray[np.bool_], one_sided: bool = True
     ) -> Iterator[NDArray[np.float64]]:
-        """Yield the Q1 field u (nodes, d) at the corners (n, 2^d, d), then its quadratic correction, both in m.
+        """Yield two arrays (n, 2^d, d), in m: the Q1 field u (nodes, d) at the corners, and its quadratic correction.
 
         `filled`, `one_sided`: see `bending.followed`.
         """
@@ -250,7 +251,7 @@ class CutDomains(Keyed):
 
     @property
     def _tracked(self) -> NDArray[np.float64]:
-        """Positions of all corners, in m.  Without `domains`, positions of the points."""
+        """Positions of all corners, in m, or positions of the points in a cut without `domains`."""
         return self.points.corners.reshape(-1, self.grid.dim) if self.domains else self.points.x
 
     @cached_property
@@ -271,12 +272,12 @@ class CutDomains(Keyed):
         return off + (middle(points.corners) - middle(points.origin))[pieces.point] - off0
 
     def cells_at(self, at: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the lexicographic cells (n,) of positions x (n, d), in m, in or on the domains of points `at` (n,)."""
+        """Return the lexicographic cells (n,) of positions x (n, d), in m, in the domains of points `at` (n,)."""
         # rounding must not assign a corner on a grid line to a cell outside the domain
         return self._filled_cell(at, x + NEAR * (self.points.x[at] - x))
 
     def _filled_cell(self, at: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the cells of positions x; the cell of the domain's largest piece replaces cells without a piece."""
+        """Return the cells of positions x.  A cell without a piece is replaced by the cell of the largest piece."""
         pieces, cells = self.pieces, self.grid.all_cells
         cell = self.grid.number(self.grid.index_from_base(x)) + self.grid.copy(self.points.id[at])
         key, keys = at * cells + cell, pieces.point * cells + pieces.cell
@@ -295,7 +296,7 @@ class CutDomains(Keyed):
 
 
 def whole_points(grid: Grid, x: NDArray[np.float64]) -> Pieces:
-    """Return one piece for each point, at the point.  All faces of a cell that contains points are open."""
+    """Return one piece for each point, at the point."""
     n, number = len(x), grid.number(grid.index_from_base(x))
     _, cell, count = np.unique(number, return_inverse=True, return_counts=True)
     h = grid.sizes_of(number)

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Parts of seeded domains after division and merging: their intervals, identifiers, corners and faces.
+"""Parts of seeded particle domains after division and merging.
 
-A part of a seeded particle domain is the image of a box of local coordinates under the bilinear or trilinear map of the
-domain.  A whole domain is the interval [0, 1] along each axis.  A division bisects an interval.  Two parts merge if
-they are the halves of one interval.  On the lattice of a box, whole domains also merge, into the intervals [0, 2], [0,
-4], and so on.
+Local coordinates in a seeded domain are from 0 to 1.  A part of the domain is a box of local coordinates, with an
+interval along each axis.  A division bisects an interval.  Two halves of an interval merge.  In the interior of a box,
+neighbouring seeded domains may also merge into the intervals [0, 2], [0, 4], and so on.
 """
 
 from __future__ import annotations
@@ -24,11 +23,11 @@ from mpm_dolfinx.points.cutting import centroids, domain_volumes
 from mpm_dolfinx.points.material_points import MaterialPoints, body_of
 
 PLACES = "corners", "reference", "origin"
-"""Names of the arrays of points that contain corners of domains."""
+"""Names of the arrays of `MaterialPoints` that contain corners of domains."""
 
 
 class SeededDomains:
-    """Seeded domains of the bodies, and identifiers of their parts, which follow from domain and interval."""
+    """Seeded domains of the bodies, and identifiers of their parts."""
 
     def __init__(self, bodies: Sequence[Body]):
         self.starts = np.cumsum([0, *map(len, bodies)])
@@ -39,7 +38,7 @@ class SeededDomains:
         self._codes = int((most // (len(bodies) * int(self.starts[-1] + 1))) ** (1 / self._dim))
 
     def known(self, part: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return which intervals (n, d, 2) are large enough to be identified by 64-bit integers."""
+        """Return which parts (n, d, 2) have a 64-bit identifier.  Very small parts have no identifier."""
         return (self._code(part) < self._codes).all(axis=1)
 
     def of(self, root: NDArray[np.int64], part: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -59,10 +58,11 @@ class SeededDomains:
         return np.rint(code).astype(np.int64)
 
     def at(self, root: NDArray[np.int64], lower: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return the domain (n,) that has the lower corner of each part, and this corner (n, d) relative to the domain.
+        """Return the seeded domain (n,) at the lower corner of each part, and the local coordinates (n, d) of the
+        corner.
 
-        `root` (n,): any domain of the body.
-        `lower` (n, d): lower corner of the part, relative to `root`.
+        `root` (n,): any seeded domain of the body.
+        `lower` (n, d): local coordinates of the lower corner in the domain `root`.
         """
         step = np.floor(lower).astype(np.int64)
         out, moved = root.copy(), step.any(axis=1).nonzero()[0]
@@ -73,9 +73,9 @@ class SeededDomains:
         return out, lower - step
 
     def places(self, root: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the body and lattice index (n, 1 + d) of seeded domains.
+        """Return body and lattice index (n, 1 + d) of seeded domains.
 
-        For a domain without a lattice, the entry of the body is -1 - id.
+        A domain without a lattice has the entry -1 - id in place of the body.
         """
         out = np.zeros((len(root), 1 + self._dim), dtype=np.int64)
         body = body_of(root, self.starts)
@@ -88,7 +88,7 @@ class SeededDomains:
         return out
 
     def sizes(self, grid: Grid, points: MaterialPoints) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the edge lengths (n, d), in cells, of domains now, and of their seeded domains at seeding."""
+        """Return the present edge lengths (n, d) of domains, and those of their seeded domains, in cell sizes."""
         root = roots(points)[0]
         return _lengths(grid.in_cells(points.corners)), self._seeded((root,), lambda: self._as_seeded(grid, root))
 
@@ -103,10 +103,7 @@ class SeededDomains:
         return seeded
 
     def from_middle(self, places: NDArray[np.int64], axis: int) -> NDArray[np.float64]:
-        """Return the indices (n,) of rows of the lattice along an axis, counted from the middle of the body.
-
-        The result is nan for domains without a lattice, and for the middle row of an odd number of rows.
-        """
+        """Return the lattice rows (n,) of domains along an axis, counted from the middle of the body, or nan."""
         out = np.full(len(places), np.nan)
         for i in np.unique(places[places[:, 0] >= 0, 0]):
             at, count = places[:, 0] == i, self.bodies[i].lattice[axis]
@@ -163,10 +160,7 @@ def beyond_corners(points: MaterialPoints, axisymmetric: bool) -> NDArray[np.flo
 
 
 def halved(points: MaterialPoints, axis: int, domains: SeededDomains, axisymmetric: bool) -> MaterialPoints:
-    """Return the halves (2n,) of n points: first all lower halves, then all upper halves.
-
-    The volumes of both halves add up to the volume of the point, in the reference and in the deformed configuration.
-    """
+    """Return the halves (2n,) of n points: first all lower halves, then all upper halves."""
     root, part = roots(points)
     at, n = domains.middle(root, part, axis), len(points)
     places = {name: halves(getattr(points, name), axis, at).reshape(-1, *points.corners.shape[1:]) for name in PLACES}
@@ -183,7 +177,7 @@ def halved(points: MaterialPoints, axis: int, domains: SeededDomains, axisymmetr
 def joined(
     lower: MaterialPoints, upper: MaterialPoints, axis: int, domains: SeededDomains, axisymmetric: bool
 ) -> MaterialPoints:
-    """Return the points (n,) merged from their halves, with F from the corners and weighted means of the data."""
+    """Return the points (n,) merged from their halves.  F follows from the corners, other data are weighted means."""
     places = {name: merged(getattr(lower, name), getattr(upper, name), axis) for name in PLACES}
     root, part = roots(lower)
     part = part.copy()
@@ -216,9 +210,9 @@ def _placed(
 
 
 def with_defect(new: MaterialPoints, old: MaterialPoints, into: NDArray[np.int64]) -> MaterialPoints:
-    """Return new points with a volume defect such that soil and fluid fill the same volume as before.
+    """Return new points with volume defects, so that fluid is conserved.
 
-    `into`: index of the old point of each new point; for merged points, index of the new point of each old point.
+    `into`: index of the old point for each new point, or after merging, index of the new point for each old point.
     """
     if "owed" not in new.data:
         return new

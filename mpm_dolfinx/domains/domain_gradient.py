@@ -15,12 +15,10 @@ from mpm_dolfinx.points.material_points import MaterialPoints, cofactor, determi
 def gradient(
     corners: NDArray[np.float64], reference: NDArray[np.float64], axisymmetric: bool = False
 ) -> NDArray[np.float64]:
-    """Return the deformation gradients F (n, d, d) of particle domains, as means over the simplices of each domain.
+    """Return the mean deformation gradients F (n, d, d) of particle domains, or (n, 3, 3) in axisymmetry.
 
-    In 2D the diagonals of the domain determine F, and det F is the current area divided by the reference area.  In 3D F
-    is scaled so that det F is the current volume divided by the reference volume.  In axisymmetry F has the shape (n,
-    3, 3).  The circumferential stretch is then the ratio of the centroid radii, and det F is the ratio of the ring
-    volumes.
+    F is scaled so that det F is the ratio of current to reference volume.  In axisymmetry, the circumferential stretch
+    is the ratio of the centroid radii.
 
     `corners`, `reference` (n, 2^d, d), in m: current corners, and reference corners.
     """
@@ -91,14 +89,13 @@ def cell_ratios(
 ) -> NDArray[np.float64]:
     """Return the volume ratios (m,) of the pieces of a cut at the start of a step.
 
-    With F-bar, the volume ratio of a cell is the present volume of its particle domains divided by their reference
-    volume.  A ratio updated by increments would drift from the volumes of the domains.  Without F-bar, and in cells
-    with yielded soil, the ratio of a piece is the ratio of its point.
+    With F-bar, a piece has the mean volume ratio of its cell: a weighted geometric mean of the ratio of the domains and
+    the ratio det F of the points.  Without F-bar, and in cells with yielded soil, a piece has the volume ratio of its
+    point.
 
     `cut`: cut particle domains.
     `points`: points at the start of the step.
-    `share` (n,): weight, from 0 to 1, of the ratio from corners in a geometric mean with the point's ratio; 0 without
-    F-bar.
+    `share` (n,): weight of the ratio of the domains in the geometric mean, from 0 to 1; 0 without F-bar.
     `flows` (n,): whether points have yielded.
     """
     cells, size = cut.cells, cut.grid.num_local

@@ -1,16 +1,14 @@
 # SPDX-License-Identifier: MIT
 """Deformation gradients that vary linearly within the particle domains of elastic soil.
 
-The gradient F of a point is the mean over its domain.  In bending the gradient varies across the domain.  With one
-gradient for each domain, and n domains over the thickness, the bending stiffness is too small by the fraction `1/n^2`.
-At a piece with the local coordinates xi in its domain, the gradient is therefore
+The gradient F of a point is the mean over its domain.  With constant F in each of n domains over the thickness of a
+beam, the bending stiffness would be too small by the fraction `1/n^2`.  At a piece with the local coordinates xi in its
+domain, the gradient is therefore
 
     F(xi) = F (1 + e),   F e = sum_a D_a (xi_a - mean of xi_a over the reference volume).
 
-The sum is over the axes a, and xi is in units of the domain's edge lengths.  The slopes D_a are a least-squares fit to
-the gradients F of neighbours of the same material across faces.  Then e is corrected so that the sum of
-`int dV / det F` over the pieces is the reference volume of the domain.  The fit reproduces linear fields on any
-mesh, and uniform fields stay uniform.
+The sum is over the axes a.  The slopes D_a are a least-squares fit to the gradients F of neighbours of the same
+material across faces.  The fit reproduces linear fields on any mesh.  The reference volume of the domain is conserved.
 """
 
 from __future__ import annotations
@@ -56,10 +54,10 @@ class Neighbours:
         self._partner = partner.reshape(-1, 2 * dim).T.copy()  # index of the opposite face; -1 if there is none
 
     def at_neighbours(self, own: NDArray[np.float64], faces: Sequence[NDArray[np.float64]]) -> Callable[[int], tuple]:
-        """Return a function of a face index that returns data, face centres and mask of the neighbours.
+        """Return a function of a face index.  The function returns data, face centres and mask of the neighbours.
 
-        `own` (c, k): c data columns of the points.
-        `faces`: centres (d, k), in m, of the points' faces, for each face index.
+        `own` (c, k): c data of each point.
+        `faces`: centres (d, k), in m, of the faces of the points, for each face index.
         """
         centres = np.array(faces).transpose(1, 2, 0).reshape(len(faces[0]), own.shape[1] * len(faces))
         point = np.arange(own.shape[1]).repeat(len(faces))
@@ -88,7 +86,7 @@ class LinearGradients:
     def at_pieces(
         self, cut: CutDomains, F: NDArray[np.float64], elastic: NDArray[np.bool_], soils: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return `linear_gradients` at pieces, uniform in domains of inelastic points.  All processes must call it."""
+        """Return the gradients at the pieces.  In inelastic domains, F is constant.  All processes must call it."""
         make = partial(Neighbours, self._comm, self._bodies, cut.points, elastic)
         return linear_gradients(self._neighbours((cut.points.id, elastic), make, self._comm), cut, F, soils)
 
@@ -110,7 +108,7 @@ def _seeded_faces(bodies: Sequence[Body], ids: NDArray[np.int64], seeded: NDArra
 def _faces_of_parts(
     comm: MPI.Intracomm, bodies: Sequence[Body], points: MaterialPoints, seeded: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    """Return a key for each face of domains and of parts of domains, equal for both domains at the face.
+    """Return a key for each face of domains and of parts of domains.  Both domains at a face have the same key.
 
     `seeded`: keys of whole domains of bodies without a lattice.
     """
@@ -152,7 +150,7 @@ def linear_gradients(
     `neighbours`: neighbours of the domains in which F may vary.
     `cut`: cut particle domains.
     `F` (n, k, k): deformation gradients of the points.
-    `soils` (n, c): constants of the points' soil; points with equal rows have the same material.
+    `soils` (n, c): material constants.  Points with equal rows have the same material.
     """
     # the last axis is the point or piece: numpy takes several times as long for rows of a few numbers each
     of, fraction = cut.pieces.point, cut.pieces.fraction
@@ -186,7 +184,7 @@ def linear_gradients(
 def _slopes(
     neighbours: Neighbours, cut: CutDomains, F: NDArray[np.float64], soils: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the derivatives of F with respect to xi, and the inverse edge matrices of domains."""
+    """Return the derivatives of F with respect to local coordinates, and the inverse edge matrices of domains."""
     rows = neighbours.rows
     d, k = cut.grid.dim, F.shape[1]
     corners = cut.points.corners[rows].transpose(1, 2, 0).copy()

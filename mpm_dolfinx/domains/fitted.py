@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Tensors at positions in the bodies, fitted to the values of the surrounding points (`local_fit`)."""
+"""Tensors at positions in the bodies, from a fit to surrounding points (`local_fit`)."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ def fitted_at(
 ) -> NDArray[np.float64]:
     """Return tensors (m, k, k) at positions in particle domains.  All processes must call this function.
 
-    The fit uses points of the same body and material, weighted by the distance in the reference configuration.  Results
-    in removed domains are meaningless.
+    The fit uses points of the same body and material, with weights that depend on the distance in the reference
+    configuration.
 
     `sizes`: number of points of each body of the scene.
-    `id` (m,): identifiers of the points in whose domains the positions lie, the same on all processes.
+    `id` (m,): identifiers of the domains that contain the positions, the same on all processes.
     `xi` (m, d): local coordinates of the positions in these domains, the same on all processes.
     `tensor`: function from material points to tensors (n, k, k).
     """
@@ -63,7 +63,7 @@ def fitted_at(
 
 
 def _near(x: NDArray[np.float64], places: NDArray[np.float64], radius: NDArray[np.float64]) -> tuple[NDArray, NDArray]:
-    """Return index pairs of `places` and points x that are closer than `radius` along each axis."""
+    """Return index pairs of `places` and points x at a distance below `radius` along each axis."""
     low, high = ((places + sign * radius[:, None]).T for sign in (-1, 1))
     bounds = low.min(axis=1, initial=np.inf), high.max(axis=1, initial=-np.inf)
     some = np.flatnonzero(((x >= bounds[0]) & (x <= bounds[1])).all(axis=1))

@@ -1,17 +1,15 @@
 # SPDX-License-Identifier: MIT
 """Correction of the corners of yielded particle domains, so that the domains keep the volumes of their points.
 
-The volume ratio of a point is a mean over its cell.  The corners of its domain follow a field that varies in the cell.
 In yielded soil, F is updated by increments, so the volumes of domains and points would drift apart.  After a step, the
 corners of yielded domains therefore move by the vectors d that minimise
 
     sum_p V_p e_p^2 + SOFT^2 sum_p V_p (mean (d / h)^2 + sum_a mean (D_a / h)^2),  V_p e_p = V_p - V - dV/dx d.
 
-The sums are over the points p.  V_p is the volume of a point, and V is the volume of its domain.  The derivative of V
-with respect to the corners is dV/dx.  The relative volume error after the motion is e_p.  D_a is the change of d along
-an edge of axis a.  The means are over the domain's corners and edges, and h contains the edge lengths of the domain's
-cell.  Shared corners move together.  Fixed corners, and corners of elastic domains, do not move.  Implicit density
-projection corrects the densities of cells in this way (Kugelstadt et al. 2019).
+The sums are over the points p with the volumes V_p.  The domain of a point has the volume V, and dV/dx is the
+derivative of V with respect to its corners.  The relative volume error after the motion is e_p.  The difference of d
+along an edge of axis a is D_a.  The means are over the corners and edges of the domain, and h is the cell size.  The
+method is similar to implicit density projection (Kugelstadt et al. 2019).
 """
 
 from __future__ import annotations
@@ -29,11 +27,10 @@ from mpm_dolfinx.grid.grid import Grid, linked, sum_by
 from mpm_dolfinx.parallel.exchange import to_root
 
 SOFT = 0.15
-"""Weight of the motion d of the corners, and of its changes along edges.
+"""Weight of the motion d of the corners, and of its differences along edges.
 
-Volume errors may alternate between the domains of a regular lattice.  To first order, no motion of the corners reduces
-such errors, so the weight is needed.  Plateau (scene "flow" of tests/plateaus.py): half this value changes the result
-by 1.5e-04, twice this value by 2.4e-04, and finer cells by 9.1e-02.
+Plateau (scene "flow" of tests/plateaus.py): half this value changes the result by 1.5e-04, twice this value by 2.4e-04,
+and finer cells by 9.1e-02.
 """
 
 
@@ -98,9 +95,9 @@ def _sparse(values: NDArray[np.float64], columns: NDArray[np.int64], count: int)
 def _joined(
     body: NDArray[np.int64], number: NDArray[np.int64], x: NDArray[np.float64], tolerance: float
 ) -> NDArray[np.int64]:
-    """Return an index for each corner of domains, which is equal for corners that coincide.
+    """Return an index for each corner of domains.  Coincident corners have equal indices.
 
-    Corners of one body coincide if their seeded indices are equal, or if they are closer than about `tolerance`, in m.
+    Corners coincide if their seeded indices are equal, or if their distance is below `tolerance`, in m.
     """
     keys = [body.repeat(x.shape[1])]
     for column in x.reshape(-1, x.shape[2]).T:

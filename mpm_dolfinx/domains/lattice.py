@@ -1,21 +1,18 @@
 # SPDX-License-Identifier: MIT
 """Lattice of the seeded corners of a body, and a third-difference filter of their displacements.
 
-Nodes cannot represent a displacement wave of the corners with a wavelength of two domains, so no nodal force resists
-such a wave.  Corners that cross grid lines excite these waves.  When the grid is reset, a filter damps them.  For each
-axis a in turn, the filter replaces the displacement d of the corners from their reference positions by
+Nodes cannot represent a displacement wave of the corners with a wavelength of two domains.  A filter damps such waves
+when the grid is reset.  For each axis a in turn, the filter replaces the displacement d of the corners by
 
     d - D_a^T (s / 64) D_a d.
 
-D_a is the third difference of four corners in a row along axis a.  If the domains in a row have different widths, D_a
-is the divided difference, scaled to the same sum of absolute weights.  The factor is `s = min(1, FAST c)`, with the
-number c of cells that the corners have crossed since the last grid reset.  The filtered displacement is the mean over
-all orders of the axes.
+D_a is the third difference of four corners in a row along axis a, or the scaled divided difference for different widths
+of domains.  The factor is `s = min(1, FAST c)`, with the number c of cells that the corners have crossed since the last
+reset.
 
-Quadratic fields remain unchanged, even at the surface.  A wave with a length of two domains is reduced by the fraction
-s, and a wave with a length of eight domains by 0.003 s.  The filter leaves out domains that have separated from their
-neighbours, and yielded soil, whose kinks are physical.  The filter does not move corners held by a wall, a prescribed
-displacement, a plate or another body.
+Quadratic fields remain unchanged.  A wave with a length of two domains is reduced by the fraction s, and a wave with a
+length of eight domains by 0.003 s.  Yielded soil is not filtered.  Corners at a wall, a prescribed displacement, a
+plate or another body do not move.
 """
 
 from __future__ import annotations
@@ -38,7 +35,7 @@ from mpm_dolfinx.parallel.exchange import Exchange
 from mpm_dolfinx.points.material_points import MaterialPoints
 
 FAST = 10
-"""Fraction of a wave with a length of two domains that the filter removes for each crossed cell (at most 1 in total).
+"""Fraction of a wave with a length of two domains that the filter removes for each crossed cell.
 
 Plateau (scene "cycles" of tests/plateaus.py): half this value changes the result by 1.5e-04, twice this value by
 3.4e-04, and finer cells by 6.2e-03.
@@ -49,11 +46,11 @@ MARGIN = len(THIRD) - 1
 
 
 class Lattice:
-    """Lattice of the domain corners of an active body, and the held corners.
+    """Lattice of the domain corners of an active body.
 
-    `start`: identifier of the body's first point.
-    `given`: for each condition, the faces with prescribed displacements, and the prescribed axes.
-    `contacts`: faces that touch other bodies, as the domain (m,) and the corner indices (m, 4) of each face.
+    `start`: identifier of the first point of the body.
+    `given`: faces with prescribed displacements, and prescribed axes, for each condition.
+    `contacts`: faces in contact with other bodies: domains (m,), and corner indices (m, 4).
     """
 
     def __init__(
@@ -84,7 +81,7 @@ class Lattice:
         self._held: Latest[tuple[NDArray[np.bool_], NDArray[np.bool_]]] = Latest()
 
     def rows(self, points: MaterialPoints) -> NDArray[np.int64]:
-        """Return the indices of the body's points."""
+        """Return the indices of the points of the body."""
         return ((points.id >= self._start) & (points.id < self._stop)).nonzero()[0]
 
     def given(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
@@ -92,7 +89,7 @@ class Lattice:
         return self.held_of(ids)[0]
 
     def held_of(self, ids: NDArray[np.int64]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Return which displacement components of corners are prescribed, and which corners touch other bodies."""
+        """Return which displacement components of corners are prescribed, and which corners are in contact."""
 
         def held() -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
             number = self.nodes(ids)
@@ -105,7 +102,7 @@ class Lattice:
         return self._numbers(ids, lambda: self._body.nodes(ids - self._start))
 
     def corners_of_parts(self, points: MaterialPoints) -> NDArray[np.int64]:
-        """Return the indices (m,) of the body's corners that are corners of parts of domains."""
+        """Return the indices (m,) of corners of divided domains."""
         own = is_part(points).nonzero()[0]
         root, part = (of[own] for of in roots(points))
         own = ((root >= self._start) & (root < self._stop)).nonzero()[0]
@@ -128,7 +125,7 @@ class Lattice:
 
         `d` (n, 2^d, d), in m: displacements of the corners.
         `crossed` (n, 2^d): numbers of cells that the corners have crossed since the grid reset.
-        `parts` (k,): indices of corners of parts of domains; these corners are not filtered.
+        `parts` (k,): indices of corners without filter.
         """
         if self._count is None:
             return np.zeros_like(d)
@@ -154,10 +151,10 @@ def _at_sites(
     values: NDArray[np.float64],
     tolerance: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], slice, Callable[[NDArray[np.float64]], NDArray[np.float64]]]:
-    """Return the values at a process's sites of a lattice, its range of layers, and a function from sites to rows.
+    """Return the values at the lattice sites of this process, its range of layers, and a function from sites to rows.
 
-    The layers of the lattice are distributed over the processes.  A site has nan if its rows of `values` differ by more
-    than `tolerance`.
+    The layers of the lattice are distributed over the processes.  A site with values that differ by more than
+    `tolerance` has nan.
     """
     across, starts = int(np.prod(shape[1:])), np.arange(comm.size + 1) * shape[0] // comm.size
     layer = number // across
@@ -191,7 +188,7 @@ def _filtered(
     thirds: Sequence[NDArray[np.float64]] | None,
     axes: Sequence[int] | None = None,
 ) -> NDArray[np.float64]:
-    """Return the values at the sites of a lattice, filtered along some axes, by default along all."""
+    """Return the values at the sites of a lattice, filtered along some axes; by default along all axes."""
     if axes is None:
         axes = tuple(axis for axis, count in enumerate(d.shape[:-1]) if count >= len(THIRD))
     if not axes:
@@ -202,7 +199,7 @@ def _filtered(
 
 
 def _divided(x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the weights of third differences at positions (n,), whose absolute values add up to 8."""
+    """Return the weights of third differences at positions (n,).  The sum of absolute weights is 8."""
     rows = np.stack([x[k : max(k, len(x) - 3 + k)] for k in range(len(THIRD))])
     distances = rows[:, None] - rows[None]
     weights = 1 / np.where(np.eye(len(THIRD), dtype=bool)[:, :, None], 1.0, distances).prod(axis=1)
@@ -251,7 +248,7 @@ def given(lattices: Sequence[Lattice], points: MaterialPoints) -> NDArray[np.boo
 
 
 def seeded(lattices: Sequence[Lattice], points: MaterialPoints) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Return the indices (n, 2^d) of corners in bodies, and which corners touch other bodies.
+    """Return the indices (n, 2^d) of corners in bodies, and which corners are in contact with other bodies.
 
     Corners of renewed domains have the index -1.
     """
@@ -281,5 +278,5 @@ def filtered(
 
 
 def crossed(grid: Grid, points: MaterialPoints, then: MaterialPoints, free: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return the numbers (n, 2^d) of cells that corners have crossed since the grid reset, or 0 if not `free`."""
+    """Return the numbers (n, 2^d) of cells that corners have crossed since the reset, or 0 without `free`."""
     return grid.cells_between(then.corners, points.corners).sum(axis=2) * free[:, None]

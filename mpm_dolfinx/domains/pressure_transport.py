@@ -1,16 +1,14 @@
 # SPDX-License-Identifier: MIT
 """Conservative, second-order remap of the pore pressure from one grid to the next.
 
-In each cell the pressure at the position x is reconstructed as `p + s . (x - c)`.  Here p is the cell pressure, s is
-the slope, and c is the centroid of the cell's storage.  Along an axis, s is van Leer's mean of the slopes towards both
-neighbours, or towards the pressure on a drained side.  At a no-flow side, s is zero.  Then s is scaled so that the
-pressure in the cell stays between the extremes of cell, neighbours and drained sides.
+In each cell, the pressure at x is reconstructed as `p + s . (x - c)`.  The cell pressure is p, and c is the centroid of
+the material, weighted by storage.  The slope s along an axis is van Leer's mean of the slopes towards both neighbours
+or towards a drained side, and zero at a no-flow side.  A limiter keeps the pressure in the cell between the extremes of
+the cell, its neighbours and drained sides.
 
-A piece of a particle domain receives the pressure at its centroid and moves with the domain.  Then the domain is cut
-again.  The fraction of the domain that remains in a cell keeps its pressure.  A fraction that enters a cell receives
-the mean pressure of the fractions that left other cells.  The centroids of the pieces are remapped in the same way.
-The error of the remapped centroid, times the mean slope of the domain, corrects the pressure.  The remap is
-conservative, and changes nothing without motion.
+Each piece of a particle domain stores the pressure at its centroid.  After the motion, the domain is cut again.  The
+fraction of the domain that is still in the same cell keeps its pressure.  All other fractions get the mean pressure of
+the fractions that left their cells.  The mean slope in the domain corrects these pressures to second order.
 """
 
 from __future__ import annotations
@@ -32,9 +30,9 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 
 @dataclass(frozen=True, eq=False)
 class PiecePressures:
-    """Pore pressures of m pieces of a scene between two steps, sorted by point and cell.
+    """Pore pressures of m pieces between two steps, sorted by point and cell.
 
-    Kept pieces have the pressures of their cells.  Other pieces have the pressures at their centroids.
+    Kept pieces are the pieces of points that hardly move.  They have the pressures of their cells.
     """
 
     id: NDArray[np.int64]  # identifier of the point (m,)
@@ -57,11 +55,11 @@ class PiecePressures:
         return {name: rows for name, rows in vars(self).items() if rows is not None}
 
     def migrated(self, exchange: Exchange) -> PiecePressures:
-        """Return the pieces that this process has after the exchange of their points."""
+        """Return the pieces on this process after an exchange of points."""
         return self._each(exchange.send)._ordered()
 
     def potentials(self, bulk: float) -> PiecePressures:
-        """Return mass potentials (see `fluid_content`) instead of pressures.
+        """Return the pieces with mass potentials (see `fluid_content`) in place of pressures.
 
         `bulk`, in Pa: bulk modulus of the fluid.
         """
@@ -70,18 +68,18 @@ class PiecePressures:
         return replace(self, pressure=pi, slope=slope, bounds=bounds)
 
     def less(self, slope: NDArray[np.float64]) -> PiecePressures:
-        """Return the pressures minus a field with uniform slope (d,), in Pa/m."""
+        """Subtract a pressure field with uniform slope (d,), in Pa/m."""
         even = self.x @ slope
         bounds = self.bounds - even[:, None]
         return replace(self, pressure=self.pressure - even, slope=self.slope - slope, bounds=bounds)
 
     def of(self, ids: NDArray[np.int64], kept: bool = True) -> PiecePressures:
-        """Return the pieces of the points with the given ids, or all other pieces if `kept` is false."""
+        """Return the pieces of the points `ids`, or of all other points if `kept` is False."""
         rows = np.isin(self.id, ids) == kept
         return self._each(lambda values: values[rows])
 
     def joined(self, other: PiecePressures) -> PiecePressures:
-        """Return these pieces and the pieces `other` of points that are new on the grid."""
+        """Return these pieces together with the pieces `other` of new points."""
         pairs = {name: (getattr(self, name), values) for name, values in other.arrays.items()}
         return PiecePressures(**{name: np.concatenate(both) for name, both in pairs.items()})._ordered()
 
@@ -94,7 +92,7 @@ class PiecePressures:
 
 
 def at_start(points: MaterialPoints) -> PiecePressures:
-    """Return one piece with uniform pressure for each point that was in no cell before."""
+    """Return one piece with uniform pressure for each new point."""
     n, p = len(points), points.pressure
     cell = np.full(n, -1)
     slope = np.zeros_like(points.x)
@@ -126,7 +124,7 @@ class Reconstruction:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the slopes (n, d), in Pa/m, and the bounds (n, 2), in Pa, of the pressures in cells.
 
-        `origin` (n, d), in m: position to which the cell's pressure refers, relative to the cell's midpoint.
+        `origin` (n, d), in m: position of the cell pressure, relative to the midpoint of the cell.
         """
         cells, p, centroid, *_ = pressures
         jump, one_sided, _, drained = self._differences(pressures)
@@ -159,9 +157,7 @@ class Reconstruction:
     ) -> NDArray[np.float64]:
         """Return pressures (m,), in Pa, at positions in owned cells, with second-order accuracy even at the surface.
 
-        In a cell at a no-flow side, the slope is the smaller of two: the slope in the next cell inside, and the linear
-        extrapolation of the slopes inside.  Pressures stay between the extremes of the cell, its neighbours, drained
-        sides, and the reconstructed value at the surface.
+        At a no-flow side, the slope is extrapolated from the cells inside, and limited by the slope in the next cell.
 
         `x` (m, d), in m: positions relative to the midpoints of their cells.
         `slot` (m,): index of the cell of each position in `pressures.cells`.
@@ -200,7 +196,7 @@ def van_leer(one_sided: NDArray[np.float64]) -> NDArray[np.float64]:
 def share_within(
     increment: NDArray[np.float64], low: NDArray[np.float64], high: NDArray[np.float64], slot: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Return the largest factor (n,) <= 1 in each cell for which increments stay within [`low`, `high`]."""
+    """Return the largest factor (n,) <= 1 in each cell with which increments stay within [`low`, `high`]."""
     bound, share = np.where(increment > 0, high[slot], low[slot]), np.ones(len(low))
     excessive = (np.abs(increment) > np.abs(bound)).nonzero()[0]
     np.minimum.at(share, slot[excessive], bound[excessive] / increment[excessive])
@@ -213,7 +209,7 @@ def _bounds_of(jump: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[
 
 
 def transport(old: PiecePressures, points: MaterialPoints, new: Pieces) -> NDArray[np.float64]:
-    """Return the pressures (n,), in Pa, of new pieces, or their mass potentials if `old` has potentials."""
+    """Return the pressures (n,), in Pa, of new pieces.  If `old` has mass potentials, the result has potentials too."""
     n = len(points)
     if not n:
         return np.empty(0)
@@ -246,7 +242,7 @@ def transport(old: PiecePressures, points: MaterialPoints, new: Pieces) -> NDArr
 
 
 def _limited(correction, pressure, old: PiecePressures, owner, new: Pieces) -> NDArray[np.float64]:
-    """Return the factor of each domain's corrections that keeps pressures within bounds."""
+    """Return the factor on the corrections in each domain that keeps pressures within bounds."""
     first, new_first = (of.searchsorted(np.arange(of[-1] + 1)) for of in (owner, new.point))
     low, high = np.minimum.reduceat(old.bounds[:, 0], first), np.maximum.reduceat(old.bounds[:, 1], first)
     margin = np.where(correction > 0, high[new.point] - pressure, low[new.point] - pressure)
@@ -261,7 +257,7 @@ def halved_pieces(
     storage: tuple[NDArray[np.float64], NDArray[np.float64]],
     bulk: float,
 ) -> PiecePressures:
-    """Return a piece for each new point, with a pressure from the mean slope in the domain of the old point.
+    """Return one piece for each half of a divided domain.  Its pressure follows from the mean slope in the domain.
 
     `pieces`: pieces of the n old points.
     `points`: old points, and m new points.
@@ -321,7 +317,7 @@ def joined_pieces(
 def _missing(
     held: NDArray[np.float64], store: NDArray[np.float64], potential: NDArray[np.float64], of: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Return the change of potentials, in Pa, after which each point contains the fluid `held`."""
+    """Return the change of potentials, in Pa, so that each point contains the fluid `held`."""
     (total, now), n = sum_by(of, np.array([store, store * potential]), len(held)), len(held)
     return np.divide(held - now, total, out=np.zeros(n), where=total > 0)
 

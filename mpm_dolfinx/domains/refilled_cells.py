@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Renewal of particle domains: choice of cells, new domains in these cells, and transfer of values from old domains."""
+"""Renewal of particle domains: choice of cells, new domains, and transfer of values from old domains."""
 
 from __future__ import annotations
 
@@ -31,20 +31,19 @@ Plateau (scene "flow" of tests/plateaus.py): half this value changes the result 
 and finer cells by 9.1e-02.
 """
 CRUMB = NEAR
-"""Smallest area of a part of a domain that is retained, divided by the area of its cell.
+"""Largest area of a removed part of a domain, divided by the area of its cell.
 
-Larger parts of the domain receive the mass and the seeded faces of smaller parts.  Source: `NEAR`.
+Other parts of the domain receive the mass and the seeded faces of a removed part.  Source: `NEAR`.
 """
 SMALL = (0.5 / EDGES) ** 2
-"""Smallest area of a part of an old domain that remains in a cell, divided by the cell area.
+"""A cell with a smaller part of an old domain is renewed too.  The area of the part is divided by the cell area.
 
-A cell with a smaller part is renewed too.  Source: definition, a square with half the length of a surface edge
-(`EDGES` edges in a cell).
+Source: definition, a square with half the length of a surface edge (`EDGES` edges in a cell).
 """
 COVERED = 0.25
-"""Largest difference between the area of the pieces in a renewed cell and its filled area, in cell areas.
+"""Largest difference between the area of the pieces in a renewed cell and its filled area, divided by the cell area.
 
-Source: definition, the area of a new domain in a full cell, which is divided into four.
+Source: definition, the area of one of the four new domains in a full cell.
 """
 SIDE = np.array([2, 1, 3, 0])
 """Face index of each edge of a domain, anticlockwise."""
@@ -84,12 +83,12 @@ class New(NamedTuple):
 
 
 def ring_lengths(grid: Grid, x: NDArray[np.float64]) -> NDArray[np.float64] | float:
-    """Return the factor (> 0) from lengths in the plane to areas at positions x (n, 2), in m, see `Grid.around`."""
+    """Return the circumference at positions x (n, 2), in m, in axisymmetry, or 1 in plane strain."""
     return np.maximum(grid.around(x), TURN * EPSILON * grid.least) if grid.axisymmetric else 1.0
 
 
 def misshapen(grid: Grid, corners: NDArray[np.float64], longest: float) -> NDArray[np.bool_]:
-    """Return which domains (n, 4, 2) have an inverted part, or an edge longer than `longest` times the cell size."""
+    """Return which domains (n, 4, 2) are partly inverted, or longer than `longest` cell sizes."""
     ring = np.ascontiguousarray(corners.transpose(1, 2, 0))[RING]
     middle = ring.sum(axis=0) / 4
     place = ring / grid.h[:, None] if grid.even else grid.in_cells(ring.swapaxes(1, 2)).swapaxes(1, 2)
@@ -100,13 +99,13 @@ def misshapen(grid: Grid, corners: NDArray[np.float64], longest: float) -> NDArr
 
 
 class RefilledCells:
-    """Renewal: replacement of distorted particle domains by new domains, in one grid reset.
+    """The renewed cells at a reset of the grid, and their new domains.
 
-    `body` (n,): index of each point's body.
+    `body` (n,): index of the body of each point.
     `flowed` (n,): whether points may be renewed.
     `needs` (n,): whether the domains of points need renewal.
     `faces`: surface of the bodies.
-    `signs`: keys of seeded faces, and index of each face's set of conditions, see `SeededFaces.signatures`.
+    `signs`: keys of seeded faces, and for each face the index of its set of conditions.
     `second`: whether to compute second moments of the pieces.
     """
 
@@ -140,12 +139,12 @@ class RefilledCells:
         """Whether each point (n,) loses its domain or a part of it."""
 
     def _volume(self, cells: NDArray[np.int64]) -> NDArray[np.float64] | float:
-        """Return the areas of cells, in m^2, or one number for equal cells."""
+        """Return the areas of cells, in m^2."""
         return self.grid.sizes_of(cells).prod(axis=-1)
 
     @cached_property
     def _areas(self) -> NDArray[np.float64]:
-        """Areas of the pieces of domains, or in axisymmetry of their sections, in m^2."""
+        """Areas of the pieces of domains, in axisymmetry of their meridional sections, in m^2."""
         pieces = self.pieces
         whole = np.abs(volumes(self.points.corners))
         if not self.grid.axisymmetric:
@@ -160,7 +159,7 @@ class RefilledCells:
         return out
 
     def _excluded(self, flowed: NDArray[np.bool_], signs: tuple[NDArray, NDArray]) -> NDArray[np.bool_]:
-        """Return which cells cannot be renewed, because of unyielded soil, two bodies, or conditions on faces."""
+        """Return which cells cannot be renewed, because of elastic soil, two bodies, or conditions on faces."""
         of, cell = self.pieces.point, self.cell
         parts = self.parts
         low, high = np.full(self.cells, np.iinfo(np.int64).max), np.full(self.cells, -1)
@@ -180,7 +179,7 @@ class RefilledCells:
     def _chosen(
         self, needed: NDArray[np.bool_], excluded: NDArray[np.bool_], small: NDArray[np.bool_]
     ) -> NDArray[np.bool_]:
-        """Return which cells to renew: cells of `needed` points, and cells where `small` parts would remain."""
+        """Return which cells to renew: cells of `needed` points, and cells with `small` parts of old domains."""
         of, cell = self.pieces.point, self.cell
         chosen = np.zeros(self.cells, dtype=bool)
         chosen[cell[needed[of]]] = True
@@ -220,9 +219,9 @@ class RefilledCells:
         return Parts(row, grid.number(index.T), (s[:, :2] - index).transpose(2, 0, 1), s[:, 2].T, side)
 
     def _chains(self, excluded: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], Region]:
-        """Return which cells the surface crosses, and the filled region of each cell that it crosses once.
+        """Return which cells the surface crosses, and the filled regions of cells with one crossing.
 
-        Cells that the surface crosses more than once are added to `excluded`.
+        Cells with several crossings are added to `excluded`.
         """
         inner = self.parts.side == NONE
         cell, x = self.parts.cell[inner], self.parts.x[inner]
@@ -304,7 +303,7 @@ class RefilledCells:
         lower: NDArray[np.float64],
         upper: NDArray[np.float64],
     ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return the keys of new edges, and the reference positions of their ends, from the nearest old surface."""
+        """Return keys and reference positions of new edges, from the nearest part of the old surface."""
         first = np.searchsorted(parts.cell[order], cells, side="left")
         stop = np.searchsorted(parts.cell[order], cells, side="right")
         edge, at = ranges(first, stop - first)
@@ -328,7 +327,7 @@ class RefilledCells:
 
     @cached_property
     def _face_areas(self) -> NDArray[np.float64]:
-        """Seeded areas of faces, increased by the areas of removed parts of the face."""
+        """Seeded areas of faces, including removed parts."""
         parts, left = self.parts, self._left
         of, share = self.faces.point[parts.row], self._share(parts.row, parts.t)
         remains = np.isin(of * self.cells + parts.cell, self.pieces.point[left] * self.cells + self.cell[left])
@@ -451,7 +450,7 @@ class RefilledCells:
     # ---- transfer of values ---------------------------------------------------------------------
 
     def slopes(self, values: NDArray[np.float64], group: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the slopes (n, 2, k), in 1/m, of point values (points, k) in new domains, from least squares."""
+        """Return the slopes (n, 2, k), in 1/m, of point values (points, k) in new domains, by least squares."""
         pieces, grid = self.pieces, self.grid
         weight = pieces.fraction * self.points.volume0[pieces.point]
 
@@ -472,7 +471,7 @@ class RefilledCells:
 
     @cached_property
     def into(self) -> tuple[NDArray, NDArray, NDArray]:
-        """Pieces of removed domains, the group that receives each piece, and the piece's fraction of the domain."""
+        """Pieces of removed domains, with the group of new domains and the fraction of the old domain of each piece."""
         pieces, outside = self.pieces, self.remainders[1]
         into = np.flatnonzero(self.chosen[self.cell] & self.affected[pieces.point])
         piece = np.concatenate([into, outside])
@@ -482,7 +481,7 @@ class RefilledCells:
         return piece, groups, share / whole[pieces.point[piece]]  # includes the mass of dropped parts
 
     def pairs(self, corners: NDArray[np.float64], group: NDArray[np.int64]) -> tuple[NDArray, NDArray, NDArray]:
-        """Return pairs of old and new domains, and the fraction of the old mass that each new domain receives."""
+        """Return pairs of old and new domains, and the fraction of the old mass for the new domain of each pair."""
         piece, groups, share = self.into
         order = np.argsort(group, kind="stable")
         first, stop = (np.searchsorted(group[order], groups, side=side) for side in ("left", "right"))
@@ -506,7 +505,7 @@ class RefilledCells:
         group: NDArray[np.int64],
         points: MaterialPoints,
     ) -> NDArray[np.float64]:
-        """Return data (n, ...) of new domains as means over the old surface in their cell, or 0 without a surface."""
+        """Return data (n, ...) of surface faces: means over the old surface in the cell, or 0 without a surface."""
         parts = self.parts
         inside = np.flatnonzero(self.chosen[parts.cell])
         cell, of = parts.cell[inside], self.faces.point[parts.row[inside]]
@@ -528,13 +527,13 @@ def no_faces(n: int) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np
 
 
 def ring_share(r0: NDArray[np.float64], r1: NDArray[np.float64], t: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the radii (n,) at coordinates t (n,) on faces from radius r0 to r1, divided by the mean radius."""
+    """Return the radii (n,) at coordinates t (n,) on faces from radius r0 to r1, divided by `(r0 + r1) / 2`."""
     mean = (r0 + r1) / 2
     return np.divide(r0 + t * (r1 - r0), mean, out=np.ones(len(t)), where=mean > 0)
 
 
 def _convex(corners: NDArray[np.float64], volume: NDArray[np.float64] | float) -> tuple[Polygons, NDArray[np.int64]]:
-    """Divide domains into convex polygons, and return the polygons and the index of the domain of each polygon."""
+    """Divide domains into convex polygons.  Return the polygons, and the index of the domain of each polygon."""
     ring = corners[:, RING]
     edge = np.tile(SIDE, (len(ring), 1))
     away = np.roll(ring, -1, axis=1) - ring

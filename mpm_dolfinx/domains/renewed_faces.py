@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Faces of renewed or divided particle domains, which represent the seeded faces of bodies."""
+"""Faces of renewed or divided particle domains, and the seeded faces that they replace."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 PARENT = "renewed faces"
 AREA = "renewed areas"
 ENDS = "renewed ends"
-"""Names of point data for the faces of the point's domain.
+"""Names of point data for the faces of renewed domains.
 
 PARENT: key of the seeded face, or -1.
 AREA: seeded area, in m^(d-1).
@@ -32,8 +32,8 @@ ROOT = "seeded domain"
 PART = "part of the seeded domain"
 """Names of point data for parts of seeded domains.
 
-ROOT: identifier of the seeded domain that has the lower corner of the part, or -1.
-PART: lower and upper ends (n, d, 2) of the part.
+ROOT: identifier of the seeded domain at the lower corner of the part, or -1.
+PART: lower and upper ends (n, d, 2) of the part, in local coordinates of the seeded domain.
 """
 
 
@@ -43,7 +43,7 @@ def keys(point: NDArray[np.int64], face: NDArray[np.int64]) -> NDArray[np.int64]
 
 
 def with_faces(points: MaterialPoints) -> MaterialPoints:
-    """Return the points with the data of renewed faces.  Points that lack these data have no renewed faces."""
+    """Return the points with data of renewed faces.  Points without such data get values for no renewed faces."""
     if PARENT in points.data:
         return points
     n = len(points)
@@ -51,7 +51,7 @@ def with_faces(points: MaterialPoints) -> MaterialPoints:
 
 
 def with_parts(points: MaterialPoints) -> MaterialPoints:
-    """Return the points with the data of parts.  Points that lack these data are whole domains, or were renewed."""
+    """Return the points with data of parts.  Points without such data get values for whole domains."""
     if ROOT in points.data:
         return points
     n, d = points.x.shape
@@ -77,7 +77,7 @@ def roots(points: MaterialPoints) -> tuple[NDArray[np.int64], NDArray[np.float64
 def faces_of_parts(
     points: MaterialPoints, id: NDArray[np.int64], face: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return which parts of domains lie on faces of seeded domains.
+    """Return the parts of domains on faces of seeded domains.
 
     `id`, `face` (m,): seeded domains and indices of their faces.
 
@@ -99,10 +99,9 @@ def faces_of_parts(
 
 
 def on_parts(faces: Surface, points: MaterialPoints) -> tuple[Surface, NDArray[np.int64]]:
-    """Return a surface that includes its faces on parts of domains, and for each row the index in the given surface.
+    """Return a surface with faces of divided domains, and for each face the index in the given surface.
 
-    Polygons of the surface on seeded domains are clipped to the parts.  These polygons must be rectangles in local
-    coordinates.
+    Polygons of the given surface must be rectangles in local coordinates.
     """
     own = np.arange(len(faces))
     if not is_part(points).any():
@@ -125,7 +124,7 @@ def on_parts(faces: Surface, points: MaterialPoints) -> tuple[Surface, NDArray[n
 
 
 class SeededFaces:
-    """Outer faces of the bodies of a scene in 2D, at seeding and now."""
+    """Surface faces of the bodies of a scene in 2D, at seeding and now."""
 
     def __init__(self, grid: Grid, bodies: Sequence[Body]):
         self.bodies = bodies
@@ -175,7 +174,7 @@ class SeededFaces:
         return out
 
     def signatures(self, surfaces: Sequence[Surface]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the keys of outer faces, and the index of each face's set of conditions, or -1 for faces to keep."""
+        """Return the keys of faces, and for each face the index of its set of conditions, or -1 for faces to keep."""
         key = self.seeded.key
         kind = np.zeros((len(key), len(surfaces)), dtype=np.int8)
         barred = np.zeros(len(key), dtype=bool)
@@ -202,7 +201,7 @@ class RenewedFaces:
     old: NDArray[np.bool_] | None = None  # in the result of `of`: which positions lie on seeded faces (n,)
 
     def of(self, number: NDArray[np.int64]) -> RenewedFaces:
-        """Return the renewed faces with indices `number` (n,).  Negative indices belong to seeded faces (`old`)."""
+        """Return the renewed faces with indices `number` (n,).  Negative indices are seeded faces."""
         old, at = number < 0, np.maximum(number, 0)
         if not len(self.row):
             return RenewedFaces(*(np.zeros((len(number), *v.shape[1:]), v.dtype) for v in self._columns), old)
@@ -215,7 +214,7 @@ class RenewedFaces:
     def in_place_of(
         self, area: NDArray[np.float64], whole: NDArray[np.float64], face: NDArray[np.int64]
     ) -> tuple[NDArray, NDArray, NDArray]:
-        """Return areas of face parts, areas of whole faces, and face indices (n,), with new values at renewed faces."""
+        """Replace areas of parts, areas of whole faces, and face indices (n,) by new values at renewed faces."""
         part = np.ptp(self.xi, axis=1).max(axis=1) / 2
         new = self.area * part, self.area, self.face
         return tuple(np.where(self.old, a, b) for a, b in zip((area, whole, face), new, strict=True))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Active cells of a grid.  A step computes only cells with material, so the grid may be a box of any size."""
+"""Active cells of a grid, which contain material.  A step computes active cells only."""
 
 from __future__ import annotations
 
@@ -61,13 +61,13 @@ class Active:
     Attributes
     ----------
     now
-        The active set, the same object as long as the cells do not change.
+        The active set.
     slot : (cells,)
         Index of each cell among the owned active cells.
     centroid : (cells, d), m
-        Offset of the material's centroid from the midpoint of the cell.  The array is empty without fluid.
+        Vector from the midpoint of the cell to the centroid of its material.  The array is empty without fluid.
     opening : (cells, d, 2)
-        Open fractions of the cell's faces.  The array is empty without fluid.
+        Fractions of the cell faces that material covers.  The array is empty without fluid.
     """
 
     def __init__(self, grid: Grid, wet: bool, cells: Sequence[NDArray], dofs: Sequence[NDArray]):

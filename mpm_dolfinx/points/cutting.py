@@ -1,20 +1,18 @@
 # SPDX-License-Identifier: MIT
 """Particle domains cut by the grid into pieces.  A piece is the part of a domain in one cell.
 
-A material point has a quadrilateral or hexahedral domain with tracked corners.  The pieces of the domain have exact
-volumes and centroids.  In 3D, pieces also have exact mean products of coordinates.  Gradients of Q1 functions are
-linear within a cell, in 3D bilinear.  One quadrature point in each piece therefore integrates these gradients exactly,
-wherever the domain lies on the grid.
+A material point has a quadrilateral or hexahedral domain with tracked corners.  Volumes and centroids of the pieces are
+exact, and in 3D also mean products of coordinates.  Gradients of Q1 functions are linear within a cell, in 3D bilinear.
+One quadrature point in each piece therefore integrates these gradients exactly.
 
-The surface of a domain consists of four edges, or in 3D of four triangles about the middle of each face.  The triangles
-of neighbouring domains match, and do not favour a diagonal of the face.  The grid planes slice this surface, one axis
-after the other.  Gauss's theorem gives the volume and the first moments of each piece from the slices.  Inverted parts
-of a domain have negative volume, and cancel its overlap with neighbours.  Pieces with negative volume are left out.
+The surface of a domain consists of four edges, or in 3D of four triangles about the middle of each face.  The grid
+planes slice this surface, one axis after the other.  Gauss's theorem gives the volume and the first moments of each
+piece.  Inverted parts of a domain have negative volume.  Pieces with negative volume are omitted.
 
-In axisymmetry pieces are rings.  The volume of a ring is `2 pi r_c` times the area of its section, where r_c is the
-radius of the section's centroid (Pappus).  Gradients are evaluated at the centroid of the volume,
+In axisymmetry, pieces are rings.  The volume of a ring is `2 pi r_c` times the area of its meridional section, where
+r_c is the centroid radius of the section (Pappus).  Gradients are evaluated at the centroid of the volume,
 `(mean r^2 / r_c, mean r z / r_c)`.  The circumferential strain `u_r / r` is the mean of the radial displacement u_r
-over the section, divided by r_c.  The nodal forces of uniform stresses are then exact.
+over the section, divided by r_c.
 """
 
 from __future__ import annotations
@@ -31,7 +29,7 @@ from mpm_dolfinx.base.tolerances import NEAR
 from mpm_dolfinx.grid.grid import ABOUT_MIDDLE, FACE_SIGNS, FACES, TURN, Grid, corner_bits, in_chunks, sum_by
 
 SLIVER = NEAR**2
-"""Smallest volume fraction of a piece.  The surface of thinner pieces may have gaps (`Grid.snap`).  Source: epsilon."""
+"""Smallest volume of a piece, divided by the volume of its domain.  Source: epsilon."""
 CHUNK = 2**15  # simplices cut in one call, so that they fit into the processor's cache
 TANGLED = 0.2  # smallest volume between corners / volume of domain; below it corners are re-initialised from F
 
@@ -64,9 +62,9 @@ def kuhn_simplices(dim: int) -> NDArray[np.int64]:
 
 @cache
 def simplices(dim: int) -> NDArray[np.int64]:
-    """Return the vertices (4 or 24, d+1) of the simplices of a domain, numbered as in `vertices`.
+    """Return the vertex indices (4 or 24, d+1) of the simplices of a domain, as in `vertices`.
 
-    A simplex consists of a facet of the surface, oriented outward, and the middle of the domain.
+    The corners of a simplex are a facet of the surface, oriented outward, and the middle of the domain.
     """
     rings = FACES[dim][:, [0, 1, 3, 2][: 2 ** (dim - 1)]]
     facets = []
@@ -80,13 +78,13 @@ def simplices(dim: int) -> NDArray[np.int64]:
 
 
 def vertices(y: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the corners y (2^d, d, n) of domains, in 3D the middles of their faces, and the middles of domains."""
+    """Return the corners y (2^d, d, n) of domains, then in 3D the middles of faces, and last the middles of domains."""
     faces = [y[index].sum(axis=0) / 4 for index in FACES[3]] if y.shape[1] == 3 else []
     return np.concatenate([y, *(v[None] for v in faces), y.sum(axis=0)[None] / len(y)])
 
 
 def simplex_volumes(v: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the signed volumes (k, n) of the simplices of domains with vertices v (m, d, n), see `vertices`."""
+    """Return the signed volumes (k, n) of the simplices of domains.  `v`: result of `vertices`."""
     d, vertex = v.shape[1], simplices(v.shape[1]).T
     s = v[vertex[:-1]].transpose(0, 2, 1, 3).reshape(d, d, -1)
     height = s[0] - v[vertex[-1]].transpose(1, 0, 2).reshape(d, -1)
@@ -115,7 +113,7 @@ def cross(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]
 
 
 def domain_volumes(corners: NDArray[np.float64], axisymmetric: bool) -> NDArray[np.float64]:
-    """Return the volumes (n,) of domains with corners (n, 2^d, d), in m^d, or in axisymmetry of their rings, in m^3."""
+    """Return the volumes (n,) of domains with corners (n, 2^d, d), in m^d, or of rings in axisymmetry, in m^3."""
     if not axisymmetric:
         return volumes(corners)
     v = vertices(np.ascontiguousarray(corners.transpose(1, 2, 0)))
@@ -131,8 +129,8 @@ def edges(corners: NDArray[np.float64]) -> NDArray[np.float64]:
 def centroids(corners: NDArray[np.float64], within: bool = False) -> NDArray[np.float64]:
     """Return the centroids (n, d), in m, of domains, or in axisymmetry of their sections.
 
-    Inverted simplices have negative volume, as in `cut`.  The centroid of a partly inverted domain may lie outside.
-    `within`: whether inverted simplices count with positive volume instead, so that all centroids lie within domains.
+    The centroid of a partly inverted domain may be outside of the domain.
+    `within`: whether to move such centroids into the domain, by a positive volume for inverted simplices.
     """
     parts = [_centroids(corners[part], within) for part in _chunks(len(corners), corners.shape[2])]
     return parts[0] if len(parts) == 1 else np.concatenate(parts)
@@ -149,7 +147,7 @@ def _centroids(corners: NDArray[np.float64], within: bool) -> NDArray[np.float64
 
 
 def tangled(corners: NDArray[np.float64], volume: NDArray[np.float64], axisymmetric: bool = False) -> NDArray[np.bool_]:
-    """Return a mask (n,) of inverted domains, whose volumes are far from the prescribed `volume` (n,), in m^d."""
+    """Return a mask (n,) of inverted domains: corners span much less than the prescribed `volume` (n,), in m^d."""
     ratio = domain_volumes(corners, axisymmetric) / volume
     return (ratio < TANGLED) | (ratio > 1 / TANGLED)
 
@@ -163,7 +161,7 @@ def parallelepipeds(
 
 
 def _chunks(count: int, dim: int) -> list[slice]:
-    """Divide the domains into slices whose simplices fit into the processor's cache."""
+    """Divide the domains into slices that fit into the cache of the processor."""
     size = CHUNK // len(simplices(dim))
     return [slice(start, start + size) for start in range(0, max(1, count), size)]
 
@@ -176,7 +174,7 @@ def cut(grid: Grid, corners: NDArray[np.float64], second: bool = False, faces: b
 
     Returns
     -------
-    The pieces with at least 1e-12 of their domain's volume.  The volume fractions of the pieces of a domain sum to one.
+    The pieces.  The volume fractions of the pieces of a domain sum to one.
     """
     chunks = _chunks(len(corners), grid.dim)
     if len(chunks) == 1:
@@ -191,15 +189,14 @@ def cut(grid: Grid, corners: NDArray[np.float64], second: bool = False, faces: b
 def on_planes(
     grid: Grid, true: NDArray[np.float64], x: NDArray[np.float64], axes: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return positions in units of cells, and positions for slicing.  Positions closer to a grid plane than `Grid.snap`
-    are moved onto this plane.
+    """Return positions in cell units, and positions for slicing.  Positions near a grid plane are moved onto this
+    plane.
 
-    If all cells are equal, positions for slicing are in units of cells.  In other grids these positions are in m,
-    because domain edges are straight in m.
+    Positions for slicing are in cell units if all cells are equal, and else in m.
 
-    `true`: positions from the grid's lower corner, in units of cells.
-    `x`, in m: the same positions, measured from the grid's base.
-    `axes`: axis of both arrays along which the d components of a position are stored.
+    `true`: positions from the lower corner of the grid, in cell units.
+    `x`, in m: the same positions, from the base of the grid.
+    `axes`: array axis of the d components of a position.
     """
     shape = [1] * true.ndim
     shape[axes] = grid.dim
@@ -213,7 +210,7 @@ def on_planes(
 
 
 def slices_in_cells(grid: Grid, s: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return slices (d, d, m), each within one cell, as distances from the grid's lower corner in units of cells."""
+    """Return slices (d, d, m) as distances from the lower corner of the grid, in cell units."""
     if grid.even:
         return s
     out = s.copy()
@@ -255,7 +252,7 @@ def _area_vectors(s: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 class _Slots:
-    """Cells in the bounding boxes of domains.  Each pair of a domain and a cell has a slot."""
+    """Cells in the bounding boxes of domains.  Each pair of a domain and a cell has an index, the slot."""
 
     def __init__(self, grid: Grid, y: NDArray[np.float64]):
         top = (grid.shape - 1)[:, None]
@@ -281,7 +278,7 @@ class _Slots:
         return out
 
     def beyond(self, values: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
-        """Return for each slot the sum of values of the slots further along an axis."""
+        """Return for each slot the sum of values over the following slots along an axis."""
         out = np.zeros(self.size)
         for steps in range(1, int(np.maximum.reduce(self._span[axis], initial=1))):
             has = (self._place[axis] + steps < self._span[axis][self.point]).nonzero()[0]
@@ -396,7 +393,7 @@ def _sum(
 def spreads(corners: NDArray[np.float64], rings: bool) -> NDArray[np.float64]:
     """Return the second moments (n, d, d) of domains about their centroids, divided by their volumes, in m^2.
 
-    `rings`: whether the domains are sections of rings, in axisymmetry.
+    `rings`: whether the domains are meridional sections of rings.
     """
     E = edges(corners)
     out = E @ E.swapaxes(1, 2) / 12  # 1/12: second moment of a unit length, exact
@@ -406,8 +403,8 @@ def spreads(corners: NDArray[np.float64], rings: bool) -> NDArray[np.float64]:
 def of_rings(spread: NDArray[np.float64], radius: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the second moments (n, 2, 2) of rings about their centroids, divided by their volumes, in m^2.
 
-    `spread` (n, 2, 2), in m^2: second moments of the sections, divided by their areas.
-    `radius` (n,), in m: radii of the sections' centroids.
+    `spread` (n, 2, 2), in m^2: second moments of the meridional sections, divided by their areas.
+    `radius` (n,), in m: centroid radii of the sections.
     """
     off = spread[:, 0] / radius[:, None]
     return spread - off[:, :, None] * off[:, None]
@@ -437,7 +434,7 @@ def _products(
     total: Callable[[NDArray[np.float64]], NDArray[np.float64]],
     slots: _Slots,
 ) -> list[NDArray[np.float64]]:
-    """Return integrals of products of two coordinates over pieces.  Coordinates begin at the cells' lower corners."""
+    """Return integrals over pieces of products of two coordinates, measured from the lower corner of the cell."""
     d = len(x)
 
     def mean(*factors: int) -> NDArray[np.float64]:
@@ -464,20 +461,18 @@ def _products(
 def cut_faces(
     grid: Grid, corners: NDArray[np.float64], local: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Cut faces of domains by the grid, and return integration points, which are exact for products of Q1 functions.
-
-    If a face crosses a grid line, the part of the face in each cell must load the nodes of this cell.
+    """Cut faces of domains by the grid, and return integration points that are exact for products of Q1 functions.
 
     `corners` (faces, 2^(d-1), d), in m: corners of the faces; triangles repeat their last corner.
-    `local` (faces, 2^(d-1), e): coordinates at the corners, which are interpolated to the integration points.
+    `local` (faces, 2^(d-1), e): further coordinates of the corners, for interpolation.
 
     Returns
     -------
     Index (n,) of the face of each of n points.
     Position (n, d) of each point.
-    Coordinates (n, e) that are interpolated at each point.
+    Interpolated coordinates (n, e) of each point.
     Fraction (n,) of the face that each point represents.
-    Middle (n, d) of the segment or triangle of each point, which is a part of the face in one cell.
+    Middle (n, d) of the segment or triangle of each point.
     """
     d, m = grid.dim, len(corners)
     y = on_planes(grid, grid.in_cells(corners), corners, 2)[1]
@@ -518,7 +513,7 @@ def cut_faces(
 def _polygons(
     grid: Grid, s: NDArray[np.float64], owner: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Return the parts of cut triangles, divided into triangles that do not depend on the order of the axes."""
+    """Return the polygons of cut triangles, divided into triangles independently of the order of the axes."""
     cut = np.bincount(owner, minlength=1)[owner] > 1
     part, of = s[:, :, cut], owner[cut]
     cell = np.floor(slices_in_cells(grid, part[:, :3]).mean(axis=0)).astype(np.int64)
@@ -594,7 +589,7 @@ def sliced(s: NDArray[np.float64], owner: NDArray[np.int64], axis: int, grid: Gr
 
 
 def cut_at(s, owner, axis: int, plane):
-    """Cut each simplex at its plane, and return the parts and owners below the plane, then above it."""
+    """Cut each simplex at its plane.  Return parts and owners below the plane, and then above the plane."""
     order = s[:, axis].argsort(axis=0)
     s = s[order[:, None], np.arange(s.shape[1])[:, None], np.arange(s.shape[2])]
     count = (s[:, axis] < plane).sum(axis=0)  # vertices below the plane

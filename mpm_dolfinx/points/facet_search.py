@@ -1,9 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Search for the nearest facets of a surface, for many positions at once, in a binary tree of oriented boxes.
+"""Search for the nearest facets of a surface, in a binary tree of oriented boxes (Gottschalk, Lin and Manocha 1996).
 
-Facets are segments in 2D and triangles in 3D.  The axes of a box are the principal axes of its vertices.  Boxes around
-smooth parts of a surface are therefore thin (Gottschalk, Lin and Manocha 1996).  All positions descend the tree at
-once.  In this file, the component is the first index of vectors, because operations on such arrays are faster.
+Facets are segments in 2D and triangles in 3D.  In this file, the component is the first index of vectors.
 """
 
 from __future__ import annotations
@@ -16,7 +14,7 @@ from numpy.typing import NDArray
 from mpm_dolfinx.base.tolerances import ROUND_OFF, SAME
 
 AT_ONCE = 2**13
-"""Number of positions in an array operation.  Larger arrays do not fit into the cache of a processor."""
+"""Number of positions in an array operation, for the cache of a processor."""
 START = 2**8 - 1
 """Number of nodes above the level at which the search for a near facet starts."""
 
@@ -62,7 +60,7 @@ class FacetTree:
         self._facet = order[:, 0]
 
     def near(self, y: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return, for each position y (d, m), a facet that is near, but not always the nearest one."""
+        """Return a facet near each position y (d, m), often the nearest facet."""
         start = min(START.bit_length(), len(self._levels) - 1)
         centre = self._levels[start].centre
         node = ((centre**2).sum(axis=0) - 2 * (y.T @ centre)).argmin(axis=1)
@@ -74,8 +72,7 @@ class FacetTree:
     def within(self, y: NDArray[np.float64], limit: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return pairs of a position and a facet, sorted by position.
 
-        Each facet that is nearer to position y (d, m) than `limit` (m,), in m, is in a pair.  Pairs of other facets are
-        also possible.
+        The pairs contain all facets at distances below `limit` (m,), in m, from positions y (d, m), and some others.
         """
         at = np.arange(y.shape[1])
         node = np.zeros(len(at), dtype=np.int64)

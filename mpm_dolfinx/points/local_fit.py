@@ -1,14 +1,13 @@
 # SPDX-License-Identifier: MIT
-"""Values at given positions from polynomials that are fitted to surrounding data (moving least squares).
+"""Values at given positions by moving least squares (Lancaster and Salkauskas 1981).
 
-For each position, the polynomial P minimises
+At each position, a polynomial P minimises
 
-    sum_i w(o_i) (P(o_i) - v_i)^2 + small terms of P's coefficients,
+    sum_i w(o_i) (P(o_i) - v_i)^2 + sum_k c_k a_k^2,
 
-where v_i are the data, o_i are the offsets of the data from the position, and w is a weight.  The value at the position
-is the constant term of P (Lancaster and Salkauskas 1981).  If the data are values of a polynomial of at most the degree
-of P, the fit is exact.  The weights decrease smoothly to zero, so values are continuous when data enter or leave the
-fit.  If the data do not determine all coefficients, the small terms make the highest degrees vanish.
+where v_i are the data, o_i are the offsets of the data from the position, and w is a weight function.  The coefficients
+of P are a_k.  The small weights c_k (`UNTOLD`) make the solution unique.  The value at the position is the constant
+term of P.
 """
 
 from __future__ import annotations
@@ -24,14 +23,14 @@ from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.parallel.exchange import over_all
 
 RADIUS = 3.0
-"""Offset beyond which the weight is zero, in spacings of the data.
+"""Largest offset with a weight, in spacings of the data.
 
 Source: exact. A parabola needs three points.  At an end of the data, these points have offsets of 0.5, 1.5 and 2.5.
 """
 UNTOLD = (0.0, 1e-10, 1e-6)
-"""Weights of the small terms for coefficients of degrees 0, 1 and 2, divided by the sum of the data weights.
+"""Weights c_k of coefficients of degrees 0, 1 and 2, divided by the sum of the data weights.
 
-With weights 0.01 or 100 times as large, pressures of a consolidating column change by 1e-5 of the load.
+With weights 0.01 or 100 times as large, pressures in a consolidating column change by 1e-5 of the load.
 """
 
 
@@ -49,10 +48,11 @@ def fitted(
     values: NDArray[np.float64],
     weight: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Return the fitted values (count, width) at `count` positions, on every process: zero if a position has no data.
+    """Return the fitted values (count, width) at `count` positions, on every process, or zero at positions without
+    data.
 
     `degree`: degree of the polynomials, 1 or 2.
-    `at` (r,): index of the position to which each row of this process's data belongs, counted from 0.
+    `at` (r,): index of the position of each row of data, from 0.
     `offset` (r, d): offset of the data from this position, in spacings of the data.
     `values` (r, width): values of the data.
     `weight` (r,): weights of the data.

@@ -1,9 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Material points: the state of the bodies, which a reset of the grid preserves.
-
-The state consists of positions, corners of the particle domains, F, pore pressure, and `data` by name: state variables
-of laws, data of conditions and, with inertia, velocity and rate of F.
-"""
+"""Material points, which store the state of the bodies."""
 
 from __future__ import annotations
 
@@ -20,14 +16,13 @@ from mpm_dolfinx.parallel.exchange import Exchange
 from mpm_dolfinx.points.cutting import centroids
 
 ACROSS = "stretch across"
-"""Name of the data with the out-of-plane stretch in plane strain, for laws with F-bar along all three axes."""
+"""Name of the point data with the out-of-plane stretch in plane strain, for laws with F-bar."""
 
 
 def body_of(ids: NDArray[np.int64], starts: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the index (n,) of each point's body.
+    """Return the index (n,) of the body of each point.
 
-    `starts` (bodies + 1,): first id of each body, and first id of renewed points.  Successive ids of renewed points
-    belong to the bodies in turn, cyclically.
+    `starts` (bodies + 1,): first id of each body, and first id of renewed points.
     """
     beyond = ids - starts[-1]
     return np.where(beyond < 0, starts.searchsorted(ids, side="right") - 1, beyond % max(1, len(starts) - 1))
@@ -89,7 +84,7 @@ def cofactor(F: NDArray[np.float64]) -> NDArray[np.float64]:
 class MaterialPoints:
     """Material points of this process.  Immutable arrays have a row for each of n points.
 
-    Positions in a state are relative to the grid's `base`.  `Simulation.points` has true positions.
+    In a `State`, positions are relative to `Grid.base`.  `Simulation.points` has true positions.
 
     Attributes
     ----------
@@ -98,22 +93,22 @@ class MaterialPoints:
     corners : (n, 2^d, d), m
         Tracked corners of the particle domain, in the order of `grid.corner_bits`.
     F : (n, d, d)
-        Deformation gradient.  In plane strain with an out-of-plane stretch: the in-plane part, scaled to det F.
+        Deformation gradient.  In plane strain with F-bar, this is the in-plane part, scaled so that its determinant is
+        the volume ratio.
     volume0 : (n,), m^d
         Reference volume.
     material : (n,)
-        Index of the point's material in the scene's list.
+        Index of the material in the list of the scene.
     pressure : (n,), Pa
-        Pore pressure, positive in compression.  The value is a second-order accurate mean over the domain.  Balances
-        use cell pressures instead.
+        Mean pore pressure in the domain, positive in compression.  The balances use cell pressures instead.
     x : (n, d), m
-        Centroid of the domain, or in axisymmetry of its section.  For linear fields, F and pressure are exact at x.
+        Centroid of the domain, or in axisymmetry of its meridional section.  F and pressure refer to x.
     origin : (n, 2^d, d), m
-        Corners at zero displacement: seeded corners, or corners when a stage last set displacements to zero.
+        Corners at zero displacement: at seeding, or at the start of a stage that set displacements to zero.
     reference : (n, 2^d, d), m
         Corners of the domain in the reference configuration of F: seeded corners, or re-initialised corners.
     data : (n, ...) by name
-        Further data of the points, such as parameters that vary with position, and the state of the law.
+        Further data, such as state variables of laws, parameters that vary with position, data of conditions, velocity.
     """
 
     id: NDArray[np.int64]
@@ -152,7 +147,7 @@ class MaterialPoints:
         return own | {"corners": corners, "x": x, "origin": of(self.origin), "reference": of(self.reference)}
 
     def __repr__(self) -> str:
-        """Return one line: number of points, their reference volume, and the ranges of J and pressure."""
+        """Return one line with the number of points, their reference volume, and the ranges of J and pressure."""
         own = [f"{len(self)} points in {self.F.shape[1]}D"]
         if len(self):
             own.append(f"{self.volume0.sum():.4g} m^{self.F.shape[1]} at rest")
@@ -169,7 +164,7 @@ class MaterialPoints:
         return len(self.id)
 
     def within(self) -> NDArray[np.float64]:
-        """Return positions (n, d), in m, within the domains: `x`, except for partly inverted domains."""
+        """Return positions (n, d), in m, inside the domains.  These are `x`, except for partly inverted domains."""
         return centroids(self.corners, within=True)
 
     @property
@@ -183,7 +178,7 @@ class MaterialPoints:
         return in_space(self.F, self.data[ACROSS]) if ACROSS in self.data else self.F
 
     def strained(self, F: NDArray[np.float64], **others: NDArray[np.float64]) -> MaterialPoints:
-        """Return the points with another F, in the shape of `F_of_laws`, and with the fields `others`."""
+        """Return the points with another F, in the shape of `F_of_laws`, and with new values of the fields `others`."""
         if ACROSS not in self.data:
             return replace(self, F=F, **others)
         F, across = in_plane(F)
@@ -191,13 +186,13 @@ class MaterialPoints:
 
     @property
     def displacement(self) -> NDArray[np.float64]:
-        """Displacement (n, d), in m, of the centroids since the start, or since a reset to zero by a stage."""
+        """Displacement (n, d), in m, of the centroids since seeding, or since a stage set displacements to zero."""
         return self.x - centroids(self.origin)
 
     def map(self, function: Callable[[NDArray], NDArray], shared: bool = True) -> MaterialPoints:
-        """Return the points after a function has selected, copied or transferred the entries of each array.
+        """Return the points after a function is applied to each array.
 
-        `shared`: whether fields that share an array also share the new array.
+        `shared`: whether fields with a common array also have a common new array.
         """
         cache: dict[int, NDArray] = {}
 
@@ -210,7 +205,7 @@ class MaterialPoints:
         return type(self)(**arrays, data={name: once(values) for name, values in self.data.items()})
 
     def where(self, rows: NDArray[np.bool_], other: MaterialPoints) -> MaterialPoints:
-        """Return the points of another state `other`, with the entries `rows` (n,) replaced by these points."""
+        """Return these points in the entries `rows` (n,), and the points `other` in all other entries."""
 
         def chosen(a: NDArray, b: NDArray) -> NDArray:
             return a if a is b else np.where(rows.reshape(-1, *[1] * (a.ndim - 1)), a, b)
@@ -257,7 +252,7 @@ _ARRAYS = attrgetter(*(f.name for f in fields(MaterialPoints) if f.name != "data
 
 
 class PlacedPoints(MaterialPoints):
-    """Material points with true positions, not relative to the grid's `base`."""
+    """Material points with true positions, in place of positions relative to `Grid.base`."""
 
     def from_base(self, base: NDArray[np.float64]) -> MaterialPoints:
         """Return the points with positions relative to `base` (d,), in m, as in a state."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Connected parts of the bodies.  Neither forces nor fluid pass between two parts."""
+"""Connected parts of the bodies: material in cells that are connected by common nodes."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Parts:
 
 @dataclass(frozen=True, eq=False)
 class OfParts:
-    """Entries of a distributed vector on this process, with the connected part `of` each entry."""
+    """Entries of a distributed vector, with the index `of` the connected part of each local entry."""
 
     comm: MPI.Comm
     of: NDArray[np.int64]
@@ -40,7 +40,7 @@ class OfParts:
 
     @cached_property
     def _sorted(self) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-        """Three arrays: order of the entries by part, first entry of each part in this order, parts with entries."""
+        """Order of the entries by part, index of the first entry of each part in this order, and parts with entries."""
         sizes = np.bincount(self.of, minlength=self.count)
         present = sizes.nonzero()[0]
         return self.of.argsort(kind="stable"), (sizes.cumsum() - sizes)[present], present
@@ -72,7 +72,7 @@ def largest_of_parts(comm: MPI.Comm, part: NDArray, values: NDArray, count: int)
 def largest_of_bodies(
     comm: MPI.Comm, part: NDArray[np.int64], values: NDArray[np.float64], inside: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
-    """Return the largest values (k, bodies) in the connected parts of each body on all processes, or 0 without parts.
+    """Return the largest values (k, bodies) in the connected parts of each body, or 0 without parts.
 
     `part` (m,): index, from 0, of the connected part of each column of `values` (k, m).
     `inside` (bodies, parts): whether a part contains points of a body on this process.
@@ -87,7 +87,7 @@ def relative(
 ) -> NDArray[np.float64]:
     """Return the norms divided by the scales.
 
-    Norms of at most `round_off` give 0.  Undefined quotients give inf.
+    The result is 0 for norms of at most `round_off`, and inf for undefined quotients.
     """
     ratio = np.empty(norms.shape)
     ratio.fill(np.inf)
@@ -99,8 +99,7 @@ def relative(
 def parts_of_cells(grid: Grid, active: NDArray[np.bool_]) -> tuple[NDArray[np.int64], int]:
     """Return the connected part (cells,) of each active local cell, counted from 1, and the number of parts.
 
-    Cells with common nodes belong to one part.  Inactive cells have index 0.  The indices do not depend on the number
-    of processes.
+    Cells with common nodes belong to one part.  Inactive cells have index 0.
     """
     cells, out = active.nonzero()[0], np.zeros(len(active), dtype=np.int64)
     own, count = _touching(grid.cell_places(cells))
@@ -120,7 +119,7 @@ def parts_of_cells(grid: Grid, active: NDArray[np.bool_]) -> tuple[NDArray[np.in
 def parts_of_domains(grid: Grid, corners: NDArray[np.float64], copy: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the connected part (n,) of each domain, counted from 0.
 
-    `copy` (n,): first cell of the domain's copy of the grid, see `Grid.copy`.
+    `copy` (n,): first cell of the copy of the grid for each domain, see `Grid.copy`.
     """
     cell = grid.number(grid.index(corners.reshape(-1, grid.dim))).reshape(corners.shape[:2]) + copy.reshape(-1, 1)
     cell, at = np.unique(cell, return_inverse=True)
@@ -134,7 +133,7 @@ def parts_of_domains(grid: Grid, corners: NDArray[np.float64], copy: NDArray[np.
 def joined_parts(
     grid: Grid, part: NDArray[np.int64], count: int, pairs: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], int]:
-    """Join the connected parts of the two cells in each pair, and return the new results of `parts_of_cells`.
+    """Connect the parts of both cells in each pair.  Return the new results of `parts_of_cells`.
 
     `pairs` (m, 2): lexicographic indices of active cells.  Processes may have different pairs.
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Convex polygons in the plane.  Many polygons are cut by lines, or divided into quadrilaterals, at once."""
+"""Arrays of convex polygons in the plane: cuts by lines, and division into quadrilaterals."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Polygons:
 
     @classmethod
     def rings(cls, x: NDArray[np.float64], edge: NDArray[np.int64] | None = None) -> Polygons:
-        """Return polygons with the vertices x (n, k, 2), by default without identifiers of the edges."""
+        """Return polygons with the vertices x (n, k, 2), and optional identifiers of edges."""
         n, k = x.shape[:2]
         return cls(x, np.full(n, k), np.full((n, k), NONE) if edge is None else edge)
 
@@ -45,7 +45,7 @@ class Polygons:
 
     @property
     def centroid(self) -> NDArray[np.float64]:
-        """Centroids (n, 2) of the polygons, in m.  For a polygon without area, the result is its first vertex."""
+        """Centroids (n, 2) of the polygons, in m.  A polygon without area has its first vertex as centroid."""
         area, moment = self._moments
         some = area > 0
         return self.x[:, 0] + np.divide(moment, area[:, None], out=np.zeros_like(moment), where=some[:, None])
@@ -80,7 +80,7 @@ class Polygons:
     def within(self, others: NDArray[np.float64], near: float = 0.0) -> Polygons:
         """Return the intersection of each polygon with a convex, anti-clockwise polygon with vertices (n, m, 2).
 
-        `near`, in m: tolerance; vertices that are outside by at most this distance count as inside.
+        `near`, in m: tolerance for vertices outside the other polygon.
         """
         out = self
         for k in range(others.shape[1]):
@@ -91,7 +91,7 @@ class Polygons:
         return out
 
     def simplified(self, near: float) -> Polygons:
-        """Return the polygons without vertices on straight edges.  Vertices within `near`, in m, become their mean."""
+        """Remove vertices on straight edges.  Vertices within `near`, in m, become their mean."""
         n, most = self.edge.shape
         used = np.arange(most) < self.count[:, None]
         kept = used & (np.abs(self.after - self.x).max(axis=2) > near)
@@ -108,7 +108,7 @@ class Polygons:
         return _packed(out.x, out.edge, (k <= last) & ~straight)
 
     def quadrilaterals(self) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64]]:
-        """Divide convex polygons into quadrilaterals, by the diagonals that divide the area most evenly.
+        """Divide convex polygons into quadrilaterals of similar area.
 
         Returns
         -------
@@ -135,7 +135,7 @@ class Polygons:
         return rows, x, edge
 
     def _divided(self) -> tuple[Polygons, Polygons]:
-        """Divide polygons with more than four vertices, and return both parts."""
+        """Divide polygons with more than four vertices into two parts."""
         n = self.x.shape[1]
         size = 3 if n == 5 else 4
         whole, best = self.area, None

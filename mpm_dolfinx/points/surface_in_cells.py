@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The surface of bodies in single cells of the plane, and quadrilaterals that fill the body behind the surface."""
+"""The surface of bodies in single cells in 2D, and quadrilaterals that fill the body behind the surface."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from mpm_dolfinx.grid.grid import cross_in_plane, sum_by
 from mpm_dolfinx.points.polygons import NONE, Polygons
 
 EDGES = 4
-"""Number of surface edges in a cell with renewed particle domains.
+"""Number of edges of the surface in a cell with renewed particle domains.
 
 Plateau (scene "flow" of tests/plateaus.py): half this value changes the result by 1.6e-03, twice this value by 1.5e-03,
 and finer cells by 9.0e-02.
 """
 BENT = 1 - 3**0.5 / 2
-"""Largest deviation of a surface without a corner from its chord, in cell sizes.  Flatter parts are divided evenly.
+"""Largest deviation of a surface without a corner from its chord, in cell sizes.
 
-Source: exact for a chord and a radius of one cell size.  The grid cannot resolve a circle of smaller radius.
+Source: exact for a chord and a radius of one cell size.
 """
 RING = np.array([0, 1, 3, 2])
 """Corners of a particle domain, anti-clockwise."""
@@ -69,7 +69,7 @@ class Region:
         self.simple = (angles.min(axis=1) > 0) & (self.area > NEAR)
 
     def area_of(self, count: int) -> NDArray[np.float64]:
-        """Return the filled area fraction of each of `count` cells: 1 for cells that are not in `cells`."""
+        """Return the filled area fraction of each of `count` cells.  All cells outside `cells` have 1."""
         out = np.ones(count)
         out[self.cells] = self.area
         return out
@@ -77,7 +77,7 @@ class Region:
     def quadrilaterals(
         self, chosen: NDArray[np.bool_]
     ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.bool_]]:
-        """Return the new domains in chosen cells: index in `cells` (m,), corners (m, 4, 2) and surface flags (m, 4)."""
+        """Return the new domains in chosen cells: cells (m,), corners (m, 4, 2), and flags of surface faces (m, 4)."""
         rows = np.flatnonzero(chosen[self.cells])
         corners, of = [np.zeros((0, 4, 2))], [rows[:0]]
         surface = [np.zeros((0, 4), dtype=bool)]
@@ -106,10 +106,10 @@ def resampled(
 ) -> NDArray[np.float64]:
     """Return the surface in n cells as vertices (n, EDGES + 1, 2) from P to Q (n, 2).
 
-    Vertices lie at sharp bends.  Nearly straight parts are divided evenly.  The vertices are then shifted to preserve
-    the area between surface and chord, or in axisymmetry the volume of the ring of this area.
+    Vertices are at sharp bends, and divide nearly straight parts evenly.  A shift of the vertices conserves the area
+    between surface and chord, or in axisymmetry the volume of the ring of this area.
 
-    `of` (m,): index of each segment's cell, ascending.
+    `of` (m,): index of the cell of each segment, ascending.
     `x` (m, 2, 2): both ends of each segment, from 0 to 1 in its cell.
     `around` (n, 2): `Grid.around` at the lower and the upper side of each cell along the first axis.
     """
@@ -123,7 +123,7 @@ def resampled(
     joint = (x[:, 0] + np.roll(x[:, 1], 1, axis=0)) / 2  # there may be small gaps between segments
 
     def divide(low: int, high: int) -> None:
-        """Set a vertex between two others: at the sharpest bend, or in the middle of a nearly straight part."""
+        """Set a vertex between two others, at the sharpest bend or in the middle."""
         middle = (low + high) // 2
         a, chord = out[:, low], out[:, high] - out[:, low]
         off = joint - a[of]
@@ -170,7 +170,7 @@ def resampled(
 
 
 def _around(x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the distances, from 0 to 4, of positions along the unit square's sides, anti-clockwise from (0, 0)."""
+    """Return the arc lengths (0 to 4) of positions on the sides of the unit square, anti-clockwise from (0, 0)."""
     near = np.stack([x[:, 1], 1 - x[:, 0], 1 - x[:, 1], x[:, 0]], axis=1)
     side = near.argmin(axis=1)
     along = np.stack([x[:, 0], 1 + x[:, 1], 3 - x[:, 0], 4 - x[:, 1]], axis=1)
