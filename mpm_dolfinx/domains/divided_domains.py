@@ -88,7 +88,7 @@ class SeededDomains:
         return out
 
     def sizes(self, grid: Grid, points: MaterialPoints) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the present edge lengths (n, d) of domains, and those of their seeded domains, in cell sizes."""
+        """Return edge lengths (n, d) of domains, and of their seeded domains at seeding, both in cell sizes."""
         root = roots(points)[0]
         return _lengths(grid.in_cells(points.corners)), self._seeded((root,), lambda: self._as_seeded(grid, root))
 

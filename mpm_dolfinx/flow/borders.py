@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Fluxes of unsaturated soil through faces between cells of different soil, and through faces of cells with several
-soils.
+"""Fluxes in unsaturated soil through faces between cells of different soil, or of several soils.
 
-`series` computes the conductivities of these faces. All other faces have two-point fluxes in UFL.
+`series` computes the conductivities of these faces. All other faces have two-point fluxes in UFL (`fluxes`).
 """
 
 from __future__ import annotations
@@ -127,9 +126,7 @@ class Borders:
         outer: NDArray[np.float64],
         drop: NDArray[np.float64],
     ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]]:
-        """Yield the indices (k,) of faces at owned mixed cells, and the result of `Relative.through_sides` for these
-        faces.
-        """
+        """Yield indices (k,) of open faces of owned mixed cells, and their results of `Relative.through_sides`."""
         rows = np.flatnonzero(self.mixed[cells] >= 0)
         if not len(rows):
             return
@@ -145,7 +142,7 @@ class Borders:
         yield rows, *np.divide(found, across, out=np.zeros_like(found), where=across > 0)
 
     def _from_others(self, paths: Paths) -> Paths:
-        """Return the flow paths with the values of ghost cells, which other processes compute."""
+        """Return the flow paths, with the values of ghost cells from other processes."""
         if self.grid.comm.size == 1:
             return paths
         columns = [values.reshape(len(self._cells), np.prod(values.shape[1:])) for values in paths]

@@ -1,19 +1,17 @@
 # SPDX-License-Identifier: MIT
 """Flow through the sides of bodies: drained sides, seepage faces, rain, prescribed inflows.
 
-Through a drained face, the outflow of a cell is `T r [p - p_out + rho_w g . (x_out - x)]`.  Here p is the pressure at
-the centroid x of the cell's material, and p_out is the outside pressure at the centroid x_out of the face.  The
-transmissibility T is `A kappa / d`, with the area A of the face, the mobility kappa, and the distance d from x to the
-face.  The mobility is the conductivity divided by the unit weight of the fluid.  The factor r is the density of the
-fluid divided by the density at zero pressure.
+Through a drained face, the outflow of a cell is `T r [p - p_out + rho_w g . (x_out - x)]`.  The cell has the pressure
+p, and x is the centroid of its material.  The face has the outside pressure p_out and the centroid x_out.  The
+transmissibility is T = A kappa / d.  Here A is the area of the face, kappa is the conductivity divided by the unit
+weight of the fluid, and d is the distance from x to the face.  The factor r is the density of the fluid, divided by its
+density rho_w at zero pressure.
 
 At a seepage face, fluid can only leave.  A primal-dual active-set method (Hintermueller, Ito and Kunisch 2002) opens
-faces with outflow and closes all other faces.  The set of open faces is updated at the start of the substep
-(`SideFeeds.begin`), and after each solution (`SideFeeds.settle`).
+faces with outflow, and closes all other faces.
 
 Infiltration equals the rain, but is at most the inflow under the pressure of ponded water.  Evaporation is at most the
-outflow at the pressure `Rain.driest`.  A pond of volume V supplies the additional inflow `V / dt` in a step of length
-dt, uniformly over its side.  Infiltration, ponding and run-off add up to the rain within rounding.
+outflow at the pressure `Rain.driest`.  In a step of length dt, a pond of volume V adds the rate V / dt to the rain.
 """
 
 from __future__ import annotations
@@ -42,12 +40,10 @@ from mpm_dolfinx.parallel.exchange import over_all, together
 class DrainedSides(Feeding):
     """Drained sides, prescribed inflows and rain of a stage.
 
-    `setting`: data that all conditions of the stage share.
-
     Raises
     ------
     ValueError
-        If a condition is on a side without points, or two conditions are on the same part of a face.
+        A condition is on a side without points, or two conditions are on the same part of a face.
     """
 
     conditions, title = (Drained, Inflow, Rain), "open sides"
@@ -71,21 +67,21 @@ class DrainedSides(Feeding):
         return [faces for _, faces in self._outlets]
 
     def unknown(self, value: float) -> dict[str, NDArray[np.float64]]:
-        """Return the outflows before the first step, all equal to `value`."""
+        """Return an outflow of `value` for each condition."""
         return {name: np.array(value) for name in self._names}
 
     def dry(self, value: float) -> dict[str, NDArray[np.float64]]:
-        """Return the run-offs before the first step, all equal to `value`."""
+        """Return a run-off of `value` for each condition with rain."""
         return {name: np.array(value) for name, rain in zip(self._names, self._rains, strict=True) if rain}
 
     def empty(self) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return volumes of zero before the first step, or {} without rain."""
+        """See `Feeding`."""
         if not any(self._rains):
             return {}
         return {"flowed": self.unknown(0.0), "ran_off": self.dry(0.0), "ponded": self.dry(0.0)}
 
     def fed(self, cut: CutDomains, pieces: PointData) -> NDArray[np.int64]:
-        """Return the indices of points whose domains have faces on open sides.  Indices may be repeated."""
+        """Return the indices of points with faces on open sides.  Indices may be repeated."""
         return np.concatenate([patch.at for patch in cut.surfaces(self.surfaces)])
 
     def placed(self, wet: Wet) -> SideFeeds:
@@ -132,7 +128,7 @@ class OpenFaces:
         return self.conductance * fluid.pi[self.at] - self.inflow
 
     def open_by(self, fluid: Fluid) -> NDArray[np.float64]:
-        """Return the outflow (m,) through each face per unit of the cell's mass potential, in m^d/(Pa s)."""
+        """Return the outflow (m,) through each face, divided by the mass potential of the cell, in m^d/(Pa s)."""
         return self.conductance
 
     derivative = open_by
@@ -175,7 +171,7 @@ class UnsaturatedFaces(OpenFaces):
     ) -> tuple[NDArray[np.float64] | float, NDArray[np.float64] | float]:
         """Return the two terms of the non-orthogonal correction: zero flow, and a fraction of the two-point flux.
 
-        The fraction is limited to [-1, 1], so that the correction does not reverse the flux.
+        The fraction is limited to [-1, 1].
         """
         difference = fluid.pi[self.at] - self.outer
         share = np.divide(correction, difference, out=np.zeros_like(correction), where=difference != 0).clip(-1, 1)
@@ -198,9 +194,8 @@ class UnsaturatedFaces(OpenFaces):
 class RainedFaces(OpenFaces):
     """All faces on open sides, if at least one side has rain.
 
-    Through a face with rain, the outflow is minus the rain.  The outflow is limited from below by the outflow at the
-    pressure of the pond, and from above by the outflow at the pressure `Rain.driest`.  Seepage is an outflow at the
-    lower limit, so faces with rain need no active set.
+    Through a face with rain, the outflow is minus the rain.  The smallest outflow is the outflow at the pressure of the
+    pond.  The largest outflow is the outflow at the pressure `Rain.driest`.
     """
 
     rain: NDArray[np.float64]  # rain (m,), m^d/s; nan for faces without rain
@@ -223,7 +218,7 @@ class RainedFaces(OpenFaces):
         )
 
     def by_force(self, fluid: Fluid) -> NDArray[np.float64]:
-        """Return the derivative (m, d) of `driven` with respect to the force: 0 for faces with rain."""
+        """Return the derivative (m, d) of `driven` with respect to the force, zero for faces with rain."""
         return np.where(np.isnan(self.rain)[:, None], super().by_force(fluid), 0.0)
 
     def open_by(self, fluid: Fluid) -> NDArray[np.float64]:
@@ -273,7 +268,7 @@ class SideFeeds(Feeds):
 
     @property
     def _ponded(self) -> NDArray[np.float64]:
-        """Volume (m^d) of each condition's pond at the start of the step."""
+        """Volumes (m^d) of the ponds at the start of the step."""
         volumes = self._before.get("ponded", {})
         return np.array([float(volumes.get(name, 0.0)) for name in self._names])
 
@@ -298,12 +293,12 @@ class SideFeeds(Feeds):
         return UnsaturatedFaces(at, conductance, sides.given, self._seeps, offset, *rest)
 
     def begin(self, at: OpenFaces, fluid: Fluid, difference: NDArray[np.float64]) -> None:
-        """Open each seepage face if its two-point flux is zero or an outflow, see `Feeds`."""
+        """See `Feeds`.  Seepage faces with an outflow are opened."""
         self._flows = at.outflow(fluid) >= 0
         self._nonorthogonal, self._share = at.nonorthogonal(fluid, difference)
 
     def leaving(self, at: OpenFaces, fluid: Fluid) -> Leaving:
-        """Return the outflow of the cells, with the non-orthogonal correction from the start of the substep."""
+        """Return the outflow of the cells, including the non-orthogonal correction."""
         flux = self._through(at, fluid)
         if fluid.force is not None:
             flux = flux + at.driven(fluid)
@@ -320,7 +315,7 @@ class SideFeeds(Feeds):
         return sum_by(at.at, at.by_force(fluid).T, len(fluid.pi)).T
 
     def settle(self, at: OpenFaces, fluid: Fluid) -> int:
-        """Open all seepage faces with outflow, close all others, and return the number of changes on this process."""
+        """Open the seepage faces with outflow, and close all others.  Return the number of changes on this process."""
         flows = at.outflow(fluid) > 0
         changes = int(np.count_nonzero((flows != self._flows) & at.seeps))
         self._flows = flows
@@ -332,9 +327,7 @@ class SideFeeds(Feeds):
         return {name: np.array(sums[i]) for i, name in enumerate(self._names)}
 
     def run_off(self, at: OpenFaces, fluid: Fluid) -> dict[str, NDArray[np.float64]]:
-        """Return the run-off, in m^d/s, by name of the condition.  Run-off is rain that neither infiltrates nor fills a
-        pond.
-        """
+        """Return the run-off, in m^d/s, by name of the condition: rain that neither infiltrates nor ponds."""
         if not any(self._rains):
             return {}
         excess = np.maximum(self._fallen, 0.0) + np.minimum(self._through(at, fluid), 0.0)  # nan without rain
@@ -343,7 +336,7 @@ class SideFeeds(Feeds):
         return {name: np.array(runs[i]) for i, name in enumerate(self._names) if self._rains[i]}
 
     def passing(self, at: OpenFaces, fluid: Fluid) -> dict[str, NDArray[np.float64]]:
-        """Return two rates (2,) for each condition: outflow through its sides, and rain on its sides, in m^d/s."""
+        """Return two rates (2,) for each condition: outflow, and rain, in m^d/s."""
         if not any(self._rains):
             return {}
         both = np.stack([self._through(at, fluid), np.nan_to_num(self._fallen)])

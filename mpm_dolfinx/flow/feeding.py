@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Interface of the conditions on the pore fluid: drained sides, inflows, rain, sources.
 
-The method `feeding(setting)` of a condition creates its `Feeding` once in a stage.  `Feeding.placed` returns the
-`Feeds` of a substep.  At each assembly of the residual, the `Feeds` add their flow rates to the outflow of the cells.
-`conditions/acting.py` has the corresponding interface for the momentum balance.
+In each stage, the method `feeding(setting)` of a condition creates a `Feeding`.  `Feeding.placed` returns the `Feeds`
+of a substep.  `Feeds.leaving` returns the outflow from the cells.  `conditions/acting.py` defines the same interface
+for the momentum balance.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 
 
 class Wet(NamedTuple):
-    """Data that the conditions on the fluid need in a substep."""
+    """Data of a substep for the conditions on the fluid."""
 
     cut: CutDomains  # particle domains cut by the grid
     points: MaterialPoints  # material points at their current positions
@@ -61,19 +61,18 @@ class Leaving(NamedTuple):
 class Feeds:
     """Flow rates of the conditions of one kind in a substep.  Subclasses define `leaving`.
 
-    Arrays have one entry for each of the n active owned cells.  The argument `at` is the result of `conducting` for the
-    current displacements.
+    Arrays have one entry for each of the n active owned cells.  The argument `at` is the result of `conducting`.
     """
 
     linear: bool = True
     """Whether the outflow is always linear in the mass potentials pi (see `fluid_content`)."""
     settles: bool = False
-    """Whether the condition has an active set, see `settle`."""
+    """Whether the condition has an active set, which `settle` updates."""
     sides: OpenSides | None = None
     """Faces with an outside pressure or a prescribed flux."""
 
     def conducting(self, flow: Conduction) -> Any:
-        """Return the data that depend on conductivities and on the motion of cells."""
+        """Return the argument `at` of other methods: data that depend on conductivities and the motion of cells."""
 
     def begin(self, at: Any, fluid: Fluid, difference: NDArray[np.float64]) -> None:
         """Start a substep.
@@ -94,10 +93,7 @@ class Feeds:
         return 0.0
 
     def coupling(self, at: Any, fluid: Fluid, unknowns: Any) -> PETSc.Mat | None:
-        """Return the derivative of the outflow with respect to pressures, without the part in `slope`; None means zero.
-
-        `unknowns`: pressure unknowns.  `Loads.joins` gives the possible entries.
-        """
+        """Return the derivative of the outflow with respect to pressures, without `slope`, or None if it is zero."""
 
     def settle(self, at: Any, fluid: Fluid) -> int:
         """Update the active set, and return the number of changes on this process."""
@@ -118,9 +114,9 @@ class Feeds:
     def volumes(
         self, rates: Sequence[Mapping[str, NDArray[np.float64]]], seconds: Sequence[float]
     ) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return the volumes (m^d) since the conditions began, by quantity and then by condition.
+        """Return volumes (m^d) since the start of the conditions, by quantity and condition.
 
-        `rates`: results of `passing` in the substeps of the last step.  `seconds`, s: time weights of these substeps.
+        `rates`, `seconds` (s): results of `passing` in the substeps of a step, and time weights of these substeps.
         """
         return {}
 
@@ -149,15 +145,15 @@ class Feeding:
         raise NotImplementedError
 
     def fed(self, cut: CutDomains, pieces: PointData) -> NDArray[np.int64]:
-        """Return the indices of points at which bodies may gain or lose fluid.  Indices may be repeated."""
+        """Return the indices of points at which fluid may enter or leave.  Indices may be repeated."""
         return np.empty(0, dtype=np.int64)
 
     def unknown(self, value: float) -> dict[str, NDArray[np.float64]]:
-        """Return the outflows before the first step, all equal to `value`."""
+        """Return an outflow of `value` for each condition."""
         return {}
 
     def dry(self, value: float) -> dict[str, NDArray[np.float64]]:
-        """Return the run-offs before the first step, all equal to `value`."""
+        """Return a run-off of `value` for each condition with rain."""
         return {}
 
     def empty(self) -> dict[str, dict[str, NDArray[np.float64]]]:

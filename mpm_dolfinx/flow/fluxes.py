@@ -1,11 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Two-point fluxes of the pore fluid through the parts of cell faces that material covers; damping of pressure jumps.
+"""Two-point fluxes of the pore fluid between cells, and damping of pressure jumps.
 
-The coefficients of the forms describe the material in the cells, and are set at each grid reset.  In a moving body, the
-fluxes through the deformed cells are pulled back to the start of the step.  Let kappa be the mobility of a cell
-(conductivity divided by unit weight), `F = I + grad u` the deformation gradient at the centroid of the cell's material,
-and `J = det F`.  The pulled-back mobility is `J F^-1 kappa F^-T`.  `drained_sides` computes the fluxes through open
-sides.
+A flux passes through the part of a cell face that material covers.  Fluxes through the deformed cells are pulled back
+to the start of the step.  The mobility kappa of a cell is its conductivity divided by the unit weight of the fluid.
+With `F = I + grad u` at the centroid of the material and `J = det F`, the pulled-back mobility is `J F^-1 kappa F^-T`.
 """
 
 from __future__ import annotations
@@ -36,16 +34,15 @@ from mpm_dolfinx.points.material_points import cofactor, determinant
 THICK = np.sqrt(2)
 """Area of the largest plane section of a cube, divided by the area of a face.  Source: exact bound (Ball 1986).
 
-Let a convex body of volume V in a cell of edge length h lie on one side of a plane.  The distance from the body's
-centroid to the plane is at least `V / ((d + 1) THICK h^(d-1))`.  A nearer face bounds only a part of the cell's
-material, and must not drain the whole cell.
+A convex body has the volume V, and is inside a cell of edge length h.  A plane outside this body has a distance of at
+least `V / ((d + 1) THICK h^(d-1))` from the centroid of the body.  Smaller distances are replaced by this bound.
 """
 ALONG = 0.1  # a side determines the slope along an axis if this component of its unit normal is larger than `ALONG`
 
 
 @dataclass(frozen=True)
 class Mobility:
-    """Mobility of the n filled owned cells.  In unsaturated soil, `mean` and `share` refer to saturated pores."""
+    """Mobility of the n filled owned cells.  `mean` and `share` are for saturated pores, also in unsaturated soil."""
 
     mean: NDArray[np.float64]  # mean over the pieces (n,), m^2/(Pa s)
     share: NDArray[np.float64] | None = None  # mobility along each axis divided by `mean` (n, d); None if all are 1
@@ -100,9 +97,8 @@ class Conduction:
         return across if hoop is None else across * hoop[at]
 
     def distance_ratio(self, at: NDArray[np.int64], normal: NDArray, offset: NDArray) -> NDArray[np.float64]:
-        """Return ratios (m,): distance from face to centroid, divided by distance from face to pressure position.
+        """Return ratios (m,) of distances from a face: to the centroid, divided by to the pressure position (`layers`).
 
-        See `layers` for pressure positions.
         `normal` (m, d): normals of the faces.
         `offset` (m, d), m: vectors from the centroids to the faces.
         """
@@ -150,9 +146,7 @@ class OpenSides:
         return self.area / np.sqrt(np.add.reduce(self.area**2, axis=1, keepdims=True))
 
     def driven(self, at: NDArray[np.int64], flow: Conduction) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return two arrays (m,): outflow per unit of the cell's mass potential, in m^d/(Pa s), and inflow, in m^d/s.
-
-        The inflow is prescribed, or caused by the outside pressure and gravity.
+        """Return two terms of the outflow: per mass potential of the cell (m,), m^d/(Pa s), and inflow (m,), m^d/s.
 
         `at` (m,): indices of the cells among the filled cells.
         """
@@ -163,15 +157,15 @@ class OpenSides:
         return conductance, self.given + conductance * self.outer(at, flow)
 
     def outer(self, at: NDArray[np.int64], flow: Conduction) -> NDArray[np.float64]:
-        """Return the mass potentials (m,), Pa, at outside pressures minus hydrostatic drops from centroids to faces."""
+        """Return the mass potentials (m,), Pa, of outside pressures, reduced to the heights of the centroids."""
         outer = self.pressure if flow.weight is None else self.pressure - flow.deformed(at, self.offset) @ flow.weight
         return mass_potential(outer, flow.bulk)
 
     def ahead(self, at: NDArray[np.int64], p: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return pressure differences (Pa) and slopes (Pa/m) from cells to drained sides.
 
-        The result is an array (n, d, 2, 2).  The indices are: cell, axis, end of the cell along this axis, and 0 for
-        the difference or 1 for the slope.  Ends without a drained side have nan for difference and slope.
+        The result (n, d, 2, 2) has the indices cell, axis, end of the cell, and 0 for the difference or 1 for the
+        slope.  Ends without a drained side have nan.
 
         `at` (m,): index of the cell of each face among the filled cells.
         `p` (n,), Pa: pressures of the filled cells.
@@ -202,7 +196,7 @@ class OpenSides:
 
 @dataclass(frozen=True)
 class PieceContents:
-    """Contributions of pieces to their owned cells.  Arrays have an entry for each of m pieces."""
+    """Data of m pieces of particle domains in owned cells."""
 
     cells: NDArray[np.int32]  # owned cell (m,)
     weight: NDArray[np.float64]  # volume (m,), m^d
@@ -214,9 +208,9 @@ class PieceContents:
 
 
 class CellContents(Keyed):
-    """Material in the cells, at the last grid reset.  Arrays over local cells have valid values in active cells only.
+    """Material in the cells, at the last grid reset.  Arrays over local cells are valid in active cells only.
 
-    `forms`: forms whose coefficients this class sets.  `pieces`: contributions of the pieces.
+    `forms`, `pieces`: forms with coefficients that this class sets, and data of the pieces.
     `filled`: owned active cells.
     """
 
@@ -228,12 +222,12 @@ class CellContents(Keyed):
         self._slot = forms.active.slot
         self._slot[filled] = np.arange(len(filled))
         self.weight, self.area = pieces.weight, pieces.area
-        """Volumes (m,) of the pieces, in m^d.  In axisymmetry `area` has the areas of their sections, in m^2."""
+        """Volumes (m,) of the pieces, in m^d, and in axisymmetry areas of their meridional sections, in m^2."""
         self._at, d = self._slot[pieces.cells], grid.dim
         rows = [self.weight, self.area, self.weight * pieces.fixed_stress], (self.area[:, None] * pieces.x).T
         sums = self.total(np.concatenate([*rows, pieces.faces.reshape(len(self.area), 2 * d).T]))
         self.volume, area, self.fixed_stress = sums[:3]
-        """Volumes (n,) of the material in filled cells, in m^d.  `fixed_stress`: integrals (n,) of beta, m^d/Pa."""
+        """Volumes (n,) of the material in filled cells, in m^d, and integrals (n,) of beta, in m^d/Pa."""
         self.fill = np.minimum(area / grid.volumes(filled), 1.0)
         """Volume fractions (n,) of material in the filled cells."""
         shapes = (forms.centroid, forms.lower_face, forms.upper_face)
@@ -252,14 +246,14 @@ class CellContents(Keyed):
         self.centroid, self.open = forms.active.centroid, forms.active.opening
         self.centroid[active] = centroid[active]
         self.open[active, :, 0], self.open[active, :, 1] = lower[active], upper[active]
-        """`centroid` (c, d), m: offsets from cell midpoints to centroids.  `open` (c, d, 2): open face fractions."""
+        """Fractions (c, d, 2) of the cell faces that material covers."""
 
     def total(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the sums (..., n) of values (..., m) over the pieces of each filled cell."""
         return sum_by(self._at, values, len(self.filled))
 
     def softest(self, softness: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the largest softness (n,) of the pieces in each filled cell, at least 1."""
+        """Return the largest softness (n,), at least 1, of the pieces in each filled cell."""
         softest = np.ones(len(self.filled))
         np.maximum.at(softest, self._at, softness)
         return softest
@@ -267,10 +261,10 @@ class CellContents(Keyed):
     def set_damping(
         self, share: NDArray[np.float64] | float = 1.0, less: NDArray[np.float64] | float = 0.0
     ) -> NDArray[np.float64]:
-        """Set the damping strength tau (n,) of elastic soil in the filled cells, and return tau, in 1/Pa.
+        """Set the damping strength of elastic soil in the filled cells to `share * tau - less`, and return tau.
 
-        `share` (n,): factor by which tau is multiplied.
-        `less` (n,), 1/Pa: storage due to changes of saturation, which is subtracted from `share * tau`.
+        `share` (n,): factor.
+        `less` (n,), 1/Pa: storage due to changes of saturation.
         """
         tau, values = self._damped.x, np.maximum(share * self.mean(self._damping) - less, 0.0)
         tau.array[self.filled] = values
@@ -359,7 +353,7 @@ class HalfFaces:
 
     @cached_property
     def side(self) -> OpenSides:
-        """The faces as open sides, because water passes through them, see `nonorthogonal.Gradients`."""
+        """The faces as open sides, for the non-orthogonal correction."""
         none, unknown = np.zeros(len(self.at)), np.full(len(self.at), np.nan)
         number, seeps = none.astype(np.int64), none.astype(bool)
         offset = self._shapes[1]
@@ -371,10 +365,10 @@ class HalfFaces:
         p: NDArray[np.float64],
         force: Callable[[NDArray[np.int64]], NDArray[np.float64]] | None,
     ) -> NDArray[np.float64]:
-        """Return pressure (Pa), position (m), force (N/m^3), pressure drop (Pa) and conductances (m^d/(Pa s)).
+        """Return data of the cell at each face, as rows.
 
-        The position is the centroid of the cell's material.  The force is the unit weight plus the inertia force.  The
-        pressure drop is from the centroid to the face.  Unsaturated soil has a conductance for each retention curve.
+        The entries are pressure (Pa), centroid (m), weight and inertia force on the fluid (N/m^3), pressure drop to the
+        face (Pa), and conductances (m^d/(Pa s)).  Unsaturated soil has one conductance for each retention curve.
 
         `p` (n,), Pa: pressures of the filled cells.
         `force`: see `Fluid`.
@@ -405,11 +399,10 @@ class FluxForms:
     """Compiled forms over the faces between active cells, and their coefficients.
 
     `weight` (d,), N/m^3: unit weight rho_w g of the pore fluid, as UFL, or None without gravity.
-    `flows`: whether any material is permeable.  If False, no fluxes are computed.
+    `flows`: whether any material is permeable.
     `pressure`: pore pressure of the cells (DG0), Pa.
     `bulk`: bulk modulus of the fluid, Pa.
-    `inertial`: motion, and the inertia force (d,) on the pore fluid that it causes, in N/m^3, as UFL; None without
-    inertia.  `by_motion` is the derivative of this part of the fluxes, at fixed relative conductivities.
+    `inertial`: motion, and its inertia force (d,) on the pore fluid, in N/m^3, as UFL; None without inertia.
     `relative`: relative conductivities in unsaturated soil, see `unsaturated`, or None.
     """
 
@@ -438,7 +431,7 @@ class FluxForms:
         h0, h1, across = across_faces(grid, n0)
 
         def opening(side, sign):
-            """Return the open fraction of the face with normal `sign * n0`, in axisymmetry times `Grid.around`."""
+            """Return the open fraction of a face, in axisymmetry times the circumference."""
             lower, upper = self.lower_face(side), self.upper_face(side)
             return sum(
                 ufl.conditional(ufl.gt(sign * n0[a], 0.5), upper[a], 0.0)
@@ -506,7 +499,7 @@ class FluxForms:
             if relative is not None:
 
                 def by_k(k):
-                    """Return `dT / dk_r` for one k_r, without squares of conductivities, because squares underflow."""
+                    """Return the derivative of T with respect to one k_r."""
                     return share * (
                         d0 * (k1 / resistance) ** 2 * ufl.diff(k0, k) + d1 * (k0 / resistance) ** 2 * ufl.diff(k1, k)
                     )
@@ -520,7 +513,7 @@ class FluxForms:
                 self.flux = FacetForm(density * slope * ufl.jump(q) * dS, grid.comm)
 
     def unequal(self, filled: NDArray[np.int32], mean: NDArray[np.float64]) -> NDArray[np.float64] | None:
-        """Return the mobilities of all local cells from `mean` of the filled cells, or None if all are equal."""
+        """Return the mobilities of local cells from `mean` of the filled cells, or None if all are equal."""
         comm = self.grid.comm
         if comm.allreduce(mean.max(initial=0.0), MPI.MAX) <= comm.allreduce(mean.min(initial=np.inf), MPI.MIN):
             return None
@@ -539,8 +532,9 @@ class FluxForms:
     ) -> NDArray[np.float64]:
         """Return the outflow of local cells through `facets`, in m^d/s, due to the gradients `slope` in `cells`.
 
-        `slope` (n, d), Pa/m: see `Gradients`.  `active` (c,): active local cells.
-        `density` (c,): density of the fluid in the active local cells, divided by the density at zero pressure.
+        `slope` (n, d), Pa/m: see `Gradients`.
+        `active` (c,): active local cells.
+        `density` (c,): density of the fluid in these cells, divided by the density at zero pressure.
         """
         self.density.x.array[active] = density
         self._sum.x.array[active] = 0.0

@@ -1,20 +1,16 @@
 # SPDX-License-Identifier: MIT
 """Mobility of cells with several conductivities, from lines through the cell along each axis.
 
-Soils along a line are in series, and lines are in parallel.  The mobility of a line is the harmonic mean of the
-mobilities along it.  The mobility of a cell along an axis is the arithmetic mean over the lines along this axis
-(Cardwell and Parsons 1945).  This mobility is exact for flow along and across any number of layers parallel to the
-grid.  Inclined layers must be at least a cell thick.  Otherwise a thin barrier has leaks, and a thin drain conducts too
-little.
+Soils along a line are in series, and lines are in parallel.  The mobility of a line is the harmonic mean over its
+soils.  The mobility of a cell along an axis is the arithmetic mean over the lines along this axis (Cardwell and Parsons
+1945).  This mobility is exact for flow along and across layers parallel to the grid.  Inclined layers must be at least
+a cell thick.
 
-The pressure of a cell refers to one position in the cell, the pressure position.  In steady flow along a line, the
-pressure at this position equals the mean pressure of the line.  Let R be the resistance of the line, and let s increase
-from 0 to 1 along the line.  The resistance from the pressure position to the lower end is `int (1 - s) dR`, and to the
-upper end `int s dR`.
-
-If layers are inclined by more than `INCLINED`, the pressure position moves to the more conductive end of the cell.
-Without this shift, an inclined drain would be interrupted between rows of cells.  The shape of a piece is approximated
-by the bounding box of its domain in the cell.  `graded` treats conductivities that vary gradually with deformation.
+The pressure of a cell refers to one position in the cell, the *pressure position*.  In steady flow along a line, the
+pressure at this position equals the mean pressure of the line.  With the resistance R and a coordinate s from 0 to 1
+along the line, the resistance from the pressure position to the lower end is `int (1 - s) dR`.  The resistance to the
+upper end is `int s dR`.  If layers are inclined by more than `INCLINED`, the pressure position moves to the more
+conductive end of the cell.
 """
 
 from __future__ import annotations
@@ -33,7 +29,7 @@ from mpm_dolfinx.grid.grid import ranges, sum_by
 from mpm_dolfinx.parallel.exchange import over_all
 
 INCLINED = 0.01
-"""Slope of layers relative to the grid, above which the pressure position of a cell moves to the more conductive end.
+"""Smallest slope of layers, relative to the grid, at which the pressure position moves to the more conductive end.
 Plateau (scene "slope" of tests/plateaus.py): half this value changes the result by 4.1e-04, twice
 this value by 5.0e-05, and finer cells by 3.4e-03.
 """
@@ -60,7 +56,7 @@ class MixedCells:
     `low`, `high`: corners (m, d) of the bounding boxes of pieces, in cell coordinates from 0 to 1.
     `x`: centroids (m, d) of the pieces, in cell coordinates.
     `volume`: volumes (m,) of the pieces, m^d.
-    `soils`: numbers (m, k) that identify the soils.  Pieces with equal rows have equal conductivities.
+    `soils` (m, k): material constants.  Pieces with equal rows have equal conductivities.
     """
 
     def __init__(self, rows, cells, low, high, x, volume, contents: CellContents, soils):
@@ -88,10 +84,9 @@ class MixedCells:
             self._lines.append(Lines(line, piece, length, before, total))
 
     def _crossed(self, rows: slice, first, count, low, high) -> list[tuple[NDArray, NDArray, NDArray]]:
-        """Return the lines, the pieces that they cross, and weights, for each axis.
+        """Return, for each axis, lines through the centroids of the pieces `rows`, crossed pieces, and weights.
 
-        The lines run through the centroids of the pieces `rows`.  The weight is below one for a line along the border
-        of a piece.
+        The weight is below one for a line along the border of a piece.
         """
         line, piece = ranges(first[rows], count[rows])
         line += rows.start
@@ -125,9 +120,8 @@ class MixedCells:
 
         `kappa`, m^2/(Pa s): mobilities of all pieces.
         `mean` (n,), m^2/(Pa s): means of `kappa` in the filled cells.
-        `share` (n, d): mobility along each axis divided by `mean`.  The values of mixed cells are set in place.
-        `now`, m^2/(Pa s): mobilities of all pieces at their pressures, in unsaturated soil.  With `now`, only inclined
-        layers shift the pressure position of a cell away from the centroid.
+        `share` (n, d): mobility along each axis divided by `mean`.  The values of mixed cells are replaced.
+        `now`, m^2/(Pa s): mobilities of all pieces at their pressures, in unsaturated soil.
         """
         along, off = self._along(kappa[self._rows])
         if now is not None:
@@ -141,7 +135,7 @@ class MixedCells:
     def _along(self, kappa: NDArray[np.float64], mean: float = 1.0) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the mobilities along the axes, and the shifts of the pressure position divided by the cell size.
 
-        With `mean` 0, only inclined layers cause shifts.  With `mean` 1, all layers cause shifts.
+        `mean`: 1 for shifts due to all layers, 0 for shifts due to inclined layers only.
         """
         n, d = len(self._filled), self._x.shape[1]
         mobility = np.zeros((n, d))
@@ -168,7 +162,7 @@ class MixedCells:
         """Return the flow paths of the mixed cells, see `Paths`.
 
         `kappa` (m,), m^2/(Pa s): mobilities of all pieces at saturation.
-        `law` (m,): index of the retention curve of each piece, < `laws`.
+        `law` (m,): index of the retention curve of each piece, below `laws`.
         `shift` (n, d), m: vectors from the centroids of filled cells to their pressure positions, or None for zeros.
         """
         kappa, law = kappa[self._rows], law[self._rows]
@@ -220,7 +214,7 @@ class MixedCells:
         return out._replace(parallel=parallel)
 
     def _sharper(self, kappa: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return a factor of the shift in each cell: 0 without inclined layers, >= 1 for slopes above `INCLINED`."""
+        """Return a factor on the shift in each cell: 0 without inclined layers, >= 1 for slopes above `INCLINED`."""
         n = len(self._filled)
 
         def total(values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -239,10 +233,10 @@ class MixedCells:
 def graded(
     contents: CellContents, offset: NDArray[np.float64], kappa: NDArray[np.float64], mean: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the mobilities (n, d) along the axes, divided by `mean`, in cells whose mobility varies gradually.
+    """Return the mobilities (n, d) along the axes, divided by `mean`, for mobilities that vary gradually in a cell.
 
-    The difference between the arithmetic and the harmonic mean of the mobilities is distributed over the axes.  The
-    share of an axis is proportional to the variance of a linear fit along this axis.
+    Across the gradient of the mobility, the mean over the cell is harmonic.  Along layers of equal mobility, it is
+    arithmetic.
 
     `offset` (m, d), m: positions of the pieces relative to the midpoints of cells.
     `kappa` (m,), m^2/(Pa s): mobilities of the pieces.
@@ -266,7 +260,7 @@ def graded(
 def mixed_cells(cut: CutDomains, soils: NDArray[np.float64], contents: CellContents) -> MixedCells | None:
     """Return the owned cells with pieces of different conductivity, or None if no process has a mixed cell.
 
-    `soils` (m, k): numbers that identify the soil of each piece.  Pieces with equal rows have equal conductivities.
+    `soils` (m, k): material constants.  Pieces with equal rows have equal conductivities.
     """
     grid = cut.grid
     cells = cut.cells

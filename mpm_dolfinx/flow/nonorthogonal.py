@@ -1,21 +1,19 @@
 # SPDX-License-Identifier: MIT
 """Non-orthogonal correction of fluxes between cells and through open sides.
 
-The two-point flux takes the difference of two cell pressures as the pressure difference across the face.  In bodies
-inclined to the grid, the two centroids are also offset along the face.  The offset is a vector t of up to half a cell
-size.  This offset causes an error that does not decrease with the cell size.  Let G be the pressure gradient in a cell
-minus the unit weight of the fluid.  The corrected flux is (see `storage` for other symbols)
+Near sides inclined to the grid, the line between the centroids of two cells is not normal to their common face.  The
+component of this line along the face is the vector t, of up to half a cell size.  Without a correction, two-point
+fluxes would have an error that does not decrease with the cell size.  Let G be the pressure gradient in a cell minus
+the unit weight of the fluid.  The corrected flux is (see `storage` for other symbols)
 
     Q = T [p+ - p- + rho_w g . (x- - x+) - (G+ + G-)/2 . t].
 
 At an open side, `p - p_out` is replaced by `p - p_out + G . t`.  Here t is the vector along the side, from the
 projection of the centroid onto the side to the centre of the face.
 
-The gradients are fitted by least squares to the pressures of neighbouring cells and drained sides, and to zero flow
-across no-flow sides.  The area vector of a no-flow side follows from the closed surface of the material in the cell.
-The fit is exact for linear pressures.  A neighbour of smaller conductivity has a smaller weight in the fit, and its
-face counts in part as a no-flow side.  Pressures that are trapped in impermeable soil therefore have no effect.
-Gradients are limited so that the corrected pressures at faces stay between the pressures of the neighbours.
+The gradients are a least-squares fit to the pressures of neighbouring cells and drained sides, and to zero flow through
+other sides.  A neighbour of smaller conductivity has a smaller weight in the fit.  The fit is exact for linear
+pressures.  Gradients are limited so that the corrected pressures at faces stay between the pressures of the neighbours.
 """
 
 from __future__ import annotations
@@ -32,7 +30,7 @@ from mpm_dolfinx.forms.point_forms import FacetSum
 from mpm_dolfinx.grid.grid import Grid, sum_by
 
 ALONG = 1e-4
-"""Fluxes are corrected if the offset of two centroids along the face exceeds this fraction of the cell size."""
+"""Fluxes are corrected if the offset t of two centroids along the face exceeds this fraction of the cell size."""
 NEAREST = 0.1
 """Lower bound of distances in the weights of the least-squares fit, divided by the cell size.  Plateau (scene "slope"
 of tests/plateaus.py): half this value changes the result by 3.0e-08, twice this value by 1.2e-06, and finer cells by
@@ -45,7 +43,7 @@ finer cells by 3.4e-03.
 
 
 def nonorthogonal_facets(contents: CellContents, facets: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Return the facets between two active cells whose centroids are offset along the facet."""
+    """Return the facets that need the non-orthogonal correction."""
     grid = contents.grid
     first, other = grid.facet_cells[facets].T
     offset = contents.centroid[other] - contents.centroid[first]
@@ -56,8 +54,6 @@ def nonorthogonal_facets(contents: CellContents, facets: NDArray[np.int32]) -> N
 
 class Gradients:
     """Pressure gradients minus the unit weight of the fluid, in all cells that need the non-orthogonal correction.
-
-    The object is valid for one cut of the particle domains.
 
     `contents`: material in the cells.
     `sides`: open sides of the bodies.
@@ -119,7 +115,7 @@ class Gradients:
 
     @cached_property
     def _units(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return two arrays of gradients: for a unit pressure difference to a neighbour, and to an open side."""
+        """Return gradients for a unit pressure difference to each neighbour, and to each open side."""
         known, d = self._known, self._separation.shape[2]
         at, no_flow = self._at[known], self._no_flow(self._contents, self._sides)[self.rows]
         size = np.linalg.norm(self._sides.area, axis=1)[self._faces[known]]
@@ -189,7 +185,8 @@ class NonorthogonalFlow(NamedTuple):
     def __call__(self, p: NDArray[np.float64], bulk: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the additional outflows (n,) from filled cells, and the corrections (m,) of pressures at open sides.
 
-        The outflows are in m^d/s.  The corrections, in Pa, apply to the pressures of the cells.
+        The outflows are in m^d/s, and the corrections in Pa.
+
         `p` (c,), Pa: pressures of the local cells.
         `bulk`, Pa: bulk modulus of the fluid.
         """
@@ -204,10 +201,7 @@ class NonorthogonalFlow(NamedTuple):
 
 
 def off_middle(sides: OpenSides, grid: Grid) -> NDArray[np.bool_]:
-    """Return a mask (m,) of faces whose centres are offset, along the side, from the centroids of their cells.
-
-    Offsets are averaged over the faces of one condition in one cell.
-    """
+    """Return a mask (m,) of open faces that need the non-orthogonal correction."""
     faces, at = np.unique(sides.number * grid.num_local + sides.cells, return_inverse=True)
     size, off = np.sqrt(np.add.reduce(sides.area**2, axis=1)), _along(sides) / grid.sizes(sides.cells)
     mean = sum_by(at, (size[:, None] * off).T, len(faces)) / sum_by(at, size, len(faces))

@@ -6,12 +6,10 @@ The damping matrix H is defined by sums over cells and axes for all pressures p 
     (H p, q) = sum of w D p D q,   D p = h ((p_+ - p) / d_+ - (p - p_-) / d_-).
 
 Here w is the weight of a cell and axis, and h is the edge length of the cell along the axis.  The neighbours along the
-axis have the pressures p_+ and p_-.  The distances from their centroids to the cell's centroid are d_+ and d_-.  A cell
-has a term along an axis if both faces across this axis are open.
+axis have the pressures p_+ and p_-.  Their centroids have the distances d_+ and d_- from the centroid of the cell.  The
+term of a cell and axis is omitted if material covers no part of one of the two faces normal to the axis.
 
-A uniform gradient is not damped, even at the sides of the body, so steep pressures are not smeared.  The sum of H p
-over the cells is zero, so damping conserves fluid.  For a pressure that alternates from cell to cell, the damping
-coefficient is 16 w.  Damping of pressure jumps with the weight w would give 4 w.
+A uniform gradient is not damped.  The sum of H p over the cells is zero, so damping conserves fluid.
 """
 
 from __future__ import annotations
@@ -35,11 +33,10 @@ def second_differences(
     """Return the matrix H.  The sparsity pattern of H depends on the active cells only.
 
     `unknowns`: pressure unknowns of the active cells.
-    `strength` (n, d), m^d/Pa: coefficient, >= 0, of each owned active cell and axis.  For alternating pressures, H
-    equals a damping of pressure jumps with this coefficient.
+    `strength` (n, d), m^d/Pa: coefficient 4 w, >= 0, of each owned active cell and axis.
     `centroid` (c, d), m: centroids of the material in the local cells, relative to the midpoints of the cells.
-    `opening` (c, d, 2): open fractions of the lower and upper faces of the local cells.  In axisymmetry the fractions
-    are multiplied by `Grid.around`.
+    `opening` (c, d, 2): fractions of the lower and upper faces of the local cells that material covers, in axisymmetry
+    times the circumference.
     """
     own = unknowns.owned
     number = unknowns.map.indices

@@ -1,15 +1,13 @@
 # SPDX-License-Identifier: MIT
 """Fluxes between two cells through unsaturated soils in series.
 
-The pressure of a cell refers to one position in the cell, the pressure position (see `layers`).  Several soils may lie
-between the pressure positions of two cells.  The pressures at the interfaces of these soils are local unknowns of each
-face.  Newton's method finds these pressures from the continuity of the flux, and static condensation eliminates the
-unknowns.  The flux law within a soil is the law between two cells of this soil (`fitted`).  Steady flow through layers
-with exponential relative conductivity is therefore exact for any position of the layers.
+The pressure of a cell refers to one position in the cell, the pressure position (`layers`).  There may be several soils
+between the pressure positions of two cells.  The pressures at the interfaces of these soils are local unknowns of the
+common face.  These unknowns satisfy the continuity of the flux, and are eliminated (static condensation).  Steady flow
+through layers with exponential relative conductivity is exact for any position of the layers.
 
-Lines through a cell (see `layers`) conduct in parallel if they cross a single soil up to the face.  All lines that
-cross several soils are replaced by one line.  The new line crosses the same soils in the same sequence, and has the
-mean length in each soil.
+A cell is crossed by several lines (`layers`).  Lines with a single soil between pressure position and face conduct in
+parallel.  All other lines are replaced by one line with the mean length in each soil.
 """
 
 from __future__ import annotations
@@ -31,9 +29,9 @@ MOST = 2200  # largest number of iterations.  Source: exact bound, twice the hal
 class Paths(NamedTuple):
     """Flow paths from the pressure positions of n cells to their faces.
 
-    The first three indices of the arrays (n, d, 2, ...) are the cell, the axis, and the end of the cell.  `parallel`
-    contains the lines that cross a single soil.  Entry 0 of `parallel` is for soil without a retention curve, and each
-    curve has one further entry.  All other lines are replaced by one line with s soils in series.
+    The first three indices of the arrays (n, d, 2, ...) are the cell, the axis, and the end of the cell.  `parallel` is
+    for lines with a single soil.  Its entry 0 is for soil without a retention curve, and each curve has one further
+    entry.  The other fields describe one line with s soils in series.
     """
 
     parallel: NDArray[np.float64]  # mobility of single-soil lines, times their fraction of all lines (l,), m^2/(Pa s)
@@ -72,7 +70,7 @@ class Through(NamedTuple):
 
 
 def none(count: int, laws: int, slots: int) -> Paths:
-    """Return paths (count, ...) that conduct nothing."""
+    """Return paths (count, ...) with zero mobility."""
     return Paths(
         np.zeros((count, laws)), np.full((count, slots), -1), np.zeros((count, slots)), np.zeros((count, slots))
     )
@@ -112,7 +110,7 @@ def through(
     `p` (m,), Pa: pressures on both sides, as two arrays.
     `paths` (m, ...): paths of one or two cells, from their pressure positions to the face.
     `lengths` (m,), m: lengths of the paths.
-    `drops` (m,), Pa: pressure drops along each path due to the fluid's weight, from the first to the second side.
+    `drops` (m,), Pa: pressure drops due to the weight of the fluid along each path, from the first to the second side.
     """
     counts = [np.maximum((path.law >= 0).sum(axis=1), 1) for path in paths]
     kinds, kind = np.unique(np.stack(counts, axis=1), axis=0, return_inverse=True)
@@ -153,7 +151,7 @@ class _Chain:
         self._difference = self._hydrostatic[:, -1] - p[1]
 
     def solved(self) -> NDArray[np.float64]:
-        """Return the conductance between both ends of the path, and the two slopes of `Through`."""
+        """Return the conductance between both ends of the path, and the slopes of `Through`."""
         links, difference = self._links, self._difference[:, None]
         inner = slice(1, -1)
         scale = np.full(self._hydrostatic.shape, np.inf)

@@ -21,7 +21,7 @@ class Sources(Feeding):
     """All sources of a scene, for all stages.
 
     `sources`: user functions that return UFL terms.
-    `pieces`: quadrature points of all pieces.  The weights of the points add up to the volumes of the material points.
+    `pieces`: quadrature points of all pieces.
     `p`: pore pressure of the cells (DG0), Pa.
     `t`, s: time at the end of the substep, a UFL constant.
     """
@@ -78,10 +78,10 @@ class SourceFeeds(Feeds):
         self.linear = sources.linear
 
     def leaving(self, at: None, fluid: Fluid) -> Leaving:
-        """Return the inflow into the cells as a negative outflow."""
+        """Return the inflow into the cells, as a negative outflow."""
         gain = self._sources.gain(self._pieces)[self._cells]
         return Leaving(-gain, gain=np.abs(gain))
 
     def slope(self, at: None, fluid: Fluid) -> NDArray[np.float64]:
-        """Return minus the derivative of the inflow with respect to the cell's pressure."""
+        """Return minus the derivative of the inflow with respect to the pressure of the cell."""
         return -self._sources.slope(self._pieces)[self._cells]

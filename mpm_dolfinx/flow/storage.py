@@ -6,37 +6,30 @@ The fluid balance of an active cell, with J_Delta = det(I + grad u), is
     int r [zeta(J_Delta, p) - zeta_n] dV_n  +  int sum_faces Q dt  =  0,      d zeta = alpha dJ + S J dp,
     Q = T r [p+ - p- + rho_w g . (x- - x+)],   T = A / (d+ / kappa+ + d- / kappa-),   kappa = k / (rho_w g).
 
-With div u instead of J_Delta, rotations would cause volume changes.  `fluid_content` defines the change of the fluid
-content zeta, and `time_integration` the integral over a substep.  A is the exact area of the body on the face, and k is
-the conductivity.  The points x+ and x- are the centroids of the material in both cells, and d+ and d- are their
-distances from the face.  The centroids, in place of cell midpoints, account for partly filled cells.  `layers` defines
-kappa and d of mixed cells.  `nonorthogonal` corrects the fluxes if the two centroids are offset along the face.
-`drained_sides` treats open sides.
+The fluid content is zeta (`fluid_content`), and `time_integration` defines the integral over a substep.  A is the area
+of the body on the face, and k is the conductivity.  The material in the two cells of a face has the centroids x+ and
+x-, and d+ and d- are their distances from the face.  `layers` defines kappa and d of cells with several soils,
+`nonorthogonal` corrects the fluxes, and `drained_sides` adds open sides.
 
 The factor `r = exp(p / K_w)` is the fluid density divided by the density rho_w at zero pressure.  In the storage term,
-r is taken at the pressure `(p_n + p) / 2`.  On a face, r is the logarithmic mean over both cells.  With this mean,
-`r [p+ - p-]` is the jump of the mass potential (`fluid_content`), and the mass that leaves a cell enters the neighbour.
-The residual is the left side of the balance, divided by the r of the storage term.  The tangent neglects the difference
-between the r of a face and the r of the storage term.
+the pressure in r is `(p_n + p) / 2`.  On a face, r is the logarithmic mean over both cells.  With this mean,
+`r [p+ - p-]` is the jump of the mass potential (`fluid_content`), and fluxes conserve mass.
 
-The volume of a particle domain drifts away from the volume that its fluid content implies.  Each point stores the
-difference of the volumes as its volume defect (`owed`).  Each step corrects a part of this defect at a constant rate.
+The volume of a particle domain drifts away from the volume that its fluid content implies.  Each point stores this
+volume defect (`owed`).  Each step corrects a part of the defect (`stepping/advance.py`).
 
-If no fluid flows within a step, Q1 displacements with DG0 pressures violate the inf-sup condition: pressures that
-alternate from cell to cell do not affect the displacements.  The term `max(0, tau d - dt kappa / d) A [p - p_n]`
-therefore stabilises jumps of the pressure increment.  Here tau (1/Pa) is the strength of the stabilisation, and `d = d+
-+ d-`.  In this term, dt is the length of the step times the coefficient of Q(u, p) in `time_integration`.  The term
-raises the coefficient `dt kappa A / d` of a face to at least `tau d A`.  The term conserves fluid, and it is zero in
-steady states.
+Without flow, Q1 displacements with DG0 pressures violate the inf-sup condition.  Jumps of the pressure increment are
+therefore stabilised by the term `max(0, tau d - dt kappa / d) A [p - p_n]`.  Here tau (1/Pa) is the strength of the
+stabilisation, and d is d+ plus d-.  In this term, dt is the time weight of the flux at the end of the substep.  The
+term conserves fluid, and it is zero in steady states.
 
-For elastic soil, tau is a quarter of the value that Silvester and Kechkar give for patches of elements (Camargo, White
-and Borja 2021).  Soil in plastic flow needs a tau up to a hundred times larger.  The increase of tau acts on second
-differences only (`second_differences`), because damping of jumps would smear steep pressures.
+For elastic soil, tau is a quarter of the value of Silvester and Kechkar for patches of elements (Camargo, White and
+Borja 2021).  In yielding soil, tau is up to a hundred times larger.  The increase of tau acts on second differences
+only (`second_differences`).
 
-With inertia, tau decreases by the factor `1 / (1 + r)`.  Here r is the resistance of the mass of a macroelement,
-divided by the resistance of its stiffness, see `OnGrid.resisting_mass`.  With the static tau, waves in undrained soil
-would be too slow.  If water moves freely in a substep of length dt, the static tau remains: the factor is `min(1, 1 /
-(1 + r) + s)` with `s = kappa rho_w / dt`.
+With inertia, tau has the factor `min(1, 1 / (1 + m) + s)`, with `s = kappa rho_w / dt`.  Here m is the ratio of
+inertial to elastic resistance of 2 x 2 cells (`OnGrid.resisting_mass`).  Without this factor, waves in undrained soil
+would be too slow.
 """
 
 from __future__ import annotations
@@ -71,18 +64,18 @@ from mpm_dolfinx.points.parts import OfParts, Parts
 from mpm_dolfinx.pores.retention import logarithm, restrained
 
 FILTER = 0.75
-"""Fraction, in [0, 1], of `beta V` that the filtered fixed-stress operator omits for checkerboard modes.  Here beta is
-the fixed-stress coefficient, and V is the volume.  Plateau (scene "beam" of tests/plateaus.py): half this value changes
+"""Fraction, in [0, 1], of the fixed-stress term `beta V` that is omitted for checkerboard pressures.  Here beta is the
+fixed-stress coefficient, and V is the volume.  Plateau (scene "beam" of tests/plateaus.py): half this value changes
 the result by 5.2e-11, twice this value by 1.3e-10, and finer cells by 1.5e-02.
 """
 
 
 FluxSlope = Callable[[PETSc.Vec], NDArray[np.float64]]
-"""Function that returns the change of outflow volumes for a change of u, see `StorageProblem.flux_slope`."""
+"""Function of a change of u.  The function returns the change of outflow volumes, see `StorageProblem.flux_slope`."""
 
 
 class CellPressure(NamedTuple):
-    """Pore pressure of the cells (DG0) in a step, Pa.  Between two steps the pressure is in `State.pieces`."""
+    """Pore pressure of the cells (DG0) in a step, Pa."""
 
     now: fem.Function  # at the current iterate
     before: fem.Function  # at the start of the substep
@@ -92,16 +85,14 @@ class CellPressure(NamedTuple):
 class StorageForms:
     """Compiled forms of the fluid balance of a scene.
 
-    `pieces`: quadrature points with the fields `biot`, `storage` (1/Pa) and `storage_at_one` (1/Pa), see
-    `change_of_content`.  With a specific yield, the points also have the field `drainage`: specific yield and suction
-    (Pa), see `skeleton.unsaturated`.
+    `pieces`: quadrature points with the fields for `change_of_content`.  With a specific yield, the points also have
+    the field `drainage`: specific yield and suction (Pa), see `skeleton.unsaturated`.
     `displacement`: increment of the displacement since the start of the step.
     `pressure`: pore pressure of the cells, positive in compression.
-    `materials`: materials and fluid of the scene.  With retention curves, pieces have the fields `retention`, `lever`,
-    `pores`.
+    `materials`: materials and fluid of the scene.
     `weight` (d,), N/m^3: unit weight rho_w g of the pore fluid, as UFL, or None without gravity.
-    `symmetric`: whether to use alpha as the derivative of the content with respect to J_Delta.  If True, the Jacobian
-    is symmetric.  The neglected term is of the order of `(p - p_n) / K_w`.
+    `symmetric`: whether to approximate the derivative of the content with respect to J_Delta by alpha.  The Jacobian is
+    then symmetric.  The neglected term is of the order of `(p - p_n) / K_w`.
     `feeding`: sources and open sides of all stages.
     `inertial`: motion and the inertia force `-rho_w a` on the pore fluid, see `FluxForms`, or None without inertia.
     """
@@ -168,25 +159,24 @@ class StorageForms:
         return b
 
     def derivatives(self, data: PointData) -> list[NDArray[np.float64]]:
-        """Return the derivatives of `change` with respect to p, and with respect to the nodal displacements u.
+        """Return derivatives of the fluid volume in filled cells.
 
-        The derivative with respect to p is an array (filled cells,), in m^d/Pa.  The derivatives with respect to u are
-        one or two arrays (filled cells, n), in m^(d-1).  The first array is for the momentum balance, and
-        differentiates `alpha dJ_Delta`.  The second array differentiates the content.  The second array exists only if
-        `symmetric` is False.
+        The first array (filled cells,), in m^d/Pa, is the derivative of `change` with respect to p.  The second array
+        (filled cells, n), in m^(d-1), is the derivative of `int alpha J_Delta dV` with respect to nodal displacements.
+        If `symmetric` is False, a third array is the derivative of `change` with respect to nodal displacements.
         """
         sums, count = self._derivatives(data), self.grid.dim * 2**self.grid.dim
         return [sums[:, 0], *[sums[:, start : start + count] for start in range(1, sums.shape[1], count)]]
 
     def drained(self, data: PointData) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the storage due to changes of saturation S (m^d/Pa), and the integral `int S d(chi p)/dp dV` (m^d)."""
+        """Return the storage (m^d/Pa) due to changes of the saturation S, and `int S d(chi p)/dp dV` (m^d)."""
         capacity, coupled = self._capacity(data).T
         return capacity, coupled
 
     def driven(
         self, assembled: FacetSum, active: NDArray[np.int64], force: NDArray[np.float64] | None
     ) -> NDArray[np.float64]:
-        """Return the outflow of active cells to other cells due to the pressures and the fluid's weight, in m^d/s.
+        """Return the outflow of active cells to other cells due to pressures and weight of the fluid, in m^d/s.
 
         `force` (c, d), N/m^3: inertia force on the fluid in the local cells; None without inertia or in saturated soil.
         """
@@ -212,7 +202,7 @@ class Outflow:
 
 @dataclass(frozen=True)
 class Rates:
-    """Outflow rates of the owned cells, in m^d/s.  The result of `integrated` has outflow volumes instead, in m^d."""
+    """Outflow rates of the owned cells, in m^d/s, or outflow volumes, in m^d, as result of `integrated`."""
 
     cells: NDArray[np.float64]  # outflow of each cell minus its sources
     net: NDArray[np.float64]  # outflow from the bodies minus sources
@@ -256,7 +246,7 @@ class StorageSystem:
         self.B_momentum = self.B if forms.symmetric else matrix(own, momentum, 2**d * d)
         flows = fluxes.by_motion is not None
         self.by_motion = matrix(own, momentum, d * (d + 1) * 2**d) if flows else None
-        """Derivative (m^(d-1)) of the outflow by inertia with respect to displacements, see `assemble_by_motion`."""
+        """Derivative (m^(d-1)) of the outflow due to inertia with respect to displacements."""
         self.residual, self.step, self._potentials = (own.vector() for _ in range(3))
         self.damp, self._alternation = (form.on(facets) for form in (fluxes.damp, fluxes.alternation))
         self._facets = facets
@@ -291,14 +281,14 @@ class StorageSystem:
         return tuple(form and form.on(facets) for form in (fluxes.flux, fluxes.gravity))
 
     def places(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the grid positions of this process's unknowns, and an empty array: no pressure is prescribed."""
+        """Return the grid positions of the local unknowns, and an empty array for prescribed unknowns."""
         places = self._forms.grid.cell_places(self.unknowns.owned)
         return places, places[:0]
 
     def change_by(self, u: PETSc.Vec, out: PETSc.Vec, *slopes: FluxSlope) -> None:
         """Set `out` to the change (m^d) of the residual due to an increment u.
 
-        `slopes`: changes of the fluxes, with those by inertia, in place of `by_motion`.
+        `slopes`: changes of the fluxes, including inertia, in place of `by_motion`.
         """
         self.B.mult(u, out)
         if self.moves and not slopes:
@@ -312,7 +302,7 @@ class StorageSystem:
         return (self.T * self._potentials).array_r
 
     def set_alternation(self) -> None:
-        """Assemble the matrix L of the filter, see `StorageProblem.assemble_preconditioner`."""
+        """Assemble the matrix L of `StorageProblem.assemble_preconditioner`."""
         zero(self.L)
         self._alternation.assemble_matrix(self.L)
         self.L.assemble()
@@ -324,10 +314,7 @@ class StorageSystem:
         flow: Conduction,
         off: tuple[FacetSum, Gradients, OpenSides] | None,
     ) -> Outflow:
-        """Assemble the fluxes through inner faces.
-
-        `off`: arguments of `NonorthogonalFlow`, or None.
-        """
+        """Assemble the fluxes between cells.  `off`: arguments of `NonorthogonalFlow`, or None."""
         fluxes = self._forms.fluxes
         mobility = fluxes.set_conduction(contents, flow)
         if (relative := self._forms.fluxes.relative) is not None:
@@ -399,11 +386,11 @@ class StorageProblem:
     """The fluid balance in one substep.  The pressure at the start of the step is `forms.p_n`.
 
     `system`: vectors and matrices, with the assembled fluxes.
-    `flow`: function that assembles the outflow at (u, p).  Argument: whether a substep starts.
+    `flow`: function that assembles the outflow at (u, p).  Its argument is True at the start of a substep.
     `dt`: time weight, s, of the rate at (u, p).
     `before`: outflow volumes from the rate of the previous substep.
-    `softness` (m,): softness of the pieces (1 if no law can yield), see `SoftnessAtPoints`.
-    `defect` (n,), m^d: part of the volume defect in the active owned cells that is corrected by the end of the substep.
+    `softness` (m,): ratio of elastic to tangent shear modulus of the pieces, 1 if no law can yield.
+    `defect` (n,), m^d: correction of volume defects in the active owned cells by the end of the substep.
     `inertial`: inertia of the bodies, or None.
     `scale`: suctions (n,), Pa, at which the pores of the active owned cells drain, or None in saturated scenes.
     """
@@ -451,9 +438,7 @@ class StorageProblem:
         """Whether jumps of the pressure are damped in any cell."""
         self._softer = self._damping_of_soft_soil(tau, softest, outflow.mobility) if flows else None
         self._correction = self._begin(outflow)
-        """Non-orthogonal correction (m^d/s) of the fluxes at the start of the substep.  The tangent omits this
-        correction.
-        """
+        """Non-orthogonal correction (m^d/s) of the fluxes, constant in the substep."""
         if self.damped:
             forms.fluxes.dt.value = dt
             zero(system.D)
@@ -498,7 +483,7 @@ class StorageProblem:
         return [one.passing(at, fluid) for one, at in both]
 
     def volumes(self, rates: Sequence[Sequence[Mapping]], seconds: Sequence[float]) -> dict[str, dict]:
-        """Return volumes since the conditions began, see `Feeds.volumes`."""
+        """Return volumes since the start of the conditions, see `Feeds.volumes`."""
         found = [one.volumes(of, seconds) for one, of in zip(self._feeds, zip(*rates, strict=True), strict=True)]
         out: dict[str, dict] = {}
         for quantity, of in (pair for one in found for pair in one.items()):
@@ -521,7 +506,7 @@ class StorageProblem:
         return volumes / (self.forms.derivatives(self.data)[0] + self._contents.fixed_stress)
 
     def filling(self, error: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the errors of the water content due to pressure errors (Pa), and the change of the content."""
+        """Return the errors of the water content due to pressure errors (Pa), and its change in the step."""
         capacity, _ = self.forms.drained(self.data)
         change = self.forms.change(self.data)[self.system.unknowns.owned]
         share = self.fill / self._contents.volume
@@ -548,13 +533,13 @@ class StorageProblem:
 
     @property
     def accuracy(self) -> float:
-        """Largest relative tolerance of linear solvers.  Dry cells store little fluid, and need small errors."""
+        """Largest relative tolerance of linear solvers."""
         return SAME if self.forms.retains else 1.0
 
     def restrained(
         self, dp: NDArray[np.float64], previous: NDArray[np.float64] | float
     ) -> tuple[NDArray[np.float64], NDArray[np.float64] | float]:
-        """Return the limited pressure decreases (Pa), and the resulting changes of the logarithm of the suction.
+        """Return limited pressure decreases (Pa), and the resulting changes of the logarithm of the suction.
 
         `dp` (n,), Pa: pressure decreases in the Newton step.
         `previous` (n,): change of the logarithm of the suction in the previous iteration.
@@ -577,8 +562,8 @@ class StorageProblem:
     def flux_slope(self, u: fem.Function, unknowns: Unknowns, dofs: NDArray[np.int64]) -> FluxSlope:
         """Return a function that maps a change of displacements to the changes (n,) of outflow volumes, in m^d.
 
-        The function computes a matrix-free finite difference (Knoll and Keyes 2004) of the conductivity laws and of the
-        geometry of the fluxes.  After the last call of the function, `set_fluxes` must assemble the fluxes again.
+        The function computes a finite difference (Knoll and Keyes 2004).  After its last call, `set_fluxes` must
+        assemble the fluxes again.
 
         `dofs`: active dofs of u.
         """
@@ -656,7 +641,7 @@ class StorageProblem:
     def net_inflow(self, rates: Rates) -> NDArray[np.float64]:
         """Return the net inflow by fluxes and sources into each filled owned cell in the step, in m^d.
 
-        Volumes refer to the density at mid-step.  `rates`: rates at the end of the substep.
+        `rates`: rates at the end of the last substep.
         """
         return (-self.dt * rates.cells - self._before.cells) / self._density
 
@@ -666,8 +651,8 @@ class StorageProblem:
         """Assemble the derivatives `C = d/dp` and `B = d/du` of the residual at (u, p).
 
         `data`: quadrature points of the pieces, by default the points of the problem.
-        `of_suction`: cells (c,), and derivatives (c, n), m^(d-1), of the nodal forces of these cells with respect to p.
-        Only laws that depend on suction have these derivatives.
+        `of_suction`: cells (c,), and derivatives (c, n), m^(d-1), of their nodal forces with respect to p, for laws
+        that depend on suction.
         """
         forms = self.forms
         system = self.system
@@ -715,8 +700,7 @@ class StorageProblem:
         factor
             Multiple of beta, >= 0.
         share
-            Weight of the filter L, in [0, 1].  The weight 0 gives the fixed-stress operator.  For a checkerboard
-            pressure, `beta V - L` vanishes, as `B K^-1 B^T` does (K: stiffness).  L is the sum of
+            Weight of L, in [0, 1].  For a checkerboard pressure, `beta V - L` is zero.  L is the sum of
             `min(beta V+, beta V-) / (4 d) [p][q]` over the faces.
         """
         system = self.system

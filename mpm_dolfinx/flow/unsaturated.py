@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Fluxes in unsaturated soil: conductivities of faces from the pressures on both sides.
 
-The relative conductivity k_r of a face is the mean of k_r over all pressures between the pressures on both sides
-(`retention.Conductance`).  The k_r of the wetter side would move a wetting front too fast.  With gravity the mean is
-modified (`fitted`), so that steady flow with exponential k_r is exact.  See `series` for mixed cells.
+The relative conductivity k_r of a face is the mean of k_r over all pressures between the pressures on both sides.  With
+gravity, the mean is corrected so that steady flow with exponential k_r is exact (`fitted`).
 """
 
 from __future__ import annotations
@@ -48,15 +47,12 @@ class Between(NamedTuple):
 def fitted(p: Sequence, tables: Sequence[Sequence], drop, scale, of: Functions) -> Between:
     """Return the relative conductivity k_r between the two sides of a face, with derivatives.
 
-    Let k be the mean of k_r over the pressures between both sides.  Let x be the jump of k_r divided by k.  Let y be x
-    times `drop`, divided by the pressure jump.  With `s(z) = sinh(z / 2) / (z / 2)`, the result is `k s(x + y) / (s(x)
-    s(y))`.  The result is exact for steady flow with an exponential k_r (Baker 1995), and never exceeds the k_r of the
-    wetter side.  Without gravity the result is k (Kirchhoff 1894).  For nearly equal pressures, k is the mean of the
-    values on both sides.
+    The mean of k_r over the pressures between both sides is k (Kirchhoff 1894).  The jump of k_r divided by k is x.
+    The product of x and `drop`, divided by the pressure jump, is y.  With `s(z) = sinh(z / 2) / (z / 2)`, the result is
+    `k s(x + y) / (s(x) s(y))`.  The result is exact for steady flow with an exponential k_r (Baker 1995).
 
     `p`: pressures on both sides, Pa.
-    `tables`: three values on each side: integral of k_r (Pa), k_r, derivative of k_r (1/Pa), see
-    `retention.Conductance`.
+    `tables`: three values on each side: integral of k_r (Pa), k_r, and derivative of k_r (1/Pa).
     `drop`: pressure drop from the first side to the second due to the weight of the fluid, Pa.
     `scale`: characteristic suction of k_r, Pa.
     `of`: elementary functions of arrays or of UFL expressions.
@@ -122,7 +118,8 @@ class Relative:
     Attributes
     ----------
     shares
-        Fractions (DG0) of a cell's saturated mobility: of soil without a retention curve, and of soil of each curve.
+        Fractions (DG0) of the saturated mobility of a cell due to soil without a retention curve, and due to each
+        curve.
     laws
         Relative conductivities as functions of pressure.
     """
