@@ -1,11 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Interface of all loads in the momentum balance: tractions, prescribed displacements, tools, weight, user conditions.
 
-Conditions of one kind act on three levels: stage, substep and assembly.  The method `acting(setting)` of a condition
-returns an `Acting`, which is created once in a stage and contains the loaded faces.  The method `placed` of this object
-returns the `Loads` of a substep, for the current position of these faces.  At each assembly, `Loads` add forces to the
-residual and stiffness to the tangent.  The step and the momentum balance call only this interface.  `flow/feeding.py`
-treats conditions on the fluid.
+In each stage, the method `acting(setting)` of a condition creates an `Acting` with the loaded faces.  `Acting.placed`
+returns the `Loads` of a substep, for the current position of these faces.  `Loads` add forces to the residual, and
+stiffness to the tangent.  `flow/feeding.py` defines the same interface for the pore fluid.
 """
 
 from __future__ import annotations
@@ -38,15 +36,15 @@ T = TypeVar("T")
 Outcome = Mapping[str, Mapping[str, NDArray[np.float64]]]
 """Reactions, outflows and other results, by quantity (such as "reactions") and then by condition."""
 QUANTITIES = ("reactions", "wall_reactions", "outflows", "tool_forces", "tool_travel")
-"""Quantities that the conditions of the package return."""
+"""Names of the results of conditions."""
 OF_RAIN = ("runoff", "flowed", "ran_off", "ponded")
-"""Further quantities that scenes with rain return."""
+"""Names of further results in scenes with rain."""
 MOTIONS = ("tool_velocity", "tool_rotation", "tool_spin")
-"""Further quantities that free tools return."""
+"""Names of further results of free tools."""
 
 
 class FormsOf:
-    """Compiled forms of the conditions of a scene, each compiled at its first use."""
+    """Forms of the conditions of a scene, compiled at first use."""
 
     def __init__(self, grid: Grid, u: fem.Function, velocity: Velocity):
         self.grid, self.u = grid, u
@@ -54,7 +52,7 @@ class FormsOf:
         self._made: dict[Callable, Any] = {}
 
     def __call__(self, make: Callable[..., T], *more) -> T:
-        """Return the forms `make(grid, u, *more)`.  The forms of each class `make` are compiled once."""
+        """Return the forms `make(grid, u, *more)`, compiled at the first call with this class `make`."""
         if make not in self._made:
             self._made[make] = make(self.grid, self.u, *more)
         return self._made[make]
@@ -93,7 +91,7 @@ class Setting:
 
 
 class Place(NamedTuple):
-    """Positions and times at which conditions act in a substep."""
+    """Data of a substep for the conditions."""
 
     cut: CutDomains  # particle domains cut by the grid
     fill: NDArray[np.float64]  # fraction of the volume of each local cell that bodies fill
@@ -121,7 +119,7 @@ class Shares(NamedTuple):
 
 
 class At(NamedTuple):
-    """Numbering of the unknowns, displacement increment u of the step, in m, and connected parts."""
+    """Displacements of an iterate: numbering of the unknowns, increment u of the step (m), and connected parts."""
 
     unknowns: Unknowns
     u: NDArray[np.float64]
@@ -134,9 +132,9 @@ class At(NamedTuple):
 
 
 class Loads:
-    """Forces and tangents of the conditions of one kind in a substep.  Methods that are not overridden add nothing.
+    """Forces and tangents of the conditions of one kind in a substep.  The methods of this base class add nothing.
 
-    Arrays b are local nodal forces, in N, as flat arrays.  Entries of ghost nodes are added at the owners of the nodes.
+    Arrays b are local nodal forces, in N, as flat arrays.
     """
 
     linear: bool = True
@@ -146,9 +144,9 @@ class Loads:
     varies: bool = False
     """Whether `loads` and `resists` depend on the displacement."""
     stiff: bool = False
-    """Whether the condition adds a `penalty`."""
+    """Whether `penalty` adds a matrix."""
     holding: bool = False
-    """Whether the condition may add constraints that `touching` does not return."""
+    """Whether the condition may support bodies by other constraints than the constraints of `touching`."""
     couples: bool = False
     """Whether the tangent couples nodes of different cells."""
     rounding_at_unknowns: NDArray[np.float64] | float = 0.0
@@ -158,7 +156,7 @@ class Loads:
     conducts: bool = False
     """Whether fluid may pass between the cells of `within_reach`."""
     key: Any = None
-    """Cache key of the penalty and the pattern, from all data on which they depend except the positions of faces."""
+    """Cache key of penalty matrix and sparsity pattern."""
 
     def joined(self, substeps: Sequence[Any]) -> Loads:
         """Return the loads with a sparsity pattern that is valid in all substeps of the step."""
@@ -172,12 +170,12 @@ class Loads:
         return self
 
     def flown(self, at: At) -> Any:
-        """Return the data of this converged substep that the next substep with inertia needs."""
+        """Return the data of this converged substep for the next substep with inertia."""
 
     def rubbing(self, at: At, v: NDArray[np.float64]) -> tuple[float, float]:
-        """Return the dissipation by slip, and a correction of the external power, both in W, at u on this process.
+        """Return the dissipation by slip, and a correction of the external power, in W, on this process.
 
-        The correction is added to the power of the forces in `push` at the nodal velocities v, in m/s.
+        `v`, m/s: nodal velocities.  The sum of the correction and the power of `push` is the external power.
         """
         return 0.0, 0.0
 
@@ -185,7 +183,7 @@ class Loads:
         """Add forces that are constant during the substep."""
 
     def pulls(self, b: NDArray[np.float64]) -> None:
-        """Add the constant part of the penalty forces.  The force scale of relative residuals omits this part."""
+        """Add the constant part of the penalty forces."""
 
     def loads(self, b: NDArray[np.float64]) -> None:
         """Add forces that depend on u."""
@@ -194,10 +192,10 @@ class Loads:
         """Add resisting forces at u, with the sign of the internal forces."""
 
     def takes_up(self, b: NDArray[np.float64]) -> None:
-        """Add forces at u that count as internal forces, also in the force scale of relative residuals."""
+        """Add forces at u that count as internal forces."""
 
     def penalty(self, A: PETSc.Mat, walls: bool) -> None:
-        """Add the matrix of forces that are linear in u.  `walls`: whether to add rows of dofs that walls fix."""
+        """Add the stiffness matrix of forces that are linear in u.  `walls`: whether to add rows that walls fix."""
 
     def pulling(self, at: At, v: NDArray[np.float64]) -> float:
         """Return the power, in W, of `pulls` and `penalty` at u and the nodal velocities v on this process."""
@@ -207,22 +205,22 @@ class Loads:
         """Add the derivative of `resists` minus `loads` at u, without final assembly."""
 
     def push(self, at: At, residual: PETSc.Vec, on: Unknowns) -> None:
-        """Subtract forces at u from the residual.  The force scale of relative residuals omits these forces."""
+        """Subtract further forces at u from the residual."""
 
     def inertia(self, at: At) -> PETSc.Vec | None:
         """Return the inertia forces at u, in N, or None without inertia."""
 
     def pattern(self, unknowns: Unknowns) -> PETSc.Mat | None:
-        """Return a zero matrix with the entries that `coupling` adds to the pattern of cells, or None."""
+        """Return a zero matrix with the sparsity pattern of `coupling`, or None."""
 
     def joins(self, unknowns: Unknowns) -> PETSc.Mat | None:
-        """Return a zero matrix with the entries by which fluid may couple the pressures of cells, or None."""
+        """Return a zero matrix with the sparsity pattern of couplings between cell pressures, or None."""
 
     def coupling(self, at: At) -> PETSc.Mat | None:
-        """Return the negative derivative of the forces in `push`, without the part that `tangent` adds."""
+        """Return minus the derivative of the forces in `push`, or None if `tangent` adds this derivative."""
 
     def settle(self, at: At, sticks: bool) -> bool:
-        """Update which points slip at u, and return whether any changed.  `sticks`: whether points may stick again."""
+        """Update the set of slipping positions, and return whether it changed.  `sticks` allows returns to stick."""
         return False
 
     def augment(self, at: At) -> bool:
@@ -230,29 +228,29 @@ class Loads:
         return False
 
     def follow(self, at: At) -> bool:
-        """Update the contact positions at u, and return whether equilibrium changed."""
+        """Update the contact positions, and return whether the equilibrium changed."""
         return False
 
     def guess(self, parts: Parts, nodal: NDArray[np.float64]) -> NDArray[np.float64] | None:
         """Return an initial guess of the displacements (nodes, d), in m, or None without a guess."""
 
     def moved(self, u: fem.Function) -> Loads:
-        """Return the loads in the initial state, with the penalty forces that a displacement u (in m) causes."""
+        """Return the loads after an additional displacement u (m) of the nodes."""
         return self
 
     def counted(self, at: At) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return local dofs (n,) on walls, and the loads (n,), in N, that wall reactions omit at these dofs."""
+        """Return local dofs (n,) on walls, and forces (n,), in N, at these dofs that are no wall reactions."""
         return np.empty(0, dtype=np.int64), np.empty(0)
 
     def within_reach(self) -> NDArray[np.int64]:
-        """Return the pairs (n, 2) of cells, by lexicographic index, that the condition may couple in the step."""
+        """Return the pairs (n, 2) of lexicographic cells that the condition may couple in the step."""
         return np.empty((0, 2), dtype=np.int64)
 
     def touching(self) -> tuple | None:
         """Return the initial constraints of this condition.
 
-        Each constraint has cells (n,), opposite cells (n,), positions (n, d) and directions (n, d).
-        Opposite cells belong to another deforming body in contact, and are None without such a body.
+        The result has cells (n,), opposite cells (n,), positions (n, d) and directions (n, d) of n constraints.
+        Opposite cells belong to another body in contact, and are None without another body.
         """
 
     @property
@@ -261,7 +259,7 @@ class Loads:
         return np.empty(0, dtype=np.int32)
 
     def rounding(self, of_cells: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the rounding errors (cells,), in N, of forces in local cells.  `of_cells`: errors of other forces."""
+        """Return the rounding errors (cells,), in N, of forces in local cells.  `of_cells`: errors of the stresses."""
         return of_cells
 
     @property
@@ -274,7 +272,7 @@ class Loads:
         return {}
 
     def gripped(self, at: At, points: MaterialPoints) -> MaterialPoints:
-        """Return the points with an updated history of this condition."""
+        """Return the points with updated data of this condition."""
         return points
 
     def ended(self, at: At) -> Loads:
@@ -282,35 +280,32 @@ class Loads:
         return self
 
     def near(self, points: MaterialPoints, corners: NDArray[np.float64]) -> NDArray[np.bool_] | bool:
-        """Return which corners (n, 2^d, d) are near a contact after a step.  Such corners follow the Q1 field alone."""
+        """Return which corners (n, 2^d, d) are near a contact after a step.  They move by the Q1 field alone."""
         return False
 
     def outside(
         self, corners: NDArray[np.float64], free: NDArray[np.bool_], everywhere: bool = False
     ) -> NDArray[np.float64]:
-        """Return the corners (n, 2^d, d), in m.  Corners in forbidden regions, such as tools, are moved out.
+        """Return the corners (n, 2^d, d), in m, after corners inside tools have moved out.
 
-        `free` (n, 2^d, d): whether no other condition prescribes a component.
-        `everywhere`: whether to correct penetrations of any depth, not only small ones.
+        `free` (n, 2^d, d): components that may change.
+        `everywhere`: whether to correct large penetrations too.
         """
         return corners
 
     def under_held(
         self, ids: NDArray[np.int64], tracked: NDArray[np.float64], volume: NDArray[np.float64], corners: NDArray
     ) -> NDArray[np.float64]:
-        """Return the corners (n, 2^d, d), in m, of re-initialised domains; corners on prescribed sides are `tracked`.
-
-        A domain with a face on a prescribed side becomes a prism of equal volume.
+        """Return the corners (n, 2^d, d), in m, of re-initialised domains.  Domains at prescribed sides become prisms.
 
         `ids` (n,): identifiers of the points.
-        `tracked`: corners that moved with the displacement field.
+        `tracked`, `corners`: corners before and after re-initialisation from F.
         `volume` (n,), in m^d: volumes of the domains.
-        `corners`: corners computed from F.
         """
         return corners
 
     def check_end(self, points: MaterialPoints, before: MaterialPoints) -> None:
-        """Raise an error if points lie in forbidden regions, such as tools, after a step.
+        """Raise an error if the positions after a step are invalid, for example inside a tool.
 
         `before`: points at the start of the step.
         """
@@ -328,13 +323,13 @@ class Acting:
     linear: bool = True
     """Whether the tangent is independent of the displacement."""
     surfaces: Sequence[Surface] = ()
-    """Loaded faces.  The grid cuts the faces of all conditions together."""
+    """Loaded faces."""
     outside: Surface | None = None
     """Faces that tools may touch, or None without tools."""
     held: Sequence[tuple[Any, Surface, Sequence[int]]] = ()
     """Prescribed displacements, each with condition, faces and prescribed axes."""
     seeded: Sequence[Surface] = ()
-    """Further faces whose displacement from the seeded position is needed.  Renewal must not replace their domains."""
+    """Further faces with conditions on displacements since seeding.  Renewal must not replace their domains."""
 
     def placed(self, place: Place) -> Loads:
         """Return the loads of a substep."""
@@ -344,9 +339,9 @@ class Acting:
         """Raise an error if the stage cannot start from the current positions."""
 
     def kept(self, n: int) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return the initial history of n points, by condition and then by name of the data."""
+        """Return initial values of the data of this condition at n points, by condition and name of the data."""
         return {}
 
     def unknown(self, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return the results of the conditions before the first step, all equal to `value`."""
+        """Return results equal to `value`, by quantity and condition."""
         return {}

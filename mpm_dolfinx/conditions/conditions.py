@@ -1,20 +1,16 @@
 # SPDX-License-Identifier: MIT
 """Conditions on sides of bodies: tractions, pressures, displacements, plates, drained sides, prescribed flux, rain.
 
-Sides of seeded bodies are named "left", "right", "bottom" and "top", in 3D also "front" (lower y) and "back" (upper y).
-A name refers to the position of the side before any map.  The sides of a mesh have the names in the mesh (`from_mesh`).
-A side moves with its body, and excludes faces that touched another body at seeding.  Regions and X are reference
-positions before all maps (`mapped`).  Reference areas are areas of the seeded shape, after the maps.
+Sides are named "left", "right", "bottom" and "top", in 3D also "front" (lower y) and "back" (upper y).  The sides of a
+mesh have the names in the mesh (`from_mesh`).  A side moves with its body, and excludes faces in contact with another
+body at seeding.  Regions and X refer to reference positions, before all maps (`mapped`).  Reference areas are areas at
+seeding, after all maps.
 
-A new kind of condition is a class in a separate file.  The method `acting` of this class adds terms to the momentum
-balance (`conditions/acting.py`).  The method `feeding` adds terms to the fluid balance (`flow/feeding.py`).
+A value may be a function of time t, reference positions X and current positions x.  The parameter names of the function
+select its arguments.
 
-A value may be a function of time t, reference positions X and current positions x.  The package passes the arguments
-that the function names, see `validation`.
-
-An invalid condition raises a ValueError when the condition, a scene or a stage is created.  A function with an invalid
-value raises the error in a step.  A condition is equal only to itself, because values and regions may be arrays or
-functions.
+A new type of condition is a class with the method `acting` (`conditions/acting.py`) for terms in the momentum balance,
+or `feeding` (`flow/feeding.py`) for terms in the fluid balance.
 """
 
 from __future__ import annotations
@@ -34,10 +30,7 @@ from mpm_dolfinx.materials.skeleton import Skeleton
 
 @dataclass(frozen=True, eq=False)
 class Condition:
-    """Base class of conditions.  Lists and arrays are copied, so that later changes to them have no effect.
-
-    `name` is the key of the results.  The default name consists of kind and side, such as "displacement_top".
-    """
+    """Base class of conditions.  `name` is the key of the results, by default type and side: "displacement_top"."""
 
     name: str | None = field(default=None, kw_only=True, repr=False)
     FUNCTIONS: ClassVar[Mapping[str, Sequence[str]]] = {"value": NAMES}
@@ -56,7 +49,7 @@ class Condition:
                 check_names(f"{line(self)}: {name}", getattr(self, name), among)
 
     def _given(self, name: str, t: float, *more, **options) -> NDArray[np.float64]:
-        """Return the value of an attribute at time t (s), see `validation.given`."""
+        """Return the value of an attribute at time t (s)."""
         what, among = f"{line(self)}: {name} at t = {t:g} s", self.FUNCTIONS[name]
         return given(what, getattr(self, name), t, *more, among=among, **options)
 
@@ -70,16 +63,16 @@ class Traction(Condition):
     side
         Side of the bodies: "left", "right", "bottom", "top", in 3D also "front" (lower y) and "back" (upper y), or a
         name from a mesh.  The condition applies to all bodies that have a side with this name.
-    value : number or (d,), or callable (t, X, x) -> number or (d,), also for each place, Pa
-        Force per reference area.  A number acts along the outward normal at the start of the step.  A negative number
-        is compressive.  Several tractions on the same face add up.
+    value : number or (d,), or callable (t, X, x) -> number or (d,), also for each position, Pa
+        Force per reference area.  A number is the component along the outward normal at the start of the step, negative
+        in compression.  Several tractions may act on the same face.
     region : ((d,), (d,)), m
-        Lower and upper corner of a box of reference positions.  The traction acts on the parts of faces inside the box.
+        Lower and upper corner of a box of reference positions.  The traction acts inside this box only.
 
     Raises
     ------
     ValueError
-        No point lies on the side, or the value is invalid.  The scene or a step raises the error.
+        No body has this side, or the value is invalid.  The scene or a step raises the error.
     """
 
     side: str
@@ -93,19 +86,19 @@ class Traction(Condition):
 
 @dataclass(frozen=True, eq=False)
 class Pressure(Condition):
-    """Pressure on a side of the bodies, always normal to the moving surface, per current area.
+    """Pressure on a side of the bodies: force per current area, normal to the moving surface.
 
-    A pressure and tractions on the same face add up.  The pressure acts on skeleton and pore fluid together.  If the
-    water enters the pores, a `Drained` must also prescribe the pore pressure.  A uniform pressure has a potential if
-    the loaded surface is closed, or ends at walls that fix the edges of this surface.  Without a potential the tangent
-    is unsymmetric.  The solver is then LU or FGMRES, and the stability of dry equilibria is not checked.
+    The pressure is a total stress.  For water in contact with the pores, a `Drained` must also prescribe the pore
+    pressure (`water` returns both).  The tangent is symmetric if the pressure is uniform, and the loaded surface is
+    closed or ends at walls that fix the normal displacement.  With an unsymmetric tangent, the stability of dry
+    equilibria is not checked.
 
     Parameters
     ----------
     side
         Side of the bodies, as for `Traction`.
     value : float or callable (t, X, x) -> float, Pa
-        Finite number, positive for compression.  Functions of position give an unsymmetric tangent.
+        Finite number, positive for compression.
     region : ((d,), (d,)), m
         As for `Traction`.
 
@@ -128,28 +121,28 @@ class Pressure(Condition):
 class Quiet(Condition):
     """Quiet (absorbing) boundary of bodies with inertia (Lysmer and Kuhlemeyer 1969).
 
-    The traction resists the velocity.  Along the normal, the traction is (rho c_p) times the velocity, with the density
-    rho and the speed c_p of compression waves.  In the tangent plane, the traction is (rho c_s) times the velocity,
-    with the speed c_s of shear waves.  Waves along the normal are absorbed.  Waves at 30 degrees to the normal are
-    reflected with up to 4 % of their energy (nu = 0.2 to 0.4).  If the side was fixed in an earlier stage without
-    inertia, it keeps the tractions of the earlier stage.  Bodies with weight need such a stage, because the kept
-    tractions carry their weight.
+    The viscous traction on the side is rho c_p times the normal velocity, plus rho c_s times the tangential velocity.
+    The density is rho, and c_p and c_s are the speeds of compression and shear waves.  Waves along the normal are
+    absorbed.  Waves at 30 degrees to the normal are reflected with up to 4 % of their energy (nu = 0.2 to 0.4).
+
+    Bodies with weight need an earlier stage without inertia, in which a `Displacement` fixes the side.  The tractions
+    at the end of this stage continue to act on the quiet side.
 
     Parameters
     ----------
     side
         Side of the bodies, as for `Traction`.
     incoming : (d,) or callable t (s) -> (d,), m/s
-        Particle velocity of a wave that enters along the inward normal.  A free surface moves at twice this velocity.
+        Particle velocity of a wave that enters along the inward normal.  A free surface doubles this velocity.
     region : ((d,), (d,)), m
         As for `Traction`.
 
     Raises
     ------
     ValueError
-        The scene raises the error.  The bodies have no inertia, or had inertia before the side became quiet.  No point
-        lies on the side.  Another `Quiet`, or a `Displacement` of all components, is on the same part of a face.  A
-        wall of the grid fixes the side.  The weight changes when the stage begins.
+        The scene raises the error.  The bodies have no inertia, or had inertia before the side became quiet.  No body
+        has this side.  Another `Quiet`, or a `Displacement` of all components, is on the same part of a face.  A wall
+        of the grid fixes the side.  Gravity changes at the start of the stage.
     """
 
     side: str
@@ -166,22 +159,22 @@ class Quiet(Condition):
 class OnSide(Condition):
     """User-defined UFL term on a side of the bodies, such as springs, dashpots or loads that depend on the motion.
 
-    An `OnSide` is an element of the scene's `terms`, and acts in all stages.
+    `Simulation(terms=[OnSide(...)])` adds the term to the momentum balance in all stages.
 
     Parameters
     ----------
     side
         Side of the bodies, as for `Traction`.
     term
-        Function as in `terms`, see `user_functions`.  The `points` of the term are quadrature points on the side.
-        `points.dx` is the area measure, and `points.normal` the outward normal, both at the start of the step.
+        Function that returns a UFL form, see `user_functions`.  Its argument `points` has the area measure `points.dx`
+        and the outward normal `points.normal`, both at the start of the step.
     region : ((d,), (d,)), m
         As for `Traction`.
 
     Raises
     ------
     ValueError
-        The function is invalid, or no point lies on the side.  The scene raises the error.
+        The function is invalid, or no body has this side.  The scene raises the error.
     """
 
     side: str
@@ -194,19 +187,20 @@ class OnSide(Condition):
 class Source:
     """User-defined UFL term in the fluid balance: a source or sink in the bodies.
 
-    A `Source` is an element of the scene's `terms`, and acts in all stages.
+    `Simulation(terms=[Source(...)])` adds the term to the fluid balance in all stages.
 
     Parameters
     ----------
     term
-        Function of a test function q of the pressure, see `user_functions`.  A positive term (in 1/s) adds fluid.
+        Function that returns a UFL form, linear in the test function q of the pressure, see `user_functions`.  A
+        positive rate (1/s) adds fluid.
     """
 
     term: Callable
 
 
 def sorted_terms(terms: Sequence[Callable | OnSide | Source]) -> tuple[list[Callable | OnSide], list[Callable]]:
-    """Return the user's terms of the momentum balance, and the user's terms of the fluid balance."""
+    """Return the user-defined terms of the momentum balance, and of the fluid balance."""
     if isinstance(terms, (str, bytes)) or not isinstance(terms, Sequence):
         raise ValueError(f"terms = {line(terms)}, must be a list of functions, OnSide and Source")
     sources = [term.term for term in terms if isinstance(term, Source)]
@@ -226,25 +220,25 @@ class Through(NamedTuple):
 class Drained(Condition):
     """Side of the bodies with a prescribed pore pressure.
 
-    The side moves with the bodies.  `outflows` of the simulation contain the flow through the side.
+    `Simulation.outflows` contains the flow through the side.
 
     Parameters
     ----------
     side
         Side of the bodies, as for `Traction`.
     pressure : float or callable (t, X, x) -> float, Pa
-        Finite pore pressure outside.  Below a water level: lambda t, x: 9810 * np.maximum(level(t) - x[:, 1], 0).
+        Finite pore pressure at the side.  Below a water level: lambda t, x: 9810 * np.maximum(level(t) - x[:, 1], 0).
     region : ((d,), (d,)), m
-        Box of reference positions.  The parts of faces inside the box are drained.
+        Box of reference positions.  The condition acts inside this box only.
     seepage
-        Whether the side is a seepage face.  Then, where the outside pressure is <= 0 (above a water level), water can
-        leave but not enter.  The pore pressure equals the outside pressure where water leaves, and is lower elsewhere.
+        Whether the side is a seepage face above the water level, which is where `pressure` <= 0.  Water can leave
+        through a seepage face, but cannot enter.
 
     Raises
     ------
     ValueError
-        The pressure is not finite.  The scene raises the error without fluid, or without a point on the side.  Another
-        `Drained` or `Inflow` is on the same part of a face.
+        The pressure is not finite, the scene has no fluid, or no body has this side.  Another `Drained`, `Inflow` or
+        `Rain` is on the same part of a face.
     """
 
     side: str
@@ -295,10 +289,9 @@ class Inflow(Flux):
     side
         Side of the bodies, as for `Traction`.
     flux : float or callable (t, X, x) -> float, m/s
-        Volume of inflow per current area and time.  The volume refers to zero pressure.  The flux is finite, and
-        negative for outflow.
+        Volume (at zero pressure) of inflow per current area and time.  The flux is finite, and negative for outflow.
     region : ((d,), (d,)), m
-        Box of reference positions.  Fluid enters through the parts of faces inside the box.
+        Box of reference positions.  The condition acts inside this box only.
 
     Raises
     ------
@@ -317,30 +310,31 @@ class Inflow(Flux):
 
 @dataclass(frozen=True, eq=False)
 class Rain(Flux):
-    """Side of the bodies with rain or evaporation, limited by the soil's capacity to take up or release water.
+    """Side of the bodies with rain or evaporation.
 
-    Rain infiltrates until the pressure at the side reaches `ponding`.  Further rain runs off.  Water evaporates at the
-    prescribed rate until the pressure at the side falls to `driest`.  Water can also seep out of the side.  `outflows`
-    of the simulation contain the flow through the side.  `simulation.outcome("runoff")` is the run-off, in m^3/s (m^2/s
-    in plane strain).  Three further outcomes are volumes since the condition began, in m^3 (m^2 in plane strain).
-    `outcome("flowed")` is the outflow through each open side.  `outcome("ran_off")` is the run-off and seepage.
-    `outcome("ponded")` is the ponded water.
+    All rain infiltrates while the pressure at the side is below `ponding`.  Otherwise, a part of the rain runs off.
+    Water evaporates at the prescribed rate while the pressure at the side is above `driest`.  Seepage out of the side
+    is possible.
+
+    `Simulation.outflows` contains the flow through the side, and `outcome("runoff")` the run-off, in m^3/s (m^2/s in
+    plane strain).  `outcome("flowed")` is the total outflow since the start of the condition, in m^3 (m^2 in plane
+    strain).  `outcome("ran_off")` is the total of run-off and seepage, and `outcome("ponded")` the volume of the pond.
 
     Parameters
     ----------
     side
         Side of the bodies, as for `Traction`.
     flux : float or callable (t, X, x) -> float, m/s
-        Volume of rain per current area and time.  The volume refers to zero pressure.  The flux is finite, and negative
-        for potential evaporation.  Vertical rain of rate r on a slope of angle b has the flux r cos(b).
+        Volume (at zero pressure) of rain per current area and time.  The flux is finite, and negative for potential
+        evaporation.  Vertical rain of rate r on a slope of angle b has the flux r cos(b).
     ponding
-        Largest pressure >= 0 of ponded water, in Pa: depth times unit weight.  The pond has one depth for the whole
-        side.  Water runs off once the pond is full.  Ponded water infiltrates or evaporates later.
+        Pressure of a full pond, in Pa, >= 0: largest depth times unit weight.  The pond has uniform depth over the
+        side.  Ponded water infiltrates or evaporates later.
     driest
         Lowest pressure at the side, in Pa, < 0 and finite: the pore pressure in equilibrium with the air.  By
         Kelvin's equation, -1e7 Pa corresponds to air of 93 % humidity at 20 °C.  In other units, give a value.
     region : ((d,), (d,)), m
-        Box of reference positions.  Rain falls on the parts of faces inside the box.
+        Box of reference positions.  The condition acts inside this box only.
 
     Raises
     ------
@@ -366,10 +360,10 @@ class Rain(Flux):
 
 @dataclass(frozen=True, eq=False)
 class Tied(Condition):
-    """Two opposite sides of a box with equal displacements, as in ground that repeats itself beyond the box.
+    """Two opposite sides of a box with equal displacements (periodic boundary condition).
 
-    At equal heights, forces on both sides are equal and opposite, with and without inertia.  A wave that leaves the box
-    at one side enters at the opposite side.  No water flows through tied sides.
+    Forces on both sides are equal and opposite.  A wave that leaves the box at one side enters at the other side.  No
+    water flows through tied sides.
 
     Parameters
     ----------
@@ -397,32 +391,29 @@ cells by 4.8e-05.
 HOLD = 3e2
 """Penalty stiffness for prescribed displacements, times cell size, divided by the `holding` modulus.
 
-The penalty acts on means over cells.  The displacement error is the change of traction in the step, divided by the
-stiffness; rotations of the traction cause no error.  The error does not accumulate, because each step measures it from
-the prescribed position.  If a body is much stiffer than the penalty, multipliers remove the error, see
-`HoldLoads.augment`.  Plateau (scene "soil" of tests/plateaus.py): half this value changes the result by 5.9e-05, twice
-this value by 2.0e-05, and finer cells by 3.0e-02.
+The displacement error is the change of the traction in the step, divided by the stiffness.  If a body is much stiffer
+than the penalty, multipliers remove this error (`HoldLoads.augment`).  Plateau (scene "soil" of tests/plateaus.py):
+half this value changes the result by 5.9e-05, twice this value by 2.0e-05, and finer cells by 3.0e-02.
 """
 YIELDING = 0.1
 """Factor on the elastic modulus in the penalty of laws with state variables.
 
-Yielding soil is much softer than elastic soil. Plateau (scene "soil" of tests/plateaus.py): half this value changes the
-result by 6.5e-05, twice this value by 1.9e-05, and finer cells by 3.0e-02.
+Plateau (scene "soil" of tests/plateaus.py): half this value changes the result by 6.5e-05, twice this value by 1.9e-05,
+and finer cells by 3.0e-02.
 """
 
 
 def resistance(material: Skeleton) -> NDArray[np.float64]:
-    """Return the reference modulus, in Pa, of a side: the oedometric modulus, but at most 4G, its value at nu = 1/3."""
+    """Return the reference modulus, in Pa, of a side: the smaller of oedometric modulus and 4 G."""
     return np.minimum(material.oedometric, 4 * material.shear)
 
 
 def holding(material: Skeleton) -> NDArray[np.float64]:
     """Return the reference modulus, in Pa, of the penalty for prescribed displacements.
 
-    A Q1 field with constant volumetric strain in each cell cannot follow a curved side.  The penalty converts the
-    difference between this field and the side into pressure.  The penalty must therefore not be stiff compared with the
-    shear stiffness.  In an undrained cavity, a penalty of 300 (lambda + 2G) gives up to 1.9 times the exact pressure.
-    A penalty of 30 (4G) gives 1.01 times the exact pressure.
+    A nearly incompressible Q1 field cannot follow a curved side, so the penalty must not be much stiffer than the shear
+    stiffness.  In an undrained cavity, a penalty of 300 (lambda + 2G) gives up to 1.9 times the exact pressure.  A
+    penalty of 30 (4G) gives 1.01 times the exact pressure.
     """
     return (YIELDING if material.state else 1.0) * resistance(material)
 
@@ -431,27 +422,25 @@ def holding(material: Skeleton) -> NDArray[np.float64]:
 class Displacement(Condition):
     """Side of the bodies with a prescribed displacement, such as a side under a footing or in a moving clamp.
 
-    `reactions` of the simulation contain the forces on the side.
+    `Simulation.reactions` contains the forces of the side on the bodies.
 
     Parameters
     ----------
     side
         Side of the bodies, as for `Traction`.
     value : (d,) or callable (t, X) -> (d,) or (m, d), m
-        Displacement at reference positions X (m, d), since the start or the last stage that set displacements to zero.
-        In a mapped body, the map converts X to seeded positions.  The value has all d components, even if some are not
-        prescribed.
+        Displacement at reference positions X (m, d), since the start, or since a stage set displacements to zero.  The
+        value has d components, also if some components are not prescribed.
     components
         Prescribed components, such as "y".  By default all d components are prescribed.
     region : ((d,), (d,)), m
-        Box of reference positions.  The displacement is prescribed on faces inside the box.  If the box ends within a
-        cell, the cell also has a node outside the box.  This node is prescribed if the box covers more than half of the
-        cell.
+        Box of reference positions.  The displacement is prescribed inside this box.  The box may end within a cell.
+        The outer node of this cell is prescribed too if the box covers more than half of the cell.
 
     Raises
     ------
     ValueError
-        No point lies on the side, or value or components are invalid.  A wall fixes a component that moves.  Another
+        No body has this side, or value or components are invalid.  A wall fixes a component that moves.  Another
         `Displacement` prescribes the component on the same part of a face, or another value at a common edge.  The
         scene or a step raises the error.
     """
@@ -469,7 +458,7 @@ class Displacement(Condition):
         return sorted("xyz".index(c) for c in set(self.components or "xyz"[:dim]))
 
     def at(self, t: float, X: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the displacements (n, d), in m, at time t (s) of places with reference positions X (n, d), in m."""
+        """Return the displacements (n, d), in m, at time t (s) and reference positions X (n, d), in m."""
         value = self._given("value", t, lambda name: X, X.shape[1], number=False)
         return np.broadcast_to(value, X.shape)
 
@@ -484,25 +473,24 @@ class _OfPlate(Traction):
 
 @dataclass(frozen=True, eq=False)
 class RigidPlate(Condition):
-    """Rigid, smooth plate on a flat side of the bodies.  All faces have an equal displacement normal to the side.
+    """Rigid, smooth plate on a flat side of the bodies.  The displacement normal to the side is uniform.
 
-    The penalty energy (kappa/2 int (grad_t x_n)^2 dA) keeps the plate flat and prevents tilting.  Here x_n is the
-    position along the normal, grad_t is the gradient along the side, and kappa is the stiffness from `RIGIDITY`.  The
-    penalty does not resist a uniform displacement, so the plate transfers the total force exactly.
+    The penalty energy is kappa/2 int (grad_t x_n)^2 dA, with the position x_n along the normal, the gradient grad_t
+    along the side, and the stiffness kappa (`RIGIDITY`).  The plate transfers the total force exactly.
 
     Parameters
     ----------
     side
         Side of the bodies, as for `Traction`.  The seeded faces must be connected, and in one plane normal to an axis.
     force : float or callable t (s) -> float, N (N/m in plane strain)
-        Total force on the side, positive for compression.  In axisymmetry it acts on the whole circumference.
+        Total force on the side, positive for compression.  In axisymmetry, it is the total over the circumference.
     region : ((d,), (d,)), m
-        Box of reference positions.  The plate lies on the faces inside the box.
+        Box of reference positions.  The plate acts inside this box only.
 
     Raises
     ------
     ValueError
-        The force is not finite, or no point lies on the side.  The faces are not connected or not coplanar; define one
+        The force is not finite, or no body has this side.  The faces are not connected or not coplanar; define one
         plate, with a region, for each part.  The scene or a step raises the error.
     """
 
@@ -517,7 +505,7 @@ class RigidPlate(Condition):
             numbers("RigidPlate: force", self.force)
 
     def traction(self, area: float, inward: NDArray[np.float64]) -> Traction:
-        """Return the plate's traction: the force along `inward` (d,), divided by the reference `area`, in m^(d-1)."""
+        """Return the force along `inward` (d,), divided by the reference `area`, in m^(d-1), as a traction."""
 
         def even(t: float) -> NDArray[np.float64]:
             return inward * self._given("force", t) / area

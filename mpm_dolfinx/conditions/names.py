@@ -20,5 +20,5 @@ class ByName(dict[str, T]):
         return np.stack(list(self.values())) if self else np.zeros(0)
 
     def __missing__(self, name: Any) -> T:
-        """Raise a KeyError for an unknown name, or for an index used as a name."""
+        """Raise KeyError for an unknown name."""
         raise KeyError(f"{name!r}: must be the name of a condition: {', '.join(map(repr, self)) or 'there is none'}")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Recorded motions: displacements as functions of time, from recorded accelerations or velocities."""
+"""Displacements as functions of time, from recorded accelerations or velocities."""
 
 from __future__ import annotations
 
@@ -26,13 +26,12 @@ class Record:
     record : file, or (n, 2)
         Two columns: times (in s) and values.  Blanks or commas separate the columns of a file, and # starts a comment.
     direction : (d,)
-        Direction of the motion.  The vector's length multiplies the values.  For a record in units of g, use
-        (9.81, 0).
+        Direction of the motion, with a length that multiplies the values: for a record in units of g, (9.81, 0).
     quantity
         Recorded quantity: "acceleration" (m/s^2) or "velocity" (m/s).
     at_rest
-        Whether to correct the accelerations by a linear function of time, so that the motion ends at its initial
-        position with zero velocity.  Without the correction, a record with a non-zero integral ends in motion.
+        Whether to correct the accelerations by a linear function of time, so that displacement and velocity are zero at
+        the end of the record.
 
     Raises
     ------
@@ -86,7 +85,7 @@ class Record:
         return self._within(self._of[0], t) * (t <= self.end)
 
     def _within(self, value: scipy.interpolate.PPoly, t: float) -> NDArray[np.float64]:
-        """Return a quantity at time t, which is zero before the record and constant after the record."""
+        """Return a quantity at time t: zero before the record, and constant after the record."""
         return self.direction * (float(value(min(t, self.end))) if t >= value.x[0] else 0.0)
 
 

@@ -19,10 +19,7 @@ from mpm_dolfinx.parallel.exchange import over_all
 
 
 class Sides:
-    """Finder of the faces on which a condition acts.  Conditions on the same faces share one `Surface`.
-
-    `present`: whether each body is active in the stage.
-    """
+    """Finder of the faces on which a condition acts.  `present`: whether each body is active in the stage."""
 
     def __init__(self, grid: Grid, bodies: Sequence[Body], present: Sequence[bool]):
         self.grid = grid
@@ -31,7 +28,7 @@ class Sides:
         self._found: dict[tuple[str, bytes], Surface] = {}
 
     def of(self, condition) -> Surface:
-        """Return the faces of a condition's side in its region, or raise ValueError if there are none."""
+        """Return the faces of a condition.  Raise ValueError if there are no faces."""
         found = self._of(condition.side, condition.region)
         if not len(found):
             where = " in the region" if condition.region is not None else ""
@@ -52,12 +49,11 @@ class Sides:
         return self._found[key]
 
     def held(self, condition: Displacement, others: Sequence[Displacement]) -> Surface:
-        """Return the faces of a prescribed displacement, except in cells that its region covers by at most one half.
+        """Return the faces of a prescribed displacement.
 
-        The last prescribed node also moves half a cell of the side beyond this node.  If the region covers at most half
-        of the cell in which it ends, the faces therefore end where the region enters this cell.  On a side inclined to
-        the grid, the faces end half a cell before the end of the region.  Both rules apply only if the side continues
-        outside the region, and no other prescribed displacement (`others`) acts there.
+        If the region ends in a cell, and covers at most half of this cell, the faces in the cell are excluded.  On a
+        side inclined to the grid, the faces end half a cell before the end of the region.  Both rules apply only if the
+        side continues beyond the region without another prescribed displacement (`others`).
         """
         faces, d = self.of(condition), self.grid.dim
         box, X = faces.region.copy(), faces.X
@@ -108,7 +104,7 @@ class Sides:
         return share / abs(float(slope[a])) if share <= (1 + NEAR) / 2 else 0.0
 
     def check_moves(self, one, holds: Iterable[Displacement], free: NDArray[np.bool_]) -> None:
-        """Raise ValueError if prescribed displacements or a wall fix all displacement components on a condition's side.
+        """Raise ValueError if walls or prescribed displacements fix all displacement components on the side.
 
         `free` (nodes, d): whether no wall fixes a component.
         """
@@ -140,10 +136,7 @@ class Sides:
         return joined([self.around(np.flatnonzero(copy == group).tolist()) for group in np.unique(copy)])
 
     def meeting(self, one: Surface, other: Surface) -> NDArray[np.float64]:
-        """Return the reference positions (n, d), in m, of corners that faces of two conditions have in common.
-
-        Corners of a mapped body are never common to faces of other bodies.
-        """
+        """Return the reference positions (n, d), in m, of common corners of the faces of two conditions."""
         dim, ends = self.grid.dim, np.cumsum([len(body) for body in self.bodies])
         moved = np.array([i if body.map is not None else -1 for i, body in enumerate(self.bodies)])
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Unit weight of the fluid under the scene's gravity, which converts hydraulic conductivity to mobility."""
+"""Unit weight of the fluid, which converts hydraulic conductivity to mobility."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Gravity = ArrayLike | Callable[[float], ArrayLike] | None
 
 
 def under(fluid: Fluid | None, gravity: Gravity) -> Fluid | None:
-    """Return the fluid, with conductivities for the scene's gravity if this gravity is constant."""
+    """Return the fluid with the gravity of the scene, if this gravity is constant."""
     if fluid is None or fluid.gravity is not None or gravity is None or callable(gravity):
         return fluid
     strength = float(np.linalg.norm(numbers("gravity", gravity, None, allowed="finite numbers")))
@@ -56,7 +56,7 @@ def with_weight(condition: T, fluid: Fluid | None) -> T:
 
 
 def warn_units(comm: MPI.Intracomm, fluid: Fluid, gravity: Gravity) -> None:
-    """Warn if no gravity is specified, and no liquid has the fluid's constants in SI units."""
+    """Warn if the scene has no gravity, and the constants of the fluid are implausible in SI units."""
     if fluid.gravity is not None or gravity is not None:
         return
     if not DENSITIES[0] <= fluid.density <= DENSITIES[1] or fluid.bulk < SOFTEST:
@@ -71,10 +71,7 @@ def warn_units(comm: MPI.Intracomm, fluid: Fluid, gravity: Gravity) -> None:
 
 
 def warn_levels(comm: MPI.Intracomm, fluid: Fluid | None, gravity: Gravity, levels: Sequence[tuple[str, Any]]) -> None:
-    """Warn about each water level whose unit weight differs from the pore fluid's.
-
-    A dry scene with gravity has no pore fluid.  The function then warns about levels whose default unit weight is not
-    the unit weight of water under this gravity.
+    """Warn of water levels with another unit weight than the pore fluid, or in dry scenes than water.
 
     `levels`: name and water pressure of each level.
     """
@@ -95,7 +92,7 @@ def warn_levels(comm: MPI.Intracomm, fluid: Fluid | None, gravity: Gravity, leve
 def other_gravity(fluid: Fluid, gravity: Sequence[NDArray[np.float64]]) -> float | None:
     """Return the last magnitude of `gravity`, in m/s^2, or None if conductivities refer to this gravity.
 
-    A gravity that varies in the step is returned only if its last magnitude is above 9.81 m/s^2.
+    If gravity varies in the step, the result is None up to 9.81 m/s^2.
 
     `gravity`: accelerations of gravity, in m/s^2, at the start of a step and at later times in the step.
     """

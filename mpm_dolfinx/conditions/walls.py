@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Walls of the grid: the displacement components that walls fix, and the forces of walls on bodies.
+"""Walls of the grid: fixed displacement components, and forces on bodies.
 
-The argument `walls` of a function gives the fixed components of each wall by name.
+The argument `walls` of functions maps the name of each wall to its fixed components.
 """
 
 from __future__ import annotations
@@ -52,9 +52,9 @@ def fixed_corners(grid: Grid, walls: Mapping[str, str], corners: NDArray[np.floa
 def stopped(
     grid: Grid, walls: Mapping[str, str], corners: NDArray[np.float64], before: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the corners (n, 2^d, d), in m, of particle domains, with corners outside the grid moved to its sides.
+    """Return the corners (n, 2^d, d), in m, of particle domains, after corners outside the grid have moved onto walls.
 
-    A corner moves if the wall at this side fixes the normal component, or if its old position `before` was in the grid.
+    Corners also move onto sides without a wall, if their old positions `before` were inside the grid.
     """
     shut = np.zeros((2, grid.dim), dtype=bool)
     for name, axes in walls.items():
@@ -69,10 +69,10 @@ def wall_forces(
 ) -> dict[str, NDArray[np.float64]]:
     """Return the force (d,), in N, of each wall by name.  All processes must call this function.
 
-    If several walls fix a component of a node, the wall normal to this component carries the force.  If none of these
-    walls is normal to the component, they share the force equally.  The axis of revolution has no radial force.
+    If several walls fix a component of a node, the wall normal to this component has the force.  Otherwise these walls
+    have equal shares of the force.
 
-    `dofs` (n,): flat local degrees of freedom, possibly repeated; free degrees of freedom are ignored.
+    `dofs` (n,): flat local degrees of freedom, possibly repeated.
     `forces` (n,), in N: forces on these degrees of freedom.
     """
     d, sides = grid.dim, SIDES[grid.dim]

@@ -25,7 +25,7 @@ def water(
     """Return two conditions for still water at a side.  The scene must have both conditions.
 
     Below the water level, hydrostatic pressure acts on the surface and on the pore fluid.  Above the level, the side is
-    a seepage face.  In each step both conditions follow the motion of the side.
+    a seepage face.
 
     Parameters
     ----------
@@ -34,7 +34,7 @@ def water(
     level : float or callable t (s) -> float, m
         Coordinate of the water level along the last axis.  The level must be finite.
     region : ((d,), (d,)), m
-        Box of reference positions.  Water acts on the parts of faces inside the box.
+        Box of reference positions.  Water acts inside this box only.
     unit_weight
         Unit weight > 0 of the water, in N/m^3.  The default is the unit weight of the scene's fluid.  A warning is
         issued if the unit weight differs from fluid density times gravity.
@@ -42,7 +42,7 @@ def water(
     Raises
     ------
     ValueError
-        A value is out of range.  An invalid value of a function raises the error in the step that needs the value.
+        A value is out of range.  For a function, a step raises the error.
     """
     if unit_weight is not None:
         numbers("water: unit_weight", unit_weight, test=lambda v: (0 < v) & (v < np.inf), allowed="> 0 and finite")
