@@ -1,14 +1,12 @@
 # SPDX-License-Identifier: MIT
-"""Direct linear solvers, used where they are faster than multigrid (`multigrid`): see `plan`.
+"""Direct linear solvers.  `solver_choice.plan` chooses between direct solvers and multigrid.
 
-On one process, PETSc factorises displacement matrices with a block for each node.  `dissection` orders the nodes along
-grid lines.  `bash demos/run.sh calibrate` prints the times of several solvers.  With 33000 unknowns in 2D and a
-symmetric matrix, the first factorisation takes 214 ms with blocks of nodes, and 888 ms with scalar entries in minimum
-degree order.  CHOLMOD takes 185 ms, UMFPACK 286 ms, and MUMPS 722 ms.
+On one process, PETSc factorises displacement matrices with a block for each node, in nested-dissection order.  With
+33000 unknowns in 2D and a symmetric matrix, the first factorisation takes 214 ms with these blocks, and 888 ms without
+blocks in minimum degree order.  CHOLMOD takes 185 ms, UMFPACK 286 ms, and MUMPS 722 ms.
 
-On several processes, one process holds the factors of displacements: shared factors would slow down the many solves.
-At the same time, another process computes the factors of pressures.  In large scenes all processes share the factors of
-MUMPS (`Thresholds.mumps`).
+On several processes, one process has the factors of displacements, and another process the factors of pressures.  In
+large scenes, all processes share the factors of MUMPS (`Thresholds.mumps`).
 """
 
 from __future__ import annotations
@@ -29,8 +27,8 @@ from mpm_dolfinx.solve.solver_choice import MUMPS, NODAL
 MOST = 500
 """Largest number of iterations of a linear solve. The Krylov space has this dimension, so GMRES never restarts.
 
-With PETSc's default, a restart every 30 iterations, FGMRES stagnates on the nearly singular tangent of a footing, and
-ends after 500 iterations. Without restarts, FGMRES takes 50 iterations. PETSc allocates the vectors on demand.
+With a restart every 30 iterations (the default of PETSc), FGMRES stagnates on the nearly singular tangent of a footing.
+Without restarts, FGMRES takes 50 iterations.
 """
 TOLERABLE = (-3, -8, -10)  # PETSc's reasons: too many iterations, indefinite preconditioner, indefinite matrix
 
@@ -41,8 +39,8 @@ def direct_solver(
     """Return a solver that factorises A at the first solve and after changes of A.
 
     `symmetric`: whether the factors are L D L^T.
-    `gathered`: whether only the last process holds the factors, which suits many solves with the same matrix.
-    `package`: package of the factorisation, by default PETSc on one process, and MUMPS on several.
+    `gathered`: whether only the last process has the factors, for many solves with the same matrix.
+    `package`: package of the factorisation, by default PETSc on one process, and MUMPS on several processes.
     """
     if symmetric:
         A.setOption(PETSc.Mat.Option.SYMMETRIC, True)
@@ -72,17 +70,14 @@ def _preonly(A: PETSc.Mat, name: str) -> PETSc.KSP:
 
 
 def renew(A: PETSc.Mat) -> None:
-    """Rebuild the sparsity pattern of a matrix in PETSc after sums with other matrices.
-
-    PETSc has grouped rows with equal patterns before the sums. LU factors with these groups would be wrong.
-    """
+    """Rebuild the sparsity pattern of a matrix in PETSc after sums with other matrices."""
     A.setPreallocationCSR([part.copy() for part in A.getValuesCSR()])
 
 
 def solved(ksp: PETSc.KSP, name: str) -> int:
-    """Return the number of iterations of a solver's last solve. Raise NotConverged if this solve failed.
+    """Return the number of iterations of the last solve. Raise NotConverged if this solve failed.
 
-    An indefinite tangent is no failure, nor is the end of all iterations: the line search tests the result.
+    An indefinite matrix or the largest number of iterations is no failure, because the line search tests the result.
     """
     count, reason = ksp.getIterationNumber(), ksp.getConvergedReason()
     if reason < 0 and reason not in TOLERABLE:
@@ -113,7 +108,7 @@ def _set_gathered(ksp: PETSc.KSP, A: PETSc.Mat, factors: NodalFactors | SingleFa
 
 
 def factorise(*preconditioners: PETSc.PC) -> None:
-    """Factorise all matrices, at the same time if different processes hold their factors."""
+    """Factorise all matrices, in parallel if different processes have their factors."""
     for pc in preconditioners:
         pc.setUp()
     for pc in preconditioners:
@@ -122,14 +117,11 @@ def factorise(*preconditioners: PETSc.PC) -> None:
 
 
 class Gathered:
-    """Preconditioner for PETSc: factors of a matrix on one process.
+    """Preconditioner for PETSc: factors of a matrix on one process. `setUp` gathers the matrix.
 
     `x`: vector with an entry for each column of the matrix.
     `factors`: factors of the whole matrix.
-    `rank`: process that holds the factors.
-
-    `setUp` gathers a matrix. The next solve computes its factors. The function `factorise` computes the factors of
-    several matrices at the same time.
+    `rank`: process of the factors.
     """
 
     def __init__(self, x: PETSc.Vec, factors: NodalFactors | SingleFactors, rank: int):
@@ -206,7 +198,7 @@ class NodalFactors:
     """Factors of displacement matrices with a block for each node, on the first process, computed on demand.
 
     `unknowns`: unknown displacements, with consecutive components of each node.
-    `symmetric`: whether the factors are U^T D U instead of L U.
+    `symmetric`: whether the factors are U^T D U, or else L U.
     """
 
     def __init__(self, unknowns: Unknowns, symmetric: bool):
@@ -254,7 +246,7 @@ def dissection(x: NDArray[np.float64]) -> NDArray[np.int64]:
 
 
 def _lines(x: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return the index of each coordinate's grid line. Only lines with nodes are counted."""
+    """Return the index of the grid line of each coordinate. Only lines with nodes are counted."""
     values, at = np.unique(x, return_inverse=True)
     return np.cumsum(np.diff(values, prepend=values[:1]) > SAME * (values[-1:] - values[:1]))[at]
 
@@ -266,7 +258,7 @@ class BlockFactors:
     `block`, `axis`: node and component of each unknown.
     `x` (n, d): position of each unknown, m.
     `dim`: number of components of a node.
-    `symmetric`: whether the factors are U^T D U instead of L U.
+    `symmetric`: whether the factors are U^T D U, or else L U.
     """
 
     def __init__(self, rows, columns, block, axis, x, dim: int, symmetric: bool):

@@ -1,26 +1,21 @@
 # SPDX-License-Identifier: MIT
-"""Solver for both balances together, for bodies so large that a direct solver is too expensive.
+"""Solver for both balances together, for large bodies.
 
     [ K  -B^T ] [du]   [R_u]
     [ B   C   ] [dp] = [R_p]
 
-K is the stiffness, C the storage and B the coupling of the balances (`newton`).  The solver is GMRES, preconditioned
-from the right with the upper block triangle.  In this triangle the fixed-stress operator `P = C + beta V` replaces the
-Schur complement `C + B K^-1 B^T`.  Here beta is the fixed-stress coefficient, and V contains the cell volumes.  One
-multigrid cycle approximates K^-1, and another cycle P^-1.  In 2D, a body must be larger than in 3D to need this solver
-(see `plan`).
+K is the stiffness, C the storage and B the coupling of the balances (`newton`).  The solver is GMRES.  Its right
+preconditioner is the upper block triangle, with the fixed-stress operator `P = C + beta V` in place of the Schur
+complement `C + B K^-1 B^T`.  Here beta is the fixed-stress coefficient, and V contains the cell volumes.  One multigrid
+cycle approximates K^-1, and another cycle P^-1.
 
-In 3D, GMRES takes 7 to 12 iterations to the tolerance 1e-3, each with one cycle on K. In 2D, GMRES takes 8 iterations
-to the tolerance 1e-5.  With algebraic multigrid, GMRES takes 10 to 15 cycles in 3D, and flexible GMRES with inner
-solves 12 to 24 cycles.  MINRES with the diagonal blocks takes 17 to 23 cycles, and conjugate gradients on the Schur
-complement 35 to 60 cycles.
+In 3D, GMRES takes 7 to 12 iterations to the tolerance 1e-3, each with one cycle on K.  In 2D, GMRES takes 8 iterations
+to the tolerance 1e-5.  With algebraic multigrid, GMRES takes 10 to 15 cycles in 3D.  MINRES with diagonal blocks takes
+17 to 23 cycles, and conjugate gradients on the Schur complement 35 to 60 cycles.
 
-At nu = 0.499 the cycle is inaccurate, and GMRES takes more than 100 iterations with 14^3 cells.  If a solve takes, or
-is predicted to take, too many iterations (see `plan`), factors of K replace the cycle.  The solver keeps these factors
-until a solve takes too many iterations again.
-
-In 2D, GMRES would take 20 to 500 iterations in yielding soil (footing, 41 cells, any smoother).  Shear bands are one
-cell wide, so coarse grids cannot represent these bands.
+At nu = 0.499 with 14^3 cells, GMRES takes more than 100 iterations.  If a solve takes too many iterations, factors of K
+replace the multigrid cycle.  In yielding soil in 2D, GMRES would take 20 to 500 iterations, because coarse grids cannot
+represent shear bands.
 """
 
 from __future__ import annotations
@@ -42,12 +37,11 @@ from mpm_dolfinx.solve.solver_choice import MUMPS, SolverPlan
 LEAST = 1e-4
 """Smallest scale of the fluid residual, divided by the fluid volume that residual forces displace in a drained body.
 
-Undrained bodies exchange nearly no fluid.  With a scale of 2e-6 times this volume, rounding errors would cause a
-residual of 2e-5.
+With 2e-6 in place of this value, rounding errors would cause a relative residual of 2e-5 in undrained bodies.
 """
 
 IDLE = object()
-"""Replaces the operator in PETSc after each solve.  Otherwise PETSc would hold all objects of the last solve."""
+"""Placeholder for the operator in PETSc between solves, to free memory."""
 Scale = NDArray[np.float64] | float
 Inverses = tuple[PETSc.PC, PETSc.PC]
 """Preconditioners that approximate K^-1 and P^-1."""
@@ -55,7 +49,7 @@ Inverses = tuple[PETSc.PC, PETSc.PC]
 
 @dataclass(frozen=True, eq=False)
 class BlockOperator:
-    """Operator and preconditioner of one solve for PETSc, with scaled equations.
+    """Operator and preconditioner of one solve, with scaled equations.
 
     `inverses`: approximations of K^-1 and P^-1.
     `work`: work vectors: two of displacements and two of pressures.
@@ -154,11 +148,10 @@ class BlockSolver:
     ) -> tuple[int, Inverses | None]:
         """Solve for (du, dp) with the residuals of both balances as right-hand side.
 
-        `scales` (parts,) and (parts,): scales of the momentum residual (N) and of the fluid residual (m^d) in each
-        connected part.
-        `rtol`: tolerance relative to the norm of both scaled residuals, for each part.
+        `scales`: two arrays (parts,): scales of the momentum residual (N) and of the fluid residual (m^d).
+        `rtol`: tolerance relative to the norm of both scaled residuals, for each connected part.
         `slopes`: derivative of the fluxes with respect to displacements, if the tangent includes it.
-        `factors`: factors from an earlier solve that replace the cycles, or None.
+        `factors`: factors from an earlier solve in place of multigrid cycles, or None.
 
         Returns
         -------
@@ -187,7 +180,7 @@ class BlockSolver:
         return count, factors
 
     def _iterate(self, inverses: Inverses, scale: tuple, slopes: tuple, rtol: float, most: int) -> int:
-        """Solve with approximations of K^-1 and P^-1, and return the number of iterations."""
+        """Solve by GMRES, and return the number of iterations.  `most`: largest number."""
         operator = BlockOperator(self._momentum, self._storage, inverses, self._work, scale, slopes)
         self._A.setPythonContext(operator)
         self._ksp.pc.setPythonContext(operator)
@@ -211,7 +204,7 @@ class BlockSolver:
 
 
 def _foresight(many: int) -> Callable[[PETSc.KSP, int, float], None]:
-    """Return a monitor that ends a solve if its last iterations predict more than `many` iterations."""
+    """Return a PETSc monitor that ends a solve if more than `many` iterations are predicted."""
     quarter = max(1, many // 4)
 
     def monitor(ksp: PETSc.KSP, count: int, norm: float) -> None:

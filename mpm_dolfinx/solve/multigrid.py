@@ -1,14 +1,12 @@
 # SPDX-License-Identifier: MIT
 """Geometric multigrid on the background grid: each coarse grid has twice the cell size of the finer grid.
 
-A coarse unknown belongs to a node, or a cell, of a grid with half as many cells along each axis. Displacements are
-interpolated linearly along each axis between nodes, and pressures between cell centres. Coarse matrices are Q^T A Q
-(Galerkin) with the fine matrix A and the interpolation Q. Cut cells, penalties and laws thus need no special treatment.
+Displacements are interpolated linearly between nodes, and pressures between cell centres. Coarse matrices are Q^T A Q
+(Galerkin) with the fine matrix A and the interpolation Q.
 
-With 504000 displacements and 251000 pressures in 2D (10^6 points), both hierarchies of grids take 0.33 s. The coarse
-matrices of a tangent take 0.1 s, and a cycle takes 0.06 s. A step takes 2.6 s with multigrid, and 7.6 s with a direct
-solver (including ordering). A wet cube of 20^3 cells in shear takes 2.0 s for 16 Newton steps. With smoothed
-aggregation (GAMG) the cube takes 11.6 s, and equally many iterations.
+With 504000 displacements and 251000 pressures in 2D (10^6 points), the set-up of both hierarchies takes 0.33 s, and a
+cycle 0.06 s. A step takes 2.6 s with multigrid, and 7.6 s with a direct solver. For a wet cube of 20^3 cells in shear,
+16 Newton steps take 2.0 s, and 11.6 s with smoothed aggregation (GAMG).
 """
 
 from __future__ import annotations
@@ -34,10 +32,10 @@ OPTIONS = {
     "mg_levels_pc_type": "sor",
 }
 FIRMLY = {"mg_levels_ksp_type": "chebyshev", "mg_levels_ksp_max_it": "3"}
-"""Smoother for nearly incompressible bodies where a direct solver cannot replace multigrid.
+"""Options of a stronger smoother, for nearly incompressible bodies without a direct solver.
 
-The test is a cube of 14^3 cells with nu = 0.49, in layers with a stiffness ratio of 1000. GMRES takes 126 iterations
-with this smoother, and 112 iterations with GAMG. With the smoother of `OPTIONS`, GMRES fails.
+In a cube of 14^3 cells with nu = 0.49, in layers with a stiffness ratio of 1000, GMRES takes 126 iterations with this
+smoother, and 112 iterations with GAMG. With the smoother of `OPTIONS`, GMRES fails.
 """
 MAYBE, NOT, IS = range(3)  # see `_shared`
 NONE = np.iinfo(np.int64).max
@@ -55,19 +53,14 @@ def multigrid_solver(
 ) -> PETSc.KSP:
     """Return GMRES with multigrid, which is set up again after A has changed.
 
-    GMRES also solves with tangents that are unsymmetric or, in buckling bodies, indefinite.
-
     `A`: matrix, which may still be empty.
     `name`: prefix of the solver's PETSc options.
-    `places` (n, d + 1), >= 0: indices of this process's unknowns along the grid axes, and of their components. Each
-    component is interpolated separately.
-    `held` (m, d + 1): fixed degrees of freedom in cells of bodies, as indices like `places`. Interpolated displacements
-    vanish at these degrees of freedom.
+    `places` (n, d + 1), >= 0: grid indices of the local unknowns along each axis, and index of the component.
+    `held` (m, d + 1): the same indices for fixed degrees of freedom in cells of bodies.
     `nodal`: whether the unknowns belong to nodes.
     `coarsest`: largest number of unknowns of the coarsest grid, which has a direct solver.
     `firmly`: whether to use the stronger smoother `FIRMLY`.
-    `lines` (n,) along each axis, m: grid lines, for cells of different sizes. Interpolation of displacements then uses
-    the distances of nodes.
+    `lines` (n,) along each axis, m: grid lines, for cells of different sizes.
     """
     ksp = PETSc.KSP().create(A.comm)
     ksp.setType(PETSc.KSP.Type.GMRES)
@@ -115,11 +108,10 @@ def interpolation(
     nodal: bool,
     lines: Sequence[NDArray[np.float64]] | None = None,
 ) -> tuple[PETSc.Mat, NDArray[np.int64], NDArray[np.int64]]:
-    """Return the interpolation, this process's coarse unknowns, and fixed coarse degrees of freedom.
+    """Return the interpolation matrix, the local coarse unknowns, and fixed coarse degrees of freedom.
 
-    A coarse cell is kept if a fine cell in it is an unknown. A coarse node is kept in two cases: it interpolates to
-    free fine nodes only, or it coincides with a free fine node. The columns of the interpolation matrix are then
-    linearly independent.
+    A coarse cell is an unknown if it contains an unknown fine cell. A coarse node is an unknown if it coincides with a
+    free fine node, or interpolates to free fine nodes only.
     """
     rows, coarse, weights = _hats(places, nodal, lines)
     near_fixed = _hats(held, nodal, lines)[1]
@@ -148,7 +140,7 @@ def interpolation(
 def _hats(
     places: NDArray[np.int64], nodal: bool, lines: Sequence[NDArray[np.float64]] | None = None
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-    """Return the fine unknown, the indices of the coarse unknown, and the weight of each entry of an interpolation."""
+    """Return fine unknown, coarse unknown (as indices), and weight for each entry of an interpolation matrix."""
     half, odd = np.divmod(places[:, :-1], 2)
     if nodal:
         share = 0.5
@@ -172,9 +164,8 @@ def _hats(
 def _shared(
     comm: MPI.Intracomm, keys: NDArray[np.int64], count: int, stated: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Return the index of the coarse unknown with each key, and whether this process owns the unknown.
+    """Return the index of the coarse unknown of each key, and whether this process owns the unknown.
 
-    The process of lowest rank with a key owns its unknown.
     `stated`: status of each key, `MAYBE`, `NOT` or `IS`; the largest status on all processes applies.
     """
     ask = Exchange(comm, (keys * comm.size // count).astype(np.int32))

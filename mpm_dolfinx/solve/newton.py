@@ -1,28 +1,22 @@
 # SPDX-License-Identifier: MIT
 """Equations of a substep: balance of momentum and storage of fluid, coupled by u and p.
 
-Each connected part of the bodies is in equilibrium on its own. In each part, the momentum residual is divided by the
-forces, and the fluid residual by the exchanged fluid volume. A line search sets the step length of each part
-separately.
-
-A Newton step of the two balances is
+Relative residuals and step lengths refer to each connected part of the bodies separately. The momentum residual is
+divided by the forces, and the fluid residual by the exchanged fluid volume. A Newton step of the two balances is
 
     [ K  -B^T ] [du]     [R_u]
-    [ B   C   ] [dp] = - [R_p].
+    [ B   C   ] [dp] = - [R_p],
 
-K, B and C are derivatives of the residuals: R_u changes by `K du - B^T dp`, and R_p by `B du + C dp`. The scheme
-`schur-cg` eliminates du, and solves for dp by conjugate gradients with the Schur complement `S = C + B K^-1 B^T`. The
-preconditioner is the fixed-stress operator `C + beta V`, with cell volumes V and `beta = 0.75 alpha^2 / K_dr`. Here
-alpha is Biot's coefficient, and K_dr is the drained bulk modulus. This operator is filtered: beta V is smaller for
-pressures that alternate from cell to cell (`StorageProblem.assemble_preconditioner`).
+with the displacement increments du, the pressure increments dp, and the residuals R_u and R_p of the two balances.  The
+scheme `schur-cg` eliminates du, and solves for dp by conjugate gradients with the Schur complement
+`S = C + B K^-1 B^T`.  The preconditioner is the fixed-stress operator `C + beta V`, with cell volumes V and
+`beta = 0.75 alpha^2 / K_dr`.  Here alpha is Biot's coefficient, and K_dr is the drained bulk modulus.  For pressures
+that alternate from cell to cell, beta V is reduced (`StorageProblem.assemble_preconditioner`).  With inertia, fluxes
+depend on accelerations, and FGMRES replaces conjugate gradients.
 
-With inertia, fluxes depend on accelerations. B then also contains this dependence, and FGMRES replaces conjugate
-gradients.
-
-The scheme `schur-fgmres` uses FGMRES and the full, slightly unsymmetric Jacobian instead. The scheme `fixed-stress` is
-the Richardson iteration of the fixed-stress split: storage solves with `C + beta V` at constant stress alternate with
-momentum solves. Large bodies use multigrid, because a direct solver is too expensive. With multigrid, `schur-cg` and
-`schur-fgmres` solve for both unknowns together, see `monolithic`.
+The scheme `schur-fgmres` uses FGMRES and the full, slightly unsymmetric Jacobian. The scheme `fixed-stress` alternates
+between storage solves with `C + beta V` at constant stress and momentum solves. For large bodies, multigrid solves for
+both unknowns together (`monolithic`).
 """
 
 from __future__ import annotations
@@ -57,7 +51,7 @@ tests/plateaus.py): half this value changes the result by 2.2e-11, twice this va
 3.0e-02.
 """
 SOLVED = 0.05
-"""Residual that the last linear solve aims at, divided by the tolerance of Newton's method.  Plateau (scene "soil" of
+"""Residual after the last linear solve, divided by the tolerance of Newton's method.  Plateau (scene "soil" of
 tests/plateaus.py): half this value changes the result by 4.0e-12, twice this value by 3.1e-11, and finer cells by
 3.0e-02.
 """
@@ -65,19 +59,16 @@ SETTLED = 1e-2  # residual below which slip of contacts may end; at larger resid
 ERROR = 1 / 20
 """Assumed pressure error of a run, divided by the estimated error e of a first-order step (`note_pressures`).
 
-For a mode with decay rate l, the stability function of sdirk2 gives an error of `0.081 dt abs(l) e` in a step, at most
-0.28 e. A pressure that follows a varying load has an error of at most 0.14 e. With little decay, the errors of all
-steps add up to 0.081 e. Errors were measured by comparison with steps an eighth as long. The errors are 0.01 to 0.08 e
-for varying loads, pressures and sources. The error is 0.17 e in a first step from zero load, and 0.26 e after a jump.
-The error of a run is at most 5 e / 20.
+Comparisons with steps an eighth as long give errors of 0.01 to 0.08 e for varying loads, pressures and sources. The
+error is 0.17 e in a first step from zero load, and 0.26 e after a jump. For a mode with decay rate l, the stability
+function of sdirk2 gives an error of `0.081 dt abs(l) e` in a step, and at most 0.28 e.
 """
 SUDDEN = np.sqrt(2)
-"""Pressure change in the second substep, divided by the change in the first substep, below which sdirk2 overshoots.
+"""Ratio of the pressure changes in the second and first substep below which sdirk2 overshoots.
 
 For a mode with `z = -(decay rate) dt`, the stability function `(1 + (1 - 2 gamma) z) / (1 - gamma z)^2` is zero at
-`z = -1 - sqrt(2)`. At this z, a pressure changes by `-gamma z / (1 - gamma z) = sqrt(2) - 1` in the first substep, and
-by `2 - sqrt(2)` in the second. If pressures follow loads, the ratio of the two changes is `(1 - gamma) / gamma`.
-Source: exact.
+`z = -1 - sqrt(2)`. The pressure then changes by `-gamma z / (1 - gamma z) = sqrt(2) - 1` in the first substep, and by
+`2 - sqrt(2)` in the second. Source: exact.
 """
 
 
@@ -117,13 +108,13 @@ def solve_substep(
     report: Report,
     kept: Kept,
 ) -> Rates | None:
-    """Solve the equations of a substep for the functions (u, p) of the forms. Return the outflow rates at the end.
+    """Solve the equations of a substep for (u, p). Return the outflow rates at the end, or None without fluid.
 
     `solvers`: linear solvers for the unknowns of the active cells.
     `momentum`, `storage`: the balances. `storage` is None without fluid.
     `ahead`: function that extrapolates (u, p) at active dofs and cells from the last steps, or None.
-    `as_reset`, `key`: see `OnGrid.as_reset`. Linear laws use the tangent at the reset until `key` changes.
-    `report`: report of the step. The counts of the substep are added to this report.
+    `as_reset`, `key`: context of the last reset, and its key. Linear laws use the tangent at the last reset.
+    `report`: report of the step, to which the counts of the substep are added.
     `kept`: data that the tangents of the step share.
 
     Raises
@@ -165,11 +156,9 @@ def note_pressures(
 ) -> None:
     """Store the pressure changes and the estimated pressure error of a step in the report.
 
-    The step uses the rates of both substeps, and a first-order step only the rates of the second one. The two fluid
-    volumes therefore differ by `seconds` times the change of the rates. The inverse of the fixed-stress operator
-    converts this difference into a pressure. This pressure is bounded for stiff modes, as in Hosea and Shampine (1996).
-    The error of the step is assumed to be `ERROR` times this pressure. Errors and changes of a cell are weighted by the
-    filled fraction of the cell.
+    The fluid volumes of the step and of a first-order step differ by `seconds` times the change of the rates between
+    the substeps.  The inverse of the fixed-stress operator converts this difference into a pressure (Hosea and Shampine
+    1996).  The estimated error is `ERROR` times this pressure, weighted by the filled fraction of the cell.
 
     `seconds`, s: time weight of the rates of the first substep.
     `dt`, s: length of the step.
@@ -215,12 +204,10 @@ class Newton:
             self._vectors.append((storage.forms.p.x, active.cells))
 
     def newton(self, as_reset: AsReset, key: Hashable, reusable: bool, ahead: Callable | None) -> Errors:
-        """Solve the balances by Newton's method.
-
-        A tangent is reused while the iterations converge. With linear laws, a tangent is reused over many steps.
+        """Solve the balances by Newton's method. A tangent is reused while the iterations converge.
 
         `reusable`: whether the tangent of the previous substep may be reused.
-        `ahead`: see `solve_substep`.
+        `as_reset`, `key`, `ahead`: see `solve_substep`.
         """
         errors, other = self._begin(ahead)
         fresh = self._linear or not reusable
@@ -233,10 +220,7 @@ class Newton:
         return self._stable(self._iterations(errors, as_reset, key, fresh))
 
     def _iterations(self, errors: Errors, as_reset: AsReset, key: Hashable, fresh: bool) -> Errors:
-        """Iterate from the present (u, p).
-
-        `fresh`: whether to start with a new tangent.
-        """
+        """Iterate from the present (u, p). `fresh`: whether to start with a new tangent."""
         elastic = self._momentum.forms.elastic
         tolerance = self._scheme.tolerance
         keep = self._solvers.plan.keep
@@ -270,10 +254,7 @@ class Newton:
         return found
 
     def _augmented(self, errors: Errors) -> Errors:
-        """Update contacts until no contact changes or a residual exceeds the tolerance, and return the errors.
-
-        The limit of Newton iterations is also the limit of these updates.
-        """
+        """Update contacts until no contact changes, or a residual exceeds the tolerance. Return the errors."""
         momentum = self._momentum
         count = 0
         while errors.worst <= self._scheme.tolerance and (momentum.settle(True) or momentum.augment()):
@@ -282,10 +263,9 @@ class Newton:
         return errors
 
     def _begin(self, ahead: Callable | None) -> tuple[Errors, list[NDArray[np.float64]] | None]:
-        """Choose the start of Newton's method. Return the errors at the start, and another start or None.
+        """Set the initial guess of Newton's method. Return its errors, and another guess or None.
 
-        The start is `ahead` if the square of its residual is small. Otherwise each part starts at the guess with the
-        smallest residual. The other start is the previous (u, p).
+        The guess is `ahead` if its residual is small, and else the guess with the smallest residual in each part.
         """
         start = self._iterate()
         if ahead is not None:
@@ -340,8 +320,7 @@ class Newton:
         """Return the errors. Raise NotConverged if the equilibrium is unstable.
 
         The tangent of an unstable equilibrium has negative eigenvalues. Only dry bodies with symmetric, factorised
-        tangents are checked, because water delays buckling. If only soft springs resist a motion, a stable solution may
-        seem unstable. One more Newton step decides such cases.
+        tangents are checked.
         """
         plan = self._solvers.plan
         if not self.report.newton or self._storage is not None or not plan.symmetric or plan.iterative:
@@ -361,7 +340,7 @@ class Newton:
         return errors
 
     def alternate(self) -> Errors:
-        """Solve momentum at fixed pressure and storage at fixed stress in turn, until both converge."""
+        """Alternate momentum solves at fixed pressure and storage solves at fixed stress, until both converge."""
         errors, report = self._errors(), self.report
         self._linearise()
         while (errors := self._augmented(errors)).worst > self._scheme.tolerance:
@@ -402,8 +381,7 @@ class Newton:
     def _errors(self, start: NDArray[np.float64] | None = None) -> Errors:
         """Assemble both residuals, add their relative norms to the history, and return the norms.
 
-        The scales contain the forces at the start of the step, but not the forces of earlier iterates.
-        Residuals within round-off are returned as 0.
+        `start`, N: forces at the start of the step, which are part of the scales. Residuals within rounding count as 0.
         """
         first = not self.report.history
         with _compat.Timer("residual"):
@@ -431,7 +409,7 @@ class Newton:
         self._solvers.linearise(self._momentum, self._storage, self._kept, shift=shift)
 
     def _linearise_as_reset(self, as_reset: AsReset) -> bool:
-        """Set the tangent at the last reset of the grid, which may belong to an earlier step."""
+        """Set the tangent at the last reset of the grid."""
         with as_reset() as pieces:
             if self._storage is not None:
                 self._storage.set_fluxes()
@@ -440,8 +418,7 @@ class Newton:
     def _direction(self, errors: Errors, slow: bool) -> int:
         """Solve the linearised problem, and return the number of coupling iterations.
 
-        `slow`: whether a new tangent has hardly reduced the storage residual, and this residual exceeds the momentum
-        residual. The tangent then also contains the derivative of fluxes with respect to displacements.
+        `slow`: whether to include the derivative of fluxes with respect to displacements, after slow convergence.
         """
         # the linear solve need not be more accurate than the next residual
         iterative, least = self._solvers.plan.iterative, self._solvers.plan.forcing

@@ -21,8 +21,8 @@ class Numerics:
     Parameters
     ----------
     quadrature
-        "domain" integrates exactly over cut particle domains. "point" integrates at material points, as in standard
-        MPM; it supports only boxes, without axisymmetry.
+        "domain": exact integration over cut particle domains. "point": integration at material points, as in standard
+        MPM, only for boxes without axisymmetry.
     coupling
         Coupling scheme of the balances of momentum and fluid, one of `COUPLINGS`.
     tolerance
@@ -32,20 +32,19 @@ class Numerics:
         Time integration: "sdirk2" (second order) or "backward-euler".
     renewal
         Whether to replace particle domains of yielded soil that are longer than a cell, see `stepping/renewal.py`.
-        Renewal requires quadrature "domain", and yielding dry or saturated soil in 2D. A `Contact`, and in axisymmetry
-        inertia, exclude renewal. On a grid with `follow`, elastic domains are also divided and merged, see
-        `stepping/division.py`. Division and merging require quadrature "domain" and dry or saturated soil, and allow no
-        `Contact` or inertia.
+        Renewal requires quadrature "domain", and yielding dry or saturated soil in 2D, without a `Contact`.
+        Axisymmetric scenes with inertia have no renewal.  On a grid with `follow`, elastic domains are also divided and
+        merged (`stepping/division.py`), in dry or saturated soil without `Contact` and without inertia.
     keep_volumes
-        Whether yielded domains keep the volumes of their points, see `domains/kept_volumes.py`. With quadrature "point"
-        this option has no effect.
+        Whether corners of yielded domains are corrected, so that domains have the volumes of their points, see
+        `domains/kept_volumes.py`. This option has no effect with quadrature "point".
     petsc_options
         PETSc options for the solvers, see `Scheme`.
 
     Raises
     ------
     ValueError
-        An option is invalid. The message names the option and its allowed values.
+        An option is invalid.
     """
 
     quadrature: str = "domain"

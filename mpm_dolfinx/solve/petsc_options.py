@@ -37,7 +37,7 @@ def check(options: Mapping[str, Any]) -> None:
 
 @contextmanager
 def using(options: Mapping[str, Any], unread: set[str] | None = None) -> Iterator[None]:
-    """Set the user's PETSc options while solvers are created. Options that solvers read are removed from `unread`."""
+    """Set PETSc options of the user in this context. Options that solvers read are removed from `unread`."""
     given, before = PETSc.Options(), {}
     for name, value in options.items():
         full = f"mpm_{name}"

@@ -17,8 +17,9 @@ COUPLINGS = {
     "fixed-stress-full": 1.0,
     "fixed-stress-fluid": None,
 }
-"""Coupling schemes, each with the factor f in the fixed-stress coefficient `beta = f alpha^2 / K_dr`. With None, beta
-is `1 / K_w`.
+"""Coupling schemes, each with the factor f in the fixed-stress coefficient `beta = f alpha^2 / K_dr`.
+
+Here alpha is Biot's coefficient, and K_dr the drained bulk modulus. With None, beta is `1 / K_w`.
 """
 
 
@@ -42,7 +43,7 @@ class Scheme:
     Raises
     ------
     ValueError
-        A value is outside its range. The message names the value.
+        A value is outside its range.
     """
 
     coupling: str
@@ -69,5 +70,5 @@ class Scheme:
 
     @property
     def beta(self) -> float:
-        """Factor f in the fixed-stress coefficient, see `COUPLINGS`. In the scheme with `beta = 1 / K_w`, f is 1."""
+        """Factor f in the fixed-stress coefficient, see `COUPLINGS`, or 1 for `beta = 1 / K_w`."""
         return COUPLINGS[self.coupling] or 1.0

@@ -1,15 +1,12 @@
 # SPDX-License-Identifier: MIT
-"""Solvers of the linearised problem, which are kept while the active cells do not change.
+"""Solvers of the linearised problem for one set of active cells.
 
     [ K  -B^T ] [du]     [R_u]
     [ B   C   ] [dp] = - [R_p]
 
-`newton` defines K, B and C. Elimination of du gives the Schur complement `S = C + B K^-1 B^T`. Systems with S are
-solved by conjugate gradients (or FGMRES), with the fixed-stress operator as preconditioner. For large bodies GMRES
+The symbols are defined in `newton`. Elimination of du gives the Schur complement `S = C + B K^-1 B^T`. Systems with S
+are solved by conjugate gradients or FGMRES, with the fixed-stress operator as preconditioner. For large bodies, GMRES
 solves for both unknowns (`monolithic`).
-
-PETSc's PCFIELDSPLIT (full Schur factorisation) takes 0.8 to 1 times the time of these solves, and equally many
-iterations. PCFIELDSPLIT also needs a copy of -B^T for each tangent.
 """
 
 from __future__ import annotations
@@ -88,7 +85,7 @@ class Kept:
     """Data that the tangents of one step share.
 
     `operator`: whether the factors of the fixed-stress operator can be reused.
-    `factors`: direct solvers that replace multigrid, or None.
+    `factors`: direct solvers in place of multigrid, or None.
     """
 
     operator: bool = False
@@ -109,7 +106,7 @@ class LinearSolvers:
         self._momentum = momentum
         self._storage = storage
         self.tangent: Latest[bool] = Latest()
-        """Key of the tangent that the matrices keep over several steps."""
+        """Key of a tangent that is reused over several steps."""
         self._solve_s = self._schur = self._block = None
         self.du, self._rhs = momentum.unknowns.vector(), momentum.unknowns.vector()
         """Newton direction of the displacements, and a work vector for right-hand sides."""
@@ -154,7 +151,7 @@ class LinearSolvers:
 
     @property
     def schur(self) -> tuple[PETSc.Mat, PETSc.KSP]:
-        """The Schur complement and its solver. Raise ValueError if multigrid solves for both unknowns."""
+        """The Schur complement and its solver. With multigrid, this property raises ValueError."""
         if self._schur is None:
             raise ValueError("solvers: monolithic multigrid has no Schur complement; direct solvers must be used")
         return self._schur, self._solve_s
@@ -171,7 +168,7 @@ class LinearSolvers:
 
         `kept`: data that the tangents of the step share.
         `data`: integration points, by default the points of the problems.
-        `shift`: fraction of the elastic shear stiffness that is added, as one number or one for each connected part.
+        `shift`: factor on the elastic shear stiffness in the regularisation, or one factor for each connected part.
         """
         kept = kept or Kept()
         with _compat.Timer("tangent"):
@@ -264,7 +261,7 @@ class LinearSolvers:
     ) -> None:
         """Solve iteratively for x with equal relative accuracy in all connected parts.
 
-        `measured`: function that converts b to the vector whose norm the solver computes, or None for b itself.
+        `measured`: function that preconditions b, if the solver uses preconditioned norms.
         """
         if of.count <= 1:
             ksp.solve(b, x)

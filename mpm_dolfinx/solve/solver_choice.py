@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Choice of solvers by the properties of the problem, and the thresholds between methods.
+"""Choice of solvers by the properties of the problem, and thresholds between solvers.
 
-There are four methods for the linearised problem. Without fluid the momentum balance is solved alone. With fluid the
-displacements are eliminated (`schur`), or both balances are solved together (`monolithic`) or in turn (fixed-stress
-iterations). The solver for displacements is direct (PETSc, with or without nodal blocks, or MUMPS) or multigrid.
+Without fluid, the momentum balance is solved alone.  With fluid, displacements are eliminated (`schur`), or both
+balances are solved together (`monolithic`) or in turn (fixed-stress iterations).  The solver for displacements is
+direct (PETSc or MUMPS) or multigrid.
 """
 
 from __future__ import annotations
@@ -18,29 +18,27 @@ ALONE, SCHUR, AT_ONCE, IN_TURN = "momentum alone", "Schur complement", "both at 
 
 @dataclass(frozen=True)
 class Thresholds:
-    """Thresholds between methods. `bash demos/run.sh calibrate` measures times on both sides of each threshold.
+    """Thresholds between solvers. `bash demos/run.sh calibrate` measures times on both sides of each threshold.
 
     multigrid_3d
-        Number of unknown displacements in 3D from which multigrid is used. Two steps of a block of 1656 unknowns take
+        Smallest number of unknown displacements in 3D with multigrid. With 1656 unknowns, two steps of a block take
         0.66 s with a direct solver and 0.59 s with multigrid. With 12784 unknowns, two steps take 32 s with a direct
         solver and 4.0 s with multigrid.
     multigrid_2d
-        The same limit in wet 2D scenes without yield. From 8000 to 74000 unknowns, the times of both solvers are equal
-        within 15 %. For larger numbers n the work of factors is larger, because it is proportional to n^1.5.
+        Smallest number of unknown displacements in wet 2D scenes without yield with multigrid. From 8000 to 74000
+        unknowns, the times of both solvers are equal within 15 %.
     mumps
-        Number of unknown displacements from which MUMPS computes the factors in wet scenes. With a symmetric K, MUMPS
-        is used on several processes only. The processes then share the factors. Below this number, one process holds
-        the factors of K. On one process, two steps of a yielding block of 73728 unknowns take 18 s with blocks of nodes
-        and 36 s with MUMPS. With 100000 unknowns, the factors of K have 1.5e7 entries (0.12 GB).
+        Smallest number of unknown displacements in wet scenes with factors by MUMPS.  If K is symmetric, MUMPS is used
+        on several processes only.  On one process, two steps of a yielding block of 73728 unknowns take 18 s with
+        blocks of nodes and 36 s with MUMPS.  With 100000 unknowns, the factors of K have 1.5e7 entries (0.12 GB).
     fallback_3d
-        Largest number of unknown displacements in 3D for which a direct solver may replace multigrid. In larger scenes,
-        factors need too much memory and time.
+        Largest number of unknown displacements in 3D for which a direct solver may replace multigrid.
     many
-        Largest number of iterations of a solve before a direct solver replaces multigrid, or before the next tangent
-        renews the factors of the fixed-stress operator. Limits of 12, 25, 50 and 500 give equally many Newton steps
-        (footing, 9 cells).
+        Largest number of iterations of a solve. After more iterations, a direct solver replaces multigrid, or the next
+        tangent renews the factors of the fixed-stress operator. Limits of 12, 25, 50 and 500 give equally many Newton
+        steps (footing, 9 cells).
     coarsest
-        Largest number of unknowns of multigrid's coarsest grid, which has a direct solver.
+        Largest number of unknowns on the coarsest grid of multigrid.
     """
 
     multigrid_3d: int = 1500
@@ -53,11 +51,11 @@ class Thresholds:
 
 THRESHOLDS = Thresholds()
 FORCING = 1e-5
-"""Tightest relative tolerance of a linear solve.  Plateau (scene "soil" of tests/plateaus.py): half this value changes
+"""Smallest relative tolerance of a linear solve.  Plateau (scene "soil" of tests/plateaus.py): half this value changes
 the result by 4.0e-11, twice this value by 1.2e-11, and finer cells by 3.0e-02.
 """
 FORCING_3D = 1e-3
-"""Tightest relative tolerance of a linear solve with multigrid in 3D."""
+"""Smallest relative tolerance of a linear solve with multigrid in 3D."""
 KEEP = 0.05
 """Largest ratio of successive residuals for which the tangent is reused.  Plateau (scene "soil" of tests/plateaus.py):
 half this value changes the result by 4.9e-11, twice this value by 1.0e-11, and finer cells by 3.0e-02.
@@ -79,9 +77,9 @@ class SolverPlan:
     displacements, pressures
         Solvers for K and for the fixed-stress operator. `pressures` is "" without fluid.
     krylov
-        PETSc's name of the iterative solver, or "preonly" for a direct solver alone.
+        Name of the iterative solver in PETSc, or "preonly" for a direct solver alone.
     fallback
-        Direct solver that replaces the multigrid cycle on K after many iterations, or "" without such a solver.
+        Direct solver that replaces multigrid after many iterations, or "".
     firmly
         Whether multigrid uses a stronger smoother, for nearly incompressible bodies without a fallback.
     symmetric
@@ -89,9 +87,9 @@ class SolverPlan:
     many, coarsest
         See `Thresholds`.
     forcing
-        Tightest relative tolerance of a linear solve, see `plan`.
+        Smallest relative tolerance of a linear solve.
     keep
-        Largest ratio of successive residuals for which the tangent is reused, see `plan`.
+        Largest ratio of successive residuals for which the tangent is reused.
     """
 
     route: str
@@ -136,14 +134,12 @@ def plan(
 ) -> SolverPlan:
     """Return the solution method for a problem.
 
-    The tangent is reused while a Newton step reduces the residual to less than 0.05 of its value, or 0.01 in wet 2D
-    scenes without yield. In 26 adaptive steps, the drained beam takes 205 Newton steps and 79 tangents with 0.05. The
-    beam takes 179 Newton steps and 83 tangents with 0.01, and 174 Newton steps and 94 tangents with 0.002. In 3D
-    tangents cost more. A beam in 3D takes up to 1.2 times the time with 0.01.
+    The tangent is reused while each Newton step reduces the residual to less than 0.05 of its value, or 0.01 in wet 2D
+    scenes without yield. In 26 adaptive steps, a drained beam takes 205 Newton steps and 79 tangents with 0.05, and 179
+    Newton steps and 83 tangents with 0.01. A beam in 3D takes up to 1.2 times the time with 0.01.
 
-    The relative tolerance of linear solves is at least 1e-5 with nonlinear laws, and 1e-3 with multigrid in 3D. With
-    factors of K, iterations are cheap, and a larger tolerance takes more Newton steps. A footing on 21 cells (backward
-    Euler) takes 299 Newton steps with 1e-5, and 370 with 1e-3.
+    The relative tolerance of linear solves is at least 1e-5 with nonlinear laws, and 1e-3 with multigrid in 3D. A
+    footing on 21 cells (backward Euler) takes 299 Newton steps with 1e-5, and 370 with 1e-3.
 
     Parameters
     ----------
