@@ -9,8 +9,8 @@ seeding, after all maps.
 A value may be a function of time t, reference positions X and current positions x.  The parameter names of the function
 select its arguments.
 
-A new type of condition is a class with the method `acting` (`conditions/acting.py`) for terms in the momentum balance,
-or `feeding` (`flow/feeding.py`) for terms in the fluid balance.
+A new type of condition is a class with the method `acting` or `feeding`.  The method `acting` adds terms to the
+momentum balance (`conditions/acting.py`).  The method `feeding` adds terms to the fluid balance (`flow/feeding.py`).
 """
 
 from __future__ import annotations

@@ -60,7 +60,7 @@ class Origin:
 
 
 def joined(both: Sequence[Origin], kept: Sequence[NDArray[np.bool_]]) -> tuple[Origin, NDArray[np.int64]]:
-    """Merge the flagged pairs of two `Origin`.  Return the result, and the new order of the pairs (n,)."""
+    """Merge the flagged pairs of two `Origin`, and return the new order of the pairs (n,)."""
     columns, start = [], 0
     comm = both[0].exchange.comm
     for of, rows in zip(both, kept, strict=True):

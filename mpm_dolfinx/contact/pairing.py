@@ -36,7 +36,7 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.points.parts import parts_of_domains
 
 REACH = 2.0
-"""Largest gap, divided by the cell size, that may close in a step.  Source: each body may move by one cell."""
+"""Largest gap, divided by the cell size, that may close in a step.  Source: definition, one cell for each body."""
 DEEP = 0.25
 """Largest penetration of an opposite position, and smallest gap that counts as open, divided by the cell size."""
 BESIDE = 0.6

@@ -2,7 +2,7 @@
 """Conservative, second-order remap of the pore pressure from one grid to the next.
 
 In each cell, the pressure at x is reconstructed as `p + s . (x - c)`.  The cell pressure is p, and c is the centroid of
-the material, weighted by storage.  The slope s along an axis is van Leer's mean of the slopes towards both neighbours
+the material, weighted by storage.  The slope s along an axis is van Leer's mean of the slopes to both neighbours
 or towards a drained side, and zero at a no-flow side.  A limiter keeps the pressure in the cell between the extremes of
 the cell, its neighbours and drained sides.
 

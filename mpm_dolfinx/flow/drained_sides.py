@@ -3,9 +3,9 @@
 
 Through a drained face, the outflow of a cell is `T r [p - p_out + rho_w g . (x_out - x)]`.  The cell has the pressure
 p, and x is the centroid of its material.  The face has the outside pressure p_out and the centroid x_out.  The
-transmissibility is T = A kappa / d.  Here A is the area of the face, kappa is the conductivity divided by the unit
-weight of the fluid, and d is the distance from x to the face.  The factor r is the density of the fluid, divided by its
-density rho_w at zero pressure.
+transmissibility is T = A kappa / d, with the area A of the face, and the distance d from x to the face.  The mobility
+kappa is the conductivity divided by the unit weight of the fluid.  The factor r is the density of the fluid, divided by
+its density rho_w at zero pressure.
 
 At a seepage face, fluid can only leave.  A primal-dual active-set method (Hintermueller, Ito and Kunisch 2002) opens
 faces with outflow, and closes all other faces.

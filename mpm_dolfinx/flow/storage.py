@@ -8,7 +8,7 @@ The fluid balance of an active cell, with J_Delta = det(I + grad u), is
 
 The fluid content is zeta (`fluid_content`), and `time_integration` defines the integral over a substep.  A is the area
 of the body on the face, and k is the conductivity.  The material in the two cells of a face has the centroids x+ and
-x-, and d+ and d- are their distances from the face.  `layers` defines kappa and d of cells with several soils,
+x-, at the distances d+ and d- from the face.  `layers` defines kappa and d of cells with several soils,
 `nonorthogonal` corrects the fluxes, and `drained_sides` adds open sides.
 
 The factor `r = exp(p / K_w)` is the fluid density divided by the density rho_w at zero pressure.  In the storage term,

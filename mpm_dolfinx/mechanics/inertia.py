@@ -128,7 +128,7 @@ def product(A: NDArray[np.float64], B: NDArray[np.float64]) -> NDArray[np.float6
 def chord(G: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return F~ - 1 and F F~^-1 for a midpoint rule without strain in rotations.
 
-    The deformation gradient is F_n at the start of the step, F = F_n + D at the midpoint, and F_n + 2 D at the end.
+    The deformation gradients at the start, midpoint and end of the step are F_n, F = F_n + D and F_n + 2 D.
     The mean of C = F^T F at start and end is F^T F + D^T D, with F at the midpoint.  Laws are evaluated at F~, with
     nearly this mean, and P is the first Piola-Kirchhoff stress:
 

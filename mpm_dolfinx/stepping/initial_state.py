@@ -177,8 +177,8 @@ def _released(
 ) -> tuple[State, dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]]:
     """Return the state on the grid of the next step, and the static tractions on sides that become quiet.
 
-    Tractions balance the stresses, the loads of the previous stage, and the remaining supports. For each name of point
-    data, the result has ids of points and tractions.
+    Tractions balance the stresses, the loads of the previous stage, and the remaining supports. Each item is a
+    name of point data, with ids of points and their tractions.
     """
     start = set_up(scene, state, 0.0)
     state, momentum = start.state, scene.momentum
