@@ -71,7 +71,7 @@ def warn_units(comm: MPI.Intracomm, fluid: Fluid, gravity: Gravity) -> None:
 
 
 def warn_levels(comm: MPI.Intracomm, fluid: Fluid | None, gravity: Gravity, levels: Sequence[tuple[str, Any]]) -> None:
-    """Warn of water levels with another unit weight than the pore fluid, or in dry scenes than water.
+    """Warn of water levels with an implausible unit weight, such as another unit weight than the pore fluid.
 
     `levels`: name and water pressure of each level.
     """

@@ -204,7 +204,7 @@ def share_within(
 
 
 def _bounds_of(jump: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the smallest difference to neighbours, at most 0, and the largest difference, at least 0."""
+    """Return the smallest (<= 0) and the largest (>= 0) difference to neighbours."""
     return np.minimum(jump.min(axis=(1, 2)), 0), np.maximum(jump.max(axis=(1, 2)), 0)
 
 

@@ -43,7 +43,7 @@ def keys(point: NDArray[np.int64], face: NDArray[np.int64]) -> NDArray[np.int64]
 
 
 def with_faces(points: MaterialPoints) -> MaterialPoints:
-    """Return the points with data of renewed faces.  Points without such data get values for no renewed faces."""
+    """Return the points with data of renewed faces, by default without renewed faces."""
     if PARENT in points.data:
         return points
     n = len(points)
@@ -51,7 +51,7 @@ def with_faces(points: MaterialPoints) -> MaterialPoints:
 
 
 def with_parts(points: MaterialPoints) -> MaterialPoints:
-    """Return the points with data of parts.  Points without such data get values for whole domains."""
+    """Return the points with data of parts, by default for whole domains."""
     if ROOT in points.data:
         return points
     n, d = points.x.shape

@@ -6,7 +6,7 @@ The fluid balance of an active cell, with J_Delta = det(I + grad u), is
     int r [zeta(J_Delta, p) - zeta_n] dV_n  +  int sum_faces Q dt  =  0,      d zeta = alpha dJ + S J dp,
     Q = T r [p+ - p- + rho_w g . (x- - x+)],   T = A / (d+ / kappa+ + d- / kappa-),   kappa = k / (rho_w g).
 
-The fluid content is zeta (`fluid_content`), and `time_integration` defines the integral over a substep.  A is the area
+The fluid content is zeta (`fluid_content`), and `time_integration` defines the time integral.  A is the area
 of the body on the face, and k is the conductivity.  The material in the two cells of a face has the centroids x+ and
 x-, at the distances d+ and d- from the face.  `layers` defines kappa and d of cells with several soils,
 `nonorthogonal` corrects the fluxes, and `drained_sides` adds open sides.

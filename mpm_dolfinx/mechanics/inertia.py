@@ -147,7 +147,8 @@ def chord(G: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float
 class InertiaForms:
     """Compiled forms of mass and momentum, with the coefficients of the midpoint rule.
 
-    `points`, `of_laws`: all integration points, and the integration points of each law.
+    `points`: all integration points.
+    `of_laws`: integration points of each law.
     """
 
     def __init__(self, points: FormPoints, of_laws: Sequence[FormPoints], u: fem.Function):

@@ -196,7 +196,7 @@ def _held_walls(grid: Grid, free: NDArray[np.bool_]) -> list[tuple[int, float]]:
 
 
 def _closed(grid: Grid, walls: Sequence[tuple[int, float]], surfaces: Sequence[Surface]) -> bool:
-    """Return whether every edge belongs to two faces or lies in a fixed wall."""
+    """Return whether every edge of the surface belongs to two faces, or is on one of the walls."""
     x = np.concatenate([faces.places() for faces in surfaces])
     count, edges = x.shape[1], _EDGES[grid.dim]
     number = np.rint(

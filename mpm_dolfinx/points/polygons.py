@@ -34,7 +34,7 @@ class Polygons:
 
     @property
     def after(self) -> NDArray[np.float64]:
-        """Next vertex (n, k, 2), in m, after each vertex."""
+        """Position (n, k, 2), in m, of the vertex after each vertex."""
         last = np.arange(self.x.shape[1]) == self.count[:, None] - 1
         return np.where(last[:, :, None], self.x[:, :1], np.roll(self.x, -1, axis=1))
 

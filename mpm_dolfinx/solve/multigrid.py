@@ -58,7 +58,7 @@ def multigrid_solver(
     `places` (n, d + 1), >= 0: grid indices of the local unknowns along each axis, and index of the component.
     `held` (m, d + 1): the same indices for fixed degrees of freedom in cells of bodies.
     `nodal`: whether the unknowns belong to nodes.
-    `coarsest`: largest number of unknowns of the coarsest grid, which has a direct solver.
+    `coarsest`: largest number of unknowns on the coarsest grid.
     `firmly`: whether to use the stronger smoother `FIRMLY`.
     `lines` (n,) along each axis, m: grid lines, for cells of different sizes.
     """
