@@ -14,6 +14,8 @@ import numpy as np
 from mpm_dolfinx.parallel.exchange import over_all
 
 T = TypeVar("T")
+EMPTY = object()
+"""Key of an empty cache."""
 
 
 class Latest(Generic[T]):
@@ -25,8 +27,10 @@ class Latest(Generic[T]):
     """
 
     def __init__(self, *derived: Latest) -> None:
-        self._entry: tuple[Any, T] | None = None
         self._derived = derived
+        self._key: Any = EMPTY
+        self.value: T | None = None
+        """The last value, or None if the cache is empty."""
 
     def __call__(self, key: Any, make: Callable[[], T], comm: MPI.Intracomm = MPI.COMM_SELF) -> T:
         """Return the value for a key.  The value is computed again if the key differs from the last key.
@@ -35,24 +39,16 @@ class Latest(Generic[T]):
         `make`: function that computes the value.
         `comm`: processes that compute the value together.  If one process needs a new value, all processes compute it.
         """
-        other = self._entry is None or not (self._entry[0] is key or same(self._entry[0], key))
+        other = self._key is not key and (self._key is EMPTY or not same(self._key, key))
         if other if comm.size == 1 else over_all(comm, other) > 0:
-            self._entry = None
-            for one in self._derived:
-                one.clear()
-            self._entry = key, make()
-        elif self._entry[0] is not key:
-            self._entry = key, self._entry[1]  # the next call mostly has the same objects in its key
-        return self._entry[1]
-
-    @property
-    def value(self) -> T | None:
-        """The last value, or None if the cache is empty."""
-        return None if self._entry is None else self._entry[1]
+            self.clear()
+            self.value = make()
+        self._key = key  # the next call mostly has the same objects in its key
+        return self.value
 
     def clear(self) -> None:
         """Remove the value, and the values that depend on it."""
-        self._entry = None
+        self._key, self.value = EMPTY, None
         for one in self._derived:
             one.clear()
 
