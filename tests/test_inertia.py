@@ -367,7 +367,7 @@ def test_the_tangent_contains_the_acceleration_of_the_water(kind):
     v = unknowns.gather_owned(np.random.default_rng(3).standard_normal(unknowns.size))
     out, content = system.unknowns.vector(), system.unknowns.vector()
     system.change_by(v, out)
-    system.B.mult(v, content)
+    system.B_momentum.mult(v, content)
     for step in (1e-7, -2e-7):
         unknowns.add(u, step, v)
         there.append(storage.assemble_residual().vector.array.copy())

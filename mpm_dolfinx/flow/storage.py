@@ -242,11 +242,10 @@ class StorageSystem:
         self.of_parts = OfParts(forms.grid.comm, parts.cells[own.owned], parts.count)
         """Connected part of the bodies to which each unknown belongs."""
         self.T, self.D, self.L = (matrix(own, own, 2 * d + 1) for _ in range(3))
-        self.B = matrix(own, momentum, 2**d * d)
-        self.B_momentum = self.B if forms.symmetric else matrix(own, momentum, 2**d * d)
-        flows = fluxes.by_motion is not None
-        self.by_motion = matrix(own, momentum, d * (d + 1) * 2**d) if flows else None
-        """Derivative (m^(d-1)) of the outflow due to inertia with respect to displacements."""
+        self.moves = moves = fluxes.by_motion is not None
+        """Whether B contains the derivative of the outflow by inertia, see `set_by_motion`."""
+        self.B_momentum = matrix(own, momentum, 2**d * d)
+        self.B = matrix(own, momentum, d * (d * moves + 1) * 2**d) if moves or not forms.symmetric else self.B_momentum
         self.residual, self.step, self._potentials = (own.vector() for _ in range(3))
         self.damp, self._alternation = (form.on(facets) for form in (fluxes.damp, fluxes.alternation))
         self._facets = facets
@@ -263,11 +262,6 @@ class StorageSystem:
             more.axpy(1.0, pattern, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
             pattern = more
         self.C, self.P = pattern.duplicate(), pattern.duplicate()
-
-    @property
-    def moves(self) -> bool:
-        """Whether inertia contributes to the tangent of the outflow."""
-        return self.by_motion is not None and self.by_motion.assembled
 
     @property
     def gravity(self) -> FacetSum | None:
@@ -288,11 +282,9 @@ class StorageSystem:
     def change_by(self, u: PETSc.Vec, out: PETSc.Vec, *slopes: FluxSlope) -> None:
         """Set `out` to the change (m^d) of the residual due to an increment u.
 
-        `slopes`: changes of the fluxes, including inertia, in place of `by_motion`.
+        `slopes`: changes of the fluxes at fixed accelerations.
         """
         self.B.mult(u, out)
-        if self.moves and not slopes:
-            self.by_motion.multAdd(u, out, out)
         for slope in slopes:
             out.array_w[:] += slope(u)
 
@@ -329,20 +321,19 @@ class StorageSystem:
             nonorthogonal = NonorthogonalFlow(self._forms.fluxes, facets, gradients, contents, sides, flow.weight)
         return Outflow([one.conducting(flow) for one in feeds], total, mobility, nonorthogonal)
 
-    def assemble_by_motion(self, dt: float, filled: NDArray[np.int64], rows: NDArray[np.float64]) -> None:
-        """Assemble `by_motion`.
+    def set_by_motion(self, dt: float, filled: NDArray[np.int64], rows: NDArray[np.float64]) -> None:
+        """Set B to the derivative (m^(d-1)) of the outflow by inertia with respect to displacements.
 
         `dt`, s: time weight of the outflow.
         `rows` (n, k), m^(d-1)/s: derivative of the outflow through open sides with respect to the nodal displacements,
         in the owned cells `filled`.
         """
-        A, fluxes = self.by_motion, self._forms.fluxes
-        zero(A)
+        fluxes = self._forms.fluxes
         facets = self._facets if fluxes.relative is None else fluxes.relative.uniform(self._facets)
-        fluxes.by_motion.on(facets).assemble_matrix(A)
-        insert_rows(A, self._forms.grid, filled, rows)
-        A.assemble()
-        A.scale(dt)
+        fluxes.by_motion.on(facets).assemble_matrix(self.B)
+        insert_rows(self.B, self._forms.grid, filled, rows)
+        self.B.assemble()
+        self.B.scale(dt)
 
     def assemble_fluxes(self, force: NDArray[np.float64] | None = None) -> None:
         """Assemble the matrix of fluxes, in unsaturated soil at the current pressures.
@@ -467,15 +458,13 @@ class StorageProblem:
         (p, p_n), owned = self._p, self.system.unknowns.owned
         return np.exp((p[owned] + p_n[owned]) / (2 * self.forms.bulk))
 
-    def outflows(self) -> dict[str, NDArray[np.float64]]:
-        """Return the outflow (m^d/s) from the bodies through each condition at (u, p), by name."""
-        fluid, both = self._fluid, zip(self._feeds, self._flow(False).at, strict=True)
-        return {name: values for one, at in both for name, values in one.outflows(at, fluid).items()}
-
-    def run_off(self) -> dict[str, NDArray[np.float64]]:
-        """Return the run-off, in m^d/s, by name of the condition."""
-        fluid, both = self._fluid, zip(self._feeds, self._flow(False).at, strict=True)
-        return {name: values for one, at in both for name, values in one.run_off(at, fluid).items()}
+    def outflows(self) -> dict[str, dict[str, NDArray[np.float64]]]:
+        """Return the outflow and any run-off (m^d/s) at (u, p), by quantity and name of the condition."""
+        fluid, out, runs = self._fluid, {}, {}
+        for one, at in zip(self._feeds, self._flow(False).at, strict=True):
+            out |= one.outflows(at, fluid)
+            runs |= one.run_off(at, fluid)
+        return {"outflows": out} | ({"runoff": runs} if runs else {})
 
     def passing(self) -> list[Mapping[str, NDArray[np.float64]]]:
         """Return the rates in a converged substep, for the method `volumes`."""
@@ -562,8 +551,9 @@ class StorageProblem:
     def flux_slope(self, u: fem.Function, unknowns: Unknowns, dofs: NDArray[np.int64]) -> FluxSlope:
         """Return a function that maps a change of displacements to the changes (n,) of outflow volumes, in m^d.
 
-        The function computes a finite difference (Knoll and Keyes 2004).  After its last call, `set_fluxes` must
-        assemble the fluxes again.
+        The function computes a matrix-free finite difference (Knoll and Keyes 2004) of the conductivity laws and of the
+        geometry of the fluxes, at fixed accelerations.  After the last call of the function, `set_fluxes` must assemble
+        the fluxes again.
 
         `dofs`: active dofs of u.
         """
@@ -588,6 +578,8 @@ class StorageProblem:
         system = self.system
         before = self._before
         outflow = self._flow(False)
+        if self._inertial is not None:
+            self._inertial.move()
         b = forms.change(self.data)
         owned = system.unknowns.owned
         density = self._density
@@ -613,7 +605,6 @@ class StorageProblem:
         system, fluid = self.system, self._fluid
         force = None
         if self._inertial is not None:
-            self._inertial.move()
             fluid = fluid._replace(force=self._inertial.forces)
             force = self._local_force()
         if system.gravity is None:
@@ -633,7 +624,6 @@ class StorageProblem:
         """Return the inertia forces on the fluid in local cells, see `StorageForms.driven`."""
         if self._inertial is None or self.forms.fluxes.relative is None:
             return None
-        self._inertial.move()
         out = np.zeros((self.forms.grid.num_local, self.forms.grid.dim))
         out[self.system.unknowns.owned] = self._inertial.forces(slice(None))
         return out
@@ -657,16 +647,12 @@ class StorageProblem:
         forms = self.forms
         system = self.system
         data = data or self.data
-        capacity, *by_u = forms.derivatives(data)
-        for A, rows in zip((system.B_momentum, system.B), by_u, strict=False):
-            zero(A)
-            insert_rows(A, forms.grid, data.places.filled, rows)
-            for cells, more in of_suction if A is system.B_momentum else ():
-                insert_rows(A, forms.grid, cells, -more)
-            A.assemble()
+        if self._inertial is not None:
+            self._inertial.move()
         if forms.fluxes.relative is not None:
             self._flow(False)
             system.assemble_fluxes(self._local_force())
+        capacity, *by_u = forms.derivatives(data)
         system.C.zeroEntries()
         system.C.axpy(self.dt, system.T, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
         if self.damped:
@@ -680,17 +666,19 @@ class StorageProblem:
             if (coupling := one.coupling(at, fluid, system.unknowns)) is not None:
                 system.C.axpy(self.dt, coupling, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
         _add_diagonal(system.C, capacity + self.dt * slope)
-        if system.by_motion is None:
-            return
-        if self._inertial is None:
-            zero(system.by_motion)  # after a stage with inertia
-            return
-        by_force = np.zeros((len(capacity), forms.grid.dim))
-        for one, at in both:
-            by_force += one.by_force(at, fluid)
-        shapes = -self._inertial.density * self._inertial.rate * self._contents.shape_values
-        rows = shapes[:, :, None] * by_force[:, None]
-        system.assemble_by_motion(self.dt, self._contents.filled, rows.reshape(len(rows), -1))
+        zero(system.B)
+        zero(system.B_momentum)
+        if system.moves and self._inertial is not None:
+            by_force = sum(one.by_force(at, fluid) for one, at in both) + np.zeros((len(capacity), forms.grid.dim))
+            shapes = -self._inertial.density * self._inertial.rate * self._contents.shape_values
+            rows = shapes[:, :, None] * by_force[:, None]
+            system.set_by_motion(self.dt, self._contents.filled, rows.reshape(len(rows), -1))
+        for cells, more in of_suction:
+            insert_rows(system.B_momentum, forms.grid, cells, -more)
+        both = [(system.B, by_u[-1]), (system.B_momentum, by_u[0])]
+        for A, rows in both[system.B is system.B_momentum :]:
+            insert_rows(A, forms.grid, data.places.filled, rows)
+            A.assemble()
 
     def assemble_preconditioner(self, factor: float, share: float) -> PETSc.Mat:
         """Return the fixed-stress operator `C + factor (beta V - share L)` for the current C.

@@ -75,8 +75,7 @@ class SchurComplement:
         s = self.storage
         s.B_momentum.multTranspose(x, self.f)
         self.solve.solve(self.f, self.v)
-        change = s.change_by if self.slopes or s.by_motion is not None else s.B.mult
-        change(self.v, y, *self.slopes)
+        s.change_by(self.v, y, *self.slopes)
         s.C.multAdd(x, y, y)
 
 

@@ -106,9 +106,7 @@ class Balances(NamedTuple):
         """
         stage, out = state.stage, {quantity: {} for quantity in QUANTITIES} | self.momentum.outcome()
         out["wall_reactions"] = self.momentum.wall_forces(stage.conditions["walls"])
-        out["outflows"] = self.storage.outflows() if self.storage else {}
-        if self.storage and (runs := self.storage.run_off()):
-            out["runoff"] = runs
+        out |= self.storage.outflows() if self.storage else {"outflows": {}}
         return out | (self.storage.volumes(passed, seconds[-len(passed) :]) if self.storage else {})
 
     def net_inflow(self, rates: Rates | None) -> NDArray[np.float64] | None:
