@@ -11,7 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpm_dolfinx.base.tolerances import EPSILON, NEAR, SAME, TINY
-from mpm_dolfinx.grid.grid import FACES, TURN, Grid, corner_bits, means_of_rows, ranges, sum_by, sums_of_rows
+from mpm_dolfinx.grid.grid import (
+    FACE_SIGNS,
+    FACES,
+    TURN,
+    Grid,
+    corner_bits,
+    means_of_rows,
+    ranges,
+    sum_by,
+    sums_of_rows,
+)
 from mpm_dolfinx.points.cutting import (
     cut,
     domain_volumes,
@@ -47,8 +57,6 @@ Source: definition, the area of one of the four new domains in a full cell.
 """
 SIDE = np.array([2, 1, 3, 0])
 """Face index of each edge of a domain, anticlockwise."""
-START, END = np.array([2, 1, 0, 3]), np.array([0, 3, 1, 2])
-"""Corner at which each face starts, and corner at which it ends, anticlockwise."""
 
 
 class Parts(NamedTuple):
@@ -56,8 +64,8 @@ class Parts(NamedTuple):
 
     row: NDArray[np.int64]  # index of the face in `OuterFaces` (m,)
     cell: NDArray[np.int64]  # cell (m,)
-    x: NDArray[np.float64]  # ends in cell coordinates in [0, 1] (m, 2, 2)
-    t: NDArray[np.float64]  # coordinates of the ends along the face, in [0, 1] (m, 2)
+    x: NDArray[np.float64]  # ends in cell coordinates in [0, 1] (m, 2, 2), anticlockwise
+    t: NDArray[np.float64]  # coordinates of the ends along the face, from 0 at its lower to 1 at its upper end (m, 2)
     side: NDArray[np.int64]  # side of the cell on which the part lies, or -1 (m,)
 
 
@@ -127,7 +135,7 @@ class RefilledCells:
         self.cell = self.pieces.cell
         self.cells = grid.cells
         self.faces = faces
-        self.parts = self._parts(faces)
+        self.parts = self._parts()
         excluded = self._excluded(flowed, signs)
         self.crossed, self.region = self._chains(excluded)
         size = self._areas / self._volume(self.cell)
@@ -191,19 +199,23 @@ class RefilledCells:
             chosen |= more
         return chosen
 
-    def _parts(self, faces: OuterFaces) -> Parts:
+    def _ends(self, row: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return the present positions (m, 2, 2), in m, of the ends of faces, the lower end first."""
+        at = FACES[2][self.faces.face[row]]
+        return np.take_along_axis(self.points.corners[self.faces.point[row]], at[:, :, None], axis=1)
+
+    def _parts(self) -> Parts:
         """Return the surface of the bodies, divided into parts by the cells."""
-        grid = self.grid
-        corners = self.points.corners[faces.point]
-        n = np.arange(len(faces.face))
-        ends = np.stack([corners[n, START[faces.face]], corners[n, END[faces.face]]])
+        grid, n = self.grid, np.arange(len(self.faces.face))
+        ends = self._ends(n).swapaxes(0, 1)
         y = on_planes(grid, grid.in_cells(ends), ends, 2)[1]
         t = np.broadcast_to(np.array([0.0, 1.0])[:, None, None], (2, len(n), 1))
         s, row = np.concatenate([y, t], axis=2).transpose(0, 2, 1), n
         for axis in range(2):
             s, row = sliced(s, row, axis, grid)
         s = slices_in_cells(grid, s)
-        s = np.where((s[0, 2] <= s[1, 2])[None, None], s, s[::-1])
+        forward = np.array(FACE_SIGNS)[self.faces.face[row]] > 0
+        s = np.where((s[0, 2] <= s[1, 2]) == forward, s, s[::-1])
         edge_vector = s[1, :2] - s[0, :2]
         size = np.hypot(*edge_vector)
         some = size > NEAR
@@ -279,15 +291,15 @@ class RefilledCells:
     def partial(self) -> New:
         """Return the new domains of cells that the surface crosses."""
         inner = np.flatnonzero(self.parts.side == NONE)
+        inner = inner[np.argsort(self.parts.cell[inner], kind="stable")]
         parts = Parts(*(column[inner] for column in self.parts))
-        order = np.argsort(parts.cell, kind="stable")
         whole = sum_by(parts.cell, self._seeded(parts.row, parts.t), self.cells)
         rows, local, surface = self.region.quadrilaterals(self.chosen)
         cells = self.region.cells[rows]
         parent, area, ends = no_faces(len(cells))
         at, face = np.nonzero(surface)
         lower, upper = (local[at, FACES[2][face, k]] for k in (0, 1))
-        key, X = self._nearest(parts, order, cells[at], lower, upper)
+        key, X = self._nearest(parts, cells[at], lower, upper)
         parent[at, face], ends[at, face] = key, X
         middle = self._place(cells[at], ((lower + upper) / 2)[:, None])[:, 0]
         edge = np.linalg.norm(upper - lower, axis=1) * ring_lengths(self.grid, middle)
@@ -298,16 +310,16 @@ class RefilledCells:
     def _nearest(
         self,
         parts: Parts,
-        order: NDArray[np.int64],
         cells: NDArray[np.int64],
         lower: NDArray[np.float64],
         upper: NDArray[np.float64],
     ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return keys and reference positions of new edges, from the nearest part of the old surface."""
-        first = np.searchsorted(parts.cell[order], cells, side="left")
-        stop = np.searchsorted(parts.cell[order], cells, side="right")
-        edge, at = ranges(first, stop - first)
-        part = order[at]
+        """Return the keys of new edges, and the reference positions of their ends, from the nearest old surface.
+
+        `parts`: old surface, ordered by cells.
+        """
+        first, stop = (np.searchsorted(parts.cell, cells, side=side) for side in ("left", "right"))
+        edge, part = ranges(first, stop - first)
         a, edge_vector = parts.x[part, 0], parts.x[part, 1] - parts.x[part, 0]
         found = []
         for place in ((lower + upper) / 2, lower, upper):
@@ -340,18 +352,13 @@ class RefilledCells:
         """Return the fraction of each face that lies between two coordinates t on the face."""
         share = np.ptp(t, axis=1)
         if self.grid.axisymmetric:
-            corners, face = self.points.corners[self.faces.point[row]], self.faces.face[row]
-            r0, r1 = (corners[np.arange(len(row)), end[face], 0] for end in (START, END))
-            share = share * ring_share(r0, r1, t.mean(axis=1))
+            share = share * ring_share(*self._ends(row)[:, :, 0].T, t.mean(axis=1))
         return share
 
     def _seeded_at(self, row: NDArray[np.int64], t: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the reference positions at coordinates t on faces, from 0 (start) to 1 (end)."""
-        face = self.faces.face[row]
-        flipped = START[face] != FACES[2][face, 0]
-        share = np.where(flipped, 1 - t, t)[:, None]
+        """Return the reference positions at coordinates t on faces."""
         low, high = self.faces.ends[row].transpose(1, 0, 2)
-        return low + share * (high - low)
+        return low + t[:, None] * (high - low)
 
     def _partial(
         self,
@@ -364,8 +371,8 @@ class RefilledCells:
         """Return the new domains in cells that the surface crosses."""
         parts = self.parts
         on = np.flatnonzero(parts.side != NONE)
+        on = on[np.argsort(4 * parts.cell[on] + parts.side[on], kind="stable")]
         place = 4 * parts.cell[on] + parts.side[on]
-        order = np.argsort(place, kind="stable")
         bordered = Parts(parts.row[on], place, parts.x[on], parts.t[on], parts.side[on])
         length = np.linalg.norm(bordered.x[:, 1] - bordered.x[:, 0], axis=1)
         length = length * ring_lengths(self.grid, self._place(parts.cell[on], bordered.x.mean(axis=1)[:, None])[:, 0])
@@ -386,7 +393,7 @@ class RefilledCells:
                 if not len(at):
                     continue
                 sides = 4 * cells[at] + side
-                key, X = self._nearest(bordered, order, sides, a[at], b[at])
+                key, X = self._nearest(bordered, sides, a[at], b[at])
                 middle = (a[at, 1 - axis] + b[at, 1 - axis]) / 2
                 covered = (middle > low[sides]) & (middle < high[sides])
                 at, sides = at[covered], sides[covered]
@@ -428,23 +435,14 @@ class RefilledCells:
         corners = np.empty_like(quads)
         corners[:, RING] = quads
         parent, area, ends = no_faces(len(quads))
-        for k in range(4):
-            at = np.flatnonzero(edge[:, k] != NONE)
-            row, face = index[pieces.point[piece[at]], edge[at, k]], SIDE[k]
-            old = points.corners[faces.point[row]]
-            low, high = (old[np.arange(len(row)), FACES[2][faces.face[row], e]] for e in (0, 1))
-            chord = high - low
-            t = [
-                np.einsum("ri,ri->r", corners[at, c] - low, chord) / np.maximum((chord**2).sum(axis=1), TINY)
-                for c in FACES[2][face]
-            ]
-            parent[at, face] = faces.key[row]
-            part = np.abs(t[1] - t[0])
-            if self.grid.axisymmetric:
-                part = part * ring_share(low[:, 0], high[:, 0], (t[0] + t[1]) / 2)
-            area[at, face] = self._face_areas[row] * part
-            X0, X1 = faces.ends[row].transpose(1, 0, 2)
-            ends[at, face] = np.stack([X0 + s[:, None] * (X1 - X0) for s in t], axis=1)
+        at, k = np.nonzero(edge != NONE)
+        row, face = index[pieces.point[piece[at]], edge[at, k]], SIDE[k]
+        low, high = self._ends(row).swapaxes(0, 1)
+        chord = high - low
+        off = corners[at[:, None], FACES[2][face]] - low[:, None]
+        t = np.einsum("rki,ri->rk", off, chord) / np.maximum((chord**2).sum(axis=1), TINY)[:, None]
+        parent[at, face], area[at, face] = faces.key[row], self._seeded(row, t)
+        ends[at, face] = np.stack([self._seeded_at(row, s) for s in t.T], axis=1)
         return New(corners, int(self.chosen.sum()) + number.ravel(), parent, area, ends), left
 
     # ---- transfer of values ---------------------------------------------------------------------
@@ -498,12 +496,7 @@ class RefilledCells:
         return old, at, share[of] * common / total[of]
 
     def on_faces(
-        self,
-        values: NDArray[np.float64],
-        corners: NDArray[np.float64],
-        parent: NDArray[np.int64],
-        group: NDArray[np.int64],
-        points: MaterialPoints,
+        self, values: NDArray[np.float64], parent: NDArray[np.int64], group: NDArray[np.int64]
     ) -> NDArray[np.float64]:
         """Return data (n, ...) of surface faces: means over the old surface in the cell, or 0 without a surface."""
         parts = self.parts
@@ -518,7 +511,7 @@ class RefilledCells:
         pieces = values[self.pieces.point[self.remainders[1]]]
         out = np.concatenate([means, pieces.reshape(len(pieces), flat.shape[1])])[group]
         out *= (parent != NONE).any(axis=1)[:, None]
-        return out.reshape(len(corners), *values.shape[1:])
+        return out.reshape(len(group), *values.shape[1:])
 
 
 def no_faces(n: int) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:

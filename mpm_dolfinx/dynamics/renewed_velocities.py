@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx.base.tolerances import SAME
 from mpm_dolfinx.domains.refilled_cells import RefilledCells
+from mpm_dolfinx.grid.grid import means_of_rows, sum_by
 from mpm_dolfinx.mechanics.inertia import RATE, VELOCITY, velocity_gradients
 from mpm_dolfinx.points.cutting import Pieces, cut
 
@@ -39,15 +40,15 @@ class Momenta(NamedTuple):
         """
         of, x = pieces.point[piece], pieces.x[piece]
         second = pieces.second[piece]
-        whole, middle = _centre(of, mass, x, len(v))
+        middle, centre = means_of_rows(of, mass, x, len(v)), means_of_rows(group, mass, x, count)
         at_pieces = v[of] + np.einsum("nij,nj->ni", L[of], x - middle[of])
-        whole, centre = _centre(group, mass, x, count)
-        velocity = _centre(group, mass, at_pieces, count)[1]
+        velocity = means_of_rows(group, mass, at_pieces, count)
         (x, y), (v_x, v_y) = (x - centre[group]).T, (at_pieces - velocity[group]).T
         rotation = L[of] @ second
         angular = mass * (x * v_y - y * v_x + rotation[:, 1, 0] - rotation[:, 0, 1])
         inertia = mass * (x**2 + y**2 + second[:, 0, 0] + second[:, 1, 1])
-        return cls(whole, centre, velocity, *(np.bincount(group, values, count) for values in (angular, inertia)))
+        whole, angular, inertia = sum_by(group, np.stack([mass, angular, inertia]), count)
+        return cls(whole, centre, velocity, angular, inertia)
 
 
 def velocities(
@@ -67,11 +68,10 @@ def velocities(
     n, count = len(x), int(group.max()) + 1
     v, L = points.data[VELOCITY], velocity_gradients(points)
     old = Momenta.of(work.pieces, *_received(work, masses[0]), v, L, count)
-    pairs = work.pairs(corners, group)
-    of, at = pairs[:2]
-    weight = pairs[2] * masses[0][of]
-    v = _centre(at, weight, v[of] + np.einsum("nij,nj->ni", L[of], x[at] - points.x[of]), n)[1]
-    L = _centre(at, weight, L[of].reshape(-1, 4), n)[1].reshape(-1, 2, 2)
+    of, at, share = work.pairs(corners, group)
+    weight = share * masses[0][of]
+    v = means_of_rows(at, weight, v[of] + np.einsum("nij,nj->ni", L[of], x[at] - points.x[of]), n)
+    L = means_of_rows(at, weight, L[of], n)
     pieces = cut(work.grid, corners, second=True)
     of = pieces.point
     new = Momenta.of(pieces, np.arange(len(of)), group[of], pieces.fraction * masses[1][of], v, L, count)
@@ -94,12 +94,12 @@ def centred(work: RefilledCells, group: NDArray, x: NDArray, mass: NDArray, old:
     `old` (points,), in kg: masses of the old domains.
     """
     cells, inside = int(work.chosen.sum()), group < work.chosen.sum()
-    received = _received(work, old)
-    centre = _centre(*received[1:], work.pieces.x[received[0]], int(group.max()) + 1)[1][:cells]
+    piece, *received = _received(work, old)
+    centre = means_of_rows(*received, work.pieces.x[piece], int(group.max()) + 1)[:cells]
     at, part = group[inside], mass[inside]
-    now = _centre(at, part, x[inside], cells)[1]
+    now = means_of_rows(at, part, x[inside], cells)
     off = x[inside] - now[at]
-    second = _centre(at, part, (off[:, :, None] * off[:, None]).reshape(-1, 4), cells)[1].reshape(-1, 2, 2)
+    second = means_of_rows(at, part, off[:, :, None] * off[:, None], cells)
     slope = np.einsum("nij,nj->ni", np.linalg.pinv(second, SAME, hermitian=True), centre - now)
     more = np.einsum("ni,ni->n", slope[at], off)
     most = np.zeros(cells)
@@ -113,10 +113,3 @@ def _received(work: RefilledCells, mass: NDArray[np.float64]) -> tuple[NDArray, 
     """Return the pieces of the removed domains, with their groups and masses."""
     piece, groups, share = work.into
     return piece, groups, share * mass[work.pieces.point[piece]]
-
-
-def _centre(group: NDArray, mass: NDArray, values: NDArray, count: int) -> tuple[NDArray, NDArray]:
-    """Return the mass and the mass-weighted mean of `values` in each group."""
-    whole = np.bincount(group, mass, count)
-    columns = [np.bincount(group, mass * column, count) for column in values.T]
-    return whole, np.stack(columns, axis=1) / np.where(whole > 0, whole, 1.0)[:, None]

@@ -213,7 +213,7 @@ class Renewal:
         data["plastic"] = _pulled(F, across, _of_tensors(np.exp, kept(logs)))
         for name, values in points.data.items():
             if name in touched:
-                data[name] = work.on_faces(values, corners, parent, group, points)
+                data[name] = work.on_faces(values, parent, group)
             elif name == ACROSS:
                 data[name] = across
             elif name == ROOT:
