@@ -13,6 +13,8 @@ SAME = EPSILON**0.5
 `SAME` is also the increment of one-sided differences.  Newton's method squares the relative error, so a step of
 relative size `SAME` leaves only rounding errors.  Source: Dennis and Schnabel (1983), sections 5.4 and 2.4.
 """
+ITERATIONS = 60
+"""Largest number of Newton iterations for a few unknowns, such as those of a law at a point."""
 CENTRAL = EPSILON ** (1 / 3)
 """Increment of central differences, relative to the variable.  Source: Dennis and Schnabel (1983), 5.6."""
 SECOND = EPSILON**0.25

@@ -22,14 +22,7 @@ from mpm_dolfinx.grid.grid import (
     sum_by,
     sums_of_rows,
 )
-from mpm_dolfinx.points.cutting import (
-    cut,
-    domain_volumes,
-    on_planes,
-    sliced,
-    slices_in_cells,
-    volumes,
-)
+from mpm_dolfinx.points.cutting import cut, domain_volumes, on_planes, sliced, slices_in_cells, volumes
 from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.points.polygons import NONE, Polygons
 from mpm_dolfinx.points.surface_in_cells import BOX, EDGES, RING, Region, resampled
@@ -308,11 +301,7 @@ class RefilledCells:
         return self._partial(cells, local, parent, area, ends)
 
     def _nearest(
-        self,
-        parts: Parts,
-        cells: NDArray[np.int64],
-        lower: NDArray[np.float64],
-        upper: NDArray[np.float64],
+        self, parts: Parts, cells: NDArray[np.int64], lower: NDArray[np.float64], upper: NDArray[np.float64]
     ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Return the keys of new edges, and the reference positions of their ends, from the nearest old surface.
 

@@ -360,10 +360,7 @@ class HalfFaces:
         return OpenSides(number, self.cells, none, none, none, seeps, self.area, offset, unknown, unknown)
 
     def rows(
-        self,
-        flow: Conduction,
-        p: NDArray[np.float64],
-        force: Callable[[NDArray[np.int64]], NDArray[np.float64]] | None,
+        self, flow: Conduction, p: NDArray[np.float64], force: Callable[[NDArray[np.int64]], NDArray[np.float64]] | None
     ) -> NDArray[np.float64]:
         """Return data of the cell at each face, as rows.
 

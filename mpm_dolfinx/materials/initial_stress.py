@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.base.errors import NotConverged
-from mpm_dolfinx.base.tolerances import NEAR, ROUND_OFF, SAME
+from mpm_dolfinx.base.tolerances import ITERATIONS, NEAR, ROUND_OFF, SAME
 from mpm_dolfinx.base.validation import at_places, line, numbers
 from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.bodies.overburden import overburden
@@ -24,8 +24,6 @@ from mpm_dolfinx.materials.trial import PLANE, SPACE
 from mpm_dolfinx.parallel.exchange import Exchange, first, over_all, together
 from mpm_dolfinx.points.material_points import MaterialPoints, unstretched
 
-EXACT, CLOSE = 1e-13, SAME  # relative stress errors at which Newton's method ends, and which are accepted
-MOST = 30  # largest number of Newton iterations
 LARGEST = 0.2  # limit to the change of a strain component in one iteration
 
 
@@ -342,16 +340,17 @@ class _ElasticStrains:
         """Return the points with elastic strains, and for each point whether its stress differs from the target."""
         comm, strain = self.materials.grid.comm, self.linear()
         largest = over_all(comm, float(np.abs(self.target).max(initial=0.0)), MPI.MAX)
-        close = CLOSE * largest + ROUND_OFF * np.maximum(*self.moduli())  # the second term is for very small strains
-        now = self.points
+        close = SAME * largest + ROUND_OFF * np.maximum(*self.moduli())  # the second term is for very small strains
+        now, exact = self.points, False
         missed = np.ones(len(strain), dtype=bool)
         try:
-            for _ in range(MOST):
+            for _ in range(ITERATIONS):
                 now, missing = self.residual(strain)
                 missed = ~(np.abs(missing).max(axis=1, initial=0.0) <= close)
-                most = float(np.nan_to_num(np.abs(missing), nan=np.inf).max(initial=0.0))
-                if not over_all(comm, most, MPI.MAX) > EXACT * largest:
+                if exact:
                     break
+                most = float(np.nan_to_num(np.abs(missing), nan=np.inf).max(initial=0.0))
+                exact = not over_all(comm, most, MPI.MAX) > SAME * largest  # after one more step
                 strain = self.step(strain, missing)
         except NotConverged:
             missed = np.ones(len(strain), dtype=bool)

@@ -26,14 +26,14 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx.base.caching import Latest
 from mpm_dolfinx.base.errors import NotConverged
-from mpm_dolfinx.base.tolerances import EPSILON, SAME
+from mpm_dolfinx.base.tolerances import EPSILON, ITERATIONS, SAME
 from mpm_dolfinx.base.validation import asked, instance, line
 from mpm_dolfinx.forms.point_forms import FormPoints, Given, PointData, PointExpression
 from mpm_dolfinx.materials.skeleton import BY_SCENE, Skeleton
 from mpm_dolfinx.materials.user_functions import call, named
 from mpm_dolfinx.parallel.exchange import first, together
 
-MOST, HALVINGS = 60, 25  # largest numbers of Newton iterations, and of halvings of steps in all iterations together
+HALVINGS = 25  # largest number of halvings of steps in all Newton iterations together
 
 
 class Solved(NamedTuple):
@@ -287,7 +287,7 @@ def _newton(system, y: NDArray[np.float64]) -> NDArray[np.int64]:
     rows, failed = np.arange(len(y)), np.zeros(len(y), dtype=bool)
     f, slope, norm = system(rows, y)
     halvings = np.zeros(len(y), dtype=int)
-    for _ in range(MOST):
+    for _ in range(ITERATIONS):
         step, old = _solve(slope, f[:, :, None])[:, :, 0], y[rows]
         solved, failed[rows] = norm <= 4 * EPSILON, ~np.isfinite(step).all(axis=1)
         step[solved & failed[rows]] = 0.0  # a solution, which may not be unique
@@ -308,7 +308,7 @@ def _newton(system, y: NDArray[np.float64]) -> NDArray[np.int64]:
         on = ~failed[rows]
         rows, f, slope = (values[on] for values in (rows, f, slope))
         norm = new[on]
-    failed[rows] = True  # not solved by `MOST` iterations
+    failed[rows] = True  # not solved by `ITERATIONS` iterations
     return np.flatnonzero(failed)
 
 

@@ -26,7 +26,10 @@ EXPLODES, SHORTEST = 1e4, 1e-3
 With 1e3 or 1e5 in place of 1e4, scenes take the same steps.
 """
 WORK = 0.5
-"""Largest ratio of the work at the end of an accepted step to the work at its start (Matthies and Strang 1979)."""
+"""Largest ratio of the work at the end of an accepted step to the work at its start.
+
+Source: Matthies and Strang (1979).
+"""
 SHIFT = 0.1
 """Fraction of the elastic shear stiffness that regularises the tangent of yielding soil, divided by the relative
 residual.

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.base.errors import NotConverged
-from mpm_dolfinx.base.tolerances import CENTRAL, FOREVER, ROUND_OFF
+from mpm_dolfinx.base.tolerances import CENTRAL, FOREVER, ITERATIONS, ROUND_OFF, SAME
 from mpm_dolfinx.base.validation import instance, numbers, whole
 from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.materials.evaluate import LawAtPoints
@@ -32,7 +32,7 @@ KINDS = (
     *WETTING,
 )
 AXIAL, LATERAL, SHEAR = (2, 2), ((0, 0), (1, 1)), (0, 1)
-ITERATIONS, CUTS, CLOSE = 30, 12, 1e-11  # limits: Newton iterations, halvings of a step, relative residual
+CUTS = 12  # largest number of halvings of a step
 
 
 @dataclass(frozen=True)
@@ -280,15 +280,15 @@ class _Point:
         nudges = np.zeros((1 + 2 * len(free), 3, 3))
         for k, (i, j) in enumerate(free):
             nudges[1 + 2 * k, i, j], nudges[2 + 2 * k, i, j] = CENTRAL, -CENTRAL
-        near = CLOSE * np.abs(goal).max() + ROUND_OFF * self._bulk  # the second term is round-off
+        near = SAME * np.abs(goal).max() + ROUND_OFF * self._bulk  # the second term is round-off
         for _ in range(ITERATIONS):
             found = self._stress(F + nudges, at.state, dt)[:, rows, columns]
             error = found[0] - goal
             if not np.isfinite(found).all():
                 break
-            if np.abs(error).max() <= near:
-                return self._updated(F, strain, at, dt)
             slope = (found[1::2] - found[2::2]).T / (2 * CENTRAL)
             step = np.linalg.lstsq(slope, error, rcond=ROUND_OFF)[0]
             F[rows, columns] -= step
+            if np.abs(error).max() <= near:  # after one more step, only rounding errors remain
+                return self._updated(F, strain, at, dt)
         raise NotConverged(f"element test: no stretch was found for the prescribed stress at a strain of {strain:g}")
