@@ -172,7 +172,7 @@ def viscous(viscosity: float) -> Callable:
 
 def unbalanced(energies: dict[str, np.ndarray]) -> float:
     """Return the largest error of the energy balance (J) of the `energies` of a result."""
-    names = ("kinetic", "elastic", "dissipated", "viscous", "renewal")
+    names = ("kinetic", "elastic", "dissipated", "viscous", "friction", "renewal")
     total = sum(energies[name] for name in names if name in energies) - energies["external"]
     return float(np.abs(total - total[0]).max())
 

@@ -90,8 +90,7 @@ def main(argv: list[str] | None = None) -> dict:
         struck = np.argmin(above)
         out["height"] = float((above[struck:].max() + DROP) / DROP)
         e = result.energies
-        total = sum(e[name] for name in ("kinetic", "elastic", "dissipated", "friction")) - e["external"]
-        out["energy"] = float(np.abs(total - total[0]).max() / e["external"][-1])
+        out["energy"] = common.unbalanced(e) / float(e["external"][-1])
         out["friction"] = float(e["friction"][-1] / e["external"][-1])
         print(f"error of the distance: sliding box {out['slides']:+.2%}, rolling ball {out['rolls']:+.2%}")
         print(f"falling ball: rebounds to {out['height']:.0%} of its height; error of the flight {out['flies']:.2%}")

@@ -76,9 +76,8 @@ def main(argv: list[str] | None = None) -> dict:
             for after, first in ((s.points.corners, before), (other.points.corners, start))
         )
         e = result.energies
-        total = e["kinetic"] + e["elastic"] + e["dissipated"] - e["external"]
         out |= {"moved": float(moved.max()), "without": float(crept.max()), "speed": float(speed.max())}
-        out |= {"energy": float(np.abs(total - total[0]).max() / e["external"][-1]), "last_speed": float(speed[-1])}
+        out |= {"energy": common.unbalanced(e) / float(e["external"][-1]), "last_speed": float(speed[-1])}
         with_inertia = f"{out['moved']:.2f} m at up to {out['speed']:.2f} m/s"
         print(f"largest displacement: with inertia {with_inertia}, without {out['without']:.2f} m")
         print(f"error of the energy balance: {out['energy']:.2%} of the work of the weight")

@@ -123,7 +123,6 @@ def slide(o: Namespace) -> dict:
     result = s.run(failed + SLIDES, o.slide_step, energies=True, observe=look, progress=False)
     moved = np.linalg.norm(s.points.displacement, axis=1)
     e = result.energies
-    total = sum(e[name] for name in ("kinetic", "elastic", "dissipated")) - e["external"]
     came = -s.outcome("flowed").array.sum()
     draw_slide(o, film, rained)
     return {
@@ -133,7 +132,7 @@ def slide(o: Namespace) -> dict:
         "last_speed": film[-1].speed,
         "moved": float(moved.max()),
         "run_out": float(s.points.corners[moved > MOVES][:, :, 0].max() - CREST - BANK / np.tan(BANK_ANGLE)),
-        "energy": float(np.abs(total - total[0]).max() / e["external"][-1]),
+        "energy": common.unbalanced(e) / float(e["external"][-1]),
         "water": abs(float(s.cells().water.sum()) - start - came) / start,
     }
 

@@ -341,13 +341,9 @@ def _split(
     d = grid.dim
     bits = corner_bits(grid.dim)
     out = []
-    edges = [domains[:, FACES[d][2 * a + 1]] - domains[:, FACES[d][2 * a]] for a in range(d)]
-    if grid.even:
-        longest = np.max([np.linalg.norm(e / grid.h, axis=2).max(axis=1) for e in edges], axis=0)
-    else:  # edges are divided by the cell size
-        y = grid.in_cells(domains - grid.base)
-        edges = [y[:, FACES[d][2 * a + 1]] - y[:, FACES[d][2 * a]] for a in range(d)]
-        longest = np.max([np.linalg.norm(e, axis=2).max(axis=1) for e in edges], axis=0)
+    y = grid.in_cells(domains - grid.base)
+    edges = [y[:, FACES[d][2 * a + 1]] - y[:, FACES[d][2 * a]] for a in range(d)]
+    longest = np.max([np.linalg.norm(e, axis=2).max(axis=1) for e in edges], axis=0)
     count = 2 ** np.ceil(np.log2(np.maximum(1.0, longest * per_cell / LONG) - SAME)).astype(np.int64)
     for n in np.unique(count):
         row = np.flatnonzero(count == n)
