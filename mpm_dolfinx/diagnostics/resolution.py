@@ -29,7 +29,7 @@ FULL = 1.2
 def warn_overlaps(cut: CutDomains, bodies: Sequence[Body]) -> Callable[..., Any] | None:
     """Warn about the fullest cell if particle domains overlap.  Return the function for the next check, or None."""
     grid, points = cut.grid, cut.points
-    volume = cut.to_cells(points.volume0 * points.J) * cut.pieces_to_cells(cut.pieces.fraction)
+    volume = cut.shares(points.volume0 * points.J)
     fill = sum_by(cut.cells, cut.plane(volume)[0], grid.num_owned)[cut.cells] / grid.volumes(cut.cells)
     most = over_all(grid.comm, float(fill.max(initial=0.0)), MPI.MAX)
     if not cut.domains or most <= FULL:
@@ -79,7 +79,7 @@ def warn_mixed(
     grid = cut.grid
     points = cut.points
     count = len(materials.materials)
-    volume = cut.to_cells(points.volume0 * points.J) * cut.pieces_to_cells(cut.pieces.fraction)
+    volume = cut.shares(points.volume0 * points.J)
     whole = over_all(grid.comm, sum_by(cut.to_cells(points.material), volume, count))
     found = []
     for modulus in (lambda m: m.oedometric, lambda m: m.shear):

@@ -167,6 +167,10 @@ class CutDomains(Keyed):
         """Send values (n, ...) of points to the owners of cells.  Return values (m, ...) of pieces in owned cells."""
         return self.pieces_to_cells(values[self.pieces.point])
 
+    def shares(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the parts (m,) of extensive quantities (n,) of points, such as volumes, in the owned pieces."""
+        return self.pieces_to_cells(self.pieces.fraction * values[self.pieces.point])
+
     def plane(self, volume: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return volumes (m,) and centroids (m, d) of pieces, or in axisymmetry of their meridional sections."""
         if not self.grid.axisymmetric:

@@ -23,7 +23,7 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 
 def stored(materials: SceneMaterials, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
     """Return the kinetic and elastic energies of points, in J.  All processes must call this function."""
-    mass = materials.present_density(points) * points.volume0 * points.J
+    mass = materials.masses(points)
     v, L = points.data[VELOCITY], velocity_gradients(points)
     moments = spreads(points.corners, materials.grid.axisymmetric)
     turning = np.einsum("nij,njk,nik->n", L, moments, L)
@@ -38,7 +38,7 @@ def drift(materials: SceneMaterials, points: MaterialPoints, held: NDArray[np.bo
 
     `held` (d,): whether supports hold bodies of this process along each axis.
     """
-    mass = materials.present_density(points) * points.volume0 * points.J
+    mass = materials.masses(points)
     held = held | (np.arange(len(held)) < materials.grid.axisymmetric)
     sums = [[mass.sum()] * len(held), mass @ points.data[VELOCITY], held]
     total, momentum, held = over_all(materials.grid.comm, np.array(sums))

@@ -431,6 +431,10 @@ class SceneMaterials:
         empty = 1 - self.saturation(points, points.pressure)[0]
         return density - empty * self.porosity(points) * self.fluid.density
 
+    def masses(self, points: MaterialPoints) -> NDArray[np.float64]:
+        """Return the masses of the points, in kg, with their present pore water."""
+        return self.present_density(points) * points.volume0 * points.J
+
     def confined_modulus(self, points: MaterialPoints, most: float = STIFFEST) -> NDArray[np.float64]:
         """Return the undrained confined modulus lambda + 2G + alpha^2 / S of the points, in Pa.
 

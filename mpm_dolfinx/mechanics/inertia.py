@@ -221,7 +221,7 @@ class InertiaForms:
         `unknowns`, `held`: unknown displacements, and displacements that walls of the grid fix.
         """
         grid = self.grid
-        of_pieces = cut.pieces_to_cells(cut.pieces.fraction * mass[cut.pieces.point])
+        of_pieces = cut.shares(mass)
         places = Places(grid, cut.cells, cut.x, cut.mixed, cut.hoop)
         pieces = PointData(self.pieces, places, of_pieces, {"spread": cut.pieces_to_cells(cut.pieces.second)})
         content = sum_by(cut.cells, of_pieces, grid.num_local)

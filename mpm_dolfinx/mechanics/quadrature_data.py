@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +16,6 @@ from mpm_dolfinx.domains.domain_gradient import cell_ratios
 from mpm_dolfinx.domains.domain_slopes import LinearGradients
 from mpm_dolfinx.forms.point_forms import FormPoints, Places, PointData
 from mpm_dolfinx.grid.grid import in_chunks, means_of_rows, sum_by
-from mpm_dolfinx.materials.evaluate import ConductivityAtPieces
 from mpm_dolfinx.materials.fields import SceneMaterials
 from mpm_dolfinx.materials.skeleton import Skeleton
 from mpm_dolfinx.parallel.exchange import over_all
@@ -162,7 +161,7 @@ class QuadraturePoints:
         fields |= {name: cut.pieces_to_cells(values) for name, values in within.items()} | self._own(cut, points)
         if self.materials.retentions:
             fields["lever"] = np.zeros_like(cut.x) if places.lever is None else places.lever
-        weight = cut.pieces_to_cells(cut.pieces.fraction * (points.volume0 * points.J)[cut.pieces.point])
+        weight = cut.shares(points.volume0 * points.J)
         apart = self._extended and self._locks
         of_points = PointData(self.pieces, places.pieces, weight, fields) if apart else None
         if self._locks and cut.domains:
@@ -232,33 +231,3 @@ class QuadraturePoints:
         if self._extended:
             fields["displacement"] = cut.total_displacement(points)
         return {name: cut.pieces_to_cells(values) for name, values in fields.items()}
-
-    def rows(self, cut: CutDomains, points: MaterialPoints, value: Callable[[Skeleton], float]) -> NDArray[np.float64]:
-        """Return a material constant at the integration points."""
-        return cut.to_cells(self.materials.table(points, value))
-
-    def mobility(
-        self, cut: CutDomains, law: ConductivityAtPieces | None, data: PointData, begins: bool
-    ) -> NDArray[np.float64]:
-        """Return the mobilities k / (rho_w g) at the integration points, in m^2/(Pa s)."""
-        if law is None:
-            return self.rows(cut, cut.points, lambda m: m.conductivity) / self._fluid.unit_weight
-        return law.evaluate(data, cut.to_cells(cut.points.material), begins) / self._fluid.unit_weight
-
-    def masses(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the masses of the material points, in kg, pore fluid included."""
-        return self.materials.present_density(points) * points.volume0 * points.J
-
-    def conducting(self, cut: CutDomains) -> NDArray[np.float64]:
-        """Return rows (n, 2) for the integration points.  Points with equal rows have equal conductivities."""
-        return cut.to_cells(self.materials.conducting(cut.points))
-
-    def fixed_stress(self, cut: CutDomains, points: MaterialPoints, of_fluid: bool) -> NDArray[np.float64]:
-        """Return the coefficient beta of the fixed-stress operator at the integration points, in 1/Pa.
-
-        `of_fluid`: whether to return 1/K_w in place of beta, for stiff skeletons.
-        """
-        if of_fluid:
-            return np.full(len(cut.cells), 1 / self._fluid.bulk)
-        beta = self.materials.table(points, lambda m: m.biot**2 / m.drained_modulus(self._grid.stretches)) * points.J
-        return cut.to_cells(beta)

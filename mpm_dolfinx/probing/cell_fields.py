@@ -58,7 +58,7 @@ def cell_fields(scene: Scene, state: State) -> CellFields:
     points = state.points
     on_grid = scene.on_grid(state.as_cut)  # cached for the next step
     cut, places = on_grid.cut, on_grid.data.pieces.places
-    weight = cut.pieces_to_cells(cut.pieces.fraction * (points.volume0 * points.J)[cut.pieces.point])
+    weight = cut.shares(points.volume0 * points.J)
     volume = sum_by(places.slots, weight, len(places.filled))
 
     def mean(values: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -365,7 +365,7 @@ class Motion:
         cut = on_grid.cut
         materials = self._materials
         forms = self._storage
-        here = cut.pieces_to_cells(cut.pieces.fraction * (before.volume0 * before.J)[cut.pieces.point])
+        here = cut.shares(before.volume0 * before.J)
         at = on_grid.contents.slot(cut.cells)
         volume = on_grid.contents.total(here)[at]
         p, p_n = (f.x.array[cut.cells] for f in (forms.p, forms.p_n))

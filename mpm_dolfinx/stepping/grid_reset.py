@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cached_property, partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,7 +66,7 @@ class OnGrid(Keyed):
         grid = cut.grid
         points = cut.points
         self.cut = cut
-        self._quadrature = quadrature
+        self._quadrature, self._materials = quadrature, quadrature.materials
         self._storage, self._u = storage, momentum.u
         self._momentum = momentum
         self._places = quadrature.places(cut)
@@ -76,7 +77,7 @@ class OnGrid(Keyed):
         """Volumes (m,) of the pieces, in m^d."""
         area, x = cut.plane(weight)
         scales = stiffness, lambda m: m.shear if m.state else 0.0  # only yielding laws need regularisation
-        moduli = [area * quadrature.rows(cut, points, scale) for scale in scales]
+        moduli = [area * self._rows(scale) for scale in scales]
         own, slots = self._places.pieces.filled, self._places.pieces.slots
         contents = (sum_by(slots, rows, len(own)) for rows in (area, *moduli))
         self.active = momentum.set_contents(own, *contents)
@@ -89,7 +90,7 @@ class OnGrid(Keyed):
         """Faces of this process between two active cells."""
         self.penalised = momentum.ghost.facets(self.facets)
         """Faces with a ghost penalty."""
-        rows = quadrature.rows(cut, points, lambda m: m.oedometric) * grid.around(cut.x)
+        rows = self._rows(lambda m: m.oedometric) * grid.around(cut.x)
         self.stiffness = np.zeros(grid.num_local)
         """Largest oedometric modulus (Pa) in each local cell, in axisymmetry times the circumference (N/m)."""
         order = rows.argsort(kind="stable")
@@ -99,14 +100,16 @@ class OnGrid(Keyed):
         self.layered = quadrature.layered
         self._sides: Latest[OpenSides] = Latest()
         if storage is not None:
+            # 1/K_w in place of beta converges for stiff skeletons only
+            beta = (lambda m: 1 / storage.bulk) if of_fluid else lambda m: m.biot**2 / m.drained_modulus(grid.stretches)
             brought = PieceContents(
                 cells=cut.cells,
                 weight=weight,
                 area=area,
                 x=x,
                 faces=cut.faces(),
-                fixed_stress=quadrature.fixed_stress(cut, points, of_fluid),
-                damping=quadrature.rows(cut, points, lambda m: m.pressure_damping()),
+                fixed_stress=self._rows(beta) * (1.0 if of_fluid else cut.to_cells(points.J)),
+                damping=self._rows(lambda m: m.pressure_damping()),
             )
             self.contents = CellContents(storage.fluxes, brought, own)
             if quadrature.materials.retentions is not None:
@@ -114,7 +117,7 @@ class OnGrid(Keyed):
                 self._places = replace(self._places, lever=lever)
                 self.data = quadrature.data(cut, self._places, points)
             if quadrature.layered:
-                alike = quadrature.conducting(cut)
+                alike = cut.to_cells(self._materials.conducting(points))
                 self._mixed = mixed_cells(cut, alike, self.contents)
                 if storage.fluxes.relative is not None:
                     law = cut.to_cells(quadrature.materials.retention_of(cut.points))
@@ -127,8 +130,8 @@ class OnGrid(Keyed):
         resistance proportional to `lambda + 3G + rho h^2 / (3 t^2)`.  `seconds`: t, in s.
         """
         filled, cut = self.contents.filled, self.cut
-        density = cut.to_cells(self._quadrature.materials.present_density(cut.points))
-        modulus = self._quadrature.rows(cut, cut.points, lambda m: m.macroelement)
+        density = cut.to_cells(self._materials.present_density(cut.points))
+        modulus = self._rows(lambda m: m.macroelement)
         density, modulus = map(self.contents.mean, (density, modulus))
         return density * (cut.grid.sizes(filled).min(axis=-1) / seconds) ** 2 / (3 * modulus)
 
@@ -145,7 +148,11 @@ class OnGrid(Keyed):
     @property
     def masses(self) -> NDArray[np.float64]:
         """Masses (n,), kg, of the points."""
-        return self._quadrature.masses(self.cut.points)
+        return self._materials.masses(self.cut.points)
+
+    def _rows(self, value: Callable[[Any], float]) -> NDArray[np.float64]:
+        """Return a material constant at the integration points."""
+        return self.cut.to_cells(self._materials.table(self.cut.points, value))
 
     def data_of(self, state: State) -> QuadratureData:
         """Return the integration points with the present data of the material points."""
@@ -168,7 +175,7 @@ class OnGrid(Keyed):
         """Return the pressures (Pa) of the filled owned cells at the start of a step."""
         if not state.stays:
             bulk = self._storage.bulk
-            retentions, new = self._quadrature.materials.retentions, self.cut.pieces
+            retentions, new = self._materials.retentions, self.cut.pieces
             old, rest = state.pieces.potentials(bulk), None if retentions is None else retentions.weight.value
             # hydrostatic pressures are excluded, because the storage of unsaturated soil is not linear
             carried = transport(old if rest is None else old.less(rest), self.cut.points, new)
@@ -187,7 +194,7 @@ class OnGrid(Keyed):
 
         The pore water of each point is conserved.
         """
-        materials = self._quadrature.materials
+        materials = self._materials
         points = self.cut.points
         bulk = self._storage.bulk
         old = state.pieces
@@ -246,9 +253,7 @@ class OnGrid(Keyed):
         Means are weighted by storage, or by volume in cells without storage.
         """
         contents, points = self.contents, self.cut.points
-        pieces = self.cut.pieces
-        of_points = self._quadrature.materials.storage(points) * points.volume0 * points.J
-        store = self.cut.pieces_to_cells(pieces.fraction * of_points[pieces.point])
+        store = self.cut.shares(self._materials.storage(points) * points.volume0 * points.J)
         potential = self.cut.pieces_to_cells(at_pieces)
         held, mean = contents.total(store), contents.mean(potential)
         return np.divide(contents.total(store * potential), held, out=mean, where=held > 0)
@@ -309,8 +314,7 @@ class OnGrid(Keyed):
 
     def due(self, state: State) -> NDArray[np.float64]:
         """Return the corrections (m^d) of the volume defects in the filled owned cells in a step."""
-        cut, due = self.cut, state.points.volume0 * state.points.data["due"]
-        share = cut.pieces_to_cells(cut.pieces.fraction * due[cut.pieces.point])
+        share = self.cut.shares(state.points.volume0 * state.points.data["due"])
         return self.contents.total(self.data.pieces["biot"][:, 0] * share)
 
     def pressures_up_to_surface(
@@ -356,9 +360,14 @@ class OnGrid(Keyed):
 
         `begins`: whether invalid values raise ValueError.
         """
-        at_pieces = self._quadrature.mobility(self.cut, self._storage.conductivity, data.pieces, begins)
+        law, cut = self._storage.conductivity, self.cut
+        if law is None:
+            at_pieces = self._rows(lambda m: m.conductivity)
+        else:
+            at_pieces = law.evaluate(data.pieces, cut.to_cells(cut.points.material), begins)
+        at_pieces = at_pieces / self._materials.fluid.unit_weight
         mean, share = self.contents.mean(at_pieces), None
-        if self._storage.conductivity is not None:
+        if law is not None:
             share = graded(self.contents, self._places.pieces.offset, at_pieces, mean)
         if self._storage.fluxes.relative is not None:
             return self._relative_mobility(at_pieces, mean, share)
@@ -369,14 +378,14 @@ class OnGrid(Keyed):
     ) -> Mobility:
         """Return the mobility of cells in unsaturated soil."""
         cut = self.cut
-        law = cut.to_cells(self._quadrature.materials.retention_of(cut.points))
+        law = cut.to_cells(self._materials.retention_of(cut.points))
         count = self._storage.fluxes.relative.count
         shares = np.stack([self.contents.mean(full * (law == i)) for i in range(count)], axis=1)
         shares = np.divide(shares, mean[:, None], out=np.zeros_like(shares), where=mean[:, None] > 0)
         given = {"shares": shares, "borders": self._borders}
         if self._mixed is None:
             return Mobility(mean, share, **given)
-        k = self._quadrature.materials.saturation(
+        k = self._materials.saturation(
             cut.points, cut.to_pieces(self._storage.p_before.x.array[cut.cells]), cut.pieces.point
         )[3]
         mobility = self._mixed.mobility(full, mean, share, full * np.maximum(cut.pieces_to_cells(k), TINY))
@@ -384,10 +393,10 @@ class OnGrid(Keyed):
 
     def pore_water(self, points: MaterialPoints) -> PoreWater | None:
         """Return the pore water of the pieces with the porosities of the points, or None in saturated scenes."""
-        materials, cut = self._quadrature.materials, self.cut
+        materials, cut = self._materials, self.cut
         if materials.retentions is None:
             return None
-        volume = cut.pieces_to_cells(cut.pieces.fraction * (points.volume0 * points.J)[cut.pieces.point])
+        volume = cut.shares(points.volume0 * points.J)
         store, pores = (volume * cut.to_cells(values(points)) for values in (materials.storage, materials.porosity))
         rows = cut.to_cells(materials.retention_rows(points))
         slot = self.contents.slot(cut.cells)
@@ -396,21 +405,21 @@ class OnGrid(Keyed):
     @property
     def heads(self) -> NDArray[np.float64]:
         """Pressures (m,) of unsaturated pieces minus the pressures of their cells, in Pa."""
-        return self._quadrature.materials.retentions.heads(self._places.lever)
+        return self._materials.retentions.heads(self._places.lever)
 
     @cached_property
     def scale(self) -> NDArray[np.float64] | None:
-        """Suctions (Pa) at which filled owned cells drain, or None in saturated scenes."""
-        if self._quadrature.materials.retentions is None:
+        """Suctions (Pa) at which filled owned cells drain (1 without retention curve), or None in saturated scenes."""
+        if self._materials.retentions is None:
             return None
         scale = np.full(len(self.contents.filled), np.inf)
-        of_points = self._quadrature.materials.retention_scale(self.cut.points)
+        of_points = self._materials.retention_scale(self.cut.points)
         np.minimum.at(scale, self.contents.slot(self.cut.cells), self.cut.to_cells(of_points))
         return np.where(np.isinf(scale), 1.0, scale)
 
     def resting_mobility(self) -> Mobility:
         """Return the conductivities (m/s) of filled owned cells in the reference configuration, as a `Mobility`."""
-        at_pieces = self._quadrature.rows(self.cut, self.cut.points, lambda m: m.conductivity)
+        at_pieces = self._rows(lambda m: m.conductivity)
         mean = self.contents.mean(at_pieces)
         return Mobility(mean) if self._mixed is None else self._mixed.mobility(at_pieces, mean, None)
 
@@ -530,8 +539,8 @@ class Assembled(Keyed):
         self.mass = None
         if stage.inertia:
             own = self.momentum
-            faces = on_grid.fill, on_grid.not_full
-            self.mass = momentum.inertia.on(on_grid.cut, on_grid.masses, *faces, own.unknowns, own.held)
+            where = on_grid.cut, on_grid.masses, on_grid.fill, on_grid.not_full
+            self.mass = momentum.inertia.on(*where, own.unknowns, own.held)
             own.mass = self.mass.M
         self.momentum.set_rounding(self._rounding(momentum, loads))
         self.round_off = float(self.momentum.rounding.norm())

@@ -109,7 +109,7 @@ class Renewal:
         group = np.concatenate([one.group for one in new])
         made = self._filled(points, work, new, tuple(stage.kept(0)))
         if moves:
-            masses = tuple(self._materials.present_density(of) * of.volume0 * of.J for of in (points, made))
+            masses = self._materials.masses(points), self._materials.masses(made)
             v, L = velocities(work, made.corners, made.x, group, masses)
             made = replace(made, data={**made.data, **dict(zip(MOTION, (v, L @ made.F), strict=True))})
         kept = ~work.affected
