@@ -64,7 +64,7 @@ def test_what_is_known_of_a_large_body_as_seeded_takes_next_to_no_memory():
         peak = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
-    assert len(body) == 512000 and not lattice.given(np.arange(2)).any() and kept < 1e4 and peak < 25 * len(body)
+    assert len(body) == 512000 and not lattice.held_of(np.arange(2))[0].any() and kept < 1e4 and peak < 25 * len(body)
 
 
 def test_the_last_digit_of_coordinates_does_not_decide_how_many_rows_a_box_has():

@@ -92,15 +92,11 @@ class Sides:
         slope, grid = np.einsum("mk,mkd->d", way, moved) / np.square(way).sum(), self.grid
         there = places.mean(axis=1)[0] + (x - X.mean(axis=1)[0]) * slope - grid.base  # seeded position of the end
         inner = there - sign * NEAR * grid.least / max(float(np.abs(slope).max()), TINY) * slope
-        slope = slope / (grid.h if grid.even else grid.sizes_at(inner[None])[0])  # derivative of the map, cells/m
+        slope = slope / grid.sizes_at(inner)  # derivative of the map, cells/m
         a = np.abs(slope).argmax()
         if np.abs(np.delete(slope, a)).max() > SAME * abs(slope[a]):
             return 0.5 / float(np.linalg.norm(slope))
-        if grid.even:
-            end = (places.mean(axis=1)[0, a] - grid.lower[a]) / grid.h[a] + (x - X.mean(axis=1)[0]) * slope[a]
-        else:
-            end = grid.in_cells(there[None])[0, a]
-        share = (sign * np.sign(slope[a]) * end) % 1.0
+        share = (sign * np.sign(slope[a]) * grid.in_cells(there)[a]) % 1.0
         return share / abs(float(slope[a])) if share <= (1 + NEAR) / 2 else 0.0
 
     def check_moves(self, one, holds: Iterable[Displacement], free: NDArray[np.bool_]) -> None:

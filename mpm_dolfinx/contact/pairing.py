@@ -250,7 +250,7 @@ class Contacts(Touching):
 
     def _sizes(self, x: NDArray[np.float64]) -> NDArray[np.float64] | float:
         """Return the shortest edges of the cells at positions x, in m."""
-        return self.grid.least if self.grid.even else self.grid.sizes_at(x).min(axis=-1)
+        return self.grid.sizes_at(x).min(axis=-1)
 
     def check_end(self, cut: CutDomains, points: MaterialPoints, before: MaterialPoints) -> None:
         """Raise NotConverged if groups overlap after a step, or may have passed through each other in the step."""

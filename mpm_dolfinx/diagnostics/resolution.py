@@ -183,8 +183,6 @@ def check_stiff(grid: Grid, bodies: Sequence[Body]) -> None:
 
 def _edge(grid: Grid, body: Body, axis: int) -> float:
     """Return the mean edge length (m) of the body's cells along an axis."""
-    if grid.even:
-        return grid.h[axis]
     low, high = body.bounds
     return float(((high - low) / np.ptp(grid.in_cells(np.stack([low, high]) - grid.base), axis=0))[axis])
 

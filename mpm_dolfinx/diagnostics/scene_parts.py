@@ -60,7 +60,7 @@ def check_axisymmetry(grid: Grid, bodies: Sequence[Body], quadrature: str) -> No
         return
     x = np.concatenate([body.corners() for body in bodies])
     inner = x[:, :, 0].min(axis=1)
-    h = grid.h[0] if grid.even else grid.widths[0][0]
+    h = grid.widths[0][0]
     near = np.flatnonzero(inner < h * (1 - NEAR))
     row = grid.index(x[near].mean(axis=1))[:, 1]
     touches = np.zeros(grid.shape[1] + 2, dtype=bool)

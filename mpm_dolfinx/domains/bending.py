@@ -47,7 +47,7 @@ def followed(
     for part in in_chunks(len(x)):
         slots, y = slot[cells[part]], (x[part] - grid.midpoints[cells[part]]).T.copy()
         out[0, part] = polynomial(field, y, slots).T
-        h = grid.h[:, None] if grid.even else grid.sizes(cells[part]).T
+        h = grid.sizes(cells[part]).reshape(-1, grid.dim).T
         weights = 0.5 * ((y / h) ** 2 - 0.25)  # t (t - 1) / 2
         out[1, part] = sum(weights[a] * polynomial(bends[a], y, slots, a) for a in range(grid.dim)).T
     return out
@@ -80,11 +80,8 @@ def _second_differences(
             local = neighbours[:, a, k]
             beyond = grid.cell_nodes[local][:, end]
             known.append((local >= 0) & filled[local])
-            if grid.even:
-                ends.append(_at(u, beyond) - value - (2 * k - 1) * along)
-            else:  # h^2 times the second derivative of a parabola
-                h, g = grid.along(cells, a), grid.along(local, a)
-                ends.append(2 * h / (h + g) * (h / g * (_at(u, beyond) - value) - (2 * k - 1) * along))
+            h, g = grid.along(cells, a), grid.along(local, a)  # h^2 times the second derivative of a parabola
+            ends.append(2 * h / (h + g) * (h / g * (_at(u, beyond) - value) - (2 * k - 1) * along))
         first, last = np.where(known[0], *ends), np.where(known[1], *ends[::-1])
         smaller = np.where(np.abs(first) < np.abs(last), first, last)
         enough = known[0] | known[1] if one_sided else known[0] & known[1]

@@ -101,7 +101,7 @@ def cell_ratios(
     cells, size = cut.cells, cut.grid.num_local
     corner_ratio = cut.to_cells(determinant(gradient(points.corners, points.reference, cut.grid.axisymmetric)))
     J, share = cut.to_cells(points.J), cut.to_cells(share)
-    weight = (share > 0) * cut.to_cells(points.volume0) * cut.pieces_to_cells(cut.pieces.fraction)
+    weight = (share > 0) * cut.shares(points.volume0)
     terms = weight, weight * share, weight * J, weight * corner_ratio, cut.to_cells(1.0 * flows)
     rest, part, own, now, yielded = (sum_by(cells, term, size)[cells] for term in terms)
     averaged = (weight > 0) & (yielded == 0)

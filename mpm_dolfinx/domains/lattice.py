@@ -84,12 +84,10 @@ class Lattice:
         """Return the indices of the points of the body."""
         return ((points.id >= self._start) & (points.id < self._stop)).nonzero()[0]
 
-    def given(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return which displacement components (m, 2^d, d) of the corners of domains are prescribed."""
-        return self.held_of(ids)[0]
-
     def held_of(self, ids: NDArray[np.int64]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Return which displacement components of corners are prescribed, and which corners are in contact."""
+        """Return which displacement components (m, 2^d, d) of corners are prescribed, and which corners (m, 2^d) touch
+        other bodies.
+        """
 
         def held() -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
             number = self.nodes(ids)
@@ -243,7 +241,7 @@ def given(lattices: Sequence[Lattice], points: MaterialPoints) -> NDArray[np.boo
     out = np.zeros(points.corners.shape, dtype=bool)
     for lattice in lattices:
         rows = lattice.rows(points)
-        out[rows] = lattice.given(points.id[rows])
+        out[rows] = lattice.held_of(points.id[rows])[0]
     return out
 
 

@@ -446,10 +446,7 @@ class FluxForms:
             # face, freely flowing water would have more mass than all of the soil in modes that alternate between nodes
             moved, force = inertial
             along_n = [ufl.dot(ufl.grad(force)(side), n0) for side in "+-"]
-            if grid.even:
-                along = ufl.avg(force) - across / 6 * (along_n[0] - along_n[1])
-            else:
-                along = ufl.avg(force) - (h0**2 * along_n[0] - h1**2 * along_n[1]) / (3 * (h0 + h1))
+            along = ufl.avg(force) - (h0**2 * along_n[0] - h1**2 * along_n[1]) / (3 * (h0 + h1))
             weight = along if weight is None else weight + along
             by_motion = ufl.derivative(along, moved, ufl.TrialFunction(moved.function_space))
         drop = 0.0 if weight is None else ufl.dot(weight, offset)
@@ -464,11 +461,8 @@ class FluxForms:
         damped = ufl.max_value(ufl.avg(self.damping) * share * (d0 + d1) - self.dt * T, 0.0)
         self.damp = FacetForm(damped * ufl.jump(dp) * ufl.jump(q) * dS, grid.comm)
         smaller = ufl.min_value(self.fixed_stress("+"), self.fixed_stress("-"))
-        if grid.even:
-            volume = fem.Constant(mesh, grid.cell_volume)  # for numbers, each value would be compiled again
-        else:
-            h = grid.edge_in_forms()("+")
-            volume = prod(h[a] for a in range(d))  # divided by h0, this is the area of the face on both sides
+        h = grid.edge_in_forms()("+")
+        volume = prod(h[a] for a in range(d))  # divided by h0, this is the area of the face on both sides
         self.alternation = FacetForm(smaller / (4 * d) * h0 / volume * ufl.jump(dp) * ufl.jump(q) * dS, grid.comm)
         self.slope = fem.Function(grid.cellwise((d,)))
         self.density = fem.Function(Q)

@@ -85,11 +85,11 @@ class Gradients:
         along = np.where(inside[:, :, None], separation / 2, 0.0)
         along[:, np.arange(2 * d), towards] = 0.0
         h = grid.sizes(contents.filled)
-        off = np.abs(along / (h if grid.even else h[:, None])).max(axis=(1, 2)) > ALONG / 2
+        off = np.abs(along / h.reshape(-1, 1, d)).max(axis=(1, 2)) > ALONG / 2
         off[at[off_middle(sides, grid)]] = True
         self.rows = rows = np.flatnonzero(off)
         """Indices of the cells that need the correction, among the filled cells."""
-        distance = h[towards] if grid.even else grid.between(contents.filled[:, None], cells, towards)
+        distance = grid.between(contents.filled[:, None], cells, towards)
         separation[:, np.arange(2 * d), towards] += np.tile([-1, 1], d) * distance
         self._own = contents.filled[rows]
         self._neighbours = cells[rows]

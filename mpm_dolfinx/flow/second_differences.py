@@ -50,7 +50,7 @@ def second_differences(
         np.minimum(opening[middle, axis, 1], opening[high, axis, 0]),
     )
     h = [grid.along(cells, axis) for cells in (low, middle, high)]
-    between = [h[1], h[1]] if grid.even else [(h[0] + h[1]) / 2, (h[1] + h[2]) / 2]
+    between = (h[0] + h[1]) / 2, (h[1] + h[2]) / 2
     pairs = (low, middle), (middle, high)
     distances = [gap + centroid[b, axis] - centroid[a, axis] for gap, (a, b) in zip(between, pairs, strict=True)]
     steep = [h[1] / np.maximum(d, gap / 2) for gap, d in zip(between, distances, strict=True)]

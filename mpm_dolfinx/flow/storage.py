@@ -443,7 +443,7 @@ class StorageProblem:
         contents, grid = self._contents, self.forms.grid
         flow = self.dt * mobility / grid.sizes(contents.filled) ** 2
         more = np.maximum((softest * tau)[:, None] - flow, 0) - np.maximum(tau[:, None] - flow, 0)
-        strength = (grid.cell_volume if grid.even else grid.volumes(contents.filled)[:, None]) * more
+        strength = np.array(grid.volumes(contents.filled)).reshape(-1, 1) * more
         return second_differences(self.system.unknowns, grid, strength, contents.centroid, contents.open)
 
     @property

@@ -250,7 +250,7 @@ class Places(Keyed):
     def stretch(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the circumferential stretch 1 + u_r / r at the points for nodal displacements u, in m."""
         grid, (*offset, product, radius) = self.grid, self.hoop.T
-        h = grid.h if grid.even else grid.sizes(self.cells).T[..., None]
+        h = grid.sizes(self.cells).T[..., None]
         hats = [0.5 + x[:, None] * grid.signs[:, a] / h[a] for a, x in enumerate(offset)]
         uneven = (product - offset[0] * offset[1])[:, None] * grid.signs.prod(axis=1) / h.prod(axis=0)
         return 1 + ((hats[0] * hats[1] + uneven) * u[grid.cell_nodes[self.cells], 0]).sum(axis=1) / radius
@@ -522,15 +522,14 @@ class PointExpression:
         live = self.live(data) if live is None else live
         count = len(data.cells if chosen is None else chosen)
         out, start = np.empty((count, self._values.shape[1])), 0
-        of_cells = self._grid.volumes(np.arange(len(self._values)))[..., None] if not self._grid.even else None
+        of_cells = np.array(self._grid.volumes(np.arange(len(self._values)))).reshape(-1, 1)
         while start < count:
             size = max((size for size in self._bound if size <= count - start), default=min(self._bound))
             stop, values = min(start + size, count), self._values[:size]
             self._rows(data, slice(start, stop) if chosen is None else chosen[start:stop], live)
             values[:] = 0.0
             self._compiled.assemble_vector(values.reshape(-1), self._rows.room(size)[:size], self._bound[size])
-            of_cell = self._grid.cell_volume if of_cells is None else of_cells[: stop - start]
-            np.divide(values[: stop - start], of_cell, out=out[start:stop])
+            np.divide(values[: stop - start], of_cells[: stop - start], out=out[start:stop])
             start = stop
         return out.reshape(count, *self._shape)
 

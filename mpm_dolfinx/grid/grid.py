@@ -491,11 +491,11 @@ class Grid:
 
     def along(self, cells: Any, axis: Any) -> NDArray[np.float64]:
         """Return the edge length (n,) of each local cell along an axis, in m.  `axis` may be an array (n,)."""
-        return self.h[axis] if self.even else self._of_process.at.sizes[cells, axis]
+        return self._h[axis] if self.even else self._of_process.at.sizes[cells, axis]
 
     def between(self, cells: Any, others: Any, axis: Any) -> NDArray[np.float64]:
         """Return the distances (n,) of midpoints of local cells from midpoints of neighbours along an axis, in m."""
-        return self.h[axis] if self.even else (self.along(cells, axis) + self.along(others, axis)) / 2
+        return self._h[axis] if self.even else (self.along(cells, axis) + self.along(others, axis)) / 2
 
     def volumes(self, cells: Any) -> NDArray[np.float64] | float:
         """Return the volumes (n,) of local cells in m^d, or in axisymmetry the areas of cells in the plane."""
@@ -726,7 +726,7 @@ class Grid:
         """Return the indices (n, d) of the cells nearest to positions x, in m from the base."""
         if not self.even:
             return np.stack([self.cells_along(a, x[:, a]) for a in range(self.dim)], axis=1)
-        i = np.floor((x - self.low) / self.h).astype(np.int64)
+        i = np.floor((x - self.low) / self._h).astype(np.int64)
         return np.minimum(np.maximum(i, 0), self.shape - 1, out=i)
 
     def owner(self, number: NDArray[np.int64]) -> NDArray[np.int32]:
@@ -804,11 +804,11 @@ class Grid:
 
     def outside(self, x: NDArray[np.float64], tolerance: float = SAME) -> NDArray[np.bool_]:
         """Return whether positions x, in m from the base, are outside the grid by more than `tolerance` cells."""
-        least = self.h if self.even else np.array([w[[0, -1]].min() for w in self.widths])  # at the sides
+        least = self._h if self.even else np.array([w[[0, -1]].min() for w in self.widths])  # at the sides
         tolerance = tolerance + rounding(np.array([self.lower, self.upper])) / least
         inside, cells = np.ones(len(x), dtype=bool), None if self.even else self.in_cells(x)
         for a in range(self.dim):
-            y = (x[:, a] - self.low[a]) / self.h[a] if self.even else cells[:, a]
+            y = (x[:, a] - self.low[a]) / self._h[a] if self.even else cells[:, a]
             inside &= (y >= -tolerance[a]) & (y <= self.shape[a] + tolerance[a])
         return ~inside  # nan counts as outside
 
@@ -820,7 +820,7 @@ class Grid:
         In 3D with `mixed`, gradients are means over pieces with centroids x.  `mixed` (n, 3), m^2: means over each
         piece of products of two offsets from its centroid.
         """
-        hats, h = self._hats(cells, x), self.sizes(cells).T[..., None] if not self.even else self.h
+        hats, h = self._hats(cells, x), self.sizes(cells).T[..., None]
         dN = np.empty((*hats[0].shape, self.dim))
         for a in range(self.dim):
             b, *more = [k for k in range(self.dim) if k != a]
@@ -839,7 +839,7 @@ class Grid:
         unequal cells, the offsets are divided by the edge lengths, see `over_edges`.
         """
         bits = corner_bits(self.dim)[:, None]
-        return np.where(bits, self.signs / (self.h if self.even else 1.0), 0.5).prod(axis=2)
+        return np.where(bits, self.signs / (self._h if self.even else 1.0), 0.5).prod(axis=2)
 
     def over_edges(self, coefficients: NDArray[np.float64], cells: NDArray[np.int32]) -> NDArray[np.float64]:
         """Convert coefficients (d, 2^d, cells) in the order of `monomials` to coefficients for offsets in m."""

@@ -205,8 +205,7 @@ def by_scene(
 
 def mean_size(grid: Grid) -> float:
     """Return the edge length, in m, of the square or cube with the volume of the largest cell."""
-    h = grid.h if grid.even else [w.max() for w in grid.widths]
-    return float(np.prod(h) ** (1 / grid.dim))
+    return float(np.prod([w.max() for w in grid.widths]) ** (1 / grid.dim))
 
 
 MOST = 100.0

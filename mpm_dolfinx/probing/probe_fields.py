@@ -171,9 +171,8 @@ class _Around:
             rows += [(probe, self._centroid[probe, place], head[probe, place], np.ones(len(probe)))]
             rows += self._outside_faces(head)
         probe, away, values, part = map(np.concatenate, zip(*rows, strict=True))
-        y = cells = away / self._lattice.size[probe, self._lattice.middle]
-        if not self._grid.even:
-            cells = self._grid.in_cells(self._x[probe] + away) - self._grid.in_cells(self._x[probe])
+        y = away / self._lattice.size[probe, self._lattice.middle]
+        cells = self._grid.in_cells(self._x[probe] + away) - self._grid.in_cells(self._x[probe])
         above = fitted(comm, len(base), 2, probe, y, (values - base[probe])[:, None], near(cells) * part)[:, 0]
         least, most = (np.full(len(base), start) for start in (np.inf, -np.inf))
         np.minimum.at(least, at[own], value[own])

@@ -293,11 +293,10 @@ def cell_time(scene: Scene, points: MaterialPoints) -> float:
     """Return the shortest time, in s, in which a wave crosses any cell."""
     density = scene.materials.density(points)
     at = density > 0
-    grid = scene.grid
-    h, of_all = (1.0, grid.least) if grid.even else (grid.sizes_at(points.x[at]).min(axis=1), 1.0)
+    h = scene.grid.sizes_at(points.x[at]).min(axis=-1)
     fastest = (scene.materials.confined_modulus(points)[at] / density[at] / h**2).max(initial=0.0)
-    fastest = over_all(grid.comm, float(fastest), MPI.MAX)
-    return of_all / fastest**0.5 if fastest > 0 else inf
+    fastest = over_all(scene.grid.comm, float(fastest), MPI.MAX)
+    return 1 / fastest**0.5 if fastest > 0 else inf
 
 
 def step_rule(times: Times, rtol: float | Adaptive | None, scene: Scene, points: MaterialPoints) -> StepSize:
