@@ -23,6 +23,8 @@ import footing
 import helpers
 import infiltration
 import mpi_renewal
+import slope as slopes
+import vibration
 
 
 def bent(h: float, nu: float = 0.0) -> dict[str, float]:
@@ -169,6 +171,17 @@ def tilted(cells: int) -> dict[str, np.ndarray]:
     return forces_of(s, 1.0, 0.25, "wall_reactions")
 
 
+def vibrating(cells: int) -> dict[str, np.ndarray]:
+    """A free bar that vibrates and moves over 2.5 of its lengths in 10 periods: histories of its end and its energy."""
+    run = vibration.flown(cells, 10, 20)
+    return {name: run[name] for name in ("swing", "energy")}
+
+
+def stable(cells: int) -> dict[str, float]:
+    """Return the factor of safety of a slope."""
+    return {"factor": mpm.factor_of_safety(slopes.slope(cells), rtol=0.01, progress=False).factor}
+
+
 SCENES = {
     "beam": (bent, 0.06, 0.03),
     "clay": (lambda h: bent(h, 0.46), 0.06, 0.03),
@@ -182,6 +195,8 @@ SCENES = {
     "contact": (rubbed, 8, 16),
     "held": (gripped, 8, 16),
     "plate": (tilted, 8, 16),
+    "bar": (vibrating, 10, 20),
+    "safety": (stable, 4, 8),
 }
 """Function of each scene, its cells (number or size) while a number is varied, and finer cells for comparison."""
 

@@ -37,7 +37,11 @@ THICK = np.sqrt(2)
 A convex body has the volume V, and is inside a cell of edge length h.  A plane outside this body has a distance of at
 least `V / ((d + 1) THICK h^(d-1))` from the centroid of the body.  Smaller distances are replaced by this bound.
 """
-ALONG = 0.1  # a side determines the slope along an axis if this component of its unit normal is larger than `ALONG`
+ALONG = 0.1
+"""A side determines the slope along an axis if this component of its unit normal is larger than `ALONG`.  Plateau
+(scene "beam" of tests/plateaus.py): half this value changes the result by 9.9e-11, twice this value by 8.7e-11, and
+finer cells by 1.4e-02.
+"""
 
 
 @dataclass(frozen=True)
