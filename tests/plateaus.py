@@ -36,6 +36,21 @@ def bent(h: float, nu: float = 0.0) -> dict[str, float]:
     return {"tip": tip[-1].ravel()[1], "pressure": np.abs(pressure).max()}
 
 
+def adaptive(h: float) -> dict[str, np.ndarray]:
+    """Histories of the tip and the pressures of a saturated beam in adaptive steps."""
+    s, _ = helpers.beam(h=h)
+    low, _ = s.bodies[0].bounds
+    probes = mpm.probes(s.bodies, low + np.array([[1.0, 0.15], [0.5, 0.1]]))
+    run = s.run(0.12, 0.02, rtol=0.02, probes=probes, progress=False)
+    return {"tip": run.displacement[:, 0, 1], "pressure": run.pressure, "inside": run.probe_pressure[:, 1]}
+
+
+def at_points(h: float) -> dict[str, np.ndarray]:
+    """History of the tip of a dry beam with integration at its points."""
+    s, probe = helpers.beam(h=h, fluid=False, ramp=1.0, numerics=mpm.Numerics(quadrature="point"))
+    return {"tip": s.run(1.0, 0.1, probes=probe, progress=False).displacement[:, 0, 1]}
+
+
 def cycled(h: float) -> dict[str, float]:
     """Return the tip displacement of a dry beam after two load cycles, and its residual stress divided by the first
     peak.
@@ -195,6 +210,8 @@ SCENES = {
     "contact": (rubbed, 8, 16),
     "held": (gripped, 8, 16),
     "plate": (tilted, 8, 16),
+    "adaptive": (adaptive, 0.06, 0.03),
+    "points": (at_points, 0.06, 0.03),
     "bar": (vibrating, 10, 20),
     "safety": (stable, 4, 8),
 }
@@ -226,7 +243,7 @@ def moved(where: str, name: str, scene: str) -> tuple[float, float, float]:
     plain, modules, out = answer(scene), holders(where, name), []
     value = getattr(modules[0], name)
     for factor in (0.5, 2):
-        other = type(value)(value * factor) if isinstance(value, int | float) else value * factor
+        other = type(value)(value * factor) if isinstance(value, int | float) else tuple(v * factor for v in value)
         try:
             for module in modules:
                 setattr(module, name, other)
