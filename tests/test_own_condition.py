@@ -121,7 +121,7 @@ class SkinOfStage(mpm.Feeding):
         return cut.surface(self.faces).at
 
     def unknown(self, value):
-        return {self.skin.name: np.array(value)}
+        return {"outflows": {self.skin.name: np.array(value)}}
 
 
 class SkinFeeds(mpm.Feeds):
@@ -141,8 +141,9 @@ class SkinFeeds(mpm.Feeds):
     def slope(self, at, fluid):
         return np.bincount(self.cells, at, len(fluid.p))
 
-    def outflows(self, at, fluid):
-        return {self.of.skin.name: np.array(self.of.grid.comm.allreduce(at @ fluid.pi[self.cells]))}
+    def outcome(self, at, fluid):
+        out = self.of.grid.comm.allreduce(at @ fluid.pi[self.cells])
+        return {"outflows": {self.of.skin.name: np.array(out)}}
 
 
 @pytest.mark.parametrize("conductance", [1e-9, 1e-6])

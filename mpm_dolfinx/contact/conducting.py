@@ -41,9 +41,9 @@ class ConductingContacts(Feeding):
         self._conducts = conducts
         self.count = sum(conducts.values())
 
-    def unknown(self, value: float) -> dict[str, NDArray[np.float64]]:
-        """Return a flow of `value` for each contact."""
-        return {name: np.array(value) for name, conducts in self._conducts.items() if conducts}
+    def unknown(self, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:
+        """Return the flows before the first step, all equal to `value`."""
+        return {"outflows": {name: np.array(value) for name, conducts in self._conducts.items() if conducts}}
 
     def placed(self, wet: Wet) -> Feeds:
         """Return the flow through the contacts in a substep."""
@@ -164,11 +164,11 @@ class ContactFeeds(Feeds):
         self._links = self._linked(links.changes + 1)
         return changes
 
-    def outflows(self, at: Conduction, fluid: Fluid) -> dict[str, NDArray[np.float64]]:
+    def outcome(self, at: Conduction, fluid: Fluid) -> dict[str, dict[str, NDArray[np.float64]]]:
         """Return the flows, in m^d/s, from the bodies `one` to the bodies `other` of each contact."""
         links, flux, *_ = self._flows(at, fluid)
         pairs = self._contact.pairs
         number, sign = pairs.number[links.closed], pairs.sign[links.closed]
         sums = over_all(self._grid.comm, np.bincount(number, sign * flux, len(self._conducts)))
         both = zip(self._conducts.items(), sums, strict=True)
-        return {name: np.array(flow) for (name, conducts), flow in both if conducts}
+        return {"outflows": {name: np.array(flow) for (name, conducts), flow in both if conducts}}

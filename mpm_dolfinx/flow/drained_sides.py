@@ -66,19 +66,19 @@ class DrainedSides(Feeding):
         """Faces on which the conditions act."""
         return [faces for _, faces in self._outlets]
 
-    def unknown(self, value: float) -> dict[str, NDArray[np.float64]]:
-        """Return an outflow of `value` for each condition."""
-        return {name: np.array(value) for name in self._names}
+    def unknown(self, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:
+        """Return outflows and run-offs before the first step, all equal to `value`, and volumes of zero with rain."""
 
-    def dry(self, value: float) -> dict[str, NDArray[np.float64]]:
-        """Return a run-off of `value` for each condition with rain."""
-        return {name: np.array(value) for name, rain in zip(self._names, self._rains, strict=True) if rain}
+        def of_all(value: float) -> dict[str, NDArray[np.float64]]:
+            return {name: np.array(value) for name in self._names}
 
-    def empty(self) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """See `Feeding`."""
+        def of_rains(value: float) -> dict[str, NDArray[np.float64]]:
+            return {name: np.array(value) for name, rain in zip(self._names, self._rains, strict=True) if rain}
+
         if not any(self._rains):
-            return {}
-        return {"flowed": self.unknown(0.0), "ran_off": self.dry(0.0), "ponded": self.dry(0.0)}
+            return {"outflows": of_all(value)}
+        volumes = {"flowed": of_all(0.0), "ran_off": of_rains(0.0), "ponded": of_rains(0.0)}
+        return {"outflows": of_all(value), "runoff": of_rains(value)} | volumes
 
     def fed(self, cut: CutDomains, pieces: PointData) -> NDArray[np.int64]:
         """Return the indices of points with faces on open sides.  Indices may be repeated."""
@@ -321,19 +321,20 @@ class SideFeeds(Feeds):
         self._flows = flows
         return changes
 
-    def outflows(self, at: OpenFaces, fluid: Fluid) -> dict[str, NDArray[np.float64]]:
-        """Return the outflow (m^d/s) through the sides of each condition, by name of the condition."""
-        sums = over_all(self._comm, sum_by(self.sides.number, self._through(at, fluid), len(self._names)))
-        return {name: np.array(sums[i]) for i, name in enumerate(self._names)}
+    def outcome(self, at: OpenFaces, fluid: Fluid) -> dict[str, dict[str, NDArray[np.float64]]]:
+        """Return the outflow through the sides of each condition, and with rain the run-off, in m^d/s.
 
-    def run_off(self, at: OpenFaces, fluid: Fluid) -> dict[str, NDArray[np.float64]]:
-        """Return the run-off, in m^d/s, by name of the condition: rain that neither infiltrates nor ponds."""
+        Run-off is rain that neither infiltrates nor fills a pond.
+        """
+        through = self._through(at, fluid)
+        sums = over_all(self._comm, sum_by(self.sides.number, through, len(self._names)))
+        out = {"outflows": {name: np.array(sums[i]) for i, name in enumerate(self._names)}}
         if not any(self._rains):
-            return {}
-        excess = np.maximum(self._fallen, 0.0) + np.minimum(self._through(at, fluid), 0.0)  # nan without rain
+            return out
+        excess = np.maximum(self._fallen, 0.0) + np.minimum(through, 0.0)  # nan without rain
         runs = over_all(self._comm, sum_by(self.sides.number, excess, len(self._names)))
         runs = np.where(self._ponded < self._most, 0.0, np.maximum(runs, 0.0))  # < 0 if a pond supplies the soil
-        return {name: np.array(runs[i]) for i, name in enumerate(self._names) if self._rains[i]}
+        return out | {"runoff": {name: np.array(runs[i]) for i, name in enumerate(self._names) if self._rains[i]}}
 
     def passing(self, at: OpenFaces, fluid: Fluid) -> dict[str, NDArray[np.float64]]:
         """Return two rates (2,) for each condition: outflow, and rain, in m^d/s."""

@@ -99,12 +99,10 @@ class Feeds:
         """Update the active set, and return the number of changes on this process."""
         return 0
 
-    def outflows(self, at: Any, fluid: Fluid) -> dict[str, NDArray[np.float64]]:
-        """Return the outflow from the bodies (m^d/s) through each condition, by name.  All processes must call this."""
-        return {}
-
-    def run_off(self, at: Any, fluid: Fluid) -> dict[str, NDArray[np.float64]]:
-        """Return the run-off, in m^d/s, by name of the condition.  All processes must call this."""
+    def outcome(self, at: Any, fluid: Fluid) -> dict[str, dict[str, NDArray[np.float64]]]:
+        """Return results of the conditions, by quantity and name, such as "outflows": the outflow from the bodies, in
+        m^d/s.  All processes must call this.
+        """
         return {}
 
     def passing(self, at: Any, fluid: Fluid) -> Mapping[str, NDArray[np.float64]]:
@@ -148,14 +146,6 @@ class Feeding:
         """Return the indices of points at which fluid may enter or leave.  Indices may be repeated."""
         return np.empty(0, dtype=np.int64)
 
-    def unknown(self, value: float) -> dict[str, NDArray[np.float64]]:
-        """Return an outflow of `value` for each condition."""
-        return {}
-
-    def dry(self, value: float) -> dict[str, NDArray[np.float64]]:
-        """Return a run-off of `value` for each condition with rain."""
-        return {}
-
-    def empty(self) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return the result of `Feeds.volumes` before the first step."""
+    def unknown(self, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:
+        """Return the results of `Feeds.outcome` before the first step, all equal to `value`, and volumes of zero."""
         return {}

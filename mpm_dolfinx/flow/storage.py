@@ -458,13 +458,13 @@ class StorageProblem:
         (p, p_n), owned = self._p, self.system.unknowns.owned
         return np.exp((p[owned] + p_n[owned]) / (2 * self.forms.bulk))
 
-    def outflows(self) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return the outflow and any run-off (m^d/s) at (u, p), by quantity and name of the condition."""
-        fluid, out, runs = self._fluid, {}, {}
+    def outcome(self) -> dict[str, dict[str, NDArray[np.float64]]]:
+        """Return the results of the conditions at (u, p), by quantity and name, see `Feeds.outcome`."""
+        fluid, out = self._fluid, {"outflows": {}}
         for one, at in zip(self._feeds, self._flow(False).at, strict=True):
-            out |= one.outflows(at, fluid)
-            runs |= one.run_off(at, fluid)
-        return {"outflows": out} | ({"runoff": runs} if runs else {})
+            for quantity, values in one.outcome(at, fluid).items():
+                out[quantity] = out.get(quantity, {}) | values
+        return out
 
     def passing(self) -> list[Mapping[str, NDArray[np.float64]]]:
         """Return the rates in a converged substep, for the method `volumes`."""

@@ -106,7 +106,7 @@ class Balances(NamedTuple):
         """
         stage, out = state.stage, {quantity: {} for quantity in QUANTITIES} | self.momentum.outcome()
         out["wall_reactions"] = self.momentum.wall_forces(stage.conditions["walls"])
-        out |= self.storage.outflows() if self.storage else {"outflows": {}}
+        out |= self.storage.outcome() if self.storage else {"outflows": {}}
         return out | (self.storage.volumes(passed, seconds[-len(passed) :]) if self.storage else {})
 
     def net_inflow(self, rates: Rates | None) -> NDArray[np.float64] | None:

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from mpm_dolfinx.base.errors import Report
 from mpm_dolfinx.base.histories import Row, Rows
 from mpm_dolfinx.base.tables import data_frame, data_set
-from mpm_dolfinx.conditions.acting import MOTIONS, QUANTITIES
+from mpm_dolfinx.conditions.acting import MOTIONS, OF_RAIN, QUANTITIES
 from mpm_dolfinx.conditions.names import ByName
 
-OUTCOMES = (*QUANTITIES, *MOTIONS, "energy", "runoff", "flowed", "ran_off", "ponded")
-"""Names of the results of the package's conditions. User-defined conditions may have other results."""
+OUTCOMES = (*QUANTITIES, *MOTIONS, "energy", *OF_RAIN)
+"""Quantities of the package's conditions. User-defined conditions may have other quantities."""
 
 
 @dataclass(frozen=True)

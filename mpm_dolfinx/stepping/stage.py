@@ -223,12 +223,7 @@ class Stage:
         d = self.free.shape[1]
         out = {quantity: {} for quantity in QUANTITIES}
         out["wall_reactions"] = {wall: np.full(d, value) for wall in SIDES[d]}
-        out["outflows"] = {name: values for one in self.feeding for name, values in one.unknown(value).items()}
-        if runs := {name: values for one in self.feeding for name, values in one.dry(value).items()}:
-            out["runoff"] = runs
-        for one in self.feeding:
-            out |= one.empty()
-        for one in self.acting:
+        for one in (*self.feeding, *self.acting):
             for quantity, values in one.unknown(value).items():
                 out[quantity] = out.get(quantity, {}) | values
         return out
