@@ -6,18 +6,18 @@ import pytest
 import ways
 
 CEILINGS = {
-    "ad hoc named numbers": 73,
+    "ad hoc named numbers": 53,
     "rules among numbers in functions": 3,
     "imports a file, mean": 5.54,
     "files in a circle of imports": 0,
     "folders in a circle of imports": 0,
     "files of the largest folder": 14,
     "parameters of the longest list": 12,
-    "assignments of three and more values": 17,
+    "assignments of three and more values": 16,
     "changes of hidden state": 0,
     "asserts and RuntimeErrors": 3,  # of users on other processes, and of two reference solutions
     "files that name a condition's class, most": 6,
-    "lines of the package": 39565,
+    "lines of the package": 39999,
 }
 
 WAYS = {"rooms of a traction": 13, "rooms of an initial pressure": 15, "homes of the pressure": 4}
