@@ -7,7 +7,7 @@ import pytest
 from helpers import limit, pressed, thresholds
 
 from mpm_dolfinx.solve.scheme import Scheme
-from mpm_dolfinx.solve.solver_choice import plan
+from mpm_dolfinx.solve.solver_choice import INCOMPLETE, ONE_SWEEP, THREE_SWEEPS, plan
 
 
 @pytest.mark.parametrize(
@@ -24,13 +24,18 @@ from mpm_dolfinx.solve.solver_choice import plan
         ((1e5, 2, {"wet": False, "processes": 2}), "momentum alone: displacements by factors"),
         ((100, 2, {"coupling": "fixed-stress"}), "in turn: displacements by factors in blocks, pressures by factors"),
         ((1e6, 3, {"locks": True}), "GMRES"),
+        ((1e6, 3, {"locks": True, "yields": True}), "GMRES, else multigrid with sweeps"),
+        ((1e4, 3, {"locks": True, "yields": True}), "GMRES, else factors by MUMPS"),
+        ((1e6, 3, {"locks": True, "yields": True, "wet": False}), "momentum alone: displacements by multigrid, GMRES"),
     ],
 )
 def test_a_plan_follows_from_what_the_problem_is_and_says_so(problem, words):
     unknowns, dim, *more = problem
-    found = plan(unknowns, dim, **(more[0] if more else {}))
+    given = more[0] if more else {}
+    found = plan(unknowns, dim, **given)
     assert words in str(found)
-    assert found.firmly == (problem[-1] == {"locks": True})
+    wet_yielding = dim == 3 and given.get("yields") and given.get("wet", True)
+    assert found.smoother == (INCOMPLETE if wet_yielding else THREE_SWEEPS if given.get("locks") else ONE_SWEEP)
 
 
 def test_a_plan_follows_its_table(monkeypatch):

@@ -3,6 +3,7 @@
 
 import gc
 import weakref
+from dataclasses import replace
 
 from petsc4py import PETSc
 
@@ -126,14 +127,17 @@ LAYERED = mpm.Hencky(
 BLOCKS = {  # soil, cells, step, m, steps, most iterations
     "nu = 0.499": (mpm.Hencky(bulk=500e6, shear=1e6, conductivity=1e-7), 14, 0.01, 2, 30),
     "nu = 0.49, layers 1 : 1000": (LAYERED, 14, 0.01, 2, 25),
-    "beyond the limit load": (FRICTIONAL, 12, 0.005, 10, 60),
+    "beyond the limit load": (FRICTIONAL, 12, 0.005, 10, 25),
+    "beyond the limit load, finer": (FRICTIONAL, 24, 0.005, 4, 25),
 }
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("block", BLOCKS)
 def test_no_linear_solve_of_a_wet_block_takes_many_iterations(block, monkeypatch):
-    """`tests/run.sh -m slow -s tests/test_solvers.py` prints the numbers."""
+    """`tests/run.sh -m slow -s tests/test_solvers.py` prints the numbers, and `tests/limit_load_3d.py` those of other
+    grids.
+    """
     counts, solve = [], monolithic.BlockSolver.solve
     monkeypatch.setattr(monolithic.BlockSolver, "solve", noting(counts, solve))
     soil, n, step, steps, most = BLOCKS[block]
@@ -159,6 +163,37 @@ def test_nearly_incompressible_bodies_in_3d_take_few_iterations_a_solve(bulk):
     """nu = 0.49 and 0.499. With multigrid alone, the second takes 60 iterations per solve."""
     report = pushed(bulk)[1]
     assert report.coupling < 15 * report.newton
+
+
+def yielded(soil: mpm.Skeleton, monkeypatch) -> tuple[mpm.Simulation, list[int], list[int]]:
+    """Return a cube after two steps, its iterations, and a list with an entry for each replacement of the cycle."""
+    counts, solve = [], monolithic.BlockSolver.solve
+    made, make = [], monolithic.BlockSolver._factorised
+    with monkeypatch.context() as patch:
+        patch.setattr(monolithic.BlockSolver, "solve", noting(counts, solve))
+        patch.setattr(monolithic.BlockSolver, "_factorised", lambda self: made.append(1) or make(self))
+        s = quarter_pushed(soil, 8, 0.01)
+        s.step(1.0), s.step(1.0)
+    return s, counts, made
+
+
+def test_yielding_soil_takes_few_iterations_without_factors(monkeypatch):
+    """With three sweeps in place of incomplete factors, a solve takes up to 41 iterations."""
+    thresholds(monkeypatch, fallback_3d=0)
+    s, counts, made = yielded(FRICTIONAL, monkeypatch)
+    assert max(counts) <= 20 and not made and np.abs(s.points.data["plastic"] - np.eye(3)).max() > 0.02
+
+
+def test_sweeps_replace_incomplete_factors_in_nearly_incompressible_soil_and_solve_the_same_problem(monkeypatch):
+    stiff, ends = replace(FRICTIONAL, bulk=50e6), []
+    for most in (THRESHOLDS.fallback_3d, 0):
+        thresholds(monkeypatch, fallback_3d=most)
+        ends.append(yielded(stiff, monkeypatch))
+    (one, few, _), (other, many, made) = ends
+    assert len(made) == 2, "once in each step"
+    assert max(few) < max(many)
+    assert np.abs(one.points.x - other.points.x).max() < 1e-7
+    assert other.points.pressure == pytest.approx(one.points.pressure, abs=1e-5 * np.abs(one.points.pressure).max())
 
 
 def test_factors_serve_as_soon_as_a_multigrid_cycle_is_foreseen_to_take_too_many_iterations(monkeypatch):

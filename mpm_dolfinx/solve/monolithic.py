@@ -14,14 +14,14 @@ to the tolerance 1e-5.  With algebraic multigrid, GMRES takes 10 to 15 cycles in
 17 to 23 cycles, and conjugate gradients on the Schur complement 35 to 60 cycles.
 
 At nu = 0.499 with 14^3 cells, GMRES takes more than 100 iterations.  If a solve takes too many iterations, factors of K
-replace the multigrid cycle.  In yielding soil in 2D, GMRES would take 20 to 500 iterations, because coarse grids cannot
-represent shear bands.
+replace the multigrid cycle, or in large 3D bodies that may yield a cycle with another smoother (`SMOOTHERS`).  In
+yielding soil in 2D, GMRES would take 20 to 500 iterations, because coarse grids cannot represent shear bands.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from petsc4py import PETSc
 
@@ -32,7 +32,7 @@ from mpm_dolfinx.base import _compat
 from mpm_dolfinx.flow.storage import FluxSlope, StorageSystem
 from mpm_dolfinx.mechanics.momentum import MomentumSystem
 from mpm_dolfinx.solve.factors import MOST, direct_solver, displacement_solver, factorise, solved
-from mpm_dolfinx.solve.solver_choice import MUMPS, SolverPlan
+from mpm_dolfinx.solve.solver_choice import MUMPS, SWEEPS, THREE_SWEEPS, SolverPlan
 
 LEAST = 1e-4
 """Smallest scale of the fluid residual, divided by the fluid volume that residual forces displace in a drained body.
@@ -114,9 +114,18 @@ class BlockSolver:
     `how`: solver plan.
     `momentum`, `storage`: the matrices.
     `cycles`: two preconditioners, a multigrid cycle on K and a multigrid cycle on P.
+    `multigrid`: function that returns multigrid on K with a smoother.
     """
 
-    def __init__(self, how: SolverPlan, momentum: MomentumSystem, storage: StorageSystem, cycles: Inverses):
+    def __init__(
+        self,
+        how: SolverPlan,
+        momentum: MomentumSystem,
+        storage: StorageSystem,
+        cycles: Inverses,
+        multigrid: Callable[..., PETSc.KSP],
+    ):
+        self._multigrid = multigrid
         self._plan = how
         self._momentum = momentum
         self._storage = storage
@@ -134,7 +143,8 @@ class BlockSolver:
         self._ksp.setConvergenceHistory(MOST, reset=True)
         self._ksp.pc.setType(PETSc.PC.Type.PYTHON)
         self._ksp.setOperators(self._A)
-        self._ksp.setMonitor(_foresight(how.many))
+        self._foresight = Foresight(max(1, how.many // 4))
+        self._ksp.setMonitor(self._foresight)
         self._ksp.setFromOptions()
 
     def solve(
@@ -157,7 +167,30 @@ class BlockSolver:
         -------
         The number of iterations, and the factors for later solves, or None.
         """
-        operator = BlockOperator(self._momentum, self._storage, factors or self._cycles, self._work)
+        given = du, dp, scales, rtol, slopes
+        replaceable = bool(self._plan.fallback) and not (factors and self._plan.fallback == SWEEPS)
+        many = self._plan.many if replaceable else MOST
+        self._foresight.active = replaceable
+        count = self._iterate(factors or self._cycles, *given, many)
+        self._foresight.active = False
+        if replaceable and self._ksp.getConvergedReason() < 0:
+            with _compat.Timer("factorisation"):
+                factors = self._factorised()
+            count += self._iterate(factors, *given, MOST)
+        return count, factors
+
+    def _iterate(
+        self,
+        inverses: Inverses,
+        du: PETSc.Vec,
+        dp: PETSc.Vec,
+        scales: tuple[NDArray, NDArray],
+        rtol: float,
+        slopes: tuple[FluxSlope, ...],
+        most: int,
+    ) -> int:
+        """Solve with approximations of K^-1 and P^-1, and return the number of iterations, at most `most`."""
+        operator = BlockOperator(self._momentum, self._storage, inverses, self._work)
         on_u, on_p = self._momentum.of_parts, self._storage.of_parts
         residuals = self._momentum.residual, self._storage.residual
         scale_u, scale_p = scales
@@ -168,31 +201,24 @@ class BlockSolver:
             scale_u, scale_p = (scale * np.where(size > 0, size, 1.0) for scale in (scale_u, scale_p))
         scale = scale_u[on_u.of], scale_p[on_p.of]
         operator.join(*residuals, self._b, *(1 / s for s in scale))
-        most = self._plan.many if self._plan.fallback else MOST
-        count = self._iterate(operator.inverses, scale, slopes, rtol, most)
-        if self._plan.fallback and self._ksp.getConvergedReason() < 0:
-            with _compat.Timer("factorisation"):
-                factors = self._factorised()
-            self._ksp.setInitialGuessNonzero(True)
-            count += self._iterate(factors, scale, slopes, rtol, MOST)
-            self._ksp.setInitialGuessNonzero(False)
-        operator.part(self._x, du, dp)
-        return count, factors
-
-    def _iterate(self, inverses: Inverses, scale: tuple, slopes: tuple, rtol: float, most: int) -> int:
-        """Solve by GMRES, and return the number of iterations.  `most`: largest number."""
-        operator = BlockOperator(self._momentum, self._storage, inverses, self._work, scale, slopes)
+        operator = replace(operator, scale=scale, slopes=slopes)
         self._A.setPythonContext(operator)
         self._ksp.pc.setPythonContext(operator)
         self._ksp.setTolerances(rtol=rtol, atol=0.0, max_it=most)
         self._ksp.solve(self._b, self._x)
         self._A.setPythonContext(IDLE)
         self._ksp.pc.setPythonContext(IDLE)
+        operator.part(self._x, du, dp)
         return solved(self._ksp, "momentum and storage")
 
     def _factorised(self) -> Inverses:
-        """Return factors of K, and in 2D of P, as preconditioners for this and later tangents."""
+        """Return factors of K, and in 2D of P, as preconditioners for this and later tangents.
+
+        In bodies too large for factors, multigrid with sweeps replaces them. This cycle is set up for each tangent.
+        """
         K, unknowns = self._momentum.K, self._momentum.unknowns
+        if self._plan.fallback == SWEEPS:
+            return self._multigrid(smoother=THREE_SWEEPS).pc, self._cycles[1]
         solvers = [displacement_solver(K, "factors", unknowns, self._plan.fallback, self._plan.symmetric)]
         if unknowns.dim == 2:
             solvers.append(direct_solver(self._storage.P, "storage_factors", gathered=self._plan.fallback != MUMPS))
@@ -203,16 +229,22 @@ class BlockSolver:
         return found[0], found[1] if found[1:] else self._cycles[1]
 
 
-def _foresight(many: int) -> Callable[[PETSc.KSP, int, float], None]:
-    """Return a PETSc monitor that ends a solve if more than `many` iterations are predicted."""
-    quarter = max(1, many // 4)
+class Foresight:
+    """Monitor that ends a solve if its last iterations predict more than the largest number of iterations.
 
-    def monitor(ksp: PETSc.KSP, count: int, norm: float) -> None:
+    `interval`: number of iterations between two predictions.
+    """
+
+    def __init__(self, interval: int):
+        self._interval = interval
+        self.active = False
+        """Whether another solver can replace the present one."""
+
+    def __call__(self, ksp: PETSc.KSP, count: int, norm: float) -> None:
+        """Predict the residual at the end of the solve."""
         rtol, _, _, most = ksp.getTolerances()
-        if most != many or not count or count % quarter:
+        if not self.active or not count or count % self._interval:
             return
         norms = ksp.getConvergenceHistory()
-        if norm * (norm / norms[count - quarter]) ** ((many - count) / quarter) > rtol * norms[0]:
+        if norm * (norm / norms[count - self._interval]) ** ((most - count) / self._interval) > rtol * norms[0]:
             ksp.setTolerances(max_it=count)
-
-    return monitor

@@ -17,6 +17,8 @@ from petsc4py import PETSc
 PREFIXES = {
     "momentum_": "factors of K",
     "momentum_multigrid_": "multigrid on K",
+    "momentum_firmly_": "multigrid on K in nearly incompressible bodies, with three sweeps on each grid",
+    "momentum_incomplete_": "multigrid on K in wet soil that may yield, with incomplete factors on each grid",
     "nodal_factors_": "factors of K in blocks",
     "storage_": "conjugate gradients or FGMRES on the Schur complement, with factors of the fixed-stress operator",
     "storage_gathered_": "these factors, if one of several processes holds them",

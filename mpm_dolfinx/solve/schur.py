@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from weakref import finalize
 
 from mpi4py import MPI
@@ -118,7 +119,8 @@ class LinearSolvers:
             """Newton direction of the pressures, and a work vector for right-hand sides."""
             if how.route == AT_ONCE:
                 self._solve_s = multigrid_solver(storage.P, "storage", *storage.places(), False, how.coarsest)
-                self._block = BlockSolver(how, momentum, storage, (self.solve_u.pc, self._solve_s.pc))
+                cycles = self.solve_u.pc, self._solve_s.pc
+                self._block = BlockSolver(how, momentum, storage, cycles, self._multigrid())
                 return
             work = momentum.unknowns.vector(), momentum.unknowns.vector()
             n, self._context = (storage.unknowns.size, None), SchurComplement(storage, self.solve_u, *work)
@@ -135,12 +137,16 @@ class LinearSolvers:
     def _momentum_solver(self) -> PETSc.KSP:
         """Return the solver for systems with K."""
         how = self.plan
-        K = self._momentum.K
-        unknowns = self._momentum.unknowns
         if how.displacements == MULTIGRID:
-            lines = self._momentum.lines
-            return multigrid_solver(K, "momentum", *self._momentum.places(), True, how.coarsest, how.firmly, lines)
-        return displacement_solver(K, "momentum", unknowns, how.displacements, how.symmetric)
+            return self._multigrid()(smoother=how.smoother)
+        momentum = self._momentum
+        return displacement_solver(momentum.K, "momentum", momentum.unknowns, how.displacements, how.symmetric)
+
+    def _multigrid(self) -> Callable[..., PETSc.KSP]:
+        """Return a function that returns multigrid on K with a smoother."""
+        momentum = self._momentum
+        given = {"nodal": True, "coarsest": self.plan.coarsest, "lines": momentum.lines}
+        return partial(multigrid_solver, momentum.K, "momentum", *momentum.places(), **given)
 
     def _set_krylov(self, kind: str) -> None:
         """Set the type of the iterative solver for the pressures."""

@@ -12,6 +12,12 @@ from dataclasses import dataclass
 
 FACTORS, NODAL, MUMPS, MULTIGRID = "factors", "factors in blocks", "factors by MUMPS", "multigrid"
 """Solvers for displacements or pressures."""
+SWEEPS = "multigrid with sweeps"
+"""Multigrid that replaces a cycle with incomplete factors, see `THREE_SWEEPS`."""
+ONE_SWEEP, THREE_SWEEPS = "multigrid", "firmly"
+"""Smoothers of multigrid by relaxation, as in the names of PETSc's options."""
+INCOMPLETE = "incomplete"
+"""Smoother of multigrid by incomplete factors, as in the names of PETSc's options."""
 ALONE, SCHUR, AT_ONCE, IN_TURN = "momentum alone", "Schur complement", "both at once", "in turn"
 """Methods for the linearised problem."""
 
@@ -79,9 +85,10 @@ class SolverPlan:
     krylov
         Name of the iterative solver in PETSc, or "preonly" for a direct solver alone.
     fallback
-        Direct solver that replaces multigrid after many iterations, or "".
-    firmly
-        Whether multigrid uses a stronger smoother, for nearly incompressible bodies without a fallback.
+        Solver that replaces the multigrid cycle on K after many iterations, or "" without such a solver.
+    smoother
+        Smoother of the multigrid cycle on K: `INCOMPLETE` in wet soil that may yield, `THREE_SWEEPS` in other nearly
+        incompressible bodies without a fallback, otherwise `ONE_SWEEP`.
     symmetric
         Whether K is symmetric.
     many, coarsest
@@ -97,7 +104,7 @@ class SolverPlan:
     pressures: str
     krylov: str
     fallback: str
-    firmly: bool
+    smoother: str
     symmetric: bool
     many: int
     coarsest: int
@@ -171,6 +178,9 @@ def plan(
     fallback = ""
     if multigrid and at_once and (dim == 2 or unknowns <= limits.fallback_3d):
         fallback = MUMPS if dim == 3 else direct
+    elif multigrid and at_once and yields:
+        fallback = SWEEPS
+    smoother = INCOMPLETE if multigrid and at_once and yields else THREE_SWEEPS if locks and not fallback else ONE_SWEEP
     if not wet:
         krylov = "gmres" if multigrid else "preonly"
     elif in_turn:
@@ -185,7 +195,7 @@ def plan(
         pressures="" if not wet else MULTIGRID if multigrid and at_once else MUMPS if mumps else FACTORS,
         krylov=krylov,
         fallback=fallback,
-        firmly=multigrid and locks and not fallback,
+        smoother=smoother,
         symmetric=symmetric,
         many=limits.many,
         coarsest=limits.coarsest,
