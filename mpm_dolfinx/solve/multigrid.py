@@ -21,7 +21,6 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
-from mpm_dolfinx.base import _compat
 from mpm_dolfinx.parallel.exchange import Exchange, over_all
 from mpm_dolfinx.solve.petsc_options import set_defaults
 from mpm_dolfinx.solve.solver_choice import INCOMPLETE, ONE_SWEEP, THREE_SWEEPS
@@ -84,8 +83,7 @@ def multigrid_solver(
     ksp.setType(PETSc.KSP.Type.GMRES)
     ksp.setPCSide(PETSc.PC.Side.RIGHT)
     ksp.setOptionsPrefix(f"mpm_{name}_{smoother}_")  # separate from the options for factors
-    with _compat.Timer("factorisation"):
-        steps = interpolations(A.comm.tompi4py(), places, held, nodal, coarsest, lines)
+    steps = interpolations(A.comm.tompi4py(), places, held, nodal, coarsest, lines)
     ksp.pc.setType(PETSc.PC.Type.MG)
     ksp.pc.setMGLevels(len(steps) + 1)
     for level, Q in zip(range(len(steps), 0, -1), steps, strict=True):

@@ -111,7 +111,7 @@ class LinearSolvers:
         self.du, self._rhs = momentum.unknowns.vector(), momentum.unknowns.vector()
         """Newton direction of the displacements, and a work vector for right-hand sides."""
         self._unread = set(scheme.petsc_options)
-        with using(scheme.petsc_options, self._unread):
+        with _compat.Timer("factorisation"), using(scheme.petsc_options, self._unread):
             self.solve_u = self._momentum_solver()
             if storage is None:
                 return
