@@ -167,7 +167,7 @@ def test_results_are_found_by_names_and_not_by_positions():
     s = block(conditions=[Springs("bottom"), mpm.Displacement("left", (0, 0), "y", name="clamp")])
     s.step(0.5)
     assert s.reactions["clamp"][1] > 0
-    with pytest.raises(KeyError, match=r"0: must be the name of a condition: 'clamp'"):
+    with pytest.raises(KeyError, match=r"0: must be one of 'clamp'"):
         s.reactions[0]
 
 

@@ -21,4 +21,4 @@ class ByName(dict[str, T]):
 
     def __missing__(self, name: Any) -> T:
         """Raise KeyError for an unknown name."""
-        raise KeyError(f"{name!r}: must be the name of a condition: {', '.join(map(repr, self)) or 'there is none'}")
+        raise KeyError(f"{name!r}: must be one of {', '.join(map(repr, self)) or 'no names'}")
