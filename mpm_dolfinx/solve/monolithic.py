@@ -168,10 +168,9 @@ class BlockSolver:
         The number of iterations, and the factors for later solves, or None.
         """
         given = du, dp, scales, rtol, slopes
-        replaceable = bool(self._plan.fallback) and not (factors and self._plan.fallback == SWEEPS)
-        many = self._plan.many if replaceable else MOST
-        self._foresight.active = replaceable
-        count = self._iterate(factors or self._cycles, *given, many)
+        cycles = self._plan.fallback == SWEEPS
+        self._foresight.active = replaceable = bool(self._plan.fallback) and not (factors and cycles)
+        count = self._iterate(factors or self._cycles, *given, MOST if cycles or not replaceable else self._plan.many)
         self._foresight.active = False
         if replaceable and self._ksp.getConvergedReason() < 0:
             with _compat.Timer("factorisation"):

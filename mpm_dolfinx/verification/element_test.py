@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mpm_dolfinx.base.errors import NotConverged
-from mpm_dolfinx.base.tolerances import CENTRAL, FOREVER, ITERATIONS, ROUND_OFF, SAME
+from mpm_dolfinx.base.tolerances import CENTRAL, FOREVER, ITERATIONS, ROUND_OFF
 from mpm_dolfinx.base.validation import instance, numbers, whole
 from mpm_dolfinx.grid.grid import Grid
 from mpm_dolfinx.materials.evaluate import LawAtPoints
@@ -280,7 +280,7 @@ class _Point:
         nudges = np.zeros((1 + 2 * len(free), 3, 3))
         for k, (i, j) in enumerate(free):
             nudges[1 + 2 * k, i, j], nudges[2 + 2 * k, i, j] = CENTRAL, -CENTRAL
-        near = SAME * np.abs(goal).max() + ROUND_OFF * self._bulk  # the second term is round-off
+        near = CENTRAL**2 * np.abs(goal).max() + ROUND_OFF * self._bulk  # errors of the slope, and round-off
         for _ in range(ITERATIONS):
             found = self._stress(F + nudges, at.state, dt)[:, rows, columns]
             error = found[0] - goal
