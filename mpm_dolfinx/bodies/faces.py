@@ -37,8 +37,8 @@ TANGENTIAL = {d: np.array([[a for a in range(d) if a != axis] for axis in range(
 class Surface:
     """Faces of particle domains on one side of the bodies.
 
-    Every process has the same faces.  Parts of faces in contact with another body are excluded.  The rest of each face
-    is divided into triangles and quadrilaterals.  Arrays have one row for each of these m polygons.
+    Every process has the same faces.  Parts of faces in contact with another body are excluded.  The area of each face
+    without contact is divided into triangles and quadrilaterals.  Arrays have one row for each of these m polygons.
     """
 
     id: NDArray[np.int64]  # identifier of the material point (m,), ascending
@@ -62,12 +62,12 @@ class Surface:
 
     @cached_property
     def outward(self) -> NDArray[np.float64]:
-        """Seeded outward area vectors (m, d), in m^(d-1), of the whole faces."""
+        """Seeded outward area vectors (m, d), in m^(d-1), of the undivided faces."""
         return face_vectors(self.domain, self.face)
 
     @cached_property
     def whole0(self) -> NDArray[np.float64]:
-        """Seeded areas (m,), in m^(d-1), of the whole faces."""
+        """Seeded areas (m,), in m^(d-1), of the undivided faces."""
         return np.linalg.norm(self.outward, axis=1)
 
     @cached_property
@@ -251,7 +251,7 @@ def _interval(X: NDArray[np.float64], region: NDArray[np.float64]) -> tuple[NDAr
 def _clipped(
     X: NDArray[np.float64], t: NDArray[np.float64], region: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Clip parts of faces to a region, and return the remaining triangles."""
+    """Clip parts of faces to a region.  Return the triangles inside the region, and the index of the part of each."""
     places = np.einsum("npk,nkd->npd", weights(t.reshape(-1, 2)).reshape(*t.shape[:2], 4), X)
     three = (t[:, 2] == t[:, 3]).all(axis=1)[:, None]  # in triangles, the middle is a corner
     middle = np.where(three, places[:, 2], places.mean(axis=1))

@@ -84,7 +84,7 @@ def read(file: Path) -> meshio.Mesh:
 
 
 def _section(data: bytes, name: str) -> bytes:
-    """Return the content of a section."""
+    """Return the bytes between the first and the last line of a section."""
     found = re.search(rb"\$%b[ \r]*\n(.*?)\s?\$End%b" % (name.encode(), name.encode()), data, re.DOTALL)
     if not found:
         raise ValueError(f"section ${name} is missing, must be in the file")

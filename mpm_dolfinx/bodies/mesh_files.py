@@ -197,8 +197,8 @@ def _first_order(
 ) -> list[tuple[str, NDArray[np.int64]]]:
     """Return the type and the corners of the cells of each block.  Blocks of unknown types are omitted.
 
-    `known`: number of corners of each type.
-    `counted`: types whose second-order cells cause a warning.
+    `known`: number of corners of each cell type.
+    `counted`: cell types whose second-order cells cause a warning.
     """
     blocks = []
     curved, off = 0, 0.0

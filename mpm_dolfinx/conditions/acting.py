@@ -38,9 +38,9 @@ Outcome = Mapping[str, Mapping[str, NDArray[np.float64]]]
 QUANTITIES = ("reactions", "wall_reactions", "outflows", "tool_forces", "tool_travel")
 """Names of the results of conditions."""
 OF_RAIN = ("runoff", "flowed", "ran_off", "ponded")
-"""Names of further results in scenes with rain."""
+"""Names of the results that only scenes with rain have."""
 MOTIONS = ("tool_velocity", "tool_rotation", "tool_spin")
-"""Names of further results of free tools."""
+"""Names of the results that only free tools have."""
 
 
 class FormsOf:
@@ -52,7 +52,7 @@ class FormsOf:
         self._made: dict[Callable, Any] = {}
 
     def __call__(self, make: Callable[..., T], *more) -> T:
-        """Return the forms `make(grid, u, *more)`, compiled at the first call with this class `make`."""
+        """Return the forms `make(grid, u, *more)`.  The first call with a class `make` compiles these forms."""
         if make not in self._made:
             self._made[make] = make(self.grid, self.u, *more)
         return self._made[make]
@@ -146,7 +146,7 @@ class Loads:
     stiff: bool = False
     """Whether `penalty` adds a matrix."""
     holding: bool = False
-    """Whether the condition may support bodies by other constraints than the constraints of `touching`."""
+    """Whether the condition may support bodies by constraints that `touching` does not return."""
     couples: bool = False
     """Whether the tangent couples nodes of different cells."""
     rounding_at_unknowns: NDArray[np.float64] | float = 0.0
@@ -170,7 +170,7 @@ class Loads:
         return self
 
     def flown(self, at: At) -> Any:
-        """Return the data of this converged substep for the next substep with inertia."""
+        """Return values of this converged substep that the next substep with inertia needs."""
 
     def rubbing(self, at: At, v: NDArray[np.float64]) -> tuple[float, float]:
         """Return the dissipation by slip, and a correction of the external power, in W, on this process.
@@ -195,7 +195,7 @@ class Loads:
         """Add forces at u that count as internal forces."""
 
     def penalty(self, A: PETSc.Mat, walls: bool) -> None:
-        """Add the stiffness matrix of forces that are linear in u.  `walls`: whether to add rows that walls fix."""
+        """Add the stiffness matrix of forces that are linear in u.  `walls`: whether to add rows of dofs at walls."""
 
     def pulling(self, at: At, v: NDArray[np.float64]) -> float:
         """Return the power, in W, of `pulls` and `penalty` at u and the nodal velocities v on this process."""
@@ -205,7 +205,7 @@ class Loads:
         """Add the derivative of `resists` minus `loads` at u, without final assembly."""
 
     def push(self, at: At, residual: PETSc.Vec, on: Unknowns) -> None:
-        """Subtract further forces at u from the residual."""
+        """Subtract contact forces, inertia forces and forces of tied sides at u from the residual."""
 
     def inertia(self, at: At) -> PETSc.Vec | None:
         """Return the inertia forces at u, in N, or None without inertia."""
@@ -239,7 +239,7 @@ class Loads:
         return self
 
     def counted(self, at: At) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return local dofs (n,) on walls, and forces (n,), in N, at these dofs that are no wall reactions."""
+        """Return local dofs (n,), and the forces (n,), in N, at these dofs that wall reactions exclude."""
         return np.empty(0, dtype=np.int64), np.empty(0)
 
     def within_reach(self) -> NDArray[np.int64]:
@@ -264,7 +264,7 @@ class Loads:
 
     @property
     def rounding_beside(self) -> float:
-        """Return the rounding error of contact forces, in N, in the cells of the other bodies."""
+        """Return the rounding error of contact forces, in N, in the cells with the opposite positions."""
         return 0.0
 
     def outcome(self, at: At) -> dict[str, dict[str, NDArray[np.float64]]]:
@@ -272,7 +272,7 @@ class Loads:
         return {}
 
     def gripped(self, at: At, points: MaterialPoints) -> MaterialPoints:
-        """Return the points with updated data of this condition."""
+        """Return the points with updated fields of this condition."""
         return points
 
     def ended(self, at: At) -> Loads:
@@ -280,7 +280,7 @@ class Loads:
         return self
 
     def near(self, points: MaterialPoints, corners: NDArray[np.float64]) -> NDArray[np.bool_] | bool:
-        """Return which corners (n, 2^d, d) are near a contact after a step.  They move by the Q1 field alone."""
+        """Return which corners (n, 2^d, d) are near a contact after a step.  The Q1 field alone moves these corners."""
         return False
 
     def outside(
@@ -329,7 +329,7 @@ class Acting:
     held: Sequence[tuple[Any, Surface, Sequence[int]]] = ()
     """Prescribed displacements, each with condition, faces and prescribed axes."""
     seeded: Sequence[Surface] = ()
-    """Further faces with conditions on displacements since seeding.  Renewal must not replace their domains."""
+    """Faces not in `held` with conditions on displacements since seeding.  Renewal must not replace their domains."""
 
     def placed(self, place: Place) -> Loads:
         """Return the loads of a substep."""
@@ -339,9 +339,9 @@ class Acting:
         """Raise an error if the stage cannot start from the current positions."""
 
     def kept(self, n: int) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return initial values of the data of this condition at n points, by condition and name of the data."""
+        """Return initial values at n points of the fields of this condition, by condition and name of the field."""
         return {}
 
     def unknown(self, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return results equal to `value`, by quantity and condition."""
+        """Return placeholders for results, by quantity and condition: each component is `value`."""
         return {}

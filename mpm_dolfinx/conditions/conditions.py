@@ -332,7 +332,7 @@ class Rain(Flux):
         side.  Ponded water infiltrates or evaporates later.
     driest
         Lowest pressure at the side, in Pa, < 0 and finite: the pore pressure in equilibrium with the air.  By
-        Kelvin's equation, -1e7 Pa corresponds to air of 93 % humidity at 20 °C.  In other units, give a value.
+        Kelvin's equation, -1e7 Pa corresponds to air of 93 % humidity at 20 °C.  If the units are not SI, give a value.
     region : ((d,), (d,)), m
         Box of reference positions.  The condition acts inside this box only.
 
@@ -396,7 +396,7 @@ than the penalty, multipliers remove this error (`HoldLoads.augment`).  Plateau 
 half this value changes the result by 5.9e-05, twice this value by 2.0e-05, and finer cells by 3.0e-02.
 """
 YIELDING = 0.1
-"""Factor on the elastic modulus in the penalty of laws with state variables.
+"""For laws with state variables, the modulus of the penalty is this factor times the elastic modulus.
 
 Plateau (scene "soil" of tests/plateaus.py): half this value changes the result by 6.5e-05, twice this value by 1.9e-05,
 and finer cells by 3.0e-02.
@@ -430,17 +430,17 @@ class Displacement(Condition):
         Side of the bodies, as for `Traction`.
     value : (d,) or callable (t, X) -> (d,) or (m, d), m
         Displacement at reference positions X (m, d), since the start, or since a stage set displacements to zero.  The
-        value has d components, also if some components are not prescribed.
+        value has d components, even if only some of them are prescribed.
     components
         Prescribed components, such as "y".  By default all d components are prescribed.
     region : ((d,), (d,)), m
         Box of reference positions.  The displacement is prescribed inside this box.  The box may end within a cell.
-        The outer node of this cell is prescribed too if the box covers more than half of the cell.
+        The nodes of this cell outside the box are prescribed too if the box covers more than half of the cell.
 
     Raises
     ------
     ValueError
-        No body has this side, or value or components are invalid.  A wall fixes a component that moves.  Another
+        No body has this side, or `value` or `components` is invalid.  A wall fixes a component that moves.  Another
         `Displacement` prescribes the component on the same part of a face, or another value at a common edge.  The
         scene or a step raises the error.
     """

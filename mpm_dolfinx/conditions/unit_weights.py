@@ -71,7 +71,7 @@ def warn_units(comm: MPI.Intracomm, fluid: Fluid, gravity: Gravity) -> None:
 
 
 def warn_levels(comm: MPI.Intracomm, fluid: Fluid | None, gravity: Gravity, levels: Sequence[tuple[str, Any]]) -> None:
-    """Warn of water levels with an implausible unit weight, such as another unit weight than the pore fluid.
+    """Warn of water levels with an implausible unit weight, such as a value that differs from the pore fluid's.
 
     `levels`: name and water pressure of each level.
     """
@@ -92,7 +92,7 @@ def warn_levels(comm: MPI.Intracomm, fluid: Fluid | None, gravity: Gravity, leve
 def other_gravity(fluid: Fluid, gravity: Sequence[NDArray[np.float64]]) -> float | None:
     """Return the last magnitude of `gravity`, in m/s^2, or None if conductivities refer to this gravity.
 
-    If gravity varies in the step, the result is None up to 9.81 m/s^2.
+    If gravity varies in the step, and its last magnitude is at most 9.81 m/s^2, the function returns None.
 
     `gravity`: accelerations of gravity, in m/s^2, at the start of a step and at later times in the step.
     """

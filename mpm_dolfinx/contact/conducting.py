@@ -75,7 +75,7 @@ class ContactFeeds(Feeds):
     """Flow through closed contacts in a substep.
 
     `contact`: contact loads between groups.
-    `wet`: data of the substep.
+    `wet`: quantities of the fluid balance in the substep.
     `conducts`: whether each contact conducts fluid, by name.
     """
 

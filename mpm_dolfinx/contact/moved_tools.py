@@ -66,7 +66,7 @@ class MotionEquation(NamedTuple):
 
 
 class MovedTools(ContactProblem):
-    """Base class that adds the motion of tools by forces to `ToolLoads`."""
+    """Base class that adds the motion of tools due to forces to `ToolLoads`."""
 
     couples = True
 
@@ -144,7 +144,7 @@ class MovedTools(ContactProblem):
         return self.flight.after(acceleration, self.shares.own, self.shares.before)
 
     def _find_at(self, w: NDArray[np.float64], motion: NDArray[np.float64]) -> Found:
-        """See `ContactProblem`.  The result includes the equation of motion of the tools."""
+        """See `ContactProblem`.  `Found.equation` is the equation of motion of the tools."""
         found = super()._find_at(w, motion)
         equation = self._equation(found)
         pulled = self._pulled(found, equation.shift)

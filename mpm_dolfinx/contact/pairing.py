@@ -110,7 +110,7 @@ class Contacts(Touching):
         present: MaterialPoints,
         cell_pairs: Callable[[], NDArray[np.int64]],
     ) -> tuple[ContactLaw, Origin]:
-        """Return the contact law, and the material points of its pairs.  The pairs were found for the points `seen`."""
+        """Return the contact law and the material points of its pairs.  The search for pairs used the points `seen`."""
         grid = self.grid
         d = self.grid.dim
         rows = []

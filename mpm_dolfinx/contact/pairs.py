@@ -171,8 +171,8 @@ def at_nodes(
 ) -> PETSc.Mat:
     """Return the matrix that maps the unknowns to weighted sums (m d,) of nodal displacements.
 
-    `value` (m, 2^d): weights at the nodes of the local cells `cell` (m,).  With lexicographic cells `other` (m,), the
-    shape (m, 2 * 2^d) includes the nodes of these cells.
+    `value` (m, 2^d): weights at the nodes of the local cells `cell` (m,).  If lexicographic cells `other` (m,) are
+    given, `value` (m, 2 * 2^d) also has weights at the nodes of these cells.
     """
     d = grid.dim
     numbers = unknowns.map.indices.reshape(-1, d)

@@ -82,7 +82,7 @@ class Touching(Acting):
         return out
 
     def unknown(self, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return forces and moments on the bodies, all equal to `value`."""
+        """Return placeholders for the forces and moments on the bodies: every component is `value`."""
         rows = np.full((len(self.names), 3 if self.grid.dim == 2 else 6), value)
         return {"tool_forces": dict(zip(self.names, rows, strict=True))}
 
@@ -129,7 +129,7 @@ class ContactProblem(Loads):
 
     @property
     def still(self) -> NDArray[np.float64]:
-        """Displacements and rotations (k, q) of tools by forces, all zero.  Between groups, q is 0."""
+        """Displacements and rotations (k, q) of tools due to forces, all zero.  Between groups, q is 0."""
         return np.zeros((len(self.now.law.contacts), 0))
 
     def found(self, at: At) -> Found:
@@ -164,7 +164,7 @@ class ContactProblem(Loads):
         return Found(w, at, touch, motion, touch.force)
 
     def _motion(self, w: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the motions (k, q) of tools by forces at relative displacements w."""
+        """Return the motions (k, q) of tools due to forces at relative displacements w."""
         return self.still
 
     def closed(self, at: At) -> NDArray[np.bool_]:
@@ -343,7 +343,7 @@ class ContactProblem(Loads):
 
 
 def _merged(both: Sequence[Any], kept: Sequence[NDArray[np.bool_]], order: NDArray[np.int64]) -> Any:
-    """Merge the flagged rows of two `Pairs` or two `ContactState` in a given order."""
+    """Merge the flagged entries of two `Pairs` or two `ContactState` in a given order."""
     names = (f.name for f in fields(both[1]) if f.name != "grid")
     columns = {name: [getattr(of, name)[rows] for of, rows in zip(both, kept, strict=True)] for name in names}
     return replace(both[1], **{name: np.concatenate(rows)[order] for name, rows in columns.items()})

@@ -156,8 +156,8 @@ class Ball(Placed):
 class Convex(Placed):
     """The convex hull of corners: a polygon in 2D, a polyhedron in 3D.
 
-    The signed distance is the largest signed distance from the planes of the faces.  Outside the hull, this value is
-    too small near edges and corners.
+    The signed distance is the largest signed distance from the planes of the faces.  Outside the hull, near edges and
+    corners, this value is less than the distance.
 
     Parameters
     ----------

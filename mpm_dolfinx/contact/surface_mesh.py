@@ -84,7 +84,7 @@ class Facets:
         return ((y - self._columns[0][0].take(at, 1)) * self._normal.take(at, 1)).sum(axis=0)
 
     def _from_sides(self, y: NDArray[np.float64], at: NDArray[np.int64]) -> tuple[NDArray, NDArray]:
-        """Return the nearest positions on the sides of facets: parameters (d, m), and vectors to y (d, d, m)."""
+        """Return the point of each side nearest to y: coordinate from 0 to 1 (d, m), and vector to y (d, d, m)."""
         corners, _, along = (of.take(at, 2) for of in self._columns)
         offset = y - corners
         share = np.clip((offset * along).sum(axis=1) / self._squares.take(at, 1), 0, 1)

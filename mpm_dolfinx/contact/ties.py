@@ -58,7 +58,7 @@ class Ties(Acting):
     Parameters
     ----------
     setting, ties
-        Data of the stage, and the tied sides by name.
+        `Setting` of the stage, and the tied sides by name.
 
     Raises
     ------

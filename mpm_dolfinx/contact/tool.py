@@ -36,7 +36,7 @@ class Pose(NamedTuple):
         return y + self.shift + (y - self.centre) @ (self.R - np.eye(len(self.R))).T
 
     def moved(self, by_forces: NDArray[np.float64]) -> Pose:
-        """Return the pose after a further displacement (d,), in m.  A further number is a rotation, in rad."""
+        """Return the pose after an additional motion: displacement (d,), in m, and if present a rotation, in rad."""
         d = len(self.R)
         R = rotation(by_forces[d]) @ self.R if by_forces[d:].any() else self.R
         return Pose(R, self.centre, self.shift + by_forces[:d])

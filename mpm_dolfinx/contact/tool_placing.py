@@ -47,7 +47,7 @@ def motion_count(dim: int) -> int:
 
 
 class LoadMotion(NamedTuple):
-    """Displacements and rotations of tools by forces, at the start and the end of a step."""
+    """Displacements and rotations of tools due to forces, at the start and the end of a step."""
 
     start: float  # start of the step, s
     end: float  # end of the step, s
@@ -130,7 +130,7 @@ class Tools(Touching):
         return pose
 
     def unknown(self, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return forces and moments equal to `value`, zero displacements due to loads, and initial velocities."""
+        """Return initial results: forces and moments `value`, zero displacements due to loads, and velocities."""
         out, d = super().unknown(value), self.grid.dim
         tools = dict(zip(self.names, self.tools, strict=True))
         out["tool_travel"] = {name: np.zeros(d if tool.free else ()) for name, tool in tools.items()}
@@ -143,7 +143,7 @@ class Tools(Touching):
         return out | {quantity: values for quantity, values in of_free.items() if values}
 
     def _before(self, place: Place) -> NDArray[np.float64]:
-        """Return the displacements and rotations of tools by forces before a step."""
+        """Return the displacements and rotations of tools due to forces before a step."""
         return self._motions(place.before, "tool_travel", "tool_rotation")
 
     def _motions(self, before: Outcome, along: str, around: str) -> NDArray[np.float64]:
@@ -373,7 +373,7 @@ class ToolLoads(ContactProblem):
         super().__init__(*tools.contact(place))
         self._tools, self._place = tools, place
         self.before = tools.by_loads.before
-        """Motions of the tools by forces before the step (k, q), m and rad."""
+        """Motions (k, q), in m and rad, of the tools due to forces before the step."""
         self.shares, self._earlier = Shares(np.inf, 0.0, None), None
 
     @property
@@ -412,7 +412,7 @@ class ToolLoads(ContactProblem):
         return out
 
     def outcome(self, at: At) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """See `Loads`.  Further results are the displacements of tools by forces, in m."""
+        """See `Loads`.  The result "tool_travel" contains the displacements of tools due to forces, in m."""
         d, displacement = self.grid.dim, {}
         motion = (self.before + self.found(at).motion)[:, :d]
         for name, tool, by_forces in zip(self.now.law.names, self.now.law.contacts, motion, strict=True):

@@ -36,8 +36,8 @@ def suction_sums(points: FormPoints, F, slopes: Sequence, locks: bool) -> CellSu
 class OfSuction:
     """Derivatives of nodal forces with respect to the pressures of cells, for laws that depend on suction.
 
-    `dilatation`: volume ratios of cells for F-bar, or None without F-bar.
-    `sums`: results of `suction_sums` for each part of the points.
+    `dilatation`: volume ratio and mean stress of each cell for F-bar, or None without F-bar.
+    `sums`: results of `suction_sums`, one for each law.
     """
 
     def __init__(self, dim: int, dilatation: MeanDilatation | None, sums: Sequence[CellSums | None]):
@@ -49,7 +49,7 @@ class OfSuction:
     def rows(self, data: QuadratureData, given: Sequence[Given]) -> list[tuple[NDArray[np.int32], NDArray[np.float64]]]:
         """Return cells, and the derivatives of their nodal forces with respect to their pressures.
 
-        `given`: values that are passed to the forms of each part.
+        `given`: for each law, values that its forms need.
         """
         parts = data.parts
         out = [(parts[k].places.filled, of(parts[k], given[k])) for k, of in self._free.items()]
@@ -63,5 +63,5 @@ class OfSuction:
 
 
 def _padded(values: NDArray[np.float64], width: int) -> NDArray[np.float64]:
-    """Return values (k, n) with rows padded by zeros to a width."""
+    """Return values (k, n), padded by zeros to the shape (k, width)."""
     return np.pad(values, ((0, 0), (0, width - values.shape[1])))

@@ -32,9 +32,9 @@ GHOST = 0.05
 9.9e-06, twice this value by 1.9e-05, and finer cells by 1.5e-02.
 """
 YIELDING = 0.02
-"""Smallest factor on the penalty for nearly incompressible laws with a state.  Plateau (scene "flow" of
-tests/plateaus.py): half this value changes the result by 6.4e-04, twice this value by 1.1e-03, and finer cells by
-8.9e-02.
+"""For nearly incompressible laws with a state, a factor of at least this value reduces the penalty.  Plateau (scene
+"flow" of tests/plateaus.py): half this value changes the result by 6.4e-04, twice this value by 1.1e-03, and finer
+cells by 8.9e-02.
 """
 RATIO = 0.3
 """Ratio of the volume fractions of two cells below which their common face has a penalty.

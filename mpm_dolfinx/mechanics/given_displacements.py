@@ -145,7 +145,7 @@ class GivenDisplacements(Acting):
         return HoldLoads(self, forms, data, held, row, own, place)
 
     def _held_points(self, place: Place, ends: Sequence[float]) -> HeldPoints:
-        """Return the integration points on sides.  `ends`: start and end of the step, in s; empty for a zero step."""
+        """Return the integration points on sides.  `ends`: start and end of the step, in s; empty if equal."""
         cut, points = place.cut, place.points
         d, t = self._grid.dim, place.t
         rows, bounds = [], []
@@ -200,7 +200,7 @@ class GivenDisplacements(Acting):
         return together(self._grid.comm, lambda: hold.at(t, X))
 
     def unknown(self, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return reactions, by quantity and name of the condition, with every component equal to `value`."""
+        """Return placeholders for the reactions, by quantity and name of the condition: every component is `value`."""
         return {"reactions": {name: np.full(self._grid.dim, value) for name in self._names}}
 
     def reactions(self, loads: HoldLoads, at: At) -> dict[str, NDArray[np.float64]]:
@@ -218,7 +218,7 @@ class GivenDisplacements(Acting):
         return dict(zip(self._names, sums, strict=True))
 
     def _warn(self, number: int, what: str, *values) -> None:
-        """Warn of a condition, once for each condition and text."""
+        """Warn about a boundary condition.  The same warning about a condition is not repeated."""
         if (number, what) not in self._warned:
             warn(self._grid.comm, ConditionWarning, what, line(self._holds[number][0]), *values)
             self._warned.add((number, what))
@@ -267,7 +267,7 @@ class HoldLoads(Loads):
     `data`: integration points, one for each component, with stiffness, direction and gap.
     `held`: geometry and stiffness of all penalties.
     `row` (k,): index in `held` of each component.
-    `share` (k, 2^d): fraction of the force of each component on each node; zero at nodes that walls fix.
+    `share` (k, 2^d): fraction of the force of each component on each node, see `HeldCells.rows`.
     `place`: time and cut domains of the substep.
     """
 
@@ -299,7 +299,7 @@ class HoldLoads(Loads):
     def augment(self, at: At) -> bool:
         """Add the penalty forces of sides that lag behind to their multipliers.  Return whether any force changed.
 
-        The updates end when an update does not halve the mean gap of any side.
+        The updates end when every side keeps more than half of its mean gap.
         """
         if not self._place.dt:
             return False
@@ -352,7 +352,7 @@ class HoldLoads(Loads):
         return float(self.pull(at.nodal) @ self._along(v.reshape(-1, self._d)))
 
     def counted(self, at: At) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return the penalty forces on walls, see `Loads.counted`."""
+        """Return dofs and penalty forces; forces at wall nodes are no wall reactions, see `Loads.counted`."""
         dofs = (
             self._d * self.data.points.grid.cell_nodes[self.data.cells] + self.data["direction"].argmax(axis=1)[:, None]
         )

@@ -30,7 +30,7 @@ Plateau (scene "held" of tests/plateaus.py): half this value changes the result 
 and finer cells by 4.0e-03.
 """
 WEAK = 8.0
-"""Stiffness of the weak penalty on deviations, divided by (modulus + 10 stress) / cell size.  Plateau
+"""Stiffness of the weak penalty on deviations from the mean, divided by (modulus + 10 stress) / cell size.  Plateau
 (scene "soil" of tests/plateaus.py): half this value changes the result by 5.0e-06, twice this value by 7.9e-06, and
 finer cells by 3.0e-02.
 """
@@ -40,9 +40,9 @@ EVERYWHERE = 1e2
 finer cells by 3.0e-02.
 """
 TENSE = 10
-"""Factor on the stress at a side in the modulus of the penalty.  This term prevents buckling of the side.
-Plateau (scene "soil" of tests/plateaus.py): half this value changes the result by 2.8e-06, twice this value by 4.7e-06,
-and finer cells by 3.0e-02.
+"""The modulus of the weak penalty is the soil's modulus plus this factor times the norm of the stress.  The stress term
+prevents buckling of the side.  Plateau (scene "soil" of tests/plateaus.py): half this value changes the result by
+2.8e-06, twice this value by 4.7e-06, and finer cells by 3.0e-02.
 """
 
 
@@ -107,12 +107,12 @@ class HeldCells:
     number, cell
         Index of the condition, and cell, of each penalty.
     x, shape, moments
-        Position, m, shape functions, and products of offsets from the midpoint of the cell, for each penalty.  A
-        penalty on a mean has mean values.
+        Position, m, of each penalty, shape functions, and products of offsets from the midpoint of the cell.  For a
+        penalty on a mean, these values are means too.
     stiffness
         Stiffness of each penalty and component, N/m.
     static
-        Fraction of each stiffness without the second penalty for inertia.
+        Fraction of each stiffness that does not come from inertia.
     limit : (2, k, d)
         Largest plausible force, N, of each of k penalties on means: limit[0] for the skeleton, limit[1] for undrained
         soil.  Larger forces would cause strains above 1 in a step.
@@ -176,8 +176,8 @@ class HeldCells:
     def rows(self, axis: int, given: NDArray[np.bool_], free: NDArray[np.bool_]) -> tuple:
         """Return the penalties on one component, with their stiffness, gap and distribution of the force to nodes.
 
-        Nodes that a wall fixes have no share of the force.  Some penalties next to walls are omitted, because the
-        prescribed displacement does not tend to zero at the wall.
+        If the prescribed displacement does not tend to zero at a wall, the wall carries the force on its nodes.  A
+        penalty at this wall is omitted if another penalty of its condition acts on one of its free nodes.
 
         `given` (conditions,): whether each condition prescribes component `axis`.
         `free` (nodes,): whether no wall fixes the node.
@@ -187,7 +187,7 @@ class HeldCells:
         `index` (k,): indices of the penalties.
         `stiffness` (k,), in N/m: stiffness of these penalties.
         `gap` (k,), in m: gaps of these penalties.
-        `share` (k, 2^d): fractions of the force on each node, without the fraction of the wall.
+        `share` (k, 2^d): fraction of the force of each penalty on each node, without the fraction that walls carry.
         `stuck`: index of a penalty that must move but has fixed nodes only, or -1.
         """
         grid, chosen = self.grid, np.flatnonzero(given[self.number])
@@ -236,8 +236,8 @@ class HeldCells:
     ) -> list[tuple[int, NDArray[np.float64]]]:
         """Return the conditions with implausibly large forces, each with the position of its largest force.
 
-        The sum of the forces at a node must also exceed its limit, because penalties in neighbouring cells may oppose
-        each other.
+        The sum of the forces at a node must also exceed the sum of their limits, because penalties in neighbouring
+        cells may oppose each other.
 
         `row` (k,): index of the penalty of each of k prescribed components.
         `axis` (k,): axis of each component.

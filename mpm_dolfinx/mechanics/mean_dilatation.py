@@ -44,7 +44,7 @@ STRESS = "stress of the law"
 
 
 class SumsOfPart(NamedTuple):
-    """Sums over the integration points of one law in each cell, for theta and pi."""
+    """Kernels for sums over the integration points of one law in each cell, which give theta and pi."""
 
     ratio: CellSums
     stress: PointExpression  # components of P for the residual, and the derivative with respect to theta for pi
@@ -83,21 +83,21 @@ class FBar:
         values: Mapping[str, object],
         known: Mapping[str, object],
     ) -> tuple:
-        """Return the stress and the cell sums of points with a law that uses F-bar.
+        """Return the stress of a law that uses F-bar, and the kernels of its integrals over each cell.
 
         `points`: integration points with the law, with the field F at the start of the step.
         `F`: deformation gradient (d, d), a UFL variable.
         `Fbar`: result of `of`.
         `ratio`: det Delta, with Delta F_n = F.
         `values`: UFL values of the law's parameters, state and local unknowns.
-        `known`: the same values, for expressions that are not differentiated.
+        `known`: like `values`, for expressions that are not differentiated.
 
         Returns
         -------
         The first Piola-Kirchhoff stress, in Pa, as UFL of F, theta and pi, for the residual.
         The derivative (d, d, d, d) of this stress with respect to F, in Pa, for the tangent.
-        Further integrals over each cell for the tangent.
-        Kernels for the sums of theta and pi over each cell.
+        Integrals over each cell for the tangent, see `MeanDilatation.assemble_matrix`.
+        Kernels for the sums over each cell that give theta and pi.
         """
         J_n, J = ufl.det(points.F), ufl.det(F)
         P, slope = self.stresses(law, F, Fbar, known)
@@ -156,7 +156,7 @@ class FBar:
 class MeanDilatation:
     """The volume ratio theta and the mean stress pi of each cell, for F-bar.
 
-    `parts`: sums for each law with F-bar, by index of the law.
+    `parts`: kernels of each law with F-bar, by index of the law.
     `dt`: time since the start of the step, s.
     """
 
@@ -208,14 +208,14 @@ class MeanDilatation:
     def _set_mean(self, f: fem.Function, sums: Sequence[NDArray[np.float64]], data: QuadratureData) -> None:
         """Set f in each cell to a mean over the pieces with F-bar.
 
-        `sums`: for each law, the sums (cells, 1) of the quantity times the volume.
+        `sums`: for each law, the integrals (cells, 1) of f over the pieces in each cell.
         """
         f.x.array[self._cells(data).filled] = self._cells(data).total(sums)[:, 0] / self._volume_of(data)[:, 0]
 
     def assemble_matrix(self, A: PETSc.Mat, data: QuadratureData, sums: Sequence[NDArray[np.float64]]) -> None:
         """Add the contribution of theta and pi to the tangent, without final assembly.
 
-        `sums`: for each law, the further integrals (cells, quantities) of `FBar.forms`.
+        `sums`: for each law, integrals (cells, quantities) over each cell, the third result of `FBar.forms`.
         """
         count, volume = 2**self._grid.dim * self._grid.dim, self._volume_of(data)
         b, c, *other, e = np.split(
@@ -274,7 +274,7 @@ class Cells:
         self.where = [np.searchsorted(self.filled, cells) for cells in of_parts]
 
     def total(self, values: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
-        """Return the sums (cells, quantities) over all parts."""
+        """Return the totals (cells, quantities) over all laws of values in cells."""
         if len(values) == 1:
             return values[0]
         out = np.zeros((len(self.filled), values[0].shape[1]))

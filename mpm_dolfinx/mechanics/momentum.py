@@ -49,7 +49,7 @@ from mpm_dolfinx.points.parts import OfParts, Parts, relative
 
 
 class FormsOfPart(NamedTuple):
-    """Compiled forms of one part of the points."""
+    """Compiled forms of one law."""
 
     residual: ElementForces
     tangent: ElementMatrices | StackedElementMatrices
@@ -98,7 +98,7 @@ class MomentumForms:
         """Forms of inertia, or None in a scene without inertia."""
         dried = pressure is not None and any("suction" in law.state for law, *_ in laws)
         self.law_forms = [self._forms_of_law(*law, pressure, dried, symmetric, dt) for law in laws]
-        """Forms of each part of the points."""
+        """Forms of each law."""
         locked = {number: part.means for number, part in enumerate(self.law_forms) if part.means is not None}
         self.dilatation = MeanDilatation(self._fbar, locked, dt) if locked else None
         self._suction = pressure if dried else None
@@ -181,7 +181,7 @@ class MomentumForms:
         return [] if self._of_suction is None else self._of_suction.rows(data, self._given(data, derive=True))
 
     def set_contents(self, own: NDArray[np.int64], *contents: NDArray[np.float64]) -> ActiveSet:
-        """Set the volume fractions and moduli of owned cells with material.  Return the active set."""
+        """Set the volume fractions and moduli of owned cells with material.  Return the active cells and unknowns."""
         self.active.clear()
         cells = self.ghost.set_contents(own, *contents)
         self.active.set(cells, lambda: self.active_nodes(cells).nonzero()[0])
@@ -441,7 +441,7 @@ class MomentumProblem:
         return At(self.system.unknowns, self.forms.u.x.array, self.system.parts)
 
     def settle(self, sticks: bool) -> bool:
-        """Update stick and slip in contacts, and return whether they changed.  `sticks` allows changes to stick."""
+        """Update stick and slip in contacts, and return whether any changed.  `sticks` allows slip to become stick."""
         return any([one.settle(self.at, sticks) for one in self.loads])
 
     def augment(self) -> bool:
@@ -451,7 +451,7 @@ class MomentumProblem:
     def guesses(self) -> list[NDArray[np.float64]]:
         """Return initial guesses of the displacements, in m, for Newton's method.
 
-        Each load may have a guess, such as a rigid rotation.  The last motion gives a further guess.
+        Each load may have a guess, such as a rigid rotation.  The motion in the last step gives one more guess.
         """
         found = [one.guess(self.system.parts, self.forms.nodal) for one in self.loads]
         found = [values.ravel() for values in (*found, self._goes_on) if values is not None]

@@ -87,7 +87,7 @@ class Plates(Acting):
 
 
 class PlateLoads(Loads):
-    """Plates in a substep.  The loads `even` are their uniform tractions."""
+    """Plates in a substep.  The loads `even` are the uniform tractions of the plates."""
 
     stiff = True
 
@@ -102,7 +102,7 @@ class PlateLoads(Loads):
         self._forms.tilt.assemble_vector(b, self._data)
 
     def penalty(self, A: PETSc.Mat, walls: bool) -> None:
-        """Add the stiffness against a slope."""
+        """Add the stiffness of the penalty on the tilt."""
         self._forms.bend.assemble_matrix(A, self._data)
 
     def moved(self, u: fem.Function) -> Loads:

@@ -37,9 +37,9 @@ over its depth have errors of 43 % at nu = 0.49.  At nu = 0.499 these pressures 
 SHARE = 0.5
 """In cells of flowing, dilatant soil, the deviation of grad u from its cell mean is multiplied by this factor.
 
-Otherwise dilatancy would lock Q1 cells.  With the factor 1, the load of a footing (phi = psi = 20 degrees) is 4.4 % too
-large with 9 cells over its width, 3.4 % with 17 cells, and does not reach a limit.  With the factor 0, the limit load
-is 6.6 % too small with 9 cells, and 3.2 % with 17 cells.
+Without this factor, dilatancy would lock Q1 cells.  With the factor 1, the load of a footing (phi = psi = 20 degrees)
+is 4.4 % too large with 9 cells over its width, 3.4 % with 17 cells, and does not reach a limit.  With the factor 0, the
+limit load is 6.6 % too small with 9 cells, and 3.2 % with 17 cells.
 """
 
 
@@ -85,7 +85,7 @@ class QuadraturePoints:
     """Pieces of particle domains as integration points, with the fields of the scene's forms.
 
     `weighs`: whether the scene has gravity.
-    `extended`: whether user-defined functions may use any data of the material points.
+    `extended`: whether user-defined functions may use any field of the material points.
 
     Attributes
     ----------
@@ -202,7 +202,7 @@ class QuadraturePoints:
         return self._constants((cut.key, values), make, self._grid.comm)
 
     def _changing(self, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
-        """Return the data of material points that change from step to step."""
+        """Return the fields of material points that change from step to step."""
         fields = {"F": points.F, **self.materials.state(points)}
         fields |= {ACROSS: points.data[ACROSS]} if self.materials.across else {}
         if self._extended:  # fields of laws are in `_constant`; in `data` each is valid only at points of its own law
@@ -224,7 +224,7 @@ class QuadraturePoints:
         return dict(zip(("F", ACROSS), in_plane(F), strict=True))
 
     def _own(self, cut: CutDomains, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
-        """Return the data that differ between pieces of a material point, for user-defined functions."""
+        """Return the fields that differ between pieces of a material point, for user-defined functions."""
         fields = {}
         if self._extended or self.varies:
             fields["position"] = cut.pieces.x + cut.grid.base

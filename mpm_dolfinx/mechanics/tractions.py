@@ -110,7 +110,7 @@ class DeadLoads(Loads):
 
 
 def owners(grid: Grid, patches: Sequence[Patches]) -> tuple[Exchange, Places]:
-    """Return the exchange that sends patch data to the owners of cells, and the positions of the received patches."""
+    """Return the exchange that sends values on patches to the owners of cells, and positions of received patches."""
     cell, x = (np.concatenate([getattr(p, name) for p in patches]) for name in ("cell", "x"))
     travel = Exchange(grid.comm, grid.owner(cell))
     return travel, Places(grid, grid.locals[travel.send(cell)], travel.send(x))

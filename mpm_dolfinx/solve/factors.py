@@ -77,7 +77,7 @@ def renew(A: PETSc.Mat) -> None:
 def solved(ksp: PETSc.KSP, name: str) -> int:
     """Return the number of iterations of the last solve. Raise NotConverged if this solve failed.
 
-    An indefinite matrix or the largest number of iterations is no failure, because the line search tests the result.
+    A solve that ends with an indefinite matrix, or after the largest number of iterations, has not failed.
     """
     count, reason = ksp.getIterationNumber(), ksp.getConvergedReason()
     if reason < 0 and reason not in TOLERABLE:
@@ -120,7 +120,7 @@ class Gathered:
     """Preconditioner for PETSc: factors of a matrix on one process. `setUp` gathers the matrix.
 
     `x`: vector with an entry for each column of the matrix.
-    `factors`: factors of the whole matrix.
+    `factors`: factors of the matrix of all processes.
     `rank`: process of the factors.
     """
 

@@ -14,7 +14,7 @@ to the tolerance 1e-5.  With algebraic multigrid, GMRES takes 10 to 15 cycles in
 17 to 23 cycles, and conjugate gradients on the Schur complement 35 to 60 cycles.
 
 At nu = 0.499 with 14^3 cells, GMRES takes more than 100 iterations.  If a solve takes too many iterations, factors of K
-replace the multigrid cycle, or in large 3D bodies that may yield a cycle with another smoother (`SMOOTHERS`).  In
+replace the multigrid cycle.  In large 3D bodies that may yield, multigrid with sweeps (`SMOOTHERS`) replaces it.  In
 yielding soil in 2D, GMRES would take 20 to 500 iterations, because coarse grids cannot represent shear bands.
 """
 
@@ -213,7 +213,7 @@ class BlockSolver:
     def _factorised(self) -> Inverses:
         """Return factors of K, and in 2D of P, as preconditioners for this and later tangents.
 
-        In bodies too large for factors, multigrid with sweeps replaces them. This cycle is set up for each tangent.
+        If bodies are too large for factors, multigrid with sweeps is the preconditioner, set up for each tangent.
         """
         K, unknowns = self._momentum.K, self._momentum.unknowns
         if self._plan.fallback == SWEEPS:

@@ -73,7 +73,7 @@ def multigrid_solver(
     `A`: matrix, which may still be empty.
     `name`: prefix of the solver's PETSc options.
     `places` (n, d + 1), >= 0: grid indices of the local unknowns along each axis, and index of the component.
-    `held` (m, d + 1): the same indices for fixed degrees of freedom in cells of bodies.
+    `held` (m, d + 1): indices, as in `places`, of fixed degrees of freedom in cells of bodies.
     `nodal`: whether the unknowns belong to nodes.
     `coarsest`: largest number of unknowns on the coarsest grid.
     `smoother`: name in `SMOOTHERS`.

@@ -51,13 +51,13 @@ tests/plateaus.py): half this value changes the result by 2.2e-11, twice this va
 3.0e-02.
 """
 SOLVED = 0.05
-"""Residual after the last linear solve, divided by the tolerance of Newton's method.  Plateau (scene "soil" of
-tests/plateaus.py): half this value changes the result by 4.0e-12, twice this value by 3.1e-11, and finer cells by
+"""Smallest residual that a linear solve must reach, divided by the tolerance of Newton's method.  Plateau (scene "soil"
+of tests/plateaus.py): half this value changes the result by 4.0e-12, twice this value by 3.1e-11, and finer cells by
 3.0e-02.
 """
 SETTLED = 1e-2
-"""Residual below which slip of contacts may end.  At larger residuals the contact area changes.  Plateau (scene
-"contact" of tests/plateaus.py): half this value changes the result by 1.5e-13, twice this value by 6.4e-12, and
+"""Largest relative residual at which slip of contacts may end.  At larger residuals the contact area changes.  Plateau
+(scene "contact" of tests/plateaus.py): half this value changes the result by 1.5e-13, twice this value by 6.4e-12, and
 finer cells by 1.1e-02.
 """
 ERROR = 1 / 20
@@ -122,7 +122,7 @@ def solve_substep(
     `ahead`: function that extrapolates (u, p) at active dofs and cells from the last steps, or None.
     `as_reset`, `key`: context of the last reset, and its key. Linear laws use the tangent at the last reset.
     `report`: report of the step, to which the counts of the substep are added.
-    `kept`: data that the tangents of the step share.
+    `kept`: factors that the tangents of the step share.
 
     Raises
     ------
@@ -270,7 +270,7 @@ class Newton:
         return errors
 
     def _begin(self, ahead: Callable | None) -> tuple[Errors, list[NDArray[np.float64]] | None]:
-        """Set the initial guess of Newton's method. Return its errors, and another guess or None.
+        """Set the initial guess of Newton's method. Return its errors, and an alternative guess or None.
 
         The guess is `ahead` if its residual is small, and else the guess with the smallest residual in each part.
         """

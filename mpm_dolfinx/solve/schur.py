@@ -82,7 +82,7 @@ class SchurComplement:
 
 @dataclass
 class Kept:
-    """Data that the tangents of one step share.
+    """Factors that the tangents of one step share.
 
     `operator`: whether the factors of the fixed-stress operator can be reused.
     `factors`: direct solvers in place of multigrid, or None.

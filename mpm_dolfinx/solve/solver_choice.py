@@ -13,7 +13,7 @@ from dataclasses import dataclass
 FACTORS, NODAL, MUMPS, MULTIGRID = "factors", "factors in blocks", "factors by MUMPS", "multigrid"
 """Solvers for displacements or pressures."""
 SWEEPS = "multigrid with sweeps"
-"""Multigrid that replaces a cycle with incomplete factors, see `THREE_SWEEPS`."""
+"""Multigrid with the smoother `THREE_SWEEPS`, which replaces multigrid with the smoother `INCOMPLETE`."""
 ONE_SWEEP, THREE_SWEEPS = "multigrid", "firmly"
 """Smoothers of multigrid by relaxation, as in the names of PETSc's options."""
 INCOMPLETE = "incomplete"
@@ -27,15 +27,15 @@ class Thresholds:
     """Thresholds between solvers. `bash demos/run.sh calibrate` measures times on both sides of each threshold.
 
     multigrid_3d
-        Smallest number of unknown displacements in 3D with multigrid. With 1656 unknowns, two steps of a block take
-        0.66 s with a direct solver and 0.59 s with multigrid. With 12784 unknowns, two steps take 32 s with a direct
-        solver and 4.0 s with multigrid.
+        From this number of unknown displacements, multigrid replaces a direct solver in 3D. With 1656 unknowns, two
+        steps of a block take 0.66 s with a direct solver and 0.59 s with multigrid. With 12784 unknowns, two steps take
+        32 s with a direct solver and 4.0 s with multigrid.
     multigrid_2d
-        Smallest number of unknown displacements in wet 2D scenes without yield with multigrid. From 8000 to 74000
-        unknowns, the times of both solvers are equal within 15 %.
+        From this number of unknown displacements, multigrid replaces a direct solver in wet 2D scenes without yield.
+        From 8000 to 74000 unknowns, the times of both solvers are equal within 15 %.
     mumps
-        Smallest number of unknown displacements in wet scenes with factors by MUMPS.  If K is symmetric, MUMPS is used
-        on several processes only.  On one process, two steps of a yielding block of 73728 unknowns take 18 s with
+        From this number of unknown displacements, MUMPS computes factors in wet scenes.  If K is symmetric, MUMPS is
+        used on several processes only.  On one process, two steps of a yielding block of 73728 unknowns take 18 s with
         blocks of nodes and 36 s with MUMPS.  With 100000 unknowns, the factors of K have 1.5e7 entries (0.12 GB).
     fallback_3d
         Largest number of unknown displacements in 3D for which a direct solver may replace multigrid.
@@ -143,7 +143,7 @@ def plan(
 
     The tangent is reused while each Newton step reduces the residual to less than 0.05 of its value, or 0.01 in wet 2D
     scenes without yield. In 26 adaptive steps, a drained beam takes 205 Newton steps and 79 tangents with 0.05, and 179
-    Newton steps and 83 tangents with 0.01. A beam in 3D takes up to 1.2 times the time with 0.01.
+    Newton steps and 83 tangents with 0.01. With 0.01, a beam in 3D takes up to 1.2 times as long as with 0.05.
 
     The relative tolerance of linear solves is at least 1e-5 with nonlinear laws, and 1e-3 with multigrid in 3D. A
     footing on 21 cells (backward Euler) takes 299 Newton steps with 1e-5, and 370 with 1e-3.
