@@ -382,7 +382,7 @@ def meeting(
     b: tuple[NDArray[np.float64], NDArray[np.float64]],
     in_cells: Callable[[NDArray[np.float64]], NDArray[np.float64]],
 ) -> tuple[float, float, NDArray[np.float64]]:
-    """Return the largest overlap of two bodies, in m, or their smallest gap, in cells, and its position, in m.
+    """Return the largest overlap of two bodies, in m, or their smallest gap, in cells, and the position, in m.
 
     `a`, `b`: results of `solids` for both bodies.
     `in_cells`: function that divides positions by the cell size.

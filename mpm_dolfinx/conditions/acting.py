@@ -239,7 +239,7 @@ class Loads:
         return self
 
     def counted(self, at: At) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return local dofs (n,), and the forces (n,), in N, at these dofs that wall reactions exclude."""
+        """Return local dofs (n,), and forces on them (n,), in N.  Wall reactions exclude these forces."""
         return np.empty(0, dtype=np.int64), np.empty(0)
 
     def within_reach(self) -> NDArray[np.int64]:

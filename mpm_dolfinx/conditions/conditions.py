@@ -360,15 +360,15 @@ class Rain(Flux):
 
 @dataclass(frozen=True, eq=False)
 class Tied(Condition):
-    """Two opposite sides of a box with equal displacements (periodic boundary condition).
+    """Two opposite sides of a body from `box` with equal displacements (periodic boundary condition).
 
-    Forces on both sides are equal and opposite.  A wave that leaves the box at one side enters at the other side.  No
-    water flows through tied sides.
+    Forces on both sides are equal and opposite.  A wave that leaves the body at one side enters at the opposite side.
+    No water flows through tied sides.
 
     Parameters
     ----------
     side, other
-        Names of two opposite sides of a box, as for `Traction`.  Both sides must have equal faces.
+        Names of two opposite sides of a body from `box`, as for `Traction`.  Both sides must have equal faces.
 
     Raises
     ------

@@ -194,7 +194,7 @@ class MovedTools(ContactProblem):
         return np.clip((motion * e).sum(axis=1, keepdims=True), -h, h) * e
 
     def _bearing_displacement(self, found: Found) -> NDArray[np.float64]:
-        """Return the displacements (k,), in m, at which a single point would carry the load of a tool, or infinity."""
+        """Return for each tool (k,) the displacement, in m, at which one point can carry its load, or else infinity."""
         law, state = self.now.law, self.now.state
         of = self.pairs.number
         along = (found.at.n * self._moved.direction[of, : self.grid.dim]).sum(axis=1)

@@ -60,7 +60,7 @@ class SubstepMotion(NamedTuple):
 
 
 class Touching(Acting):
-    """Base class of the tools of a stage, and of its contacts between groups."""
+    """Base class for the tools of a stage, and for the contacts between groups."""
 
     linear = False
 

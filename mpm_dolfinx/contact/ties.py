@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Tied sides: two opposite sides of a box have equal displacements (periodic boundary condition).
+"""Tied sides: two opposite sides of a body have equal displacements (periodic boundary condition).
 
 The penalty energy is `k/2 int (u_one - u_other)^2 dA`.  Here u_one and u_other are the displacements at opposite
 positions of the two sides, and k is the penalty stiffness.  Displacements are measured from the initial positions of

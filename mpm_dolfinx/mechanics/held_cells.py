@@ -236,8 +236,8 @@ class HeldCells:
     ) -> list[tuple[int, NDArray[np.float64]]]:
         """Return the conditions with implausibly large forces, each with the position of its largest force.
 
-        The sum of the forces at a node must also exceed the sum of their limits, because penalties in neighbouring
-        cells may oppose each other.
+        The sum of the forces at a node must also exceed the sum of their limits: penalties in neighbouring cells may
+        oppose each other.
 
         `row` (k,): index of the penalty of each of k prescribed components.
         `axis` (k,): axis of each component.

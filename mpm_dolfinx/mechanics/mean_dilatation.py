@@ -85,7 +85,7 @@ class FBar:
     ) -> tuple:
         """Return the stress of a law that uses F-bar, and the kernels of its integrals over each cell.
 
-        `points`: integration points with the law, with the field F at the start of the step.
+        `points`: integration points of the law, with the field F at the start of the step.
         `F`: deformation gradient (d, d), a UFL variable.
         `Fbar`: result of `of`.
         `ratio`: det Delta, with Delta F_n = F.

@@ -154,7 +154,7 @@ class QuadraturePoints:
         return Places(self._grid, cut.cells, middle + share * (cut.x - middle), mixed)
 
     def data(self, cut: CutDomains, places: PiecePlaces, points: MaterialPoints) -> QuadratureData:
-        """Return the integration points of cut domains with all their data in the present state."""
+        """Return the integration points of cut domains with all their fields in the present state."""
         within = self._gradients(cut, points) if self._linear is not None and cut.domains else {}
         even = {name: values for name, values in self._changing(points).items() if name not in within}
         fields = {**self._constant(cut, points), **{name: cut.to_cells(values) for name, values in even.items()}}

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Line search: length of a Newton step.
 
-Without yield, a step is halved only if a law cannot be evaluated at its end, or if the residual grows by more than the
-factor `EXPLODES`.
+Without yield, a Newton step is halved in two cases: a law cannot be evaluated at its end, or the residual grows by more
+than the factor `EXPLODES`.
 
 In yielding soil, the criterion is the work of the residuals along the step.  A full step is accepted in two cases: if
 the work at its end is less than half of the initial work, or if neither residual nor work increase.  Otherwise

@@ -22,7 +22,7 @@ class Numerics:
     ----------
     quadrature
         "domain": exact integration over cut particle domains. "point": integration at material points, as in standard
-        MPM, only for boxes without axisymmetry.
+        MPM, only for boxes along the grid, not in axisymmetry.
     coupling
         Coupling scheme of the balances of momentum and fluid, one of `COUPLINGS`.
     tolerance
@@ -33,8 +33,8 @@ class Numerics:
     renewal
         Whether to replace particle domains of yielded soil that are longer than a cell, see `stepping/renewal.py`.
         Renewal requires quadrature "domain", and yielding dry or saturated soil in 2D, without a `Contact`.
-        Axisymmetric scenes with inertia have no renewal.  On a grid with `follow`, it also divides and merges elastic
-        domains of dry or saturated soil, without `Contact` and inertia (`stepping/division.py`).
+        Axisymmetric scenes with inertia have no renewal.  On a grid with `follow`, elastic domains are also divided and
+        merged (`stepping/division.py`).  Division requires dry or saturated soil, without `Contact` and inertia.
     keep_volumes
         Whether corners of yielded domains are corrected, so that domains have the volumes of their points, see
         `domains/kept_volumes.py`. This option has no effect with quadrature "point".
