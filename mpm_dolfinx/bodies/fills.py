@@ -219,7 +219,7 @@ def _check_shape(grid: Grid, fill: int, corners: NDArray, u: NDArray) -> None:
 def _penetration(
     grid: Grid, bodies: Sequence[Body], other: int, corners: NDArray, points: MaterialPoints, misfit: float
 ) -> tuple[float, float, NDArray[np.float64]]:
-    """Return the overlap of a body and the fill, in m, or without overlap their gap, in cells, and the position."""
+    """Return the overlap of a body and the fill, in m, or otherwise their gap, in cells, and the position."""
     start = _start(bodies, other)
     rows = np.flatnonzero((points.id >= start) & (points.id < start + len(bodies[other])))
     both = [(c, np.full(len(c), MISFIT / 2 * grid.least + misfit)) for c in (points.corners[rows], corners)]

@@ -435,7 +435,7 @@ class Displacement(Condition):
         Prescribed components, such as "y".  By default all d components are prescribed.
     region : ((d,), (d,)), m
         Box of reference positions.  The displacement is prescribed inside this box.  The box may end within a cell.
-        The nodes of this cell outside the box are prescribed too if the box covers more than half of the cell.
+        Nodes of this cell outside the box are prescribed too if the box covers more than half of the cell.
 
     Raises
     ------

@@ -181,7 +181,7 @@ class MomentumForms:
         return [] if self._of_suction is None else self._of_suction.rows(data, self._given(data, derive=True))
 
     def set_contents(self, own: NDArray[np.int64], *contents: NDArray[np.float64]) -> ActiveSet:
-        """Set the volume fractions and moduli of owned cells with material.  Return the active cells and unknowns."""
+        """Set the volume fractions and moduli of owned cells with material.  Return the active cells and nodes."""
         self.active.clear()
         cells = self.ghost.set_contents(own, *contents)
         self.active.set(cells, lambda: self.active_nodes(cells).nonzero()[0])
