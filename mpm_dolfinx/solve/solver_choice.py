@@ -15,9 +15,9 @@ FACTORS, NODAL, MUMPS, MULTIGRID = "factors", "factors in blocks", "factors by M
 SWEEPS = "multigrid with sweeps"
 """Multigrid with the smoother `THREE_SWEEPS`, which replaces multigrid with the smoother `INCOMPLETE`."""
 ONE_SWEEP, THREE_SWEEPS = "multigrid", "firmly"
-"""Smoothers of multigrid by relaxation, as in the names of PETSc's options."""
+"""Smoothers of multigrid by relaxation. Prefixes of PETSc options contain these names (`momentum_firmly_`)."""
 INCOMPLETE = "incomplete"
-"""Smoother of multigrid by incomplete factors, as in the names of PETSc's options."""
+"""Smoother of multigrid by incomplete factors. Prefixes of PETSc options contain this name."""
 ALONE, SCHUR, AT_ONCE, IN_TURN = "momentum alone", "Schur complement", "both at once", "in turn"
 """Methods for the linearised problem."""
 
