@@ -25,8 +25,8 @@ from mpm_dolfinx.points.material_points import MaterialPoints, middle
 STILL = 3e-4
 """Largest motion of corners, divided by the cell size, without a new cut of the domains.
 
-In a consolidating column of ten cells, a new cut in every step changes pressures by 7e-5 of the load.  The settlement
-changes by 3e-5 of its value.  Plateau (scene "strip" of tests/plateaus.py): half this value changes the result by
+In a consolidating column of ten cells, a new cut in every step changes pressures by 7e-5 of the load, and the
+settlement by the fraction 3e-5.  Plateau (scene "strip" of tests/plateaus.py): half this value changes the result by
 0.0e+00, twice this value by 7.6e-05, and finer cells by 3.7e-02.
 """
 
@@ -169,7 +169,7 @@ class CutDomains(Keyed):
         return self.pieces_to_cells(values[self.pieces.point])
 
     def shares(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the parts (m,) of extensive quantities (n,) of points, such as volumes, in the owned pieces."""
+        """Return the values (m,) in the owned pieces of extensive quantities (n,) of points, such as volumes."""
         return self.pieces_to_cells(self.pieces.fraction * values[self.pieces.point])
 
     def plane(self, volume: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

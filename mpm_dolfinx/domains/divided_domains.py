@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Parts of seeded particle domains after division and merging.
 
-Local coordinates in a seeded domain are from 0 to 1.  A part of the domain is a box of local coordinates, with an
-interval along each axis.  A division bisects an interval.  Two halves of an interval merge.  In the interior of a box,
-neighbouring seeded domains may also merge into the intervals [0, 2], [0, 4], and so on.
+Local coordinates in a seeded domain are from 0 to 1.  A part of the domain has an interval of local coordinates along
+each axis.  A division bisects this interval along one axis.  Both halves may merge again.  Inside a body from `box`,
+neighbouring seeded domains may also merge.  The merged domain then has a longer interval, such as [0, 2] or [0, 4].
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ class SeededDomains:
         return seeded
 
     def from_middle(self, places: NDArray[np.int64], axis: int) -> NDArray[np.float64]:
-        """Return the lattice rows (n,) of domains along an axis, from the middle of the body.  Without lattice: nan."""
+        """Return the rows (n,) of domains along an axis, counted from the middle of the body.  Without lattice: nan."""
         out = np.full(len(places), np.nan)
         for i in np.unique(places[places[:, 0] >= 0, 0]):
             at, count = places[:, 0] == i, self.bodies[i].lattice[axis]
@@ -177,7 +177,7 @@ def halved(points: MaterialPoints, axis: int, domains: SeededDomains, axisymmetr
 def joined(
     lower: MaterialPoints, upper: MaterialPoints, axis: int, domains: SeededDomains, axisymmetric: bool
 ) -> MaterialPoints:
-    """Return the points (n,) merged from their halves.  F follows from the corners, other data are weighted means."""
+    """Return the points (n,) merged from their halves.  F follows from the corners; other values are weighted means."""
     places = {name: merged(getattr(lower, name), getattr(upper, name), axis) for name in PLACES}
     root, part = roots(lower)
     part = part.copy()
@@ -201,7 +201,7 @@ def _placed(
     of: tuple[NDArray[np.int64], NDArray[np.float64]],
     beyond: NDArray[np.float64],
 ) -> MaterialPoints:
-    """Return points with new corners, identifiers and parts, and F from the corners."""
+    """Return points with new corners, identifiers, `ROOT` and `PART`.  F is computed from the corners."""
     root, part = of
     is_whole = whole(part)
     data = {ROOT: np.where(is_whole, -1, root), PART: np.where(is_whole[:, None, None], 0.0, part)}

@@ -89,13 +89,13 @@ def cell_ratios(
 ) -> NDArray[np.float64]:
     """Return the volume ratios (m,) of the pieces of a cut at the start of a step.
 
-    With F-bar, a piece has the mean volume ratio of its cell: a weighted geometric mean of the ratio of the domains and
-    the ratio det F of the points.  Without F-bar, and in cells with yielded soil, a piece has the volume ratio of its
-    point.
+    With F-bar, a piece has the mean volume ratio of its cell: a weighted geometric mean of two ratios: the volume ratio
+    of the domains from their corners, and det F of the points.  Without F-bar, and in cells with yielded soil, a piece
+    has the volume ratio of its point.
 
     `cut`: cut particle domains.
     `points`: points at the start of the step.
-    `share` (n,): weight of the ratio of the domains in the geometric mean, from 0 to 1; 0 without F-bar.
+    `share` (n,): weight of the ratio from corners in the geometric mean, from 0 to 1; 0 without F-bar.
     `flows` (n,): whether points have yielded.
     """
     cells, size = cut.cells, cut.grid.num_local

@@ -54,9 +54,9 @@ class Neighbours:
         self._partner = partner.reshape(-1, 2 * dim).T.copy()  # index of the opposite face; -1 if there is none
 
     def at_neighbours(self, own: NDArray[np.float64], faces: Sequence[NDArray[np.float64]]) -> Callable[[int], tuple]:
-        """Return a function of a face index.  The function returns data, face centres and mask of the neighbours.
+        """Return a function of a face index, which returns values, face centres and a mask of existing neighbours.
 
-        `own` (c, k): c data of each point.
+        `own` (c, k): c values of each of k points.
         `faces`: centres (d, k), in m, of the faces of the points, for each face index.
         """
         centres = np.array(faces).transpose(1, 2, 0).reshape(len(faces[0]), own.shape[1] * len(faces))
@@ -86,7 +86,7 @@ class LinearGradients:
     def at_pieces(
         self, cut: CutDomains, F: NDArray[np.float64], elastic: NDArray[np.bool_], soils: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return the gradients at the pieces.  In inelastic domains, F is constant.  All processes must call it."""
+        """Return the gradients at the pieces.  In inelastic domains, F is constant.  All processes must call this."""
         make = partial(Neighbours, self._comm, self._bodies, cut.points, elastic)
         return linear_gradients(self._neighbours((cut.points.id, elastic), make, self._comm), cut, F, soils)
 
@@ -110,7 +110,7 @@ def _faces_of_parts(
 ) -> NDArray[np.int64]:
     """Return a key for each face of domains and of parts of domains.  Both domains at a face have the same key.
 
-    `seeded`: keys of whole domains of bodies without a lattice.
+    `seeded`: keys of the faces of whole domains, for bodies without a lattice.
     """
     dim, part = bodies[0].dim, is_part(points)
     root, ends = roots(points)

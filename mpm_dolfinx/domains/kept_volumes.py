@@ -6,10 +6,10 @@ corners of yielded domains therefore move by the vectors d that minimise
 
     sum_p V_p e_p^2 + SOFT^2 sum_p V_p (mean (d / h)^2 + sum_a mean (D_a / h)^2),  V_p e_p = V_p - V - dV/dx d.
 
-The sums are over the points p with the volumes V_p.  The domain of a point has the volume V, and dV/dx is the
-derivative of V with respect to its corners.  The relative volume error after the motion is e_p.  The difference of d
-along an edge of axis a is D_a.  The means are over the corners and edges of the domain, and h is the cell size.  The
-method is similar to implicit density projection (Kugelstadt et al. 2019).
+The sums are over the points p with the volumes V_p.  The domain of a point has the volume V before this motion, and
+dV/dx is the derivative of V with respect to the corners.  The relative volume error after the motion is e_p.  D_a is
+the difference of d between both ends of an edge along axis a.  Each mean is over the corners, or over the edges along
+a, of the domain.  The cell size is h.  The method is similar to implicit density projection (Kugelstadt et al. 2019).
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ def _motion(grid: Grid, domains: Domains) -> NDArray[np.float64]:
 
 
 def _sparse(values: NDArray[np.float64], columns: NDArray[np.int64], count: int) -> csr_matrix:
-    """Return a matrix (m, count) with values (m, k) in columns (m, k)."""
+    """Return a matrix (m, count), whose rows have the values (m, k) in the columns (m, k)."""
     m, k = values.shape
     return csr_matrix((values.ravel(), columns.ravel(), np.arange(m + 1) * k), (m, count))
 

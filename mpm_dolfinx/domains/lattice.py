@@ -7,7 +7,7 @@ when the grid is reset.  For each axis a in turn, the filter replaces the displa
     d - D_a^T (s / 64) D_a d.
 
 D_a is the third difference of four corners in a row along axis a, or the scaled divided difference for different widths
-of domains.  The factor is `s = min(1, FAST c)`, with the number c of cells that the corners have crossed since the last
+of domains.  The factor s is `min(1, FAST c)`, with the number c of cells that the corners have crossed since the last
 reset.
 
 Quadratic fields remain unchanged.  A wave with a length of two domains is reduced by the fraction s, and a wave with a
@@ -49,8 +49,8 @@ class Lattice:
     """Lattice of the domain corners of an active body.
 
     `start`: identifier of the first point of the body.
-    `given`: faces with prescribed displacements, and prescribed axes, for each condition.
-    `contacts`: faces in contact with other bodies: domains (m,), and corner indices (m, 4).
+    `given`: for each condition, the faces with prescribed displacements, and the prescribed axes.
+    `contacts`: domains (m,) with a face in contact with another body, and corner indices (m, 4) of this face.
     """
 
     def __init__(
@@ -96,7 +96,7 @@ class Lattice:
         return self._held(ids, held)
 
     def nodes(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the indices (m, 2^d) of the corners of domains in the body."""
+        """Return the indices (m, 2^d), in the body, of the corners of domains."""
         return self._numbers(ids, lambda: self._body.nodes(ids - self._start))
 
     def corners_of_parts(self, points: MaterialPoints) -> NDArray[np.int64]:
@@ -149,7 +149,7 @@ def _at_sites(
     values: NDArray[np.float64],
     tolerance: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], slice, Callable[[NDArray[np.float64]], NDArray[np.float64]]]:
-    """Return the values at the lattice sites of this process, its range of layers, and a function from sites to rows.
+    """Return the values at the lattice sites of this process, its layers, and a function from sites to corners.
 
     The layers of the lattice are distributed over the processes.  A site with values that differ by more than
     `tolerance` has nan.
@@ -197,7 +197,7 @@ def _filtered(
 
 
 def _divided(x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the weights of third differences at positions (n,).  The sum of absolute weights is 8."""
+    """Return weights of third differences at positions (n,) along an axis.  The sum of absolute weights is 8."""
     rows = np.stack([x[k : max(k, len(x) - 3 + k)] for k in range(len(THIRD))])
     distances = rows[:, None] - rows[None]
     weights = 1 / np.where(np.eye(len(THIRD), dtype=bool)[:, :, None], 1.0, distances).prod(axis=1)
@@ -246,7 +246,7 @@ def given(lattices: Sequence[Lattice], points: MaterialPoints) -> NDArray[np.boo
 
 
 def seeded(lattices: Sequence[Lattice], points: MaterialPoints) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Return the indices (n, 2^d) of corners in bodies, and which corners are in contact with other bodies.
+    """Return the indices (n, 2^d) of corners, counted in each body, and which corners touch other bodies.
 
     Corners of renewed domains have the index -1.
     """
@@ -276,5 +276,5 @@ def filtered(
 
 
 def crossed(grid: Grid, points: MaterialPoints, then: MaterialPoints, free: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return the numbers (n, 2^d) of cells that corners have crossed since the reset, or 0 without `free`."""
+    """Return the numbers (n, 2^d) of cells that corners have crossed since the reset; 0 if not `free`."""
     return grid.cells_between(then.corners, points.corners).sum(axis=2) * free[:, None]

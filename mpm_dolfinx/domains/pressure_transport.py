@@ -2,9 +2,9 @@
 """Conservative, second-order remap of the pore pressure from one grid to the next.
 
 In each cell, the pressure at x is reconstructed as `p + s . (x - c)`.  The cell pressure is p, and c is the centroid of
-the material, weighted by storage.  The slope s along an axis is van Leer's mean of the slopes to both neighbours
-or towards a drained side, and zero at a no-flow side.  A limiter keeps the pressure in the cell between the extremes of
-the cell, its neighbours and drained sides.
+the material, weighted by storage.  The slope s along an axis is van Leer's mean of the slopes to both neighbours.  A
+drained side counts as a neighbour.  At a no-flow side, s is zero.  A limiter keeps the pressure in the cell between the
+extremes of the cell, its neighbours and drained sides.
 
 Each piece of a particle domain stores the pressure at its centroid.  After the motion, the domain is cut again.  The
 fraction of the domain that is still in the same cell keeps its pressure.  All other fractions get the mean pressure of
@@ -196,7 +196,7 @@ def van_leer(one_sided: NDArray[np.float64]) -> NDArray[np.float64]:
 def share_within(
     increment: NDArray[np.float64], low: NDArray[np.float64], high: NDArray[np.float64], slot: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Return the largest factor (n,) <= 1 in each cell with which increments stay within [`low`, `high`]."""
+    """Return for each cell the largest factor (n,) <= 1 that keeps its increments within [`low`, `high`]."""
     bound, share = np.where(increment > 0, high[slot], low[slot]), np.ones(len(low))
     excessive = (np.abs(increment) > np.abs(bound)).nonzero()[0]
     np.minimum.at(share, slot[excessive], bound[excessive] / increment[excessive])
@@ -204,7 +204,7 @@ def share_within(
 
 
 def _bounds_of(jump: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the smallest (<= 0) and the largest (>= 0) difference to neighbours."""
+    """Return the smallest (<= 0) and the largest (>= 0) pressure difference of each cell to its neighbours."""
     return np.minimum(jump.min(axis=(1, 2)), 0), np.maximum(jump.max(axis=(1, 2)), 0)
 
 
@@ -242,7 +242,7 @@ def transport(old: PiecePressures, points: MaterialPoints, new: Pieces) -> NDArr
 
 
 def _limited(correction, pressure, old: PiecePressures, owner, new: Pieces) -> NDArray[np.float64]:
-    """Return the factor on the corrections in each domain that keeps pressures within bounds."""
+    """Return for each piece the largest factor on its correction that keeps its domain's pressures in bounds."""
     first, new_first = (of.searchsorted(np.arange(of[-1] + 1)) for of in (owner, new.point))
     low, high = np.minimum.reduceat(old.bounds[:, 0], first), np.maximum.reduceat(old.bounds[:, 1], first)
     margin = np.where(correction > 0, high[new.point] - pressure, low[new.point] - pressure)
@@ -317,13 +317,13 @@ def joined_pieces(
 def _missing(
     held: NDArray[np.float64], store: NDArray[np.float64], potential: NDArray[np.float64], of: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Return the change of potentials, in Pa, so that each point contains the fluid `held`."""
+    """Return the change of potentials, in Pa, after which each point contains the fluid volume `held`."""
     (total, now), n = sum_by(of, np.array([store, store * potential]), len(held)), len(held)
     return np.divide(held - now, total, out=np.zeros(n), where=total > 0)
 
 
 def _outermost(bounds: NDArray[np.float64], of: NDArray[np.int64], n: int) -> NDArray[np.float64]:
-    """Return the smallest lower and the largest upper bounds of rows with equal indices."""
+    """Return the smallest lower bound and the largest upper bound for each index in `of`."""
     out = np.stack([np.full(n, np.inf), np.full(n, -np.inf)], axis=1)
     np.minimum.at(out[:, 0], of, bounds[:, 0])
     np.maximum.at(out[:, 1], of, bounds[:, 1])

@@ -39,7 +39,7 @@ CRUMB = NEAR
 Other parts of the domain receive the mass and the seeded faces of a removed part.  Source: `NEAR`.
 """
 SMALL = (0.5 / EDGES) ** 2
-"""A cell with a smaller part of an old domain is renewed too.  The area of the part is divided by the cell area.
+"""Cells in which a part of an old domain has less than this fraction of the cell area are renewed too.
 
 Source: definition, a square with half the length of a surface edge (`EDGES` edges in a cell).
 """
@@ -305,7 +305,7 @@ class RefilledCells:
     ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Return the keys of new edges, and the reference positions of their ends, from the nearest old surface.
 
-        `parts`: old surface, ordered by cells.
+        `parts`: parts of the old surface, ordered by cell.
         """
         first, stop = (np.searchsorted(parts.cell, cells, side=side) for side in ("left", "right"))
         edge, part = ranges(first, stop - first)
@@ -400,7 +400,7 @@ class RefilledCells:
 
     @cached_property
     def remainders(self) -> tuple[New, NDArray[np.int64]]:
-        """New domains in the pieces of removed domains outside renewed cells, and these pieces."""
+        """New domains for pieces of removed domains outside renewed cells, and the indices of these pieces."""
         pieces, points = self.pieces, self.points
         left = self._left
         rings, of = _convex(points.corners[pieces.point[left]], self._volume(self.cell[left]))
@@ -458,7 +458,7 @@ class RefilledCells:
 
     @cached_property
     def into(self) -> tuple[NDArray, NDArray, NDArray]:
-        """Pieces of removed domains, with the group of new domains and the fraction of the old domain of each piece."""
+        """Pieces of removed domains, the group of new domains that receives each, and its share of the old domain."""
         pieces, outside = self.pieces, self.remainders[1]
         into = np.flatnonzero(self.chosen[self.cell] & self.affected[pieces.point])
         piece = np.concatenate([into, outside])
@@ -468,7 +468,7 @@ class RefilledCells:
         return piece, groups, share / whole[pieces.point[piece]]  # includes the mass of dropped parts
 
     def pairs(self, corners: NDArray[np.float64], group: NDArray[np.int64]) -> tuple[NDArray, NDArray, NDArray]:
-        """Return pairs of old and new domains, and the fraction of the old mass for the new domain of each pair."""
+        """Return pairs of an old and a new domain, and the fraction of the old mass that the new domain receives."""
         piece, groups, share = self.into
         order = np.argsort(group, kind="stable")
         first, stop = (np.searchsorted(group[order], groups, side=side) for side in ("left", "right"))

@@ -43,7 +43,7 @@ def keys(point: NDArray[np.int64], face: NDArray[np.int64]) -> NDArray[np.int64]
 
 
 def with_faces(points: MaterialPoints) -> MaterialPoints:
-    """Return the points with data of renewed faces, by default without renewed faces."""
+    """Return the points with the data `PARENT`, `AREA` and `ENDS`, by default for points without renewed faces."""
     if PARENT in points.data:
         return points
     n = len(points)
@@ -51,7 +51,7 @@ def with_faces(points: MaterialPoints) -> MaterialPoints:
 
 
 def with_parts(points: MaterialPoints) -> MaterialPoints:
-    """Return the points with data of parts, by default for whole domains."""
+    """Return the points with the data `ROOT` and `PART`, by default for whole domains."""
     if ROOT in points.data:
         return points
     n, d = points.x.shape
@@ -77,7 +77,7 @@ def roots(points: MaterialPoints) -> tuple[NDArray[np.int64], NDArray[np.float64
 def faces_of_parts(
     points: MaterialPoints, id: NDArray[np.int64], face: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return the parts of domains on faces of seeded domains.
+    """Return the parts of divided domains that lie on given faces of seeded domains.
 
     `id`, `face` (m,): seeded domains and indices of their faces.
 
@@ -214,7 +214,7 @@ class RenewedFaces:
     def in_place_of(
         self, area: NDArray[np.float64], whole: NDArray[np.float64], face: NDArray[np.int64]
     ) -> tuple[NDArray, NDArray, NDArray]:
-        """Replace areas of parts, areas of whole faces, and face indices (n,) by new values at renewed faces."""
+        """Replace areas of parts of faces, areas of whole faces, and face indices (n,) by those of renewed faces."""
         part = np.ptp(self.xi, axis=1).max(axis=1) / 2
         new = self.area * part, self.area, self.face
         return tuple(np.where(self.old, a, b) for a, b in zip((area, whole, face), new, strict=True))
