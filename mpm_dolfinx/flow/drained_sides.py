@@ -67,7 +67,7 @@ class DrainedSides(Feeding):
         return [faces for _, faces in self._outlets]
 
     def unknown(self, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return outflows and run-offs before the first step, all equal to `value`, and volumes of zero with rain."""
+        """Return placeholders before the first step: `value` for outflows and run-offs, and zero for volumes."""
 
         def of_all(value: float) -> dict[str, NDArray[np.float64]]:
             return {name: np.array(value) for name in self._names}
@@ -147,7 +147,7 @@ class OpenFaces:
         return np.einsum("md,md->m", fluid.force(self.at), self.by_force(fluid))
 
     def by_force(self, fluid: Fluid) -> NDArray[np.float64]:
-        """Return the derivative (m, d) of `driven` with respect to the force, in m^(d+3)/(N s)."""
+        """Return the derivative (m, d) of the outflow `driven` with respect to the inertia force, in m^(d+3)/(N s)."""
         return np.where(self.seeps, 0.0, self.open_by(fluid))[:, None] * self.offset
 
 
@@ -194,8 +194,8 @@ class UnsaturatedFaces(OpenFaces):
 class RainedFaces(OpenFaces):
     """All faces on open sides, if at least one side has rain.
 
-    Through a face with rain, the outflow is minus the rain.  The smallest outflow is the outflow at the pressure of the
-    pond.  The largest outflow is the outflow at the pressure `Rain.driest`.
+    Through a face with rain, the outflow is minus the rain.  It is at least the outflow at the pressure of the pond,
+    and at most the outflow at the pressure `Rain.driest`.
     """
 
     rain: NDArray[np.float64]  # rain (m,), m^d/s; nan for faces without rain
@@ -218,7 +218,7 @@ class RainedFaces(OpenFaces):
         )
 
     def by_force(self, fluid: Fluid) -> NDArray[np.float64]:
-        """Return the derivative (m, d) of `driven` with respect to the force, zero for faces with rain."""
+        """Return the derivative (m, d) of `driven` with respect to the inertia force, or zero for faces with rain."""
         return np.where(np.isnan(self.rain)[:, None], super().by_force(fluid), 0.0)
 
     def open_by(self, fluid: Fluid) -> NDArray[np.float64]:

@@ -72,7 +72,7 @@ class Feeds:
     """Faces with an outside pressure or a prescribed flux."""
 
     def conducting(self, flow: Conduction) -> Any:
-        """Return the argument `at` of other methods: data that depend on conductivities and the motion of cells."""
+        """Return the argument `at` of the methods below, which depends on conductivities and the motion of cells."""
 
     def begin(self, at: Any, fluid: Fluid, difference: NDArray[np.float64]) -> None:
         """Start a substep.
@@ -101,12 +101,12 @@ class Feeds:
 
     def outcome(self, at: Any, fluid: Fluid) -> dict[str, dict[str, NDArray[np.float64]]]:
         """Return results of the conditions, by quantity and name, such as "outflows": the outflow from the bodies, in
-        m^d/s.  All processes must call this.
+        m^d/s.  All processes must call this method.
         """
         return {}
 
     def passing(self, at: Any, fluid: Fluid) -> Mapping[str, NDArray[np.float64]]:
-        """Return the rates in a substep, for the method `volumes`.  All processes must call this method."""
+        """Return the flow rates in a substep, for the method `volumes`.  All processes must call this method."""
         return {}
 
     def volumes(
@@ -134,7 +134,7 @@ class Feeding:
     count: int = 0
     """Number of conditions."""
     varies: bool = False
-    """Whether pressures or fluxes depend on time or position."""
+    """Whether prescribed pressures or fluxes depend on time or position."""
     surfaces: Sequence[Surface] = ()
     """Faces on which the conditions act."""
 
@@ -147,5 +147,5 @@ class Feeding:
         return np.empty(0, dtype=np.int64)
 
     def unknown(self, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return the results of `Feeds.outcome` before the first step, all equal to `value`, and volumes of zero."""
+        """Return placeholders for `Feeds.outcome` before the first step: zero for volumes, `value` for all others."""
         return {}

@@ -38,9 +38,9 @@ A convex body has the volume V, and is inside a cell of edge length h.  A plane 
 least `V / ((d + 1) THICK h^(d-1))` from the centroid of the body.  Smaller distances are replaced by this bound.
 """
 ALONG = 0.1
-"""A side determines the slope along an axis if this component of its unit normal is larger than `ALONG`.  Plateau
-(scene "beam" of tests/plateaus.py): half this value changes the result by 9.9e-11, twice this value by 8.7e-11, and
-finer cells by 1.4e-02.
+"""A drained side determines the pressure slope along an axis if its unit normal has a larger component along the axis.
+Plateau (scene "beam" of tests/plateaus.py): half this value changes the result by 9.9e-11, twice this value by 8.7e-11,
+and finer cells by 1.4e-02.
 """
 
 
@@ -101,7 +101,7 @@ class Conduction:
         return across if hoop is None else across * hoop[at]
 
     def distance_ratio(self, at: NDArray[np.int64], normal: NDArray, offset: NDArray) -> NDArray[np.float64]:
-        """Return ratios (m,) of distances from a face: to the centroid, divided by to the pressure position (`layers`).
+        """Return ratios (m,): distance of a face from the centroid over that from the pressure position (`layers`).
 
         `normal` (m, d): normals of the faces.
         `offset` (m, d), m: vectors from the centroids to the faces.
@@ -150,7 +150,7 @@ class OpenSides:
         return self.area / np.sqrt(np.add.reduce(self.area**2, axis=1, keepdims=True))
 
     def driven(self, at: NDArray[np.int64], flow: Conduction) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return two terms of the outflow: per mass potential of the cell (m,), m^d/(Pa s), and inflow (m,), m^d/s.
+        """Return conductances c (m,), m^d/(Pa s), and inflows q (m,), m^d/s: the outflow is c times potential minus q.
 
         `at` (m,): indices of the cells among the filled cells.
         """
@@ -231,7 +231,8 @@ class CellContents(Keyed):
         rows = [self.weight, self.area, self.weight * pieces.fixed_stress], (self.area[:, None] * pieces.x).T
         sums = self.total(np.concatenate([*rows, pieces.faces.reshape(len(self.area), 2 * d).T]))
         self.volume, area, self.fixed_stress = sums[:3]
-        """Volumes (n,) of the material in filled cells, in m^d, and integrals (n,) of beta, in m^d/Pa."""
+        """Volumes (n,) of the material in filled cells (m^d), and its integrals (n,) of the fixed-stress beta
+        (m^d/Pa)."""
         self.fill = np.minimum(area / grid.volumes(filled), 1.0)
         """Volume fractions (n,) of material in the filled cells."""
         shapes = (forms.centroid, forms.lower_face, forms.upper_face)

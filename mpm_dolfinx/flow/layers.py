@@ -84,9 +84,9 @@ class MixedCells:
             self._lines.append(Lines(line, piece, length, before, total))
 
     def _crossed(self, rows: slice, first, count, low, high) -> list[tuple[NDArray, NDArray, NDArray]]:
-        """Return, for each axis, lines through the centroids of the pieces `rows`, crossed pieces, and weights.
+        """Return for each axis the lines through the centroids of the pieces `rows`, the crossed pieces, and weights.
 
-        The weight is below one for a line along the border of a piece.
+        A crossed piece has a weight below one if the line runs along its border.
         """
         line, piece = ranges(first[rows], count[rows])
         line += rows.start
@@ -120,7 +120,7 @@ class MixedCells:
 
         `kappa`, m^2/(Pa s): mobilities of all pieces.
         `mean` (n,), m^2/(Pa s): means of `kappa` in the filled cells.
-        `share` (n, d): mobility along each axis divided by `mean`.  The values of mixed cells are replaced.
+        `share` (n, d): mobility along each axis divided by `mean`.  This method replaces the values of mixed cells.
         `now`, m^2/(Pa s): mobilities of all pieces at their pressures, in unsaturated soil.
         """
         along, off = self._along(kappa[self._rows])
@@ -135,7 +135,7 @@ class MixedCells:
     def _along(self, kappa: NDArray[np.float64], mean: float = 1.0) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the mobilities along the axes, and the shifts of the pressure position divided by the cell size.
 
-        `mean`: 1 for shifts due to all layers, 0 for shifts due to inclined layers only.
+        `mean`: 1 if all layers shift the pressure position, 0 if only inclined layers shift it.
         """
         n, d = len(self._filled), self._x.shape[1]
         mobility = np.zeros((n, d))
@@ -235,8 +235,7 @@ def graded(
 ) -> NDArray[np.float64]:
     """Return the mobilities (n, d) along the axes, divided by `mean`, for mobilities that vary gradually in a cell.
 
-    Across the gradient of the mobility, the mean over the cell is harmonic.  Along layers of equal mobility, it is
-    arithmetic.
+    Along the gradient of the mobility, the mean over the cell is harmonic.  Normal to the gradient, it is arithmetic.
 
     `offset` (m, d), m: positions of the pieces relative to the midpoints of cells.
     `kappa` (m,), m^2/(Pa s): mobilities of the pieces.

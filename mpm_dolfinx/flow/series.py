@@ -31,7 +31,7 @@ class Paths(NamedTuple):
 
     The first three indices of the arrays (n, d, 2, ...) are the cell, the axis, and the end of the cell.  `parallel` is
     for lines with a single soil.  Its entry 0 is for soil without a retention curve, and each curve has one further
-    entry.  The other fields describe one line with s soils in series.
+    entry.  The fields `law`, `length` and `resistance` describe one line with s soils in series.
     """
 
     parallel: NDArray[np.float64]  # mobility of single-soil lines, times their fraction of all lines (l,), m^2/(Pa s)

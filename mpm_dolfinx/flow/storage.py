@@ -71,7 +71,7 @@ the result by 5.2e-11, twice this value by 1.3e-10, and finer cells by 1.5e-02.
 
 
 FluxSlope = Callable[[PETSc.Vec], NDArray[np.float64]]
-"""Function of a change of u.  The function returns the change of outflow volumes, see `StorageProblem.flux_slope`."""
+"""Function that maps a change of the displacements u to changes of outflow volumes, see `StorageProblem.flux_slope`."""
 
 
 class CellPressure(NamedTuple):
@@ -243,7 +243,7 @@ class StorageSystem:
         """Connected part of the bodies to which each unknown belongs."""
         self.T, self.D, self.L = (matrix(own, own, 2 * d + 1) for _ in range(3))
         self.moves = moves = fluxes.by_motion is not None
-        """Whether B contains the derivative of the outflow by inertia, see `set_by_motion`."""
+        """Whether the matrix B contains the derivative of the outflow due to inertia, see `set_by_motion`."""
         self.B_momentum = matrix(own, momentum, 2**d * d)
         self.B = matrix(own, momentum, d * (d * moves + 1) * 2**d) if moves or not forms.symmetric else self.B_momentum
         self.residual, self.step, self._potentials = (own.vector() for _ in range(3))
@@ -265,7 +265,7 @@ class StorageSystem:
 
     @property
     def gravity(self) -> FacetSum | None:
-        """Form of fluxes between cells of one soil, due to p and weight.  None in saturated soil without weight."""
+        """Form of fluxes between cells of one soil by pressure and weight.  None in saturated soil without weight."""
         return (self._uniform or self._over_uniform())[1]
 
     def _over_uniform(self) -> tuple[FacetSum | None, FacetSum | None]:
@@ -322,7 +322,7 @@ class StorageSystem:
         return Outflow([one.conducting(flow) for one in feeds], total, mobility, nonorthogonal)
 
     def set_by_motion(self, dt: float, filled: NDArray[np.int64], rows: NDArray[np.float64]) -> None:
-        """Set B to the derivative (m^(d-1)) of the outflow by inertia with respect to displacements.
+        """Set the matrix B to the derivative (m^(d-1)) of the outflow due to inertia with respect to displacements.
 
         `dt`, s: time weight of the outflow.
         `rows` (n, k), m^(d-1)/s: derivative of the outflow through open sides with respect to the nodal displacements,
@@ -481,7 +481,7 @@ class StorageProblem:
 
     @property
     def linear(self) -> bool:
-        """Whether the tangent is independent of the pressure."""
+        """Whether the tangent of the fluid balance is independent of the pressure."""
         drains = self.forms.drains or self.forms.retains
         return not drains and not self._settles and all(one.linear for one in self._feeds)
 
@@ -495,7 +495,7 @@ class StorageProblem:
         return volumes / (self.forms.derivatives(self.data)[0] + self._contents.fixed_stress)
 
     def filling(self, error: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the errors of the water content due to pressure errors (Pa), and its change in the step."""
+        """Return the errors of the water content due to pressure errors (Pa), and the change of the water content."""
         capacity, _ = self.forms.drained(self.data)
         change = self.forms.change(self.data)[self.system.unknowns.owned]
         share = self.fill / self._contents.volume

@@ -147,7 +147,7 @@ def _centroids(corners: NDArray[np.float64], within: bool) -> NDArray[np.float64
 
 
 def tangled(corners: NDArray[np.float64], volume: NDArray[np.float64], axisymmetric: bool = False) -> NDArray[np.bool_]:
-    """Return a mask (n,) of inverted domains: corners span much less than the prescribed `volume` (n,), in m^d."""
+    """Return a mask (n,) of inverted domains: corners span much less or much more than `volume` (n,), in m^d."""
     ratio = domain_volumes(corners, axisymmetric) / volume
     return (ratio < TANGLED) | (ratio > 1 / TANGLED)
 
@@ -278,7 +278,7 @@ class _Slots:
         return out
 
     def beyond(self, values: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
-        """Return for each slot the sum of values over the following slots along an axis."""
+        """Return for each slot the sum of the values over all later slots of its domain along an axis."""
         out = np.zeros(self.size)
         for steps in range(1, int(np.maximum.reduce(self._span[axis], initial=1))):
             has = (self._place[axis] + steps < self._span[axis][self.point]).nonzero()[0]
@@ -464,13 +464,13 @@ def cut_faces(
     """Cut faces of domains by the grid, and return integration points that are exact for products of Q1 functions.
 
     `corners` (faces, 2^(d-1), d), in m: corners of the faces; triangles repeat their last corner.
-    `local` (faces, 2^(d-1), e): further coordinates of the corners, for interpolation.
+    `local` (faces, 2^(d-1), e): e values at the corners, which are interpolated to the points.
 
     Returns
     -------
     Index (n,) of the face of each of n points.
     Position (n, d) of each point.
-    Interpolated coordinates (n, e) of each point.
+    Values (n, e) interpolated from `local` to each point.
     Fraction (n,) of the face that each point represents.
     Middle (n, d) of the segment or triangle of each point.
     """
@@ -589,7 +589,7 @@ def sliced(s: NDArray[np.float64], owner: NDArray[np.int64], axis: int, grid: Gr
 
 
 def cut_at(s, owner, axis: int, plane):
-    """Cut each simplex at its plane.  Return parts and owners below the plane, and then above the plane."""
+    """Cut each simplex at its plane.  Return parts below the plane, their owners, parts above, and their owners."""
     order = s[:, axis].argsort(axis=0)
     s = s[order[:, None], np.arange(s.shape[1])[:, None], np.arange(s.shape[2])]
     count = (s[:, axis] < plane).sum(axis=0)  # vertices below the plane

@@ -72,7 +72,8 @@ class FacetTree:
     def within(self, y: NDArray[np.float64], limit: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return pairs of a position and a facet, sorted by position.
 
-        The pairs contain all facets at distances below `limit` (m,), in m, from positions y (d, m), and some others.
+        The pairs contain all facets closer than `limit` (m,), in m, to positions y (d, m), and some at larger
+        distances.
         """
         at = np.arange(y.shape[1])
         node = np.zeros(len(at), dtype=np.int64)

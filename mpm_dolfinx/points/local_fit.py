@@ -23,7 +23,7 @@ from mpm_dolfinx.grid.grid import sum_by
 from mpm_dolfinx.parallel.exchange import over_all
 
 RADIUS = 3.0
-"""Largest offset with a weight, in spacings of the data.
+"""Largest offset with a nonzero weight, in spacings of the data.
 
 Source: exact. A parabola needs three points.  At an end of the data, these points have offsets of 0.5, 1.5 and 2.5.
 """
@@ -54,9 +54,9 @@ def fitted(
     data.
 
     `degree`: degree of the polynomials, 1 or 2.
-    `at` (r,): index of the position of each row of data, from 0.
+    `at` (r,): index, from 0, of the position to which each of r data belongs.
     `offset` (r, d): offset of the data from this position, in spacings of the data.
-    `values` (r, width): values of the data.
+    `values` (r, width): `width` values of each of the r data.
     `weight` (r,): weights of the data.
     """
     powers = [rows for k in range(degree + 1) for rows in combinations_with_replacement(range(offset.shape[1]), k)]

@@ -240,7 +240,7 @@ class MaterialPoints:
         return received.map(lambda rows: rows[order])
 
     def find(self, ids: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Find the points of this process with given `ids`.  Return their indices in `ids` and among the points."""
+        """Return the indices, in `ids` and among all points of this process, of the points that have these `ids`."""
         at = self.id.searchsorted(ids)
         found = ((at < len(self)) & (self.id[np.minimum(at, len(self) - 1)] == ids)).nonzero()[0] if len(self) else []
         found = np.asarray(found, dtype=np.int64)

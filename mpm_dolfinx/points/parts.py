@@ -160,7 +160,7 @@ def _touching(index: NDArray[np.int64]) -> tuple[NDArray[np.int64], int]:
 
 
 def _joined(rows: NDArray[np.int64], columns: NDArray[np.int64], shape: Sequence[int]) -> tuple[NDArray[np.int64], int]:
-    """Return the component of each row, and the number of components.  Rows with a common column are connected."""
+    """Return the connected component of each row, and their number.  Each column connects all its rows."""
     part, count = linked(sum(shape), rows, shape[0] + columns)
     return part[: shape[0]], count
 
