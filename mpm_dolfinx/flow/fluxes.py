@@ -231,8 +231,7 @@ class CellContents(Keyed):
         rows = [self.weight, self.area, self.weight * pieces.fixed_stress], (self.area[:, None] * pieces.x).T
         sums = self.total(np.concatenate([*rows, pieces.faces.reshape(len(self.area), 2 * d).T]))
         self.volume, area, self.fixed_stress = sums[:3]
-        """Volumes (n,) of the material in filled cells (m^d), and its integrals (n,) of the fixed-stress beta
-        (m^d/Pa)."""
+        """Volumes (n,) of material in the filled cells (m^d), and integrals (n,) of the fixed-stress beta (m^d/Pa)."""
         self.fill = np.minimum(area / grid.volumes(filled), 1.0)
         """Volume fractions (n,) of material in the filled cells."""
         shapes = (forms.centroid, forms.lower_face, forms.upper_face)

@@ -41,7 +41,7 @@ def lines_at(
     """Return the lines (m) along each axis that a user's function `follow` gives at time t (s) and positions x (n, d),
     in m.
 
-    Number of lines, first and last coordinate along each axis must be as in `given`, the lines at the start.
+    Along each axis, number of lines, first and last coordinate must be as in `given`, the lines at the start.
     """
     what, count = f"grid: follow at t = {t:g} s", [len(of) for of in given]
     allowed = f"{' and '.join(map(str, count))} coordinates along the axes"
@@ -67,7 +67,7 @@ def carried(lines: Sequence[NDArray[np.float64]], shift: NDArray[np.float64]) ->
     Raises
     ------
     ValueError
-        The smallest cells touch a side and move along its normal, or other cells would become smaller.
+        The smallest cells touch a side and move along its normal, or other cells would become smaller than these cells.
     """
     out = []
     for letter, x, step in zip("xyz", lines, shift.tolist(), strict=False):

@@ -386,13 +386,13 @@ class Grid:
         Origin of all internal positions: the lower corner of the grid, in axisymmetry at the radius 0.  A near origin
         reduces rounding errors.
     low, high : (d,), m
-        Lower and upper corner relative to `base`.
+        Lower and upper corner of the grid, relative to `base`.
     stretches
         Dimension of deformation gradients: d, or 3 in axisymmetry, because of the circumferential stretch.
     mesh
         The dolfinx mesh, created at its first use.  The coordinates of the mesh are relative to `base`.  On several
         processes, a scene whose cells are distributed in another way has a separate mesh and grid, `Simulation.grid`.
-        Scenes with terms or sources always use this mesh, because terms may be defined on it.
+        Scenes with user-defined terms or sources always use this mesh, because terms may be defined on it.
     """
 
     def __init__(

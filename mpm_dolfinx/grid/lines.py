@@ -60,8 +60,8 @@ def graded(
     lower, upper : (d,), m
         Lower and upper corner of the grid; d = 2 or 3.
     fine : (boxes, 2, d), m
-        Lower and upper corners of at least one fine box.  Boxes must be inside the grid.  Small cells also fill gaps
-        narrower than one cell, between two boxes, or between a box and a side.
+        Lower and upper corners of at least one fine box.  Boxes must be inside the grid.  Small cells also fill the gap
+        between two boxes, or between a box and a side, if it is narrower than a cell.
     size : number or (d,), m
         Largest edge lengths > 0 of the small cells.  Cells may be smaller, because each box contains a whole number of
         cells.

@@ -111,7 +111,7 @@ class Writer:
         self.close()
 
     def close(self) -> None:
-        """Release the lock of the folder.  Further calls have no effect.  Files are complete without this method."""
+        """Release the lock of the folder.  A second call has no effect.  Files are complete without this call."""
         self._lock, self.closed = None, True
 
     def _hold(self, folder: Path) -> None:

@@ -319,12 +319,12 @@ class Retentions:
 
 
 def _constants(law) -> list[str]:
-    """Return the names of the constants of a law."""
+    """Return the names of the constants of a retention curve, or an empty list for a user-defined curve."""
     return [f.name for f in fields(law)] if isinstance(law, Retention) else []
 
 
 def _lifted(law, values: Sequence):
-    """Return a copy of a law whose constants are UFL values."""
+    """Return a copy of a law, in which UFL values replace the constants."""
     out = copy(law)
     if isinstance(law, Retention):
         vars(out).update(zip(_constants(law), values, strict=False))
@@ -421,7 +421,7 @@ class Conductance:
 
 
 REACH = (1e-8, 1e8)
-"""Smallest and largest tabulated suction, over the law's scale.  Source: k_r outside is constant, exact to 1e-8."""
+"""Smallest and largest tabulated suction, over the law's scale.  Source: k_r beyond is constant, exact to 1e-8."""
 ROWS = 4000
 """Number of tabulated suctions.  Plateau (scene "dry" of tests/plateaus.py): half this value changes the result by
 2.1e-08, twice this value by 2.6e-09, and finer cells by 6.6e-03.

@@ -72,16 +72,16 @@ class Simulation:
         Initial effective stress, tension positive: `K0`, or a function of positions x (n, d). The function returns
         normal stresses (n, 3) or tensors (n, 3, 3), Pa. A dictionary {index: ...} gives initial stresses to some bodies
         only. A body that a stage adds has initial stress only if the dictionary lists it. Iterations at the start bring
-        the stress into equilibrium with loads and initial pore pressures. Under constant loads the first step then
-        causes no displacement.
+        the stress into equilibrium with loads and initial pore pressures. After these iterations, the first step under
+        constant loads causes no displacement.
     terms
         User-defined terms in UFL. A function is a term of the momentum balance, see `user_functions`.  `OnSide` is such
         a term on a side.  A `Source` is a term of the fluid balance.
     numerics
         Quadrature, coupling, tolerance and time integration, see `Numerics`.
     inertia
-        True: bodies have inertia, and need no walls.  `Moving`: they also have an initial velocity.  False: later
-        stages may have inertia.  None: no stage has inertia. Inertia requires `quadrature="domain"`.
+        True: bodies have inertia, and need no walls.  `Moving`: bodies also have an initial velocity.  False: only
+        later stages may have inertia.  None: no stage has inertia. Inertia requires `quadrature="domain"`.
 
     Attributes
     ----------
@@ -148,7 +148,7 @@ class Simulation:
         """Wall time for compiling or loading the forms, in s."""
 
     def __str__(self) -> str:
-        """Return a table of all terms and solvers.  It shows whether the scene uses them, and why."""
+        """Return a table of all terms and solvers.  The table shows whether the scene uses each of them, and why."""
         return summary.table(self.scene, self.state)
 
     # ---- results --------------------------------------------------------------------------------
@@ -301,17 +301,17 @@ class Simulation:
             Whether bodies have inertia from now on; a scene created with `inertia=None` cannot have inertia.  Bodies
             that get inertia start without velocity.
         conditions
-            All conditions from now on; by default the present conditions.  Pass `[*simulation.conditions, more]` to
-            add the condition `more`.  Every `Contact` remains in force, even if it is not listed.
+            All conditions from now on; by default the present conditions.  To add a condition `new`, pass
+            `[*simulation.conditions, new]`.  Every `Contact` remains in force, even if it is not listed.
         add
             Indices of bodies that are `Later`, for example a fill.  Added bodies have no velocity.  Added bodies have
             an initial stress only if `initial_stress` lists them.  A fill is added to the present surface of the bodies
-            that it touched at seeding.  Its free sides remain at their seeded positions.
+            that it touched at seeding.  The free sides of the fill remain at their seeded positions.
         remove
             Indices of bodies to be removed, for example by an excavation.
         reset_displacement
             Whether displacements are measured from the present positions from now on. Values of conditions do not
-            change: a present `Displacement` with the value d then moves its side by d again.
+            change: a present `Displacement` with the value d moves its side by another d.
         fields
             New values of entries of `points.data`, by name.  A value is an array (n, ...) for the n points of this
             process, or one value for all points.  An entry is a state variable of a law, a material constant that

@@ -34,7 +34,7 @@ FINEST = NEAR**2
 Source: epsilon, smaller steps change only the last four digits of the time.
 """
 SAFETY, SHRINKS, GROWS, KEEPS = 0.9, 0.2, 5.0, 1.2
-"""Constants for the ratio of an adaptive step to the previous step.
+"""Constants for the ratio of the lengths of an adaptive step and the previous step.
 
 The ratio is `SAFETY` times a power of (tolerance / error), but at least `SHRINKS` and at most `GROWS`.  If the ratio is
 between 1 and `KEEPS`, the step keeps its length.  Source: Hairer, Norsett and Wanner (1993), equation 4.13; for `KEEPS`
@@ -46,7 +46,7 @@ RINGS = 5e-3
 SDIRK2 overshoots a jump by at most 0.21 times the jump.
 """
 AGAIN = 2.0
-"""Smallest ratio of the rate of a sudden pressure change to the rate of pressure at the start of the last step."""
+"""A pressure change is a jump only if its rate exceeds this factor times the rate at the start of the last step."""
 MOST = SAME / EPSILON
 """Largest number of output intervals.  Source: exact; `SAME` times a shorter interval is below rounding errors."""
 RESOLVED = 10
@@ -159,8 +159,8 @@ class StepSize:
         """Return the step control after a completed step.
 
         After a reduction, the length of equal steps doubles again as soon as `waits` steps have converged.  The initial
-        value of `waits` is 0.  When a doubled step fails, `waits` increases to 2 `waits` + 1.  When it converges,
-        `waits` is halved.
+        value of `waits` is 0.  When a doubled step fails, `waits` increases to 2 `waits` + 1.  When a doubled step
+        converges, `waits` is halved.
         """
         small, whole = self.next(size, report, control, failed), size > (1 - SAME) * control.small
         if self.by_error:
@@ -180,12 +180,12 @@ class StepSize:
         return bool((excess > np.maximum(RINGS * np.asarray(control.change), NEAR * max(control.change))).any())
 
     def _factor(self, report: Report, control: StepControl, power: float) -> float:
-        """Return the length of the next step, divided by the length of the computed step, from its error."""
+        """Return the ratio of lengths of the next step and the computed step, from the error of the computed step."""
         excess = self._excess(report, control)
         return min(GROWS, max(SHRINKS, SAFETY / excess**power if excess > 0 else GROWS))
 
     def _excess(self, report: Report, control: StepControl) -> float:
-        """Return the largest ratio of an error to its tolerance, for the pressure, the motion and the water content.
+        """Return the largest of three ratios of error to tolerance: for the pressure, the motion and the water content.
 
         If pressures dissipate within a step, their error does not affect the motion.  The tolerance of the pressure is
         therefore at least `rtol` times the pressure change that the step would cause without flow.

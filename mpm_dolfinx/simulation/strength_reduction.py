@@ -5,8 +5,8 @@ Trials with different factors give bounds of this number.  The factor divides co
 tangents of the angles of friction and dilation (Griffiths and Lane 1999).  Failure of Newton's method is no criterion,
 because it may also fail in soil that is strong enough.  Instead, a trial adds a viscous stress to the soil, and
 computes the motion in time.  The criterion is the overload, the ratio of the viscous stress to the shear stress.  If
-the soil is strong enough, the bodies come to rest, and the overload vanishes.  In a slide the overload remains.  For
-any viscosity and cell size, it equals the missing strength.
+the soil is strong enough, the bodies come to rest, and the overload vanishes.  In a slide, the overload remains.  Then
+it equals the missing strength, for any viscosity and cell size.
 
 All trials start after one step with soil that cannot yield.  In this step, bodies in equilibrium keep their stresses.
 All other bodies get elastic stresses.
@@ -53,7 +53,7 @@ Plateau (scene "safety" of tests/plateaus.py): half this value changes the resul
 5.4e-03, and finer cells by 4.2e-02.
 """
 STRAINS = 4.0
-"""Strain in a trial that barely slides, divided by the overload, or by the elastic strain at yield if it is smaller.
+"""Strain in a trial that barely slides, divided by the smaller of the overload and the elastic strain at yield.
 
 Twice the number of steps changes the factor of safety of a slope by less than 0.1 %.  Plateau (scene "safety" of
 tests/plateaus.py): half this value changes the result by 1.1e-02, twice this value by 1.1e-02, and finer cells by
@@ -70,7 +70,7 @@ class Safety:
     factor
         Mean of the two bounds.
     bounds
-        Largest factor of a trial that came to rest, and smallest factor of a trial that did not.
+        Largest factor of a trial that came to rest, and smallest factor of a trial with a slide.
     overloads
         Overloads (n,) in the n steps of each trial, by the factor of the trial.  The overload of a step is the work of
         the viscous stress, divided by the work of the shear stress, in soil that may yield.
@@ -90,8 +90,8 @@ def factor_of_safety(
     """Return the factor of safety: the largest number by which the strength can be divided before the bodies fail.
 
     The simulation does not change.  Bodies that are not in equilibrium need no earlier run.  Suction contributes to the
-    strength through the effective stress.  The factor does not divide the friction of tools.  It depends on `rtol` if
-    only a thin weak layer at the surface slides.  All processes must call this function.
+    strength through the effective stress.  The factor does not divide the friction of tools.  The result depends on
+    `rtol` if only a thin weak layer at the surface slides.  All processes must call this function.
 
     Parameters
     ----------
@@ -189,8 +189,8 @@ def _bracket(rests: Callable[[float], bool]) -> tuple[float, float]:
 def _ends(overloads: Sequence[float], steps: int, least: float) -> bool:
     """Return whether the overloads of the first steps already determine the result of a trial.
 
-    The overload decreases more and more slowly.  If its present rate of decrease is too small for it to vanish in the
-    remaining steps, the bodies slide.
+    The overload decreases more and more slowly.  The bodies slide if the overload, at its present rate of decrease,
+    does not vanish in the remaining steps.
     """
     *before, last = overloads
     rate = min(1.0, last / before[-1]) if before else 0.0
@@ -199,7 +199,7 @@ def _ends(overloads: Sequence[float], steps: int, least: float) -> bool:
 
 @dataclass
 class _Trial:
-    """Scene and state of a trial for the time loop, with a list of Newton steps."""
+    """Scene and state of a trial for the time loop, with the number of Newton steps of each step."""
 
     scene: Scene
     state: State

@@ -83,9 +83,9 @@ def run(
         Tolerance of adaptive steps, or `Adaptive`, which adds limits of the step length. The estimated error of the
         pore pressures stays below about `rtol` times the larger of two pressure changes: the largest change since the
         start of the run, and the undrained change in the step. `rtol` is at least ten times `tolerance`, and < 1. If no
-        fluid flows, each step is one output interval.  Terms and laws that depend on velocity then raise ValueError,
-        because their error cannot be estimated.  With inertia, `rtol` also limits the error of the motion, relative to
-        the largest motion since the start, see `motion_error`.  In unsaturated soil, `rtol` also limits the error of
+        fluid flows, each step is one output interval.  Without flow, terms and laws that depend on velocity raise
+        ValueError: their error cannot be estimated.  With inertia, `rtol` also limits the error of the motion, relative
+        to the largest motion since the start, see `motion_error`.  In unsaturated soil, `rtol` also limits the error of
         the water content, relative to the largest change of water content in any step so far.  The estimated error of a
         pressure is the fraction `solve.newton.ERROR` of the error of a first-order step.  In tests, the largest true
         error of a run was 0.7 to 5 times the largest estimate.  The factor 5 occurred after a jump of the load.
@@ -101,8 +101,8 @@ def run(
     probes
         Material particles at which results are recorded.
     observe
-        Functions of the simulation, called at each output time, such as a `Writer`.  `result` contains the histories so
-        far.
+        Functions of the simulation, called at each output time, such as a `Writer`.  During a call, `Simulation.result`
+        contains the histories so far.
     checkpoint
         Function called after all observers, such as a `Checkpoint`.
     after
@@ -112,7 +112,7 @@ def run(
         Whether to record energies of bodies with inertia, and the work of forces since the start, in `Result.energies`.
     progress
         Whether to show a progress bar on a terminal, and to warn of the first reduced step. The logger `mpm_dolfinx`
-        reports the other reduced steps at level INFO.
+        reports all later reduced steps at level INFO.
 
     Returns
     -------

@@ -97,8 +97,8 @@ class Motion:
         `state`: state at the start of the step.
         `on_grid`, `data`: the bodies on the grid, and their integration points at the start of the step.
         `loads`: loads at the end of the step.
-        `net_inflow` (n,), m^d: net inflow of fluid into the filled owned cells in the step. None: no change of volume
-        defects.
+        `net_inflow` (n,), m^d: net inflow of fluid into the filled owned cells in the step. With None, volume defects
+        do not change.
         `report`: report of the step, for error messages.
         `carried`: function that returns the new velocities of the points (`Mass.carried`).
         `stays`: whether points that hardly move may keep their pieces until the next step.
@@ -180,7 +180,7 @@ class Motion:
     def ahead(self, on_grid: OnGrid, state: State, seconds: float, first: float, implicit: bool) -> list[NDArray]:
         """Return extrapolated displacements (m) of active dofs, and with fluid also pressures (Pa) of active cells.
 
-        These values are the initial guess of Newton's method. The arguments are those of `Trend.over`.
+        These values are the initial guess of Newton's method. `Trend.over` explains the last three arguments.
         """
         cut, points = on_grid.cut, state.points
         grid, pieces = cut.grid, on_grid.data.pieces
@@ -284,7 +284,7 @@ class Motion:
     ) -> tuple[MaterialPoints, NDArray[np.bool_], int]:
         """Return the points with new corners and F, which points keep their pieces, and the number of inverted domains.
 
-        F of elastic points follows from the corners of their domains. F of yielded points is `deformed`.
+        F of elastic points follows from the corners of their domains. F of yielded points is the result of `deformed`.
         """
         cut, stage = on_grid.cut, state.stage
         grid, folded = cut.grid, 0
@@ -435,14 +435,14 @@ class Motion:
             raise NotConverged(f"{what}, J <= {least.max(initial=0):.3g}: {', '.join(shown) or 'elsewhere'}")
 
     def left_grid(self, state: State, on_grid: OnGrid) -> State:
-        """Return the state for a reset of the grid, with the pressures of pieces."""
+        """Return the state for a reset of the grid: it contains pore pressures of the pieces for the next grid."""
         pieces = state.pieces and self._left(state.pieces, state.points, state.stage, state.t, on_grid, False)
         return replace(state, pieces=pieces, stay=None)
 
     def _left(
         self, carried: PiecePressures, points: MaterialPoints, stage: Stage, t: float, on_grid: OnGrid, some: bool
     ) -> PiecePressures:
-        """Return the pressures of pieces for the transfer to the next grid."""
+        """Return the pore pressures of the pieces for the transfer to the next grid."""
         with _compat.Timer("remap"):
             pieces = on_grid.cut.pieces
             store = self._materials.storage(points) * points.volume0 * points.J

@@ -115,7 +115,7 @@ class Balances(NamedTuple):
 
 
 def joined(loads: list[list[Loads]]) -> list[list[Loads]]:
-    """Return the loads of each substep.  All contacts have the matrix pattern of all substeps."""
+    """Return the loads of each substep.  The matrix pattern of each contact covers all substeps."""
     if not any(map(attrgetter("couples"), chain.from_iterable(loads))):
         return loads
     return [[one.joined(of) for one, of in zip(now, zip(*loads, strict=True), strict=True)] for now in loads]

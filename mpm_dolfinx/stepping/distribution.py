@@ -27,7 +27,7 @@ class Distributed(Protocol):
 def distribute(simulation: Distributed) -> None:
     """Distribute the cells anew, if the numbers of points on the processes then become more equal.
 
-    This happens only before a step that resets the grid.
+    Cells are distributed only before a step that resets the grid.
     """
     grid = simulation.scene.grid
     if grid.comm.size == 1 or (state := simulation.state).stays:

@@ -2,9 +2,9 @@
 """Division and merging of elastic particle domains where grid cells become finer or coarser.
 
 Lengths of domains are divided by the cell size. A domain is bisected along a local axis if each half is at least as
-long as the domain was at seeding. Two halves merge if the merged domain is at most as long as a domain at seeding. In
-the interior of a box, neighbouring domains of the lattice may merge too. Domains are never divided or merged if they
-have yielded, contain probes, or have a side with prescribed displacement.
+long as the domain was at seeding. Two halves merge if the merged domain is at most as long as a domain at seeding.
+Inside a body from `box`, neighbouring seeded domains may merge too. Domains are never divided or merged if they have
+yielded, contain probes, or have a side with prescribed displacement.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ class Division:
     def _replaced(
         self, state: State, old: MaterialPoints, new: MaterialPoints, into: NDArray[np.int64], rule: Callable
     ) -> tuple[State, int]:
-        """Return the state with new points, and the number of old points."""
+        """Return the state in which new points replace old points, and the number of old points on all processes."""
         new, ids = with_defect(new, old, into), old.id
         pieces = state.pieces
         if pieces is not None:
@@ -125,7 +125,7 @@ class Division:
         return wants
 
     def _intervals(self, points: MaterialPoints, axis: int) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Return a key of each domain, and whether the domain is an upper half.
+        """Return a key of each domain, and whether the domain is the upper one of two halves.
 
         The two halves of a divided domain have equal keys. Keys of other domains contain nan.
         """

@@ -216,7 +216,7 @@ class OnGrid(Keyed):
         return self.cut.pieces_to_cells(there + more[pieces.point])
 
     def of_pieces(self, state: State, name: str, fresh: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the data `name` (m, ...) of the pieces. New pieces have the values `fresh`."""
+        """Return the values (m, ...) of the array `name` of pieces. New pieces have the values `fresh`."""
         return state.of_pieces(name, fresh, self.cut.pieces.point)
 
     @contextmanager
@@ -275,7 +275,7 @@ class OnGrid(Keyed):
         `store` (m,), m^d/Pa: storage of the pieces, the weights of the means.
         `t`, s: time of the pressures on open sides.
         `water`: pore water of the pieces, in unsaturated scenes.
-        `at_rest`: hydrostatic pressures, with gravity. The reconstruction acts on differences from these pressures.
+        `at_rest`: hydrostatic pressures, or None without gravity. The reconstruction acts on differences from them.
         """
         pieces = self.data.pieces
         contents = self.contents
@@ -443,7 +443,7 @@ class OnGrid(Keyed):
         return joined_parts(self.cut.grid, *self.active.parts_of_cells, pairs)
 
     def parts_of_points(self, loads: Sequence[Loads]) -> tuple[NDArray[np.int64], int]:
-        """Return `parts`, but with contact as a connection between parts."""
+        """Return the index of the connected part of each point, and the number of parts. Contact connects parts."""
         return self._of_points(*self.parts_of_cells(loads))
 
     @cached_property

@@ -2,7 +2,7 @@
 """State at the start of each stage.
 
 Initial stresses are not exactly in equilibrium. The momentum balance is therefore solved at constant pressures. This
-changes the elastic strains of the points, but not their positions.
+solution changes the elastic strains of the points, but not their positions.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ from mpm_dolfinx.stepping.step import set_up
 DEPTH = 40
 """Number of previous iterations in Anderson mixing. Twice this value gives the same number of iterations.
 
-Iterations end if half as many further iterations do not halve the square of the smallest residual.
+Iterations end if `DEPTH / 2` iterations in succession do not halve the square of the smallest residual.
 """
 REMARKABLE = 0.05
 """A change of the initial stress by more than this fraction of the largest initial stress causes a warning.
@@ -69,7 +69,7 @@ def first_state(scene: Scene, conditions: Mapping[str, Any], later: Sequence[int
     first = scene.stage(conditions, present, later)
     if scene.initial.given and (quiet := first.of(Quiet)):
         raise ValueError(
-            f"{next(iter(quiet))}: cannot balance an initial stress, must begin a stage later: first prescribe the side"
+            f"{next(iter(quiet))}: cannot balance initial stress, must begin in a later stage: first prescribe the side"
         )
     _check_weight(first, None, 0.0)
     _warn_dammed(scene, first, 0.0)
@@ -177,8 +177,8 @@ def _released(
 ) -> tuple[State, dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]]:
     """Return the state on the grid of the next step, and the static tractions on sides that become quiet.
 
-    Tractions balance the stresses, the loads of the previous stage, and the remaining supports. Each item is a
-    name of point data, with ids of points and their tractions.
+    Tractions balance the stresses, the loads of the previous stage, and the remaining supports. The keys are names of
+    point data. The values are ids of points, and the tractions at these points.
     """
     start = set_up(scene, state, 0.0)
     state, momentum = start.state, scene.momentum
@@ -232,7 +232,7 @@ def _kept_at_rest(scene: Scene, state: State) -> State:
 def _gripped(
     scene: Scene, after: Stage, points: MaterialPoints, before: MaterialPoints | None = None
 ) -> MaterialPoints:
-    """Return the points with the data that conditions store."""
+    """Return the points with the data that conditions store in points."""
     kept = after.kept(len(points))
     if clashes := sorted(kept.keys() & scene.materials.seeded.data.keys()):
         raise ValueError(f"{clashes[0]!r}: points have data of this name, the condition must have another name")
@@ -264,7 +264,7 @@ def _check_weight(after: Stage, before: Stage | None, t: float) -> None:
     was = np.zeros(after.free.shape[1]) if was is None else was
     if now is not None and (now != was).any():
         what = f"{next(iter(quiet))}: its traction at rest does not bear the weight, gravity = {line(now.tolist())}"
-        allowed = "must begin a stage later: first prescribe the side in a stage without inertia"
+        allowed = "must begin in a later stage: first prescribe the side in a stage without inertia"
         raise ValueError(f"{what} after {line(was.tolist())}, {allowed}")
 
 
@@ -401,9 +401,9 @@ def pieces_at_start(scene: Scene, points: MaterialPoints) -> PiecePressures:
 def balanced(scene: Scene, state: State) -> State:
     """Return a state with stresses in equilibrium with its loads and pore pressures.
 
-    Let points have the strain of a displacement w. The solution of the momentum balance is then a further displacement
-    u(w). The fixed-point iteration `w <- w + u(w)` with Anderson mixing (Walker and Ni 2011) finds w with the smallest
-    u(w). Points store mean strains, so small nodal forces remain. The forces `State.held` balance them.
+    If the points have the strain of a displacement w, the momentum balance gives an additional displacement u(w). The
+    fixed-point iteration `w <- w + u(w)` with Anderson mixing (Walker and Ni 2011) finds w with the smallest u(w).
+    Points store mean strains, so small nodal forces remain. The forces `State.held` balance them.
 
     Raises
     ------

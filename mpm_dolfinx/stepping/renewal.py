@@ -72,7 +72,7 @@ class Renewal:
         return free if state.stay is None else free & ~state.stay.keeps
 
     def renewed(self, state: State) -> tuple[State, int]:
-        """Return the state with renewed domains, and the number of replaced domains. All processes must call it.
+        """Return the state with renewed domains, and the number of replaced domains. All processes must call this.
 
         After a renewal, the first process has all points. A failure raises NotConverged.
         """
@@ -185,7 +185,7 @@ class Renewal:
         ratio = volume / volume0
 
         def kept(values: NDArray) -> NDArray:
-            """Return means within the range of the values, with conserved mass-weighted sum."""
+            """Return means that stay within the range of the values and conserve their mass-weighted sum."""
             means = mean(values).reshape(n, -1)
             for column, of in zip(means.T, values.reshape(len(values), means.shape[1]).T, strict=True):
                 missing = sum_by(groups, part * (mass * of)[source], count) - sum_by(group, volume0 * column, count)
@@ -237,7 +237,7 @@ class Renewal:
         )
 
     def _elastic(self, points: MaterialPoints, rows: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the elastic left Cauchy-Green tensors of some points."""
+        """Return the elastic left Cauchy-Green tensors of the points with indices `rows`."""
         F = unstretched(points.F_of_laws[rows])
         return F @ points.data["plastic"][rows] @ F.swapaxes(1, 2)
 
@@ -248,7 +248,7 @@ def _joined(points: MaterialPoints, made: MaterialPoints, kept: NDArray[np.bool_
 
 
 def _of_tensors(function: np.ufunc, b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return a function of symmetric tensors, such as their logarithm."""
+    """Apply a function, such as the logarithm, to the eigenvalues of symmetric tensors, and return the tensors."""
     value, axes = np.linalg.eigh(b)
     return (axes * function(value)[:, None]) @ axes.swapaxes(1, 2)
 

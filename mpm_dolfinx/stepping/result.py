@@ -35,7 +35,7 @@ class Result:
         Numbers of steps, of Newton iterations and of coupling iterations so far.
     cuts, rejected
         Numbers of steps that were repeated with a shorter length: `cuts` without convergence, `rejected` for a large
-        error. In runs with equal steps, `rejected` counts jumps of pressure.
+        error. In runs with equal steps, a step is rejected only if the pressure jumps.
     reinitialised
         Number of inverted domains that were re-initialised from F.
     renewed

@@ -103,7 +103,7 @@ class Scene:
         self.materials = scene = SceneMaterials(grid, materials, bodies, seeded, fluid, bool(initial))
         self.gravity = fem.Constant(grid.mesh, np.zeros(grid.dim)) if weighs else None
         self.t, self.dt = fem.Constant(grid.mesh, 0.0), fem.Constant(grid.mesh, 1.0)
-        """Two times (s) as constants of forms: at the end of the substep, and since the start of the step."""
+        """Constants of forms, in s: time at the end of the substep, and its difference from the start of the step."""
         inside = [term for term in terms if not isinstance(term, OnSide)]
         self.pieces = QuadraturePoints(scene, bodies, weighs, bool(len(inside) + len(sources)))
         laws, p = self.pieces.laws, CellPressure(*(fem.Function(grid.cellwise()) for _ in range(3))) if fluid else None
@@ -269,7 +269,7 @@ class Scene:
             raise ValueError(f"grid: follow = {line(follow)}, not in the first stage, must be one of its conditions")
 
     def followed(self, state: State) -> State:
-        """Move the grid lines for the next step.  Return the state on these lines."""
+        """Move the grid lines for the next step.  Return the state on the new lines."""
         if self.grid.follow is None:
             return state
         state = with_lines(self.grid, state, lambda at: self.motion.left_grid(at, self.on_grid(at.stay.points)))
@@ -308,7 +308,7 @@ class Scene:
     def for_reset(self, state: State, renew: bool) -> tuple[State, int]:
         """Return a state for a reset of the grid, and the number of renewed domains.
 
-        The points are on the owners of their cells.  `renew`: whether renewal is allowed.
+        In this state, each point is on the process that owns its cell.  `renew`: whether renewal is allowed.
         """
         if state.stays:
             return state, 0
@@ -341,7 +341,7 @@ class Scene:
         Raises
         ------
         ValueError
-            A body has a free rigid-body mode.  At the start of a stage, a connected part has such a mode.
+            A body has a free rigid-body mode, or a connected part of a body has one at the start of a stage.
         """
 
         def make() -> Assembled:

@@ -219,7 +219,7 @@ class Stage:
         return QUANTITIES + OF_RAIN + MOTIONS
 
     def unknown(self, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return the results of conditions before the first step, by quantity and name, all equal to `value`."""
+        """Return placeholders `value` for results of conditions before the first step, by quantity and name."""
         d = self.free.shape[1]
         out = {quantity: {} for quantity in QUANTITIES}
         out["wall_reactions"] = {wall: np.full(d, value) for wall in SIDES[d]}

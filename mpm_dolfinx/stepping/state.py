@@ -53,7 +53,7 @@ class StepControl:
     drift : m/s
         Mean velocity of free bodies at the start of the run, see `motion_error`.
     filled
-        Largest change of the water content in a step since the start of the run.
+        Largest change of the water content in any step since the start of the run.
     """
 
     interval: float = 0.0
@@ -152,7 +152,7 @@ class State:
     begins
         Whether the next step is the first step of the stage.
     velocity : (unknowns,), m/s
-        Nodal velocities in the last step on this process, with ghosts. In scenes with yield or contact, these give the
+        Nodal velocities in the last step on this process, with ghosts. In scenes with yield or contact, they give the
         initial guess of Newton's method. None before the first step, and in other scenes.
     trend
         Motion in the last steps.  In elastic bodies, it gives the initial guess of Newton's method.  None in other
