@@ -48,7 +48,7 @@ SCHEMES = {
     "fixed stress, 1": ("richardson", 1.0, 0.0),
     "fixed stress, 1/K_w": ("richardson", None, 0.0),
 }
-"""By scheme: Krylov method, beta divided by alpha^2/K_dr, and factor of L.
+"""For each scheme: Krylov method, beta divided by alpha^2/K_dr, and the factor of L in the preconditioner.
 
 A second value of None means beta = 1/K_w.
 """

@@ -115,7 +115,7 @@ class ExplicitFriction(mpm.DruckerPrager):
     """Drucker-Prager soil whose friction follows from the mean stress at the start of each step.
 
     Within a step, the friction angle equals the dilation angle, so flow is associated. The cohesion of the step
-    contains the remaining friction (Krabbenhoft, Karim, Lyamin and Sloan 2012). Two state variables are added:
+    contains friction minus dilation (Krabbenhoft, Karim, Lyamin and Sloan 2012). Two state variables are added:
     mean: mean Kirchhoff stress, in Pa.
     strength: strength at zero mean stress in the last step, in Pa.
     """

@@ -11,7 +11,7 @@ Mandel (1953); Abousleiman, Cheng, Cui, Detournay and Roegiers (1996), Géotechn
 
 Errors:
 
-* `p_0.01` to `p_1`: largest error of the pressure at T = 0.01 to 1, multiplied by a / force.
+* `p_0.01`, `p_0.1`, `p_0.5`, `p_1`: largest error of the pressure at this T, multiplied by a / force.
 * `p_max`: relative error of the highest pressure in the innermost cell, which occurs at T = 0.07.
 * `p_rise`: relative error of the difference between the highest pressure and p0.
 * `settlement`: largest relative error of the plate's settlement at T = 0.01, 0.1, 0.5 and 1.

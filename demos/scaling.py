@@ -220,7 +220,7 @@ def terms(dim: int, n: float, processes: int, imbalance: float = 1.0) -> list[fl
 
 
 def modelled(row: dict) -> float:
-    """Return the time of a step to which the cost model is fitted, in s."""
+    """Return the time that the cost model describes, in s: a step, in 2D without the solvers."""
     return row["step"] - (sum(row[part] for part in SOLVERS) if row["dim"] == 2 else 0.0)
 
 

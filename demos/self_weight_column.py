@@ -10,8 +10,8 @@ doi:10.1016/j.advengsoft.2019.102748), here with a hundredth of its stiffness. T
 
 `stress` is the mean error of the stress over the points, divided by rho0 g l0 and weighted by volume. `height` is the
 relative error of the column's height. With 64 cells over the initial height, `stress` is 6.4e-6, and the published
-error of GIMP is 4.4e-4. `--quadrature point` integrates at the points instead of over the pieces of their domains. The
-error is then about 8 % with any number of cells.
+error of GIMP is 4.4e-4. `--quadrature point` integrates at the points instead of over the pieces of their domains. With
+this option, the error is about 8 % with any number of cells.
 """
 
 from __future__ import annotations

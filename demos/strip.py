@@ -10,10 +10,10 @@ Abaqus' benchmark 1.14.3. With q = E/2 (--load 0.5) the pores under the strip cl
 stiffness of the grains, so the run fails at this time.
 
 The references for q/E = 0.25 are results of Taylor-Hood elements, extrapolated in the step length and the cell size.
-All errors are relative to the displacement of the strip's middle. `settlement` is the largest error of the middle's
-settlement from T = 0.1 on, and `at_once` is this error at T = 0.01. `edge` is the largest error from T = 0.1 on at the
-strip's edge, where the load jumps. `beside` is the largest error from T = 0.1 on at the far end of the drained surface.
---reference also runs Taylor-Hood elements on the same cells. The demo runs on one process.
+All errors are relative to the displacement of the strip's middle. `at_once` is the error of the middle's settlement at
+T = 0.01. The largest errors from T = 0.1 on are `settlement` in the middle, `edge` at the strip's edge, where the load
+jumps, and `beside` at the far end of the drained surface. --reference also runs Taylor-Hood elements on the same cells.
+The demo runs on one process.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ WALLS = {"left": "x", "right": "x", "bottom": "y"}
 
 
 def conditions(load: float) -> dict:
-    """Return the conditions for a load, divided by E."""
+    """Return the fluid, walls and conditions for a load, which is given as a fraction of E."""
     strip = mpm.Traction("top", lambda t: (0, -load * E * min(1, t / (RAMP * UNIT))), ((0, 0), (STRIP, 2 * HEIGHT)))
     return {"fluid": WATER, "walls": WALLS, "conditions": [strip, mpm.Drained("top")]}
 

@@ -10,9 +10,9 @@ The second scene is a levee of 3 m with slopes of 1:2 on an impervious base. The
 is constant for two days, and falls again in two days. The soil of the levee retains water under suction, so water that
 infiltrates late also drains late.
 
-Errors after 2, 3, 4 and 8 hours are the largest errors of the height of the water table at six positions, in m. A
-further error is the relative error of the final outflow into the ditch. `balance` is the error of the slab's water
-balance, divided by the volume of rain. The demo runs on one process.
+Errors after 2, 3, 4 and 8 hours are the largest errors of the height of the water table at six positions, in m. Another
+error is the relative error of the final outflow into the ditch. `balance` is the error of the slab's water balance,
+divided by the volume of rain. The demo runs on one process.
 """
 
 from __future__ import annotations

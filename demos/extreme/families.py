@@ -282,7 +282,7 @@ def beside_q1(beam: Beam, cells: tuple[int, int]) -> Scene:
 
 @family(0.01)
 def weight():
-    """Compare bodies under their weight, a column with exact heights (rho g H / E = 1e-6 to 10), a beam with FEM."""
+    """Compare columns under their weight with exact heights (rho g H / E = 1e-6 to 10), and beams with FEM."""
     density = (1 - SOIL.porosity) * SOIL.grain_density
     for ratio in decades(-6, 1):
         E = density * 10 / ratio

@@ -199,7 +199,7 @@ def _publish(workshop: Path, folder: Path) -> None:
 
 @contextmanager
 def _replaced(**functions: Callable) -> Iterator[None]:
-    """Context in which other functions replace functions of FFCx's module."""
+    """Context that replaces functions of FFCx's module by the given functions."""
     before = {name: getattr(libraries, name) for name in functions}
     for name, function in functions.items():
         setattr(libraries, name, function)

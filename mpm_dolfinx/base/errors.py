@@ -58,7 +58,7 @@ class NotConverged(StepFailed):
 
 
 class CannotFollow(NotConverged):
-    """A time step in which bodies cannot follow a prescribed displacement, for any step length."""
+    """A time step in which bodies cannot follow a prescribed displacement.  Shorter steps would fail too."""
 
 
 class LeftGrid(StepFailed):

@@ -76,7 +76,7 @@ class Rows(Sequence[Row]):
 
     @classmethod
     def of_columns(cls, columns: dict[str, NDArray[np.float64]], outcomes: Sequence[Any]) -> Rows:
-        """Return n rows from n outcomes and from arrays (n, ...) of each quantity.  Other lengths raise ValueError."""
+        """Return n rows from n outcomes and an array (n, ...) of each quantity.  Different lengths raise ValueError."""
         if columns.keys() != set(COLUMNS):
             raise ValueError(f"the columns are {', '.join(columns)}, must be {', '.join(COLUMNS)}")
         if {len(values) for values in columns.values()} != {len(outcomes)}:

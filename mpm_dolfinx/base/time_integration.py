@@ -47,8 +47,8 @@ def in_step(
 
     The scheme computes the velocity v as the displacement in the substep, divided by the length `share` dt of the
     substep.  If the exact displacement were prescribed, v would be first-order accurate, and accelerations would not
-    converge.  The result is therefore (`start` + `share` dt v), where v is the slope of a parabola at the end of the
-    substep.  This parabola passes through the three exact displacements.
+    converge.  The prescribed displacement is therefore (`start` + `share` dt v), where v is the slope of a parabola at
+    the end of the substep.  This parabola passes through the three exact displacements.
 
     `share`: end of the substep as a fraction of the step.
     `start`, `now`, `end`: exact displacements at the start of the step, and at the ends of the substep and the step.

@@ -137,7 +137,7 @@ def functions(name: str, values) -> None:
 
 
 def asked(name: str, allowed: str, function: Callable, *values):
-    """Return the value of a user's function.  Replace its exceptions by a ValueError with the name of the object."""
+    """Return the value of a user's function.  If the function fails, raise ValueError with the object's name."""
     try:
         return function(*values)
     except Exception as error:
@@ -203,7 +203,7 @@ def takes(function: Callable) -> tuple[str, ...] | None:
 
 
 def _names(function: Callable, parameters: list[Parameter] | None) -> tuple[str, ...] | None:
-    """Like `takes`, for a function with known parameters."""
+    """Return the result of `takes` for a function with the given parameters."""
     if parameters is None or (len(parameters) == 1 and parameters[0].name not in PLACES):
         return ("t",)
     names = tuple([p.name for p in parameters])

@@ -23,7 +23,7 @@ from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
 from mpm_dolfinx.points.material_points import body_of
 
 FULL = 1.2
-"""Filled fraction of a cell above which a warning is given.  It is 1.08 for undamaged domains below a deep footing."""
+"""Filled fraction of a cell above which a warning is given.  Undistorted domains below a deep footing reach 1.08."""
 
 
 def warn_overlaps(cut: CutDomains, bodies: Sequence[Body]) -> Callable[..., Any] | None:
@@ -105,7 +105,7 @@ def warn_mixed(
 
 
 def _losses(cut: CutDomains, volume: NDArray[np.float64], modulus: NDArray[np.float64]) -> tuple[NDArray, ...]:
-    """Return the loss times volume (m^d), the ratio of moduli, and the softest piece of each owned cell.
+    """For each owned cell, return the loss times the volume (m^d), the ratio of moduli, and the softest piece.
 
     Let M be the moduli and s the volume fractions in a cell.  Layers in series have the compliance `sum (s / M)`, but
     equal strain in the cell gives the compliance `1 / sum (s M)`.  The loss is the difference of both compliances,

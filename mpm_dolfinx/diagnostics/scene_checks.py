@@ -82,7 +82,7 @@ def check_held(
 
 
 def _extents(active: ActiveSet, part: NDArray[np.int64], count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the centres and the largest edges of the bounding boxes of parts."""
+    """Return the centres and the longest edges of the bounding boxes of connected parts."""
     grid = active.grid
     low, high = np.full((2, count, grid.dim), np.inf)  # `high` has a negative sign
     for sign, ends in ((1, low), (-1, high)):

@@ -27,7 +27,7 @@ def balancing_tractions(
     forces: NDArray[np.float64],
     held: NDArray[np.bool_],
 ) -> dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]:
-    """Return the points and the tractions that replace the reactions of each side of bodies at rest.
+    """For each side of bodies at rest, return its points, and the tractions that replace its reactions.
 
     Tractions are forces per reference area, computed from the stresses.  Additional tractions, which vary like
     rigid-body displacements, give each connected part the resultant and the moment of its reactions.

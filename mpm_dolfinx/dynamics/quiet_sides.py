@@ -86,7 +86,7 @@ class QuietSides(Acting):
         return [faces for _, faces in self._sides.values()]
 
     def kept(self, n: int) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return the point fields of tractions at rest, initially zero at n points."""
+        """Return the point fields of the tractions on sides at rest, initially zero at n points."""
         return {name: {traction_name(name): np.zeros((n, self._grid.dim))} for name in self._sides}
 
     def placed(self, place: Place) -> Loads:
@@ -120,7 +120,7 @@ class QuietLoads(Loads):
         self._forms, self._data = forms, data
 
     def dead(self, b: NDArray[np.float64]) -> None:
-        """Add the nodal forces of tractions at rest and of incoming waves."""
+        """Add the nodal forces of incoming waves, and of the constant tractions t_0 of sides at rest."""
         self._forms.stays.assemble_vector(b, self._data)
 
     def resists(self, b: NDArray[np.float64]) -> None:

@@ -150,7 +150,7 @@ class ElementMatrices:
         self._sums = CellSums([*entries, *along, *beside.scalars], points)
 
     def assemble_matrix(self, A: PETSc.Mat, data: PointData, given: Given = NONE) -> NDArray[np.float64]:
-        """Add the matrix to `A`, which the caller assembles.  Return the values (cells, quantities) of `beside`."""
+        """Add the matrix to `A`, which the caller assembles.  Return the integrals (cells, quantities) of `beside`."""
         sums = self._sums(data, given)
         insert(A, self._grid, data.places.filled, sums[:, self._entry])
         return sums[:, self._count :]
@@ -208,7 +208,7 @@ class StackedElementMatrices:
         return sums
 
     def _of_batch(self, data: PointData, live, chosen: NDArray[np.int64], missing: NDArray) -> tuple[NDArray, NDArray]:
-        """Return the element matrices of a batch of cells, and the integrals `beside`."""
+        """Return the element matrices of a batch of cells, and the integrals of `beside` over each cell."""
         d, (cells, most) = self._d, missing.shape
         g = data.places.shape_gradients(chosen)
         g = g @ data["F"][chosen].reshape(-1, d, d)

@@ -38,7 +38,7 @@ RESERVED = frozenset(
     "F dF softness owed due storage storage_at_one density position displacement porosity0 gradient drainage retention "
     "pores".split()
 )
-"""Names of data at quadrature points.  Parameters and state variables must have other names."""
+"""Names of fields at quadrature points.  Parameters and state variables must have other names."""
 WHAT_IS_NAMED = "parameters, state and unknowns"
 EVOLVED = 1e-3
 """Soil has yielded if a state variable differs from its initial value by more than this number.  Plateau (scene "soil"
@@ -228,11 +228,11 @@ class SceneMaterials:
             raise ValueError(f"{law.__name__}: {name} has shape {shape}, in another law {other}; must be equal")
 
     def parts(self, pieces: FormPoints, common: Sequence[str]) -> list[tuple[type[Skeleton], FormPoints, bool]]:
-        """Return the law and the integration points of each part of the soil, and whether Q1 cells would lock.
+        """For each part of the soil, return its law, its integration points, and whether Q1 cells would lock in it.
 
         The materials of a part have one law, and are either all nearly incompressible or all compressible.  A single
-        part has the integration points `pieces`.  Each of several parts has its own integration points, with the fields
-        `common` and the parameters and state of the law.
+        part has the integration points `pieces`.  If there are several parts, each has its own integration points.
+        Their fields are `common`, and the parameters and state of the law.
         """
         if len(self._parts) == 1:
             return [(law, pieces, locks) for law, locks, _ in self._parts]
@@ -320,7 +320,7 @@ class SceneMaterials:
         The function is called as `value(material, *columns)` and returns values (n, ...) or one number.  For a uniform
         material without `columns`, the function may also return one value (...) for all points.
 
-        `columns` (n,): further arguments of the function, with one value for each point.
+        `columns` (n,): arguments of the function after the material, with one value for each point.
         """
         each, shapes = [], set()
         for i in self._used:
@@ -524,7 +524,7 @@ class SceneMaterials:
         return out
 
     def total_stress(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the total Cauchy stress, in Pa, like `effective_stress`.  All processes must call this method."""
+        """Return the total Cauchy stress (n, d, d), in Pa, see `effective_stress`.  All processes must call it."""
         return self.effective_stress(points) - self.pore_stress(points)[:, None, None] * np.eye(self.grid.stretches)
 
     def updated_state(

@@ -221,7 +221,7 @@ def _in_columns(
     unit_weight: NDArray[np.float64],
     above: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the corners and unit weights of all particle domains in the columns of given domains.
+    """Return corners and unit weights of all particle domains in the vertical columns through given domains.
 
     `ids` (n,), `corners` (n, 2^d, d), in m, `unit_weight` (n,), in N/m^3: particle domains of this process.
     `above` (k, 2^d, d), in m: corners of the given domains of this process.
@@ -283,7 +283,7 @@ class _ElasticStrains:
 
     @property
     def free(self) -> NDArray[np.bool_]:
-        """Whether each strain component is unknown."""
+        """For each point and strain component, whether the component is unknown."""
         out = np.repeat(~self.given[:, None], len(self.components), axis=1)
         out[:, 2] &= self.materials.knows_across(self.points)
         return out

@@ -45,8 +45,8 @@ def write(comm: MPI.Intracomm, file: Path, arrays: Mapping[str, NDArray], rows: 
     If a process cannot write, all processes raise its error.
 
     `arrays`: arrays by name, on rank 0.
-    `rows`: rows (n, ...) of this process for further arrays, by name.  The file contains the rows of all processes, in
-    the order of the ranks.
+    `rows`: this process's rows (n, ...) of distributed arrays, by name.  The file contains the rows of all processes,
+    in the order of the ranks.
     """
     part = file.with_name(file.name + ".part")
     rows = {name: np.ascontiguousarray(of) for name, of in rows.items()}
@@ -129,13 +129,13 @@ def some_rows(file: Path, member: Member, first: int, last: int) -> NDArray:
 def read(
     comm: MPI.Intracomm, file: Path, of: Mapping[str, Member], ranges: Mapping[str, tuple[int, int]]
 ) -> dict[str, NDArray]:
-    """Return the rows of arrays in an archive that this process reads, by name.
+    """Return the rows that this process reads from each array in an archive, by name of the array.
 
     Raise ValueError on all processes if the bytes of an array do not have its checksum.
 
     `of`: result of `members`.
-    `ranges`: first row, and last row plus one, of this process, by name.  The processes read consecutive rows, and
-    together all rows.
+    `ranges`: first row, and last row plus one, that this process reads, by name of the array.  The processes read
+    consecutive rows, and together all rows.
     """
     rows = together(comm, lambda: {name: some_rows(file, of[name], *ranges[name]) for name in of})
     sums = comm.gather([(zlib.crc32(found), found.nbytes) for found in rows.values()])

@@ -74,7 +74,7 @@ class _Lattice:
 
 
 class _Around:
-    """Data of the cells in blocks around n probes, in arrays (n, cells, ...).  All processes have the same arrays."""
+    """Values of the cells in blocks around n probes, as arrays (n, cells, ...).  All processes have the same arrays."""
 
     def __init__(self, scene: Scene, state: State, on_grid: OnGrid, probes: Probes):
         self._grid = scene.grid
@@ -103,7 +103,7 @@ class _Around:
         self._sides = open_sides([one.placed(wet) for one in state.stage.feeding], d)
 
     def _gathered(self, on_grid: OnGrid, p: NDArray[np.float64], soils: NDArray[np.float64]) -> tuple[NDArray, NDArray]:
-        """Return arrays (n, cells, ...) with the local indices and with data of the cells in the blocks.
+        """Return arrays (n, cells, ...) with the local indices and the values of the cells in the blocks.
 
         An empty cell, or a cell of another process, has the index -1.
 

@@ -2,7 +2,7 @@
 """Reference solution: body-fitted, total-Lagrangian finite elements for Biot's equations at finite strain.
 
 The unknowns are the total displacement u and the pore pressure p, positive in compression.  The deformation gradient is
-F = I + grad u, and J = det F.  A step starts from state n.  The equations in the reference configuration of a box are
+F = I + grad u, and J = det F.  A step starts from state n.  The equations, integrated over the undeformed body, are
 
     momentum   int [d psi/dF - alpha chi p dJ/dF] : grad v dV  =  int t . v dA + int m g . v dV
     storage    int rho [zeta(J, p) - zeta_n] q dV
@@ -22,8 +22,8 @@ face between two cells, and h is the distance of their centres.  The mean of k_r
 kappa.  Two-point fluxes are not consistent if cells shear.
 
 In axisymmetry F contains the circumferential stretch, and integrals extend over the full circumference.  Materials,
-retention, user-defined terms and time integration use the code of the material point method.  The two methods therefore
-differ only in discretisation.
+retention curves, user-defined terms and time integration are those of the material point method.  The two methods
+therefore differ only in discretisation.
 """
 
 from __future__ import annotations
@@ -419,7 +419,7 @@ class BiotFEM:
 
     @property
     def _seen(self):
-        """Scaled pressure in k_r, as UFL.
+        """Scaled pressure at which k_r is evaluated, as UFL.
 
         The factor `_whole` determines whether the tangent contains the derivative of k_r.
         """

@@ -201,7 +201,7 @@ class _Point:
         self._bulk = float(material.bulk)
 
     def _data(self, F: NDArray[np.float64], state: dict[str, NDArray[np.float64]]):
-        """Return form data for several deformation gradients and one state of the law."""
+        """Return points with the given deformation gradients, all with the same state of the law."""
         m, grid = len(F), self._law.grid
         inputs = {name: np.tile(v, (m, *[1] * v.ndim)) for name, v in (self._parameters | state).items()}
         cells = np.arange(m, dtype=np.int32) % 8
@@ -273,7 +273,7 @@ class _Point:
     def _balanced(
         self, at: _At, F: NDArray[np.float64], free: Sequence, goal: ArrayLike, strain: float, dt: float
     ) -> _At:
-        """Return the sample after a step of dt, in s, with the stresses `goal`, in Pa, in the `free` components."""
+        """Return the sample after a step of dt, in s.  The stresses in the `free` components reach `goal`, in Pa."""
         if not free:
             return self._updated(F, strain, at, dt)
         F, rows, columns = F.copy(), *np.array(free).T
