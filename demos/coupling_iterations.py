@@ -50,7 +50,7 @@ SCHEMES = {
 }
 """For each scheme: Krylov method, beta divided by alpha^2/K_dr, and the factor of L in the preconditioner.
 
-A second value of None means beta = 1/K_w.
+If beta has the value None, it is 1/K_w.
 """
 MOST = 200  # iterations after which a scheme counts as divergent
 RAMP_STEP = 0.02  # s: all systems have the load increment of this time, for any dt

@@ -60,7 +60,7 @@ def column(
 
 
 def sudden(cells: int, base: str) -> dict[str, np.ndarray]:
-    """Return histories of the stress on the base and of the velocity of the top, divided by q and by q / (rho c)."""
+    """Return histories of the stress on the base divided by q, and of the top's velocity divided by q / (rho c)."""
     soil, h = SOIL(grain_density=GRAINS), LENGTH / cells
     c = np.sqrt(MODULUS / ((1 - POROSITY) * GRAINS))
     foot = mpm.Quiet("bottom") if base == "quiet" else mpm.Displacement("bottom", (0, 0), "y")

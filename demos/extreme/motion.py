@@ -110,7 +110,7 @@ def column(
 ) -> Make:
     """Return a function that makes a column of two halves between smooth walls, with inertia.
 
-    young, density: of the lower and of the upper half.  load: on the top, Pa.  units: factors of m, kg and s.
+    young, density: values of the lower and of the upper half. load: Pa, on the top. units: factors of m, kg and s.
     """
     m, kg, second = units
     stress = kg / (m * second**2)

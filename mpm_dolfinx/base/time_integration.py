@@ -2,8 +2,8 @@
 """Time integration: the substeps (stages) of a time step.
 
 Without inertia the momentum balance has no time derivative.  The fluid content zeta of a cell satisfies zeta' + Q(u, p)
-= 0 with the displacement u, the pressure p, and the net outflow Q.  The subscript n denotes the start of a step, 1 and
-2 the ends of its substeps, and dt its length.  The two methods are
+= 0 with the displacement u, the pressure p, and the net outflow Q.  The subscript n denotes the start of a step of
+length dt, and 1 and 2 denote the ends of its substeps.  The two methods are
 
     backward-euler   zeta(u, p) - zeta_n + dt Q(u, p) = 0,
     sdirk2           zeta(u1, p1) - zeta_n + gamma dt Q(u1, p1) = 0                               loads at t + gamma dt,

@@ -159,7 +159,7 @@ class ElementMatrices:
 def _circumferential(tangent, gradients: list, over_radius: list, row: tuple[int, int], column: tuple[int, int]):
     """Return the contribution of circumferential strains to one entry of an element matrix, as UFL.
 
-    `row`, `column`: node and axis of v, and of u.
+    `row`: node and axis of v.  `column`: node and axis of u.
     """
     (v, i) = row
     (u, j) = column

@@ -286,7 +286,7 @@ class PointData(Keyed):
         self._stored: Latest[NDArray[np.float64]] = Latest()
 
     def part(self, points: FormPoints, places: Places, rows: NDArray[np.int64]) -> PointData:
-        """Return the data of the points with the indices `rows`, for the fields of `points`."""
+        """Return the points with the indices `rows`, with values of the fields of `points`."""
         fields = {name: self.rows[name][rows] for name in points.sizes}
         return PointData(points, places, self.volume[rows], fields)
 
@@ -544,7 +544,7 @@ class CellSums:
         self._form = PointForm(ufl.inner(ufl.as_vector(quantities), q) * points.dx, points, dense)
 
     def __call__(self, data: PointData, given: Given = NONE) -> NDArray[np.float64]:
-        """Return the sums (cells, quantities) for the cells that contain points."""
+        """Return the sums over the points of each filled cell, as an array (cells, quantities)."""
         even, filled = self._grid.even, data.places.filled
         sums = np.zeros((len(filled) if even else self._grid.num_local, self._count))
         self._form.assemble_vector(sums.reshape(-1), data, given)

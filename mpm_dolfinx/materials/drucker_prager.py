@@ -31,7 +31,7 @@ MATCHES = {
     "compression": lambda t, s, c: (6 * s / np.sqrt(3) / (3 - s), 6 * c / np.sqrt(3) / (3 - s)),
     "extension": lambda t, s, c: (6 * s / np.sqrt(3) / (3 + s), 6 * c / np.sqrt(3) / (3 + s)),
 }
-"""Functions that return eta and xi for tan phi, sin phi and cos phi: one for each fit to the Mohr-Coulomb law."""
+"""For each fit to the Mohr-Coulomb law: a function of tan phi, sin phi and cos phi that returns eta and xi."""
 LEAST = 1e-20
 """Constant added to the squared deviatoric strain under a square root, so that the root is differentiable at zero.
 Plateau (scene "soil" of tests/plateaus.py): half this value changes the result by 2.3e-11, twice this value by 1.0e-11,

@@ -278,7 +278,7 @@ class ConductivityAtPieces:
     laws
         Distinct conductivity laws of the materials.
     pieces
-        Integration points of the pieces, with the fields F, position, conductivity and porosity0 if there are `laws`.
+        Integration points of the pieces.  With `laws`, their fields are F, position, conductivity and porosity0.
     displacement
         Increment of the displacement since the start of the step.
     pressure

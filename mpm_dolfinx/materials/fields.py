@@ -530,7 +530,7 @@ class SceneMaterials:
     def updated_state(
         self, points: MaterialPoints, before: MaterialPoints, dt: float
     ) -> dict[str, NDArray[np.float64]]:
-        """Return the point data after a step of length dt, in s.
+        """Return the point fields after a step of length dt, in s, by name.
 
         `points`: points with the new F and the old state.
         `before`: points with the old F.

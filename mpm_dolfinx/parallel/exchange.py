@@ -109,7 +109,7 @@ def to_root(comm: MPI.Intracomm, rows: int) -> Exchange:
 def evenly(comm: MPI.Intracomm, numbers: NDArray[np.int64]) -> NDArray[np.int32]:
     """Return a rank (n,) for each of the ascending numbers (n,) >= 0, so that all ranks get equally many numbers.
 
-    All numbers of all processes are distinct.  The smallest numbers get rank 0, the next rank 1, and so on.
+    All numbers of all processes are distinct.  The smallest numbers get rank 0, larger numbers rank 1, and so on.
     """
     below = over_all(comm, len(numbers)) * np.arange(1, comm.size) // comm.size
     low, high = np.zeros_like(below), np.full_like(below, over_all(comm, int(numbers.max(initial=0)), MPI.MAX) + 1)
