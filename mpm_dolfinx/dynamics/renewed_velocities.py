@@ -15,7 +15,7 @@ from mpm_dolfinx.mechanics.inertia import RATE, VELOCITY, velocity_gradients
 from mpm_dolfinx.points.cutting import Pieces, cut
 
 MOTION = VELOCITY, RATE
-"""Names of the point data for the velocity and for the rate of F."""
+"""Names of the point fields for the velocity and for the rate of F."""
 
 
 class Momenta(NamedTuple):

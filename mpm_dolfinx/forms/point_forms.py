@@ -10,7 +10,7 @@ with the offset xi = x_p - x_mid of the point p from the midpoint x_mid.  The ri
 derivatives at the midpoint, and the one-point rule integrates it.
 
 In the list of cells of the integral, a cell occurs once for each of its points.  The assembler therefore calls the
-kernel once for each point.  The offset xi and all other data of the points are DG0 coefficients, with one row for each
+kernel once for each point.  The offset xi and all fields of the points are DG0 coefficients, with one row for each
 entry of the list.  With the cell volume V and the weights w_p of the points, the integral of f w / V over the list is
 sum_p w_p f(x_p).
 """

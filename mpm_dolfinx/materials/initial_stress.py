@@ -376,7 +376,7 @@ def strained(materials: SceneMaterials, points: MaterialPoints, moved: MaterialP
 
 
 def _with(points: MaterialPoints, chosen: NDArray[np.bool_], **values: NDArray) -> MaterialPoints:
-    """Return a copy of `points` with new data at the points where `chosen` is True."""
+    """Return a copy of `points` with new field values at the points where `chosen` is True."""
     data = dict(points.data)
     for name, new in values.items():
         if name in data and chosen.any():

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Transfer of array rows to other processes, and of answers back to the senders.
 
-A row contains the data of one piece of a particle domain, one corner or one loaded point in a cell.  The process that
+A row contains the values of one piece of a particle domain, one corner or one loaded point in a cell.  The process that
 owns the cell receives the row, and assembles the integrals of the cell.
 """
 
