@@ -11,9 +11,9 @@ stiffness of the grains, so the run fails at this time.
 
 The references for q/E = 0.25 are results of Taylor-Hood elements, extrapolated in the step length and the cell size.
 All errors are relative to the displacement of the strip's middle. `at_once` is the error of the middle's settlement at
-T = 0.01. The largest errors from T = 0.1 on are `settlement` in the middle, `edge` at the strip's edge, where the load
-jumps, and `beside` at the far end of the drained surface. --reference also runs Taylor-Hood elements on the same cells.
-The demo runs on one process.
+T = 0.01. Three errors are maxima over T >= 0.1: `settlement` in the middle, `edge` at the strip's edge, and `beside` at
+the far end of the drained surface. --reference also runs Taylor-Hood elements on the same cells. The demo runs on one
+process.
 """
 
 from __future__ import annotations

@@ -300,8 +300,8 @@ class Skeleton:
 
         For laws with a state, tau is half of the value for macroelements of 2 x 2 cells, 3 alpha^2 / (8 (lambda + 3G))
         (Silvester and Kechkar 1990; Camargo, White and Borja 2021).  For other laws tau is a quarter of the value for
-        macroelements, which improves conditioning and smears pressures less. In 3D tau is the same as in 2D, because
-        the value for 2 x 2 x 2 cells is too small for pressures that alternate along two axes.
+        macroelements, which improves conditioning and smears pressures less. In 3D tau is the same as in 2D: the value
+        for 2 x 2 x 2 cells is too small for pressures that alternate along two axes.
         """
         return (0.5 if self.state else 0.25) * self.biot**2 * 3 / (8 * self.macroelement)
 

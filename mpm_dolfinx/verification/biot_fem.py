@@ -22,7 +22,7 @@ face between two cells, and h is the distance of their centres.  The mean of k_r
 kappa.  Two-point fluxes are not consistent if cells shear.
 
 In axisymmetry F contains the circumferential stretch, and integrals extend over the full circumference.  Materials,
-retention curves, user-defined terms and time integration are those of the material point method.  The two methods
+retention curves, user-defined terms and time integration are the same as in the material point method.  The two methods
 therefore differ only in discretisation.
 """
 
