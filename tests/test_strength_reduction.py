@@ -32,7 +32,7 @@ def block(materials, load=LOAD, run=True, **options):
     """Return a block on a smooth floor under a load on its top, with a free right side. run: whether to load it."""
     grid = mpm.Grid([0, 0], [1.0, 1.0], [4, 4])
     half = (mpm.box(grid, [0, 0], [0.5, 0.25]), mpm.box(grid, [0, 0.25], [0.5, 0.5], material=len(materials) - 1))
-    top = mpm.Traction("top", lambda t: (0, -load * min(1, t)), region=((0, 0.3), (0.5, 1)))
+    top = mpm.Traction("top", lambda t: (0, -load * (min(1, t) if run else 1)), region=((0, 0.3), (0.5, 1)))
     walls = {"left": "x", "bottom": "y"}
     s = mpm.Simulation(grid, half, materials, walls=walls, conditions=[top, *options.pop("conditions", [])], **options)
     if run:
@@ -58,6 +58,13 @@ def test_a_block_carries_what_its_strength_over_the_factor_does(materials):
     assert safety.factor == pytest.approx(EXACT, rel=0.005)
     assert safety.bounds[1] < 1.006 * safety.bounds[0]
     assert s.state is state, "the simulation is what it was"
+
+
+def test_loads_keep_their_present_values():
+    """Earlier, loads went on in time, so the factor depended on the length of the steps."""
+    s = block([CLAY])
+    s.stage(conditions=[mpm.Traction("top", lambda t: (0, -LOAD * t), region=((0, 0.3), (0.5, 1)))])
+    assert mpm.factor_of_safety(s, dt=5.0, rtol=0.005).factor == pytest.approx(EXACT, rel=0.005)
 
 
 def test_stresses_in_bodies_that_cannot_yield_do_not_change_the_factor():

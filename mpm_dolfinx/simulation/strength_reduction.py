@@ -96,7 +96,7 @@ def factor_of_safety(
     Parameters
     ----------
     simulation
-        Scene with its loads, which must be constant in time from now on.
+        Scene with its loads, which keep their present values.
     dt
         Length of a step, in s, > 0.  The step must be long compared with viscous time scales of laws and terms.  If
         fluid flows, `dt` is required.  Choose a short step for undrained failure, and a long step for drained failure.
@@ -182,8 +182,8 @@ def _bracket(rests: Callable[[float], bool]) -> tuple[float, float]:
             return min(known, trial), max(known, trial)
         known = trial
     found, allowed = ("come to rest", "slide") if begins else ("slide", "come to rest")
-    allowed += " at some factor" if begins else " at some factor; loads must be constant in time"
-    raise ValueError(f"factor_of_safety: the bodies {found} with strength divided by {known:.3g}, must {allowed}")
+    what = f"factor_of_safety: the bodies {found} with strength divided by {known:.3g}"
+    raise ValueError(f"{what}, must {allowed} at some factor")
 
 
 def _ends(overloads: Sequence[float], steps: int, least: float) -> bool:
@@ -251,7 +251,7 @@ class _Weakened:
         self._strengths, self.newton = _strengths(scene, initial.points), []
         points = replace(initial.points, data={**initial.points.data, **self._strengths})
         initial = begin_stage(self._scene, replace(initial, points=points), {}, [], [], False, {})
-        self._start = self._unyielding(initial)
+        self._start = self._unyielding(replace(initial, t=initial.t - dt))
         stress, modulus = _mean_stress(self._scene, self._start.points), _shear_modulus(self._scene, self._start.points)
         self._viscosity.value = steps / STRAINS * max(least * modulus, stress) * dt
 
@@ -282,6 +282,7 @@ class _Weakened:
         """Compute a step of a trial.  `what`: description of the soil for an error message."""
         try:
             run(trial, trial.state.t + self._dt, self._dt, progress=False)
+            trial.state = replace(trial.state, t=trial.state.t - self._dt)  # loads keep their values
         except GaveUp as error:
             raise GaveUp(f"factor_of_safety: {what}: {error}", error.result, error.history) from error
 
