@@ -21,6 +21,8 @@ if __name__ == "__main__":
         first = len(counts)
         result = simulation.run(step, 1, progress=False)
         wall, newton = wall + result.wall, newton + result.newton
+        if not counts:
+            sys.exit(f"{n}^3 cells: factors solve this small block, take at least 8^3 cells")
         load = -float(simulation.reactions.array[0, 2])
         if simulation.grid.comm.rank == 0:
             took = f"iterations {np.mean(counts[first:]):.1f}, at most {max(counts[first:])}"

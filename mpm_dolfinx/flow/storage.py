@@ -666,8 +666,11 @@ class StorageProblem:
             if (coupling := one.coupling(at, fluid, system.unknowns)) is not None:
                 system.C.axpy(self.dt, coupling, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
         _add_diagonal(system.C, capacity + self.dt * slope)
-        zero(system.B)
-        zero(system.B_momentum)
+        couplings = [(system.B_momentum, by_u[0])]
+        if system.B is not system.B_momentum:
+            couplings.append((system.B, by_u[-1]))
+        for B, _ in couplings:
+            zero(B)
         if system.moves and self._inertial is not None:
             by_force = sum(one.by_force(at, fluid) for one, at in both) + np.zeros((len(capacity), forms.grid.dim))
             shapes = -self._inertial.density * self._inertial.rate * self._contents.shape_values
@@ -675,10 +678,9 @@ class StorageProblem:
             system.set_by_motion(self.dt, self._contents.filled, rows.reshape(len(rows), -1))
         for cells, more in of_suction:
             insert_rows(system.B_momentum, forms.grid, cells, -more)
-        both = [(system.B, by_u[-1]), (system.B_momentum, by_u[0])]
-        for A, rows in both[system.B is system.B_momentum :]:
-            insert_rows(A, forms.grid, data.places.filled, rows)
-            A.assemble()
+        for B, rows in couplings:
+            insert_rows(B, forms.grid, data.places.filled, rows)
+            B.assemble()
 
     def assemble_preconditioner(self, factor: float, share: float) -> PETSc.Mat:
         """Return the fixed-stress operator `C + factor (beta V - share L)` for the current C.

@@ -211,10 +211,7 @@ class BlockSolver:
         return solved(self._ksp, "momentum and storage")
 
     def _factorised(self) -> Inverses:
-        """Return factors of K, and in 2D of P, as preconditioners for this and later tangents.
-
-        If bodies are too large for factors, multigrid with sweeps is the preconditioner, set up for each tangent.
-        """
+        """Return preconditioners for later tangents too: factors of K and in 2D of P, or multigrid with sweeps."""
         K, unknowns = self._momentum.K, self._momentum.unknowns
         if self._plan.fallback == SWEEPS:
             return self._multigrid(smoother=THREE_SWEEPS).pc, self._cycles[1]
