@@ -2,15 +2,15 @@
 """Flow of pore fluid through the closed parts of contacts between groups.
 
 A pair consists of two opposite positions on the surfaces in contact (`pairs`).  While the gap of a pair is closed,
-fluid flows between the cells of both positions.  The flow is a two-point flux, as between neighbouring cells
-(`flow/fluxes.py`), so the pressure is continuous across the contact:
+fluid flows between the two cells that contain these positions.  The flow is a two-point flux, as between neighbouring
+cells (`flow/fluxes.py`), so the pressure is continuous across the contact:
 
     Q = r [p_1 - p_2 + rho_w g . (x_2 - x_1)] / (d_1 / (A kappa_1) + d_2 / (A kappa_2)).
 
-A is the contact area of the pair, and kappa is the mobility of a cell normal to the surface.  The distance d is
-measured from the centroid x of the material in a cell to the surface.  The factor r is the density of the fluid,
-divided by its reference density.  The set of closed pairs is updated between Newton steps, at most `ROUNDS` times in a
-substep.
+A is the contact area of the pair, and kappa is the mobility in a cell, in the direction normal to the surface.  The
+distance d is measured from the centroid x of the material in a cell to the surface.  The factor r is the density of the
+fluid, divided by its reference density.  The set of closed pairs is updated between Newton steps, at most `ROUNDS`
+times in a substep.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from mpm_dolfinx.parallel.exchange import Exchange, over_all
 
 
 class ConductingContacts(Feeding):
-    """The contacts of a stage that conduct fluid.  `conducts` maps each name to True if the contact conducts."""
+    """The contacts that conduct pore fluid in a stage.  `conducts`: for each contact name, whether it conducts."""
 
     title = "contacts that conduct"
     varies = True  # the closed pairs change
@@ -42,7 +42,7 @@ class ConductingContacts(Feeding):
         self.count = sum(conducts.values())
 
     def unknown(self, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return the flows before the first step, all equal to `value`."""
+        """Return placeholders for the flows before the first step: `value` for each contact that conducts."""
         return {"outflows": {name: np.array(value) for name, conducts in self._conducts.items() if conducts}}
 
     def placed(self, wet: Wet) -> Feeds:
@@ -76,7 +76,7 @@ class ContactFeeds(Feeds):
 
     `contact`: contact loads between groups.
     `wet`: quantities of the fluid balance in the substep.
-    `conducts`: whether each contact conducts fluid, by name.
+    `conducts`: for each contact name, whether the contact conducts fluid.
     """
 
     settles = True
@@ -91,7 +91,7 @@ class ContactFeeds(Feeds):
         self._correction = np.zeros(0, dtype=np.int64), np.zeros(0)
 
     def _linked(self, changes: int) -> Links:
-        """Return the pairs that are closed at u."""
+        """Return the pairs that are closed at the present displacements, and the cells on both sides."""
         contents, pairs = self._wet.contents, self._contact.pairs
         closed = self._contact.closed(self._wet.at)
         other, area = pairs.other[closed], pairs.outward[closed]
@@ -103,17 +103,17 @@ class ContactFeeds(Feeds):
 
     @property
     def _now(self) -> Links:
-        """The closed pairs of the current contact law."""
+        """The closed pairs, determined again if the contact law has new pairs."""
         if self._contact.now.law is not self._links.law:
             self._links = self._linked(self._links.changes)
         return self._links
 
     def conducting(self, flow: Conduction) -> Conduction:
-        """Return the argument."""
+        """Return `flow` unchanged."""
         return flow
 
     def begin(self, at: Conduction, fluid: Fluid, difference: NDArray[np.float64]) -> None:
-        """Store the non-orthogonal corrections of the pressure differences."""
+        """Store, for each closed pair, the non-orthogonal correction of the pressure difference."""
         links = self._links
         near, far = np.split(difference, [len(links.near.at)])  # as in `sides`
         self._correction = self._contact.pairs.place[links.closed], near - links.exchange.back(far)
@@ -151,12 +151,12 @@ class ContactFeeds(Feeds):
         return Leaving(own[0] - other[0], own[1] + other[1])
 
     def coupling(self, at: Conduction, fluid: Fluid, unknowns: Any) -> PETSc.Mat:
-        """Return the derivative of `leaving` with respect to the pressures."""
+        """Return the derivative of `leaving` with respect to the cell pressures."""
         links, *_, slopes = self._flows(at, fluid)
         return self._contact.pairs.conducting(unknowns, links.closed, slopes)
 
     def settle(self, at: Conduction, fluid: Fluid) -> int:
-        """Update the closed pairs, and return the number of changes on this process."""
+        """Update the set of closed pairs.  Return how many pairs of this process have opened or closed."""
         links = self._now
         changes = int((self._contact.closed(self._wet.at) != links.closed).sum())
         if links.changes == ROUNDS or not over_all(self._grid.comm, changes):

@@ -30,18 +30,18 @@ class Contact:
     friction
         Coulomb's coefficient mu, >= 0.
     adhesion
-        Additional shear strength of the contact, Pa, >= 0, as for a `Tool`.
+        Shear strength of the contact in addition to friction, Pa, >= 0, as for a `Tool`.
     conducts
         Whether pore fluid flows through closed parts of the contact.  The pore pressure is then continuous across these
         parts.  A gap of at most 5e-4 cell sizes counts as closed.  `Simulation.outflows` contains the flow from `one`
-        to `other`.  Friction always depends on the total normal stress.
+        to `other`.  With or without flow, friction depends on the total normal stress.
     name
         Name of the contact in results; by default "contact".
 
     Raises
     ------
     ValueError
-        A value is invalid.  A scene also raises this error if two groups have a common body or no contact.
+        A value is invalid.  A scene also raises this error if two groups share a body, or have no common `Contact`.
     """
 
     one: int | Sequence[int]
@@ -84,7 +84,7 @@ class Contact:
 
 
 def groups_of(contacts: Sequence[Contact], count: int) -> list[tuple[int, ...]]:
-    """Return the groups in a scene of `count` bodies, sorted by first body."""
+    """Return the groups, as tuples of body indices, in a scene of `count` bodies, sorted by smallest index."""
     pairs = [contact.groups(count) for contact in contacts]
     groups = sorted({group for pair in pairs for group in pair})
     for one, other in combinations(groups, 2):
@@ -102,14 +102,14 @@ def groups_of(contacts: Sequence[Contact], count: int) -> list[tuple[int, ...]]:
 def grouped(
     grid: Grid, bodies: Sequence[Body], contacts: Sequence[Contact], quadrature: str, other: dict[str, Any]
 ) -> Grid:
-    """Return the grid of a scene.  With contacts, the grid has a copy for each group.
+    """Return the grid of a scene.  With contacts, this grid contains a separate copy of the box for each group.
 
     Parameters
     ----------
     contacts, quadrature
         See `Simulation`.
     other
-        Options that a scene with contacts must not use, by name.
+        Values, by name, of options that must be absent or empty in a scene with contacts.
 
     Raises
     ------

@@ -24,7 +24,7 @@ class Rough(Protocol):
 
 
 def pressure_name(name: str) -> str:
-    """Return the name of the point field with the pressure (n,), in Pa, of a tool or contact."""
+    """Return the name of the point field that stores the contact pressure (n,), in Pa, of a tool or contact."""
     return f"{name}_pressure"
 
 
@@ -35,7 +35,7 @@ def shear_name(name: str) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Origin:
-    """The material point and the contact of each contact pair."""
+    """For each contact pair, its material point and its contact."""
 
     exchange: Exchange  # sends the pairs to the owners of their cells
     point: NDArray[np.int64]  # index of the material point on this process (n,)
@@ -45,7 +45,7 @@ class Origin:
     def means(
         self, contacts: Mapping[str, Rough], points: MaterialPoints, push: NDArray, shear: NDArray
     ) -> MaterialPoints:
-        """Store the mean contact pressures and shear tractions of the pairs at their points."""
+        """Return the points with mean pressures `push` and tractions `shear` of their contact pairs."""
         push = self.exchange.back(push)
         shear = self.exchange.back(shear)
         data = dict(points.data)
@@ -60,7 +60,7 @@ class Origin:
 
 
 def joined(both: Sequence[Origin], kept: Sequence[NDArray[np.bool_]]) -> tuple[Origin, NDArray[np.int64]]:
-    """Merge the flagged pairs of two `Origin`, and return the new order of the pairs (n,)."""
+    """Merge the pairs of two `Origin` that `kept` flags.  Return the result, and the new order of the pairs (n,)."""
     columns, start = [], 0
     comm = both[0].exchange.comm
     for of, rows in zip(both, kept, strict=True):

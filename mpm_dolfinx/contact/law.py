@@ -51,16 +51,16 @@ GRIP = 6.0
 cells by 1.1e-02.
 """
 DEPTH = 5e-4
-"""Allowed mean penetration, divided by the cell size.  Plateau (scene "contact" of tests/plateaus.py): half this value
-changes the result by 2.6e-03, twice this value by 2.4e-03, and finer cells by 1.1e-02.
+"""Allowed mean penetration in a cell, divided by the cell size.  Plateau (scene "contact" of tests/plateaus.py): half
+this value changes the result by 2.6e-03, twice this value by 2.4e-03, and finer cells by 1.1e-02.
 """
 ROUNDS = int(-np.log2(DEPTH * DEPTH))
-"""Largest number of augmentations, and of updates of the pairs, in a substep."""
+"""Largest number of augmentations, and largest number of updates of the contact pairs, in a substep."""
 BEGIN = 1.0, np.inf, 0.0, 0.0  # initial values of `ContactState.updates`
 STIFFER = 10.0
 """The stiffness k is multiplied by this factor if an augmentation does not halve the penetration."""
 RAMP = 10.0
-"""Largest ratio of adhesion to normal pressure.  Source: definition in the documentation of `Tool`."""
+"""Largest ratio of the mobilised adhesion to the normal pressure.  Source: definition, see `Tool`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +107,7 @@ class ContactLaw:
         self.pairs = pairs
         key, self.of = np.unique(pairs.number * self.grid.num_local + pairs.cell, return_inverse=True)
         self.key = key
-        """Key (k,) of each condition: `i * num_local + c`, from the indices i of the contact and c of the cell."""
+        """Number (k,) that identifies each condition: `i * num_local + c`, with contact index i and local cell c."""
         self.cell = key % self.grid.num_local
         self.area = sum_by(self.of, pairs.area, len(key))
         strength = np.array([(contact.friction, contact.adhesion) for contact in contacts], dtype=float)
@@ -119,7 +119,7 @@ class ContactLaw:
         self.frictional = any(contact.frictional for contact in contacts)
 
     def begins(self) -> ContactState:
-        """Return the state at the start of a substep: pressures of the previous step, and stick everywhere."""
+        """Return the state at the start of a substep: lambda from the previous step, and all conditions stick."""
         k, d = len(self.key), self.grid.dim
         none, zero = np.zeros(k, dtype=bool), np.zeros((k, d))
         return ContactState(self.mean(self.pairs.pressure), zero, none, none, zero, np.full((k, 4), BEGIN))
@@ -133,11 +133,11 @@ class ContactLaw:
         return means_of_rows(self.of, self.pairs.area, values, len(self.area))
 
     def stiffness(self, state: ContactState) -> NDArray[np.float64]:
-        """Return the stiffness k (m,), in Pa/m, of the pairs."""
+        """Return the penalty stiffness k (m,), in Pa/m, of the pairs."""
         return state.updates[self.of, 0] * self._stiffness
 
     def touch(self, state: ContactState, at: Geometry) -> Touch:
-        """Return the forces of the pairs and the derivatives of these forces."""
+        """Return the contact forces on the pairs, and the derivatives of these forces."""
         stiffness = self.stiffness(state)
         push = np.maximum(0.0, state.pressure[self.of] - stiffness * at.gap)
         # gaps within rounding count as contact, because light bodies penetrate less than 1e-8 cells
@@ -156,7 +156,7 @@ class ContactLaw:
     def _friction(
         self, state: ContactState, n: NDArray, slip: NDArray, old: NDArray, pressure: NDArray, on: NDArray
     ) -> tuple:
-        """Return the fields of `Touch` from `sticks` to `by_pressure`."""
+        """Return the last six attributes of `Touch`, `sticks` to `by_pressure`."""
         P = np.eye(n.shape[1]) - n[:, :, None] * n[:, None, :]
         hold = np.where(self.strength.any(axis=1), self._hold, 0.0) * on
         (mu, adhesion), slips = self.strength.T, state.slips
@@ -211,7 +211,7 @@ class ContactLaw:
         return area * out
 
     def choose(self, state: ContactState, touch: Touch, sticks: bool) -> tuple[ContactState, bool]:
-        """Update the set of slipping conditions.  Return the new state, and whether a condition changed.
+        """Update the set of slipping conditions.  Return the new state, and whether this set has changed.
 
         If `sticks`, slipping conditions may return to stick.
         """
@@ -231,10 +231,10 @@ class ContactLaw:
         return replace(state, slip=slip, resticks=resticks, parts=parts, stuck=stuck), changed
 
     def augmented(self, state: ContactState, touch: Touch, largest: Callable[[NDArray], NDArray]) -> ContactState:
-        """Return the state after an augmentation in connected parts of the bodies with too large penetrations.
+        """Augment lambda in the connected parts of the bodies with penetrations above `DEPTH`.  Return the new state.
 
-        `largest` returns the largest of values (k,) in the connected part of each condition.  More than `ROUNDS`
-        augmentations raise NotConverged.
+        `largest`: function that replaces each of k values by the largest value in its connected part.  More than
+        `ROUNDS` augmentations raise NotConverged.
         """
         # penetrations count by volume: small parts of faces follow their neighbours, and correct no penetration alone
         x = self.pairs.x

@@ -4,9 +4,9 @@
 The vector q contains the displacement of a tool in a step and, in 2D, its rotation.  The equation of motion is
 `m (q - q^) / (g dt)^2 = l - sum A^T f`, as for nodes (`mechanics/inertia.py`).  The matrix m contains the mass and the
 moment of inertia.  The predictor q^ is the motion without forces.  The step has the length dt, and g is the coefficient
-of the time integration.  Loads and weight are l, and the contact forces on the points are f.  The vector `A q` is the
-displacement of the contact positions on the tool.  The columns of A are e_x, e_y, and `e_z x r` with the lever arm r.
-A load-controlled tool moves along its load, until the reaction equals the load.
+of the time integration.  The vector l contains loads and weight, and f contains the contact forces on the points.  The
+vector `A q` is the displacement of the contact positions on the tool.  The columns of A are e_x, e_y, and `e_z x r`
+with the lever arm r.  A load-controlled tool moves along its load, until the reaction equals the load.
 
 The unknowns q are eliminated (static condensation).  Let w be the relative displacements of the pairs, and dw their
 increment.  D is minus the derivative of f with respect to w.  Forces rotate with the tool, so an increment dq changes f
@@ -46,7 +46,7 @@ from mpm_dolfinx.parallel.exchange import over_all
 
 
 class Moved(NamedTuple):
-    """Data of the k tools of a stage.  Tools that forces do not move have zeros."""
+    """Masses, motions and loads of the k tools of a stage, or zeros for tools that forces do not move."""
 
     mass: NDArray[np.float64]  # masses (k, q), kg, and moments of inertia, kg m^2; 0 for load-controlled tools
     guides: NDArray[np.float64]  # projections (k, q, q) on the motions that each tool can perform, see `motion_count`
@@ -66,7 +66,7 @@ class MotionEquation(NamedTuple):
 
 
 class MovedTools(ContactProblem):
-    """Base class that adds the motion of tools due to forces to `ToolLoads`."""
+    """Base class that extends `ToolLoads`: forces move the tools."""
 
     couples = True
 
@@ -98,7 +98,7 @@ class MovedTools(ContactProblem):
 
     @cached_property
     def key(self) -> tuple[NDArray[np.int32], ...]:
-        """The cells under each tool that forces move."""
+        """For each tool that forces move, the local cells that contain its contact pairs."""
         return tuple(np.unique(self.pairs.cell[self.pairs.number == k]) for k in np.flatnonzero(self._moves))
 
     def joined(self, substeps: Sequence[MovedTools]) -> MovedTools:
@@ -162,13 +162,13 @@ class MovedTools(ContactProblem):
         return out + q[self.pairs.number, d:] * across(found.touch.force) if d == 2 else out
 
     def _onto(self, found: Found, force: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the generalised forces `A^T f` on the tools."""
+        """Return the contribution `A^T f` of each contact pair to the generalised forces on its tool."""
         if self.grid.dim > 2:
             return force
         return np.hstack([force, (across(found.at.arm) * force).sum(axis=1, keepdims=True)])
 
     def _sizes(self, found: Found, force: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return upper bounds of the generalised forces on the tools."""
+        """Return upper bounds of the contributions that `_onto` returns."""
         moment = np.linalg.norm(found.at.arm, axis=1) * np.linalg.norm(force, axis=1)
         return np.hstack([force, moment[:, None][:, : self.grid.dim == 2]])
 
@@ -194,7 +194,7 @@ class MovedTools(ContactProblem):
         return np.clip((motion * e).sum(axis=1, keepdims=True), -h, h) * e
 
     def _bearing_displacement(self, found: Found) -> NDArray[np.float64]:
-        """Return for each tool (k,) the displacement, in m, at which one point can carry its load, or else infinity."""
+        """Return for each tool (k,) the displacement, in m, at which the first pair bears the load, or infinity."""
         law, state = self.now.law, self.now.state
         of = self.pairs.number
         along = (found.at.n * self._moved.direction[of, : self.grid.dim]).sum(axis=1)
@@ -282,7 +282,7 @@ class MovedTools(ContactProblem):
         return True
 
     def _check_bears(self, found: Found, wrong: NDArray[np.bool_]) -> None:
-        """Raise NotConverged if no motion of a load-controlled tool gives its load.  `wrong` (k,) flags such tools."""
+        """Raise NotConverged if no motion of a tool balances its load.  `wrong` (k,) flags the tools out of balance."""
         load, e = self._moved.load, self._moved.direction
         far = (found.motion * e).sum(axis=1) >= (1 - SAME) * self.grid.least
         for k in np.flatnonzero(wrong & (far | found.equation.slides))[:1]:
@@ -293,7 +293,7 @@ class MovedTools(ContactProblem):
             raise NotConverged(f"{line(self.now.law.contacts[k])}: load {load[k]:.6g} N, but {why}")
 
     def outcome(self, at: At) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """See `Loads`.  Free tools also have a velocity (m/s), rotation (rad), and angular velocity (rad/s)."""
+        """See `Loads`.  For free tools, results include velocity (m/s), rotation (rad) and angular velocity (rad/s)."""
         out = super().outcome(at)
         if not self._rate:
             return out

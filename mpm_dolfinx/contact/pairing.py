@@ -36,11 +36,11 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.points.parts import parts_of_domains
 
 REACH = 2.0
-"""Largest gap, divided by the cell size, that may close in a step.  Source: definition, one cell for each body."""
+"""Largest gap, divided by the cell size, that may close in a step.  Source: definition, one cell per body."""
 DEEP = 0.25
-"""Largest penetration of an opposite position, and smallest gap that counts as open, divided by the cell size."""
+"""Largest penetration at which a pair is found, and smallest gap at which it may be dropped, in cell sizes."""
 BESIDE = 0.6
-"""Distance from another group, divided by the cell size, below which domain corners move by the Q1 field alone.
+"""Distance from another group, divided by the cell size, below which domain corners have no correction for bending.
 Plateau (scene "contact" of tests/plateaus.py): half this value changes the result by 1.1e-03, twice this value by
 6.3e-04, and finer cells by 1.1e-02.
 """
@@ -110,7 +110,7 @@ class Contacts(Touching):
         present: MaterialPoints,
         cell_pairs: Callable[[], NDArray[np.int64]],
     ) -> tuple[ContactLaw, Origin]:
-        """Return the contact law and the material points of its pairs.  The search for pairs used the points `seen`."""
+        """Return the contact law and the material points of its pairs.  `found`: pairs of the points `seen`."""
         grid = self.grid
         d = self.grid.dim
         rows = []
@@ -164,7 +164,7 @@ class Contacts(Touching):
         return [self._opposite(cut, own, other, points) for _, own, other, _ in self._faces]
 
     def _cells_within_reach(self, cut: CutDomains, found: Sequence[tuple[Facets, Pairs]]) -> NDArray[np.int64]:
-        """Return all pairs of cells between which contact is possible in the step, as `first * cells + second`."""
+        """Return the pairs of cells that may be in contact in the step, as `first * grid.all_cells + second`."""
         grid = self.grid
         keys = []
         count = self.grid.all_cells
@@ -203,7 +203,7 @@ class Contacts(Touching):
     def _opposite(
         self, cut: CutDomains, faces: Surface, others: Surface, points: MaterialPoints
     ) -> tuple[Facets, Pairs]:
-        """Return the facets on `others`, and the pairs of points on `faces` with these facets."""
+        """Return the facets of `others`, and the pairs of points on `faces` with opposite positions on `others`."""
         patches = cut.surface(faces)
         facets = self._facets(cut, others, points)
         d = self.grid.dim
@@ -229,14 +229,14 @@ class Contacts(Touching):
         return facets, Pairs(row[order], other[order], t[order], gap[order])
 
     def _under(self, facets: Facets, chosen: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the cells below positions x on the chosen facets."""
+        """Return, for positions x on the chosen facets, the cells on the inner side of the surface."""
         grid, inside = self.grid, x - NEAR * self.grid.least * facets.outward[chosen]
         number = grid.number(grid.index_from_base(inside)) + facets.cell[chosen] // grid.cells * grid.cells
         keys = np.unique(facets.face * grid.all_cells + facets.cell)
         return np.where(np.isin(facets.face[chosen] * grid.all_cells + number, keys), number, facets.cell[chosen])
 
     def near(self, cut: CutDomains, points: MaterialPoints, corners: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return which corners (n, 2^d, d) are near another group after the step.  `points`: points before the step."""
+        """Return whether each corner (n, 2^d) after the step is nearer than `BESIDE` cells to another group."""
         present = replace(points, corners=corners)
         out, largest = np.zeros(corners.shape[:2], dtype=bool), BESIDE * self.grid.sizes_at(corners).max(axis=-1)
         largest = np.broadcast_to(largest, corners.shape[:2])
@@ -249,7 +249,7 @@ class Contacts(Touching):
         return out
 
     def _sizes(self, x: NDArray[np.float64]) -> NDArray[np.float64] | float:
-        """Return the shortest edges of the cells at positions x, in m."""
+        """Return the shortest edge, in m, of the cell at each position x."""
         return self.grid.sizes_at(x).min(axis=-1)
 
     def check_end(self, cut: CutDomains, points: MaterialPoints, before: MaterialPoints) -> None:
@@ -311,7 +311,7 @@ class ContactLoads(ContactProblem):
 
 
 def _ranks(setting: Setting) -> NDArray[np.int64]:
-    """Return the rank of the connected part of each point, sorted by surface area and extent."""
+    """Return for each point the index of its connected part in a list of all parts, sorted by surface and extent."""
     grid, bodies = setting.grid, setting.sides.bodies
     corners = np.concatenate([body.corners() for body in bodies])
     copy = np.asarray(grid.copy(np.arange(len(corners))))
@@ -327,21 +327,21 @@ def _ranks(setting: Setting) -> NDArray[np.int64]:
 
 
 def _rotated(shear: NDArray[np.float64], n: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rotate shear tractions into the planes with normals n."""
+    """Rotate shear tractions (m, d) into the planes with unit normals n (m, d)."""
     flat = shear - np.einsum("md,md->m", shear, n)[:, None] * n
     size = np.maximum(np.linalg.norm(flat, axis=1), TINY)
     return flat * (np.linalg.norm(shear, axis=1) / size)[:, None]
 
 
 def _on(corners: NDArray[np.float64], t: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the positions at face coordinates t in [0, 1] on faces."""
+    """Return the positions at face coordinates t, in [0, 1], on faces with these corners."""
     if corners.shape[2] == 2:
         return corners[:, 0] + t[:, :1] * (corners[:, 1] - corners[:, 0])
     return np.einsum("mk,mkd->md", weights(t), corners)
 
 
 def _along(corners: NDArray, x: NDArray, n: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the intersections of lines from x along n with faces: face coordinates, and distances from x in m."""
+    """Intersect lines from x along n with faces.  Return face coordinates, and distances from x in m."""
     if corners.shape[2] == 2:  # as in `Faces`, with unit width along a third axis
         corners = np.dstack([corners[:, BITS[:, 0]], np.broadcast_to(BITS[:, 1], (len(x), 4))])
         x, n = np.column_stack([x, np.full(len(x), 0.5)]), np.column_stack([n, np.zeros(len(x))])

@@ -2,8 +2,7 @@
 """Contact pairs: a quadrature point on a surface, and the opposite position on a tool or another group of bodies.
 
 The displacement of the point relative to the opposite position is `w = B u`.  The vector u contains the nodal
-displacements.  B interpolates u in the cell of the point.  Between groups, B subtracts the displacement in the cell
-with the opposite position.
+displacements.  B interpolates u in the cell of the point.  Between groups, B subtracts u at the opposite position.
 """
 
 from __future__ import annotations
@@ -61,11 +60,11 @@ class Pairs:
 
     @property
     def largest_coordinate(self) -> NDArray[np.float64] | float:
-        """Largest coordinates, in m."""
+        """Largest absolute coordinates from which gaps are computed, in m."""
         return self.grid.reach
 
     def other_side(self) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
-        """Return the cells (m,) and shape functions (m, 2^d) at the opposite positions, or None with a tool."""
+        """Return the cells (m,) and shape functions (m, 2^d) at the opposite positions, or None on tools."""
         return None
 
     def operator(self, unknowns: Unknowns) -> PETSc.Mat:
@@ -158,7 +157,7 @@ def shape_values_in(grid: Grid, cells: NDArray[np.int64], x: NDArray[np.float64]
 
 
 def on_owners(grid: Grid, cells: NDArray[np.int64]) -> NDArray[np.int32]:
-    """Return the local indices of lexicographic cells, on the processes that own the cells."""
+    """Send lexicographic cells to the processes that own them, and return their local indices there."""
     return grid.locals[Exchange(grid.comm, grid.owner(cells)).send(cells)]
 
 

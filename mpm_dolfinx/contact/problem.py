@@ -95,9 +95,9 @@ class ContactProblem(Loads):
     law, origin
         Contact law at the start of the step, and the material points of its pairs.
     again
-        Function that returns `law` and `origin` at given nodal displacements (local array, in m).
+        Function that returns `law` and `origin` for the pairs at given nodal displacements (local array, in m).
     cell_pairs
-        Function that returns all pairs of cells between which contact is possible, as `first * cells + second`.
+        Function that returns all pairs of cells between which contact is possible: `first * grid.all_cells + second`.
     """
 
     linear, smooth, touches = False, False, True
@@ -129,11 +129,11 @@ class ContactProblem(Loads):
 
     @property
     def still(self) -> NDArray[np.float64]:
-        """Displacements and rotations (k, q) of tools due to forces, all zero.  Between groups, q is 0."""
+        """Zero motions (k, q) of tools, as without forces.  Between groups there are no tools, so q = 0."""
         return np.zeros((len(self.now.law.contacts), 0))
 
     def found(self, at: At) -> Found:
-        """Return the contact at the displacements u."""
+        """Return geometry, forces and tool motions at the displacements u."""
 
         def find() -> Found:
             w = self._apart_by(self.now.law, at)
@@ -157,7 +157,7 @@ class ContactProblem(Loads):
         return self._operator((law, unknowns), make, self.grid.comm) if law is self.now.law else make()
 
     def _find_at(self, w: NDArray[np.float64], motion: NDArray[np.float64]) -> Found:
-        """Return the contact at relative displacements w and motions of the tools."""
+        """Return geometry and forces at relative displacements w and given motions of the tools."""
         law = self.now.law
         at = law.pairs.at(w, motion)
         touch = law.touch(self.now.state, at)
@@ -211,7 +211,7 @@ class ContactProblem(Loads):
         return petsc_matrix(all_of, m * d, grid.comm, own=True).PtAP(B)
 
     def coupling(self, at: At) -> PETSc.Mat:
-        """Return minus the derivative of the contact forces at u."""
+        """Return minus the derivative of the contact forces with respect to the nodal displacements, at u."""
         collect_garbage(self.grid.comm)  # with friction in 3D, pairs in 12 cells fill 60 MB in each iteration
         found, law = self.found(at), self.now.law
         B, _ = self._B(law, at.unknowns)
@@ -234,7 +234,7 @@ class ContactProblem(Loads):
         return changed
 
     def augment(self, at: At) -> bool:
-        """Augment the contact pressures where mean penetrations are too large.  Return whether forces changed."""
+        """Augment the pressures where mean penetrations exceed `DEPTH` cells.  Return whether forces changed."""
         law, state = self.now.law, self.now.state
         part = at.parts.cells[law.cell]
         new = law.augmented(state, self.found(at).touch, lambda of: at.parts.largest(self.grid.comm, part, of)[part])
@@ -257,7 +257,7 @@ class ContactProblem(Loads):
         return bool(late.any())
 
     def _continued(self, new: Current, at: At) -> tuple[Current, NDArray[np.bool_]]:
-        """Return the contact with updated pairs, and the connected parts with gap changes above `DEPTH` cells."""
+        """Return the contact with updated pairs, and which connected parts have gap changes above `DEPTH` cells."""
         found = self.found(at)
         law, state = self.now.law, self.now.state
         pairs = new.law.pairs
@@ -336,21 +336,21 @@ class ContactProblem(Loads):
 
     @property
     def rounding_beside(self) -> float:
-        """Rounding error of forces in the cells with the opposite positions, in N."""
+        """Largest rounding error, in N, of contact forces in the cells with the opposite positions."""
         if self.pairs.other_side() is None:
             return 0.0
         return over_all(self.grid.comm, float(self.now.law.rounding(self.now.state).max(initial=0.0)), MPI.MAX)
 
 
 def _merged(both: Sequence[Any], kept: Sequence[NDArray[np.bool_]], order: NDArray[np.int64]) -> Any:
-    """Merge the flagged entries of two `Pairs` or two `ContactState` in a given order."""
+    """Merge the entries of two `Pairs`, or of two `ContactState`, that `kept` flags, and sort them by `order`."""
     names = (f.name for f in fields(both[1]) if f.name != "grid")
     columns = {name: [getattr(of, name)[rows] for of, rows in zip(both, kept, strict=True)] for name in names}
     return replace(both[1], **{name: np.concatenate(rows)[order] for name, rows in columns.items()})
 
 
 def outer(a: PETSc.Vec, b: PETSc.Vec) -> PETSc.Mat:
-    """Return the matrix `a b^T`, without entries in zero rows and columns."""
+    """Return the sparse matrix `a b^T`, which stores no zero rows and columns."""
     start, comm = b.owner_range[0], b.comm.tompi4py()
     rows, columns = np.flatnonzero(a.array_r), np.flatnonzero(b.array_r)
     at, value = start + columns, b.array_r[columns]

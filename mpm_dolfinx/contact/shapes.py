@@ -17,7 +17,7 @@ from mpm_dolfinx.base.validation import asked, line, numbers
 
 ROUNDED = SAME  # penetration, divided by the cell size, below which a position lies on the surface
 DISTANCE = 0.1
-"""A user's distance function must have a slope between 1 minus and 1 plus this value."""
+"""Largest deviation from 1 of the slope of a user's distance function."""
 
 
 DistanceField = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
@@ -43,7 +43,7 @@ def _flat(y: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _across(offset: NDArray[np.float64]) -> DistanceField:
-    """Return the lengths of vectors, with first and second derivatives."""
+    """Return the lengths of vectors, with first and second derivatives with respect to the vectors."""
     r = np.maximum(np.linalg.norm(offset, axis=1), TINY)
     e = offset / r[:, None]
     return r, e, (np.eye(offset.shape[1]) - e[:, :, None] * e[:, None, :]) / r[:, None, None]
@@ -66,7 +66,7 @@ def unit_vector(name: str, value: ArrayLike) -> NDArray[np.float64]:
 
 
 class Placed:
-    """Base class of shapes whose first field is a position or several positions."""
+    """Base class of shapes whose first attribute contains one or several positions."""
 
     @property
     def dim(self) -> int:
@@ -75,7 +75,7 @@ class Placed:
 
     @property
     def middle(self) -> NDArray[np.float64]:
-        """Mean (d,), in m, of the positions in the first field."""
+        """Mean (d,), in m, of the positions in the first attribute."""
         return np.atleast_2d(getattr(self, fields(self)[0].name)).mean(axis=0)
 
     def moved(self, by: NDArray[np.float64]) -> Shape:
@@ -157,7 +157,7 @@ class Convex(Placed):
     """The convex hull of corners: a polygon in 2D, a polyhedron in 3D.
 
     The signed distance is the largest signed distance from the planes of the faces.  Outside the hull, near edges and
-    corners, this value is less than the distance.
+    corners, this value is less than the true distance.
 
     Parameters
     ----------
@@ -281,7 +281,7 @@ class Distance:
         return self._at(y + self.base)
 
     def _at(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the signed distances at true positions, in m."""
+        """Return the signed distances, in m, at positions y in the user's coordinates."""
         if not len(y):  # user functions may fail for no positions
             return np.zeros(0)
         allowed = f"a finite number for each of {len(y)} places (m, {y.shape[1]})"
@@ -293,7 +293,7 @@ class Distance:
         return self._slopes(y + self.base, _power_of_two(CENTRAL * self.size))
 
     def _slopes(self, y: NDArray[np.float64], step: float) -> NDArray[np.float64]:
-        """Return the gradients of the distance at true positions, by central differences."""
+        """Return the gradients of the distance at positions in the user's coordinates, by central differences."""
         slopes = [(self._at(y + e) - self._at(y - e)) / (2 * step) for e in step * np.eye(y.shape[1])]
         return np.stack(slopes, axis=1)
 

@@ -75,7 +75,7 @@ class Facets:
         return FacetTree(self.corners)
 
     def inside(self, y: NDArray[np.float64], at: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return which positions y (d, m) have their orthogonal projections inside facets (m,)."""
+        """Return whether each position y (d, m) lies in its facet (m,) after orthogonal projection onto its plane."""
         corners, out, _ = self._columns
         return (((y - corners.take(at, 2)) * out.take(at, 2)).sum(axis=1) <= self._margin).all(axis=0)
 
@@ -84,7 +84,7 @@ class Facets:
         return ((y - self._columns[0][0].take(at, 1)) * self._normal.take(at, 1)).sum(axis=0)
 
     def _from_sides(self, y: NDArray[np.float64], at: NDArray[np.int64]) -> tuple[NDArray, NDArray]:
-        """Return the point of each side nearest to y: coordinate from 0 to 1 (d, m), and vector to y (d, d, m)."""
+        """Return, for each side, its nearest point to y: coordinate from 0 to 1 (d, m), and vector to y (d, d, m)."""
         corners, _, along = (of.take(at, 2) for of in self._columns)
         offset = y - corners
         share = np.clip((offset * along).sum(axis=1) / self._squares.take(at, 1), 0, 1)
@@ -119,7 +119,7 @@ class Facets:
         return Nearest(facet, part, offset.T)
 
     def part_at(self, y: NDArray[np.float64], at: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the parts of facets (m,), see `Nearest`, that contain positions y (m, d)."""
+        """Return the part of its facet (m,), see `Nearest`, on which each position y (m, d) lies."""
         d, rows = y.shape[1], np.arange(len(at))
         to_corners = np.linalg.norm(y[:, None] - self.corners[at], axis=2)
         vectors = self._from_sides(np.ascontiguousarray(y.T), at)[1]
@@ -207,7 +207,7 @@ class SurfaceMesh(Placed):
             raise ValueError(str(error).replace("SurfaceMesh:", f"SurfaceMesh{file}:", 1)) from None
 
     def _rows(self, count: int, d: int) -> NDArray[np.int64]:
-        """Return the facets as valid indices."""
+        """Return the facets as integers, or raise ValueError for invalid indices."""
         if self.facets is None and d == 2:
             return np.stack([np.arange(count), np.roll(np.arange(count), -1)], axis=1)
         allowed = f"integers (m, {d}) from 0 to {count - 1}"
@@ -245,7 +245,7 @@ class SurfaceMesh(Placed):
 
     @cached_property
     def _normals(self) -> NDArray[np.float64]:
-        """Normals (m, 1 + 2 d, d) of the parts of each facet (`Nearest`).  Edges and vertices have mean normals."""
+        """Normals (m, 1 + 2 d, d) of each facet, its sides and its vertices.  Sides and vertices have mean normals."""
         table, d = self._table, self.vertices.shape[1]
         n = table.normal
         out = np.repeat(n[:, None], 1 + 2 * d, axis=1)
@@ -267,7 +267,7 @@ class SurfaceMesh(Placed):
         return out
 
     def _near(self, y: NDArray[np.float64]) -> tuple[Nearest, NDArray, NDArray]:
-        """Return the nearest positions, their mean normals (m, d), and signed distances (m,), in m."""
+        """Return the nearest positions on the surface, the normals there (m, d), and signed distances (m,), in m."""
         near = self._table.nearest(y)
         n = self._normals[near.facet, near.part]
         return near, n, np.copysign(np.linalg.norm(near.offset, axis=1), np.einsum("md,md->m", near.offset, n))
@@ -277,7 +277,7 @@ class SurfaceMesh(Placed):
         return self._near(y)[2]
 
     def distance_up_to(self, y: NDArray[np.float64], limit: float) -> NDArray[np.float64]:
-        """Return the signed distances (n,), in m, or a lower bound for distances above `limit`, in m."""
+        """Return the signed distances (n,), in m.  Distances above `limit` (m) may be replaced by a lower bound."""
         low, high = self._bounds
         out = np.linalg.norm(np.maximum(0, np.maximum(low - y, y - high)), axis=1)
         near = out <= limit
@@ -337,7 +337,7 @@ class SurfaceMesh(Placed):
 
 
 def _merged(x: NDArray[np.float64], facets: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Merge coincident vertices.  Return the vertices, and the facets that do not degenerate."""
+    """Merge coincident vertices.  Return the vertices, and the facets that still have different vertices."""
     used, facets = np.unique(facets, return_inverse=True)
     x, same = np.unique(x[used], axis=0, return_inverse=True)
     facets = same.ravel()[facets.reshape(-1, x.shape[1])]

@@ -35,7 +35,7 @@ class Tie:
     """Two opposite tied sides, and their pairs of opposite faces.
 
     `partner` (n,): index of the face on the other side, for each face on the first side.
-    `offset` (n, d), in m: vector to this opposite face.
+    `offset` (n, d), in m: vector from each face on the first side to its opposite face.
     `axis`: axis normal to the sides.
     """
 
@@ -63,7 +63,7 @@ class Ties(Acting):
     Raises
     ------
     ValueError
-        The sides are not opposite, or their faces differ.  A side is tied twice, quiet, or open to water.
+        The sides are not opposite, or their faces differ.  A side is tied twice, or is quiet, or has a flow condition.
     """
 
     conditions, title = (Tied,), "tied sides"
@@ -109,17 +109,17 @@ class TieLoads(Loads):
     Parameters
     ----------
     cell : (m,)
-        Local cells on one side.
+        Local cells that contain positions on one side.
     x : (m, d), m
-        Positions in these cells.
+        These positions.
     other : (m,)
-        Lexicographic cells of any process on the other side.
+        Lexicographic cells that contain the opposite positions; other processes may own them.
     y : (m, d), m
-        Positions in the cells `other`.
+        Opposite positions on the other side.
     stiffness : (m,), N/m
-        Penalty stiffness.
+        Penalty stiffness k, multiplied by the area of the surface at each position.
     gap : (m, d), m
-        Differences of displacements at the start of the step.
+        Differences of displacements between both sides at the start of the step.
     """
 
     couples = True
@@ -158,13 +158,13 @@ class TieLoads(Loads):
         return np.append(cell, on_owners(self._grid, other))
 
     def pattern(self, unknowns: Unknowns) -> PETSc.Mat:
-        """Return a zero matrix with the pattern of `coupling`."""
+        """Return a zero matrix with the sparsity pattern of `coupling`."""
         out = self.coupling(At(unknowns, np.empty(0)))  # the coupling does not depend on the displacement
         out.zeroEntries()
         return out
 
     def coupling(self, at: At) -> PETSc.Mat:
-        """Return the derivative of the penalty forces."""
+        """Return the derivative of the penalty forces with respect to the nodal displacements."""
         B = self._B(at.unknowns)
         k = scipy.sparse.diags(self._stiffness, format="csr")
         return petsc_matrix(k, B.getLocalSize()[0], self._grid.comm, own=True).PtAP(B)

@@ -36,7 +36,7 @@ class Pose(NamedTuple):
         return y + self.shift + (y - self.centre) @ (self.R - np.eye(len(self.R))).T
 
     def moved(self, by_forces: NDArray[np.float64]) -> Pose:
-        """Return the pose after an additional motion: displacement (d,), in m, and if present a rotation, in rad."""
+        """Return the pose after an additional displacement (d,), in m, and an optional rotation, in rad."""
         d = len(self.R)
         R = rotation(by_forces[d]) @ self.R if by_forces[d:].any() else self.R
         return Pose(R, self.centre, self.shift + by_forces[:d])
@@ -48,7 +48,7 @@ def rotation(angle: float) -> NDArray[np.float64]:
 
 
 def motion_by_forces(outcome: Mapping[str, Mapping[str, NDArray]], name: str) -> NDArray[np.float64]:
-    """Return the displacement, in m, of a tool due to forces, and the rotation, in rad, of a free tool."""
+    """Return the displacement, in m, of a tool due to forces, and the rotation, in rad, if the tool rotates freely."""
     angle = outcome.get("tool_rotation", {})
     by_forces = outcome["tool_travel"][name]
     return np.append(by_forces, angle[name]) if name in angle else by_forces
@@ -75,7 +75,7 @@ class Tool:
     friction
         Coulomb's coefficient mu, >= 0.
     adhesion
-        Additional shear strength of the contact, Pa, >= 0.  The adhesion is at most ten times the normal pressure.  For
+        Shear strength of the contact in addition to friction, Pa, >= 0; limited to ten times the normal pressure.  For
         undrained soil, use the product of the adhesion factor and s_u, with friction 0.
     load : float or callable t (s) -> float, N (N/m in plane strain), >= 0
         Force on the tool along `direction`.  The tool moves along `direction` until the reaction equals the load.  This
@@ -183,7 +183,7 @@ class Tool:
         return np.eye(dim) if self.direction is None else np.outer(along, along)
 
     def _uniform(self, dim: int) -> Uniform | None:
-        """Return the centroid and squared radius of gyration of a free disc or polygon, or None."""
+        """Return the centroid and squared radius of gyration of a free disc or polygon, or None for other tools."""
         if not self.free or dim != 2:
             return None
         if isinstance(self.shape, SurfaceMesh):
@@ -224,7 +224,7 @@ class Tool:
         return along
 
     def on(self, grid: Grid) -> Tool:
-        """Return the tool for positions relative to the base of the grid."""
+        """Return a copy of the tool for positions relative to `grid.base`."""
         out, base = copy(self), grid.base
         if base.any():
             vars(out).update(_base=base, _moved=None if callable(self.shape) else self.shape.moved(-base))

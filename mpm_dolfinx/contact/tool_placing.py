@@ -30,14 +30,14 @@ from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
 from mpm_dolfinx.points.material_points import MaterialPoints, middle
 
 NEAR = 0.1
-"""Distance from a tool, in cell sizes, below which domain corners move by the Q1 field. Plateau (scene "tool" of
-tests/plateaus.py): half this value changes the result by 4.1e-03, twice this value by 1.5e-03, and finer cells by
+"""Distance from a tool, in cell sizes, below which domain corners have no correction for bending. Plateau (scene "tool"
+of tests/plateaus.py): half this value changes the result by 4.1e-03, twice this value by 1.5e-03, and finer cells by
 7.1e-02."""
 FACING = 0.5  # smallest cosine between the normal of a face that faces the tool and the direction to the tool
 
 
 def _box(x: NDArray[np.float64]) -> list[tuple[NDArray[np.float64], MPI.Op]]:
-    """Return both corners of the bounding box of x, each with the MPI operation for the box of all processes."""
+    """Return both corners of the bounding box of x, each with the MPI operation that combines all processes."""
     return [(x.min(axis=0, initial=np.inf), MPI.MIN), (x.max(axis=0, initial=-np.inf), MPI.MAX)]
 
 
@@ -98,7 +98,7 @@ class Tools(Touching):
         return [tool.rotates(self.grid.dim) and not self.grid.axisymmetric for tool in self.tools]
 
     def going(self, by_loads: LoadMotion, end: float | None = None) -> Tools:
-        """Return the tools with a given motion by loads."""
+        """Return a copy of the tools with the motion due to forces in a step."""
         tools = copy(self)
         tools.by_loads, tools._end = by_loads, end
         return tools
@@ -108,7 +108,7 @@ class Tools(Touching):
         return self._pose(self.tools[number], t)
 
     def _posed(self, tool: Tool, start: float, t: float) -> Pose:
-        """Return the pose of a tool at the end of a substep.  With inertia, velocities are of second order."""
+        """Return the pose of a tool at the end of a substep.  With inertia, its velocity has second order."""
         pose = self._pose(tool, t)
         if self._end is None or not start < t < self._end or tool.free:
             return pose
@@ -130,7 +130,7 @@ class Tools(Touching):
         return pose
 
     def unknown(self, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return initial results: forces and moments `value`, zero displacements due to loads, and velocities."""
+        """Return the results before the first step: forces `value` (placeholder), zero motions, initial velocities."""
         out, d = super().unknown(value), self.grid.dim
         tools = dict(zip(self.names, self.tools, strict=True))
         out["tool_travel"] = {name: np.zeros(d if tool.free else ()) for name, tool in tools.items()}
@@ -147,7 +147,7 @@ class Tools(Touching):
         return self._motions(place.before, "tool_travel", "tool_rotation")
 
     def _motions(self, before: Outcome, along: str, around: str) -> NDArray[np.float64]:
-        """Return displacements and rotations of tools (tools, q), or their rates, from the results of a step."""
+        """Return two results of a step, such as displacement and rotation, or their rates, for all tools (tools, q)."""
         d = self.grid.dim
         out = np.zeros((len(self.tools), motion_count(d)))
         for row, name, tool in zip(out, self.names, self.tools, strict=True):
@@ -164,7 +164,7 @@ class Tools(Touching):
         return MovedToolLoads(tools, place, moved=moved) if moved.guides.any() else ToolLoads(tools, place)
 
     def _moved(self, place: Place) -> Moved:
-        """Return the data of tools that forces move.  No tool moves while an initial stress is balanced."""
+        """Return masses, motions and loads of tools that forces move; none while an initial stress is balanced."""
         d, q = self.grid.dim, motion_count(self.grid.dim)
         of = [tool for tool in self.tools if tool.free or (tool.load is not None and place.t > place.start)]
         moves = [tool in of and tool.free == place.inertia for tool in self.tools]
@@ -221,7 +221,7 @@ class Tools(Touching):
         """Return which positions below a tool are within half a cell of an edge of the tool.
 
         These positions have no contact, because the last loaded node also represents half a cell outside the edge.
-        Edges of the tool beyond the end of the body are ignored.
+        Edges beyond which the surface of the body does not continue are ignored.
         """
         grid, (y, n) = self.grid, (x[faces], unit[faces])
         h = grid.sizes_at(y)
@@ -420,7 +420,7 @@ class ToolLoads(ContactProblem):
         return super().outcome(at) | {"tool_travel": displacement}
 
     def near(self, points: MaterialPoints, corners: NDArray[np.float64]) -> NDArray[np.bool_] | bool:
-        """Return which corners touch tools."""
+        """Return which corners are within `NEAR` cells of a tool."""
         return self._tools.near(corners, self._place.t)
 
     def outside(
@@ -435,4 +435,4 @@ class ToolLoads(ContactProblem):
 
 
 class MovedToolLoads(MovedTools, ToolLoads):
-    """Contact loads of tools, if forces move at least one tool."""
+    """Contact loads of tools.  This class is used if forces move at least one tool."""
