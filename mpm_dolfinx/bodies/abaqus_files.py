@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Reader of input files of Abaqus and CalculiX, with positions of instances, element sets and surfaces.
+"""Reader of input files of Abaqus and CalculiX: cells, element sets, surfaces, and the positions of instances.
 
 The reader of meshio keeps only the nodes of the last part, and ignores the positions of instances.
 """
@@ -21,7 +21,7 @@ from mpm_dolfinx.bodies.mesh_cells import Block
 PLANE = re.compile(r"(?:(?:C|DC|DCC|EC)?(?:PE|PS|PEG|AX|GAX|2D)|AC(?:2D|AX)|S|STRI|DS|M3D|SFM3D|R3D)(3|4|6|8|9)(?!\d)")
 SOLID = re.compile(r"(?:(?:C|DC|DCC|EC|AC|Q)3D|SC)(4|5|6|8|10|13|15|20|27)(?![\dV])")
 LINE = re.compile(r"(?:T2D|T3D|R2D|RAX|DC1D|AC1D)(2|3)|(?:B|PIPE|SAX)[23]?([123])")
-"""Pattern of the names of line elements.  Group 1 is the number of nodes, group 2 the order of a beam element."""
+"""Pattern of the names of line elements.  Group 1 of a match is the number of nodes, group 2 the order of a beam."""
 NO_CELL = ("SPRING", "DASHPOT", "MASS", "ROTARY", "CONN", "GAP", "JOINT", "HEATCAP", "DCOUP", "ITS", "DIST", "FRAME")
 """Name prefixes of elements without volume or area."""
 KINDS = {
@@ -54,7 +54,7 @@ class _Set:
 
 @dataclass
 class _Scope:
-    """Definitions inside a part, or outside all parts."""
+    """Nodes, elements, sets and surfaces that are defined in one part, or outside all parts."""
 
     name: str = ""
     nodes: list[tuple[NDArray[np.int64], NDArray[np.float64]]] = field(default_factory=list)  # numbers (n,), x (n, 3)
@@ -105,7 +105,7 @@ def read(file: Path) -> meshio.Mesh:
 
 
 def _keywords(file: Path) -> Iterator[tuple[str, dict[str, str], list[str]]]:
-    """Yield all keywords of a file and of its included files."""
+    """Yield each keyword of a file and of its included files, with its options and data lines."""
     keyword, rows = "", []
     with file.open(errors="replace") as lines:
         for line in map(str.strip, lines):
@@ -138,7 +138,7 @@ def _keyword(file: Path, line: str, rows: list[str]) -> Iterator[tuple[str, dict
 
 
 def _placed(file: Path) -> list[_Placed]:
-    """Return the definitions outside parts, and all instances.  Without instances, return all parts."""
+    """Return the definitions outside parts, and all instances.  In files without instances, return all parts."""
     whole = _Scope()
     scope = whole
     parts = {}
@@ -260,7 +260,7 @@ def _assembled(placed: list[_Placed]) -> meshio.Mesh:
 def _unique(
     numbers: list[NDArray[np.int64]], what: str, x: NDArray[np.float64] | None = None
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the sorted node or element numbers, and their permutation.
+    """Return the sorted node or element numbers, and the permutation that sorts them.
 
     Repeated numbers raise ValueError.  Two nodes may have the same number if their positions are equal.
     """
@@ -276,7 +276,7 @@ def _unique(
 
 
 def _groups(placed: list[_Placed], cells: list, numbers: list) -> dict[str, list[NDArray[np.int64]]]:
-    """Return the cells of element sets and surfaces by name."""
+    """Return, by name, the cells of instances, element sets and surfaces in each block of cells."""
     chosen: dict[str, list[tuple[int, NDArray[np.int64]]]] = {}
     seen = [
         [key for key, found in one.scope.sets.items() if not (found.internal and key.startswith("_"))] for one in placed

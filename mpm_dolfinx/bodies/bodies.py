@@ -21,8 +21,8 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 class Body:
     """A seeded body: the reference geometry of all its particle domains, on every process.
 
-    A reference domain is a box of a lattice, or a part of a mesh cell.  The function `map` moves its corners to the
-    seeded domain.
+    A reference domain is a box of a lattice, or a part of a mesh cell.  The function `map` moves the corners of
+    reference domains to the seeded positions.
     """
 
     material: int = 0  # index in the scene's list of materials
@@ -37,7 +37,7 @@ class Body:
         raise NotImplementedError
 
     def lower_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the lower corners (n, d), in m, of the bounding boxes of the chosen domains, before the map."""
+        """Return the lower corners (n, d), in m, of the bounding boxes of the chosen reference domains."""
         return self.reference(chosen).min(axis=1)
 
     def sides_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.bool_]:
@@ -46,7 +46,7 @@ class Body:
 
     @property
     def lower(self) -> NDArray[np.float64]:
-        """Lower corners (n, d), in m, of the boxes of all domains."""
+        """Lower corners (n, d), in m, of the bounding boxes of all reference domains."""
         return self.lower_of(slice(None))
 
     @property
@@ -65,12 +65,12 @@ class Body:
 
     @cached_property
     def spacing(self) -> NDArray[np.float64]:
-        """Smallest edge lengths (d,), in m, of the boxes of the domains."""
+        """Smallest edge lengths (d,), in m, of the bounding boxes of the reference domains."""
         return np.min([self.boxes(part).min(axis=0) for part in in_chunks(len(self))], axis=0)
 
     @cached_property
     def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Lower and upper corners (d,) of the body's bounding box before the map, in m."""
+        """Lower and upper corner (d,), in m, of the bounding box of all reference domains."""
         low, high = np.full((2, self.dim), [[np.inf], [-np.inf]])
         for part in in_chunks(len(self)):
             lower = self.lower_of(part)
@@ -89,11 +89,11 @@ class Body:
         return tuple(SIDES[self.dim])
 
     def named(self, name: str) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the faces on the side `name`, as domains (n,) in ascending order and face indices (n,)."""
+        """Return the faces on the side `name`: the indices of their domains (n,), ascending, and face indices (n,)."""
         return self.facing(*SIDES[self.dim][name]) if name in self.names else (np.empty(0, np.int64),) * 2
 
     def facing(self, axis: int, end: int, least: float = 0.0) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the surface faces with normals along an axis, as domains (n,) and face indices (n,).
+        """Return the surface faces with normals along an axis: indices of their domains (n,), and face indices (n,).
 
         `end`: 0 for normals in the negative direction, 1 for the positive direction.
         `least`: in bodies from meshes, smallest component of the unit normals along the axis.
@@ -111,24 +111,24 @@ class Body:
         return len(self) / max(1, len(self._with_face(axis, 0))), self._mean_edge(axis)
 
     def _mean_edge(self, axis: int) -> float:
-        """Return the mean edge length of the domains' boxes along an axis, in m."""
+        """Return the mean edge length, in m, of the bounding boxes of the reference domains along an axis."""
         return sum(float(self.boxes(part)[:, axis].sum()) for part in in_chunks(len(self))) / len(self)
 
     def outer(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return all surface faces, as domains (n,) and face indices (n,), sorted by face index."""
+        """Return all surface faces, sorted by face index: the indices of their domains (n,), and face indices (n,)."""
         rows = [self._with_face(axis, end) for axis in range(self.dim) for end in (0, 1)]
         return np.concatenate(rows), np.repeat(np.arange(len(rows)), list(map(len, rows)))
 
     def reference(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
-        """Return the reference positions (n, 2^d, d), in m, of corners of the chosen domains, before the map."""
+        """Return the corners (n, 2^d, d), in m, of the chosen reference domains."""
         raise NotImplementedError
 
     def corners(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
-        """Return the corners (n, 2^d, d) of the chosen domains after the map, in m."""
+        """Return the seeded corners (n, 2^d, d), in m, of the chosen domains, after `map`."""
         return self.images(self.reference(chosen))
 
     def images(self, X: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the images (..., d) of reference positions (..., d) under the map, both in m."""
+        """Return the images (..., d) of reference positions (..., d) under `map`, both in m."""
         if self.map is None or not X.size:  # user maps may fail for no positions
             return X
         x = X.reshape(-1, X.shape[-1])
@@ -138,7 +138,7 @@ class Body:
         return images.reshape(X.shape)
 
     def bend(self, chosen: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the largest distance, in m, between the straight edges of domains and the curved images of edges."""
+        """Return the largest distance (n,), in m, of straight edges of each chosen domain from the mapped edges."""
         out = np.zeros(len(chosen))
         if self.map is None:
             return out
@@ -151,16 +151,16 @@ class Body:
         return out
 
     def boxes(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
-        """Return the edge lengths (n, d), in m, of the bounding boxes of the chosen domains, before the map."""
+        """Return the edge lengths (n, d), in m, of the bounding boxes of the chosen reference domains."""
         return np.ptp(self.reference(chosen), axis=1)
 
     @property
     def volume_of_boxes(self) -> float:
-        """Total volume of all boxes, in m^d."""
+        """Total volume, in m^d, of the bounding boxes of all reference domains."""
         return sum(float(self.boxes(part).prod(axis=1).sum()) for part in in_chunks(len(self)))
 
     def size(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
-        """Return the edge lengths (n, d), in m, of boxes with the volumes of the chosen domains."""
+        """Return the edge lengths (n, d), in m, of `boxes`, scaled to the volumes of the chosen seeded domains."""
         boxes = self.boxes(chosen)
         if self.aligned:
             return boxes
@@ -202,7 +202,7 @@ def mapped(grid: Grid, body: Body, map: Callable[[NDArray[np.float64]], NDArray[
     grid
         Background grid.
     body
-        Body from `box`, `shape`, `from_mesh`, `polygon`, or `mapped`.  An earlier map is applied first.
+        Body from `box`, `shape`, `from_mesh`, `polygon`, or `mapped`.  An existing map is applied first.
     map
         Smooth function from positions (n, d) to positions (n, d) in the grid, both in m.  The Jacobian determinant must
         be positive.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Bodies of boxes on a regular lattice, described by a few numbers."""
+"""Bodies that consist of boxes of a lattice, which need little memory."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from mpm_dolfinx.grid.grid import MOST, Grid, among, begin_with, corner_bits, in
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LatticeBody(Body):
-    """A body of boxes on a lattice.  The rows of the lattice may have different widths."""
+    """A body of boxes on a lattice.  Rows, which are layers of boxes normal to an axis, may differ in width."""
 
     rows: tuple[NDArray[np.float64], ...]  # coordinates of the rows' boundaries along each axis (count + 1,), m
     widths: tuple[NDArray[np.float64], ...]  # widths of the rows along each axis (count,), m
@@ -34,7 +34,7 @@ class LatticeBody(Body):
 
     @cached_property
     def spacing(self) -> NDArray[np.float64]:
-        """Smallest widths (d,) of the rows along each axis, in m."""
+        """Smallest width (d,) of a row along each axis, in m."""
         return np.array([widths.min() for widths in self.widths])
 
     @property
@@ -43,7 +43,7 @@ class LatticeBody(Body):
         return len(self.rows)
 
     def _index(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the lattice indices of the chosen domains."""
+        """Return the lattice indices (n, d) of the chosen domains."""
         if self.filled is not None:
             numbers = self.filled[chosen]
         elif isinstance(chosen, slice):
@@ -53,15 +53,15 @@ class LatticeBody(Body):
         return np.stack(np.unravel_index(numbers, self.count), axis=-1)
 
     def _at(self, index: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the positions, in m, of lattice corners."""
+        """Return the positions (..., d), in m, of lattice corners with indices (..., d)."""
         return np.stack([rows[i] for rows, i in zip(self.rows, np.moveaxis(index, -1, 0), strict=True)], axis=-1)
 
     def lower_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the lower corners (n, d), in m, of the boxes of the chosen domains, before the map."""
+        """Return the lower corners (n, d), in m, of the chosen reference domains."""
         return self._at(self._index(chosen))
 
     def boxes(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
-        """Return the edge lengths (n, d), in m, of the boxes of the chosen domains, before the map."""
+        """Return the edge lengths (n, d), in m, of the chosen reference domains."""
         return np.stack([widths[i] for widths, i in zip(self.widths, self._index(chosen).T, strict=True)], axis=-1)
 
     def centre_of(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.float64]:
@@ -69,9 +69,9 @@ class LatticeBody(Body):
         return self.lower_of(chosen) + 0.5 * self.boxes(chosen)
 
     def reference(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
-        """Return the reference positions (n, 2^d, d), in m, of corners of the chosen domains, before the map.
+        """Return the corners (n, 2^d, d), in m, of the chosen reference domains.
 
-        The coordinates of a common corner are bitwise equal in all its domains.
+        If several domains share a corner, its coordinates are bitwise equal in all of them.
         """
         return self._at(self._index(chosen)[:, None] + corner_bits(self.dim))
 
@@ -126,7 +126,7 @@ class LatticeBody(Body):
         return self._index(rows) - self._ends[0]
 
     def nodes(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the node indices (n, 2^d) of the corners of domains.  Domains share the index of a common corner."""
+        """Return the node indices (n, 2^d) of the corners of domains.  A corner that domains share has one index."""
         corners = self.places(rows)[:, None] + corner_bits(self.dim)
         return np.ravel_multi_index(tuple(np.moveaxis(corners, 2, 0)), tuple(np.add(self.lattice, 1)))
 
@@ -169,7 +169,7 @@ def box(grid: Grid, lower: ArrayLike, upper: ArrayLike, per_cell: int = 2, mater
     lower, upper : (d,), m
         Corners of the box, inside the grid.  Corners need not lie on grid lines.
     per_cell
-        Points per cell and direction, >= 1, rounded so that whole domains fill the box.  With 1 point, bodies are too
+        Points per cell and direction, >= 1, up to rounding: whole domains fill the box.  With 1 point, bodies are too
         flexible and creep.  In 3D, use at least 2.
     material
         Index of the material in the scene's list, >= 0.

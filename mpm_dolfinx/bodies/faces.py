@@ -62,17 +62,17 @@ class Surface:
 
     @cached_property
     def outward(self) -> NDArray[np.float64]:
-        """Seeded outward area vectors (m, d), in m^(d-1), of the undivided faces."""
+        """Outward area vectors at seeding (m, d), in m^(d-1), of the whole faces that contain the polygons."""
         return face_vectors(self.domain, self.face)
 
     @cached_property
     def whole0(self) -> NDArray[np.float64]:
-        """Seeded areas (m,), in m^(d-1), of the undivided faces."""
+        """Areas at seeding (m,), in m^(d-1), of the whole faces that contain the polygons."""
         return np.linalg.norm(self.outward, axis=1)
 
     @cached_property
     def area0(self) -> NDArray[np.float64]:
-        """Seeded areas (m,), in m^(d-1), of the polygons."""
+        """Areas at seeding (m,), in m^(d-1), of the polygons."""
         x = self.places()
         if x.shape[2] == 2:
             return np.linalg.norm(x[:, 1] - x[:, 0], axis=1)
@@ -91,7 +91,7 @@ class Surface:
         return interpolate(domain, self.xi.reshape(-1, self.xi.shape[2])).reshape(self.xi.shape)
 
     def reference(self, at: NDArray[np.int64], xi: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the reference positions (n, d), in m, at local coordinates xi (n, d) in the domains of polygons."""
+        """Return reference positions (n, d), in m, at local coordinates xi (n, d) in the domains of polygons `at`."""
         return np.clip(interpolate(self.before[at], xi), *self.region)
 
     @cached_property
@@ -124,7 +124,7 @@ Region = tuple[ArrayLike, ArrayLike]
 
 
 def limits(region: Region | None, dim: int) -> NDArray[np.float64]:
-    """Return the lower and upper corners (2, d) of a region, in m, or infinite corners for None."""
+    """Return the lower and upper corner (2, d) of a region, in m.  If `region` is None, the corners are infinite."""
     if region is None:
         return np.repeat([[-np.inf], [np.inf]], dim, axis=1)
     allowed = f"two corners of {dim} coordinates each, the lower first"
@@ -140,7 +140,7 @@ def surface(
     Parameters
     ----------
     name
-        Side: "left", "right", "bottom", "top", in 3D also "front", "back", or a name from a mesh.  None: all sides.
+        Side: "left", "right", "bottom", "top", in 3D "front", "back", or a name from a mesh; None for all sides.
     region : ((d,), (d,)), m
         Box of reference positions that limits the faces.
     present
@@ -204,7 +204,7 @@ def _limited(
     t: NDArray[np.float64],
     region: NDArray[np.float64],
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Clip parts of faces to a region.  Return the index of the face of each clipped part, and its corners."""
+    """Clip parts of faces to a region.  Return, for each clipped part, the index of its face, and its corners."""
     dim, three = body.dim, (t[:, 2] == t[:, 3]).all(axis=1)
     X = _face_corners(body, row[part], face[part])
     bent = np.zeros(len(X), dtype=bool)
@@ -251,7 +251,7 @@ def _interval(X: NDArray[np.float64], region: NDArray[np.float64]) -> tuple[NDAr
 def _clipped(
     X: NDArray[np.float64], t: NDArray[np.float64], region: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Clip parts of faces to a region.  Return the triangles inside the region, and the index of the part of each."""
+    """Divide parts of faces into triangles, and clip these to a region.  Return the triangles, and the part of each."""
     places = np.einsum("npk,nkd->npd", weights(t.reshape(-1, 2)).reshape(*t.shape[:2], 4), X)
     three = (t[:, 2] == t[:, 3]).all(axis=1)[:, None]  # in triangles, the middle is a corner
     middle = np.where(three, places[:, 2], places.mean(axis=1))
@@ -267,7 +267,7 @@ def _clipped(
 
 
 def _free(own: Faces, others: Sequence[Faces]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the parts of faces without contact to other bodies.  Triangles repeat their last corner."""
+    """Return faces and corners of the parts of faces without contact to other bodies.  Triangles repeat a corner."""
     on = [covers(own, other) for other in others]
     if not on:
         return np.arange(len(own.row)), np.tile(BITS, (len(own.row), 1, 1)).astype(float)

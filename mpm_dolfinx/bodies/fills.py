@@ -40,7 +40,7 @@ class Contact:
         return float(covered(len(self.own.row), self.cover) @ np.linalg.norm(self.own.outward, axis=1))
 
     def corners(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the domains (n, 1) of the fill's paired faces, and the corner indices (n, 4) of these faces."""
+        """Return the domains (n, 1) of the fill's faces in the pairs, and the indices (n, 4) of their corners."""
         face = self.cover.face
         return self.own.row[face][:, None], self.own.index[face]
 
@@ -52,7 +52,7 @@ class Contact:
         return on, weights(np.clip(s, 0, 1).reshape(-1, 2)).reshape(*s.shape[:2], 4) @ self.moved
 
     def misfit(self, u: NDArray[np.float64]) -> float:
-        """Return the largest distance, in m, between the corners of the body and the displaced fill."""
+        """Return the largest distance, in m, of corners of the body's faces from the faces of the displaced fill."""
         on = (np.abs(self.cover.t - 0.5) <= 0.5).all(axis=2)
         share = weights(np.clip(self.cover.t, 0, 1).reshape(-1, 2)).reshape(*on.shape, 4)
         off = share @ u[self.corners()] - self.moved
@@ -70,16 +70,16 @@ def put(
 ) -> MaterialPoints:
     """Return the material points of a fill on the displaced surface of the active bodies.
 
-    Sides of the fill that touched another body at seeding have the present displacement of this body.  The side
-    opposite to the largest contact is not displaced.  Displacements between these sides are interpolated.  The fill has
-    no velocity and no strain.
+    Sides of the fill that touch another body at seeding get the present displacement of this body.  The side opposite
+    to the largest contact is not displaced.  Displacements between these sides are interpolated.  The fill has no
+    velocity and no strain.
 
     Parameters
     ----------
     bodies, others, fill
-        All bodies, indices of the active bodies, and index of the fill.
+        All bodies of the scene; the indices of the active bodies; the index of the fill.
     points, new
-        Points of the active bodies, and seeded points of the fill, on this process.
+        Points of this process: the present points of the active bodies; the seeded points of the fill.
 
     Raises
     ------
@@ -175,7 +175,7 @@ def _springs(body: Body, node: NDArray[np.int64], count: int) -> csr_array:
 
 
 def _between(K: csr_array, fixed: NDArray[np.bool_], u: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the displacements of a network of springs, with displacements u prescribed at `fixed` nodes."""
+    """Return the displacements of a network of springs with stiffness K, and with given u at `fixed` nodes."""
     out, free = u.copy(), np.flatnonzero(~fixed)
     if len(free):
         held = np.flatnonzero(fixed)
@@ -219,7 +219,7 @@ def _check_shape(grid: Grid, fill: int, corners: NDArray, u: NDArray) -> None:
 def _penetration(
     grid: Grid, bodies: Sequence[Body], other: int, corners: NDArray, points: MaterialPoints, misfit: float
 ) -> tuple[float, float, NDArray[np.float64]]:
-    """Return the overlap of a body and the fill, in m, or otherwise their gap, in cells, and the position."""
+    """Return the overlap (m) of body and fill, their gap (cells), and the position; overlap or gap is 0."""
     start = _start(bodies, other)
     rows = np.flatnonzero((points.id >= start) & (points.id < start + len(bodies[other])))
     both = [(c, np.full(len(c), MISFIT / 2 * grid.least + misfit)) for c in (points.corners[rows], corners)]

@@ -36,7 +36,7 @@ class _Numbers:
         self._bytes, self._words = BytesIO(section), iter(() if binary else section.split())
 
     def take(self, count: int, kind: str = "i") -> NDArray:
-        """Return the next numbers, of the type int ("i"), size_t ("u") or double ("d")."""
+        """Return the next `count` numbers, of the type int ("i"), size_t ("u") or double ("d")."""
         dtype, out = np.dtype({"i": "<i4", "u": "<u8", "d": "<f8"}[kind]), float if kind == "d" else np.int64
         if self._binary:
             return np.frombuffer(self._bytes.read(count * dtype.itemsize), dtype).astype(out)
@@ -53,7 +53,7 @@ def version(file: Path) -> str:
 
 
 def read(file: Path) -> meshio.Mesh:
-    """Return the mesh of a file of format 4.1.  `cell_sets` has physical groups by tag, `field_data` by name."""
+    """Return the mesh of a file of format 4.1.  `cell_sets` contains cells by tag, `field_data` tags by group name."""
     data = file.read_bytes()
     _, kind, size = _section(data, "MeshFormat").split()[:3]
     binary = kind == b"1"
@@ -92,7 +92,7 @@ def _section(data: bytes, name: str) -> bytes:
 
 
 def _names(data: bytes) -> dict[str, NDArray[np.int64]]:
-    """Return the tags and dimensions of the physical groups of each name."""
+    """Return, by name, the tags and dimensions of the physical groups with this name."""
     out: dict[str, list[tuple[int, int]]] = {}
     if b"$PhysicalNames" in data:
         for line in _section(data, "PhysicalNames").decode(errors="replace").splitlines()[1:]:
@@ -127,7 +127,7 @@ def _nodes(numbers: _Numbers) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
 
 
 def _elements(numbers: _Numbers) -> Iterator[tuple[int, int, str, NDArray[np.int64]]]:
-    """Yield the elements of each entity."""
+    """Yield, for each entity, its dimension, tag, cell type, and the nodes of its elements."""
     for _ in range(numbers.take(4, "u")[0]):
         dim, entity, kind = map(int, numbers.take(3))
         if kind not in TYPES:

@@ -117,7 +117,7 @@ def _file(file: Path) -> meshio.Mesh:
 
 
 def _of_meshio(grid: Grid, mesh: meshio.Mesh | Path, names: Mapping[str, int], tags: str | None, name: str) -> Mesh:
-    """Convert a meshio mesh, or a mesh file that meshio reads."""
+    """Convert a meshio mesh, or a mesh file that meshio reads, to a `Mesh`."""
     from mpm_dolfinx.bodies import mesh_readers
 
     if isinstance(mesh, Path):
@@ -195,10 +195,10 @@ def _positions(dim: int, points: Any) -> NDArray[np.float64]:
 def _first_order(
     name: str, x: NDArray[np.float64], mesh: meshio.Mesh, known: Mapping[str, int], counted: Collection[str]
 ) -> list[tuple[str, NDArray[np.int64]]]:
-    """Return the type and the corners of the cells of each block.  Blocks of unknown types are omitted.
+    """Return the cell type, and the corners of the cells, for each block of cells of a known type.
 
     `known`: number of corners of each cell type.
-    `counted`: cell types whose second-order cells cause a warning.
+    `counted`: cell types for which cells of second order cause a warning.
     """
     blocks = []
     curved, off = 0, 0.0
@@ -242,7 +242,7 @@ def _warn_curved(name: str, count: int, off: float) -> None:
 def _merged(
     cells: dict[str, NDArray[np.int64]], parts: dict[str, dict[str, NDArray[np.int64]]]
 ) -> tuple[dict[str, NDArray[np.int64]], dict[str, dict[str, NDArray[np.int64]]]]:
-    """Return all cells, and the cells of each part.  Repeated cells of several physical groups of gmsh are merged."""
+    """Return all cells, and the cells of each part.  Cells repeated by several gmsh groups occur once."""
     cells = dict(cells)
     for kind, rows in cells.items():
         first, same = distinct(np.sort(rows, axis=1))
@@ -310,7 +310,7 @@ def _numbers(names: Mapping[str, int] | None) -> Mapping[str, int]:
 
 
 def numbered(tags: NDArray[np.int64], names: Mapping[str, int]) -> Iterator[tuple[str, NDArray[np.bool_]]]:
-    """Yield each name, and which entries of `tags` (n,) have this name.  Tags without a name are named by digits."""
+    """Yield each name, and which entries of `tags` (n,) have this name.  Unnamed tags are named by their digits."""
     for name, number in names.items():
         if (tags == number).any():
             yield name, tags == number
@@ -362,7 +362,7 @@ def _of_dolfinx(grid: Grid, mesh, cell_tags, facet_tags, names: Mapping[str, int
 
 
 def _of_rows(dim: int, kind: str, rows: list[tuple], curved: bool, names: Mapping[str, int]) -> Mesh:
-    """Convert the gathered nodes, cells and tags of a dolfinx mesh."""
+    """Convert the gathered nodes, cells and tags of a dolfinx mesh to a `Mesh`."""
     number, x, cells, tag, side, off = map(np.concatenate, zip(*rows, strict=True))
     if curved:
         _warn_curved("mesh", len(cells), off.max())

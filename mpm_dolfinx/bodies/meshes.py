@@ -88,7 +88,7 @@ class MeshBody(Body):
         return tuple(self.tagged)
 
     def named(self, name: str) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the faces on the side `name`, as domains (n,) in ascending order and face indices (n,)."""
+        """Return the faces on the side `name`: the indices of their domains (n,), ascending, and face indices (n,)."""
         if name not in self.tagged:
             return (np.empty(0, np.int64),) * 2
         return np.nonzero(self.tagged[name].reshape(len(self), 2 * self.dim))
@@ -107,16 +107,16 @@ class MeshBody(Body):
         return float(np.ptp(self.vertices[:, :, axis])) / edge, edge
 
     def reference(self, chosen: slice | NDArray[np.int64] = slice(None)) -> NDArray[np.float64]:
-        """Return the reference positions (n, 2^d, d), in m, of corners of the chosen domains, before the map."""
+        """Return the corners (n, 2^d, d), in m, of the chosen reference domains."""
         return self.vertices[chosen]
 
     def nodes(self, rows: slice | NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return node indices (n, 2^d) of the corners of domains.  Domains share the index of a common corner."""
+        """Return the node indices (n, 2^d) of the corners of domains.  A corner that domains share has one index."""
         return self.numbers[rows]
 
 
 def _numbered(vertices: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return the node indices of the corners of domains.  Equal corners have equal indices."""
+    """Return the node indices of the corners of domains.  Coincident corners have one index."""
     x = vertices.reshape(-1, vertices.shape[2])
     pairs = cKDTree(x).query_pairs(NEAR * np.ptp(vertices, axis=1).min(), output_type="ndarray")
     return linked(len(x), *pairs.T)[0].reshape(vertices.shape[:2])
@@ -188,7 +188,7 @@ def _divided(grid: Grid, mesh: Mesh, part: str | None, per_cell: int, name: str)
 def _domains(mesh: Mesh, cells: Mapping[str, NDArray[np.int64]]) -> list[tuple[NDArray, NDArray, NDArray]]:
     """Return the corners of the particle domains, the mesh facet of each face, and the cell of each domain.
 
-    A facet is a row of its nodes, with -1 before the nodes of a triangle.  Faces inside a cell have rows of -1.
+    A facet is a row of node indices; rows of triangles begin with -1.  In rows of faces inside a cell, all are -1.
     """
     d = mesh.x.shape[1]
     start = 0
@@ -207,7 +207,7 @@ def _domains(mesh: Mesh, cells: Mapping[str, NDArray[np.int64]]) -> list[tuple[N
 
 
 def _check_repeated(mesh: Mesh, cells: Mapping[str, NDArray[np.int64]], name: str) -> None:
-    """Raise an error for repeated cells."""
+    """Raise an error for cells that occur more than once."""
     for kind, nodes in cells.items():
         first, same = distinct(np.sort(nodes, axis=1))
         count = np.bincount(same)
@@ -288,7 +288,7 @@ def _box_overlaps(
 
 
 def _oriented(domains: NDArray[np.float64], keys: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Return the domains with right-handed order of corners, and the facets of their faces."""
+    """Return the domains with corners in right-handed order, and the mesh facets of their faces in the new order."""
     d, left = domains.shape[2], volumes(domains) < 0
     bits, face = corner_bits(d), np.arange(2 * d)
     swapped = (bits[:, [1, 0, *range(2, d)]] << np.arange(d)).sum(axis=1)
@@ -315,7 +315,7 @@ def _check_convex(domains: NDArray[np.float64], name: str) -> None:
 
 
 def _facets(keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the different facets, and the facet of each face.  Faces inside cells have the facet 0."""
+    """Return the different mesh facets, and for each face the index of its facet, or 0 for faces inside cells."""
     rows = np.concatenate([np.full((1, keys.shape[2]), -1), keys.reshape(-1, keys.shape[2])])
     first, facet = distinct(rows)
     return rows[first], facet[1:].reshape(keys.shape[:2])
@@ -334,9 +334,9 @@ def _in_side(facets: NDArray[np.int64], named: Sequence[NDArray[np.int64]]) -> N
 def _split(
     grid: Grid, domains: NDArray[np.float64], per_cell: int
 ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.bool_]]:
-    """Divide domains that are large compared with the cells.
+    """Divide domains that are large compared with the cells of the grid.
 
-    Return the new domains, the index of the original domain of each, and which faces lie on faces of the original.
+    For each new domain, return its corners, its original domain, and which of its faces lie on the original's.
     """
     d = grid.dim
     bits = corner_bits(grid.dim)

@@ -27,7 +27,7 @@ MISFIT = 1e-2
 
 @dataclass
 class Faces:
-    """Faces of a body after its map."""
+    """Faces of a body at seeding, after `Body.map`."""
 
     row: NDArray[np.int64]  # domain of the face (m,)
     index: NDArray[np.int64]  # indices of the face's corners in the domain (m, 4)
@@ -227,7 +227,7 @@ def uncovered_triangles(
 
 
 def within(s: NDArray, owner: NDArray, low: NDArray, high: NDArray) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Clip triangles (3, 2, n) to boxes from `low` to `high`.  Return clipped triangles, each with its `owner`."""
+    """Clip triangles (3, 2, n) to boxes from `low` to `high`.  Return the triangles, and the `owner` of each."""
     low, high = (np.broadcast_to(x, (s.shape[2], 2)) for x in (low, high))
     index = np.arange(s.shape[2])
     for axis in (0, 1):
@@ -237,7 +237,7 @@ def within(s: NDArray, owner: NDArray, low: NDArray, high: NDArray) -> tuple[NDA
 
 
 def _triangles(quads: NDArray, owner: NDArray) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Divide each quadrilateral into two triangles.  Return the triangles, each with its `owner`."""
+    """Divide each quadrilateral into two triangles.  Return the triangles, and the `owner` of each."""
     both = [quads[:, list(simplex)].transpose(1, 2, 0) for simplex in kuhn_simplices(2)]
     return np.concatenate(both, axis=2).astype(float), np.tile(owner, 2)
 
@@ -248,7 +248,7 @@ def _areas(s: NDArray) -> NDArray[np.float64]:
 
 
 def split(s: NDArray, owner: NDArray, axis: int, plane) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-    """Cut triangles (3, e, n) by a plane.  Return triangles, each with its `owner`: below the plane, then above it."""
+    """Cut triangles (3, e, n) by a plane.  Return the parts below and above it, each with its `owner`."""
     plane = np.broadcast_to(plane, len(owner))
     low, high = s[:, axis].min(axis=0) < plane, s[:, axis].max(axis=0) > plane
     both = np.flatnonzero(low & high)
@@ -382,7 +382,7 @@ def meeting(
     b: tuple[NDArray[np.float64], NDArray[np.float64]],
     in_cells: Callable[[NDArray[np.float64]], NDArray[np.float64]],
 ) -> tuple[float, float, NDArray[np.float64]]:
-    """Return the largest overlap of two bodies, in m, or their smallest gap, in cells, and the position, in m.
+    """Return the largest overlap (m) of two bodies, their smallest gap (cells), and the position; overlap or gap is 0.
 
     `a`, `b`: results of `solids` for both bodies.
     `in_cells`: function that divides positions by the cell size.
