@@ -91,7 +91,7 @@ class Setting:
 
 
 class Place(NamedTuple):
-    """Data of a substep for the conditions."""
+    """Geometry, points and times of a substep, for the conditions."""
 
     cut: CutDomains  # particle domains cut by the grid
     fill: NDArray[np.float64]  # fraction of the volume of each local cell that bodies fill
@@ -106,7 +106,7 @@ class Place(NamedTuple):
 
     @property
     def rate(self) -> float:
-        """Acceleration divided by displacement in a substep of SDIRK2, in 1/s^2, or 0 without inertia."""
+        """Derivative of acceleration by displacement in a substep of SDIRK2, in 1/s^2, or 0 without inertia."""
         return 1 / (GAMMA * self.dt) ** 2 if self.inertia and self.dt > 0 else 0.0
 
 
@@ -119,7 +119,7 @@ class Shares(NamedTuple):
 
 
 class At(NamedTuple):
-    """Displacements of an iterate: numbering of the unknowns, increment u of the step (m), and connected parts."""
+    """Displacement increment `u` of the step (m) in an iterate, its numbering `unknowns`, and connected `parts`."""
 
     unknowns: Unknowns
     u: NDArray[np.float64]
@@ -134,13 +134,13 @@ class At(NamedTuple):
 class Loads:
     """Forces and tangents of the conditions of one kind in a substep.  The methods of this base class add nothing.
 
-    Arrays b are local nodal forces, in N, as flat arrays.
+    Arguments b are flat arrays of forces, in N, at the local nodes.
     """
 
     linear: bool = True
     """Whether the tangent is independent of the displacement."""
     smooth: bool = True
-    """Whether the tangent of a substep may be used in the next substep."""
+    """Whether the tangent of a substep may be reused in the next substep."""
     varies: bool = False
     """Whether `loads` and `resists` depend on the displacement."""
     stiff: bool = False
@@ -154,16 +154,16 @@ class Loads:
     touches: bool = False
     """Whether the condition is a contact, which may open."""
     conducts: bool = False
-    """Whether fluid may pass between the cells of `within_reach`."""
+    """Whether fluid may pass between the pairs of cells that `within_reach` returns."""
     key: Any = None
-    """Cache key of penalty matrix and sparsity pattern."""
+    """Cache key: penalty matrix and sparsity pattern are reused while it does not change."""
 
     def joined(self, substeps: Sequence[Any]) -> Loads:
         """Return the loads with a sparsity pattern that is valid in all substeps of the step."""
         return self
 
     def begun(self, shares: Shares, earlier: Any) -> Loads:
-        """Return the loads of a substep with inertia.
+        """Return these loads, prepared for a substep with inertia.
 
         `earlier`: result of `flown` in the previous substep.
         """
@@ -175,7 +175,7 @@ class Loads:
     def rubbing(self, at: At, v: NDArray[np.float64]) -> tuple[float, float]:
         """Return the dissipation by slip, and a correction of the external power, in W, on this process.
 
-        `v`, m/s: nodal velocities.  The sum of the correction and the power of `push` is the external power.
+        `v`, m/s: nodal velocities.  The external power is the power of the forces in `push`, plus the correction.
         """
         return 0.0, 0.0
 
@@ -183,10 +183,10 @@ class Loads:
         """Add forces that are constant during the substep."""
 
     def pulls(self, b: NDArray[np.float64]) -> None:
-        """Add the constant part of the penalty forces."""
+        """Add the part of the penalty forces that is independent of u."""
 
     def loads(self, b: NDArray[np.float64]) -> None:
-        """Add forces that depend on u."""
+        """Add external forces that depend on u."""
 
     def resists(self, b: NDArray[np.float64]) -> None:
         """Add resisting forces at u, with the sign of the internal forces."""
@@ -195,14 +195,14 @@ class Loads:
         """Add forces at u that count as internal forces."""
 
     def penalty(self, A: PETSc.Mat, walls: bool) -> None:
-        """Add the stiffness matrix of forces that are linear in u.  `walls`: whether to add rows of dofs at walls."""
+        """Add the stiffness matrix of forces linear in u.  `walls`: whether to add rows of dofs that walls fix."""
 
     def pulling(self, at: At, v: NDArray[np.float64]) -> float:
-        """Return the power, in W, of `pulls` and `penalty` at u and the nodal velocities v on this process."""
+        """Return the power (W) of the forces of `pulls` and `penalty` at u and nodal velocities v, on this process."""
         return 0.0
 
     def tangent(self, K: PETSc.Mat) -> None:
-        """Add the derivative of `resists` minus `loads` at u, without final assembly."""
+        """Add the derivative, with respect to u, of `resists` minus `loads`.  The caller assembles K."""
 
     def push(self, at: At, residual: PETSc.Vec, on: Unknowns) -> None:
         """Subtract contact forces, inertia forces and forces of tied sides at u from the residual."""
@@ -211,16 +211,16 @@ class Loads:
         """Return the inertia forces at u, in N, or None without inertia."""
 
     def pattern(self, unknowns: Unknowns) -> PETSc.Mat | None:
-        """Return a zero matrix with the sparsity pattern of `coupling`, or None."""
+        """Return a zero matrix with the sparsity pattern of `coupling`, or None if this method returns None."""
 
     def joins(self, unknowns: Unknowns) -> PETSc.Mat | None:
-        """Return a zero matrix with the sparsity pattern of couplings between cell pressures, or None."""
+        """Return a zero matrix with the sparsity pattern of couplings between cell pressures; None without them."""
 
     def coupling(self, at: At) -> PETSc.Mat | None:
-        """Return minus the derivative of the forces in `push`, or None if `tangent` adds this derivative."""
+        """Return minus the derivative, with respect to u, of the forces in `push`, or None if `tangent` adds it."""
 
     def settle(self, at: At, sticks: bool) -> bool:
-        """Update the set of slipping positions, and return whether it changed.  `sticks` allows returns to stick."""
+        """Update the set of slipping positions.  Return whether it changed.  If `sticks`, they may stick again."""
         return False
 
     def augment(self, at: At) -> bool:
@@ -239,7 +239,7 @@ class Loads:
         return self
 
     def counted(self, at: At) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return local dofs (n,), and forces on them (n,), in N.  Wall reactions exclude these forces."""
+        """Return local dofs (n,), and forces on them (n,), in N, which do not belong to the wall reactions."""
         return np.empty(0, dtype=np.int64), np.empty(0)
 
     def within_reach(self) -> NDArray[np.int64]:
@@ -247,10 +247,10 @@ class Loads:
         return np.empty((0, 2), dtype=np.int64)
 
     def touching(self) -> tuple | None:
-        """Return the initial constraints of this condition.
+        """Return the constraints of displacements by this condition, before the first iteration.
 
-        The result has cells (n,), opposite cells (n,), positions (n, d) and directions (n, d) of n constraints.
-        Opposite cells belong to another body in contact, and are None without another body.
+        The result has cells (n,), opposite cells (n,), positions (n, d) and directions (n, d) of n constraints.  In
+        contact of two bodies, opposite cells belong to the second body; otherwise they are None.
         """
 
     @property
@@ -259,12 +259,12 @@ class Loads:
         return np.empty(0, dtype=np.int32)
 
     def rounding(self, of_cells: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the rounding errors (cells,), in N, of forces in local cells.  `of_cells`: errors of the stresses."""
+        """Return the rounding errors (cells,), in N, of forces in local cells.  `of_cells`: errors due to stresses."""
         return of_cells
 
     @property
     def rounding_beside(self) -> float:
-        """Return the rounding error of contact forces, in N, in the cells with the opposite positions."""
+        """Return the largest rounding error, in N, of contact forces in the opposite cells (see `touching`)."""
         return 0.0
 
     def outcome(self, at: At) -> dict[str, dict[str, NDArray[np.float64]]]:
@@ -272,7 +272,7 @@ class Loads:
         return {}
 
     def gripped(self, at: At, points: MaterialPoints) -> MaterialPoints:
-        """Return the points with updated fields of this condition."""
+        """Return the points after an update of the point fields of this condition."""
         return points
 
     def ended(self, at: At) -> Loads:
@@ -280,7 +280,7 @@ class Loads:
         return self
 
     def near(self, points: MaterialPoints, corners: NDArray[np.float64]) -> NDArray[np.bool_] | bool:
-        """Return which corners (n, 2^d, d) are near a contact after a step.  The Q1 field alone moves these corners."""
+        """Return which corners (n, 2^d, d) are near a contact after a step.  They move without `bending`."""
         return False
 
     def outside(
@@ -296,7 +296,7 @@ class Loads:
     def under_held(
         self, ids: NDArray[np.int64], tracked: NDArray[np.float64], volume: NDArray[np.float64], corners: NDArray
     ) -> NDArray[np.float64]:
-        """Return the corners (n, 2^d, d), in m, of re-initialised domains.  Domains at prescribed sides become prisms.
+        """Return corners (n, 2^d, d), in m, of re-initialised domains, as prisms at sides with prescribed displacement.
 
         `ids` (n,): identifiers of the points.
         `tracked`, `corners`: corners before and after re-initialisation from F.
@@ -329,7 +329,7 @@ class Acting:
     held: Sequence[tuple[Any, Surface, Sequence[int]]] = ()
     """Prescribed displacements, each with condition, faces and prescribed axes."""
     seeded: Sequence[Surface] = ()
-    """Faces not in `held` with conditions on displacements since seeding.  Renewal must not replace their domains."""
+    """Other faces whose conditions refer to displacements since seeding.  Renewal must not replace their domains."""
 
     def placed(self, place: Place) -> Loads:
         """Return the loads of a substep."""
@@ -339,7 +339,7 @@ class Acting:
         """Raise an error if the stage cannot start from the current positions."""
 
     def kept(self, n: int) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return initial values at n points of the fields of this condition, by condition and name of the field."""
+        """Return initial values, at n points, of the point fields of this condition, by condition and field name."""
         return {}
 
     def unknown(self, value: float) -> dict[str, dict[str, NDArray[np.float64]]]:

@@ -30,7 +30,7 @@ from mpm_dolfinx.materials.skeleton import Skeleton
 
 @dataclass(frozen=True, eq=False)
 class Condition:
-    """Base class of conditions.  `name` is the key of the results, by default type and side: "displacement_top"."""
+    """Base class of conditions.  Results are stored by `name`, by default type and side, such as "displacement_top"."""
 
     name: str | None = field(default=None, kw_only=True, repr=False)
     FUNCTIONS: ClassVar[Mapping[str, Sequence[str]]] = {"value": NAMES}
@@ -193,7 +193,7 @@ class Source:
     ----------
     term
         Function that returns a UFL form, linear in the test function q of the pressure, see `user_functions`.  A
-        positive rate (1/s) adds fluid.
+        positive factor of q (1/s) adds fluid.
     """
 
     term: Callable
@@ -289,7 +289,7 @@ class Inflow(Flux):
     side
         Side of the bodies, as for `Traction`.
     flux : float or callable (t, X, x) -> float, m/s
-        Volume (at zero pressure) of inflow per current area and time.  The flux is finite, and negative for outflow.
+        Inflow, as volume at zero pressure, per current area and time.  The flux is finite, and negative for outflow.
     region : ((d,), (d,)), m
         Box of reference positions.  The condition acts inside this box only.
 
@@ -325,11 +325,11 @@ class Rain(Flux):
     side
         Side of the bodies, as for `Traction`.
     flux : float or callable (t, X, x) -> float, m/s
-        Volume (at zero pressure) of rain per current area and time.  The flux is finite, and negative for potential
+        Rain, as volume at zero pressure, per current area and time.  The flux is finite, and negative for potential
         evaporation.  Vertical rain of rate r on a slope of angle b has the flux r cos(b).
     ponding
-        Pressure of a full pond, in Pa, >= 0: largest depth times unit weight.  The pond has uniform depth over the
-        side.  Ponded water infiltrates or evaporates later.
+        Pressure of a full pond, in Pa, >= 0: its depth times the unit weight of water.  The pond has uniform depth over
+        the side.  Ponded water infiltrates or evaporates later.
     driest
         Lowest pressure at the side, in Pa, < 0 and finite: the pore pressure in equilibrium with the air.  By
         Kelvin's equation, -1e7 Pa corresponds to air of 93 % humidity at 20 °C.  If the units are not SI, give a value.
@@ -368,7 +368,7 @@ class Tied(Condition):
     Parameters
     ----------
     side, other
-        Names of two opposite sides of a body from `box`, as for `Traction`.  Both sides must have equal faces.
+        Names of two opposite sides of a body from `box`, as for `Traction`.  Both sides must have congruent faces.
 
     Raises
     ------
@@ -404,7 +404,7 @@ and finer cells by 3.0e-02.
 
 
 def resistance(material: Skeleton) -> NDArray[np.float64]:
-    """Return the reference modulus, in Pa, of a side: the smaller of oedometric modulus and 4 G."""
+    """Return the reference modulus, in Pa, of a material at a side: the smaller of oedometric modulus and 4 G."""
     return np.minimum(material.oedometric, 4 * material.shear)
 
 
@@ -412,8 +412,8 @@ def holding(material: Skeleton) -> NDArray[np.float64]:
     """Return the reference modulus, in Pa, of the penalty for prescribed displacements.
 
     A nearly incompressible Q1 field cannot follow a curved side, so the penalty must not be much stiffer than the shear
-    stiffness.  In an undrained cavity, a penalty of 300 (lambda + 2G) gives up to 1.9 times the exact pressure.  A
-    penalty of 30 (4G) gives 1.01 times the exact pressure.
+    stiffness.  In an undrained cavity, the penalty modulus 300 (lambda + 2G) gives up to 1.9 times the exact pressure.
+    The modulus 30 (4G) gives 1.01 times the exact pressure.
     """
     return (YIELDING if material.state else 1.0) * resistance(material)
 
@@ -441,8 +441,8 @@ class Displacement(Condition):
     ------
     ValueError
         No body has this side, or `value` or `components` is invalid.  A wall fixes a component that moves.  Another
-        `Displacement` prescribes the component on the same part of a face, or another value at a common edge.  The
-        scene or a step raises the error.
+        `Displacement` prescribes this component on the same part of a face, or at a common edge with another value.
+        The scene or a step raises the error.
     """
 
     side: str
@@ -505,7 +505,7 @@ class RigidPlate(Condition):
             numbers("RigidPlate: force", self.force)
 
     def traction(self, area: float, inward: NDArray[np.float64]) -> Traction:
-        """Return the force along `inward` (d,), divided by the reference `area`, in m^(d-1), as a traction."""
+        """Return the plate's traction: the force along `inward` (d,), divided by the reference `area`, in m^(d-1)."""
 
         def even(t: float) -> NDArray[np.float64]:
             return inward * self._given("force", t) / area
@@ -514,13 +514,13 @@ class RigidPlate(Condition):
 
 
 def facing(faces: Surface) -> tuple[int, int]:
-    """Return the axis and the sign of the mean outward normal of seeded faces."""
+    """Return the axis nearest to the mean outward normal of seeded faces, and the sign of the normal along it."""
     outward = faces.outward.sum(axis=0)
     axis = int(np.abs(outward).argmax())
     return axis, int(np.sign(outward[axis]))
 
 
 def inward(faces: Surface) -> NDArray[np.float64]:
-    """Return the inward unit vector (d,) of seeded faces, along the axis of the mean normal."""
+    """Return the unit vector (d,) into the body, along the axis nearest to the mean normal of seeded faces."""
     axis, sign = facing(faces)
     return -sign * np.eye(faces.outward.shape[1])[axis]

@@ -26,7 +26,7 @@ class Record:
     record : file, or (n, 2)
         Two columns: times (in s) and values.  Blanks or commas separate the columns of a file, and # starts a comment.
     direction : (d,)
-        Direction of the motion, with a length that multiplies the values: for a record in units of g, (9.81, 0).
+        Direction of the motion.  Its length multiplies the values: use (9.81, 0) for a record in units of g.
     quantity
         Recorded quantity: "acceleration" (m/s^2) or "velocity" (m/s).
     at_rest

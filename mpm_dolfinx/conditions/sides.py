@@ -53,7 +53,7 @@ class Sides:
 
         If the region ends in a cell, and covers at most half of this cell, the faces in the cell are excluded.  On a
         side inclined to the grid, the faces end half a cell before the end of the region.  Both rules apply only if the
-        side continues beyond the region without another prescribed displacement (`others`).
+        side continues beyond the region, and none of `others` prescribes displacements there.
         """
         faces, d = self.of(condition), self.grid.dim
         box, X = faces.region.copy(), faces.X
@@ -132,7 +132,7 @@ class Sides:
         return joined([self.around(np.flatnonzero(copy == group).tolist()) for group in np.unique(copy)])
 
     def meeting(self, one: Surface, other: Surface) -> NDArray[np.float64]:
-        """Return the reference positions (n, d), in m, of common corners of the faces of two conditions."""
+        """Return the reference positions (n, d), in m, of corners that faces of both conditions share."""
         dim, ends = self.grid.dim, np.cumsum([len(body) for body in self.bodies])
         moved = np.array([i if body.map is not None else -1 for i, body in enumerate(self.bodies)])
 

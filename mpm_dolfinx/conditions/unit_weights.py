@@ -26,7 +26,7 @@ Gravity = ArrayLike | Callable[[float], ArrayLike] | None
 
 
 def under(fluid: Fluid | None, gravity: Gravity) -> Fluid | None:
-    """Return the fluid with the gravity of the scene, if this gravity is constant."""
+    """Return the fluid, with the gravity of the scene if this gravity is constant and the fluid has no other."""
     if fluid is None or fluid.gravity is not None or gravity is None or callable(gravity):
         return fluid
     strength = float(np.linalg.norm(numbers("gravity", gravity, None, allowed="finite numbers")))
@@ -34,7 +34,7 @@ def under(fluid: Fluid | None, gravity: Gravity) -> Fluid | None:
 
 
 def weighed(value, fluid: Fluid | None):
-    """Return a water pressure, by default with the unit weight of the pore fluid."""
+    """Return the value of a condition.  A water pressure without unit weight gets the unit weight of the pore fluid."""
     by_fluid = isinstance(value, OfWater) and value.given is None and fluid is not None
     return replace(value, given=fluid.unit_weight) if by_fluid else value
 
@@ -90,7 +90,7 @@ def warn_levels(comm: MPI.Intracomm, fluid: Fluid | None, gravity: Gravity, leve
 
 
 def other_gravity(fluid: Fluid, gravity: Sequence[NDArray[np.float64]]) -> float | None:
-    """Return the last magnitude of `gravity`, in m/s^2, or None if conductivities refer to this gravity.
+    """Return the last magnitude of `gravity`, in m/s^2, if it differs from the gravity of conductivities, or None.
 
     If gravity varies in the step, and its last magnitude is at most 9.81 m/s^2, the function returns None.
 

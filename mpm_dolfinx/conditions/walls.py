@@ -69,7 +69,7 @@ def wall_forces(
 ) -> dict[str, NDArray[np.float64]]:
     """Return the force (d,), in N, of each wall by name.  All processes must call this function.
 
-    If several walls fix a component of a node, the wall normal to this component has the force.  Otherwise these walls
+    If several walls fix a component of a node, the wall normal to this component gets the force.  Otherwise these walls
     have equal shares of the force.
 
     `dofs` (n,): flat local degrees of freedom, possibly repeated.
