@@ -18,8 +18,8 @@ from mpm_dolfinx.stepping.state import State
 class CellFields:
     """Fields of the n cells of this process that contain material.
 
-    Means are volume averages over the material in a cell, second-order accurate at its centroid `x`.  If grid lines
-    move, they are at their positions of the next step.
+    Means are volume averages over the material in a cell.  As values at its centroid `x`, they have second order.  If
+    grid lines move, cells refer to the lines of the next step.
 
     Attributes
     ----------
@@ -62,7 +62,7 @@ def cell_fields(scene: Scene, state: State) -> CellFields:
     volume = sum_by(places.slots, weight, len(places.filled))
 
     def mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the mean in each cell of the values of its pieces."""
+        """Return the volume-weighted mean, in each cell, of the values of its pieces."""
         return means_of_rows(places.slots, weight, values, len(volume))
 
     effective = mean(cut.to_cells(scene.materials.effective_stress(points)))

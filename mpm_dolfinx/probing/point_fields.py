@@ -25,8 +25,8 @@ class PointFields:
     mean_effective_stress : (n,), Pa
         `p' = -tr(effective stress) / 3`, positive in compression.
     deviatoric_stress : (n,), Pa
-        `q = sqrt(3/2 s : s)`, with the deviator s of the stress.  In a triaxial test q is the axial stress minus the
-        radial stress, without sign.
+        `q = sqrt(3/2 s : s)`, with the deviator s of the stress.  In a triaxial test, q is the absolute difference of
+        axial and radial stress.
     porosity : (n,)
         Present porosity, `1 - (1 - n_0) / J`, with the initial porosity n_0 and the volume ratio J.
     saturation : (n,)

@@ -49,7 +49,7 @@ class _Lattice:
     `number` (n, cells): lexicographic indices of the cells in the grid, or -1 outside the grid.
     `middle`: index of the probe's cell in its block.
     `stride` (d,): increment of the index in a block to the next cell along each axis.
-    `neighbours`: indices of cells, and of their neighbours, in a block, by axis and end (0 or 1).
+    `neighbours`: for each axis and end (0 or 1), indices in a block of cells, and of their neighbours.
     """
 
     def __init__(self, grid: Grid, cell: NDArray[np.int64]):
@@ -208,7 +208,7 @@ class _Around:
         return low, high
 
     def _outside_faces(self, head: NDArray[np.float64]) -> list[tuple[NDArray, ...]]:
-        """Return probe, position, head and weight of each face between cells of the fit and other connected cells."""
+        """Return probe, position, head and weight of each face between cells of the fit and cells outside the fit."""
         out = []
         for (axis, end), pair in self._lattice.neighbours.items():
             own_cells, other_cells = pair
@@ -229,7 +229,8 @@ class _Around:
         return out
 
     def _drained(self, weight: NDArray[np.float64]) -> tuple[NDArray, ...]:
-        """Return for each drained side of a cell: probe, position, head, weight, and whether the probe is in this cell.
+        """Return for each drained side of a cell: probe, position, head, weight, and whether it is the probe's own
+        cell.
 
         Positions and heads are means over all drained faces on the side.
         """

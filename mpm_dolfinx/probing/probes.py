@@ -31,7 +31,7 @@ class Probes:
     stressed: bool = False  # whether stresses are recorded too
 
     def check(self, bodies: Sequence[Body], present: Sequence[bool]) -> None:
-        """Raise ValueError if the probes were made for other bodies, or if a probe is in an absent body."""
+        """Raise ValueError if the probes were made for another scene's bodies, or if a probe is in an absent body."""
         if len(bodies) != len(self.bodies) or not all(map(_same, bodies, self.bodies)):
             what = f"made for {len(self.bodies)} bodies, the scene has {len(bodies)}"
             raise ValueError(f"probes: {what}; must be made with all bodies of the scene, in the scene's order")
@@ -54,7 +54,7 @@ class Probes:
     def _shared(
         self, comm: MPI.Intracomm, known: NDArray[np.int64], values: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return the values of all probes.  `values`: values of the probes `known` on this process."""
+        """Return the values of all probes on all processes.  `values`: values here of the probes `known`."""
         out = np.zeros((len(self.id), *values.shape[1:]))
         out[known] = values
         return over_all(comm, out)
