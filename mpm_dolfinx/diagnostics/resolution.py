@@ -23,11 +23,11 @@ from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
 from mpm_dolfinx.points.material_points import body_of
 
 FULL = 1.2
-"""Filled fraction of a cell above which a warning is given.  Undistorted domains below a deep footing reach 1.08."""
+"""Filled fraction of a cell above which a warning is given.  Undistorted domains below a deep footing fill 1.08."""
 
 
 def warn_overlaps(cut: CutDomains, bodies: Sequence[Body]) -> Callable[..., Any] | None:
-    """Warn about the fullest cell if particle domains overlap.  Return the function for the next check, or None."""
+    """Warn about the fullest cell if particle domains overlap.  Return the next check, or None after a warning."""
     grid, points = cut.grid, cut.points
     volume = cut.shares(points.volume0 * points.J)
     fill = sum_by(cut.cells, cut.plane(volume)[0], grid.num_owned)[cut.cells] / grid.volumes(cut.cells)
@@ -57,11 +57,11 @@ def bodies_in(cut: CutDomains, bodies: Sequence[Body], cell: int) -> tuple[list[
 
 
 LOSS = 0.03
-"""Lost fraction of the deformation of a soft material in cells with stiffer materials that causes a warning."""
+"""A warning is given if a soft material loses this fraction of its deformation in cells with stiffer materials."""
 AGAIN = 2.0
-"""Factor by which the lost fraction must grow before the next warning, as interfaces move through cells."""
+"""Factor by which the lost fraction must grow, as interfaces move through cells, before the next warning."""
 FINE = 0.1
-"""Lost fraction in one cell below which the loss is ignored.  Stiffness ratios below 2.1 cause smaller losses."""
+"""Lost fraction in one cell below which it is ignored.  Stiffness ratios below 2.1 cause losses below this value."""
 
 
 def warn_mixed(
@@ -74,7 +74,7 @@ def warn_mixed(
     Returns
     -------
     callable
-        Function for later checks, with a larger `least` after a warning.
+        Function for the next check.  If this call has warned, the threshold `least` of the next check is larger.
     """
     grid = cut.grid
     points = cut.points
@@ -137,7 +137,7 @@ def warn_thin(grid: Grid, bodies: Sequence[Body], walls: Mapping[str, str], wet:
     The stress increment of a step is constant in a cut domain.  In a single step, n points over the thickness therefore
     give `1 - 1/n^2` of the bending stiffness.  In several steps the fraction is larger (`domain_slopes`).  A body with
     one point over its thickness carries no moment.  It creeps from step to step, because only the stress increments
-    resist bending.  Saturated bodies (`wet`) lose more stiffness, and also creep with more points.
+    resist bending.  Saturated bodies (`wet`) lose more stiffness, and creep even with several points.
     """
     few, slender = (FEW_WET, SLENDER_WET) if wet else (FEW, SLENDER)
     for i, body in enumerate(bodies):
@@ -158,7 +158,7 @@ def check_stiff(grid: Grid, bodies: Sequence[Body]) -> None:
     """Raise ValueError for 3D bodies with one domain in each cell, if domains end at grid lines along two axes.
 
     Displacements that alternate from node to node along both axes then have zero mean gradients in all pieces, and no
-    stiffness.  They may vary in any way along the third axis.  In 2D each component has a single displacement field of
+    stiffness.  Along the third axis they may vary in any way.  In 2D each component has a single displacement field of
     this kind, and walls prevent it.
     """
     for i, body in enumerate(bodies if grid.dim == 3 else ()):
@@ -182,7 +182,7 @@ def check_stiff(grid: Grid, bodies: Sequence[Body]) -> None:
 
 
 def _edge(grid: Grid, body: Body, axis: int) -> float:
-    """Return the mean edge length (m) of the body's cells along an axis."""
+    """Return the mean edge length (m), along an axis, of the grid cells that contain the body."""
     low, high = body.bounds
     return float(((high - low) / np.ptp(grid.in_cells(np.stack([low, high]) - grid.base), axis=0))[axis])
 
