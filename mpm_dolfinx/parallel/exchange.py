@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Transfer of array rows to other processes, and of answers back to the senders.
 
-A row contains the values of one piece of a particle domain, one corner or one loaded point in a cell.  The process that
-owns the cell receives the row, and assembles the integrals of the cell.
+A row contains the values of one domain piece, one corner or one loaded point.  The process that owns the cell receives
+the row, and assembles the integrals of the cell.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class Exchange:
         return self._transfer(rows, 1, self._sf.reduceBegin, self._sf.reduceEnd)
 
     def back(self, rows: NDArray) -> NDArray:
-        """Send back one answer (a row) for each received row, and return the answers to all sent rows."""
+        """Send one row in answer to each received row.  Return the answers to all rows that this process sent."""
         if self.comm.size == 1:
             return rows
         return self._transfer(rows, 0, self._sf.bcastBegin, self._sf.bcastEnd)
@@ -107,7 +107,7 @@ def to_root(comm: MPI.Intracomm, rows: int) -> Exchange:
 
 
 def evenly(comm: MPI.Intracomm, numbers: NDArray[np.int64]) -> NDArray[np.int32]:
-    """Return a rank (n,) for each of the ascending numbers (n,) >= 0, so that all ranks get equally many numbers.
+    """Assign the ascending numbers (n,) >= 0 to ranks, so that all ranks get equally many.  Return the ranks (n,).
 
     All numbers of all processes are distinct.  The smallest numbers get rank 0, larger numbers rank 1, and so on.
     """
@@ -150,7 +150,7 @@ def at_root(comm: MPI.Intracomm, action: Callable[[], T]) -> T:
 def by_user(comm: MPI.Intracomm, name: str, action: Callable[[], T]) -> T:
     """Return the result of a user's function `name`.  If it fails on one process, all processes raise an error.
 
-    The process where it fails, also by Ctrl-C, raises the original error.  All other processes raise a RuntimeError.
+    The process where it fails or is interrupted raises the original error.  All other processes raise a RuntimeError.
     """
     value = raised = None
     try:

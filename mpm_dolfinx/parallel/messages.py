@@ -14,7 +14,7 @@ from tqdm import tqdm
 logger = logging.getLogger("mpm_dolfinx")
 
 WITHIN = {"mpm_dolfinx", "contextlib", "functools"}
-"""Packages that the origin of a warning skips, so that the warning names a line of the user's script."""
+"""Packages whose stack frames a warning skips, so that it names a line of the user's script."""
 
 
 class ResultWarning(UserWarning):

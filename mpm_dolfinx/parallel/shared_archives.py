@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Numpy archives (.npz) whose arrays several processes write and read together, by rows.
 
-Each process writes its own rows, and reads an equal number of rows.  No process has an array of all rows in memory.
+Each process writes its own rows, and reads an equal share of all rows.  No process has an array of all rows in memory.
 The file does not depend on the number of processes that wrote it.
 """
 
@@ -44,7 +44,7 @@ def write(comm: MPI.Intracomm, file: Path, arrays: Mapping[str, NDArray], rows: 
 
     If a process cannot write, all processes raise its error.
 
-    `arrays`: arrays by name, on rank 0.
+    `arrays`: arrays by name that are not distributed, on rank 0.
     `rows`: this process's rows (n, ...) of distributed arrays, by name.  The file contains the rows of all processes,
     in the order of the ranks.
     """
@@ -99,7 +99,7 @@ def write(comm: MPI.Intracomm, file: Path, arrays: Mapping[str, NDArray], rows: 
 
 
 def members(file: Path, names: Iterable[str]) -> dict[str, Member]:
-    """Find named arrays in an archive, by name.  Raise ValueError if an array is compressed or incomplete."""
+    """Return the `Member` of each named array.  Raise ValueError if an array is compressed or incomplete."""
     out = {}
     with open(file, "rb") as f, ZipFile(f) as archive:
         for name in names:
@@ -131,10 +131,10 @@ def read(
 ) -> dict[str, NDArray]:
     """Return the rows that this process reads from each array in an archive, by name of the array.
 
-    Raise ValueError on all processes if the bytes of an array do not have its checksum.
+    Raise ValueError on all processes if an array differs from its checksum.
 
     `of`: result of `members`.
-    `ranges`: first row, and last row plus one, that this process reads, by name of the array.  The processes read
+    `ranges`: for each array name, the first row that this process reads, and the last row plus one.  The processes read
     consecutive rows, and together all rows.
     """
     rows = together(comm, lambda: {name: some_rows(file, of[name], *ranges[name]) for name in of})
@@ -162,7 +162,7 @@ def _row_bytes(dtype: np.dtype, shape: tuple[int, ...]) -> int:
 
 
 def _joined(crc: int, parts: Iterable[tuple[int, int]]) -> int:
-    """Return the checksum of bytes with checksum `crc`, followed by parts with given checksums and lengths."""
+    """Return the checksum of bytes with checksum `crc`, followed by bytes whose checksums and lengths are `parts`."""
     for more, length in parts:
         for k in range(length.bit_length()):
             crc = _product(_power(k), crc) if length >> k & 1 else crc
@@ -172,7 +172,7 @@ def _joined(crc: int, parts: Iterable[tuple[int, int]]) -> int:
 
 @cache
 def _power(k: int) -> int:
-    """Return the factor `x^(8 2^k)` of a checksum for 2^k following bytes."""
+    """Return the polynomial `x^(8 2^k)`, by which a checksum is multiplied if 2^k bytes follow."""
     return _product(_power(k - 1), _power(k - 1)) if k else ONE >> 8
 
 
