@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Background grid: a box of quadrilaterals or hexahedra between lines along the axes.
 
-A grid of equal cells computes the cells of points by division.  Other grids search along each axis.  Methods such as
+With equal cells, a division finds the cell of a point.  Other grids search along each axis.  Methods such as
 `sizes` and `volumes` return a value for each cell, but for equal cells a single row (`h`) or a single number.
 
 The mesh is created at its first use.  Before its first use, a simulation distributes the cells to processes by numbers
@@ -67,11 +67,11 @@ def _faces(dim: int) -> NDArray[np.int64]:
 FACES = {d: _faces(d) for d in (2, 3)}
 """Corner indices (2d, 2^(d-1)) of the faces of a cell or a particle domain."""
 FACE_SIGNS = (-1, 1, 1, -1, -1, 1)
-"""Direction of the normals (6,) of faces with corners in the order of `FACES`: 1 outward, -1 inward.  In 2D there are
-only the first four.
+"""Direction of the normals (6,) of faces with corners in the order of `FACES`: 1 outward, -1 inward.  In 2D, only the
+first four apply.
 """
 ABOUT_MIDDLE = ((0, 1, 4), (1, 3, 4), (3, 2, 4), (2, 0, 4))
-"""Triangles that divide a face in 3D symmetrically.  Each triangle has two corners and the middle of the face."""
+"""Triangles that divide a face in 3D symmetrically.  Each has two corners of the face, and its middle (4)."""
 
 
 def side(name: str, dim: int) -> tuple[int, int]:
@@ -110,7 +110,7 @@ def means_of_rows(index: NDArray, weight: NDArray, rows: NDArray[np.float64], si
 
 
 def linked(count: int, one: NDArray[np.int64], other: NDArray[np.int64]) -> tuple[NDArray[np.int64], int]:
-    """Return the group (count,) of each object, and the number of groups.  Links connect the objects of a group.
+    """Return the group index (count,) of each object, and the number of groups.  Links connect objects of a group.
 
     `one`, `other` (m,): the two objects of each link.
     """
@@ -141,7 +141,7 @@ def polynomial(
 
 
 def ranges(first: NDArray[np.int64], count: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return all integers (n,) in the ranges `first` to `first + count - 1`, after the index (n,) of their range."""
+    """Return the range index (n,), and the value (n,), of all integers in the ranges `first` to `first + count - 1`."""
     of = np.arange(len(count)).repeat(count)
     return of, np.arange(len(of)) + np.repeat(first - (np.cumsum(count) - count), count)
 
@@ -194,7 +194,7 @@ class Spacing(NamedTuple):
 
 
 class LocalCells:
-    """Table that converts lexicographic indices of cells to local indices: `self[number]`, -1 on other processes.
+    """Table from lexicographic to local indices of cells: `self[number]`.  Cells of other processes have index -1.
 
     `number` (cells,): lexicographic indices of the local cells.
     """
@@ -283,7 +283,7 @@ class Cells:
 
     @cached_property
     def near_others(self) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Masks of local nodes within two cells of nodes that processes share, and of local cells with such nodes."""
+        """Masks of local nodes within two cells of nodes that processes share, and of local cells with shared nodes."""
         holders = fem.Function(self._nodes)
         holders.x.array[:] = 1.0
         _compat.scatter_reverse_add(holders)
@@ -359,8 +359,8 @@ class Grid:
     Raises
     ------
     ValueError
-        Corners or lines are not finite or not ascending.  Numbers of cells are not integers >= 1.  There are too many
-        nodes for PETSc.  An axisymmetric grid is in 3D or has r < 0.  `follow` is given without lines.
+        Corners or lines are not finite or not ascending.  Numbers of cells are not integers >= 1.  PETSc cannot number
+        so many nodes.  An axisymmetric grid is in 3D or has r < 0.  `follow` is given without lines.
 
     Attributes
     ----------
@@ -444,7 +444,7 @@ class Grid:
         self._cells: Cells | None = None
 
     def from_base(self, lines: Sequence[NDArray[np.float64]]) -> tuple[NDArray[np.float64], ...]:
-        """Convert lines (n,), in m, along each axis from true coordinates to coordinates relative to the base."""
+        """Convert lines (n,), in m, along each axis from the user's coordinates to coordinates relative to the base."""
         return tuple(x - start for x, start in zip(lines, self.base, strict=True))
 
     def _spaced(self, lines: tuple[NDArray[np.float64], ...] | None) -> Spacing:
@@ -534,7 +534,7 @@ class Grid:
         return np.abs(self.in_cells(y) - self.in_cells(x))
 
     def places(self, index: NDArray[np.integer], share: NDArray[np.float64] | float = 0.0) -> NDArray[np.float64]:
-        """Return positions (n, d) in m from the base, at the fraction `share` of the edges of cells.
+        """Return positions (n, d) in cells, in m from the base: lower corner plus the fraction `share` of the edges.
 
         `index` (n, d): indices of cells along the axes.  Beyond a side, cells are as large as the outermost cell.
         """
@@ -585,7 +585,7 @@ class Grid:
 
     @property
     def _of_process(self) -> Cells:
-        """The cells of this process.  Without loads, each process has an equal number of cells."""
+        """The cells of this process.  Without earlier `share`, processes get equally many cells."""
         if self._cells is None:
             self.share(np.zeros(int(np.prod(self.shape))))
         return self._cells
@@ -626,7 +626,7 @@ class Grid:
         Partition(boxes, tuple(self.shape))
 
     def distributed(self, boxes: NDArray[np.int64]) -> Grid:
-        """Return a copy of this grid and its present lines, with the boxes (ranks, 2, d) of the processes."""
+        """Return a copy of this grid, with its present lines, in which processes own the boxes (ranks, 2, d)."""
         other = self._again()
         other.seeded, other._spacing = self.seeded, self._spacing
         other._cells = other._made(boxes)
@@ -666,17 +666,17 @@ class Grid:
 
     @property
     def cells(self) -> int:
-        """Number of cells of one copy."""
+        """Number of cells in one copy of the box."""
         return prod(self.shape.tolist())
 
     @cached_property
     def all_cells(self) -> int:
-        """Number of cells of all copies."""
+        """Number of cells in all copies of the box."""
         return self.copies * self.cells
 
     @property
     def nodes(self) -> int:
-        """Number of nodes of one copy."""
+        """Number of nodes in one copy of the box."""
         return int(np.prod(self.shape + 1))
 
     def copy(self, ids: NDArray[np.int64]) -> NDArray[np.int64] | int:
@@ -693,7 +693,7 @@ class Grid:
 
     @property
     def given(self) -> dict[str, Any]:
-        """Arguments with which `Grid` creates an equal grid, by name."""
+        """Keyword arguments with which `Grid` creates a copy of this grid."""
         rest = {"axisymmetric": self.axisymmetric, "comm": self.comm}
         if self.even:
             return {"lower": self.lower, "upper": self.upper, "cells": self.shape, **rest}
@@ -719,7 +719,7 @@ class Grid:
         return np.ravel_multi_index(tuple(index.T), tuple(self.shape))
 
     def index(self, x: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the indices (n, d) of the cells nearest to true positions x, in m."""
+        """Return the indices (n, d) of the cells nearest to positions x in the user's coordinates, in m."""
         return self.index_from_base(x - self.base)
 
     def index_from_base(self, x: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -770,7 +770,7 @@ class Grid:
         return np.ravel_multi_index(tuple(index), tuple(self.shape + 1)) + copy * self.nodes
 
     def from_other(self, other: Grid, nodal: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return nodal values (unknowns,) on this grid from nodal values on an equal grid with another partition."""
+        """Return nodal values (unknowns,) from values on `other`, a copy of this grid with another partition."""
         rows = nodal.reshape(-1, self.dim)
         some = rows.any(axis=1)
         return self.from_rows(other.node_numbers()[some], rows[some])
@@ -861,7 +861,7 @@ class Grid:
         return out
 
     def _hats(self, cells: NDArray[np.int32], x: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-        """Return the factors of the Q1 shape functions, one for each axis.  A factor is linear along its axis."""
+        """Return the factors of the Q1 shape functions, one for each axis.  Each is linear in one coordinate."""
         y = (x - self.midpoints[cells]) / self.sizes(cells)
         return [0.5 + y[:, a, None] * self.signs[:, a] for a in range(self.dim)]
 
@@ -893,7 +893,7 @@ def begin_with(name: str, grid: Any) -> None:
 class GridOfGroups(Grid):
     """A grid with a separate copy of the box for each contact group, so that groups share no nodes.
 
-    All copies occupy the same space.  Cells at the same place in all copies belong to the same process.
+    All copies occupy the same space.  Cells at the same position in all copies belong to the same process.
 
     `grid`: grid of the bodies.
     `group` (bodies,): index, from 0, of the group of each body.

@@ -17,7 +17,7 @@ MOST = 2**31 - 1
 
 
 def rounding(x: NDArray[np.float64]) -> float:
-    """Return the largest rounding error, in m, of coordinates of the magnitude of x, in m."""
+    """Return the largest rounding error, in m, of coordinates as large as x, in m."""
     return 8 * EPSILON * float(np.abs(x).max(initial=0.0))
 
 
@@ -60,8 +60,8 @@ def graded(
     lower, upper : (d,), m
         Lower and upper corner of the grid; d = 2 or 3.
     fine : (boxes, 2, d), m
-        Lower and upper corners of at least one fine box.  Boxes must be inside the grid.  Small cells also fill the gap
-        between two boxes, or between a box and a side, if it is narrower than a cell.
+        Lower and upper corners of at least one fine box.  Boxes must be inside the grid.  Small cells also fill gaps
+        narrower than `size` between two boxes, or between a box and a side.
     size : number or (d,), m
         Largest edge lengths > 0 of the small cells.  Cells may be smaller, because each box contains a whole number of
         cells.

@@ -134,7 +134,7 @@ def _extent(filled: NDArray[np.bool_], axis: int) -> int:
 
 
 def destinations(partition: Partition, cells: NDArray[np.int64]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Return one list with the ranks that have each cell, its owner first, and the start of each cell in the list.
+    """Return one list of the ranks that have each cell, owner first, and the position of each cell's first rank.
 
     `cells` (n,): lexicographic indices.  A cell is a ghost on the processes that own its neighbours across faces.
     """
