@@ -35,7 +35,7 @@ def shear_name(name: str) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Origin:
-    """For each contact pair, its material point and its contact."""
+    """For each contact pair, the indices of its material point and its contact."""
 
     exchange: Exchange  # sends the pairs to the owners of their cells
     point: NDArray[np.int64]  # index of the material point on this process (n,)

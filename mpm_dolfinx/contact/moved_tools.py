@@ -66,7 +66,7 @@ class MotionEquation(NamedTuple):
 
 
 class MovedTools(ContactProblem):
-    """Base class that extends `ToolLoads`: forces move the tools."""
+    """Base class that extends `ToolLoads` by the motion of tools due to forces."""
 
     couples = True
 

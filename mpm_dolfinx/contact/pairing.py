@@ -36,7 +36,7 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 from mpm_dolfinx.points.parts import parts_of_domains
 
 REACH = 2.0
-"""Largest gap, divided by the cell size, that may close in a step.  Source: definition, one cell per body."""
+"""Largest gap, in cell sizes, that may close in a step, if both bodies move by one cell.  Source: definition."""
 DEEP = 0.25
 """Largest penetration at which a pair is found, and smallest gap at which it may be dropped, in cell sizes."""
 BESIDE = 0.6
@@ -334,7 +334,7 @@ def _rotated(shear: NDArray[np.float64], n: NDArray[np.float64]) -> NDArray[np.f
 
 
 def _on(corners: NDArray[np.float64], t: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the positions at face coordinates t, in [0, 1], on faces with these corners."""
+    """Return the positions at face coordinates t, in [0, 1], on faces with given corners."""
     if corners.shape[2] == 2:
         return corners[:, 0] + t[:, :1] * (corners[:, 1] - corners[:, 0])
     return np.einsum("mk,mkd->md", weights(t), corners)

@@ -64,7 +64,7 @@ class Pairs:
         return self.grid.reach
 
     def other_side(self) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
-        """Return the cells (m,) and shape functions (m, 2^d) at the opposite positions, or None on tools."""
+        """Return the cells (m,) and shape functions (m, 2^d) at the opposite positions, or None for tools."""
         return None
 
     def operator(self, unknowns: Unknowns) -> PETSc.Mat:
@@ -135,7 +135,7 @@ class FacePairs(Pairs):
     outward: NDArray[np.float64]
 
     def at(self, w: NDArray[np.float64], motion: NDArray[np.float64]) -> Geometry:
-        """See `Pairs`.  Lever arms refer to the start of the step."""
+        """See `Pairs`.  Lever arms refer to positions at the start of the step."""
         gap = np.einsum("md,md->m", self.n, self.offset + w)
         return Geometry(gap, self.n, None, w, self.x + self.grid.base, self.shear)
 

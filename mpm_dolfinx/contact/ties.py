@@ -111,7 +111,7 @@ class TieLoads(Loads):
     cell : (m,)
         Local cells that contain positions on one side.
     x : (m, d), m
-        These positions.
+        Positions on this side.
     other : (m,)
         Lexicographic cells that contain the opposite positions; other processes may own them.
     y : (m, d), m

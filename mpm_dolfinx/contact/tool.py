@@ -236,7 +236,7 @@ class Tool:
         return self.friction > 0 or self.adhesion > 0
 
     def solid(self, h: float) -> Shape:
-        """Return the shape.  `h` is the cell size, in m."""
+        """Return the shape.  `h` is the cell size, in m, for finite differences."""
         return Distance(self.shape, h, self._base) if callable(self.shape) else self._moved or self.shape
 
     def gap(self, y: NDArray[np.float64], h: float) -> NDArray[np.float64]:

@@ -108,7 +108,7 @@ class Tools(Touching):
         return self._pose(self.tools[number], t)
 
     def _posed(self, tool: Tool, start: float, t: float) -> Pose:
-        """Return the pose of a tool at the end of a substep.  With inertia, its velocity has second order."""
+        """Return the pose of a tool at the end of a substep; with inertia, velocities have second-order accuracy."""
         pose = self._pose(tool, t)
         if self._end is None or not start < t < self._end or tool.free:
             return pose
@@ -220,7 +220,7 @@ class Tools(Touching):
     ) -> NDArray[np.bool_]:
         """Return which positions below a tool are within half a cell of an edge of the tool.
 
-        These positions have no contact, because the last loaded node also represents half a cell outside the edge.
+        These positions have no contact, because the last loaded node also represents the half cell beyond the edge.
         Edges beyond which the surface of the body does not continue are ignored.
         """
         grid, (y, n) = self.grid, (x[faces], unit[faces])
