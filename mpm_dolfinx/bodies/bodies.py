@@ -202,7 +202,7 @@ def mapped(grid: Grid, body: Body, map: Callable[[NDArray[np.float64]], NDArray[
     grid
         Background grid.
     body
-        Body from `box`, `shape`, `from_mesh`, `polygon`, or `mapped`.  An existing map is applied first.
+        Body from `box`, `shape`, `from_mesh`, `polygon`, or `mapped`.  An earlier map of this body is applied first.
     map
         Smooth function from positions (n, d) to positions (n, d) in the grid, both in m.  The Jacobian determinant must
         be positive.

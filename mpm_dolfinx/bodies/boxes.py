@@ -106,7 +106,7 @@ class LatticeBody(Body):
 
     @property
     def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Lower and upper corners (d,) of the body's bounding box before the map, in m."""
+        """Lower and upper corner (d,), in m, of the bounding box of all reference domains."""
         low, high = self._ends
         return self._at(low), self._at(high + 1)
 

@@ -188,7 +188,7 @@ def _divided(grid: Grid, mesh: Mesh, part: str | None, per_cell: int, name: str)
 def _domains(mesh: Mesh, cells: Mapping[str, NDArray[np.int64]]) -> list[tuple[NDArray, NDArray, NDArray]]:
     """Return the corners of the particle domains, the mesh facet of each face, and the cell of each domain.
 
-    A facet is a row of node indices; rows of triangles begin with -1.  In rows of faces inside a cell, all are -1.
+    A facet is a row of node indices; for triangles, it begins with -1.  For faces inside cells, all entries are -1.
     """
     d = mesh.x.shape[1]
     start = 0
