@@ -192,7 +192,7 @@ class Loads:
         """Add resisting forces at u, with the sign of the internal forces."""
 
     def takes_up(self, b: NDArray[np.float64]) -> None:
-        """Add forces at u that count as internal forces."""
+        """Add forces at u that count as internal forces, such as minus the weight of pore fluid that flows in."""
 
     def penalty(self, A: PETSc.Mat, walls: bool) -> None:
         """Add the stiffness matrix of forces linear in u.  `walls`: whether to add rows of dofs that walls fix."""
@@ -280,7 +280,7 @@ class Loads:
         return self
 
     def near(self, points: MaterialPoints, corners: NDArray[np.float64]) -> NDArray[np.bool_] | bool:
-        """Return which corners (n, 2^d, d) are near a contact after a step.  They move without `bending`."""
+        """Return which corners (n, 2^d, d) are near a contact after a step, and move without correction for bending."""
         return False
 
     def outside(
@@ -329,7 +329,7 @@ class Acting:
     held: Sequence[tuple[Any, Surface, Sequence[int]]] = ()
     """Prescribed displacements, each with condition, faces and prescribed axes."""
     seeded: Sequence[Surface] = ()
-    """Other faces whose conditions refer to displacements since seeding.  Renewal must not replace their domains."""
+    """Faces not in `held` whose conditions refer to seeded positions.  Renewal must not replace their domains."""
 
     def placed(self, place: Place) -> Loads:
         """Return the loads of a substep."""

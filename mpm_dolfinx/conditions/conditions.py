@@ -231,7 +231,7 @@ class Drained(Condition):
     region : ((d,), (d,)), m
         Box of reference positions.  The condition acts inside this box only.
     seepage
-        Whether the side is a seepage face above the water level, which is where `pressure` <= 0.  Water can leave
+        Whether the side is a seepage face where `pressure` <= 0, which is above the water level.  Water can leave
         through a seepage face, but cannot enter.
 
     Raises

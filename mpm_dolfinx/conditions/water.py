@@ -42,7 +42,7 @@ def water(
     Raises
     ------
     ValueError
-        A value is out of range.  For a function, a step raises the error.
+        A value is out of range.  If `level` is a function, a step raises the error.
     """
     if unit_weight is not None:
         numbers("water: unit_weight", unit_weight, test=lambda v: (0 < v) & (v < np.inf), allowed="> 0 and finite")
