@@ -18,8 +18,8 @@ from mpm_dolfinx.stepping.state import State
 class CellFields:
     """Fields of the n cells of this process that contain material.
 
-    Means are volume averages over the material in a cell.  As values at its centroid `x`, they have second order.  If
-    grid lines move, cells refer to the lines of the next step.
+    Means are volume averages over the material in a cell.  They approximate values at its centroid `x` to second order.
+    If grid lines move, cells refer to the lines of the next step.
 
     Attributes
     ----------

@@ -229,8 +229,7 @@ class _Around:
         return out
 
     def _drained(self, weight: NDArray[np.float64]) -> tuple[NDArray, ...]:
-        """Return for each drained side of a cell: probe, position, head, weight, and whether it is the probe's own
-        cell.
+        """Return for each drained side of a cell: probe, position, head, weight, and whether this is the probe's cell.
 
         Positions and heads are means over all drained faces on the side.
         """

@@ -54,7 +54,7 @@ class Probes:
     def _shared(
         self, comm: MPI.Intracomm, known: NDArray[np.int64], values: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return the values of all probes on all processes.  `values`: values here of the probes `known`."""
+        """Return the values of all probes on all processes.  `values`: values of the probes `known` here."""
         out = np.zeros((len(self.id), *values.shape[1:]))
         out[known] = values
         return over_all(comm, out)
