@@ -23,7 +23,7 @@ from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
 from mpm_dolfinx.points.material_points import body_of
 
 FULL = 1.2
-"""Filled fraction of a cell above which a warning is given.  Undistorted domains below a deep footing fill 1.08."""
+"""Filled fraction of a cell above which a warning is given.  Cells below a deep footing are filled up to 1.08."""
 
 
 def warn_overlaps(cut: CutDomains, bodies: Sequence[Body]) -> Callable[..., Any] | None:
@@ -61,7 +61,7 @@ LOSS = 0.03
 AGAIN = 2.0
 """Factor by which the lost fraction must grow, as interfaces move through cells, before the next warning."""
 FINE = 0.1
-"""Lost fraction in one cell below which it is ignored.  Stiffness ratios below 2.1 cause losses below this value."""
+"""Lost fraction in one cell below which the loss is ignored.  Stiffness ratios below 2.1 never cause this loss."""
 
 
 def warn_mixed(

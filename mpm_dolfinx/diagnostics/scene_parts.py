@@ -20,7 +20,7 @@ from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
 def checked_parts(
     grid: Grid, bodies: Sequence[Body | Later], materials: Sequence[Skeleton]
 ) -> tuple[list[Body], list[int]]:
-    """Return the bodies, and the indices of bodies absent in stage 1. Raise ValueError for invalid arguments."""
+    """Return the bodies, and indices of bodies absent in the first stage. Raise ValueError for invalid arguments."""
     begin_with("grid", grid)
     all_of("bodies", bodies, (Body, Later), 1)
     all_of("materials", materials, Skeleton, 1)
