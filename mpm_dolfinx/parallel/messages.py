@@ -42,7 +42,7 @@ def set_log_level(level: int | str) -> None:
     Raises
     ------
     ValueError
-        If the level is unknown.
+        The level is unknown.
     """
     try:
         logger.setLevel(level)

@@ -134,8 +134,8 @@ def read(
     Raise ValueError on all processes if an array differs from its checksum.
 
     `of`: result of `members`.
-    `ranges`: for each array name, the first row that this process reads, and the last row plus one.  The processes read
-    consecutive rows, and together all rows.
+    `ranges`: for each array name, the first row that this process reads, and the last row plus one.  Together, the
+    processes read all rows.
     """
     rows = together(comm, lambda: {name: some_rows(file, of[name], *ranges[name]) for name in of})
     sums = comm.gather([(zlib.crc32(found), found.nbytes) for found in rows.values()])
