@@ -4,7 +4,7 @@
 With equal cells, a division finds the cell of a point.  Other grids search along each axis.  Methods such as
 `sizes` and `volumes` return a value for each cell, but for equal cells a single row (`h`) or a single number.
 
-The mesh is created at its first use.  Before its first use, a simulation distributes the cells to processes by numbers
+The mesh is created at its first use.  Before, a simulation distributes the cells so that processes have similar numbers
 of points.
 """
 
@@ -461,8 +461,8 @@ class Grid:
     def move(self, lines: Mapping[str, NDArray[np.float64]] | None) -> None:
         """Move the lines of a grid with `follow` to coordinates (n,) under the keys "x", "y", "z", in m from the base.
 
-        With None, the lines return to their initial coordinates.  All coordinates of nodes, cells and mesh then equal
-        exactly the coordinates in a new grid with these lines.
+        With None, the lines return to their initial coordinates.  All coordinates of nodes, cells and mesh are then
+        bitwise equal to coordinates in a new grid with these lines.
         """
         new = self.seeded if lines is None else tuple(lines[letter] for letter in "xyz"[: self.dim])
         if self.follow is not None and any((x != old).any() for x, old in zip(new, self.lines, strict=True)):
@@ -585,7 +585,7 @@ class Grid:
 
     @property
     def _of_process(self) -> Cells:
-        """The cells of this process.  Without earlier `share`, processes get equally many cells."""
+        """The cells of this process.  If `share` was not called, processes get equally many cells."""
         if self._cells is None:
             self.share(np.zeros(int(np.prod(self.shape))))
         return self._cells

@@ -104,7 +104,7 @@ def imbalance(load: NDArray[np.float64], of: NDArray[np.int64]) -> float:
 def _bisect(weight: NDArray[np.float64], filled: NDArray[np.bool_], low: NDArray[np.int64], out: NDArray[np.int64]):
     """Divide a box of cells into a box for each rank, written to `out`.
 
-    If there are enough cells, each rank gets at least one cell, even if loads are then less equal.
+    If there are enough cells, each rank gets at least one cell, even if this makes loads less equal.
     """
     count = len(out)
     if count == 1 or weight.size == 1:
@@ -134,7 +134,7 @@ def _extent(filled: NDArray[np.bool_], axis: int) -> int:
 
 
 def destinations(partition: Partition, cells: NDArray[np.int64]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Return one list of the ranks that have each cell, owner first, and the position of each cell's first rank.
+    """Return one list of the ranks that have each cell, owner first, and the index at which each cell begins.
 
     `cells` (n,): lexicographic indices.  A cell is a ghost on the processes that own its neighbours across faces.
     """
