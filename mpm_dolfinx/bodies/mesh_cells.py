@@ -2,8 +2,8 @@
 """Cell types of meshes: their facets, and their division into particle domains.
 
 A triangle is divided into three quadrilaterals, and a tetrahedron into four hexahedra.  Each of these domains has a
-vertex of the cell as a corner.  Its other corners are midpoints of edges, facets and the cell.  A wedge is divided like
-an extruded triangle, and a pyramid like two tetrahedra.  Quadrilaterals and hexahedra are not divided.
+vertex of the cell as a corner.  The other corners of the domain are midpoints of edges, facets and the cell.  A wedge
+is divided like an extruded triangle, and a pyramid like two tetrahedra.  Quadrilaterals and hexahedra are not divided.
 """
 
 from __future__ import annotations

@@ -220,7 +220,7 @@ class Loads:
         """Return minus the derivative, with respect to u, of the forces in `push`, or None if `tangent` adds it."""
 
     def settle(self, at: At, sticks: bool) -> bool:
-        """Update the set of slipping positions.  Return whether it changed.  If `sticks`, they may stick again."""
+        """Update the set of slipping positions.  Return whether it changed.  If `sticks`, positions may stick again."""
         return False
 
     def augment(self, at: At) -> bool:
@@ -280,7 +280,7 @@ class Loads:
         return self
 
     def near(self, points: MaterialPoints, corners: NDArray[np.float64]) -> NDArray[np.bool_] | bool:
-        """Return which corners (n, 2^d, d) are near a contact after a step, and move without correction for bending."""
+        """Return which corners (n, 2^d, d) are near a contact after a step, and move with the Q1 field, uncorrected."""
         return False
 
     def outside(

@@ -166,7 +166,7 @@ class OnSide(Condition):
     side
         Side of the bodies, as for `Traction`.
     term
-        Function that returns a UFL form, see `user_functions`.  Its argument `points` has the area measure `points.dx`
+        Function that returns a UFL form, see `user_functions`.  The argument `points` has the area measure `points.dx`
         and the outward normal `points.normal`, both at the start of the step.
     region : ((d,), (d,)), m
         As for `Traction`.
@@ -483,7 +483,8 @@ class RigidPlate(Condition):
     side
         Side of the bodies, as for `Traction`.  The seeded faces must be connected, and in one plane normal to an axis.
     force : float or callable t (s) -> float, N (N/m in plane strain)
-        Total force on the side, positive for compression.  In axisymmetry, it is the total over the circumference.
+        Total force on the side, positive for compression.  In axisymmetry, the force is the total over the
+        circumference.
     region : ((d,), (d,)), m
         Box of reference positions.  The plate acts inside this box only.
 

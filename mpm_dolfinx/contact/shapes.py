@@ -269,7 +269,7 @@ class Cone(Placed):
 class Distance:
     """A shape given by a user's signed distance function.
 
-    Derivatives are finite differences.  Their increments are powers of two, for small rounding errors.
+    Derivatives are finite differences.  The increments of the differences are powers of two, for small rounding errors.
     """
 
     function: Callable[[NDArray[np.float64]], ArrayLike]  # signed distance, m

@@ -82,7 +82,7 @@ class Tool:
         motion is added to `displacement`, and `Simulation.tool_travel` contains it.  At the start, the gap between tool
         and body must be smaller than a cell.  In axisymmetry, the load is the total over the circumference.
     direction : (d,)
-        Direction of the load, of any length.  In axisymmetry, it must be along the axis.
+        Direction of the load, of any length.  In axisymmetry, the direction must be along the axis.
     mass
         Mass of a free tool, kg (kg/m in plane strain), > 0, for scenes with inertia.  Weight, load and contact forces
         move a free tool along `direction`, or by default in any direction.  The motion starts at the initial position

@@ -23,7 +23,7 @@ from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
 from mpm_dolfinx.points.material_points import body_of
 
 FULL = 1.2
-"""Filled fraction of a cell above which a warning is given.  Cells below a deep footing are filled up to 1.08."""
+"""Filled fraction of a cell above which a warning is given.  Undistorted domains below a deep footing reach 1.08."""
 
 
 def warn_overlaps(cut: CutDomains, bodies: Sequence[Body]) -> Callable[..., Any] | None:
@@ -136,8 +136,8 @@ def warn_thin(grid: Grid, bodies: Sequence[Body], walls: Mapping[str, str], wet:
 
     The stress increment of a step is constant in a cut domain.  In a single step, n points over the thickness therefore
     give `1 - 1/n^2` of the bending stiffness.  In several steps the fraction is larger (`domain_slopes`).  A body with
-    one point over its thickness carries no moment.  It creeps from step to step, because only the stress increments
-    resist bending.  Saturated bodies (`wet`) lose more stiffness, and creep even with several points.
+    one point over its thickness carries no moment.  Such a body creeps from step to step, because only the stress
+    increments resist bending.  Saturated bodies (`wet`) lose more stiffness, and creep even with several points.
     """
     few, slender = (FEW_WET, SLENDER_WET) if wet else (FEW, SLENDER)
     for i, body in enumerate(bodies):
@@ -158,8 +158,8 @@ def check_stiff(grid: Grid, bodies: Sequence[Body]) -> None:
     """Raise ValueError for 3D bodies with one domain in each cell, if domains end at grid lines along two axes.
 
     Displacements that alternate from node to node along both axes then have zero mean gradients in all pieces, and no
-    stiffness.  Along the third axis they may vary in any way.  In 2D each component has a single displacement field of
-    this kind, and walls prevent it.
+    stiffness.  Along the third axis, these displacements may vary in any way.  In 2D each component has a single
+    displacement field of this kind, and walls prevent it.
     """
     for i, body in enumerate(bodies if grid.dim == 3 else ()):
         low, between = np.array([[np.inf], [-np.inf]]) * np.ones(grid.dim)  # of domains; the highest end inside a cell

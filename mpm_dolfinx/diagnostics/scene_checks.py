@@ -33,7 +33,7 @@ def check_held(
     Raises
     ------
     ValueError
-        A part can move as a rigid body.  The message gives its position and its number of free rigid-body modes.
+        A part can move as a rigid body.  The message gives the part's position and number of free rigid-body modes.
     """
     grid = active.grid
     part, count = active.parts_of_cells if each else (active.contains.astype(np.int64), 1)

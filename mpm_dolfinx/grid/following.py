@@ -32,7 +32,7 @@ def check_follow(follow: Any, lines: Sequence[ArrayLike] | None) -> None:
     else:
         raise ValueError(f"grid: follow = {line(follow)}, must be a Tool, or a function of t, x or both")
     if lines is None:
-        raise ValueError("grid: follow is given without lines; lines must be given, their number stays constant")
+        raise ValueError("grid: follow is given without lines; lines must be given, and their number is kept")
 
 
 def lines_at(

@@ -41,7 +41,7 @@ REACH = 1e-4  # distance, in cell sizes, by which bodies may lie outside the gri
 TURN = 2 * np.pi
 """Angle of a whole revolution.  Axisymmetric volumes, forces and outflows refer to this angle.  Source: definition."""
 CHUNK = 2**14
-"""Largest number of rows of an array that are processed together.  It limits the size of temporary arrays."""
+"""Largest number of rows of an array that are processed together.  This limits the size of temporary arrays."""
 SNAP = 1e-10
 """Distance, in cell sizes, below which a vertex is considered to lie on a plane of the grid; see `Grid.snap`."""
 ORDER = "the order is Grid(lower, upper, cells)"
@@ -71,7 +71,7 @@ FACE_SIGNS = (-1, 1, 1, -1, -1, 1)
 first four apply.
 """
 ABOUT_MIDDLE = ((0, 1, 4), (1, 3, 4), (3, 2, 4), (2, 0, 4))
-"""Triangles that divide a face in 3D symmetrically.  Each has two corners of the face, and its middle (4)."""
+"""Triangles that divide a face in 3D symmetrically.  Each triangle has two corners of the face and its middle."""
 
 
 def side(name: str, dim: int) -> tuple[int, int]:
@@ -861,7 +861,7 @@ class Grid:
         return out
 
     def _hats(self, cells: NDArray[np.int32], x: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-        """Return the factors of the Q1 shape functions, one for each axis.  Each is linear in one coordinate."""
+        """Return the factors of the Q1 shape functions, one for each axis.  Each factor is linear in one coordinate."""
         y = (x - self.midpoints[cells]) / self.sizes(cells)
         return [0.5 + y[:, a, None] * self.signs[:, a] for a in range(self.dim)]
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Transfer of array rows to other processes, and of answers back to the senders.
 
-A row contains the values of one domain piece, one corner or one loaded point.  The process that owns the cell receives
-the row, and assembles the integrals of the cell.
+A row contains values of one domain piece, one corner or one loaded point in a cell.  The process that owns the cell
+receives the row, and assembles the integrals of the cell.
 """
 
 from __future__ import annotations

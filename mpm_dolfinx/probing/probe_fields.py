@@ -134,8 +134,8 @@ class _Around:
     def _connected(self, same: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Return a mask of the cells that the fit uses, and a mask of the cells connected to the cell of the probe.
 
-        The fit uses cells that contain only the soil of the probe.  If there are none, it uses cells with only the
-        material of the probe, or otherwise all filled cells.
+        The fit uses cells that contain only the soil of the probe.  Without such cells, the fit uses cells with only
+        the material of the probe, or else all filled cells.
 
         `same` (n, cells, 3): whether conductivity, conductivity law and material of all soil in a cell are as at the
         probe.

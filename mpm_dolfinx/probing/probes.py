@@ -136,7 +136,7 @@ def _domains_at(
 
 
 def coordinates(corners: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the local coordinates of a position in each of n domains.  Inside a domain they are from -1 to 1."""
+    """Return the local coordinates of a position in each of n domains.  Inside a domain, these are from -1 to 1."""
     signs, xi = 2 * corner_bits(len(x)) - 1, np.zeros((len(corners), len(x)))
     for _ in range(20):  # Newton's method; the first step is exact for parallelepipeds
         hats = 0.5 * (1 + signs * xi[:, None, :])
