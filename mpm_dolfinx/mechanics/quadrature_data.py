@@ -22,7 +22,7 @@ from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.material_points import ACROSS, MaterialPoints, in_plane, in_space
 
 STIFF_DRY = 50
-"""Weight of the volume ratio from corners of domains in dry bodies, divided by G / (lambda + 2G), and at most 1.
+"""In dry bodies, the volume ratio from corners of domains has the weight min(1, `STIFF_DRY` G / (lambda + 2G)).
 
 The volume ratio at the start of a step is a weighted mean of two values: from the corners of domains (`cell_ratios`),
 and from F of the points.  With nu = 0.4999 and a weight of 1, the stress change at a reset of the grid would exceed the
@@ -44,7 +44,7 @@ limit load is 6.6 % too small with 9 cells, and 3.2 % with 17 cells.
 
 
 def corner_share(material: Skeleton, wet: bool) -> NDArray[np.float64]:
-    """Return the weight of the volume ratio from the corners at the start of a step."""
+    """Return the weight of the volume ratio from the corners of domains, at the start of a step."""
     stiffness = material.oedometric / material.shear
     return (
         np.minimum(np.maximum(2 - stiffness / STIFF_WET, 0.0), 1.0) if wet else np.minimum(1.0, STIFF_DRY / stiffness)
@@ -53,7 +53,7 @@ def corner_share(material: Skeleton, wet: bool) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class QuadratureData:
-    """Integration points of a step, with their fields.  A part contains the points of one law."""
+    """Integration points of a step, with their fields.  A part contains the integration points of one law."""
 
     pieces: PointData  # all integration points
     parts: tuple[PointData, ...]  # integration points of each part
