@@ -44,7 +44,7 @@ class Lines:
     line: NDArray[np.int64]  # index, among pieces of mixed cells, of the piece through whose centroid the line runs
     piece: NDArray[np.int64]  # index of the crossed piece
     length: NDArray[np.float64]  # length in the crossed piece, divided by the cell size
-    before: NDArray[np.float64]  # fraction of the piece's resistance below the position of mean pressure
+    before: NDArray[np.float64]  # fraction of the piece's resistance that lies below the pressure position
     total: NDArray[np.float64]  # length of the whole line in the cell, divided by the cell size
 
 
@@ -214,7 +214,7 @@ class MixedCells:
         return out._replace(parallel=parallel)
 
     def _sharper(self, kappa: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return a factor on the shift in each cell: 0 without inclined layers, >= 1 for slopes above `INCLINED`."""
+        """Return a factor (n,) on pressure shifts in cells: 0 without inclined layers, >= 1 for slopes > `INCLINED`."""
         n = len(self._filled)
 
         def total(values: NDArray[np.float64]) -> NDArray[np.float64]:
