@@ -148,7 +148,7 @@ def flight_of(start: Start) -> Flight | None:
 
 
 def leads(scene: Scene, loads: Sequence[Loads]) -> bool:
-    """Return whether Newton's method starts from extrapolated displacements: with yield, or quasi-static contact."""
+    """Return whether Newton's method starts from extrapolation: in scenes with yield, or with quasi-static contact."""
     momentum = scene.momentum
     return not momentum.elastic or (momentum.inertia is None and any([one.touches for one in loads]))
 

@@ -177,8 +177,8 @@ def _released(
 ) -> tuple[State, dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]]:
     """Return the state on the grid of the next step, and the static tractions on sides that become quiet.
 
-    Tractions balance the stresses, the loads of the previous stage, and the remaining supports. The keys are names of
-    point data. The values are ids of points, and the tractions at these points.
+    Tractions balance the stresses, the loads of the previous stage, and the remaining supports. In the dictionary, keys
+    are names of point data. Values are ids of points, and the tractions at these points.
     """
     start = set_up(scene, state, 0.0)
     state, momentum = start.state, scene.momentum
@@ -460,7 +460,7 @@ def balanced(scene: Scene, state: State) -> State:
 
 
 def _report(scene: Scene, seeded: State, points: MaterialPoints, count: int, left: float, touches: bool) -> None:
-    """Log the changes of the stresses. Raise ValueError for a large relative residual, or warn with contact."""
+    """Log the changes of the stresses. Raise ValueError for a large relative residual; with contact, warn instead."""
     materials, comm = scene.materials, scene.grid.comm
     if left > REMARKABLE and not touches:
         scene.forget()

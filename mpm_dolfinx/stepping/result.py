@@ -47,7 +47,7 @@ class Result:
     residual
         Largest relative residual of the momentum and fluid equations so far.
     wall, profile
-        Wall times, s, of the whole run, and of each task on this process.
+        `wall`: wall time of the whole run, s.  `profile`: wall time of each task on this process, s.
     converged
         Whether the run has reached `t_end`, or an event has ended it.
     event

@@ -39,7 +39,7 @@ class StepControl:
     interval : s
         Output interval of the run; 0 if output intervals are not equal.
     small : s
-        Next trial step.
+        Length of the next trial step.
     waits, kept
         See `StepSize.grown`.
     change : (bodies,), Pa
