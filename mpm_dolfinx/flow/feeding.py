@@ -130,7 +130,7 @@ class Feeding:
     conditions: ClassVar[tuple[type, ...]] = ()
     """Classes of conditions of this kind."""
     title: ClassVar[str] = "user-defined conditions"
-    """Name of this kind in the summary of a scene."""
+    """Name of these conditions in the summary of a scene."""
     count: int = 0
     """Number of conditions."""
     varies: bool = False

@@ -101,7 +101,7 @@ class Conduction:
         return across if hoop is None else across * hoop[at]
 
     def distance_ratio(self, at: NDArray[np.int64], normal: NDArray, offset: NDArray) -> NDArray[np.float64]:
-        """Return the distances (m,) from centroids to faces, divided by those from pressure positions (`layers`).
+        """Return ratios (m,): distance of faces from centroids, divided by distance from pressure positions (`layers`).
 
         `normal` (m, d): normals of the faces.
         `offset` (m, d), m: vectors from the centroids to the faces.
@@ -169,7 +169,7 @@ class OpenSides:
         """Return pressure differences (Pa) and slopes (Pa/m) from cells to drained sides.
 
         The result (n, d, 2, 2) has the indices cell, axis, end of the cell, and 0 for the difference or 1 for the
-        slope.  Ends without a drained side have nan.
+        slope.  Ends without a drained side have the placeholder nan.
 
         `at` (m,): index of the cell of each face among the filled cells.
         `p` (n,), Pa: pressures of the filled cells.
@@ -432,7 +432,7 @@ class FluxForms:
         h0, h1, across = across_faces(grid, n0)
 
         def opening(side, sign):
-            """Return the open fraction of a face, in axisymmetry times the circumference."""
+            """Return the fraction of a face that material covers, in axisymmetry times the circumference."""
             lower, upper = self.lower_face(side), self.upper_face(side)
             return sum(
                 ufl.conditional(ufl.gt(sign * n0[a], 0.5), upper[a], 0.0)
@@ -494,7 +494,7 @@ class FluxForms:
             if relative is not None:
 
                 def by_k(k):
-                    """Return the derivative of T with respect to one k_r."""
+                    """Return the derivative of the transmissibility T with respect to one k_r."""
                     return share * (
                         d0 * (k1 / resistance) ** 2 * ufl.diff(k0, k) + d1 * (k0 / resistance) ** 2 * ufl.diff(k1, k)
                     )

@@ -84,7 +84,7 @@ class MixedCells:
             self._lines.append(Lines(line, piece, length, before, total))
 
     def _crossed(self, rows: slice, first, count, low, high) -> list[tuple[NDArray, NDArray, NDArray]]:
-        """Return for each axis the lines through the centroids of the pieces `rows`, the crossed pieces, and weights.
+        """Return for each axis the lines through the centroids of pieces `rows`, the pieces they cross, and weights.
 
         A crossed piece has a weight below one if the line runs along its border.
         """
@@ -233,7 +233,7 @@ class MixedCells:
 def graded(
     contents: CellContents, offset: NDArray[np.float64], kappa: NDArray[np.float64], mean: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the mobilities (n, d) along the axes, divided by `mean`, for mobilities that vary gradually in a cell.
+    """Return the mobilities (n, d) along the axes, divided by `mean`, of soil whose mobility varies gradually in cells.
 
     Along the gradient of the mobility, the mean over the cell is harmonic.  Normal to the gradient, it is arithmetic.
 

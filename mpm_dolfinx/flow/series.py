@@ -44,7 +44,7 @@ class Paths(NamedTuple):
         return Paths(*(values[index] for values in self))
 
     def everywhere(self, dim: int) -> Paths:
-        """Repeat the paths (n, ...) for both ends of all axes."""
+        """Return the paths (n, ...), repeated for both ends of all axes."""
         parts = ((np.repeat(values, 2 * dim, axis=0), values.shape) for values in self)
         return Paths(*(many.reshape(shape[0], dim, 2, shape[1]) for many, shape in parts))
 

@@ -94,7 +94,7 @@ class StorageForms:
     `symmetric`: whether to approximate the derivative of the content with respect to J_Delta by alpha.  The Jacobian is
     then symmetric.  The neglected term is of the order of `(p - p_n) / K_w`.
     `feeding`: sources and open sides of all stages.
-    `inertial`: motion and the inertia force `-rho_w a` on the pore fluid, see `FluxForms`, or None without inertia.
+    `inertial`: data for the inertia force `-rho_w a` on the pore fluid, see `FluxForms`, or None without inertia.
     """
 
     def __init__(
@@ -169,7 +169,7 @@ class StorageForms:
         return [sums[:, 0], *[sums[:, start : start + count] for start in range(1, sums.shape[1], count)]]
 
     def drained(self, data: PointData) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return in filled cells the storage (m^d/Pa) by changes of saturation S, and `int S d(chi p)/dp dV` (m^d)."""
+        """Return for each cell the storage (m^d/Pa) by drainage, and `int S d(chi p)/dp dV` (m^d) with saturation S."""
         capacity, coupled = self._capacity(data).T
         return capacity, coupled
 
@@ -601,7 +601,7 @@ class StorageProblem:
         return StorageResidual(r, *system.of_parts.sums(np.array(rows)), rates)
 
     def _rates(self, outflow: Outflow) -> Rates:
-        """Return the rates at (u, p)."""
+        """Return the outflow rates at (u, p)."""
         system, fluid = self.system, self._fluid
         force = None
         if self._inertial is not None:

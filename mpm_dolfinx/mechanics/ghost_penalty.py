@@ -100,7 +100,7 @@ class GhostPenalty:
         self.elastic_shear = FacetForm(2 * self.fill * self.shear * around * ufl.inner(*strains) * dx, grid.comm)
 
     def _scale(self):
-        """Return the strength of a face times the mean modulus of both cells, as UFL."""
+        """Return the penalty's strength on a face times the mean modulus of both cells, as UFL."""
         fills, moduli, beside = ([f("+"), f("-")] for f in (self.fill, self.modulus, self.beside))
         full, little = ufl.max_value(*fills), ufl.min_value(*fills)
         fullest = ufl.conditional(ufl.lt(*fills), *beside)  # largest volume fraction next to the emptier cell

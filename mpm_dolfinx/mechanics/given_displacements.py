@@ -299,7 +299,7 @@ class HoldLoads(Loads):
     def augment(self, at: At) -> bool:
         """Add the penalty forces of sides that lag behind to their multipliers.  Return whether any force changed.
 
-        The updates end when the last update has left more than half of the mean gap of every side.
+        The updates end when one update leaves more than half of the mean gap of every side.
         """
         if not self._place.dt:
             return False

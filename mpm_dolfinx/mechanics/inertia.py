@@ -185,7 +185,7 @@ class InertiaForms:
         self._ghost = kinks(grid, V, GHOST_MASS * ufl.avg(self.density), 3)
 
     def set_substep(self, inertia: Inertia | None, midpoint: bool) -> None:
-        """Set the coefficients of a substep.  `midpoint`: whether the substep uses a midpoint rule."""
+        """Set the coefficients of forms in a substep.  `midpoint`: whether the substep uses a midpoint rule."""
         self.midpoint.value = float(midpoint and inertia is not None)
         self._rate.value = 0.0 if inertia is None else inertia.rate
         if inertia is not None:
@@ -348,7 +348,7 @@ class Mass:
         return inverses(self._mean(off[:, None] * off + second))
 
     def _mean(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return for each point the volume mean (..., n) of values (..., m) of its pieces."""
+        """Return for each point the volume-weighted mean (..., n) of values (..., m) of its pieces."""
         pieces = self._cut.pieces
         return sum_by(pieces.point, pieces.fraction * values, len(self._cut.points))
 

@@ -90,7 +90,7 @@ class FBar:
         `Fbar`: result of `of`.
         `ratio`: det Delta, with Delta F_n = F.
         `values`: UFL values of the law's parameters, state and local unknowns.
-        `known`: like `values`, but local unknowns do not depend on F; for expressions without derivatives.
+        `known`: like `values`, but the local unknowns do not depend on F.
 
         Returns
         -------
@@ -178,7 +178,7 @@ class MeanDilatation:
         return self._cells(data).filled, self._cells(data).total(sums), self._volume_of(data)
 
     def at(self, data: QuadratureData, motion: tuple, solve: Callable[[], Sequence[Given]]) -> list[Given]:
-        """Set theta and pi, and return the values for the forms of each law.  All processes must call this method.
+        """Set theta and pi.  Return the values that the forms of each law need.  All processes must call this method.
 
         `motion`: cache key that identifies the present displacement.
         `solve`: function that solves for local unknowns of the laws.

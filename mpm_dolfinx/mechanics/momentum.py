@@ -539,7 +539,7 @@ class MomentumProblem:
     def out_of_balance(
         self, r: PETSc.Vec, scales: NDArray[np.float64], first: bool
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return two relative residuals of each part: with rounding errors subtracted, and for the convergence test.
+        """Return two relative residuals of each part: one without rounding errors, and one for the convergence test.
 
         `r`, `scales` (parts,), in N: residuals and force scales.
         `first`: whether this is the first residual of a step, in which rounding errors are not subtracted.

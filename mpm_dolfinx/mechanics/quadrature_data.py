@@ -139,7 +139,7 @@ class QuadraturePoints:
         return PiecePlaces(pieces, tuple(parts))
 
     def _law_places(self, cut: CutDomains, pieces: Places) -> Places:
-        """Return the positions at which laws are evaluated.  The factor `SHARE` moves them towards cell midpoints."""
+        """Return the positions at which laws are evaluated.  The factor `SHARE` moves them towards cell means."""
         if not self.materials.dilates or self._grid.axisymmetric:
             return pieces
         flows = cut.to_cells(self.materials.dilating(cut.points))

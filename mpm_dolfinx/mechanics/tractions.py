@@ -163,7 +163,7 @@ class PressureLoads(Loads):
         self._forms, self._data = forms, data
 
     def loads(self, b: NDArray[np.float64]) -> None:
-        """Add the forces on the present area."""
+        """Add the nodal forces of the pressures on the present area."""
         self._forms.work.assemble_vector(b, self._data)
 
     def tangent(self, K: PETSc.Mat) -> None:
@@ -172,7 +172,7 @@ class PressureLoads(Loads):
 
 
 def closed(grid: Grid, free: NDArray[np.bool_], pressures: Sequence[tuple[Pressure, Surface]]) -> bool:
-    """Return whether each surface of equal pressure is closed, or ends at walls that fix the normal displacement.
+    """Return whether each surface under one pressure is closed, or ends at walls that fix the normal displacement.
 
     `free` (nodes, d): whether walls leave each displacement component free.
     """

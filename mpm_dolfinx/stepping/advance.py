@@ -216,7 +216,7 @@ class Motion:
     def _kept(
         self, values: NDArray[np.float64] | None, on_grid: OnGrid, keeps: NDArray[np.bool_]
     ) -> NDArray[np.float64] | None:
-        """Return the nodal values, with zeros outside cells where points keep their pieces."""
+        """Return the nodal values in cells where points keep their pieces, and zeros at all other nodes."""
         if values is None:
             return None
         cut = on_grid.cut
@@ -228,7 +228,7 @@ class Motion:
     ) -> NDArray[np.float64]:
         """Return the pressures (Pa) of the points from the pressures of the cells at time t (s).
 
-        `nodal` (nodes, d), m: displacement since the reset of the grid, if any.
+        `nodal` (nodes, d), m: displacement since the reset of the grid, or None without motion.
         """
         at_rest = self._at_rest(stage, t, nodal)
         return on_grid.cut.in_plane(on_grid.pressures_up_to_surface(self._reconstruction, stage, t, at_rest))

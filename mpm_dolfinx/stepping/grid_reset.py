@@ -275,7 +275,7 @@ class OnGrid(Keyed):
         `store` (m,), m^d/Pa: storage of the pieces, the weights of the means.
         `t`, s: time of the pressures on open sides.
         `water`: pore water of the pieces, in unsaturated scenes.
-        `at_rest`: hydrostatic pressures, or None without gravity. The reconstruction acts on differences from them.
+        `at_rest`: hydrostatic pressures, subtracted before the reconstruction, or None without gravity.
         """
         pieces = self.data.pieces
         contents = self.contents
@@ -409,7 +409,7 @@ class OnGrid(Keyed):
 
     @cached_property
     def scale(self) -> NDArray[np.float64] | None:
-        """Suctions (Pa) at which filled owned cells drain (1 without retention curve), or None in saturated scenes."""
+        """Suctions (Pa) at which filled owned cells drain; 1 without a retention curve; None in saturated scenes."""
         if self._materials.retentions is None:
             return None
         scale = np.full(len(self.contents.filled), np.inf)
@@ -544,7 +544,7 @@ class Assembled(Keyed):
             own.mass = self.mass.M
         self.momentum.set_rounding(self._rounding(momentum, loads))
         self.round_off = float(self.momentum.rounding.norm())
-        """Norm (N) of the rounding error in the residual of the momentum."""
+        """Norm (N) of the rounding error in the residual of the momentum balance."""
         self._off = None
         if self.storage is not None:
             self.storage.set_alternation()

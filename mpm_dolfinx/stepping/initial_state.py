@@ -341,7 +341,7 @@ def _filled(
 def _without_extra(
     scene: Scene, points: MaterialPoints, add: Sequence[int], fields: Mapping[str, ArrayLike]
 ) -> MaterialPoints:
-    """Return the points without data that added bodies lack. Raise ValueError for data that `fields` does not give."""
+    """Return the points without data that added bodies lack. Raise ValueError if `fields` lacks such data."""
     extra = points.data.keys() - scene.materials.seeded.data.keys()
     for name in sorted(extra - fields.keys()):
         what = f"stage: add: body {add[0]}: its points have no {name!r}"

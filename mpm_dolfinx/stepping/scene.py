@@ -336,7 +336,7 @@ class Scene:
 
         `now`: present loads.
         `as_cut`: function that returns the loads at the last reset.
-        `begins`: whether this is the first step of a stage.  Then all parts of the bodies must have supports.
+        `begins`: whether this is the first step of a stage.  If so, all parts of the bodies must have supports.
 
         Raises
         ------

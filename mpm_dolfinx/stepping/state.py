@@ -204,7 +204,7 @@ class State:
         return self.stay.points if self.stay.keeps is None else self.stay.points.where(self.stay.keeps, self.points)
 
     def of_pieces(self, name: str, fresh: NDArray[np.float64], point: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the data `name` (m, ...) of the pieces. New pieces have the values `fresh`.
+        """Return the array `name` (m, ...) of `pieces` for all present pieces. New pieces have the values `fresh`.
 
         `point` (m,): index of the point of each piece.
         """
