@@ -24,8 +24,8 @@ stabilisation, and d is d+ plus d-.  In this term, dt is the time weight of the 
 term conserves fluid, and it is zero in steady states.
 
 For elastic soil, tau is a quarter of the value of Silvester and Kechkar for patches of elements (Camargo, White and
-Borja 2021).  In yielding soil, tau is up to a hundred times larger.  The increase of tau acts only on second
-differences of the pressure (`second_differences`).
+Borja 2021).  In yielding soil, tau is up to a hundred times larger than this value.  The increase of tau acts only on
+second differences of the pressure (`second_differences`).
 
 With inertia, tau has the factor `min(1, 1 / (1 + m) + s)`, with `s = kappa rho_w / dt`.  Here m is the ratio of
 inertial to elastic resistance of 2 x 2 cells (`OnGrid.resisting_mass`).  Without this factor, waves in undrained soil
@@ -91,8 +91,8 @@ class StorageForms:
     `pressure`: pore pressure of the cells, positive in compression.
     `materials`: materials and fluid of the scene.
     `weight` (d,), N/m^3: unit weight rho_w g of the pore fluid, as UFL, or None without gravity.
-    `symmetric`: whether to approximate the derivative of the content with respect to J_Delta by alpha.  The Jacobian is
-    then symmetric.  The neglected term is of the order of `(p - p_n) / K_w`.
+    `symmetric`: whether to approximate the derivative of the fluid content with respect to J_Delta by alpha.  The
+    Jacobian is then symmetric.  The neglected term is of the order of `(p - p_n) / K_w`.
     `feeding`: sources and open sides of all stages.
     `inertial`: data for the inertia force `-rho_w a` on the pore fluid, see `FluxForms`, or None without inertia.
     """
@@ -202,7 +202,7 @@ class Outflow:
 
 @dataclass(frozen=True)
 class Rates:
-    """Outflow rates of the owned cells, in m^d/s, or outflow volumes, in m^d, as result of `integrated`."""
+    """Outflow rates of the owned cells, in m^d/s.  The result of `integrated` contains outflow volumes, in m^d."""
 
     cells: NDArray[np.float64]  # outflow of each cell minus its sources
     net: NDArray[np.float64]  # outflow from the bodies minus sources
@@ -378,7 +378,7 @@ class StorageProblem:
 
     `system`: vectors and matrices, with the assembled fluxes.
     `flow`: function that assembles the outflow at (u, p).  Its argument is True at the start of a substep.
-    `dt`: time weight, s, of the rate at (u, p).
+    `dt`: time weight, s, of the outflow rate at (u, p).
     `before`: outflow volumes from the rate of the previous substep.
     `softness` (m,): ratio of elastic to tangent shear modulus of the pieces, 1 if no law can yield.
     `defect` (n,), m^d: correction of volume defects in the active owned cells by the end of the substep.
@@ -467,7 +467,7 @@ class StorageProblem:
         return out
 
     def passing(self) -> list[Mapping[str, NDArray[np.float64]]]:
-        """Return the rates in a converged substep, for the method `volumes`."""
+        """Return the flow rates of the conditions in a converged substep, for the method `volumes`."""
         fluid, both = self._fluid, zip(self._feeds, self._flow(False).at, strict=True)
         return [one.passing(at, fluid) for one, at in both]
 
@@ -631,7 +631,7 @@ class StorageProblem:
     def net_inflow(self, rates: Rates) -> NDArray[np.float64]:
         """Return the net inflow by fluxes and sources into each filled owned cell in the step, in m^d.
 
-        `rates`: rates at the end of the last substep.
+        `rates`: outflow rates at the end of the last substep.
         """
         return (-self.dt * rates.cells - self._before.cells) / self._density
 

@@ -361,8 +361,8 @@ class HoldLoads(Loads):
     def guess(self, parts: Parts, nodal: NDArray[np.float64]) -> NDArray[np.float64] | None:
         """Return an initial guess of the nodal displacements, or None if no connected part rotates.
 
-        The guess of a rotated part is the rigid motion nearest to its prescribed displacements.  The guess of other
-        parts is `nodal`.
+        The guess of a rotated part is the rigid motion nearest to its prescribed displacements.  For all other parts,
+        the guess is `nodal`.
         """
         grid = self.data.points.grid
         if grid.axisymmetric:

@@ -38,8 +38,8 @@ SHARE = 0.5
 """In cells of flowing, dilatant soil, the deviation of grad u from its cell mean is multiplied by this factor.
 
 Without this factor, dilatancy would lock Q1 cells.  With the factor 1, the load of a footing (phi = psi = 20 degrees)
-is 4.4 % too large with 9 cells over its width, 3.4 % with 17 cells, and does not reach a limit.  With the factor 0, the
-limit load is 6.6 % too small with 9 cells, and 3.2 % with 17 cells.
+does not reach a limit.  It is 4.4 % too large with 9 cells over the width of the footing, and 3.4 % with 17 cells.
+With the factor 0, the limit load is 6.6 % too small with 9 cells, and 3.2 % with 17 cells.
 """
 
 

@@ -175,7 +175,7 @@ def balances(
 ) -> Balances:
     """Return the balances at the end of a substep, at the present u and p.
 
-    `before`: rates of the previous substep.
+    `before`: outflow rates of the previous substep.
     `flight`: present velocities, or None without inertia.
     """
     substep = acting.substep

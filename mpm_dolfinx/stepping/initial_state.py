@@ -477,7 +477,7 @@ def _report(scene: Scene, seeded: State, points: MaterialPoints, count: int, lef
 
 
 def _problem(scene: Scene, start: Start, state: State) -> MomentumProblem:
-    """Return the momentum balance at zero displacement and zero rates."""
+    """Return the momentum balance at zero displacement and zero velocity."""
     matrices, data = start.matrices, start.on_grid.data_of(state)
     at = start.on_grid.cut, start.on_grid.fill, state.points, data
     place = Place(*at, state.t, 0.0, state.t, state.outcome)

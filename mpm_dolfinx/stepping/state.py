@@ -92,7 +92,7 @@ class Trend:
     lengths : (k,)
         Lengths (s) of the steps, beginning with the last step.
     rates : (n, k, d (1 + d)), with fluid (n, k, d (1 + d) + 1)
-        Mean rates of x (m/s), of F (1/s), and with fluid also of the pressure (Pa/s), in each of these steps.
+        Mean rates in each of these steps: of x (m/s), of F (1/s), and with fluid of the pressure (Pa/s).
     """
 
     lengths: NDArray[np.float64]
