@@ -49,7 +49,7 @@ class OfSuction:
     def rows(self, data: QuadratureData, given: Sequence[Given]) -> list[tuple[NDArray[np.int32], NDArray[np.float64]]]:
         """Return pairs of arrays: cells, and the derivatives of nodal forces with respect to the pressure of each cell.
 
-        `given`: for each law, values of the fields that change between assemblies, see `FormPoints.follow`.
+        `given`: for each law, values of the fields that the caller passes to an assembly, see `FormPoints.follow`.
         """
         parts = data.parts
         out = [(parts[k].places.filled, of(parts[k], given[k])) for k, of in self._free.items()]
