@@ -12,7 +12,7 @@ A `Simulation` has these parts:
 `Simulation.run` returns a `Result`, with records at `probes`.  A `Writer` writes results to files, and `one_file` joins
 these files.  `resume` continues a run from a `Checkpoint`.  `Simulation.stage` changes the scene between two runs.
 `factor_of_safety` divides the strength of the soil until the bodies fail.  `mpm_dolfinx.materials.user_functions`
-describes terms in UFL.
+describes user-defined terms in UFL.
 
 Units are SI units, or other consistent units (see `Fluid`).  Stress is positive in tension, and pore pressure is
 positive in compression.  In plane strain, forces refer to a thickness of 1 m.  In axisymmetry, forces refer to the full

@@ -76,7 +76,7 @@ def _is_law(value: object) -> bool:
 
 
 def constants_of(law: type[mpm_dolfinx.Skeleton], texts: Sequence[str]) -> dict[str, float | list[float]]:
-    """Return the constants of a law, by name, from texts `name=value`, each for another constant."""
+    """Return the constants of a law, by name, from texts `name=value`.  No name may occur twice."""
     out, known = {}, [f.name for f in fields(law) if f.init]
     for text in texts:
         name, equals, value = text.partition("=")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Fluxes in unsaturated soil through faces between cells of different soil, or of several soils.
+"""Fluxes in unsaturated soil through faces between cells of different soil, and faces of cells with several soils.
 
 `series` computes the conductivities of these faces. All other faces have two-point fluxes in UFL (`fluxes`).
 """

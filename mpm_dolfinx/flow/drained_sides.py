@@ -192,7 +192,7 @@ class UnsaturatedFaces(OpenFaces):
 
 @dataclass(frozen=True)
 class RainedFaces(OpenFaces):
-    """All faces on open sides, if at least one side has rain.
+    """Faces on all open sides.  This class replaces `OpenFaces` if at least one side has rain.
 
     Through a face with rain, the outflow is minus the rain.  It is at least the outflow at the pressure of the pond,
     and at most the outflow at the pressure `Rain.driest`.
@@ -337,7 +337,7 @@ class SideFeeds(Feeds):
         return out | {"runoff": {name: np.array(runs[i]) for i, name in enumerate(self._names) if self._rains[i]}}
 
     def passing(self, at: OpenFaces, fluid: Fluid) -> dict[str, NDArray[np.float64]]:
-        """Return two rates (2,) for each condition: outflow, and rain, in m^d/s."""
+        """Return for each condition the rates (2,) of outflow and rain, in m^d/s."""
         if not any(self._rains):
             return {}
         both = np.stack([self._through(at, fluid), np.nan_to_num(self._fallen)])

@@ -93,7 +93,7 @@ class Feeds:
         return 0.0
 
     def coupling(self, at: Any, fluid: Fluid, unknowns: Any) -> PETSc.Mat | None:
-        """Return the derivative of the outflow with respect to pressures, without `slope`, or None if it is zero."""
+        """Return the derivatives of the outflow with respect to cell pressures that `slope` omits, or None if zero."""
 
     def settle(self, at: Any, fluid: Fluid) -> int:
         """Update the active set, and return the number of changes on this process."""
@@ -130,7 +130,7 @@ class Feeding:
     conditions: ClassVar[tuple[type, ...]] = ()
     """Classes of conditions of this kind."""
     title: ClassVar[str] = "user-defined conditions"
-    """Name of this kind in the summary of a scene."""
+    """Name of these conditions in the summary of a scene."""
     count: int = 0
     """Number of conditions."""
     varies: bool = False

@@ -38,7 +38,7 @@ A convex body has the volume V, and is inside a cell of edge length h.  A plane 
 least `V / ((d + 1) THICK h^(d-1))` from the centroid of the body.  Smaller distances are replaced by this bound.
 """
 ALONG = 0.1
-"""A drained side determines the pressure slope along an axis if its unit normal has a larger component along the axis.
+"""A drained side determines the pressure slope along axes on which its unit normal has a component above this value.
 Plateau (scene "beam" of tests/plateaus.py): half this value changes the result by 9.9e-11, twice this value by 8.7e-11,
 and finer cells by 1.4e-02.
 """
@@ -101,7 +101,7 @@ class Conduction:
         return across if hoop is None else across * hoop[at]
 
     def distance_ratio(self, at: NDArray[np.int64], normal: NDArray, offset: NDArray) -> NDArray[np.float64]:
-        """Return ratios (m,): distance of a face from the centroid over that from the pressure position (`layers`).
+        """Return ratios (m,): distance of faces from centroids, divided by distance from pressure positions (`layers`).
 
         `normal` (m, d): normals of the faces.
         `offset` (m, d), m: vectors from the centroids to the faces.
@@ -111,7 +111,7 @@ class Conduction:
         return np.divide(distance, shifted, out=np.ones(len(distance)), where=shifted > 0)
 
     def density(self, p: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the mean relative densities (m,) between two pressures (m,), in Pa, see `fluid_content`."""
+        """Return the mean relative densities (m,) of fluid between two pressures (m,), Pa, see `fluid_content`."""
         return mean_density(p, other, self.bulk)
 
     def deformed(self, at: NDArray[np.int64], vector: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -150,7 +150,7 @@ class OpenSides:
         return self.area / np.sqrt(np.add.reduce(self.area**2, axis=1, keepdims=True))
 
     def driven(self, at: NDArray[np.int64], flow: Conduction) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return conductances c (m,), m^d/(Pa s), and inflows q (m,), m^d/s: the outflow is c times potential minus q.
+        """Return c (m,), m^d/(Pa s), and q (m,), m^d/s, for the outflow `c pi - q` with the cell's mass potential pi.
 
         `at` (m,): indices of the cells among the filled cells.
         """
@@ -161,7 +161,7 @@ class OpenSides:
         return conductance, self.given + conductance * self.outer(at, flow)
 
     def outer(self, at: NDArray[np.int64], flow: Conduction) -> NDArray[np.float64]:
-        """Return the mass potentials (m,), Pa, of outside pressures, reduced to the heights of the centroids."""
+        """Return the mass potentials (m,), Pa, of outside pressures, reduced to the heights of the cells' centroids."""
         outer = self.pressure if flow.weight is None else self.pressure - flow.deformed(at, self.offset) @ flow.weight
         return mass_potential(outer, flow.bulk)
 
@@ -169,7 +169,7 @@ class OpenSides:
         """Return pressure differences (Pa) and slopes (Pa/m) from cells to drained sides.
 
         The result (n, d, 2, 2) has the indices cell, axis, end of the cell, and 0 for the difference or 1 for the
-        slope.  Ends without a drained side have nan.
+        slope.  Ends without a drained side have the placeholder nan.
 
         `at` (m,): index of the cell of each face among the filled cells.
         `p` (n,), Pa: pressures of the filled cells.
@@ -214,7 +214,7 @@ class PieceContents:
 class CellContents(Keyed):
     """Material in the cells, at the last grid reset.  Arrays over local cells are valid in active cells only.
 
-    `forms`, `pieces`: forms with coefficients that this class sets, and data of the pieces.
+    `forms`: forms whose coefficients this class sets.  `pieces`: data of the pieces.
     `filled`: owned active cells.
     """
 
@@ -226,12 +226,12 @@ class CellContents(Keyed):
         self._slot = forms.active.slot
         self._slot[filled] = np.arange(len(filled))
         self.weight, self.area = pieces.weight, pieces.area
-        """Volumes (m,) of the pieces, in m^d, and in axisymmetry areas of their meridional sections, in m^2."""
+        """`weight` (m,): volumes of pieces, m^d.  `area` (m,): the same, in axisymmetry areas of sections, m^2."""
         self._at, d = self._slot[pieces.cells], grid.dim
         rows = [self.weight, self.area, self.weight * pieces.fixed_stress], (self.area[:, None] * pieces.x).T
         sums = self.total(np.concatenate([*rows, pieces.faces.reshape(len(self.area), 2 * d).T]))
         self.volume, area, self.fixed_stress = sums[:3]
-        """Volumes (n,) of material in the filled cells (m^d), and integrals (n,) of the fixed-stress beta (m^d/Pa)."""
+        """`volume` (n,): material in filled cells, m^d.  `fixed_stress` (n,): integral of beta in each cell, m^d/Pa."""
         self.fill = np.minimum(area / grid.volumes(filled), 1.0)
         """Volume fractions (n,) of material in the filled cells."""
         shapes = (forms.centroid, forms.lower_face, forms.upper_face)
@@ -257,7 +257,7 @@ class CellContents(Keyed):
         return sum_by(self._at, values, len(self.filled))
 
     def softest(self, softness: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the largest softness (n,), at least 1, of the pieces in each filled cell."""
+        """Return for each filled cell the largest `softness` of its pieces, at least 1, see `StorageProblem`."""
         softest = np.ones(len(self.filled))
         np.maximum.at(softest, self._at, softness)
         return softest
@@ -265,7 +265,7 @@ class CellContents(Keyed):
     def set_damping(
         self, share: NDArray[np.float64] | float = 1.0, less: NDArray[np.float64] | float = 0.0
     ) -> NDArray[np.float64]:
-        """Set the damping strength of elastic soil in the filled cells to `share * tau - less`, and return tau.
+        """Set the damping strength of elastic soil in filled cells to `share * tau - less`, at least 0, and return it.
 
         `share` (n,): factor.
         `less` (n,), 1/Pa: storage due to changes of saturation.
@@ -287,7 +287,7 @@ class CellContents(Keyed):
         """Return the motion of filled cells, at the centroids of their material.
 
         `nodal`: displacements, in m.
-        `rests`: cells that do not move.
+        `rests`: indices of filled cells that do not move.
         """
         hoop, d = None, self.grid.dim
         at_centroids = nodal @ self._shapes
@@ -403,7 +403,7 @@ class FluxForms:
     `flows`: whether any material is permeable.
     `pressure`: pore pressure of the cells (DG0), Pa.
     `bulk`: bulk modulus of the fluid, Pa.
-    `inertial`: motion, and its inertia force (d,) on the pore fluid, in N/m^3, as UFL; None without inertia.
+    `inertial`: `InertiaForms.moved`, and the inertia force (d,) on the pore fluid, in N/m^3; None without inertia.
     `relative`: relative conductivities in unsaturated soil, see `unsaturated`, or None.
     """
 
@@ -432,7 +432,7 @@ class FluxForms:
         h0, h1, across = across_faces(grid, n0)
 
         def opening(side, sign):
-            """Return the open fraction of a face, in axisymmetry times the circumference."""
+            """Return the fraction of a face that material covers, in axisymmetry times the circumference."""
             lower, upper = self.lower_face(side), self.upper_face(side)
             return sum(
                 ufl.conditional(ufl.gt(sign * n0[a], 0.5), upper[a], 0.0)
@@ -494,7 +494,7 @@ class FluxForms:
             if relative is not None:
 
                 def by_k(k):
-                    """Return the derivative of T with respect to one k_r."""
+                    """Return the derivative of the transmissibility T with respect to one k_r."""
                     return share * (
                         d0 * (k1 / resistance) ** 2 * ufl.diff(k0, k) + d1 * (k0 / resistance) ** 2 * ufl.diff(k1, k)
                     )

@@ -44,7 +44,7 @@ class Lines:
     line: NDArray[np.int64]  # index, among pieces of mixed cells, of the piece through whose centroid the line runs
     piece: NDArray[np.int64]  # index of the crossed piece
     length: NDArray[np.float64]  # length in the crossed piece, divided by the cell size
-    before: NDArray[np.float64]  # fraction of the piece's resistance below the position of mean pressure
+    before: NDArray[np.float64]  # fraction of the piece's resistance that lies below the pressure position
     total: NDArray[np.float64]  # length of the whole line in the cell, divided by the cell size
 
 
@@ -84,7 +84,7 @@ class MixedCells:
             self._lines.append(Lines(line, piece, length, before, total))
 
     def _crossed(self, rows: slice, first, count, low, high) -> list[tuple[NDArray, NDArray, NDArray]]:
-        """Return for each axis the lines through the centroids of the pieces `rows`, the crossed pieces, and weights.
+        """Return for each axis the lines through the centroids of pieces `rows`, the pieces they cross, and weights.
 
         A crossed piece has a weight below one if the line runs along its border.
         """
@@ -214,7 +214,7 @@ class MixedCells:
         return out._replace(parallel=parallel)
 
     def _sharper(self, kappa: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return a factor on the shift in each cell: 0 without inclined layers, >= 1 for slopes above `INCLINED`."""
+        """Return a factor (n,) on pressure shifts in cells: 0 without inclined layers, >= 1 for slopes > `INCLINED`."""
         n = len(self._filled)
 
         def total(values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -233,7 +233,7 @@ class MixedCells:
 def graded(
     contents: CellContents, offset: NDArray[np.float64], kappa: NDArray[np.float64], mean: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the mobilities (n, d) along the axes, divided by `mean`, for mobilities that vary gradually in a cell.
+    """Return the mobilities (n, d) along the axes, divided by `mean`, of soil whose mobility varies gradually in cells.
 
     Along the gradient of the mobility, the mean over the cell is harmonic.  Normal to the gradient, it is arithmetic.
 

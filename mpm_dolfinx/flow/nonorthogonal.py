@@ -12,7 +12,7 @@ At an open side, `p - p_out` is replaced by `p - p_out + G . t`.  Here t is the 
 projection of the centroid onto the side to the centre of the face.
 
 The gradients are a least-squares fit to the pressures of neighbouring cells and drained sides, and to zero flow through
-other sides.  A neighbour of smaller conductivity has a smaller weight in the fit.  The fit is exact for linear
+other sides.  A neighbour that conducts less than the cell has a smaller weight in the fit.  The fit is exact for linear
 pressures.  Gradients are limited so that the corrected pressures at faces stay between the pressures of the neighbours.
 """
 
@@ -77,7 +77,7 @@ class Gradients:
         for axis, end in np.ndindex(d, 2):
             inside[:, axis, end] &= share[cells[:, axis, end], axis, 1 - end] > 0
         weight = np.ones(inside.shape)
-        if mobility is not None:  # series conductance of both cells, divided by the value for equal cells
+        if mobility is not None:  # series conductance of both cells, divided by its value for equal mobilities
             own, other = mobility[contents.filled][:, None, None], mobility[cells]
             weight = np.minimum(
                 1.0, np.divide(2 * other, own + other, out=np.zeros(inside.shape), where=own + other > 0)

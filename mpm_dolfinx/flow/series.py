@@ -23,7 +23,7 @@ from mpm_dolfinx.base.tolerances import EPSILON, SAME, TINY
 from mpm_dolfinx.flow.unsaturated import Laws
 from mpm_dolfinx.pores.retention import FARTHEST
 
-MOST = 2200  # largest number of iterations.  Source: exact bound, twice the halvings of a bracket of doubles (IEEE 754)
+MOST = 2200  # largest number of iterations.  Source: exact bound, two per halving of an interval of doubles (IEEE 754)
 
 
 class Paths(NamedTuple):
@@ -37,19 +37,19 @@ class Paths(NamedTuple):
     parallel: NDArray[np.float64]  # mobility of single-soil lines, times their fraction of all lines (l,), m^2/(Pa s)
     law: NDArray[np.int64]  # retention curve of each soil in series, -1 for unused entries (s,)
     length: NDArray[np.float64]  # fraction of the path in each soil (s,)
-    resistance: NDArray[np.float64]  # length divided by mobility and by the fraction of lines (s,), Pa s/m^2
+    resistance: NDArray[np.float64]  # length divided by mobility and by the fraction of series lines (s,), Pa s/m^2
 
     def at(self, *index) -> Paths:
         """Return the paths at an index of the arrays."""
         return Paths(*(values[index] for values in self))
 
     def everywhere(self, dim: int) -> Paths:
-        """Repeat the paths (n, ...) for both ends of all axes."""
+        """Return the paths (n, ...), repeated for both ends of all axes."""
         parts = ((np.repeat(values, 2 * dim, axis=0), values.shape) for values in self)
         return Paths(*(many.reshape(shape[0], dim, 2, shape[1]) for many, shape in parts))
 
     def with_slots(self, count: int) -> Paths:
-        """Return the paths with room for `count` soils in series."""
+        """Return the paths, padded to `count` soils in series."""
         more = [(0, 0)] * (self.law.ndim - 1) + [(0, count - self.law.shape[-1])]
         law, length, resistance = (
             np.pad(values, more, constant_values=v) for values, v in zip(self[1:], (-1, 0, 0), strict=True)
@@ -57,7 +57,7 @@ class Paths(NamedTuple):
         return Paths(self.parallel, law, length, resistance)
 
     def eased(self, factor: NDArray[np.float64]) -> Paths:
-        """Multiply the mobilities of the paths by a factor (n, d) along each axis."""
+        """Return the paths with mobilities multiplied by a factor (n, d) along each axis."""
         factor = factor[:, :, None, None]
         return self._replace(parallel=self.parallel * factor, resistance=self.resistance / factor)
 
@@ -194,7 +194,7 @@ class _Chain:
         return _Flows(c * k, c * own, c * other, c * k * difference, rounding)
 
     def _chain(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Select the values of the segments in series."""
+        """Return the values (faces, segments) of the segments in series."""
         starts = np.cumsum([0, *(count + 1 for count in self._counts)])
         number = [i for first, count in zip(starts, self._counts, strict=False) for i in range(first, first + count)]
         return np.stack([values[self._parts[i] : self._parts[i + 1]] for i in number], axis=1)

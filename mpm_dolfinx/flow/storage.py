@@ -24,8 +24,8 @@ stabilisation, and d is d+ plus d-.  In this term, dt is the time weight of the 
 term conserves fluid, and it is zero in steady states.
 
 For elastic soil, tau is a quarter of the value of Silvester and Kechkar for patches of elements (Camargo, White and
-Borja 2021).  In yielding soil, tau is up to a hundred times larger.  The increase of tau acts on second differences
-only (`second_differences`).
+Borja 2021).  In yielding soil, tau is up to a hundred times larger than this value.  The increase of tau acts only on
+second differences of the pressure (`second_differences`).
 
 With inertia, tau has the factor `min(1, 1 / (1 + m) + s)`, with `s = kappa rho_w / dt`.  Here m is the ratio of
 inertial to elastic resistance of 2 x 2 cells (`OnGrid.resisting_mass`).  Without this factor, waves in undrained soil
@@ -91,10 +91,10 @@ class StorageForms:
     `pressure`: pore pressure of the cells, positive in compression.
     `materials`: materials and fluid of the scene.
     `weight` (d,), N/m^3: unit weight rho_w g of the pore fluid, as UFL, or None without gravity.
-    `symmetric`: whether to approximate the derivative of the content with respect to J_Delta by alpha.  The Jacobian is
-    then symmetric.  The neglected term is of the order of `(p - p_n) / K_w`.
+    `symmetric`: whether to approximate the derivative of the fluid content with respect to J_Delta by alpha.  The
+    Jacobian is then symmetric.  The neglected term is of the order of `(p - p_n) / K_w`.
     `feeding`: sources and open sides of all stages.
-    `inertial`: motion and the inertia force `-rho_w a` on the pore fluid, see `FluxForms`, or None without inertia.
+    `inertial`: data for the inertia force `-rho_w a` on the pore fluid, see `FluxForms`, or None without inertia.
     """
 
     def __init__(
@@ -126,13 +126,13 @@ class StorageForms:
         J = ufl.det(delta)
         stored = change_of_content(pieces.biot, pieces.storage_at_one, pieces.storage, J, p - self.p_n)
         self.drains = "drainage" in pieces.sizes
-        """Whether pores drain when the water table falls."""
+        """Whether any soil has a specific yield, so that its pores drain when the water table falls."""
         if self.drains:
             yielded, suction = pieces.drainage
             stored += yielded * (filled(p, suction) - filled(self.p_n, suction))
         coupling = 1.0
         self.retains = retentions is not None
-        """Whether pores drain under suction."""
+        """Whether the soils have retention curves, so that pores drain under suction."""
         if self.retains:
             full, before = (retentions.of("saturation", at, pieces) for at in (p, self.p_n))
             denser = ufl.exp(-fem.Constant(self.grid.mesh, 1 / (2 * bulk)) * (p - self.p_n))
@@ -169,7 +169,7 @@ class StorageForms:
         return [sums[:, 0], *[sums[:, start : start + count] for start in range(1, sums.shape[1], count)]]
 
     def drained(self, data: PointData) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the storage (m^d/Pa) due to changes of the saturation S, and `int S d(chi p)/dp dV` (m^d)."""
+        """Return for each cell the storage (m^d/Pa) by drainage, and `int S d(chi p)/dp dV` (m^d) with saturation S."""
         capacity, coupled = self._capacity(data).T
         return capacity, coupled
 
@@ -202,7 +202,7 @@ class Outflow:
 
 @dataclass(frozen=True)
 class Rates:
-    """Outflow rates of the owned cells, in m^d/s, or outflow volumes, in m^d, as result of `integrated`."""
+    """Outflow rates of the owned cells, in m^d/s.  The result of `integrated` contains outflow volumes, in m^d."""
 
     cells: NDArray[np.float64]  # outflow of each cell minus its sources
     net: NDArray[np.float64]  # outflow from the bodies minus sources
@@ -218,7 +218,7 @@ class StorageSystem:
     """Vectors and matrices of the pressure unknowns, for one set of active cells.
 
     `forms`: compiled forms, with the material in the cells.
-    `cells`, `facets`: active local cells including ghosts, and the faces between two of these cells.
+    `cells`: active local cells, including ghosts.  `facets`: faces between two of these cells.
     `momentum`: unknowns of the displacement.
     `parts`: connected parts of the bodies.
     `joins`: functions that return the pattern of couplings of cell pressures, see `Loads.joins`.
@@ -265,24 +265,24 @@ class StorageSystem:
 
     @property
     def gravity(self) -> FacetSum | None:
-        """Form of fluxes between cells of one soil by pressure and weight.  None in saturated soil without weight."""
+        """Form of the fluxes between cells of the same soil.  None in saturated soil without gravity."""
         return (self._uniform or self._over_uniform())[1]
 
     def _over_uniform(self) -> tuple[FacetSum | None, FacetSum | None]:
-        """Return the forms of the flux matrix and of `gravity`, over the faces between cells of one soil."""
+        """Return the forms of the flux matrix and of `gravity`, over the faces between cells of the same soil."""
         fluxes, facets = self._forms.fluxes, self._facets
         facets = facets if fluxes.relative is None else fluxes.relative.uniform(facets)
         return tuple(form and form.on(facets) for form in (fluxes.flux, fluxes.gravity))
 
     def places(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the grid positions of the local unknowns, and an empty array for prescribed unknowns."""
+        """Return the grid positions of the local unknowns, and an empty array, because no pressure is prescribed."""
         places = self._forms.grid.cell_places(self.unknowns.owned)
         return places, places[:0]
 
     def change_by(self, u: PETSc.Vec, out: PETSc.Vec, *slopes: FluxSlope) -> None:
         """Set `out` to the change (m^d) of the residual due to an increment u.
 
-        `slopes`: changes of the fluxes at fixed accelerations.
+        `slopes`: functions that return changes of outflow volumes at fixed accelerations.
         """
         self.B.mult(u, out)
         for slope in slopes:
@@ -378,7 +378,7 @@ class StorageProblem:
 
     `system`: vectors and matrices, with the assembled fluxes.
     `flow`: function that assembles the outflow at (u, p).  Its argument is True at the start of a substep.
-    `dt`: time weight, s, of the rate at (u, p).
+    `dt`: time weight, s, of the outflow rate at (u, p).
     `before`: outflow volumes from the rate of the previous substep.
     `softness` (m,): ratio of elastic to tangent shear modulus of the pieces, 1 if no law can yield.
     `defect` (n,), m^d: correction of volume defects in the active owned cells by the end of the substep.
@@ -467,7 +467,7 @@ class StorageProblem:
         return out
 
     def passing(self) -> list[Mapping[str, NDArray[np.float64]]]:
-        """Return the rates in a converged substep, for the method `volumes`."""
+        """Return the flow rates of the conditions in a converged substep, for the method `volumes`."""
         fluid, both = self._fluid, zip(self._feeds, self._flow(False).at, strict=True)
         return [one.passing(at, fluid) for one, at in both]
 
@@ -495,7 +495,7 @@ class StorageProblem:
         return volumes / (self.forms.derivatives(self.data)[0] + self._contents.fixed_stress)
 
     def filling(self, error: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the errors of the water content due to pressure errors (Pa), and the change of the water content."""
+        """Return errors of the water content due to pressure errors (Pa), and its absolute changes in the step."""
         capacity, _ = self.forms.drained(self.data)
         change = self.forms.change(self.data)[self.system.unknowns.owned]
         share = self.fill / self._contents.volume
@@ -522,7 +522,7 @@ class StorageProblem:
 
     @property
     def accuracy(self) -> float:
-        """Largest relative tolerance of linear solvers."""
+        """Largest relative tolerance of linear solvers that this balance allows."""
         return SAME if self.forms.retains else 1.0
 
     def restrained(
@@ -594,14 +594,14 @@ class StorageProblem:
         rates, dt = self._rates(outflow), self.dt
         mass = r.array_r + dt * rates.cells + before.cells
         r.array_w[:] = mass / density
-        # bound of rounding errors: of volumes, and of fluxes that cancel
+        # bound of the rounding errors of volumes, and of opposite fluxes
         round_off = 8 * EPSILON * (self._contents.volume + dt * rates.turnover + before.turnover)
         exchanged, gain = np.abs(change) + dt * rates.gain + before.gain, change + dt * rates.net + before.net
         rows = exchanged, round_off, np.abs(mass), gain
         return StorageResidual(r, *system.of_parts.sums(np.array(rows)), rates)
 
     def _rates(self, outflow: Outflow) -> Rates:
-        """Return the rates at (u, p)."""
+        """Return the outflow rates at (u, p)."""
         system, fluid = self.system, self._fluid
         force = None
         if self._inertial is not None:
@@ -631,7 +631,7 @@ class StorageProblem:
     def net_inflow(self, rates: Rates) -> NDArray[np.float64]:
         """Return the net inflow by fluxes and sources into each filled owned cell in the step, in m^d.
 
-        `rates`: rates at the end of the last substep.
+        `rates`: outflow rates at the end of the last substep.
         """
         return (-self.dt * rates.cells - self._before.cells) / self._density
 

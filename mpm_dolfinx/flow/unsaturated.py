@@ -47,9 +47,9 @@ class Between(NamedTuple):
 def fitted(p: Sequence, tables: Sequence[Sequence], drop, scale, of: Functions) -> Between:
     """Return the relative conductivity k_r between the two sides of a face, with derivatives.
 
-    The mean of k_r over the pressures between both sides is k (Kirchhoff 1894).  The jump of k_r divided by k is x.
-    The product of x and `drop`, divided by the pressure jump, is y.  With `s(z) = sinh(z / 2) / (z / 2)`, the result is
-    `k s(x + y) / (s(x) s(y))`.  The result is exact for steady flow with an exponential k_r (Baker 1995).
+    Let k be the mean of k_r over the pressures between both sides (Kirchhoff 1894).  Let x be the jump of k_r, divided
+    by k.  Let y be the product of x and `drop`, divided by the pressure jump.  With `s(z) = sinh(z / 2) / (z / 2)`, the
+    result is `k s(x + y) / (s(x) s(y))`.  The result is exact for steady flow with an exponential k_r (Baker 1995).
 
     `p`: pressures on both sides, Pa.
     `tables`: three values on each side: integral of k_r (Pa), k_r, and derivative of k_r (1/Pa).

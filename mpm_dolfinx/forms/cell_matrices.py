@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Nodal forces and element matrices of Q1 vectors, summed over the points of a cell before they are inserted."""
+"""Nodal forces and element matrices of Q1 vectors, summed over the points of a cell before the global assembly."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from mpm_dolfinx.grid.grid import Grid, sum_by
 
 
 def shape_gradients(points: FormPoints) -> list:
-    """Return the gradients of the Q1 shape functions at the points as UFL.  In 3D they are means over each piece."""
+    """Return the gradients of the Q1 shape functions at the points as UFL.  In 3D they are means over the pieces."""
     grid, xi = points.grid, points.offset
     h = grid.edge_in_forms()
     out = []
@@ -37,7 +37,7 @@ def shape_gradients(points: FormPoints) -> list:
 
 
 def shape_over_radius(points: FormPoints) -> list:
-    """Return N / r as UFL, averaged over each piece, for each Q1 shape function N and the radius r."""
+    """Return the mean of N / r over each piece as UFL, for each Q1 shape function N.  Here r is the radius."""
     grid, hoop = points.grid, points.functions["hoop"]
     h, out = grid.edge_in_forms(), []
     for s in grid.signs.tolist():
@@ -47,7 +47,7 @@ def shape_over_radius(points: FormPoints) -> list:
 
 
 def along_shapes(T, points: FormPoints) -> list:
-    """Return T : grad v as UFL, for each Q1 shape function v and each of its components."""
+    """Return T : grad v as UFL, for the Q1 test functions v of each node and component."""
     gradients, d = shape_gradients(points), points.grid.dim
     if not points.grid.axisymmetric:
         return [ufl.dot(T, g)[i] for g in gradients for i in range(d)]
@@ -79,7 +79,7 @@ def insert_rows(A: PETSc.Mat, grid: Grid, cells: NDArray[np.int32], rows: NDArra
 
 
 def _entries(count: int, symmetric: bool) -> tuple[NDArray, NDArray, NDArray]:
-    """Return row and column of each stored entry of a matrix, and the storage index (count, count) of each entry."""
+    """Return rows and columns of the stored entries of a matrix, and the storage index (count, count) of each entry."""
     rows, columns = np.triu_indices(count) if symmetric else np.divmod(np.arange(count**2), count)
     place = np.empty((count, count), dtype=np.int64)
     if symmetric:
@@ -115,21 +115,21 @@ NOTHING = Beside()
 
 
 class ElementMatrices:
-    """The bilinear form grad v : A : grad u of Q1 vectors, with one insertion for each cell.
+    """The bilinear form grad v : A : grad u of Q1 vectors, integrated over the points.
 
     DG0 test functions make the assembler of dolfinx sum each entry of an element matrix over the points of the cell.
-    Each element matrix is then inserted once.
+    Each element matrix is then added to the global matrix once.
 
     Parameters
     ----------
     tangent : UFL tensor (d, d, d, d)
         Components A[i, k, j, l] at the points.
     points
-        Points of the forms.
+        UFL coefficients of the integration points.
     symmetric
         Whether A[i, k, j, l] = A[j, l, i, k].  If True, only half of the entries are computed.
     beside
-        Further integrals.
+        Integrals over each cell that are computed together with the element matrix.
     """
 
     def __init__(
@@ -176,10 +176,10 @@ def _circumferential(tangent, gradients: list, over_radius: list, row: tuple[int
 class StackedElementMatrices:
     """The bilinear form (grad v F) : A : (grad u F) of Q1 vectors, with products by BLAS.
 
-    In 3D, cells contain many points, so that products by BLAS are faster than products in the kernel.  A matrix
-    contains the gradients of the shape functions, multiplied by F, at the n points of a cell.  The element matrix is
-    then the product of an 8 x 3n and a 3n x 72 matrix.  Cells with about the same number of points are computed
-    together.
+    In 3D, cells contain many points, so that products by BLAS are faster than products in the kernel.  An element
+    matrix is the product of two matrices for the n points of a cell.  The first (8, 3n) contains the weighted gradients
+    grad N F of the shape functions N.  The second (3n, 72) contains A times these gradients.  Cells with about the same
+    number of points are computed together.
 
     Parameters: see `ElementMatrices`.  The points must have the field F (d, d).
     """
@@ -199,7 +199,7 @@ class StackedElementMatrices:
         self._sorted: Latest[list] = Latest()
 
     def assemble_matrix(self, A: PETSc.Mat, data: PointData, given: Given = NONE) -> NDArray[np.float64]:
-        """Add the matrix to `A`, which the caller assembles.  Return the values (cells, quantities) of `beside`."""
+        """Add the matrix to `A`, which the caller assembles.  Return the integrals (cells, quantities) of `beside`."""
         live, filled = self._values.live(data, given), data.places.filled
         sums = np.empty((len(filled), self._along * 2**self._d * self._d + self._scalars))
         for cells, points, missing in self._sorted(data.places.key, lambda: batches(data.places)):
@@ -234,8 +234,8 @@ def batches(places: Places) -> list[tuple[NDArray[np.int64], NDArray[np.int64], 
 
     Returns for each batch
     ----------------------
-    Indices (c,) of its cells in the array `Places.filled`.  Indices (c, most) of the points in each cell.  Cells with
-    fewer points have arbitrary indices at the end.  Mask (c, most), True for these arbitrary indices.
+    Indices (c,) of its cells in the array `Places.filled`.  Indices (c, most) of the points in each cell; cells with
+    fewer than `most` points have placeholders at the end.  Mask (c, most), True for placeholders.
     """
     cells = places.cells
     filled = places.filled

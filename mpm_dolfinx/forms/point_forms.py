@@ -6,8 +6,8 @@ multilinear function v on a box of dimension d equals the first d + 1 terms of i
 
     v(x_p) = v + grad v . xi + 1/2 xi . grad grad v . xi + ...,
 
-with the offset xi = x_p - x_mid of the point p from the midpoint x_mid.  The right side is plain UFL, with v and its
-derivatives at the midpoint, and the one-point rule integrates it.
+with the offset xi = x_p - x_mid of the point p from the midpoint x_mid.  The right side is plain UFL.  A quadrature
+rule with one point evaluates v and its derivatives at the midpoint.
 
 In the list of cells of the integral, a cell occurs once for each of its points.  The assembler therefore calls the
 kernel once for each point.  The offset xi and all fields of the points are DG0 coefficients, with one row for each
@@ -37,8 +37,8 @@ from mpm_dolfinx.forms.axes import block
 from mpm_dolfinx.grid.grid import Grid, in_chunks
 
 BATCH, MANY = 2**10, 2**12
-"""`BATCH`: number of points in a batch of element matrices, which fits into the cache.  `MANY`: number of points in one
-evaluation of an expression; for the last points, `BATCH`.
+"""`BATCH`: number of points in a batch of element matrices, which fits into the processor's cache.  `MANY`: number of
+points in one evaluation of an expression.  If fewer points remain, each evaluation takes `BATCH` points.
 """
 
 
@@ -57,7 +57,7 @@ class FormPoints:
     """UFL coefficients for quantities at the points.  `PointData` contains their values.
 
     `grid`: background grid.
-    `fields`: shape of each quantity, by name.  Its coefficient is the attribute of this name.
+    `fields`: shape of each quantity, by name.  The attribute of this name is the coefficient.
     """
 
     def __init__(self, grid: Grid, **fields: tuple[int, ...]):
@@ -67,9 +67,9 @@ class FormPoints:
             for name, shape in {"offset": (grid.dim,), "weight": (), **_moments(grid), **fields}.items()
         }
         self.live: dict[str, Callable[[PointData], NDArray[np.float64]] | None] = {}
-        """Functions that return the values (n, size) of fields that change between assemblies, by name.
+        """For each field that changes between assemblies, by name: function that returns the values (n, size).
 
-        The value is None if the caller passes the values of a field to each assembly.
+        None replaces the function if the caller passes the values to each assembly.
         """
         self.dx = PointMeasure(grid.mesh, self.functions["weight"])
         self.sizes = {name: int(np.prod(shape, dtype=int)) for name, shape in fields.items()}
@@ -146,14 +146,14 @@ class FormPoints:
         return ufl.Identity(self.grid.stretches) + (self.grad(u) if self.grid.axisymmetric else self.gradient(u))
 
     def moved_by(self, u: fem.Function):
-        """Return u at the points as UFL, or for unequal cells as a coefficient with values from numpy."""
+        """Return u at the points as UFL.  On a grid of unequal cells, it is a coefficient with values from numpy."""
         if self.grid.even:
             return self.value(u)
         d = self.grid.dim
         return self.follow("displaced", (d,), lambda data: self.grid.at(data.cells, data.x, u.x.array.reshape(-1, d)))
 
     def deformation(self, u: fem.Function):
-        """Return the deformation gradient (I + grad u) F at the points as a UFL variable, with the field `F`."""
+        """Return the deformation gradient (I + grad u) F at the points as a UFL variable, with the points' field F."""
         F = self.increment(u) * self.F
         return ufl.variable(block(F) if self.grid.axisymmetric else F)
 
@@ -205,7 +205,7 @@ class Places(Keyed):
             hoop = np.column_stack([offset, offset.prod(axis=1), x[:, 0]])
         self.hoop = hoop
         self.filled, self.slots = np.unique(cells, return_inverse=True)
-        """Two arrays: the cells that contain points, and the index of each point's cell in the first array."""
+        """`filled`: cells that contain points.  `slots` (n,): index of each point's cell in `filled`."""
 
     @cached_property
     def nodal(self) -> NDArray[np.intp]:
@@ -226,16 +226,16 @@ class Places(Keyed):
         return Places(self.grid, self.cells[rows], self.x[rows], mixed, hoop)
 
     def shape_gradients(self, chosen: slice | NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the gradients, in 1/m, of the Q1 shape functions at points, or for pieces in 3D the mean gradients."""
+        """Return the gradients, in 1/m, of the Q1 shape functions at points.  For pieces in 3D, they are means."""
         mixed = None if self.mixed is None else self.mixed[chosen]
         return self.grid.shape_gradients(self.cells[chosen], self.x[chosen], mixed)
 
     @cached_property
     def products(self) -> list[list[tuple[int, NDArray[np.float64] | float]]]:
-        """For each axis, the monomials in the other coordinates, as pairs of `bits` and `product`.
+        """For each axis, the monomials of the other coordinates at the points, as pairs (`bits`, `product`).
 
-        The bits of `bits` select coordinates, see `Grid.monomials`.  The array `product` (n,) contains the products of
-        these coordinates, relative to the midpoint of the cell, in 3D as means over pieces.
+        `bits` is a bit mask of the coordinates in a monomial, see `Grid.monomials`.  `product` (n,) contains the values
+        of the monomial.  Coordinates are relative to the midpoint of the cell.  In 3D, products are means over pieces.
         """
         along = []
         for axis in range(self.grid.dim):
@@ -286,7 +286,7 @@ class PointData(Keyed):
         self._stored: Latest[NDArray[np.float64]] = Latest()
 
     def part(self, points: FormPoints, places: Places, rows: NDArray[np.int64]) -> PointData:
-        """Return the points with the indices `rows`, with values of the fields of `points`."""
+        """Return the points with the indices `rows`.  The result has the fields of `points` only."""
         fields = {name: self.rows[name][rows] for name in points.sizes}
         return PointData(points, places, self.volume[rows], fields)
 
@@ -340,7 +340,7 @@ Given = Mapping[str, NDArray[np.float64]]
 NONE: Given = MappingProxyType({})
 
 Packed = tuple[NDArray[np.float64], list[tuple[slice, NDArray[np.float64], NDArray[np.intp]]]]
-"""Array with a row of coefficients for each point, and columns, values and dofs of each function on the grid."""
+"""Array with a row of coefficients for each point; then for each function on the grid, its columns, values and dofs."""
 
 
 class Rows:
@@ -389,11 +389,11 @@ class Rows:
         for columns, name, _ in self._changing:
             rows[:, columns] = live[name][chosen]
         for columns, values, at in dofs:
-            rows[:, columns] = values.take(at, mode="wrap")  # "raise" checks every index
+            rows[:, columns] = values.take(at, mode="wrap")  # mode "raise" would check every index
         return rows
 
     def _pack(self, data: PointData, chosen: slice | NDArray[np.int64]) -> Packed:
-        """Return rows with the values of constant fields, and the dofs of functions on the grid."""
+        """Return rows with the values of fields that never change, and the dofs of functions on the grid."""
         cells = data.cells[chosen]
         rows, dofs = self.room(len(cells))[: len(cells)], []
         for columns, name in self._fixed:
@@ -408,8 +408,8 @@ class PointForm:
     """A form with the measure `points.dx`, compiled once and assembled for any positions of the points.
 
     `form`: linear or bilinear UFL form, with integrals over `points.dx` only.
-    `dense`: whether a DG0 test function has values only for cells with points, numbered in ascending order.  If True,
-    all cells must be equal, because kernels are called for arbitrary cells.
+    `dense`: whether the vector of a DG0 test function has entries only for cells with points, in ascending order.  If
+    True, all cells must have equal size, because kernels then use the geometry of other cells.
     """
 
     def __init__(self, form: ufl.Form, points: FormPoints, dense: bool = False):
@@ -491,7 +491,7 @@ class PointExpression:
     """A UFL expression of quantities at the points, evaluated at every point.
 
     For each point, the kernel of a form with a DG0 test function is called for an arbitrary cell.  Its result is
-    divided by the volume of this cell.  Gradients of functions on the grid are allowed only if all cells are equal.
+    divided by the volume of this cell.  Gradients of functions on the grid are allowed only with equal cells.
 
     `expression`: UFL expression of any shape, with coefficients of `points`.
     """
@@ -544,7 +544,7 @@ class CellSums:
         self._form = PointForm(ufl.inner(ufl.as_vector(quantities), q) * points.dx, points, dense)
 
     def __call__(self, data: PointData, given: Given = NONE) -> NDArray[np.float64]:
-        """Return the sums over the points of each filled cell, as an array (cells, quantities)."""
+        """Return the sums over the points of each cell that contains points, as an array (cells, quantities)."""
         even, filled = self._grid.even, data.places.filled
         sums = np.zeros((len(filled) if even else self._grid.num_local, self._count))
         self._form.assemble_vector(sums.reshape(-1), data, given)

@@ -128,7 +128,7 @@ def insert_for_each_axis(A: PETSc.Mat, nodes: NDArray[np.int32], dim: int, matri
 
 
 def zero(A: PETSc.Mat) -> None:
-    """Set a matrix to zero before assembly, also if it has never been assembled."""
+    """Set a matrix to zero before assembly.  A matrix that has never been assembled does not change."""
     if A.assembled:
         A.zeroEntries()
 

@@ -13,7 +13,7 @@ class Velocity:
     """Velocity `(u - past) / own` at the end of a substep.
 
     `u`, in m: displacement increment of the step.
-    `own`, in s: weight a_ii dt of the velocity at the end of the substep; in backward Euler, the length of the step.
+    `own`, in s: Runge-Kutta coefficient a_ii of the substep times the length dt of the step; in backward Euler, dt.
     `past`, in m: part of u that is due to the velocity in the previous substep; in backward Euler, zero.
     """
 

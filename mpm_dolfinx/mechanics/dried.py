@@ -19,11 +19,11 @@ from mpm_dolfinx.mechanics.quadrature_data import QuadratureData
 
 
 def suction_sums(points: FormPoints, F, slopes: Sequence, locks: bool) -> CellSums | None:
-    """Return the compiled sums over each cell for `OfSuction`, or None for laws without suction.
+    """Return the compiled sums over the points of each cell for `OfSuction`, or None if the law needs no sums.
 
     `F`: deformation gradient (d, d), a UFL variable.
-    `slopes`: UFL derivatives of the first Piola-Kirchhoff stress (d, d), and with F-bar also of the mean stress, with
-    respect to the pressure.  Empty for laws without suction.
+    `slopes`: UFL derivatives with respect to the pressure: of the first Piola-Kirchhoff stress (d, d), and with F-bar
+    also of the mean stress.  Empty for laws without suction.
     `locks`: whether the law uses F-bar.
     """
     share = 1 / ufl.det(points.F)
@@ -47,9 +47,9 @@ class OfSuction:
         self._free = {number: of for number, of in found.items() if number not in self._locked}
 
     def rows(self, data: QuadratureData, given: Sequence[Given]) -> list[tuple[NDArray[np.int32], NDArray[np.float64]]]:
-        """Return cells, and the derivatives of their nodal forces with respect to their pressures.
+        """Return pairs of arrays: cells, and the derivatives of nodal forces with respect to the pressure of each cell.
 
-        `given`: for each law, values that its forms need.
+        `given`: for each law, values of the fields that the caller passes to an assembly, see `FormPoints.follow`.
         """
         parts = data.parts
         out = [(parts[k].places.filled, of(parts[k], given[k])) for k, of in self._free.items()]

@@ -32,7 +32,7 @@ GHOST = 0.05
 9.9e-06, twice this value by 1.9e-05, and finer cells by 1.5e-02.
 """
 YIELDING = 0.02
-"""For nearly incompressible laws with a state, a factor of at least this value reduces the penalty.  Plateau (scene
+"""Smallest value of the factor that reduces the penalty for nearly incompressible laws with a state.  Plateau (scene
 "flow" of tests/plateaus.py): half this value changes the result by 6.4e-04, twice this value by 1.1e-03, and finer
 cells by 8.9e-02.
 """
@@ -100,10 +100,10 @@ class GhostPenalty:
         self.elastic_shear = FacetForm(2 * self.fill * self.shear * around * ufl.inner(*strains) * dx, grid.comm)
 
     def _scale(self):
-        """Return the strength of a face times the mean modulus of both cells, as UFL."""
+        """Return the penalty's strength on a face times the mean modulus of both cells, as UFL."""
         fills, moduli, beside = ([f("+"), f("-")] for f in (self.fill, self.modulus, self.beside))
         full, little = ufl.max_value(*fills), ufl.min_value(*fills)
-        fullest = ufl.conditional(ufl.lt(*fills), *beside)  # largest filling next to the emptier cell
+        fullest = ufl.conditional(ufl.lt(*fills), *beside)  # largest volume fraction next to the emptier cell
         strength = ufl.max_value(0.0, 1 - little / (RATIO * full)) * (full / fullest) ** 2
         if self._at_points:
             strength = SPARSE

@@ -49,7 +49,7 @@ class HoldForms:
         v, du = ufl.TestFunction(u.function_space), ufl.TrialFunction(u.function_space)
 
         def along(w):
-            """Return the component of a Q1 field along `direction`, averaged over points with these moments."""
+            """Return the component of a Q1 field along `direction`, as a mean over points with the given moments."""
             second = ufl.grad(ufl.grad(w))
             i, j, k = ufl.indices(3)
             mean = w + ufl.dot(ufl.grad(w), h.offset) + ufl.as_vector(second[i, j, k] * h.squares[j, k], i) / 2
@@ -124,7 +124,7 @@ class GivenDisplacements(Acting):
         """Return the penalties in a substep."""
         d, comm = self._grid.dim, self._grid.comm
         self._check_meeting(place.t)
-        ends = (place.start, place.start + place.dt) if place.dt > 0 else ()  # empty if the displacement is zero
+        ends = (place.start, place.start + place.dt) if place.dt > 0 else ()  # empty if dt = 0, without displacement
         held = HeldCells(self._grid, self._held_points(place, ends))
         placed, message = [], ""
         for axis in range(d):
@@ -251,7 +251,7 @@ class GivenDisplacements(Acting):
         index = np.arange(2**self._grid.dim)
         for _, faces, _ in self._holds:
             held = np.flatnonzero(np.isin(ids, faces.id))
-            number = faces.face[np.searchsorted(faces.id, ids[held])]  # the first of a domain's two held faces
+            number = faces.face[np.searchsorted(faces.id, ids[held])]  # if a domain has two held faces, the first
             axis, end = (k[:, None] for k in np.divmod(number, 2))
             outward = face_vectors(tracked[held], number)
             depth = volume[held, None] * outward / (outward**2).sum(axis=1, keepdims=True)
@@ -294,12 +294,12 @@ class HoldLoads(Loads):
         self.key = np.append(self._d * row + data["direction"].argmax(axis=1), place.dt if place.inertia else 0.0)
         self.under_held = acting.under_held
         self._asked = data["gap"][:, 0]  # prescribed increments of means: `augment` has not changed the gaps yet
-        self._lacked = np.full(1, np.inf)  # for each side of a part: last sum of gaps in `augment`, at first infinite
+        self._lacked = np.full(1, np.inf)  # for each side of a connected part: sum of gaps in the last `augment`
 
     def augment(self, at: At) -> bool:
         """Add the penalty forces of sides that lag behind to their multipliers.  Return whether any force changed.
 
-        The updates end when every side keeps more than half of its mean gap.
+        The updates end when one update leaves more than half of the mean gap of every side.
         """
         if not self._place.dt:
             return False
@@ -361,8 +361,8 @@ class HoldLoads(Loads):
     def guess(self, parts: Parts, nodal: NDArray[np.float64]) -> NDArray[np.float64] | None:
         """Return an initial guess of the nodal displacements, or None if no connected part rotates.
 
-        The guess of a rotated part is the rigid motion nearest to its prescribed displacements.  The guess of other
-        parts is `nodal`.
+        The guess of a rotated part is the rigid motion nearest to its prescribed displacements.  For all other parts,
+        the guess is `nodal`.
         """
         grid = self.data.points.grid
         if grid.axisymmetric:
@@ -385,7 +385,7 @@ class HoldLoads(Loads):
         return self.data.cells
 
     def rounding(self, of_cells: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the rounding errors of the penalty forces."""
+        """Return rounding errors in cells: `of_cells` plus the errors of the penalty forces."""
         grid = self.data.points.grid
         held = np.zeros(grid.num_local)
         np.maximum.at(held, self.data.cells, self.data["stiffness"][:, 0])

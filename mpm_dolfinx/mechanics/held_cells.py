@@ -5,8 +5,8 @@ In each cell, a stiff penalty acts on the mean displacement of the side, and a w
 mean.  A stiff penalty at each point would lock sides that are curved or inclined to the grid.  The traction at the
 start of the step is applied as a load, so the penalties carry only the increment of the traction.
 
-With inertia, a second penalty with the modulus rho (h / (gamma dt))^2 acts on the increment of the step.  This penalty
-prevents a lag of the side in short steps.
+With inertia, a second penalty acts on the displacement increment of the step.  Its modulus is rho (h / (gamma dt))^2,
+with the density rho, the cell size h and `GAMMA`.  This penalty prevents a lag of the side in short steps.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class HeldPoints(NamedTuple):
     number: NDArray[np.int64]  # (n,) index of the condition
     cell: NDArray[np.int32]  # (n,) local cell
     area: NDArray[np.float64]  # (n,) reference area, m^(d-1)
-    modulus: NDArray[np.float64]  # (n,) penalty modulus times area, N; up to `undrained`: at the last reset
+    modulus: NDArray[np.float64]  # (n,) penalty modulus times area, N; until `undrained`, values of the last reset
     tension: NDArray[np.float64]  # (n,) norm of the stress times area, N
     resistance: NDArray[np.float64]  # (n,) resisting modulus times area, N
     confined: NDArray[np.float64]  # (n,) confined modulus times area, N, with a limited contribution of the fluid
@@ -60,7 +60,7 @@ class HeldPoints(NamedTuple):
     inertial: NDArray[np.float64]  # (n,) rho (h / (gamma dt))^2 times area, N; 0 without inertia
     x: NDArray[np.float64]  # (n, d) position, m
     gap: NDArray[np.float64]  # (n, d) prescribed position minus present position, m
-    step: NDArray[np.float64]  # (n, d) prescribed displacement since the start of the step, or gap after a jump, m
+    step: NDArray[np.float64]  # (n, d) prescribed displacement since the start of the step, plus any jump, m
     given: NDArray[np.float64]  # (n, 2 d) prescribed displacements at start and end of the step, m
     normal: NDArray[np.float64]  # (n, d) area vector at the last reset of the grid, m^(d-1)
     force: NDArray[np.float64]  # (n, d) force of the present stress, rotated with the side, N
@@ -74,7 +74,7 @@ def inner_cells(
     cell: NDArray[np.int32],
     normal: NDArray[np.float64],
 ) -> NDArray[np.int64]:
-    """Return the local cell (n,) of the constraint of each of n points on sides.
+    """Return for each of n points on sides the local cell (n,) whose constraint includes the point.
 
     Points in nearly empty cells belong to the constraint of the next cell inside the body (aggregation; Badia, Verdugo
     and Martin 2018).
@@ -107,8 +107,8 @@ class HeldCells:
     number, cell
         Index of the condition, and cell, of each penalty.
     x, shape, moments
-        Position, m, of each penalty, shape functions, and products of offsets from the midpoint of the cell.  For a
-        penalty on a mean, these values are means too.
+        For each penalty: position (m), values of shape functions, and products of offsets from the midpoint of the
+        cell.  For a penalty on a mean, these values are means over the side too.
     stiffness
         Stiffness of each penalty and component, N/m.
     static
@@ -177,7 +177,7 @@ class HeldCells:
         """Return the penalties on one component, with their stiffness, gap and distribution of the force to nodes.
 
         If the prescribed displacement does not tend to zero at a wall, the wall carries the force on its nodes.  A
-        penalty at this wall is omitted if another penalty of its condition acts on one of its free nodes.
+        penalty there is omitted if another penalty of the same condition acts on one of the same free nodes.
 
         `given` (conditions,): whether each condition prescribes component `axis`.
         `free` (nodes,): whether no wall fixes the node.
@@ -214,7 +214,7 @@ class HeldCells:
     def _held_beside(
         self, number: NDArray[np.int64], nodes: NDArray[np.int32], N: NDArray[np.float64], stuck: NDArray[np.bool_]
     ) -> NDArray[np.bool_]:
-        """Return which penalties at a wall have a free node in common with other penalties of their condition.
+        """Return a mask of penalties at a wall that share a free node with another penalty of the same condition.
 
         `N` (k, 2^d): values of the shape functions of the nodes.
         `stuck` (k, 2^d): whether each node is at a wall.

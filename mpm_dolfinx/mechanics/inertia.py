@@ -132,7 +132,7 @@ def product(A: NDArray[np.float64], B: NDArray[np.float64]) -> NDArray[np.float6
 
 
 def chord(G: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return F~ - 1 and F F~^-1 for a midpoint rule without strain in rotations.
+    """Return F~ - I and F F~^-1 for a midpoint rule in which rotations cause no strain.
 
     The deformation gradients at the start, midpoint and end of the step are F_n, F = F_n + D and F_n + 2 D.
     The mean of C = F^T F at start and end is F^T F + D^T D, with F at the midpoint.  Laws are evaluated at F~, with
@@ -185,7 +185,7 @@ class InertiaForms:
         self._ghost = kinks(grid, V, GHOST_MASS * ufl.avg(self.density), 3)
 
     def set_substep(self, inertia: Inertia | None, midpoint: bool) -> None:
-        """Set the coefficients of a substep.  `midpoint`: whether the substep uses a midpoint rule."""
+        """Set the coefficients of forms in a substep.  `midpoint`: whether the substep uses a midpoint rule."""
         self.midpoint.value = float(midpoint and inertia is not None)
         self._rate.value = 0.0 if inertia is None else inertia.rate
         if inertia is not None:
@@ -224,7 +224,7 @@ class InertiaForms:
         `mass` (n,), in kg: masses of the points.
         `fill` (cells,): volume fractions of the local cells.
         `facets`: faces between two active cells, at least one of them not full.
-        `unknowns`, `held`: unknown displacements, and displacements that walls of the grid fix.
+        `unknowns`: unknown displacements.  `held`: displacements that walls of the grid fix.
         """
         grid = self.grid
         of_pieces = cut.shares(mass)
@@ -277,7 +277,7 @@ class Mass:
         return forces
 
     def stiffness(self, rate: float) -> PETSc.Mat:
-        """Return the derivative of the inertia forces, in N/m, for a `rate` in 1/s^2."""
+        """Return the derivative, in N/m, of the inertia forces with respect to u.  `rate`, in 1/s^2: see `Inertia`."""
         return self._stiffness(rate, lambda: self.M * rate)
 
     def velocity(self, points: MaterialPoints) -> PETSc.Vec:
@@ -348,12 +348,12 @@ class Mass:
         return inverses(self._mean(off[:, None] * off + second))
 
     def _mean(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return for each point the volume mean (..., n) of values (..., m) of its pieces."""
+        """Return for each point the volume-weighted mean (..., n) of values (..., m) of its pieces."""
         pieces = self._cut.pieces
         return sum_by(pieces.point, pieces.fraction * values, len(self._cut.points))
 
     def _at_points(self, points: MaterialPoints, v: PETSc.Vec) -> dict[str, NDArray[np.float64]]:
-        """Return the affine velocity field in each domain that is nearest to the nodal velocities."""
+        """Return for each domain the affine velocity field nearest to the field of the nodal velocities v."""
         cut, grid, places, nodal = self._cut, self._forms.grid, self._pieces.places, self.local(v)
         d, of_cells = grid.dim, grid.over_edges(grid.monomials @ nodal.take(places.nodal), places.filled)
         at, slope = polynomial(of_cells, places.offset.T, places.slots).T, self._pieces.gradients_of(nodal)

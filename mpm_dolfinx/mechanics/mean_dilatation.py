@@ -4,7 +4,7 @@
 The law is evaluated at a scaled deformation gradient Fbar.  The volume ratio theta of Fbar in the step is a mean over
 the cell:
 
-    Fbar = (theta J_n / det F)^(1/3) F,     theta = sum w det(Delta) / sum w   over the locking pieces of the cell.
+    Fbar = (theta J_n / det F)^(1/3) F,     theta = sum w det(Delta) / sum w   over the cell's pieces with F-bar.
 
 Here w is the volume of a piece, Delta = I + grad u is the deformation gradient of the step, F = Delta F_n, and
 J_n = det F_n.  The scaling acts along all three axes, so in plane strain there is an out-of-plane stretch.  Only nearly
@@ -47,7 +47,7 @@ class SumsOfPart(NamedTuple):
     """Kernels for sums over the integration points of one law in each cell, which give theta and pi."""
 
     ratio: CellSums
-    stress: PointExpression  # components of P for the residual, and the derivative with respect to theta for pi
+    stress: PointExpression  # components of P for the residual, then the derivative of psi by theta for pi
 
 
 class FBar:
@@ -90,7 +90,7 @@ class FBar:
         `Fbar`: result of `of`.
         `ratio`: det Delta, with Delta F_n = F.
         `values`: UFL values of the law's parameters, state and local unknowns.
-        `known`: like `values`, for expressions that are not differentiated.
+        `known`: like `values`, but the local unknowns do not depend on F.
 
         Returns
         -------
@@ -125,7 +125,7 @@ class FBar:
 
             dtau = s C : dF + (theta dtau/dtheta) (dtheta / theta - F^-T : dF),   C = dtau/dFbar,
 
-        for F (d, d) and the (d, d) components of s F.
+        where F and s F have only their (d, d) components in the plane.
         """
         P, slope = self.stresses(law, F, Fbar, values)
         if law.kirchhoff is None or self.grid.dim == 3:
@@ -178,9 +178,9 @@ class MeanDilatation:
         return self._cells(data).filled, self._cells(data).total(sums), self._volume_of(data)
 
     def at(self, data: QuadratureData, motion: tuple, solve: Callable[[], Sequence[Given]]) -> list[Given]:
-        """Set theta and pi, and return the values for the forms of each law.  All processes must call this method.
+        """Set theta and pi.  Return the values that the forms of each law need.  All processes must call this method.
 
-        `motion`: key of the present displacement.
+        `motion`: cache key that identifies the present displacement.
         `solve`: function that solves for local unknowns of the laws.
         """
 
@@ -250,7 +250,7 @@ class MeanDilatation:
         return tuple(part.key for part in self._parts(data))
 
     def _volume_of(self, data: QuadratureData) -> NDArray[np.float64]:
-        """Return the total volume, in m^d, of the pieces with F-bar in each filled cell."""
+        """Return the total volume, in m^d, of the pieces with F-bar in each cell that has such pieces."""
         key = self._key(data)
 
         def volumes() -> NDArray[np.float64]:
@@ -274,7 +274,7 @@ class Cells:
         self.where = [np.searchsorted(self.filled, cells) for cells in of_parts]
 
     def total(self, values: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
-        """Return the totals (cells, quantities) over all laws of values in cells."""
+        """Return sums (cells, quantities) over all laws.  `values`: for each law, the values in its cells."""
         if len(values) == 1:
             return values[0]
         out = np.zeros((len(self.filled), values[0].shape[1]))

@@ -121,7 +121,7 @@ class MomentumForms:
         self.ghost = GhostPenalty(grid, V, at_points)
         kept = [self.ghost.fill.x.array], [f.x.array for f in (self.u, *rooms)]
         self.active = Active(grid, pressure is not None, *kept)
-        """Active cells.  u is zero at nodes of other cells."""
+        """Active cells and nodes.  At all other nodes, u is zero."""
 
     def _forms_of_law(
         self,
@@ -188,7 +188,7 @@ class MomentumForms:
         return self.active.now
 
     def summed(self, room: int, adders: Sequence[Callable[[NDArray[np.float64]], None]]) -> NDArray[np.float64]:
-        """Return the sum of nodal forces over processes.  `room`: index of the buffer for the result."""
+        """Return the nodal forces of `adders`, summed over processes.  `room`: index of the buffer for the result."""
         carrier, out = self._rooms[room]
         out[self.active.now.dofs] = 0.0
         for add in adders:
@@ -225,7 +225,7 @@ class MomentumForms:
 
     @property
     def _motion(self) -> tuple:
-        """Key of the present displacement and suction."""
+        """Cache key that identifies the present displacement and suction."""
         p = None if self._suction is None else self._suction.x.array.copy()
         return self.u.x.array[self.active.now.dofs], self.inertia and float(self.inertia.midpoint.value), p
 
@@ -236,7 +236,7 @@ class MomentumForms:
         return [] if some else [NONE] * len(self.law_forms)
 
     def _given(self, data: QuadratureData, derive: bool = False) -> Sequence[Given]:
-        """Set theta and pi, and return the values at u for the forms of each law."""
+        """Set theta and pi at u.  Return the stresses and local unknowns that the forms of each law need."""
 
         motion = self._motion
 
@@ -318,7 +318,7 @@ class MomentumSystem:
         self.rounding = self.unknowns.vector()
         """Rounding error of the residual at each unknown, in N."""
         self.of_whole = self.unknowns.vector()
-        """Rounding error of each unknown, in N, times the square root of the size of its connected part."""
+        """`rounding` of each unknown, in N, times the square root of the number of unknowns in its connected part."""
         self.K = matrix(self.unknowns, self.unknowns, 3**d * d)
         self.mass: PETSc.Mat | None = None
         """Mass matrix, in kg, or None without inertia."""
@@ -380,7 +380,7 @@ class MomentumSystem:
         return A
 
     def set_penalty(self, loads: Sequence[Loads]) -> None:
-        """Assemble the ghost penalty, the penalties of loads and the regularisation, which are linear in u."""
+        """Assemble the matrices of ghost penalty, penalties of loads, and regularisation, which do not depend on u."""
         for penalty in (self.held_penalty, self.penalty):
             zero(penalty)
             for one in (self._ghost, *loads):
@@ -539,7 +539,7 @@ class MomentumProblem:
     def out_of_balance(
         self, r: PETSc.Vec, scales: NDArray[np.float64], first: bool
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return two relative residuals of each connected part: without rounding errors, and for the convergence test.
+        """Return two relative residuals of each part: one without rounding errors, and one for the convergence test.
 
         `r`, `scales` (parts,), in N: residuals and force scales.
         `first`: whether this is the first residual of a step, in which rounding errors are not subtracted.
@@ -567,7 +567,7 @@ class MomentumProblem:
         return wall_forces(self.forms.grid, walls, np.concatenate(dofs), np.concatenate(values))
 
     def outcome(self) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return the reactions and outflows of the conditions at u, by quantity and name."""
+        """Return the reactions and outflows of the conditions at u, by quantity and name of the condition."""
         out: dict[str, dict[str, NDArray[np.float64]]] = {}
         for one in self.loads:
             for quantity, values in one.outcome(self.at).items():

@@ -22,7 +22,7 @@ from mpm_dolfinx.parallel.exchange import over_all
 from mpm_dolfinx.points.material_points import ACROSS, MaterialPoints, in_plane, in_space
 
 STIFF_DRY = 50
-"""Weight of the volume ratio from corners of domains in dry bodies, divided by G / (lambda + 2G), and at most 1.
+"""In dry bodies, the volume ratio from corners of domains has the weight min(1, `STIFF_DRY` G / (lambda + 2G)).
 
 The volume ratio at the start of a step is a weighted mean of two values: from the corners of domains (`cell_ratios`),
 and from F of the points.  With nu = 0.4999 and a weight of 1, the stress change at a reset of the grid would exceed the
@@ -38,13 +38,13 @@ SHARE = 0.5
 """In cells of flowing, dilatant soil, the deviation of grad u from its cell mean is multiplied by this factor.
 
 Without this factor, dilatancy would lock Q1 cells.  With the factor 1, the load of a footing (phi = psi = 20 degrees)
-is 4.4 % too large with 9 cells over its width, 3.4 % with 17 cells, and does not reach a limit.  With the factor 0, the
-limit load is 6.6 % too small with 9 cells, and 3.2 % with 17 cells.
+does not reach a limit.  It is 4.4 % too large with 9 cells over the width of the footing, and 3.4 % with 17 cells.
+With the factor 0, the limit load is 6.6 % too small with 9 cells, and 3.2 % with 17 cells.
 """
 
 
 def corner_share(material: Skeleton, wet: bool) -> NDArray[np.float64]:
-    """Return the weight of the volume ratio from the corners at the start of a step."""
+    """Return the weight of the volume ratio from the corners of domains, at the start of a step."""
     stiffness = material.oedometric / material.shear
     return (
         np.minimum(np.maximum(2 - stiffness / STIFF_WET, 0.0), 1.0) if wet else np.minimum(1.0, STIFF_DRY / stiffness)
@@ -53,7 +53,7 @@ def corner_share(material: Skeleton, wet: bool) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class QuadratureData:
-    """Integration points of a step, with their fields.  A part contains the points of one law."""
+    """Integration points of a step, with their fields.  A part contains the integration points of one law."""
 
     pieces: PointData  # all integration points
     parts: tuple[PointData, ...]  # integration points of each part
@@ -139,7 +139,7 @@ class QuadraturePoints:
         return PiecePlaces(pieces, tuple(parts))
 
     def _law_places(self, cut: CutDomains, pieces: Places) -> Places:
-        """Return the positions at which laws are evaluated.  The factor `SHARE` moves them towards cell midpoints."""
+        """Return the positions at which laws are evaluated.  The factor `SHARE` moves them towards cell means."""
         if not self.materials.dilates or self._grid.axisymmetric:
             return pieces
         flows = cut.to_cells(self.materials.dilating(cut.points))

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """The rigid motion nearest to prescribed displacements: initial guess of Newton's method for bodies that rotate.
 
-A linearised rotation by an angle a stretches a body by a^2 / 2.  Soil may yield at this stretch, so the first Newton
-step would be a bad guess.
+A linearised rotation by an angle a stretches a body by a^2 / 2.  Without this guess, the first Newton step is such a
+rotation, and soil may yield.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def rigid_motion(
     The result is None for small rotations, and for displacements that are far from a rigid motion.  All processes must
     call this function.
 
-    `holds`: penalties of prescribed displacements, with direction, gap, in m, and stiffness, which weights the fit.
+    `holds`: penalties of prescribed displacements, with direction, gap (m), and stiffness (weight in the fit).
     `counts` (k,): whether each penalty is used.
     """
     d = x.shape[1]
@@ -62,7 +62,7 @@ def rigid_motion(
 def rotated(
     comm: MPI.Intracomm, weight: NDArray[np.float64], x: NDArray[np.float64], to: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the rotation nearest to a motion of weighted positions (Kabsch 1976).
+    """Return the rotation that best maps positions x to the positions `to`, with weights (Kabsch 1976).
 
     The result is the identity for small rotations, and for motions that are far from rigid.  All processes must call
     this function.
@@ -87,7 +87,7 @@ def _apply(turn: Rotation, x: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _spin(x: NDArray[np.float64], e: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the velocities along directions e for unit angular velocities about each axis."""
+    """Return the velocities of positions x along directions e, for a unit angular velocity about each axis."""
     if x.shape[1] == 2:
         return (x[:, :1] * e[:, 1:] - x[:, 1:] * e[:, :1]).copy()
     return np.cross(x, e)

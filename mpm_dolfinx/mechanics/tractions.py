@@ -33,7 +33,7 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 
 
 class SideLoads(Acting):
-    """Loads of one kind on sides of the bodies in a stage, by name."""
+    """All tractions, or all pressures, on sides of the bodies in a stage."""
 
     def __init__(self, setting: Setting, loads: Mapping[str, Any]):
         self._grid, self._forms = setting.grid, setting.forms
@@ -69,7 +69,7 @@ class SideLoads(Acting):
 
 
 class DeadForces:
-    """Form of the work of point forces."""
+    """Form of the virtual work of forces at points."""
 
     def __init__(self, grid: Grid, u: fem.Function):
         self.points = p = FormPoints(grid, force=(grid.dim,))
@@ -105,12 +105,12 @@ class DeadLoads(Loads):
         self._work, self.data = work, data
 
     def dead(self, b: NDArray[np.float64]) -> None:
-        """Add the forces."""
+        """Add the nodal forces."""
         self._work.assemble_vector(b, self.data)
 
 
 def owners(grid: Grid, patches: Sequence[Patches]) -> tuple[Exchange, Places]:
-    """Return the exchange that sends values on patches to the owners of cells, and positions of received patches."""
+    """Return the exchange that sends values of patches to the owners of their cells, and the received positions."""
     cell, x = (np.concatenate([getattr(p, name) for p in patches]) for name in ("cell", "x"))
     travel = Exchange(grid.comm, grid.owner(cell))
     return travel, Places(grid, grid.locals[travel.send(cell)], travel.send(x))
@@ -163,7 +163,7 @@ class PressureLoads(Loads):
         self._forms, self._data = forms, data
 
     def loads(self, b: NDArray[np.float64]) -> None:
-        """Add the forces on the present area."""
+        """Add the nodal forces of the pressures on the present area."""
         self._forms.work.assemble_vector(b, self._data)
 
     def tangent(self, K: PETSc.Mat) -> None:
@@ -172,7 +172,7 @@ class PressureLoads(Loads):
 
 
 def closed(grid: Grid, free: NDArray[np.bool_], pressures: Sequence[tuple[Pressure, Surface]]) -> bool:
-    """Return whether each surface of equal pressure is closed, or ends at walls that fix the normal displacement.
+    """Return whether each surface under one pressure is closed, or ends at walls that fix the normal displacement.
 
     `free` (nodes, d): whether walls leave each displacement component free.
     """

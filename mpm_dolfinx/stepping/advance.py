@@ -113,7 +113,7 @@ class Motion:
         with _compat.Timer("move points"):
             cut, pieces = on_grid.cut, data.pieces
             for one in (pieces, *data.parts):
-                one.forget()  # the memory is largest below
+                one.forget()  # the use of memory peaks below
             grid, d = cut.grid, cut.grid.dim
             nodal = self._momentum.u.x.array.reshape(-1, d)
             deformed = cache(partial(self._deformed, cut, data, nodal))
@@ -208,7 +208,7 @@ class Motion:
     def _at_rest(self, stage: Stage, t: float, nodal: NDArray[np.float64] | None) -> AtPlaces | None:
         """Return a function for hydrostatic pressures, or None without gravity."""
         gravity, grid = stage.gravity_at(t), self._momentum.grid
-        if gravity is None:  # also without conductivity: conductivity of a distant body must not change pressures
+        if gravity is None:  # independent of conductivity: a distant permeable body must not change pressures
             return None
         weight = self._materials.fluid.density * gravity
         return lambda cells, x: (x - grid.low + (0.0 if nodal is None else grid.at(cells, x, nodal))) @ weight
@@ -216,7 +216,7 @@ class Motion:
     def _kept(
         self, values: NDArray[np.float64] | None, on_grid: OnGrid, keeps: NDArray[np.bool_]
     ) -> NDArray[np.float64] | None:
-        """Return the nodal values, with zeros outside cells where points keep their pieces."""
+        """Return the nodal values in cells where points keep their pieces, and zeros at all other nodes."""
         if values is None:
             return None
         cut = on_grid.cut
@@ -228,7 +228,7 @@ class Motion:
     ) -> NDArray[np.float64]:
         """Return the pressures (Pa) of the points from the pressures of the cells at time t (s).
 
-        `nodal` (nodes, d), m: displacement since the reset of the grid, if any.
+        `nodal` (nodes, d), m: displacement since the reset of the grid, or None without motion.
         """
         at_rest = self._at_rest(stage, t, nodal)
         return on_grid.cut.in_plane(on_grid.pressures_up_to_surface(self._reconstruction, stage, t, at_rest))
@@ -263,7 +263,7 @@ class Motion:
             delta[:, 2, 2] = pieces.places.stretch(nodal) if grid.axisymmetric else 1.0
         self._momentum.average(delta, data)
         columns = np.empty((len(F), d * d + 1))
-        for part in in_chunks(len(F)):  # products of all pieces would take the memory of a step
+        for part in in_chunks(len(F)):  # in chunks, because products of all pieces would take much memory
             product = delta[part] @ F[part]
             columns[part, :-1], columns[part, -1] = product.reshape(-1, d * d), determinant(product)
         mean = cut.mean(cut.to_pieces(columns))
@@ -282,7 +282,7 @@ class Motion:
         followed: Iterable[NDArray[np.float64]],
         deformed: Callable[[], NDArray[np.float64]],
     ) -> tuple[MaterialPoints, NDArray[np.bool_], int]:
-        """Return the points with new corners and F, which points keep their pieces, and the number of inverted domains.
+        """Return points with new corners and F, a mask of points that keep their pieces, and the count of inversions.
 
         F of elastic points follows from the corners of their domains. F of yielded points is the result of `deformed`.
         """
@@ -358,7 +358,7 @@ class Motion:
         """Return the volume defects of the points after a step, per reference volume, and their corrections.
 
         The step adds `(c - q) / alpha` to the defect.  Here c is the increase of the fluid content according to volumes
-        and cell pressures, q is the net inflow, and alpha is Biot's coefficient.  Soil with a free surface has no
+        and cell pressures, q is the net inflow, and alpha is Biot's coefficient.  Soil with a specific yield has no
         defect.
         """
         before = state.points

@@ -148,7 +148,7 @@ def flight_of(start: Start) -> Flight | None:
 
 
 def leads(scene: Scene, loads: Sequence[Loads]) -> bool:
-    """Return whether Newton's method starts from extrapolated displacements: with yield, or quasi-static contact."""
+    """Return whether Newton's method starts from extrapolation: in scenes with yield, or with quasi-static contact."""
     momentum = scene.momentum
     return not momentum.elastic or (momentum.inertia is None and any([one.touches for one in loads]))
 
@@ -175,7 +175,7 @@ def balances(
 ) -> Balances:
     """Return the balances at the end of a substep, at the present u and p.
 
-    `before`: rates of the previous substep.
+    `before`: outflow rates of the previous substep.
     `flight`: present velocities, or None without inertia.
     """
     substep = acting.substep
@@ -215,6 +215,6 @@ def balances(
 
 
 def pushed_back(scene: Scene, on_grid: OnGrid, cells: NDArray[np.int64] | slice) -> NDArray[np.float64]:
-    """Return the inertia forces (n, d) on the pore fluid in some of the filled owned cells, in N/m^3."""
+    """Return the inertia forces (n, d) on the pore fluid in the chosen filled owned cells, in N/m^3."""
     contents = on_grid.contents
     return -scene.fluid.density * scene.momentum.inertia.at(contents.filled[cells], contents.shape_values[cells])

@@ -25,7 +25,7 @@ class Distributed(Protocol):
 
 
 def distribute(simulation: Distributed) -> None:
-    """Distribute the cells anew, if the numbers of points on the processes then become more equal.
+    """Distribute the cells anew, if this makes the numbers of points on the processes more equal.
 
     Cells are distributed only before a step that resets the grid.
     """

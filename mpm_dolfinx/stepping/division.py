@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Division and merging of elastic particle domains where grid cells become finer or coarser.
 
-Lengths of domains are divided by the cell size. A domain is bisected along a local axis if each half is at least as
-long as the domain was at seeding. Two halves merge if the merged domain is at most as long as a domain at seeding.
-Inside a body from `box`, neighbouring seeded domains may merge too. Domains are never divided or merged if they have
-yielded, contain probes, or have a side with prescribed displacement.
+Here, all lengths are divided by the cell size. A domain is bisected along a local axis if each half is at least as long
+as the domain was at seeding. Two halves merge if the merged domain is at most as long as a domain at seeding. Inside a
+body from `box`, neighbouring seeded domains may merge too. Domains are never divided or merged if they have yielded,
+contain probes, or have a side with prescribed displacement.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ class Division:
 
     @cached_property
     def _outer(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Seeded domains and face indices of the surface of all bodies."""
+        """Ids of seeded domains, and indices of their faces, on the surfaces of all bodies."""
         found = [body.outer() for body in self._domains.bodies]
         ids = [start + row for start, (row, _) in zip(self._domains.starts, found, strict=False)]
         return np.concatenate(ids), np.concatenate([face for _, face in found])
@@ -125,9 +125,9 @@ class Division:
         return wants
 
     def _intervals(self, points: MaterialPoints, axis: int) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Return a key of each domain, and whether the domain is the upper one of two halves.
+        """Return a row of numbers for each domain, and whether the domain is the upper one of two halves.
 
-        The two halves of a divided domain have equal keys. Keys of other domains contain nan.
+        The two halves of a divided domain have equal rows. Rows of other domains contain nan.
         """
         root, part = roots(points)
         place, size = self._domains.places(root), np.ptp(part, axis=2)

@@ -137,7 +137,7 @@ class OnGrid(Keyed):
 
     @property
     def mixes(self) -> bool:
-        """Whether a cell contains several soils, and the ratio of their conductivities varies with pressure."""
+        """Whether any cell contains several soils whose ratio of conductivities varies with pressure."""
         return self._mixed is not None and self._storage.fluxes.relative is not None
 
     @cached_property
@@ -216,7 +216,7 @@ class OnGrid(Keyed):
         return self.cut.pieces_to_cells(there + more[pieces.point])
 
     def of_pieces(self, state: State, name: str, fresh: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the values (m, ...) of the array `name` of pieces. New pieces have the values `fresh`."""
+        """Return the array `name` (m, ...) of `PiecePressures` for all pieces. New pieces have the values `fresh`."""
         return state.of_pieces(name, fresh, self.cut.pieces.point)
 
     @contextmanager
@@ -267,7 +267,7 @@ class OnGrid(Keyed):
         water: PoreWater | None,
         at_rest: AtPlaces | None,
     ) -> list[NDArray[np.float64]]:
-        """Return pressures (m,), slopes (m, d) and bounds (m, 2) in the pieces, from the pressures of the cells.
+        """Return pressures (m,) of the pieces, their slopes (m, d) and bounds (m, 2), from the pressures of the cells.
 
         The mean mass potential of the pieces equals the potential of their cell. In unsaturated scenes, the pore water
         of a cell is conserved instead.
@@ -275,7 +275,7 @@ class OnGrid(Keyed):
         `store` (m,), m^d/Pa: storage of the pieces, the weights of the means.
         `t`, s: time of the pressures on open sides.
         `water`: pore water of the pieces, in unsaturated scenes.
-        `at_rest`: hydrostatic pressures, or None without gravity. The reconstruction acts on differences from them.
+        `at_rest`: hydrostatic pressures, subtracted before the reconstruction, or None without gravity.
         """
         pieces = self.data.pieces
         contents = self.contents
@@ -409,7 +409,7 @@ class OnGrid(Keyed):
 
     @cached_property
     def scale(self) -> NDArray[np.float64] | None:
-        """Suctions (Pa) at which filled owned cells drain (1 without retention curve), or None in saturated scenes."""
+        """Suctions (Pa) at which filled owned cells drain; 1 without a retention curve; None in saturated scenes."""
         if self._materials.retentions is None:
             return None
         scale = np.full(len(self.contents.filled), np.inf)
@@ -424,7 +424,7 @@ class OnGrid(Keyed):
         return Mobility(mean) if self._mixed is None else self._mixed.mobility(at_pieces, mean, None)
 
     def rests(self, state: State) -> NDArray[np.int64] | None:
-        """Return the filled owned cells in which all points keep their pieces, or None if no point keeps its pieces."""
+        """Return indices of filled owned cells whose points all keep their pieces, or None if no point keeps them."""
         if not state.stay:
             return None
         moves = self.cut.to_cells(~state.stay.keeps).astype(float)
@@ -544,7 +544,7 @@ class Assembled(Keyed):
             own.mass = self.mass.M
         self.momentum.set_rounding(self._rounding(momentum, loads))
         self.round_off = float(self.momentum.rounding.norm())
-        """Norm (N) of the rounding error in the residual of the momentum."""
+        """Norm (N) of the rounding error in the residual of the momentum balance."""
         self._off = None
         if self.storage is not None:
             self.storage.set_alternation()
@@ -581,7 +581,7 @@ class Assembled(Keyed):
     ) -> tuple[list[Feeds], Callable[[bool], Outflow]]:
         """Return the fluid conditions, and a function `outflow(begins)` for the fluxes at u.
 
-        With `begins`, invalid values raise ValueError.
+        If `begins` is True, invalid values raise ValueError.
 
         `state`: state at the start of the step.
         `weight` (d,), N/m^3: unit weight of the fluid, or None without gravity.
@@ -604,7 +604,7 @@ class Assembled(Keyed):
         def mobility(begins: bool) -> Mobility:
             if self._varies:
                 return on_grid.mobility(data, begins)
-            together = [grid.comm] if mixture else []  # a key without pressures is equal on all processes
+            together = [grid.comm] if mixture else []  # without pressures, the cache key is equal on all processes
             return self._mobility(mixture, lambda: on_grid.mobility(data, True), *together)
 
         def fit() -> Gradients | None:

@@ -177,8 +177,8 @@ def _released(
 ) -> tuple[State, dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]]:
     """Return the state on the grid of the next step, and the static tractions on sides that become quiet.
 
-    Tractions balance the stresses, the loads of the previous stage, and the remaining supports. The keys are names of
-    point data. The values are ids of points, and the tractions at these points.
+    Tractions balance the stresses, the loads of the previous stage, and the remaining supports. In the dictionary, keys
+    are names of point data. Values are ids of points, and the tractions at these points.
     """
     start = set_up(scene, state, 0.0)
     state, momentum = start.state, scene.momentum
@@ -341,7 +341,7 @@ def _filled(
 def _without_extra(
     scene: Scene, points: MaterialPoints, add: Sequence[int], fields: Mapping[str, ArrayLike]
 ) -> MaterialPoints:
-    """Return the points without data that added bodies lack. Raise ValueError for data that `fields` does not give."""
+    """Return the points without data that added bodies lack. Raise ValueError if `fields` lacks such data."""
     extra = points.data.keys() - scene.materials.seeded.data.keys()
     for name in sorted(extra - fields.keys()):
         what = f"stage: add: body {add[0]}: its points have no {name!r}"
@@ -460,7 +460,7 @@ def balanced(scene: Scene, state: State) -> State:
 
 
 def _report(scene: Scene, seeded: State, points: MaterialPoints, count: int, left: float, touches: bool) -> None:
-    """Log the changes of the stresses. Raise ValueError for a large relative residual, or warn with contact."""
+    """Log the changes of the stresses. Raise ValueError for a large relative residual; with contact, warn instead."""
     materials, comm = scene.materials, scene.grid.comm
     if left > REMARKABLE and not touches:
         scene.forget()
@@ -477,7 +477,7 @@ def _report(scene: Scene, seeded: State, points: MaterialPoints, count: int, lef
 
 
 def _problem(scene: Scene, start: Start, state: State) -> MomentumProblem:
-    """Return the momentum balance at zero displacement and zero rates."""
+    """Return the momentum balance at zero displacement and zero velocity."""
     matrices, data = start.matrices, start.on_grid.data_of(state)
     at = start.on_grid.cut, start.on_grid.fill, state.points, data
     place = Place(*at, state.t, 0.0, state.t, state.outcome)

@@ -20,7 +20,7 @@ from mpm_dolfinx.stepping.state import State
 
 
 def with_lines(grid: Grid, state: State, left: Callable[[State], State]) -> State:
-    """Move the grid lines for the next step.  Return the state, in which all domains are cut anew if lines have moved.
+    """Move the grid lines for the next step.  Return the state.  If lines have moved, the step cuts all domains anew.
 
     `left`: function that adds pressures of pieces to a state, called before the lines move.
     """

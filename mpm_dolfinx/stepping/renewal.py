@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Renewal: replacement of distorted particle domains of flowing soil by new ones, at a reset of the grid.
 
-F of yielded soil is updated by increments, so its domains serve for integration only. Cells with a piece of a domain
-longer than `LONGEST` are filled anew:
+F of yielded soil is updated by increments, so the domains of this soil serve for integration only. Cells with a piece
+of a domain longer than `LONGEST` are filled anew:
 
 * A full cell is divided into four equal domains.
 * A cell that the surface crosses once is filled with quadrilaterals about the centroid of the filled part. The surface
@@ -254,6 +254,6 @@ def _of_tensors(function: np.ufunc, b: NDArray[np.float64]) -> NDArray[np.float6
 
 
 def _pulled(F: NDArray[np.float64], across: NDArray[np.float64] | None, b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the inverse plastic tensors C_p^-1 for elastic left Cauchy-Green tensors b and F."""
+    """Return the inverse plastic tensors C_p^-1 from deformation gradients F and elastic Cauchy-Green tensors b."""
     inverse = np.linalg.inv(unstretched(F if across is None else in_space(F, across)))
     return inverse @ b @ inverse.swapaxes(1, 2)

@@ -17,7 +17,7 @@ from mpm_dolfinx.conditions.acting import MOTIONS, OF_RAIN, QUANTITIES
 from mpm_dolfinx.conditions.names import ByName
 
 OUTCOMES = (*QUANTITIES, *MOTIONS, "energy", *OF_RAIN)
-"""Quantities of the package's conditions. User-defined conditions may have other quantities."""
+"""Names of the results of the package's conditions. User-defined conditions may have other results."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Result:
     residual
         Largest relative residual of the momentum and fluid equations so far.
     wall, profile
-        Wall times, s, of the whole run, and of each task on this process.
+        Wall time of the whole run, and wall times of its tasks on this process, s.
     converged
         Whether the run has reached `t_end`, or an event has ended it.
     event

@@ -91,7 +91,7 @@ class Scene:
         given |= {"initial": initial, "velocity": velocity}
         self._on = partial(Scene, bodies=bodies, materials=materials, fluid=fluid, **given)
         self.former: WeakSet[SceneMaterials] = WeakSet()
-        """Materials of this scene on grids with other distributions among processes."""
+        """Materials of this scene on earlier partitions of the grid among processes."""
         self.bodies = tuple(bodies)
         self.numerics, scheme = numerics, numerics.scheme
         terms, sources = extensions
@@ -228,7 +228,7 @@ class Scene:
         return out
 
     def adopted(self, state: State) -> State:
-        """Convert a state of the same scene on another partition."""
+        """Return a state of the same scene on another partition, converted to the partition of this scene."""
         before = state.stage
         given = {**before.conditions, "conditions": tuple(before.given.values())}
         nodal = {name: rows for name in NODAL if (rows := getattr(state, name)) is not None}
@@ -336,7 +336,7 @@ class Scene:
 
         `now`: present loads.
         `as_cut`: function that returns the loads at the last reset.
-        `begins`: whether this is the first step of a stage.  Then all parts of the bodies must have supports.
+        `begins`: whether this is the first step of a stage.  If so, all parts of the bodies must have supports.
 
         Raises
         ------

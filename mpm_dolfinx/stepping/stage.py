@@ -141,7 +141,7 @@ class Stage:
         return [*self.surfaces, *(one.outside for one in self.acting if one.outside is not None)]
 
     def of(self, *kinds: type) -> dict[str, Any]:
-        """Return the conditions of some classes, by name."""
+        """Return the conditions of the given classes, by name."""
         return {name: one for name, one in self.named.items() if isinstance(one, kinds)}
 
     def followed(self, grid: Grid) -> str | None:
@@ -197,7 +197,7 @@ class Stage:
         return {data: rows for one in self.acting for of in one.kept(n).values() for data, rows in of.items()}
 
     def data_names(self, names: Collection[str]) -> set[str]:
-        """Return the names of point data that the conditions `names` store."""
+        """Return the names of the point data that the conditions named in `names` store."""
         return {data for one in self.acting for name, of in one.kept(0).items() if name in names for data in of}
 
     def same(self, before: Stage) -> set[str]:
@@ -328,7 +328,7 @@ def stage(
 
 
 def _check_inertia(by_name: Mapping[str, Any], inertia: bool) -> None:
-    """Raise ValueError for conditions that a stage with, or without, inertia does not allow."""
+    """Raise ValueError for conditions that need inertia in a stage without it, or that inertia does not allow."""
     for name, one in by_name.items():
         if isinstance(one, Quiet) and not inertia:
             raise ValueError(f"{name}: bodies have no inertia, must be given with inertia=True")

@@ -39,7 +39,7 @@ class StepControl:
     interval : s
         Output interval of the run; 0 if output intervals are not equal.
     small : s
-        Next trial step.
+        Length of the next trial step.
     waits, kept
         See `StepSize.grown`.
     change : (bodies,), Pa
@@ -92,7 +92,7 @@ class Trend:
     lengths : (k,)
         Lengths (s) of the steps, beginning with the last step.
     rates : (n, k, d (1 + d)), with fluid (n, k, d (1 + d) + 1)
-        Mean rates of x (m/s), of F (1/s), and with fluid also of the pressure (Pa/s), in each of these steps.
+        Mean rates in each of these steps: of x (m/s), of F (1/s), and with fluid of the pressure (Pa/s).
     """
 
     lengths: NDArray[np.float64]
@@ -204,7 +204,7 @@ class State:
         return self.stay.points if self.stay.keeps is None else self.stay.points.where(self.stay.keeps, self.points)
 
     def of_pieces(self, name: str, fresh: NDArray[np.float64], point: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the data `name` (m, ...) of the pieces. New pieces have the values `fresh`.
+        """Return the array `name` (m, ...) of `pieces` for all present pieces. New pieces have the values `fresh`.
 
         `point` (m,): index of the point of each piece.
         """
