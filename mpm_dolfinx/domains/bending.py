@@ -9,8 +9,8 @@ at x is
 where N_i are the shape functions, u_i are the nodal displacements, and t_a is the position along axis a in the cell,
 from 0 to 1.  D_a is a limited second difference of nodal displacements along axis a: the minmod of the second
 differences at both ends of the cell edge at node i.  If only one end has a second difference, D_a is this difference.
-With inertia, D_a is zero in this case, because stresses would oscillate at surfaces on grid lines.  The field u is
-continuous, and exact for quadratic displacements.
+With inertia, D_a is zero in this case, because stresses would otherwise oscillate at surfaces on grid lines.  The field
+u is continuous, and exact for quadratic displacements.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def _second_differences(
 ) -> list[NDArray[np.float64]]:
     """Return the second differences along the edges of owned cells, for each axis.
 
-    The differences are interpolated between the edges of a cell.  The results are the coefficients, see `polynomial`.
+    A polynomial interpolates between the edges of each cell.  Its coefficients are returned, see `polynomial`.
     """
     d = grid.dim
     bits = corner_bits(grid.dim)

@@ -39,13 +39,13 @@ class Patches:
     grid
         Background grid.
     faces, row : (n,)
-        Surface faces of the bodies, or parts of these faces, and for each point the index of its face.
+        `faces`: surface faces of the bodies, or parts of them.  `row`: index of each point's face in `faces`.
     face, at : (n,)
-        Index of the face in its domain, and index of the material point.
+        `face`: index of the face in its domain.  `at`: index of the material point with this domain.
     cell : (n,)
         Lexicographic index of the cell.
     x, xi : (n, d)
-        Position at the last cut, m, and local coordinates in the domain.
+        `x`: position at the last cut, m.  `xi`: local coordinates in the domain.
     share : (n,)
         Fraction of the face that the point represents.
     """
@@ -117,7 +117,7 @@ class CutDomains(Keyed):
         Whether to integrate over the exact pieces of the domains.  Otherwise each point is one piece, as in standard
         MPM.
     second, faces
-        Whether to compute second moments and face areas of the pieces.
+        Whether to compute second moments of the pieces, and their areas on cell faces.
     """
 
     def __init__(self, grid: Grid, points: MaterialPoints, domains: bool, second: bool = False, faces: bool = True):
@@ -134,7 +134,7 @@ class CutDomains(Keyed):
         self.to_pieces = exchange.back
         """Function that sends values of the pieces from the owners of their cells to the processes of the points."""
         self.cells, self.x = grid.locals[exchange.send(pieces.cell)], exchange.send(pieces.x)
-        """Owned cells (m,) and centroids (m, d), in m, of m pieces."""
+        """Cells (m,) and centroids (m, d), in m, of the m pieces in owned cells."""
         self.mixed = exchange.send(pieces.mixed) if grid.dim == 3 and domains else None
         """In 3D: mean products of coordinates in each piece, see `Pieces`."""
         self.hoop = exchange.send(pieces.hoop) if grid.axisymmetric else None
@@ -239,7 +239,7 @@ class CutDomains(Keyed):
         return out
 
     def displacement(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the values (n, d) of a Q1 field u (nodes, d) at the points."""
+        """Return the values (n, d) of a Q1 field u (nodes, d) at the points.  Only for a cut without `domains`."""
         exchange, cells = self._followed
         return exchange.back(self.grid.at(cells, exchange.send(self._tracked), u))
 
@@ -282,7 +282,7 @@ class CutDomains(Keyed):
         return self._filled_cell(at, x + NEAR * (self.points.x[at] - x))
 
     def _filled_cell(self, at: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the cells of positions x.  A cell without a piece is replaced by the cell of the largest piece."""
+        """Return the cells of positions x.  If a domain has no piece there, take the cell of its largest piece."""
         pieces, cells = self.pieces, self.grid.all_cells
         cell = self.grid.number(self.grid.index_from_base(x)) + self.grid.copy(self.points.id[at])
         key, keys = at * cells + cell, pieces.point * cells + pieces.cell
@@ -301,7 +301,7 @@ class CutDomains(Keyed):
 
 
 def whole_points(grid: Grid, x: NDArray[np.float64]) -> Pieces:
-    """Return one piece for each point, at the point."""
+    """Return one piece for each point, located at the point, as in standard MPM."""
     n, number = len(x), grid.number(grid.index_from_base(x))
     _, cell, count = np.unique(number, return_inverse=True, return_counts=True)
     h = grid.sizes_of(number)

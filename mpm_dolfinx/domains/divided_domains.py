@@ -75,7 +75,7 @@ class SeededDomains:
     def places(self, root: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return body and lattice index (n, 1 + d) of seeded domains.
 
-        A domain without a lattice has the entry -1 - id in place of the body.
+        Domains of bodies without a lattice have the entry -1 - id in place of the body.
         """
         out = np.zeros((len(root), 1 + self._dim), dtype=np.int64)
         body = body_of(root, self.starts)
@@ -103,7 +103,7 @@ class SeededDomains:
         return seeded
 
     def from_middle(self, places: NDArray[np.int64], axis: int) -> NDArray[np.float64]:
-        """Return the rows (n,) of domains along an axis, counted from the middle of the body.  Without lattice: nan."""
+        """Return the row numbers (n,) of domains along an axis, from the middle of the body; nan without a lattice."""
         out = np.full(len(places), np.nan)
         for i in np.unique(places[places[:, 0] >= 0, 0]):
             at, count = places[:, 0] == i, self.bodies[i].lattice[axis]
@@ -112,7 +112,7 @@ class SeededDomains:
         return out
 
     def middle(self, root: NDArray[np.int64], part: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
-        """Return the local coordinates (n,), between 0 and 1, of the middles of intervals along an axis."""
+        """Return the fractions (n,) of the edges along an axis, from 0 to 1, at which a division cuts the domains."""
         out, size = np.full(len(root), 0.5), np.rint(np.ptp(part, axis=2)[:, axis]).astype(np.int64)
         body = body_of(root, self.starts)
         for i in np.unique(body[size > 1]):
@@ -141,7 +141,7 @@ def whole(part: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 
 def halves(corners: NDArray[np.float64], axis: int, middle: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return both halves (2, n, 2^d, d) of domains (n, 2^d, d), divided at the local coordinates `middle` (n,)."""
+    """Return both halves (2, n, 2^d, d) of domains (n, 2^d, d), cut at the fractions `middle` (n,) of the edges."""
     low, high = FACES[corners.shape[2]][2 * axis : 2 * axis + 2]
     t = middle[:, None, None]
     out = np.stack([corners, corners])
@@ -155,7 +155,7 @@ def merged(lower: NDArray[np.float64], upper: NDArray[np.float64], axis: int) ->
 
 
 def beyond_corners(points: MaterialPoints, axisymmetric: bool) -> NDArray[np.float64]:
-    """Return the factor (n, k, k) of F that the corners do not determine."""
+    """Return the factor A (n, k, k) in F = G A, where the corners determine G, but not A."""
     return np.linalg.inv(gradient(points.corners, points.reference, axisymmetric)) @ points.F
 
 
@@ -210,7 +210,7 @@ def _placed(
 
 
 def with_defect(new: MaterialPoints, old: MaterialPoints, into: NDArray[np.int64]) -> MaterialPoints:
-    """Return new points with volume defects, so that fluid is conserved.
+    """Return the new points with changed volume defects ("owed"), so that fluid is conserved.
 
     `into`: index of the old point for each new point, or after merging, index of the new point for each old point.
     """

@@ -54,7 +54,7 @@ class Neighbours:
         self._partner = partner.reshape(-1, 2 * dim).T.copy()  # index of the opposite face; -1 if there is none
 
     def at_neighbours(self, own: NDArray[np.float64], faces: Sequence[NDArray[np.float64]]) -> Callable[[int], tuple]:
-        """Return a function of a face index, which returns values, face centres and a mask of existing neighbours.
+        """Return a function of a face index that returns the neighbours' values and face centres, and which exist.
 
         `own` (c, k): c values of each of k points.
         `faces`: centres (d, k), in m, of the faces of the points, for each face index.
@@ -135,7 +135,7 @@ def _faces_of_parts(
 
 
 def _pairs(key: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return for each row of keys the index of the other equal row, or -1."""
+    """Return for each row of keys the index of the identical other row, or -1."""
     order, out = np.lexsort(key.T), np.full(len(key), -1)
     same = np.logical_and.reduce(key[order[1:]] == key[order[:-1]], axis=1).nonzero()[0]
     out[order[same]], out[order[same + 1]] = order[same + 1], order[same]
@@ -150,7 +150,7 @@ def linear_gradients(
     `neighbours`: neighbours of the domains in which F may vary.
     `cut`: cut particle domains.
     `F` (n, k, k): deformation gradients of the points.
-    `soils` (n, c): material constants.  Points with equal rows have the same material.
+    `soils` (n, c): material constants.  Points with identical rows have the same material.
     """
     # the last axis is the point or piece: numpy takes several times as long for rows of a few numbers each
     of, fraction = cut.pieces.point, cut.pieces.fraction
@@ -184,7 +184,7 @@ def linear_gradients(
 def _slopes(
     neighbours: Neighbours, cut: CutDomains, F: NDArray[np.float64], soils: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the derivatives of F with respect to local coordinates, and the inverse edge matrices of domains."""
+    """Return the derivatives of F with respect to local coordinates, and inverse matrices of edge vectors."""
     rows = neighbours.rows
     d, k = cut.grid.dim, F.shape[1]
     corners = cut.points.corners[rows].transpose(1, 2, 0).copy()

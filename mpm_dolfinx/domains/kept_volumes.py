@@ -27,7 +27,7 @@ from mpm_dolfinx.grid.grid import Grid, linked, sum_by
 from mpm_dolfinx.parallel.exchange import to_root
 
 SOFT = 0.15
-"""Weight of the motion d of the corners, and of its differences along edges.
+"""Weight of the motion d of the corners, and of its differences along edges, relative to the volume errors.
 
 Plateau (scene "flow" of tests/plateaus.py): half this value changes the result by 1.5e-04, twice this value by 2.4e-04,
 and finer cells by 9.1e-02.
@@ -95,7 +95,7 @@ def _sparse(values: NDArray[np.float64], columns: NDArray[np.int64], count: int)
 def _joined(
     body: NDArray[np.int64], number: NDArray[np.int64], x: NDArray[np.float64], tolerance: float
 ) -> NDArray[np.int64]:
-    """Return an index for each corner of domains.  Coincident corners have equal indices.
+    """Return an index for each corner of domains.  Coincident corners have the same index.
 
     Corners coincide if their seeded indices are equal, or if their distance is below `tolerance`, in m.
     """

@@ -6,13 +6,13 @@ when the grid is reset.  For each axis a in turn, the filter replaces the displa
 
     d - D_a^T (s / 64) D_a d.
 
-D_a is the third difference of four corners in a row along axis a, or the scaled divided difference for different widths
-of domains.  The factor s is `min(1, FAST c)`, with the number c of cells that the corners have crossed since the last
-reset.
+D_a is the third difference at four corners in a row along axis a.  If domains have different widths, D_a is the scaled
+divided difference.  The factor s is `min(1, FAST c)`, with the number c of cells that the corners have crossed since
+the last reset.
 
 Quadratic fields remain unchanged.  A wave with a length of two domains is reduced by the fraction s, and a wave with a
-length of eight domains by 0.003 s.  Yielded soil is not filtered.  Corners at a wall, a prescribed displacement, a
-plate or another body do not move.
+length of eight domains by 0.003 s.  Yielded soil is not filtered.  The filter does not move corners at a wall, a
+prescribed displacement, a plate or another body.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from mpm_dolfinx.parallel.exchange import Exchange
 from mpm_dolfinx.points.material_points import MaterialPoints
 
 FAST = 10
-"""Fraction of a wave with a length of two domains that the filter removes for each crossed cell.
+"""Fraction (at most 1) of a wave with a length of two domains that the filter removes, per crossed cell.
 
 Plateau (scene "cycles" of tests/plateaus.py): half this value changes the result by 1.5e-04, twice this value by
 3.4e-04, and finer cells by 6.2e-03.
@@ -100,7 +100,7 @@ class Lattice:
         return self._numbers(ids, lambda: self._body.nodes(ids - self._start))
 
     def corners_of_parts(self, points: MaterialPoints) -> NDArray[np.int64]:
-        """Return the indices (m,) of corners of divided domains."""
+        """Return the lattice indices (m,) of corners of divided or merged domains."""
         own = is_part(points).nonzero()[0]
         root, part = (of[own] for of in roots(points))
         own = ((root >= self._start) & (root < self._stop)).nonzero()[0]

@@ -36,7 +36,7 @@ class PiecePressures:
     """
 
     id: NDArray[np.int64]  # identifier of the point (m,)
-    cell: NDArray[np.int64]  # lexicographic index of the cell (m,); -1 at the start
+    cell: NDArray[np.int64]  # lexicographic index of the cell (m,); -1 before the first cut
     fraction: NDArray[np.float64]  # fraction of the domain (m,)
     pressure: NDArray[np.float64] | None  # pressure at the centroid (m,), Pa; None for kept pieces
     x: NDArray[np.float64]  # current centroid (m, d), m
@@ -68,7 +68,7 @@ class PiecePressures:
         return replace(self, pressure=pi, slope=slope, bounds=bounds)
 
     def less(self, slope: NDArray[np.float64]) -> PiecePressures:
-        """Subtract a pressure field with uniform slope (d,), in Pa/m."""
+        """Return the pieces after subtraction of a linear pressure field with the slope (d,), in Pa/m."""
         even = self.x @ slope
         bounds = self.bounds - even[:, None]
         return replace(self, pressure=self.pressure - even, slope=self.slope - slope, bounds=bounds)
@@ -124,7 +124,7 @@ class Reconstruction:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the slopes (n, d), in Pa/m, and the bounds (n, 2), in Pa, of the pressures in cells.
 
-        `origin` (n, d), in m: position of the cell pressure, relative to the midpoint of the cell.
+        `origin` (n, d), in m: position to which the cell pressure refers, relative to the midpoint of the cell.
         """
         cells, p, centroid, *_ = pressures
         jump, one_sided, _, drained = self._differences(pressures)
@@ -139,7 +139,7 @@ class Reconstruction:
         return slope * scale[:, None], p[cells, None] + np.array([low, high]).T
 
     def _differences(self, pressures: CellPressures) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-        """Return pressure differences and slopes at cell ends, and which ends have neighbours or drained sides."""
+        """Return pressure differences and slopes at both cell ends, and which ends have neighbours or drained sides."""
         cells, p, centroid, faces, outer = pressures
         neighbours, own = self._neighbour[cells], cells[:, None, None]
         axis, end = np.arange(self.grid.dim)[:, None], np.arange(2)

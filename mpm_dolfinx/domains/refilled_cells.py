@@ -53,7 +53,7 @@ SIDE = np.array([2, 1, 3, 0])
 
 
 class Parts(NamedTuple):
-    """Parts of the surface, each in one cell."""
+    """Parts of the faces on the surface.  Each part lies in one cell."""
 
     row: NDArray[np.int64]  # index of the face in `OuterFaces` (m,)
     cell: NDArray[np.int64]  # cell (m,)
@@ -103,7 +103,7 @@ class RefilledCells:
     """The renewed cells at a reset of the grid, and their new domains.
 
     `body` (n,): index of the body of each point.
-    `flowed` (n,): whether points may be renewed.
+    `flowed` (n,): whether the domains of points may be renewed.
     `needs` (n,): whether the domains of points need renewal.
     `faces`: surface of the bodies.
     `signs`: keys of seeded faces, and for each face the index of its set of conditions.
@@ -135,7 +135,7 @@ class RefilledCells:
         filled = np.where(self.crossed, self.region.area_of(self.cells), 1.0)
         excluded |= np.abs(sum_by(self.cell, size, self.cells) - filled) > COVERED
         self.chosen = self._chosen(flowed & needs, excluded, size < SMALL)
-        """Which cells are renewed."""
+        """Whether each cell (cells,) is renewed."""
         self.affected = self._at(self.chosen)
         """Whether each point (n,) loses its domain or a part of it."""
 
@@ -154,7 +154,7 @@ class RefilledCells:
         return area * (whole / sum_by(pieces.point, area, len(whole)))[pieces.point]
 
     def _at(self, cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Return which points have a piece in any of the cells."""
+        """Return which points (n,) have a piece in a cell for which `cells` (cells,) is true."""
         out = np.zeros(len(self.points), dtype=bool)
         out[self.pieces.point[cells[self.cell]]] = True
         return out
@@ -268,7 +268,7 @@ class RefilledCells:
         return number[cells]
 
     def _place(self, cells: NDArray[np.int64], y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the positions of local coordinates y, from 0 to 1, in cells."""
+        """Return the positions (n, k, 2), in m, with coordinates y (n, k, 2), from 0 to 1, in cells (n,)."""
         index = np.stack(np.unravel_index(cells % self.grid.cells, tuple(self.grid.shape)), axis=1)
         return self.grid.places(np.broadcast_to(index[:, None], y.shape), y)
 
@@ -303,7 +303,7 @@ class RefilledCells:
     def _nearest(
         self, parts: Parts, cells: NDArray[np.int64], lower: NDArray[np.float64], upper: NDArray[np.float64]
     ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return the keys of new edges, and the reference positions of their ends, from the nearest old surface.
+        """Return for new edges the keys of the nearest seeded faces, and the reference positions of both ends.
 
         `parts`: parts of the old surface, ordered by cell.
         """
@@ -323,12 +323,12 @@ class RefilledCells:
         return key, np.stack([self._seeded_at(*one) for one in found[1:]], axis=1)
 
     def _seeded(self, row: NDArray[np.int64], t: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the seeded areas of parts of faces."""
+        """Return the seeded areas of the parts of faces between two coordinates t."""
         return self._face_areas[row] * self._share(row, t)
 
     @cached_property
     def _face_areas(self) -> NDArray[np.float64]:
-        """Seeded areas of faces, including removed parts."""
+        """Seeded areas of faces, increased so that the remaining parts include the areas of removed parts."""
         parts, left = self.parts, self._left
         of, share = self.faces.point[parts.row], self._share(parts.row, parts.t)
         remains = np.isin(of * self.cells + parts.cell, self.pieces.point[left] * self.cells + self.cell[left])
@@ -357,7 +357,7 @@ class RefilledCells:
         area: NDArray[np.float64],
         ends: NDArray[np.float64],
     ) -> New:
-        """Return the new domains in cells that the surface crosses."""
+        """Return new domains.  Their faces on cell sides take over the old surface on these sides."""
         parts = self.parts
         on = np.flatnonzero(parts.side != NONE)
         on = on[np.argsort(4 * parts.cell[on] + parts.side[on], kind="stable")]
@@ -394,7 +394,7 @@ class RefilledCells:
 
     @cached_property
     def _left(self) -> NDArray[np.int64]:
-        """Pieces of removed domains outside the renewed cells, without parts smaller than `CRUMB`."""
+        """Indices of the pieces of removed domains outside the renewed cells, without pieces smaller than `CRUMB`."""
         left = np.flatnonzero(self.affected[self.pieces.point] & ~self.chosen[self.cell])
         return left[self._areas[left] > CRUMB * self._volume(self.cell[left])]
 
@@ -458,7 +458,7 @@ class RefilledCells:
 
     @cached_property
     def into(self) -> tuple[NDArray, NDArray, NDArray]:
-        """Pieces of removed domains, the group of new domains that receives each, and its share of the old domain."""
+        """For each piece of removed domains: index, receiving group of new domains, and fraction of the old mass."""
         pieces, outside = self.pieces, self.remainders[1]
         into = np.flatnonzero(self.chosen[self.cell] & self.affected[pieces.point])
         piece = np.concatenate([into, outside])
@@ -487,7 +487,7 @@ class RefilledCells:
     def on_faces(
         self, values: NDArray[np.float64], parent: NDArray[np.int64], group: NDArray[np.int64]
     ) -> NDArray[np.float64]:
-        """Return data (n, ...) of surface faces: means over the old surface in the cell, or 0 without a surface."""
+        """Return point data (n, ...) of new domains at surfaces: means over the cell's old surface, otherwise 0."""
         parts = self.parts
         inside = np.flatnonzero(self.chosen[parts.cell])
         cell, of = parts.cell[inside], self.faces.point[parts.row[inside]]
@@ -504,7 +504,7 @@ class RefilledCells:
 
 
 def no_faces(n: int) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return keys, seeded areas and ends of faces for n domains without faces on the surface."""
+    """Return placeholders for n domains without faces on the surface: keys `NONE`, areas 0 and ends 0."""
     return np.full((n, 4), NONE), np.zeros((n, 4)), np.zeros((n, 4, 2, 2))
 
 

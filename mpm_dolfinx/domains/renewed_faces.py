@@ -22,7 +22,7 @@ AREA = "renewed areas"
 ENDS = "renewed ends"
 """Names of point data for the faces of renewed domains.
 
-PARENT: key of the seeded face, or -1.
+PARENT: key (see `keys`) of the seeded face that the face replaces, or -1.
 AREA: seeded area, in m^(d-1).
 ENDS: reference positions of the ends, in m.
 """
@@ -38,12 +38,12 @@ PART: lower and upper ends (n, d, 2) of the part, in local coordinates of the se
 
 
 def keys(point: NDArray[np.int64], face: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return a key (m,) for faces of seeded points, in 2D."""
+    """Return integers (m,) that identify faces of seeded points, in 2D."""
     return 4 * np.asarray(point, dtype=np.int64) + face
 
 
 def with_faces(points: MaterialPoints) -> MaterialPoints:
-    """Return the points with the data `PARENT`, `AREA` and `ENDS`, by default for points without renewed faces."""
+    """Return the points with the data `PARENT`, `AREA` and `ENDS`; missing data are added as placeholders."""
     if PARENT in points.data:
         return points
     n = len(points)
@@ -51,7 +51,7 @@ def with_faces(points: MaterialPoints) -> MaterialPoints:
 
 
 def with_parts(points: MaterialPoints) -> MaterialPoints:
-    """Return the points with the data `ROOT` and `PART`, by default for whole domains."""
+    """Return the points with the data `ROOT` and `PART`; missing data are added as for whole domains."""
     if ROOT in points.data:
         return points
     n, d = points.x.shape
@@ -83,7 +83,7 @@ def faces_of_parts(
 
     Returns
     -------
-    Index (n,) of the face for each part.
+    Index (n,), among the m faces, of the face of each part.
     Index (n,) of the point for each part.
     Lower and upper ends (n, d) of each part in its seeded domain.
     """
@@ -99,7 +99,7 @@ def faces_of_parts(
 
 
 def on_parts(faces: Surface, points: MaterialPoints) -> tuple[Surface, NDArray[np.int64]]:
-    """Return a surface with faces of divided domains, and for each face the index in the given surface.
+    """Return a surface with the added faces of divided domains, and the index of each face in the given surface.
 
     Polygons of the given surface must be rectangles in local coordinates.
     """
@@ -146,7 +146,7 @@ class SeededFaces:
         return OuterFaces(*(column[order] for column in columns))
 
     def of(self, points: MaterialPoints) -> OuterFaces:
-        """Return the outer faces of the points."""
+        """Return the present outer faces of the points' domains."""
         seeded = self.seeded
         known, at = points.find(seeded.point)
         columns = [(at, *(v[known] for v in (seeded.face, seeded.key, seeded.area, seeded.ends)))]
@@ -174,7 +174,7 @@ class SeededFaces:
         return out
 
     def signatures(self, surfaces: Sequence[Surface]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the keys of faces, and for each face the index of its set of conditions, or -1 for faces to keep."""
+        """Return the keys of seeded faces, and the index of each face's set of conditions, or -1 to forbid renewal."""
         key = self.seeded.key
         kind = np.zeros((len(key), len(surfaces)), dtype=np.int8)
         barred = np.zeros(len(key), dtype=bool)
@@ -190,7 +190,7 @@ class SeededFaces:
 
 @dataclass(frozen=True)
 class RenewedFaces:
-    """Faces of renewed domains on surfaces."""
+    """Faces of renewed domains that lie on given surfaces."""
 
     row: NDArray[np.int64]  # index of the seeded face among the faces of all surfaces (m,)
     at: NDArray[np.int64]  # index of the point (m,)
@@ -214,7 +214,7 @@ class RenewedFaces:
     def in_place_of(
         self, area: NDArray[np.float64], whole: NDArray[np.float64], face: NDArray[np.int64]
     ) -> tuple[NDArray, NDArray, NDArray]:
-        """Replace areas of parts of faces, areas of whole faces, and face indices (n,) by those of renewed faces."""
+        """Return areas of parts, areas of faces and face indices (n,), replaced by those of renewed faces."""
         part = np.ptp(self.xi, axis=1).max(axis=1) / 2
         new = self.area * part, self.area, self.face
         return tuple(np.where(self.old, a, b) for a, b in zip((area, whole, face), new, strict=True))

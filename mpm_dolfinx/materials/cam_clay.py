@@ -12,9 +12,9 @@ with associated flow.  P_0 is the pressure at F = I, G is the shear modulus, M i
 P_c is the size of the yield surface, and e_v^p is the plastic volume strain.  The logarithm of the specific volume is
 linear in ln P (bilogarithmic law), with the slope lambda in first loading and the slope kappa in unloading.
 
-A step starts from the trial stresses P_t and Q_t, and from the size P_c,n of the yield surface.  The unknowns are a,
-which is the plastic compaction divided by kappa, and the plastic multiplier dgamma.  With 6G dgamma / M^2 = exp(h) - 1
-and w = (Q_t / (M P_t))^2, the stress at the end of the step is given by
+A step starts from the trial stresses P_t and Q_t, and from the size P_c,n of the yield surface.  The two unknowns are
+the plastic compaction divided by kappa, called `a`, and the plastic multiplier dgamma.  With
+6G dgamma / M^2 = exp(h) - 1 and w = (Q_t / (M P_t))^2, the stress at the end of the step is given by
 
     P = P_t exp(-a),   Q = Q_t exp(-h),   P_c = P_c,n exp(rho a),   rho = kappa / (lambda - kappa),
     (6G kappa / M^2) a = (exp(h) - 1) (2P - P_c).
@@ -211,7 +211,7 @@ LC = {"r": "> kappa / lambda_, <= 1", "beta": ">= 0 1/Pa and finite", "reference
 
 
 def _dried(function: Callable) -> Callable:
-    """Return a `function` of Modified Cam Clay with lambda and P_c at the present suction."""
+    """Return `function`, a method of Modified Cam Clay, with lambda and P_c at the present suction."""
     arguments = Skeleton.arguments_of(function)
 
     def of(**given):
@@ -311,8 +311,8 @@ class BarcelonaBasic(ModifiedCamClay):
 class _Return:
     """Result of the return mapping for a value of the unknown d.
 
-    `compaction`: a.
-    `flow`: h.
+    `compaction`: a, the plastic compaction divided by kappa.
+    `flow`: h = ln(Q_t / Q).
     `steepness`: w exp(-d), the square of Q / (M P) at the end of the step.
     `trial_pressure`: P_t, in Pa.
     `rho`: kappa / (lambda - kappa).

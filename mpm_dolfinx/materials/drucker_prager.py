@@ -57,7 +57,7 @@ class DruckerPrager(Frictional):
         Stress states in which the cone coincides with the Mohr-Coulomb yield surface.  "plane strain" gives the
         collapse load of the Mohr-Coulomb law in plane strain, exactly for associated flow.  "compression" is the outer
         cone of triaxial compression, and "extension" is the inner cone of triaxial extension.  In axisymmetry no cone
-        coincides in all stress states: a circular footing bears 10 % less with von Mises's law than with Tresca's.
+        fits all stress states: a circular footing bears 10 % less with von Mises's law than with Tresca's.
 
     Other parameters: see `Skeleton`.  All parameters are passed by name.  The state variable `plastic` in `points.data`
     is the inverse plastic metric C_p^-1 (3, 3), and `hardened` is kappa.  Source: de Souza Neto, Peric and Owen (2008),
@@ -97,7 +97,7 @@ class DruckerPrager(Frictional):
 
     @property
     def eta_flow(self):
-        """Coefficient of the pressure in the plastic potential."""
+        """Coefficient of the pressure in the plastic potential, as eta in the yield function."""
         return self._cone(self.dilation)[0]
 
     @staticmethod

@@ -61,7 +61,7 @@ class LawAtPoints:
 
     @cached_property
     def points(self) -> FormPoints:
-        """Integration points with the fields F, parameters and state of the law."""
+        """Integration points, with F and the law's parameters and state variables as fields."""
         return FormPoints(self.grid, F=(self._stretches, self._stretches), **self._shapes)
 
     @cached_property
@@ -121,7 +121,7 @@ class LawAtPoints:
         return PointExpression(expression(self.law.energy, [()], "F", F=self._F, **self._values), self.points)
 
     def energy(self, data: PointData) -> NDArray[np.float64]:
-        """Return the stored energy (n,) per reference volume, in Pa, of a law with an energy."""
+        """Return the stored energy (n,) per reference volume, in Pa.  The law must define `energy`."""
         return self._evaluate(self._energy, data)
 
     @cached_property
@@ -167,7 +167,7 @@ def knows_space(grid: Grid, m: Skeleton) -> bool:
 
     Some user-defined laws accept F (2, 2) only.  Laws with local unknowns are assumed to accept F (3, 3).
 
-    `m`: material with constants as arrays for one point.
+    `m`: material whose constants are arrays (1, ...) with the value at one point.
     """
     law = type(m)
     function, shape = (law.energy, ()) if law.kirchhoff is None else (law.kirchhoff, (3, 3))
@@ -222,11 +222,11 @@ class SoftnessAtPoints:
     In plastic flow, volume strains and pressures may alternate from cell to cell.  The damping coefficient tau of
     pressure jumps must then grow with the softness of the soil.
 
-    The strain of a step is e = dev sym dF F^-1, with the change dF of F.  With the Kirchhoff stress T(s) at F - (1 - s)
-    dF, the tangent shear modulus is G_t = (dT/ds) : e / (2 e : e) at s = 1.  In soil at rest, the direction of e is
-    random.  The result is therefore a weighted mean of G_t, with the weight e : e, and of the modulus of the previous
-    step, with the weight `NEAR`^4.  The forms use the softness of the previous step, because Newton's method may not
-    converge with the softness of the current iterate.
+    The deviatoric strain of a step is e = dev sym dF F^-1, with the change dF of F.  With the Kirchhoff stress T(s) at
+    F - (1 - s) dF, the tangent shear modulus is G_t = (dT/ds) : e / (2 e : e) at s = 1.  In soil at rest, the direction
+    of e is random.  The softness therefore uses a weighted mean of two moduli: G_t with the weight e : e, and the
+    modulus of the previous step with the weight `NEAR`^4.  The forms use the softness of the previous step, because
+    Newton's method may not converge with the softness of the current iterate.
 
     `grid`, `law`, `shapes`, `stretches`: see `LawAtPoints`.
     """
@@ -278,7 +278,7 @@ class ConductivityAtPieces:
     laws
         Distinct conductivity laws of the materials.
     pieces
-        Integration points of the pieces.  With `laws`, their fields are F, position, conductivity and porosity0.
+        Integration points of the pieces.  With `laws`, they have the fields F, position, conductivity and porosity0.
     displacement
         Increment of the displacement since the start of the step.
     pressure

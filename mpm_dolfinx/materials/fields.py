@@ -38,7 +38,7 @@ RESERVED = frozenset(
     "F dF softness owed due storage storage_at_one density position displacement porosity0 gradient drainage retention "
     "pores".split()
 )
-"""Names of fields at quadrature points.  Parameters and state variables must have other names."""
+"""Reserved names of fields at quadrature points.  No parameter or state variable may have such a name."""
 WHAT_IS_NAMED = "parameters, state and unknowns"
 EVOLVED = 1e-3
 """Soil has yielded if a state variable differs from its initial value by more than this number.  Plateau (scene "soil"
@@ -64,9 +64,9 @@ class SceneMaterials:
     bodies
         All bodies.
     points
-        Material points of this process, as seeded.  Fields are evaluated at the reference positions of the points.
+        Material points of this process, as seeded.  Constants are evaluated at the points' reference positions.
     fluid
-        Pore fluid, if there is one.
+        Pore fluid, or None in a scene without fluid.
     prestressed
         Whether points may have an initial stress.
     """
@@ -88,7 +88,7 @@ class SceneMaterials:
         places = {i: _places(bodies, i, points.id[own]) for i, own in rows.items()}
 
         def at_points() -> list[tuple[Skeleton, Skeleton]]:
-            """Return each material with its values at the points of this process, and at one point of the scene."""
+            """Return each used material twice: with values at this process's points, and at one point of the scene."""
             return [_evaluated(grid, materials[i], places[i], points.id[rows[i]]) for i in self._used]
 
         evaluated, at_first = zip(*at_points(), strict=True)
@@ -132,7 +132,7 @@ class SceneMaterials:
             for i, m in zip(self._used, used, strict=True)
             if m.conductivity_law
         }
-        """Checksums of fields, and values of laws of flow, to compare a checkpoint with the scene."""
+        """For checkpoints: checksums of varying constants, and samples of conductivity laws and retention curves."""
         for i, m in zip(self._used, used, strict=True):
             if m.retention is not None:
                 self.checksums[f"retention of material {i}"] = drained(m.retention)
@@ -187,7 +187,7 @@ class SceneMaterials:
         return self.stretches if (law, True, True) in self._parts else self.grid.stretches
 
     def _add_shapes(self, m: Skeleton, seeded: dict[str, NDArray[np.float64]], count: int) -> None:
-        """Add the shapes of a law's parameters and state, and initialise the state."""
+        """Check a law, add the shapes of its parameters and state to `shapes`, and its initial state to `seeded`."""
         law = type(m)
         if (law.energy is None) == (law.kirchhoff is None):
             which = "neither" if law.energy is None else "both"
@@ -228,11 +228,11 @@ class SceneMaterials:
             raise ValueError(f"{law.__name__}: {name} has shape {shape}, in another law {other}; must be equal")
 
     def parts(self, pieces: FormPoints, common: Sequence[str]) -> list[tuple[type[Skeleton], FormPoints, bool]]:
-        """For each part of the soil, return its law, its integration points, and whether Q1 cells would lock in it.
+        """Return law, integration points, and whether Q1 cells would lock without F-bar, for each part of the soil.
 
-        The materials of a part have one law, and are either all nearly incompressible or all compressible.  A single
-        part has the integration points `pieces`.  If there are several parts, each has its own integration points.
-        Their fields are `common`, and the parameters and state of the law.
+        Materials form one part if they have the same law, and all or none of them are nearly incompressible.  If there
+        is only one part, its integration points are `pieces`.  Otherwise each part has its own points, with the fields
+        named in `common`, and with the law's parameters and state variables.
         """
         if len(self._parts) == 1:
             return [(law, pieces, locks) for law, locks, _ in self._parts]
@@ -249,11 +249,11 @@ class SceneMaterials:
         return self._part[points.material]
 
     def law_of(self, points: MaterialPoints) -> NDArray[np.int64]:
-        """Return the index of the law of each point."""
+        """Return for each point the index of its law in `laws`."""
         return np.array([self.laws.index(law) for law, *_ in self._parts])[self.part_of(points)]
 
     def locking(self, points: MaterialPoints) -> NDArray[np.bool_]:
-        """Return for each point whether Q1 cells with its material would lock."""
+        """Return for each point whether Q1 cells with its material would lock without F-bar."""
         return np.array([locks for _, locks, _ in self._parts])[self.part_of(points)]
 
     def stretched(self, points: MaterialPoints) -> NDArray[np.bool_]:
@@ -265,7 +265,7 @@ class SceneMaterials:
         return np.array([known for *_, known in self._parts])[self.part_of(points)]
 
     def conducting(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return (n, 2): the conductivity of each point, in m/s, and a number that identifies its laws of flow."""
+        """Return (n, 2): conductivity in m/s, and a number that identifies conductivity law and retention curve."""
         laws, known = [m.conductivity_law for m in self.materials], self.conductivity_laws
         law = np.array([known.index(law) if law in known else -1 for law in laws])[points.material]
         by_place = np.array([law is not None and _names_place(law) for law in laws])[points.material]
@@ -276,18 +276,18 @@ class SceneMaterials:
         return np.stack([conductivity, number], axis=1)
 
     def retention_of(self, points: MaterialPoints) -> NDArray[np.int64]:
-        """Return the number of the retention curve of each point, or 0 if its pores stay saturated."""
+        """Return the number of each point's retention curve, counted from 1, or 0 if its pores stay saturated."""
         return np.array([self.retentions.number(m.retention) for m in self.materials])[points.material]
 
     def saturation(
         self, points: MaterialPoints, p: NDArray[np.float64], of: NDArray[np.int64] | slice = slice(None)
     ) -> tuple[NDArray[np.float64], ...]:
-        """Return saturation S, dS/dp, chi and relative permeability at pressures p, in Pa.  `of`: indices of points."""
+        """Return saturation S, dS/dp, Bishop's chi and relative permeability of points `of` at pressures p, in Pa."""
         return self.saturations(self.retention_rows(points)[of], p)
 
     @cached_property
     def retentions(self) -> Retentions | None:
-        """Retention curves of the scene, or None."""
+        """Retention curves of the scene, or None if all pores stay saturated."""
         laws = list(dict.fromkeys(self.materials[i].retention for i in self._used))
         some = [law for law in laws if law is not None]
         return Retentions(some, None not in laws, self.grid) if some and self.fluid is not None else None
@@ -297,16 +297,16 @@ class SceneMaterials:
         return SaturationAt(self.grid, self.retentions)
 
     def saturations(self, rows: NDArray[np.float64], p: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
-        """Return saturation S, dS/dp, chi and relative permeability.  `rows`: values of `retention_rows`; p in Pa."""
+        """Return the result of `saturation` at pressures p, in Pa, for `rows` of the result of `retention_rows`."""
         return self._saturation(rows, p)
 
     def retention_scale(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the characteristic suction of the retention curve at each point, in Pa."""
+        """Return the characteristic suction of each point's retention curve, in Pa; infinite without a curve."""
         scales = [np.inf if m.retention is None else scale_of(m.retention) for m in self.materials]
         return np.array(scales)[points.material]
 
     def pore_stress(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return alpha chi p at the points, in Pa: the effective stress minus the total stress."""
+        """Return alpha chi p at the points, in Pa, with the coefficients alpha of Biot and chi of Bishop."""
         pressure = self.table(points, attrgetter("biot")) * points.pressure
         return pressure if self.retentions is None else pressure * self.saturation(points, points.pressure)[2]
 
@@ -335,12 +335,12 @@ class SceneMaterials:
         return out
 
     def changed(self, what: str, points: MaterialPoints, named: Collection[str]) -> MaterialPoints:
-        """Return the points after a change of the fields `named`.  Fields that depend on them are computed again.
+        """Return the points after a change of the constants `named`, with updated constants that follow from them.
 
         Raises
         ------
         ValueError
-            A field is out of its range.
+            A constant is out of its range.
         """
         data = dict(points.data)
         for i in self._used:
@@ -357,14 +357,14 @@ class SceneMaterials:
         return replace(points, data=data)
 
     def _at(self, points: MaterialPoints, i: int, rows: NDArray[np.int64]) -> Skeleton:
-        """Return a copy of a material with arrays of constants, one value for each of the points `rows`."""
+        """Return a copy of material `i` whose constants are arrays, with one value for each of the points `rows`."""
         if not self._fields[i]:
             return self.materials[i]
         values = {name: points.data[name][rows] for name in self._fields[i]}
         return _expanded(self.materials[i], values, len(rows))
 
     def parameters(self, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
-        """Return each parameter at the points, with zeros at points whose law does not have the parameter."""
+        """Return each parameter at the points, with zeros as placeholders where the law does not have the parameter."""
         out = {name: np.zeros((len(points), *s)) for name, s in self.shapes.items() if name not in self.state_names}
         for i in self._used:
             rows = (points.material == i).nonzero()[0]
@@ -375,7 +375,7 @@ class SceneMaterials:
 
     @property
     def constants(self) -> dict[str, Skeleton]:
-        """Names of all material constants in the scene, each with a material that has the constant."""
+        """For the name of each material constant in the scene: one material that has this constant."""
         return {name: self.materials[i] for i in self._used for name in constants_of(self.materials[i])}
 
     @cached_property
@@ -398,11 +398,11 @@ class SceneMaterials:
         return 1 - (1 - self.table(points, attrgetter("porosity"))) / points.J
 
     def storage(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the storage coefficient of the points, in 1/Pa, in a scene with fluid."""
+        """Return the storage coefficient of the points, in 1/Pa.  The scene must have a fluid."""
         return self.table(points, lambda m, n: m.storage(self.fluid.bulk, n), self.porosity(points))
 
     def storage_at_one(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the storage coefficient of the points, in 1/Pa, for a porosity of 1."""
+        """Return the storage coefficient, in 1/Pa, that the points would have at a porosity of 1."""
         return self.table(points, lambda m: m.storage(self.fluid.bulk, 1.0))
 
     @property
@@ -411,7 +411,7 @@ class SceneMaterials:
         return any(getattr(law, "specific_yield", 0.0) > 0 for law in self.conductivity_laws)
 
     def drainage(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the specific yield, and the suction, in Pa, at which drainable pores are empty."""
+        """Return (n, 2): the specific yield, and the suction, in Pa, at which drainable pores are empty."""
         names = {"specific_yield": 0.0, "suction": 1.0}
         return np.stack(
             [self.table(points, lambda m, k=k, v=v: getattr(m.conductivity_law, k, v)) for k, v in names.items()],
@@ -473,7 +473,7 @@ class SceneMaterials:
         return np.array([not m.state for m in self.materials])[points.material]
 
     def soil_rows(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return for each point the index of its material, and all constants that vary except the initial stress."""
+        """Return (n, ...): material index, and constants that vary with position, without the initial stretch."""
         fields = [points.data[name] for name in self.field_names if name != "seeded_stretch"]
         fields = [rows.reshape(len(rows), int(np.prod(rows.shape[1:]))) for rows in fields]
         return np.column_stack([points.material, *fields])
@@ -485,7 +485,7 @@ class SceneMaterials:
         return any(m.dilates and (callable(m.dilation) or np.any(m.dilation)) for m in used)
 
     def dilating(self, points: MaterialPoints) -> NDArray[np.bool_]:
-        """Return for each point whether its soil has yielded with dilatant flow."""
+        """Return for each point whether its soil has yielded and has a dilation angle > 0."""
         return self.evolved(points) & (self.table(points, lambda m: m.dilation if m.dilates else 0.0) > 0)
 
     def effective_stress(self, points: MaterialPoints) -> NDArray[np.float64]:
@@ -508,8 +508,8 @@ class SceneMaterials:
     def stored(self, points: MaterialPoints) -> NDArray[np.float64]:
         """Return the elastic energy of the skeleton per reference volume, in Pa, at the points.
 
-        All processes must call this method.  Laws with `elastic_hencky` but without an energy have Hencky's energy with
-        constant moduli.  For other laws without an energy the result is zero.
+        All processes must call this method.  For laws with `elastic_hencky` that define no energy, the result is
+        Hencky's energy with constant moduli.  For other laws that define no energy, it is zero.
         """
         out = np.zeros(len(points))
         bulk, shear = (self.table(points, lambda m, name=name: getattr(m, name)) for name in ("bulk", "shear"))
@@ -524,16 +524,16 @@ class SceneMaterials:
         return out
 
     def total_stress(self, points: MaterialPoints) -> NDArray[np.float64]:
-        """Return the total Cauchy stress (n, d, d), in Pa, see `effective_stress`.  All processes must call it."""
+        """Return the total Cauchy stress, in Pa, shaped as `effective_stress`.  All processes must call this method."""
         return self.effective_stress(points) - self.pore_stress(points)[:, None, None] * np.eye(self.grid.stretches)
 
     def updated_state(
         self, points: MaterialPoints, before: MaterialPoints, dt: float
     ) -> dict[str, NDArray[np.float64]]:
-        """Return the point fields after a step of length dt, in s, by name.
+        """Return the fields of the points, by name, with the state after a step of length dt, in s.
 
-        `points`: points with the new F and the old state.
-        `before`: points with the old F.
+        `points`: points with F at the end of the step, and with the state at its start.
+        `before`: points at the start of the step.
 
         Raises
         ------
@@ -565,7 +565,7 @@ class SceneMaterials:
         return out
 
     def _placed(self, points: MaterialPoints) -> list[tuple[LawAtPoints, NDArray[np.int64], PointData]]:
-        """Return for each law the indices of its points, and the values that its forms need at these points."""
+        """Return each law, the indices of its points, and the values that its forms need at these points."""
         number, values = self.law_of(points), {**self.parameters(points), **self.state(points)}
         values["F"] = points.F_of_laws
         rows = [(number == k).nonzero()[0] for k in range(len(self.laws))]
@@ -603,7 +603,7 @@ def _by_place(m: Skeleton) -> list[str]:
 
 
 def _evaluated(grid: Grid, m: Skeleton, X: NDArray[np.float64], ids: NDArray[np.int64]) -> tuple[Skeleton, Skeleton]:
-    """Return a material with its values at the points of this process, and at the scene's point with the lowest id.
+    """Return two copies of a material: with values at this process's points, and at the material's point of lowest id.
 
     `X` (n, d), in m: reference positions of this process's points with the material.
     `ids` (n,): ids of these points.
@@ -634,7 +634,7 @@ def _check_local(all_points: Skeleton, half: Skeleton, names: Sequence[str]) -> 
 
 
 def _places(bodies: Sequence[Body], material: int, ids: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return the reference positions, in m, of the points with a material."""
+    """Return the reference positions (n, d), in m, of the points `ids`, whose material has the index `material`."""
     starts = np.cumsum([0, *map(len, bodies)])
     at = ids.searchsorted(starts)
     each = zip(bodies, starts[:-1], pairwise(at), strict=True)
@@ -650,7 +650,7 @@ def _ends(grid: Grid, values: Sequence) -> tuple[float, float]:
 
 
 def _checksum(grid: Grid, ids: NDArray[np.int64], rows: NDArray[np.float64], total: int) -> int:
-    """Return a checksum of the rows of all processes, in the order of their ids."""
+    """Return one checksum of the values `rows` at all points of all processes, in the order of the point ids."""
     exchange, checksum = Exchange(grid.comm, (ids * grid.comm.size // total).astype(np.int32)), 0
     content = exchange.send(rows)[exchange.send(ids).argsort()].tobytes()
     for rank in range(grid.comm.size):

@@ -60,7 +60,7 @@ class K0:
         return numbers(f"K0: {name}", value, (), *shapes, **test)
 
     def values(self, name: str, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the ratio or the surcharge at positions x (n, d), in m."""
+        """Return the parameter `name`, "ratio" or "surcharge", at positions x (n, d), in m."""
         value = getattr(self, name)
         given = at_places(f"K0: {name}", "one value per position", value, "x", x) if callable(value) else value
         return self._checked(name, given, (len(x),))
@@ -77,7 +77,7 @@ def hydrostatic(level: float, unit_weight: float | None = None) -> Callable[[NDA
     Parameters
     ----------
     level
-        Height, m, along the last axis.
+        Height of the phreatic level, m, along the last axis.
     unit_weight
         Unit weight of the fluid, N/m^3, > 0; by default the unit weight of the scene's fluid, or 9810 outside a scene.
         A warning is given if the value differs from the unit weight of the scene's fluid.
@@ -91,7 +91,7 @@ def hydrostatic(level: float, unit_weight: float | None = None) -> Callable[[NDA
 
 @dataclass(frozen=True)
 class OfWater:
-    """Base of water pressures that have a unit weight."""
+    """Base class of water pressures.  `given` is the unit weight, in N/m^3, or None for the standard value."""
 
     @property
     def unit_weight(self) -> float:
@@ -140,7 +140,7 @@ class InitialStresses:
     def of(self, materials: SceneMaterials, points: MaterialPoints, present: Sequence[bool], gravity) -> MaterialPoints:
         """Return the points with the elastic strains of their initial stress.  All processes must call this method.
 
-        `present`: whether each body is present, so that its weight acts on the soil below.
+        `present`: whether each body is present.  Only the weight of present bodies acts on the soil below.
         `gravity` (d,), in m/s^2: acceleration of gravity, or None.
         """
         if not self.given:
@@ -161,8 +161,7 @@ class InitialStresses:
         return stressed(materials, points, rows, target)
 
     def lifted(self, materials: SceneMaterials, points: MaterialPoints) -> str:
-        """Return the stress and the position of a point where K0 gives vertical tension, as text.  It is empty without
-        tension.
+        """Return as text the stress and position of a point where K0 gives vertical tension, or "" without tension.
 
         All processes must call this method.
         """
@@ -175,7 +174,7 @@ class InitialStresses:
         return first(materials.grid.comm, "".join(f"{vertical[i]:.4g} Pa at {where[i].tolist()}" for i in rows))
 
     def _at(self, stress: InitialStress, body: int, points: MaterialPoints, above: list[NDArray]) -> NDArray:
-        """Return the effective stress, in Pa, of points of a body."""
+        """Return the initial effective stress (n, 3, 3), in Pa, at points of a body."""
         n, d = points.x.shape
         if not isinstance(stress, K0):
             name = f"initial_stress of body {body}: {line(stress)}"
@@ -289,7 +288,7 @@ class _ElasticStrains:
         return out
 
     def of(self, tensor: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the components of tensors (n, 3, 3), with zeros for known strain components."""
+        """Return the components of tensors (n, 3, 3), with zeros at the components that are not unknown, see `free`."""
         i, j = np.array(self.components).T
         return np.where(self.free, tensor[:, i, j], 0.0)
 
@@ -350,7 +349,7 @@ class _ElasticStrains:
                 if exact:
                     break
                 most = float(np.nan_to_num(np.abs(missing), nan=np.inf).max(initial=0.0))
-                exact = not over_all(comm, most, MPI.MAX) > SAME * largest  # after one more step
+                exact = not over_all(comm, most, MPI.MAX) > SAME * largest  # the next step is the last
                 strain = self.step(strain, missing)
         except NotConverged:
             missed = np.ones(len(strain), dtype=bool)

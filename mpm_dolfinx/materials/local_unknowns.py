@@ -33,7 +33,7 @@ from mpm_dolfinx.materials.skeleton import BY_SCENE, Skeleton
 from mpm_dolfinx.materials.user_functions import call, named
 from mpm_dolfinx.parallel.exchange import first, together
 
-HALVINGS = 25  # largest number of halvings of steps in all Newton iterations together
+HALVINGS = 25  # largest number of halvings of steps at a point, in all its Newton iterations together
 
 
 class Solved(NamedTuple):
@@ -61,7 +61,7 @@ class LocalUnknowns:
     Attributes
     ----------
     values
-        UFL of the unknowns, by name, as functions of F; also the trial values, as `trial`.
+        UFL of the unknowns, by name, as functions of F; under the name `trial`, the trial values.
     known
         Like `values`, but the unknowns do not depend on F.  For laws with an energy, `known` equals `values`.
     """
@@ -97,9 +97,9 @@ class LocalUnknowns:
     def solve(self, data: PointData, derive: bool = True, motion: tuple = ()) -> Given:
         """Solve for the unknowns at the present F, and return values for the forms.  All processes must call this.
 
-        `derive`: whether to compute the derivatives dy/dz too.  Forms with `values` need them.
-        `motion`: values that change with the displacement.  Results are reused while `data`, `motion` and dt are the
-        same.
+        `derive`: whether to compute also the derivatives dy/dz, which forms with `values` need.
+        `motion`: numbers that identify the present displacement.  Results are reused while `data`, `motion` and dt are
+        the same.
         """
         key = data.key, motion, float(self._dt.value)
         solved = self._solved(key, lambda: self._equations.solve(data, self._trial.evaluate(data)), self._comm)
@@ -293,7 +293,7 @@ def _newton(system, y: NDArray[np.float64]) -> NDArray[np.int64]:
         step[solved & failed[rows]] = 0.0  # a solution, which may not be unique
         failed[rows] &= ~solved
         close = (np.abs(step) <= SAME * np.maximum(1.0, np.abs(old))).all(axis=1) | solved
-        y[rows] = old - step  # the solution at points that are close
+        y[rows] = old - step  # the solution at points with a small step
         on = ~(close | failed[rows])
         rows, step, old, norm = (values[on] for values in (rows, step, old, norm))
         length = np.ones(int(on.sum()))
@@ -329,7 +329,7 @@ def _solve(A: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64
 
 
 def _parts(values) -> list:
-    """Return all components of UFL values."""
+    """Return the list of all scalar components of UFL values."""
     return [value[i] if i else value for value in values for i in np.ndindex(value.ufl_shape)]
 
 

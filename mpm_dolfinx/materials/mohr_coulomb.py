@@ -33,7 +33,7 @@ from mpm_dolfinx.materials.frictional import Frictional
 from mpm_dolfinx.materials.skeleton import Field, _check
 from mpm_dolfinx.materials.trial import PLANE, Coaxial, Isotropic, components, eigen, symmetric
 
-FACE, EDGES, ALL = slice(0, 1), slice(1, 3), slice(None)  # main face, its edges, and all faces of `_Return`
+FACE, EDGES, ALL = slice(0, 1), slice(1, 3), slice(None)  # entries of `_Return._faces`: main face, its edges, and all
 NEVER = 1e6  # largest tensile strength, divided by the bulk modulus
 
 
@@ -101,7 +101,7 @@ class MohrCoulomb(Frictional):
 
     @staticmethod
     def solution(trial, bulk, shear, sine, sine_flow, strength, cutoff):
-        """Return the final stress, in Pa, its derivatives, and whether the flow is plastic (1 or 0)."""
+        """Return the final stress, in Pa, its derivatives with respect to b, and whether flow is plastic (1 or 0)."""
         x, axes = eigen(trial["b"])
         with np.errstate(invalid="ignore", divide="ignore"):  # in a diverging iterate, which is rejected later
             e = np.log(x) / 2
@@ -164,7 +164,7 @@ class _Surface:
         self.T = cutoff
 
     def outside(self, t: NDArray) -> NDArray:
-        """Return the largest yield function at principal stresses t (n, 3).  It is > 0 outside the yield surface."""
+        """Return the largest of all yield functions at principal stresses t (n, 3); > 0 means outside the surface."""
         return np.maximum(self.p * t[:, 0] - self.q * t[:, 2] - self.k, t[:, 0] - self.T)
 
 
@@ -194,7 +194,7 @@ class _Return:
         )
 
     def end(self, few: slice) -> tuple[NDArray, NDArray, NDArray]:
-        """Return final stresses, their derivatives with respect to trial stresses, and the violated amounts, in Pa.
+        """Return final stresses, their derivatives with respect to trial stresses, and their `_violation`, in Pa.
 
         `few`: the faces and edges of the yield surface that are tried.  `ALL` also includes the vertices.
         """
@@ -227,7 +227,7 @@ class _Return:
         return t, slopes, self._violation(t, multipliers.T)
 
     def _at(self, t: NDArray, conditions: Callable) -> tuple[NDArray, NDArray, NDArray]:
-        """Return the results of `end` for a vertex with the stresses t."""
+        """Return the results of `end` for a vertex with the principal stresses t."""
         drop = self._trial - t
         mean = drop.mean(axis=1)
         plastic = drop / (2 * self._G)[:, None] + (mean / (3 * self._K) - mean / (2 * self._G))[:, None]

@@ -20,7 +20,7 @@ from mpm_dolfinx.forms.axes import block, embedded, planar
 from mpm_dolfinx.materials.skeleton import Field, Skeleton
 
 AT_REST = " at rest"
-"""Suffix of the names of point fields that store state variables at the start."""
+"""Suffix in the names of point fields that store the initial values of state variables."""
 
 
 def stressed(m: Skeleton, knows_space: bool) -> Skeleton:

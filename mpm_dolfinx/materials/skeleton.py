@@ -37,7 +37,7 @@ DRIED = ("suction", "suction_at_start")
 LOCKING = 0.43
 """Poisson's ratio nu above which cells use F-bar, which doubles the run time of a step.
 
-The tip deflection of the drained beam with h = 0.015 m has these errors:
+The tip deflection of a drained beam, in cells of 0.015 m, has these errors:
 nu = 0.3: -0.02 % without F-bar, +0.22 % with F-bar.
 nu = 0.45: -0.44 % without F-bar, +0.21 % with F-bar.
 nu = 0.49: -2.0 % without F-bar, +0.21 % with F-bar.
@@ -57,7 +57,7 @@ class Skeleton:
     Parameters
     ----------
     bulk
-        Drained bulk modulus K in three dimensions, Pa, > 0, even in plane strain.
+        Drained bulk modulus K, Pa, > 0: the modulus in three dimensions, also for plane strain.
     shear
         Shear modulus G, Pa, > 0.
     porosity
@@ -76,13 +76,13 @@ class Skeleton:
         of the substep, Pa).
     retention
         Retention curve and relative permeability: `VanGenuchten`, `Gardner`, `BrooksCorey` or a user-defined object,
-        see `retention`.  The argument is passed by name.  With None the pores stay saturated.
+        see `retention`.  Pass this argument by name.  With None the pores stay saturated.
 
     A law adds its parameters as fields of the dataclass and defines one of the static methods below.  Arguments of a
     method may be F, and the law's fields, properties and state variables.  F is (d, d) in general.  In axisymmetry F is
     (3, 3), with the circumferential stretch last, see `axes`.  In plane strain F is (3, 3), with the out-of-plane
-    stretch last, if Q1 cells would lock or if the soil has an initial stress.  For a law that does not accept F (3, 3)
-    in plane strain, F is (2, 2).
+    stretch last, if Q1 cells would lock without F-bar, or if the soil has an initial stress.  For a law that does not
+    accept F (3, 3) in plane strain, F is (2, 2).
 
     energy
         Stored energy psi per reference volume, Pa.  Stress and tangent are UFL's derivatives.
@@ -104,12 +104,12 @@ class Skeleton:
         Alternative to `residual` in numpy, for return mappings with many cases, and for existing codes.  The function
         takes arrays (n, ...) of the law's fields, state and `trial`.  The function returns a dict with a pair for each
         unknown: the values (n, ...), and a dict of derivatives (n, ..., ...) by name of the trial value.  A derivative
-        may also be a function without arguments.  This function is called only if a tangent is assembled.  A missing
+        may also be a function without arguments that returns the array, called only for a tangent.  A missing
         derivative is zero.  Without a solution, return NaN or infinity; the time step is then reduced.  Newton's method
         is slow if the derivative of `energy` with respect to the unknowns is not zero.
     trial
-        Function of F, which returns trial values as UFL, by name.  Residuals depend on F only through these values.
-        Without `trial`, residuals have F as argument.  Only `kirchhoff` and `update` receive values other than UFL.
+        Function of F that returns trial values as UFL, by name.  Residuals depend on F only through these values.
+        Without `trial`, residuals have F as argument.  Only `kirchhoff` and `update` receive non-UFL trial values.
 
     All these functions may have the argument `dt`, the time since the start of the step, s, for rate-dependent laws.
     If a law receives the new state and dt = 0, it must return the stress at the end of the step.  The argument
@@ -164,7 +164,7 @@ class Skeleton:
     """Whether the stress is linear in F, so that factors of the stiffness matrix can be reused."""
     state: ClassVar[Mapping[str, ArrayLike]] = {}
     by_scene: ClassVar[tuple[str, ...]] = ()
-    """Which of `dt` and `cell_size` are arguments of the law's functions."""
+    """The names `dt` and `cell_size`, if they are arguments of the law's functions."""
     parameters: ClassVar[tuple[str, ...]] = ()
     """Names of fields and properties that are arguments of the law's functions."""
 
@@ -228,7 +228,7 @@ class Skeleton:
 
     @property
     def symmetric(self) -> bool:
-        """Whether the tangent is symmetric; assumed false for laws defined by their stress."""
+        """Whether the tangent is symmetric; assumed false for laws that define `kirchhoff`."""
         return self.kirchhoff is None
 
     def check_cells(self, cell_size: float) -> None:
@@ -307,7 +307,7 @@ class Skeleton:
 
     @property
     def macroelement(self) -> float:
-        """Modulus lambda + 3G, in Pa, that resists a displacement of the middle of 2 x 2 cells."""
+        """Modulus lambda + 3G, in Pa, that resists a displacement of the middle node of 2 x 2 cells."""
         return self.bulk + 7 * self.shear / 3
 
     def storage(self, fluid_bulk: float, porosity):
@@ -316,7 +316,7 @@ class Skeleton:
 
 
 def constants_of(material: Skeleton) -> list[str]:
-    """Return the names of the constants of a material, which may vary with position."""
+    """Return the names of a material's constants, uniform or functions of position."""
     return [f.name for f in fields(material) if f.name not in ("conductivity_law", "retention")]
 
 
@@ -373,7 +373,7 @@ def _deviatoric(F):
 
 
 def _stretch_difference(C):
-    """Return the difference of the logarithmic principal stretches of a symmetric 2x2 tensor, as UFL."""
+    """Return as UFL the difference of the logarithmic principal stretches for the tensor C = F^T F (2, 2)."""
     ratio = ((C[0, 0] - C[1, 1]) ** 2 + 4 * C[0, 1] ** 2) / (C[0, 0] + C[1, 1]) ** 2
     radius = ufl.sqrt(ratio + SEPARATION**2 / 4)
     return (ufl.ln(1 + radius) - ufl.ln(1 - radius)) / 2
@@ -456,7 +456,7 @@ class unsaturated:
     Parameters
     ----------
     suction
-        Half width of the transition, Pa, > 0.  Recommended: 0.5 to 1 times unit weight of water times cell height.
+        Half width of the transition in p, Pa, > 0.  Recommended: 0.5 to 1 times unit weight of water times cell height.
     least
         Conductivity of drained soil, divided by the conductivity of saturated soil, in (0, 1).
     specific_yield
@@ -519,4 +519,4 @@ class Fluid:
         return self.density * (self.gravity or STANDARD_GRAVITY)
 
 
-STANDARD_GRAVITY = 9.81  # m/s^2, by which conductivities are defined.  Source: standard gravity of 1901, three digits
+STANDARD_GRAVITY = 9.81  # m/s^2, default g that defines conductivities.  Source: standard gravity of 1901

@@ -43,7 +43,7 @@ class SofteningDruckerPrager(DruckerPrager):
     viscosity
         Viscosity eta of Perzyna's law f = eta dgamma/dt, Pa s, >= 0, with the yield function f of `DruckerPrager`.
 
-    Other parameters: see `DruckerPrager`, without hardening.  The state variable `plastic` is the inverse plastic
+    Other parameters: see `DruckerPrager`; `hardening` must be 0.  The state variable `plastic` is the inverse plastic
     metric C_p^-1 (3, 3).  The state variable `hardened` is xi gamma, with the coefficient xi of the cohesion in the
     yield function and the plastic shear strain gamma.  Soil in tension at the apex of the cone has the cohesion c_r.
 
@@ -100,7 +100,7 @@ class SofteningDruckerPrager(DruckerPrager):
 
 def _softened(trial: Trial, bulk, shear, cone, hardened, cohesion, residual, strain, drag) -> dict:
     """Return the result of `drucker_prager.returned` with softening.  At the plastic strain `strain`, c = c_r."""
-    end = cone[1] * strain  # in terms of `hardened`
+    end = cone[1] * strain  # value of `hardened` at which c = c_r
     moduli = trial, bulk, shear, *cone
     falling = returned(*moduli, cohesion, (residual - cohesion) / end, hardened, drag)
     left = returned(*moduli, residual, 0.0, hardened, drag)

@@ -78,7 +78,7 @@ def symmetric(values):
 
 
 def eigen(b: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return eigenvalues (n, 3), and axes (n, 3, 3) as columns, of tensors with components b."""
+    """Return eigenvalues (n, 3), and axes (n, 3, 3) as columns, of tensors with the components b (n, 4 or 6)."""
     n = len(b)
     if b.shape[1] == len(SPACE):
         full = np.empty((n, 3, 3))
@@ -103,8 +103,8 @@ class Coaxial:
     """Tensors (n, 3, 3) with the principal axes of n given tensors.
 
     `x` (n, 3), `axes` (n, 3, 3): eigenvalues and axes of the given tensors, see `eigen`.
-    `y` (n, 3): principal values.
-    `plane`: whether the given tensors have the components in `PLANE`.
+    `y` (n, 3): principal values of the new tensors.
+    `plane`: whether the given tensors have only the components in `PLANE`.
     """
 
     def __init__(self, x: NDArray[np.float64], axes: NDArray[np.float64], y: NDArray[np.float64], plane: bool):
@@ -127,7 +127,7 @@ class Coaxial:
         return out
 
     def tangent(self, slopes: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the derivatives of `values` with respect to the components of the given tensors.
+        """Return the derivatives (n, 6, components) of `values` with respect to the components of the given tensors.
 
         In principal axes, dy_ij = (y_i - y_j) / (x_i - x_j) dx_ij for i != j.  The limit for x_i = x_j is
         (dy_i/dx_i - dy_i/dx_j) dx_ij.

@@ -2,21 +2,21 @@
 """User-defined functions that return UFL.
 
 The package passes each argument by its name; the names are listed below.  `skeleton.Skeleton` describes functions for
-laws and conductivities.  `Simulation` takes terms of the balances, integrated over the configuration at the start of
-the step.  Their arguments are:
+laws and conductivities.  `Simulation` takes functions for terms of the balances, integrated over the configuration at
+the start of the step.  Possible arguments of these functions are:
 
 points
     Quadrature points.  The integral of 1 over the measure `points.dx` is the volume of the material points.
     `points.value(f)` and `points.grad(f)` are the value and gradient of f = u or v.  In axisymmetry the gradient is (3,
-    3), with f_r / r.  `points.F` is the deformation gradient at the start of the step, in the shape of grad u; its
-    determinant is the volume ratio.  `points.position` is the position at the start of the step.
+    3), with f_r / r.  `points.F` is the deformation gradient at the start of the step, in the shape of grad u; det F is
+    the volume ratio since seeding.  `points.position` is the position at the start of the step.
     `points.displacement` is the displacement since the start of the run, or since a stage that reset it to zero.  Other
     attributes are the laws' state variables, and parameters that are functions of position.
 t
-    Time, s, as a UFL constant: the end of the substep.
+    Time at the end of the substep, s, as a UFL constant.
 
-A function in `terms` is added to the balance of momentum, `int P : grad v dV - loads + term = 0`.  Further possible
-arguments of this function are:
+A function in `terms` is added to the balance of momentum, `int P : grad v dV - loads + term = 0`.  This function may
+also have the arguments:
 
 u
     Increment of the displacement in the step, m; Q1.
@@ -30,8 +30,8 @@ dt
 
 The tangent of a term with v is assumed to be unsymmetric.
 
-The function of a `Source` returns the inflow as a volume rate of fluid at zero pressure, m^d/s.  Further possible
-arguments of this function are:
+The function of a `Source` returns the inflow as a volume rate of fluid at zero pressure, m^d/s.  This function may also
+have the arguments:
 
 q
     Test function, constant in the cells.  The source is `s * q * points.dx` with s in 1/s.
@@ -93,7 +93,7 @@ def expression(function: Callable, shapes: Sequence[tuple[int, ...]], of: str = 
 
 
 def _check_parts(what: str, out: ufl.core.expr.Expr) -> None:
-    """Raise ValueError if UFL contains infinite numbers, NaN, or a sum over an index of two sizes."""
+    """Raise ValueError if UFL contains infinite numbers, NaN, or an index of two different sizes."""
     for part in unique_pre_traversal(out):
         if isinstance(part, ufl.constantvalue.RealValue) and not np.isfinite(float(part)):
             raise ValueError(f"{what}: contains {float(part)}, must be finite")
@@ -106,9 +106,9 @@ def _check_parts(what: str, out: ufl.core.expr.Expr) -> None:
 
 
 def named(what: str, given, shapes: Mapping[str, tuple[int, ...]], some: bool = False) -> dict:
-    """Return the dict `value` of a user-defined function with UFL of the given shapes, or raise ValueError.
+    """Return `given`, the result of a user-defined function, as a dict of UFL with these shapes, or raise ValueError.
 
-    `some`: whether names may be missing.
+    `some`: whether the dict may lack some of the names.
     """
     instance(f"{what}: its result", given, dict)
     allowed, out = f"{'some of ' if some else ''}the names and shapes {dict(shapes)}", {}
@@ -157,7 +157,7 @@ def term_of(term: Callable, unknown: ufl.Coefficient, test: ufl.Argument, **avai
 
 @contextmanager
 def compiling(what: str, allowed: str) -> Iterator[None]:
-    """Replace errors of UFL and its compiler by a ValueError with the name of the object."""
+    """Replace errors of UFL and its compiler by a ValueError with the name `what` of the object."""
     try:
         yield
     except (Exception, ArityMismatch) as error:  # UFL and FFCx raise many kinds; one is no Exception
@@ -168,7 +168,7 @@ def compiling(what: str, allowed: str) -> Iterator[None]:
 
 
 def _is_ours(error: Exception) -> bool:
-    """Return whether this package raised an error."""
+    """Return whether an error was raised in this package, and not in a library."""
     frames = error.__traceback__
     while frames.tb_next is not None:
         frames = frames.tb_next

@@ -25,7 +25,7 @@ class ActiveSet:
 
     @cached_property
     def dofs(self) -> NDArray[np.int64]:
-        """Unrolled degrees of freedom of the nodes."""
+        """Unrolled indices of the displacement components at the nodes."""
         return (self.nodes[:, None] * self.grid.dim + np.arange(self.grid.dim)).ravel()
 
     @cached_property
@@ -56,14 +56,14 @@ class Active:
     wet
         Whether cells may contain fluid.
     cells, dofs
-        Arrays over the local cells, and over the unrolled local degrees of freedom.  `clear` sets the arrays to 0.
+        Arrays by local cell, and by unrolled local degree of freedom.  `clear` sets these arrays to 0.
 
     Attributes
     ----------
     now
         The active set.
     slot : (cells,)
-        Index of each cell among the owned active cells.
+        Index of each local cell among the owned active cells.
     centroid : (cells, d), m
         Vector from the midpoint of the cell to the centroid of its material.  The array is empty without fluid.
     opening : (cells, d, 2)

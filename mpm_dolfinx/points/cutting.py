@@ -31,7 +31,7 @@ from mpm_dolfinx.grid.grid import ABOUT_MIDDLE, FACE_SIGNS, FACES, TURN, Grid, c
 SLIVER = NEAR**2
 """Smallest volume of a piece, divided by the volume of its domain.  Source: epsilon."""
 CHUNK = 2**15  # simplices cut in one call, so that they fit into the processor's cache
-TANGLED = 0.2  # smallest volume between corners / volume of domain; below it corners are re-initialised from F
+TANGLED = 0.2  # smallest volume within the corners / volume of the point; below it corners are re-initialised from F
 
 
 @dataclass
@@ -62,7 +62,7 @@ def kuhn_simplices(dim: int) -> NDArray[np.int64]:
 
 @cache
 def simplices(dim: int) -> NDArray[np.int64]:
-    """Return the vertex indices (4 or 24, d+1) of the simplices of a domain, as in `vertices`.
+    """Return the simplices (4 or 24, d+1) of a domain: indices of their vertices in the result of `vertices`.
 
     The corners of a simplex are a facet of the surface, oriented outward, and the middle of the domain.
     """
@@ -130,7 +130,7 @@ def centroids(corners: NDArray[np.float64], within: bool = False) -> NDArray[np.
     """Return the centroids (n, d), in m, of domains, or in axisymmetry of their sections.
 
     The centroid of a partly inverted domain may be outside of the domain.
-    `within`: whether to move such centroids into the domain, by a positive volume for inverted simplices.
+    `within`: whether to move such centroids into the domain, by positive weights of inverted simplices.
     """
     parts = [_centroids(corners[part], within) for part in _chunks(len(corners), corners.shape[2])]
     return parts[0] if len(parts) == 1 else np.concatenate(parts)
@@ -147,7 +147,7 @@ def _centroids(corners: NDArray[np.float64], within: bool) -> NDArray[np.float64
 
 
 def tangled(corners: NDArray[np.float64], volume: NDArray[np.float64], axisymmetric: bool = False) -> NDArray[np.bool_]:
-    """Return a mask (n,) of inverted domains: corners span much less or much more than `volume` (n,), in m^d."""
+    """Return a mask (n,) of inverted domains: corners enclose much less or more than `volume` (n,), in m^d."""
     ratio = domain_volumes(corners, axisymmetric) / volume
     return (ratio < TANGLED) | (ratio > 1 / TANGLED)
 
@@ -169,7 +169,7 @@ def _chunks(count: int, dim: int) -> list[slice]:
 def cut(grid: Grid, corners: NDArray[np.float64], second: bool = False, faces: bool = True) -> Pieces:
     """Cut the particle domains by the grid.
 
-    `corners` (n, 2^d, d), in m: corners of the domains, inside the grid; corner k is at the ends `corner_bits(d)[k]`.
+    `corners` (n, 2^d, d), in m: corners of the domains, inside the grid, in the order of `corner_bits`.
     `second`, `faces`: whether to compute second moments and face areas of the pieces.
 
     Returns
@@ -192,7 +192,7 @@ def on_planes(
     """Return positions in cell units, and positions for slicing.  Positions near a grid plane are moved onto this
     plane.
 
-    Positions for slicing are in cell units if all cells are equal, and else in m.
+    Positions for slicing are in cell units if all cells have one size, and else in m.
 
     `true`: positions from the lower corner of the grid, in cell units.
     `x`, in m: the same positions, from the base of the grid.
@@ -270,7 +270,7 @@ class _Slots:
         self.cell = self.low[:, self.point] + self._place
 
     def of(self, owner: NDArray[np.int64], index: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the slots of cells, for the domains `owner`."""
+        """Return the slots of pairs of a domain, `owner`, and a cell, `index`."""
         before = self._start - (self.low * self._stride).sum(axis=0)
         out = before.take(owner) + index[-1].astype(np.int64)  # the last stride is 1
         for place, stride in zip(index[:-1], self._stride, strict=False):
@@ -278,7 +278,7 @@ class _Slots:
         return out
 
     def beyond(self, values: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
-        """Return for each slot the sum of the values over all later slots of its domain along an axis."""
+        """Return for each slot the sum of values over the slots of the same domain beyond it along an axis."""
         out = np.zeros(self.size)
         for steps in range(1, int(np.maximum.reduce(self._span[axis], initial=1))):
             has = (self._place[axis] + steps < self._span[axis][self.point]).nonzero()[0]
@@ -513,7 +513,7 @@ def cut_faces(
 def _polygons(
     grid: Grid, s: NDArray[np.float64], owner: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Return the polygons of cut triangles, divided into triangles independently of the order of the axes."""
+    """Divide the parts of faces in cells into triangles, independently of the order in which the axes were cut."""
     cut = np.bincount(owner, minlength=1)[owner] > 1
     part, of = s[:, :, cut], owner[cut]
     cell = np.floor(slices_in_cells(grid, part[:, :3]).mean(axis=0)).astype(np.int64)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Search for the nearest facets of a surface, in a binary tree of oriented boxes (Gottschalk, Lin and Manocha 1996).
 
-Facets are segments in 2D and triangles in 3D.  In this file, the component is the first index of vectors.
+Facets are segments in 2D and triangles in 3D.  In this file, arrays of vectors have the component as first index.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from mpm_dolfinx.base.tolerances import ROUND_OFF, SAME
 AT_ONCE = 2**13
 """Number of positions in an array operation, for the cache of a processor."""
 START = 2**8 - 1
-"""Number of nodes above the level at which the search for a near facet starts."""
+"""Number of nodes of the tree above the level at which the search for a near facet starts."""
 
 
 class Boxes(NamedTuple):

@@ -28,7 +28,7 @@ RADIUS = 3.0
 Source: exact. A parabola needs three points.  At an end of the data, these points have offsets of 0.5, 1.5 and 2.5.
 """
 UNTOLD = (0.0, 1e-10, 1e-6)
-"""Weights c_k of coefficients of degrees 0, 1 and 2, divided by the sum of the data weights.
+"""Weights c_k of polynomial coefficients of degrees 0, 1 and 2, divided by the sum of the data weights.
 
 With weights 0.01 or 100 times as large, pressures of a consolidating column change by 1e-5 of the load.  Plateau (scene
 "adaptive" of tests/plateaus.py): half this value changes the result by 5.8e-08, twice this value by 1.2e-07, and finer

@@ -67,7 +67,7 @@ def unstretched(F: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def in_plane(F: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the in-plane part of F (n, 3, 3), scaled to `det F`, and the out-of-plane stretch."""
+    """Return the in-plane part of F (n, 3, 3), scaled to the determinant `det F`, and the out-of-plane stretch."""
     across = F[:, 2, 2]
     return F[:, :2, :2] * np.sqrt(across)[:, None, None], across.copy()
 
@@ -108,7 +108,7 @@ class MaterialPoints:
     reference : (n, 2^d, d), m
         Corners of the domain in the reference configuration of F: seeded corners, or re-initialised corners.
     data : (n, ...) by name
-        Further data, such as state variables of laws, parameters that vary with position, data of conditions, velocity.
+        All other data: state variables of laws, parameters that vary with position, data of conditions, velocity.
     """
 
     id: NDArray[np.int64]
@@ -192,7 +192,7 @@ class MaterialPoints:
     def map(self, function: Callable[[NDArray], NDArray], shared: bool = True) -> MaterialPoints:
         """Return the points after a function is applied to each array.
 
-        `shared`: whether fields with a common array also have a common new array.
+        `shared`: whether fields that share an array also share the new array.
         """
         cache: dict[int, NDArray] = {}
 
@@ -214,7 +214,7 @@ class MaterialPoints:
         return type(self)(**arrays, data={name: chosen(v, other.data[name]) for name, v in self.data.items()})
 
     def joined(self, other: MaterialPoints) -> MaterialPoints:
-        """Return these and other points, ordered by id."""
+        """Return these points and the points `other`, ordered by id."""
         order = np.concatenate([self.id, other.id]).argsort()
         pairs = {f.name: (getattr(self, f.name), getattr(other, f.name)) for f in fields(self) if f.name != "data"}
         data = {name: np.concatenate([rows, other.data[name]])[order] for name, rows in self.data.items()}
@@ -240,7 +240,7 @@ class MaterialPoints:
         return received.map(lambda rows: rows[order])
 
     def find(self, ids: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the indices, in `ids` and among all points of this process, of the points that have these `ids`."""
+        """Return for all `ids` that are on this process their indices in `ids`, and the indices of their points."""
         at = self.id.searchsorted(ids)
         found = ((at < len(self)) & (self.id[np.minimum(at, len(self) - 1)] == ids)).nonzero()[0] if len(self) else []
         found = np.asarray(found, dtype=np.int64)

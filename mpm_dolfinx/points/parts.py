@@ -22,8 +22,8 @@ class Parts:
     """Connected parts of the bodies on the grid."""
 
     count: int  # number of parts
-    cells: NDArray[np.int64]  # index, from 0, of each active local cell's part, else -1
-    nodes: NDArray[np.int64]  # index, from 0, of each active local node's part, else -1
+    cells: NDArray[np.int64]  # index, from 0, of the part of each local cell; -1 for inactive cells
+    nodes: NDArray[np.int64]  # index, from 0, of the part of each local node; -1 for inactive nodes
 
     def largest(self, comm: MPI.Comm, part: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the largest of `values` (n, ...) in each connected part (count, ...), or -inf for empty parts."""
@@ -32,7 +32,7 @@ class Parts:
 
 @dataclass(frozen=True, eq=False)
 class OfParts:
-    """Entries of a distributed vector, with the index `of` the connected part of each local entry."""
+    """Entries of a distributed vector.  `of` contains the index of the connected part of each local entry."""
 
     comm: MPI.Comm
     of: NDArray[np.int64]
@@ -72,7 +72,7 @@ def largest_of_parts(comm: MPI.Comm, part: NDArray, values: NDArray, count: int)
 def largest_of_bodies(
     comm: MPI.Comm, part: NDArray[np.int64], values: NDArray[np.float64], inside: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
-    """Return the largest values (k, bodies) in the connected parts of each body, or 0 without parts.
+    """Return the largest values (k, bodies) in the connected parts of each body, or 0 for bodies without parts.
 
     `part` (m,): index, from 0, of the connected part of each column of `values` (k, m).
     `inside` (bodies, parts): whether a part contains points of a body on this process.
@@ -87,7 +87,7 @@ def relative(
 ) -> NDArray[np.float64]:
     """Return the norms divided by the scales.
 
-    The result is 0 for norms of at most `round_off`, and inf for undefined quotients.
+    The result is 0 for norms of at most `round_off`, and otherwise inf for scales of 0 and infinite norms.
     """
     ratio = np.empty(norms.shape)
     ratio.fill(np.inf)
@@ -147,7 +147,7 @@ def joined_parts(
 
 
 def _touching(index: NDArray[np.int64]) -> tuple[NDArray[np.int64], int]:
-    """Return the connected part of each cell, and the number of parts, from grid indices and copies."""
+    """Return the connected part of each cell, and the number of parts.  `index`: grid indices and copy of each cell."""
     if not len(index):
         return np.empty(0, dtype=np.int64), 0
     low = index.min(axis=0)
@@ -160,7 +160,7 @@ def _touching(index: NDArray[np.int64]) -> tuple[NDArray[np.int64], int]:
 
 
 def _joined(rows: NDArray[np.int64], columns: NDArray[np.int64], shape: Sequence[int]) -> tuple[NDArray[np.int64], int]:
-    """Return the connected component of each row, and their number.  Each column connects all its rows."""
+    """Return the connected component of each row, and their number.  Rows with a common column are connected."""
     part, count = linked(sum(shape), rows, shape[0] + columns)
     return part[: shape[0]], count
 
@@ -168,7 +168,7 @@ def _joined(rows: NDArray[np.int64], columns: NDArray[np.int64], shape: Sequence
 def _over_processes(
     grid: Grid, own: NDArray[np.int64], count: int, nodes: NDArray[np.integer], of_node: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], int]:
-    """Return the connected part of each cell on all processes, and the number of parts."""
+    """Return the connected part of each cell, joined over all processes, and the number of parts."""
     counts = grid.comm.allgather(count)
     start = sum(counts[: grid.comm.rank])
     index, copy = np.split(grid.node_places(nodes), [grid.dim], axis=1)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The surface of bodies in single cells in 2D, and quadrilaterals that fill the body behind the surface."""
+"""The surface of bodies in single cells in 2D, and quadrilaterals that fill the part of a cell inside the body."""
 
 from __future__ import annotations
 

@@ -38,7 +38,7 @@ def direct_solver(
 ) -> PETSc.KSP:
     """Return a solver that factorises A at the first solve and after changes of A.
 
-    `symmetric`: whether the factors are L D L^T.
+    `symmetric`: whether the factors are L D L^T, or else L U.
     `gathered`: whether only the last process has the factors, for many solves with the same matrix.
     `package`: package of the factorisation, by default PETSc on one process, and MUMPS on several processes.
     """
@@ -92,7 +92,7 @@ def negative_pivots(solver: PETSc.KSP) -> int:
 
 
 def displacement_solver(A: PETSc.Mat, name: str, unknowns: Unknowns, how: str, symmetric: bool) -> PETSc.KSP:
-    """Return a direct solver for many solves with one matrix A of displacements. `how`: see `plan`."""
+    """Return a direct solver for many solves with one matrix A of displacements. `how`: see `SolverPlan`."""
     if how != NODAL:
         return direct_solver(A, name, symmetric, package="mumps" if how == MUMPS else None)
     ksp = _preonly(A, name)
@@ -120,8 +120,8 @@ class Gathered:
     """Preconditioner for PETSc: factors of a matrix on one process. `setUp` gathers the matrix.
 
     `x`: vector with an entry for each column of the matrix.
-    `factors`: factors of the matrix of all processes.
-    `rank`: process of the factors.
+    `factors`: factors of the gathered matrix.
+    `rank`: process that has the factors.
     """
 
     def __init__(self, x: PETSc.Vec, factors: NodalFactors | SingleFactors, rank: int):

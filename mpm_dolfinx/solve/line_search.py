@@ -21,11 +21,11 @@ from dataclasses import dataclass
 import numpy as np
 
 SHORTEST = 1e-3
-"""Smallest fraction of the full step.  Plateau (scene "tool" of tests/plateaus.py): half this value changes the result
-by 1.2e-03, twice this value by 0.0e+00, and finer cells by 7.1e-02.
+"""Smallest length of a step, as a fraction of the full Newton step.  Plateau (scene "tool" of tests/plateaus.py): half
+this value changes the result by 1.2e-03, twice this value by 0.0e+00, and finer cells by 7.1e-02.
 """
 EXPLODES = 1e4
-"""Largest growth of the residual in a step without yield.
+"""Largest factor by which the residual may grow in a step without yield.
 
 With 1e3 or 1e5 in place of 1e4, scenes take the same steps.
 """
@@ -45,14 +45,14 @@ steps with 0.05, 41 with 0.1, and 43 with 0.2.
 
 @dataclass(frozen=True)
 class Halving:
-    """Search for the step length without yield.
+    """Search for the step length in soil that does not yield.
 
     `step`: next trial, as a fraction of the full step.
     """
 
     step: float = 1.0
     limit = EXPLODES
-    """Largest growth of the residual at the end of a step."""
+    """Largest factor by which the residual may grow in a step."""
 
     def after(self, work: float, growth: float) -> Halving | None:
         """Return the next trial, or None if the search ends.
@@ -71,10 +71,10 @@ class Search:
     low: float = 0.0  # the work changes its sign between `low` and `high`
     at_low: float = 1.0  # work at `low`, divided by the initial work
     high: float = np.inf
-    at_high: float = np.nan  # work at `high` / initial work
+    at_high: float = np.nan  # work at `high`, divided by the initial work
     ends: bool = False  # whether the next step is the last trial
     limit = sys.float_info.max
-    """Largest growth of the residual at the end of a step."""
+    """Largest factor by which the residual may grow in a step."""
 
     def after(self, work: float, growth: float) -> Search | None:
         """Return the next trial, or None if the search ends.

@@ -14,8 +14,8 @@ to the tolerance 1e-5.  With algebraic multigrid, GMRES takes 10 to 15 cycles in
 17 to 23 cycles, and conjugate gradients on the Schur complement 35 to 60 cycles.
 
 At nu = 0.499 with 14^3 cells, GMRES takes more than 100 iterations.  If a solve takes too many iterations, factors of K
-replace the multigrid cycle.  In large 3D bodies that may yield, multigrid with sweeps (`SMOOTHERS`) replaces it.  In
-yielding soil in 2D, GMRES would take 20 to 500 iterations, because coarse grids cannot represent shear bands.
+replace the multigrid cycle.  In large 3D bodies that may yield, multigrid with sweeps (`SMOOTHERS`) replaces the cycle.
+In yielding soil in 2D, GMRES with multigrid would take 20 to 500 iterations: coarse grids cannot represent shear bands.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ class BlockOperator:
         self.join(u, p, y)
 
     def displaced(self) -> NDArray[np.float64]:
-        """Return the fluid volumes (parts,) that unit residual forces displace, in m^d/N."""
+        """Return the fluid volumes (parts,) that residual forces displace, divided by the forces, in m^d/N."""
         forces, (u, _, _, g) = self.momentum.residual, self.work
         self.inverses[0].apply(forces, u)
         self.storage.B.mult(u, g)
@@ -114,7 +114,7 @@ class BlockSolver:
     `how`: solver plan.
     `momentum`, `storage`: the matrices.
     `cycles`: two preconditioners, a multigrid cycle on K and a multigrid cycle on P.
-    `multigrid`: function that returns multigrid on K with a smoother.
+    `multigrid`: function that creates multigrid on K with a given smoother.
     """
 
     def __init__(
@@ -161,7 +161,7 @@ class BlockSolver:
         `scales`: two arrays (parts,): scales of the momentum residual (N) and of the fluid residual (m^d).
         `rtol`: tolerance relative to the norm of both scaled residuals, for each connected part.
         `slopes`: derivative of the fluxes with respect to displacements, if the tangent includes it.
-        `factors`: factors from an earlier solve in place of multigrid cycles, or None.
+        `factors`: factors from an earlier solve that replace multigrid cycles, or None.
 
         Returns
         -------
@@ -211,7 +211,7 @@ class BlockSolver:
         return solved(self._ksp, "momentum and storage")
 
     def _factorised(self) -> Inverses:
-        """Return preconditioners for later tangents too: factors of K and in 2D of P, or multigrid with sweeps."""
+        """Return preconditioners that later tangents reuse: factors of K (in 2D also P), or multigrid with sweeps."""
         K, unknowns = self._momentum.K, self._momentum.unknowns
         if self._plan.fallback == SWEEPS:
             return self._multigrid(smoother=THREE_SWEEPS).pc, self._cycles[1]
@@ -226,7 +226,7 @@ class BlockSolver:
 
 
 class Foresight:
-    """Monitor that ends a solve if its last iterations predict more than the largest number of iterations.
+    """Monitor that ends a solve early if it converges too slowly for its largest number of iterations.
 
     `interval`: number of iterations between two predictions.
     """
@@ -237,7 +237,7 @@ class Foresight:
         """Whether another solver can replace the present one."""
 
     def __call__(self, ksp: PETSc.KSP, count: int, norm: float) -> None:
-        """Predict the residual at the end of the solve."""
+        """End the solve if the residual, extrapolated to the last allowed iteration, exceeds the tolerance."""
         rtol, _, _, most = ksp.getTolerances()
         if not self.active or not count or count % self._interval:
             return

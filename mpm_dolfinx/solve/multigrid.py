@@ -70,7 +70,7 @@ def multigrid_solver(
 ) -> PETSc.KSP:
     """Return GMRES with multigrid, which is set up again after A has changed.
 
-    `A`: matrix, which may still be empty.
+    `A`: matrix, whose entries may be set later.
     `name`: prefix of the solver's PETSc options.
     `places` (n, d + 1), >= 0: grid indices of the local unknowns along each axis, and index of the component.
     `held` (m, d + 1): indices, as in `places`, of fixed degrees of freedom in cells of bodies.
@@ -124,7 +124,7 @@ def interpolation(
     nodal: bool,
     lines: Sequence[NDArray[np.float64]] | None = None,
 ) -> tuple[PETSc.Mat, NDArray[np.int64], NDArray[np.int64]]:
-    """Return the interpolation matrix, the local coarse unknowns, and fixed coarse degrees of freedom.
+    """Return the interpolation matrix, and for the coarse grid the local unknowns and fixed degrees of freedom.
 
     A coarse cell is an unknown if it contains an unknown fine cell. A coarse node is an unknown if it coincides with a
     free fine node, or interpolates to free fine nodes only.
@@ -156,7 +156,7 @@ def interpolation(
 def _hats(
     places: NDArray[np.int64], nodal: bool, lines: Sequence[NDArray[np.float64]] | None = None
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-    """Return fine unknown, coarse unknown (as indices), and weight for each entry of an interpolation matrix."""
+    """Return for each entry of an interpolation matrix: fine unknown, coarse unknown (grid indices), and weight."""
     half, odd = np.divmod(places[:, :-1], 2)
     if nodal:
         share = 0.5
@@ -180,9 +180,10 @@ def _hats(
 def _shared(
     comm: MPI.Intracomm, keys: NDArray[np.int64], count: int, stated: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Return the index of the coarse unknown of each key, and whether this process owns the unknown.
+    """Return the index of each coarse unknown or `NONE`, and whether this process owns the unknown.
 
-    `stated`: status of each key, `MAYBE`, `NOT` or `IS`; the largest status on all processes applies.
+    `keys`: integers >= 0 and < `count` that identify the coarse unknowns on all processes.  `stated`: status of each
+    key, `MAYBE`, `NOT` or `IS`; the largest status on all processes applies.
     """
     ask = Exchange(comm, (keys * comm.size // count).astype(np.int32))
     distinct, who = np.unique(ask.send(keys), return_inverse=True)

@@ -42,9 +42,9 @@ from mpm_dolfinx.solve.factors import negative_pivots
 from mpm_dolfinx.solve.line_search import SHIFT, Halving, Search
 from mpm_dolfinx.solve.schur import Kept, LinearSolvers
 
-INNER = 1e-3  # momentum tolerance / storage error; small, because errors of rotations change volumes
+INNER = 1e-3  # tolerance of momentum solves / storage residual; small, because wrong rotations change volumes
 MOMENTUM_STEPS = 10
-REBALANCED = 6  # largest number of iterations with changing contacts, divided by the number without
+REBALANCED = 6  # largest number of Newton steps while contacts change, divided by the usual largest number
 LOOSEST = 1e-2
 """Largest ratio of the residual after a linear solve to the residual before this solve. Plateau (scene "soil" of
 tests/plateaus.py): half this value changes the result by 2.2e-11, twice this value by 6.0e-12, and finer cells by
@@ -67,11 +67,11 @@ For a mode with decay rate l, the stability function of sdirk2 gives an error of
 0.28 e. A pressure that follows a varying load has an error of at most 0.14 e. With little decay, the errors of all
 steps add up to 0.081 e. Errors were measured by comparison with steps an eighth as long. The errors are 0.01 to 0.08 e
 for varying loads, pressures and sources. The error is 0.17 e in a first step from zero load, and 0.26 e after a jump.
-The error of a run is at most 5 e / 20. Plateau (scene "adaptive" of tests/plateaus.py): half this value changes the
-result by 1.8e-02, twice this value by 3.9e-03, and finer cells by 3.8e-02.
+The error of a run is at most 5 times the assumed error e / 20. Plateau (scene "adaptive" of tests/plateaus.py): half
+this value changes the result by 1.8e-02, twice this value by 3.9e-03, and finer cells by 3.8e-02.
 """
 SUDDEN = np.sqrt(2)
-"""Ratio of the pressure changes in the second and first substep below which sdirk2 overshoots.
+"""Pressure change in the second substep divided by the change in the first substep, below which sdirk2 overshoots.
 
 For a mode with `z = -(decay rate) dt`, the stability function `(1 + (1 - 2 gamma) z) / (1 - gamma z)^2` is zero at
 `z = -1 - sqrt(2)`. The pressure then changes by `-gamma z / (1 - gamma z) = sqrt(2) - 1` in the first substep, and by
@@ -80,7 +80,7 @@ For a mode with `z = -(decay rate) dt`, the stability function `(1 + (1 - 2 gamm
 
 
 AsReset = Callable[[], AbstractContextManager[QuadratureData]]
-"""See `OnGrid.as_reset`."""
+"""Type of `OnGrid.as_reset`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +101,7 @@ class Errors:
 
     @cached_property
     def worst(self) -> float:
-        """The largest residual of all parts."""
+        """The largest relative residual of both balances in all parts."""
         return float(np.maximum.reduce(self.each, initial=0.0))
 
 
@@ -115,12 +115,12 @@ def solve_substep(
     report: Report,
     kept: Kept,
 ) -> Rates | None:
-    """Solve the equations of a substep for (u, p). Return the outflow rates at the end, or None without fluid.
+    """Solve the equations of a substep for (u, p). Return the outflow rates at its end, or None without fluid.
 
     `solvers`: linear solvers for the unknowns of the active cells.
     `momentum`, `storage`: the balances. `storage` is None without fluid.
     `ahead`: function that extrapolates (u, p) at active dofs and cells from the last steps, or None.
-    `as_reset`, `key`: context of the last reset, and its key. Linear laws use the tangent at the last reset.
+    `as_reset`, `key`: context with the state at the last grid reset, and cache key of its tangent for linear laws.
     `report`: report of the step, to which the counts of the substep are added.
     `kept`: factors that the tangents of the step share.
 
@@ -169,7 +169,7 @@ def note_pressures(
 
     `seconds`, s: time weight of the rates of the first substep.
     `dt`, s: length of the step.
-    `of_bodies`: function for the largest values in each body, see `Motion.of_bodies`.
+    `of_bodies`: function that returns the largest values in each body, see `Motion.of_bodies`.
     """
     if storage is None or not report.newton:
         return
@@ -272,7 +272,7 @@ class Newton:
     def _begin(self, ahead: Callable | None) -> tuple[Errors, list[NDArray[np.float64]] | None]:
         """Set the initial guess of Newton's method. Return its errors, and an alternative guess or None.
 
-        The guess is `ahead` if its residual is small, and else the guess with the smallest residual in each part.
+        The guess is the result of `ahead` if its residual is small, else in each part the u with the smallest residual.
         """
         start = self._iterate()
         if ahead is not None:
@@ -388,7 +388,7 @@ class Newton:
     def _errors(self, start: NDArray[np.float64] | None = None) -> Errors:
         """Assemble both residuals, add their relative norms to the history, and return the norms.
 
-        `start`, N: forces at the start of the step, which are part of the scales. Residuals within rounding count as 0.
+        `start`, N: forces at the start of the step, a lower bound of the scales. Residuals within rounding count as 0.
         """
         first = not self.report.history
         with _compat.Timer("residual"):
@@ -514,5 +514,5 @@ class Newton:
 
 
 def _ratio(part: float, whole: float) -> float:
-    """Return a ratio, or nan if it is not finite."""
+    """Return `part / whole`, or nan if the ratio is not finite."""
     return part / whole if whole and np.isfinite(part) else np.nan

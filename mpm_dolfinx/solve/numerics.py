@@ -65,7 +65,7 @@ class Numerics:
 
     @property
     def scheme(self) -> Scheme:
-        """Coupling scheme of the two problems, with its tolerance."""
+        """Coupling scheme of the balances of momentum and fluid, with its tolerance."""
         return Scheme(self.coupling, self.tolerance, petsc_options=self.petsc_options)
 
 

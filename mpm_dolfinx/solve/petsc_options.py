@@ -27,7 +27,7 @@ PREFIXES = {
     "factors_": "factors of K that replace multigrid cycles",
     "storage_factors_": "factors of the fixed-stress operator that replace multigrid cycles",
 }
-"""Prefixes of option names, and their solvers."""
+"""For each prefix of option names: the solver that reads these options."""
 
 
 def check(options: Mapping[str, Any]) -> None:

@@ -106,7 +106,7 @@ class LinearSolvers:
         self._momentum = momentum
         self._storage = storage
         self.tangent: Latest[bool] = Latest()
-        """Key of a tangent that is reused over several steps."""
+        """Cache whose key identifies the present tangent, if several steps use this tangent."""
         self._solve_s = self._schur = self._block = None
         self.du, self._rhs = momentum.unknowns.vector(), momentum.unknowns.vector()
         """Newton direction of the displacements, and a work vector for right-hand sides."""
@@ -143,7 +143,7 @@ class LinearSolvers:
         return displacement_solver(momentum.K, "momentum", momentum.unknowns, how.displacements, how.symmetric)
 
     def _multigrid(self) -> Callable[..., PETSc.KSP]:
-        """Return a function that returns multigrid on K with a smoother."""
+        """Return a function that creates multigrid on K with a given smoother."""
         momentum = self._momentum
         given = {"nodal": True, "coarsest": self.plan.coarsest, "lines": momentum.lines}
         return partial(multigrid_solver, momentum.K, "momentum", *momentum.places(), **given)
@@ -156,7 +156,7 @@ class LinearSolvers:
 
     @property
     def schur(self) -> tuple[PETSc.Mat, PETSc.KSP]:
-        """The Schur complement and its solver. With multigrid, this property raises ValueError."""
+        """The Schur complement and its solver. With `monolithic` multigrid, this property raises ValueError."""
         if self._schur is None:
             raise ValueError("solvers: monolithic multigrid has no Schur complement; direct solvers must be used")
         return self._schur, self._solve_s
@@ -171,9 +171,9 @@ class LinearSolvers:
     ) -> bool:
         """Assemble the tangents at (u, p), and factorise them.
 
-        `kept`: data that the tangents of the step share.
-        `data`: integration points, by default the points of the problems.
-        `shift`: factor on the elastic shear stiffness in the regularisation, or one factor for each connected part.
+        `kept`: factors that the tangents of the step share, see `Kept`.
+        `data`: integration points, by default the points of `momentum` and `storage`.
+        `shift`: fraction of the elastic shear stiffness that regularises the tangent; one number, or one for each part.
         """
         kept = kept or Kept()
         with _compat.Timer("tangent"):
@@ -222,7 +222,7 @@ class LinearSolvers:
     ) -> int:
         """Solve for (du, dp) with the present residuals, and return the number of coupling iterations.
 
-        `kept`: data that the tangents of the step share.
+        `kept`: factors that the tangents of the step share, see `Kept`.
         `rtol`: relative tolerance, for each connected part.
         `forces`, `exchanged` (parts,): scales of the residuals: forces (N) and exchanged fluid volume (m^d).
         `slope`: derivative of the fluxes with respect to displacements, if the tangent includes it.
@@ -299,7 +299,7 @@ class LinearSolvers:
         self.solve_u.solve(self._rhs, self.du)
 
     def turn_round(self, parts: NDArray[np.bool_] | None = None) -> None:
-        """Reverse the Newton direction in some parts, or in all parts."""
+        """Reverse the Newton direction in the chosen connected parts, by default in all."""
         directions = [(self.du, self._momentum)] + ([(self.dp, self._storage)] if self._storage is not None else [])
         for direction, system in directions:
             if parts is None or parts.all():

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 FACTORS, NODAL, MUMPS, MULTIGRID = "factors", "factors in blocks", "factors by MUMPS", "multigrid"
 """Solvers for displacements or pressures."""
 SWEEPS = "multigrid with sweeps"
-"""Multigrid with the smoother `THREE_SWEEPS`, which replaces multigrid with the smoother `INCOMPLETE`."""
+"""Fallback after too many iterations of multigrid with `INCOMPLETE`: multigrid with the smoother `THREE_SWEEPS`."""
 ONE_SWEEP, THREE_SWEEPS = "multigrid", "firmly"
 """Smoothers of multigrid by relaxation. Prefixes of PETSc options contain these names (`momentum_firmly_`)."""
 INCOMPLETE = "incomplete"
@@ -32,7 +32,7 @@ class Thresholds:
         32 s with a direct solver and 4.0 s with multigrid.
     multigrid_2d
         From this number of unknown displacements, multigrid replaces a direct solver in wet 2D scenes without yield.
-        From 8000 to 74000 unknowns, the times of both solvers are equal within 15 %.
+        From 8000 to 74000 unknowns, the times of both solvers differ by at most 15 %.
     mumps
         From this number of unknown displacements, MUMPS computes factors in wet scenes.  If K is symmetric, MUMPS is
         used on several processes only.  On one process, two steps of a yielding block of 73728 unknowns take 18 s with

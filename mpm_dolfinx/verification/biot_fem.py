@@ -74,7 +74,7 @@ class Space:
     """Space of the unknowns w = (u, p/scale), or w = u without fluid, and functions in this space.
 
     `old`: w at the start of the step.
-    `past`: change of w in the step due to the rate in the previous substep.
+    `past`: contribution of the rate in the previous substep to the change of w in the step.
     `b`, `f`: residual and loads.
     `same`: copy of w, which is constant in derivatives.
     `u`, `p`: displacement and scaled pressure, the parts of w.
@@ -114,10 +114,10 @@ class BiotFEM:
     Parameters
     ----------
     grid
-        Mesh of the body, which is a box: a `Grid` with equal cells, used by this model only.
+        Mesh of the box-shaped body: a `Grid` with cells of equal size, which no other model uses.
     material, fluid
-        Skeleton without state, and pore fluid.  With steep retention curves (n > 2.5, or with an air entry), steps may
-        fail to converge.
+        Skeleton whose law has no state variables and no local unknowns; pore fluid, or None.  With steep retention
+        curves (n > 2.5, or with an air entry), steps may fail to converge.
     walls
         Sides of the box, each with the displacement components that are zero there, such as {"left": "xy"}.
     conditions
@@ -218,7 +218,7 @@ class BiotFEM:
 
     @property
     def _places(self):
-        """Reference positions, not relative to the base of the grid, as UFL."""
+        """True reference positions as UFL, in place of positions relative to the base of the grid."""
         return ufl.SpatialCoordinate(self.grid.mesh) + self._constant(self.grid.base)
 
     def _constant(self, value: ArrayLike) -> fem.Constant:
@@ -243,7 +243,7 @@ class BiotFEM:
         return f
 
     def _box(self, name: str, region: Region | None = None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the corners of a flat box around a side or a part of it."""
+        """Return the lowest and the highest corner of a flat box around a side or a part of it."""
         grid, (axis, end) = self.grid, side(name, self.grid.dim)
         low, high = limits(region, grid.dim) - grid.base
         plane, near = (grid.low, grid.high)[end][axis], NEAR * grid.h
@@ -368,7 +368,7 @@ class BiotFEM:
         return block(F) if self.grid.axisymmetric else F
 
     def _in_plane(self, T):
-        """Return a tensor, in axisymmetry without circumferential components."""
+        """Return the tensor T, in axisymmetry without its circumferential components."""
         return ufl.as_matrix([[T[i, j] for j in (0, 1)] for i in (0, 1)]) if self.grid.axisymmetric else T
 
     def _begin(self, pressure: float | Callable, x: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -65,7 +65,7 @@ class _Rings:
 class Cavity:
     """A thick cylinder of soil in plane strain under inner and outer pressure, with linear elements."""
 
-    rings: _Rings  # law
+    rings: _Rings  # soil, one ring for each element
     R: NDArray[np.float64]  # initial radii of the nodes, m
     r: NDArray[np.float64]  # present radii of the nodes, m
     state: State  # state of the law
@@ -94,7 +94,7 @@ class Cavity:
             if exact:
                 state = self.rings.updated(_stretches(self.R, r), self.state)
                 return replace(self, r=r, state=state, pressure=inside / r[0])
-            exact = np.abs(force).max() < SAME * scale  # after one more step
+            exact = np.abs(force).max() < SAME * scale  # the next step is the last
             K = np.einsum("ase,est,bte->eab", B, D, B) * weight[:, None, None]
             bands = np.zeros((3, n))
             bands[1, :-1] += K[:, 0, 0]

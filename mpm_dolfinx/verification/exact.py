@@ -63,7 +63,7 @@ def terzaghi_pressure(z: ArrayLike, t: ArrayLike, height: float, cv: float, p0: 
     Parameters
     ----------
     z : (...), m, in [0, height]; distance from the drained end; z and t are broadcast
-    t : (...), s, > 0; time since the pressure was p0
+    t : (...), s, > 0; time since the uniform pressure p0
     height : m, > 0; length of the layer
     cv : m²/s, > 0; coefficient of consolidation kappa / (S + alpha²/(K + 4G/3))
     p0 : Pa; pressure at t = 0+
@@ -355,7 +355,7 @@ def shear_flexible_rod(
 
 
 def _rod(loads: Array, axial: float, shear: float):
-    """Return a function of arclength: x, y, rotation and moment of a rod with unit length and bending stiffness."""
+    """Return a function of arclength, for x, y, rotation and moment of a rod with length and bending stiffness 1."""
     s, state = np.linspace(0, 1, 41), np.zeros((4, 41))
     state[0] = s
 
