@@ -32,7 +32,7 @@ def stored(materials: SceneMaterials, points: MaterialPoints) -> dict[str, NDArr
 
 
 def drift(materials: SceneMaterials, points: MaterialPoints, held: NDArray[np.bool_]) -> list[float]:
-    """Return the mean velocity of all bodies, in m/s.  It is zero along axes with supports, and along the radius.
+    """Return the mean velocity of all bodies, in m/s.  It is set to 0 along axes with supports and along the radius.
 
     All processes must call this function.
 
