@@ -61,8 +61,8 @@ def struck(h: float, way: str, steps: int = 80) -> tuple[np.ndarray, np.ndarray,
 
 
 def flown(cells: int, periods: int, steps: int) -> dict[str, np.ndarray]:
-    """Move the free bar. Return times (in periods), the oscillation of its end (m), and its energy over the initial
-    energy.
+    """Move the free bar. Return times (in periods), the oscillation of its end (m), and its energy, divided by the
+    initial energy.
     """
     h, count = 1 / cells, 3 * cells + 8 + round(2.5 * cells)
     grid = mpm.Grid([0, 0], [count * h, h], [count, 1])
