@@ -223,7 +223,7 @@ class CompiledForm:
         return self.form
 
     def packed(self, form=None) -> dict:
-        """Return dolfinx's array of coefficient values, with one row for each entity, for each integral."""
+        """Return dolfinx's coefficient values: an array for each integral, with one row for each entity."""
         form = form or self.form
         return cpp.fem.pack_coefficients(form)
 

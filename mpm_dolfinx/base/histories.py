@@ -57,8 +57,8 @@ class _Columns:
 class Rows(Sequence[Row]):
     """Immutable sequence of one `Row` for each output time of a run.
 
-    The method `more` returns a new object that shares its arrays with this object.  Its run time therefore does not
-    depend on the number of rows.  If a quantity has different shapes in two rows, the smaller array is padded with nan.
+    The method `more` returns a new object that shares its arrays with this object.  `more` thus takes the same time for
+    any number of rows.  If a quantity has different shapes in two rows, the smaller array is padded with nan.
 
     Attributes
     ----------

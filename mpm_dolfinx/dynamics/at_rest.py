@@ -76,7 +76,7 @@ def balancing_tractions(
 def _rigid(arm: NDArray[np.float64], free: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Return k rigid-body displacements (k, n, d) of n points with lever arms (n, d).
 
-    Rotations are omitted if the displacement along any axis is fixed.
+    Displacements along fixed axes are omitted.  If an axis is fixed, rotations are omitted too.
     """
     n, d = arm.shape
     fields = [np.broadcast_to(e, (n, d)) for e in np.eye(d)[free]]

@@ -336,7 +336,7 @@ def _nodal_rows(simulation: Simulation, name: str, nodal: NDArray[np.float64] | 
 
 
 def _check_lines(arrays: dict[str, NDArray], grid: Grid) -> None:
-    """Raise ValueError if the arrays are not lines of this grid, or if the grid's lines cannot move."""
+    """Raise ValueError if the arrays cannot be positions of this grid's lines, or if these lines cannot move."""
     shapes = {letter: x.shape for letter, x in zip("xyz", grid.lines, strict=False)}
     if grid.follow is None or {name: x.shape for name, x in arrays.items()} != shapes:
         raise ValueError("lines: these are not lines of the grid")
@@ -360,7 +360,7 @@ def _nodal(name: str, arrays: dict[str, NDArray], grid: Grid) -> tuple[NDArray, 
 
 
 def _check_trend(trend: Trend, points: MaterialPoints, wet: bool) -> None:
-    """Raise ValueError if the stored motion of the last steps does not belong to the points."""
+    """Raise ValueError if the stored motion in the last steps does not fit the points."""
     (n, d), k = points.x.shape, len(trend.lengths)
     right = k in (1, 2, 3) and trend.lengths.shape == (k,) and trend.rates.shape == (n, k, d * (1 + d) + wet)
     numbers_only = all(v.dtype == np.float64 and np.isfinite(v).all() for v in vars(trend).values())

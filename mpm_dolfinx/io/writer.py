@@ -206,7 +206,7 @@ def _write_tools(simulation: Simulation, file: Path) -> None:
 
 
 class Lock:
-    """An exclusive lock of a folder.  It ends when all writers of this process have released it."""
+    """An exclusive lock of a folder.  The lock ends when all writers of this process have released it."""
 
     _held: ClassVar[WeakValueDictionary[Path, Lock]] = WeakValueDictionary()
 

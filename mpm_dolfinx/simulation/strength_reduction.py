@@ -273,7 +273,7 @@ class _Weakened:
         return replace(trial.state, t=initial.t)
 
     def _trial(self, start: State, strength: Callable[[str, NDArray[np.float64]], NDArray[np.float64]]) -> _Trial:
-        """Return a trial that starts from a state.  `strength`: function of name and original value."""
+        """Return a trial that starts from a state.  `strength`: returns a strength from name and full value."""
         data = {name: strength(name, value) for name, value in self._strengths.items()}
         points = replace(start.points, data={**start.points.data, **data})
         return _Trial(self._scene, replace(start, points=points, velocity=None, result=None, control=None), self.newton)
