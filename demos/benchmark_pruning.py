@@ -125,7 +125,7 @@ def draining(cells: int, **options) -> mpm.Simulation:
 
 
 def layered(cells: int, off: float) -> mpm.Simulation:
-    """Return the draining block with four layers of alternating conductivity, `off` cells away from grid lines."""
+    """Return the draining block with four layers of two conductivities; interfaces are `off` cells from grid lines."""
     h, heights = 1 / cells, np.arange(5) / 4
     heights[1:-1] += off * h
     grid = mpm.Grid([0, 0], [1, 1 + 2 * h], [cells, cells + 2])

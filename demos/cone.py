@@ -67,7 +67,7 @@ class Push:
     N: resistance after each step.
     frame: final corners (n, 4, 2) of the domains (m), the values (n,) to draw, and the outline (k, 2) of the cone (m).
     seeded: number of points at the start.
-    cells: number of grid cells, and number of cells if all cells were as small as the smallest.
+    cells: number of grid cells, and number of cells of the smallest size that would fill the grid.
     """
 
     depth: list[float] = field(default_factory=list)
@@ -235,7 +235,7 @@ def following(o: Namespace, clay: mpm.Skeleton, fixed: Push) -> dict[str, float]
 
     load: relative difference of the mean N in the second half of the push.
     last: relative difference of the final N.
-    cells: number of cells, divided by the number if all cells were as small as the smallest.
+    cells: number of cells, divided by the number of cells of the smallest size that would fill the grid.
     fixed: number of cells, divided by the number with fixed grid lines.
     """
     run, halfway = push(o.cells, o.depth * R, clay, follow=True), o.depth / 2

@@ -109,7 +109,7 @@ def judge(row: Row, make: Make, bound: float, rtol: float | None = None) -> Row:
 
 
 def check(row: Row, scene: Scene, result: mpm.Result, bound: float) -> None:
-    """Compare a completed run with its reference, and set outcome and error of the row."""
+    """Compare a completed run with its reference, and store the outcome and the error in the row."""
     s = scene.simulation
     row.condition = condition(s.scene.last[1].momentum.K)
     try:

@@ -118,7 +118,7 @@ def seen(s: mpm.Simulation, T: float) -> tuple[float, NDArray, NDArray, NDArray]
 
 
 def elements(cells: int, load: float, a_decade: int) -> NDArray[np.float64]:
-    """Return the upward displacements of Taylor-Hood elements at `TIMES` and `PLACES`, divided by `HEIGHT`."""
+    """Return the upward displacements by Taylor-Hood elements at `TIMES` and `PLACES`, divided by `HEIGHT`."""
     fem, out = BiotFEM(mpm.Grid([0, 0], [HEIGHT] * 2, [cells] * 2), SOIL, **conditions(load)), []
     for T in times(a_decade):
         fem.step(T * UNIT - fem.t)

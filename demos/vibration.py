@@ -40,7 +40,7 @@ class Bar(mpm.LinearElastic):
 
 
 def struck(h: float, way: str, steps: int = 80) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return times, displacements of the tip, and the frequency (Hz) of a beam after an impulse."""
+    """Return times (s), displacements of the tip (m), and the frequency (Hz) of a beam after an impulse."""
     grid = mpm.Grid([0, 0], [LENGTH + 3 * h, DEPTH + 4 * h], [round(LENGTH / h) + 3, round(DEPTH / h) + 4])
     beam, axis = mpm.box(grid, [0, 2 * h], [LENGTH, DEPTH + 2 * h]), ("along", "across").index(way)
 

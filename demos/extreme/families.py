@@ -411,7 +411,7 @@ def dried(k: float, steep: float, driest: float = -1.5) -> Scene:
 def layered_rain():
     """Compare two layers under rain with exact heads, for ratios of k from 1e-3 to 1e3 and alpha h = 1e-2 to 1e2.
 
-    `rain` defines alpha h. The interface is off the grid lines.
+    `rain` defines alpha h. The interface is not on a grid line.
     """
     for ratio in decades(-3, 3, 2):
         for steep in decades(-2, 2):

@@ -71,7 +71,7 @@ def bar(
 
 
 def ends(s: mpm.Simulation, axis: int) -> tuple[float, float]:
-    """Return displacement and velocity of the last face of a body along an axis."""
+    """Return displacement and velocity, along an axis, of the outermost face of a body."""
     points = s.points
     i = points.x[:, axis].argmax()
     face = points.corners[i, :, axis].max()
@@ -239,7 +239,7 @@ def inertia_base():
 
 
 def driven(dt: float, steps: int = 4) -> Scene:
-    """Return a block off the grid lines, whose left side accelerates."""
+    """Return a block whose left side accelerates; no side is on a grid line."""
     grid = mpm.Grid([0, 0], [N * H, N * H], [N, N])
     body = mpm.box(grid, [0.23, 0.23], [0.63, 0.63])
     way = H * min(0.1, SMALL * dt / CROSSES)  # m

@@ -76,7 +76,7 @@ def place(s: mpm.Simulation, corners: np.ndarray) -> None:
 
 @dataclass(frozen=True)
 class Beam:
-    """A cantilever, clamped at its left end, with the tip displacement of Taylor-Hood elements as reference."""
+    """A cantilever, clamped at its left end, with the tip displacement by Taylor-Hood elements as reference."""
 
     material: mpm.materials.Skeleton = SOIL
     fluid: mpm.Fluid | None = None
