@@ -6,9 +6,9 @@ feature hardly changes the results. Examples are a gravity of zero, a conductivi
 from yield. `settlement` is the relative difference between the final settlements of the two scenes. In the pair "mean
 dilatation" (F-bar), the two scenes have different Poisson ratios and therefore different settlements.
 
-The two scenes of a pair take one step each in turn, --repeat times. The table gives the run time of the fastest step of
-each scene. All times are processor times. The compile time is the additional time of the first step with an empty cache
-of compiled forms. The memory is the peak memory with a full cache.
+The two scenes of a pair take four steps each in turn, --repeat times. The table gives the run time of the fastest step
+of each scene. All times are processor times. The compile time is the additional time of the first step with an empty
+cache of compiled forms. The memory is the peak memory with a full cache.
 """
 
 from __future__ import annotations
@@ -125,7 +125,7 @@ def draining(cells: int, **options) -> mpm.Simulation:
 
 
 def layered(cells: int, off: float) -> mpm.Simulation:
-    """Return the draining block with four layers of alternating conductivity, `off` cells away from grid lines."""
+    """Return the draining block with four layers of two conductivities; interfaces are `off` cells from grid lines."""
     h, heights = 1 / cells, np.arange(5) / 4
     heights[1:-1] += off * h
     grid = mpm.Grid([0, 0], [1, 1 + 2 * h], [cells, cells + 2])
@@ -137,14 +137,14 @@ def layered(cells: int, off: float) -> mpm.Simulation:
 
 
 class Watched(mpm.Hencky):
-    """Hencky's law with a damping of pressure jumps four times as strong."""
+    """Hencky's law with a damping of pressure jumps four times as strong as in `mpm.Hencky`."""
 
     def pressure_damping(self) -> float:
         return 4 * super().pressure_damping()
 
 
 def conducting(cells: int, law: type[mpm.Skeleton]) -> mpm.Simulation:
-    """Return the draining block. At its conductivity, pressure jumps in `Watched` are computed, but not damped."""
+    """Return the draining block. With its conductivity and `Watched`, pressure jumps are computed, but not damped."""
     kappa = 8 * soil().pressure_damping() / cells**2 / (GAMMA * DT)
     return block(cells, soil(law, conductivity=kappa * WATER["fluid"].unit_weight), **WATER)
 

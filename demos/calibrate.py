@@ -55,7 +55,7 @@ CASES: dict[str, tuple[Callable[[int], mpm.Simulation], tuple[int, ...], tuple[i
     "multigrid_2d": (lambda n: block(2, n, ELASTIC, True), (64, 96, 128, 192), (16,)),
     "mumps": (lambda n: block(2, n, YIELDS, True), (64, 128, 192, 256), (12,)),
 }
-"""By threshold: a function that returns a scene with n cells along an axis; values of n; values of n with --quick.
+"""For each threshold: function that returns a scene with n cells along an axis, values of n, and n with --quick.
 """
 
 FACTORED = (16, 128, 256)
@@ -113,7 +113,7 @@ def factored(n: int, soil: mpm.Skeleton) -> Iterator[tuple[str, int, list[float]
 
 
 def main(argv: list[str] | None = None) -> dict:
-    """Print the tables, and return the times by threshold and number of unknowns."""
+    """Print the tables, and return the times for each threshold and number of unknowns."""
     parser = common.Parser(__doc__, __file__, processes=True)
     parser.add_argument("--repeat", type=int, default=2, help="turns of a pair")
     parser.add_argument("--quick", action="store_true", help="small blocks, one turn")

@@ -10,8 +10,8 @@ steps are needed because laws with history are first-order accurate in the step.
    has moved from radius R to r, with `r^2 - a^2 = R^2 - a0^2`.
 2. The wall is fixed after the expansion, and excess pressures dissipate through the outer boundary.
 3. Drained cavities expand in Modified Cam Clay (Chen and Abousleiman 2013) and in Mohr-Coulomb sand with phi = 30
-   degrees (Yu and Houlsby 1991). The sand has no dilation, or associated flow. The published solutions are for infinite
-   soil. The outer boundary therefore follows a radial solution (`mpm_dolfinx.verification.cavity`).
+   degrees (Yu and Houlsby 1991). The sand has either no dilation or associated flow. The published solutions are for
+   infinite soil. The outer boundary therefore follows a radial solution (`mpm_dolfinx.verification.cavity`).
 
 Pressures are divided by the initial pressure p_0. Errors are relative errors of the cavity pressure, and in undrained
 clay also of the pore pressure at the wall. In undrained clay errors are evaluated at the radii `MARKS`, and in drained
@@ -84,7 +84,7 @@ def ray(X: np.ndarray) -> np.ndarray:
 
 
 def ring(cells: int, soil: mpm.Skeleton, widest: float, outside: Callable | None = None, **scene) -> mpm.Simulation:
-    """Return a quarter of the ring around a cavity of radius 1 + t, in m.
+    """Return a quarter of the ring around a cavity, whose radius (m) is 1 + t at the time t (s).
 
     cells: number of cells over the initial radius of the cavity.
     widest: largest radius of the cavity, in m.
@@ -108,7 +108,7 @@ def ring(cells: int, soil: mpm.Skeleton, widest: float, outside: Callable | None
 
 
 def widen(s: mpm.Simulation, cells: int, radius: float, push: float) -> float:
-    """Widen the cavity to a radius (m) by at most `push` cells in a step, and return its `pressure`."""
+    """Widen the cavity to a radius (m), in steps of at most `push` cells, and return its `pressure`."""
     steps = max(1, int(np.ceil((radius - 1 - s.t) * cells / push - 1e-6)))
     s.run(radius - 1, (radius - 1 - s.t) / steps, progress=False)
     return pressure(s, radius)

@@ -149,7 +149,7 @@ def save(fig, path: Path, dpi: int = 130) -> None:
 
 
 def weight(unit_weight: float) -> Callable:
-    """Return a term for `terms=`: a downward weight, in N/m³ of undeformed ground."""
+    """Return a term for `terms=`: a downward weight (N) per volume (m³) of undeformed ground."""
 
     def weight(points, v):
         return unit_weight / ufl.det(points.F) * points.value(v)[1] * points.dx
@@ -171,7 +171,7 @@ def viscous(viscosity: float) -> Callable:
 
 
 def unbalanced(energies: dict[str, np.ndarray]) -> float:
-    """Return the largest error of the energy balance (J) of the `energies` of a result."""
+    """Return the largest error of the energy balance (J), from the `energies` of a result."""
     names = ("kinetic", "elastic", "dissipated", "viscous", "friction", "renewal")
     total = sum(energies[name] for name in names if name in energies) - energies["external"]
     return float(np.abs(total - total[0]).max())

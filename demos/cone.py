@@ -65,9 +65,9 @@ class Push:
 
     depth: depth of the tip after each step, divided by R.
     N: resistance after each step.
-    frame: final corners (n, 4, 2) of the domains (m), a field (n,), and the outline (k, 2) of the cone (m).
+    frame: final corners (n, 4, 2) of the domains (m), the values (n,) to draw, and the outline (k, 2) of the cone (m).
     seeded: number of points at the start.
-    cells: number of grid cells, and number of cells if all cells were as small as the smallest.
+    cells: number of grid cells, and number of cells of the smallest size that would fill the grid.
     """
 
     depth: list[float] = field(default_factory=list)
@@ -145,7 +145,7 @@ def push(cells: int, depth: float, clay: mpm.Skeleton, follow: bool = False) -> 
 
 @dataclass
 class Dissipation:
-    """Excess pressure at the edge between cone and shaft, divided by s_u.
+    """Results in wet clay. excess: pressure at the edge between cone and shaft when the cone stops, divided by s_u.
 
     rest: fraction of the excess pressure that remains at the times T* of `TIMES`.
     frame: corners of the domains, excess pressures divided by s_u, and outline of the cone, when the cone stops.
@@ -172,7 +172,7 @@ def push_wet(cells: int, depth: float) -> Dissipation:
     edge = np.array([R, outline[-2, 1] - depth])
 
     def excess(s: mpm.Simulation) -> float:
-        """Return the mean excess pressure of the points within a cell of the edge, divided by s_u."""
+        """Return the mean excess pressure of the points within one cell size of the edge, divided by s_u."""
         near = np.linalg.norm(s.points.x - edge, axis=1) < h
         volume = s.points.volume0[near]
         return float(volume @ s.points.pressure[near] / volume.sum() / STRENGTH)
@@ -235,7 +235,7 @@ def following(o: Namespace, clay: mpm.Skeleton, fixed: Push) -> dict[str, float]
 
     load: relative difference of the mean N in the second half of the push.
     last: relative difference of the final N.
-    cells: number of cells, divided by the number if all cells were as small as the smallest.
+    cells: number of cells, divided by the number of cells of the smallest size that would fill the grid.
     fixed: number of cells, divided by the number with fixed grid lines.
     """
     run, halfway = push(o.cells, o.depth * R, clay, follow=True), o.depth / 2

@@ -50,7 +50,7 @@ SCHEMES = {
 }
 """For each scheme: Krylov method, beta divided by alpha^2/K_dr, and the factor of L in the preconditioner.
 
-If beta has the value None, it is 1/K_w.
+The entry None stands for beta = 1/K_w.
 """
 MOST = 200  # iterations after which a scheme counts as divergent
 RAMP_STEP = 0.02  # s: all systems have the load increment of this time, for any dt
@@ -73,7 +73,7 @@ LAWS = {"damped": mpm.Hencky, "undamped": Undamped}
 class Count:
     """Number of iterations of a scheme for one linear system, or None if the scheme diverges.
 
-    lowest, highest: extreme eigenvalues of P^-1 S, with the preconditioner P (conjugate gradients only).
+    lowest, highest: extreme eigenvalues of P^-1 S, with preconditioner P and Schur complement S; nan if not computed.
     """
 
     scene: str
@@ -128,7 +128,7 @@ class System:
 
 
 def with_water(s: mpm.Simulation, bulk: float) -> mpm.Simulation:
-    """Return the scene in its present state, with water of another bulk modulus, in Pa.
+    """Return a copy of the scene in its present state, with water of another bulk modulus, in Pa.
 
     Pressures are scaled to at most a tenth of the bulk modulus, so that the density of the water stays physical.
     """
@@ -159,7 +159,7 @@ def linearise(s: mpm.Simulation, dt: float) -> System:
 
 
 def count(s: System, scheme: str) -> tuple[int | None, float, float]:
-    """Return the number of iterations for a linear system, and the extreme eigenvalues of P^-1 S."""
+    """Return the number of iterations for a linear system, and the extreme eigenvalues of P^-1 S (see `Count`)."""
     method, factor, share = SCHEMES[scheme]
     if factor is None:
         factor = s.soil.drained_modulus(2) / s.soil.biot**2 / s.bulk

@@ -175,7 +175,7 @@ def orders(h: list[float], left: list[float]) -> list[float]:
 
 
 def reference(o: Namespace) -> tuple[np.ndarray, np.ndarray]:
-    """Return the tip deflection in a load cycle (m) by finite elements, and the load (Pa)."""
+    """Return the tip deflection (m) by finite elements, and the load (Pa), at each time of a load cycle."""
     case = options(o.h[-1], o.load)
     size = [0, 0], [beam.LENGTH, beam.HEIGHT], beam.REFERENCE_CELLS
     fem = BiotFEM(mpm.Grid(*size), beam.material(case), **conditions(case))

@@ -29,7 +29,7 @@ CONVERGED = {
     30: ((-631.67, -1582.23, -3205.4, -4983.1, -6211.2), 1.15932e-3, 1.57255e-6),
     120: ((-906.99, -2267.84, -4542.4, -6847.5, -8264.9), 1.55827e-3, 3.33066e-7),
 }
-"""By time, in min: pressures at the five heights (Pa), settlement (m) and outflow at the foot (m/s)."""
+"""At each time (min): pressures at the five heights (Pa), settlement (m) and outflow at the foot (m/s)."""
 
 
 class Sand:

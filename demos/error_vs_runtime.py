@@ -8,8 +8,8 @@ Reference solutions are converged in space and in time.
 
 * beam: the poroelastic beam. Two errors of the tip deflection are given: the largest at all output times, and the
   largest after 0.1 s. The reference has 67 x 20 Taylor-Hood elements and steps of 0.005 s.
-* drained: the poroelastic beam without water, loaded in ten steps. The tip deflection is compared with that of 67 x 20
-  Taylor-Hood elements.
+* drained: the poroelastic beam without water, loaded in ten steps. The reference of the tip deflection is a solution
+  with 67 x 20 Taylor-Hood elements.
 * terzaghi: the settlement at T_v = 0.5 is compared with the exact settlement.
 * mandel: the settlement of the plate at T = 0.1 is compared with the exact settlement.
 * column: the height of the soft column under its own weight is compared with the exact height.
@@ -250,7 +250,7 @@ def measure(case: str, quick: bool, repeat: int) -> list[Row]:
 
 
 def time_at(rows: list[Row], error: float) -> float:
-    """Return the shortest time (s) of the runs with at most this error, or nan if there is none."""
+    """Return the shortest time (s) of runs with at most this error, or nan if no run is so accurate."""
     return min((r.wall_s for r in rows if r.error <= error), default=np.nan)
 
 

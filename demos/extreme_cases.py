@@ -12,8 +12,8 @@ one of these outcomes:
 * warned: the error is above the bound, and the package has issued a warning.
 * wrong, nan or hung: a defect, which the exit status reports. An unexpected exception counts as wrong.
 
-Errors are relative to the largest exact value, or as the docstring of the family defines. The condition number is that
-of the last stiffness matrix, scaled to a unit diagonal. The demo runs on one process.
+Errors are relative to the largest exact value, or the docstring of the family defines them. The condition number refers
+to the last stiffness matrix, scaled to a unit diagonal. The demo runs on one process.
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ def judge(row: Row, make: Make, bound: float, rtol: float | None = None) -> Row:
 
 
 def check(row: Row, scene: Scene, result: mpm.Result, bound: float) -> None:
-    """Compare a completed run with its reference, and set outcome and error of the row."""
+    """Compare a completed run with its reference, and store the outcome and the error in the row."""
     s = scene.simulation
     row.condition = condition(s.scene.last[1].momentum.K)
     try:
@@ -126,7 +126,7 @@ def check(row: Row, scene: Scene, result: mpm.Result, bound: float) -> None:
 
 
 def condition(K) -> float:
-    """Return the condition number of a matrix scaled to a unit diagonal, or nan without a matrix."""
+    """Return the condition number of a matrix scaled to a unit diagonal, or nan if no matrix was assembled."""
     if not K.assembled:
         return nan
     A = csr_matrix(K.getValuesCSR()[::-1], shape=K.getSize()).toarray()
@@ -136,7 +136,7 @@ def condition(K) -> float:
 
 
 def worst(rows: list[Row], name: str) -> float:
-    """Return the largest value of a field of all rows, without nan."""
+    """Return the largest value of one attribute over all rows, or nan if no row has a value."""
     return max((v for r in rows if not isnan(v := getattr(r, name))), default=nan)
 
 
@@ -174,7 +174,7 @@ def write(out: Path, rows: list[Row]) -> None:
 
 
 def draw(out: Path, rows: list[Row]) -> None:
-    """Draw errors, condition numbers and numbers of Newton iterations by family."""
+    """Draw errors, condition numbers and numbers of Newton iterations for each family."""
     names = [name for name in FAMILIES if any(r.family == name for r in rows)]
     colours = dict(zip(OUTCOMES, ("C0", "C2", "0.5", "C1", "C3", "black", "C4"), strict=True))
     fig, (axes,) = common.figure(1, 3, (13, 1.5 + 0.34 * len(names)))

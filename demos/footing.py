@@ -93,7 +93,7 @@ LIMIT_DEPTH, LIMIT_STEPS = 0.0015, 8  # for --square: depth / B, number of steps
 
 
 def capacity(friction: float) -> float:
-    """Return Prandtl's N_c of a friction angle, in degrees."""
+    """Return Prandtl's N_c for a friction angle in degrees."""
     t = np.tan(np.radians(friction))
     return 2 + np.pi if t == 0 else (np.exp(np.pi * t) * np.tan(np.pi / 4 + np.radians(friction) / 2) ** 2 - 1) / t
 
@@ -179,7 +179,7 @@ class Push:
     results: list[mpm.Result] = field(default_factory=list)
 
     def total(self, name: str) -> float:
-        """Return the sum of a field of all results, such as the number of steps."""
+        """Return the sum of one attribute, such as the number of steps, over all results."""
         return sum(getattr(result, name) for result in self.results)
 
     @property
@@ -255,11 +255,11 @@ def push(
 def limit_load(
     how: str, cells: int, box: tuple[float, float] | None = None, graded: bool = False, steps: int = 40
 ) -> Push:
-    """Push the footing into very stiff soil, with loads divided by the theoretical limit load.
+    """Push the footing into very stiff soil; the returned loads are divided by the theoretical limit load.
 
     how: key of `LIMITS_OF`.
-    box, graded: see `push`; by default the box in `LIMITS_OF`, with equal cells.
-    steps: number of computed steps out of 40, if undrained.
+    box, graded: see `push`; by default the box of `LIMITS_OF`, with cells of equal size.
+    steps: number of steps that are computed, of the 40 steps of an undrained push.
     """
     soil, (depth, own) = replace(SOIL, bulk=STIFF * SOIL.bulk, shear=STIFF * SOIL.shear), LIMITS_OF[how]
     box = box or own
@@ -362,7 +362,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def of_many_sizes(cells: int, folder: Path) -> dict:
-    """Compare the undrained limit load on graded cells in a large box with that on equal cells in a small box.
+    """Compare undrained limit loads: on graded cells in a large box, and on equal cells in a small box.
 
     Returns the load, the number of points and the processor time (s) for both boxes, and their ratios.
     """

@@ -49,7 +49,7 @@ class Contact:
     half: float
 
     def errors(self, stiff: float) -> tuple[float, float]:
-        """Return the relative errors of half-width and largest pressure against Hertz for the computed force.
+        """Return the relative errors of half-width and largest pressure. Reference: Hertz's solution for this force.
 
         stiff: modulus E* of the gel, in Pa.
         """
@@ -92,7 +92,7 @@ def scene(cells: int, wet: bool) -> mpm.Simulation:
 class Pressed:
     """Results of a run.
 
-    contacts: initial contact, and in wet gel final contact.
+    contacts: the initial contact and, in wet gel, also the final contact.
     forces: forces at the start and at `TIMES`, in N/m.
     frame: initial corners, pore pressures, and shape of the cylinder.
     balance: largest error of the fluid balance.

@@ -27,7 +27,7 @@ STIFF = {"bulk": 1e10, "shear": 5e9}  # Pa: soil that hardly deforms
 ALPHA, K = 5.0, 1e-5  # 1/m, m/s, of the exponential soil
 HOURS = (1, 6, 12)
 FRONT = {6: (0.2544, 0.017406), 12: (0.375096, 0.026335)}
-"""By hour: depth (m) at which the head is -5 m, and infiltrated water (m), extrapolated from 1600 finite volumes."""
+"""At each time (h): depth (m) where the head is -5 m, and infiltrated water (m), extrapolated from 1600 cells."""
 DRY = {
     "soil": mpm.LinearElastic(
         **STIFF,

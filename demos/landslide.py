@@ -46,7 +46,7 @@ def slope(cells: int) -> mpm.Simulation:
 
 
 def slide(s: mpm.Simulation, dt: float) -> tuple[mpm.Result, np.ndarray]:
-    """Divide the strength, let the slope slide, and return the result and the largest speeds, in m/s."""
+    """Divide the strength by `still.WEAKER`, let the slope slide, and return result and largest speeds (m/s)."""
     friction = np.degrees(np.arctan(np.tan(np.radians(still.FRICTION)) / still.WEAKER))
     s.stage(inertia=True, fields={"friction": friction, "cohesion": still.COHESION / still.WEAKER})
     speeds = [0.0]

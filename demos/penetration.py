@@ -96,7 +96,7 @@ class Push:
     N: resistance, for each step.
     excess: excess pressure divided by s_u, for each step.
     steady: whether a step counts in the error of N.
-    frame: final corners (n, 4, 2) in m, a field (n,), and the shape of the bar (k, 4, 2) in m.
+    frame: final corners (n, 4, 2) in m, the values (n,) to draw, and the shape of the bar (k, 4, 2) in m.
     lines: final grid lines along both axes, in m.
     """
 
@@ -122,7 +122,7 @@ def push(alpha: float, cells: int, depth: float, follow: bool = False) -> Push:
 def leg(out: Push, stress: Callable | None, alpha: float, cells: int, y: float, way: float, follow: bool) -> Callable:
     """Push a bar down, append the results to `out`, and return the final stresses.
 
-    stress: initial stresses, see `kept`. With None, the clay is first loaded by the pressure on its top.
+    stress: function for initial stresses, see `kept`; None: the pressure on the top first loads the clay.
     y: initial height of the bar, divided by D.
     way: displacement of the bar, divided by D.
     """

@@ -166,7 +166,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def reference(o: Namespace, result: mpm.Result, axis: np.ndarray) -> mpm.Result:
-    """Return the finite element result at the times of `result`, at positions `axis` (n, 2)."""
+    """Return the finite element solution at the output times of `result`, and at the positions `axis` (n, 2)."""
     fem = BiotFEM(mpm.Grid([0, 0], [LENGTH, HEIGHT], REFERENCE_CELLS), material(o), **physics(o))
     found = fem.run(o.t_end, o.dt / 4, probes=axis, progress=True)
     at = [int(np.argmin(np.abs(found.t - t))) for t in result.t]

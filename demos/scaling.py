@@ -9,9 +9,9 @@ including waiting. Memory is the peak since the start of the process.
 
 The exponent of a part of the step is the slope of log(time) against log(points), fitted to the larger half of the
 sizes. `kB a point` is the slope of the memory against the number of points. Runs on several processes also print the
-load balance and the messages of a step. The load balance (`imbalance`) is the largest number of pieces of a process
-divided by the mean. Messages are counted on the process with the most messages. `exchange` counts the messages of the
-package, and `solvers` the messages of PETSc's Krylov solvers. Messages of MUMPS and of dolfinx are not counted.
+load balance and the messages of a step. The load balance (`imbalance`) is the largest number of pieces of a process,
+divided by the mean number. Messages are counted on the process with the most messages. `exchange` counts the messages
+of the package, and `solvers` the messages of PETSc's Krylov solvers. Messages of MUMPS and of dolfinx are not counted.
 
 If there are runs on one process and on several, a cost model is fitted. The time T of a step (s), with n points on P
 processes is
@@ -89,7 +89,7 @@ def scene(dim: int, points: float) -> tuple[mpm.Simulation, float]:
 
 
 def sent() -> np.ndarray:
-    """Return five counts: messages and bytes of exchanges, and messages, bytes and reductions of solvers."""
+    """Return this process's counts: messages, bytes of exchanges, and messages, bytes, reductions of solvers."""
     events = [PETSc.Log.Event(name).getPerfInfo() for name in ("KSPSolve", "PCSetUp")]
     solver = [sum(e[name] for e in events) for name in ("numMessages", "messageLength", "numReductions")]
     return np.array([traffic.messages, traffic.bytes, *solver], dtype=float)
@@ -136,10 +136,10 @@ def measure(dim: int, points: float) -> dict:
 
 
 def held(root: object, buffers: bool = True) -> tuple[dict[str, int], set[int]]:
-    """Return the bytes of all arrays of an object on this process, by kind, and the lengths of their axes.
+    """Return for each kind of array the bytes of an object's arrays on this process, and all lengths of axes.
 
-    Shared memory counts once. Arrays in files that are mapped into memory have the kind "files", and no lengths of
-    axes.
+    Shared memory counts once. Arrays in files that are mapped into memory have the kind "files"; the lengths of their
+    axes are omitted.
 
     buffers: whether to count the buffers of integrands too.
     """
@@ -178,7 +178,7 @@ def held(root: object, buffers: bool = True) -> tuple[dict[str, int], set[int]]:
 
 
 def in_own_process(dim: int, points: float, processes: int) -> dict:
-    """Return the result of `measure` in a new process, or in several."""
+    """Run `measure` in a new process, or in several new processes, and return its result."""
     command = [sys.executable, "-m", "mpi4py", __file__, "--one", str(dim), str(points)]
     if processes > 1:
         command = ["mpirun", "--oversubscribe", "-n", str(processes), *command]
@@ -194,7 +194,7 @@ def in_own_process(dim: int, points: float, processes: int) -> dict:
 
 
 def exponents(rows: list[dict]) -> dict[str, float]:
-    """Return the exponents of the parts, and the memory: initial memory (MB) and kB per point."""
+    """Return the exponent of each part of a step, the initial memory (MB), and the memory per point (kB)."""
     upper = rows[(len(rows) - 1) // 2 :]
     n, memory = (np.array([row[name] for row in rows], dtype=float) for name in ("points", "memory_MB"))
     slope, base = np.polyfit(n, memory, 1, w=1 / memory)
@@ -207,7 +207,7 @@ def exponents(rows: list[dict]) -> dict[str, float]:
 
 
 def halo(dim: int, n: float, processes: int) -> float:
-    """Return the number of points along faces that a process shares with others, for a power of two of processes."""
+    """Return the number H of points along the faces that one of 2^k processes shares with others."""
     turn = round(np.log2(processes))
     halved = np.array([turn // dim + (axis < turn % dim) for axis in range(dim)])
     sides = n ** (1 / dim) / 2.0**halved
@@ -215,17 +215,17 @@ def halo(dim: int, n: float, processes: int) -> float:
 
 
 def terms(dim: int, n: float, processes: int, imbalance: float = 1.0) -> list[float]:
-    """Return the terms of the cost model: 1, n / P, H and log2 P."""
+    """Return the factors of e, a, b and c in the cost model: 1, n / P, H and log2 P."""
     return [1.0, imbalance * n / processes, halo(dim, n, processes), np.log2(processes)]
 
 
 def modelled(row: dict) -> float:
-    """Return the time that the cost model describes, in s: a step, in 2D without the solvers."""
+    """Return the measured time, in s, that the cost model describes: a whole step, but in 2D without the solvers."""
     return row["step"] - (sum(row[part] for part in SOLVERS) if row["dim"] == 2 else 0.0)
 
 
 def fit(rows: list[dict]) -> dict[str, float]:
-    """Return the coefficients of the cost model (s) and the largest relative error for the runs."""
+    """Return the coefficients of the cost model (s), and its largest relative error over all runs."""
     timed = [row for row in rows if row["processes"] <= (os.cpu_count() or 1)]
     A = np.array([terms(row["dim"], row["points"], row["processes"], row["imbalance"]) for row in timed])
     T = np.array([modelled(row) for row in timed])
@@ -243,7 +243,7 @@ def predicted(model: dict[str, float], dim: int, n: float, processes: int) -> fl
 
 
 def by_part(rows: list[dict], found: dict[str, float]) -> str:
-    """Return a Markdown table of the time of each part, its exponent, and memory."""
+    """Return a Markdown table with the time and the exponent of each part of a step, and with the memory."""
     lines = [["seconds of a step", *(f"{row['points']}" for row in rows), "exponent"]]
     for part in ("step", *PARTS, "rest"):
         lines.append([part, *(f"{row[part]:.2g}" for row in rows), f"{found.get(part, np.nan):.2f}"])
@@ -315,7 +315,7 @@ def draw_parts(left, right, rows: list[dict]) -> None:
 
 
 def write(out: Path, rows: list[dict]) -> dict:
-    """Write tables and pictures, print the tables, and return exponents and cost models, by dimension."""
+    """Write tables and pictures, print the tables, and return the exponents and the cost model for 2D and 3D."""
     common.write_csv(out / "scaling.csv", rows[0], (row.values() for row in rows))
     text, found = [], {}
     for dim in sorted({row["dim"] for row in rows}):

@@ -23,7 +23,7 @@ follows
 
 with the acceleration a of the base towards the bank. The coefficient C is one for a block on a horizontal plane. For
 the bank, the balance of power gives C = sum(m phi_x) / sum(m phi.phi). Here m is the mass of a point, and phi is its
-final displacement divided by that of the crest.
+final displacement, divided by the final displacement of the crest.
 """
 
 from __future__ import annotations

@@ -62,7 +62,7 @@ def slope(cells: int) -> mpm.Simulation:
 
 
 def slide(s: mpm.Simulation, steps: int) -> mpm.Result:
-    """Divide the strength and let the slope run out, in `steps` steps of half a second and four long steps."""
+    """Divide the strength by `WEAKER`. Let the slope run out in `steps` steps of half a second and four long steps."""
     friction = np.degrees(np.arctan(np.tan(np.radians(FRICTION)) / WEAKER))
     s.stage(fields={"friction": friction, "cohesion": COHESION / WEAKER})
     s.run(0.5 * steps, 0.5, progress=False)

@@ -74,7 +74,7 @@ def bank(cells: int, length: float, room: float, friction: float, cohesion: floa
 
 @dataclass
 class Failure:
-    """Stability numbers gamma' H / c (n,), and settlement rates (n,) of the crest.
+    """Stability numbers gamma' H / c (n,), `number`, and settlement rates (n,) of the crest, `rate`.
 
     A settlement rate is the settlement in a step, divided by the mean settlement in the first five steps.
     critical: stability number at which the bank fails.
@@ -167,7 +167,7 @@ def alternating(p: np.ndarray) -> np.ndarray:
 
 
 def at_toe(s: mpm.Simulation) -> float:
-    """Return the rms of the alternating part of the pressures beyond the initial side of the bank, in Pa."""
+    """Return the rms of the alternating part of the pressures in front of the initial side of the bank, in Pa."""
     cells, p = s.cells(), np.full(tuple(s.grid.shape), np.nan)
     p[tuple(s.grid.index(cells.x).T)] = cells.pressure
     found = alternating(p)[round(HEIGHT / s.grid.h[0]) - 1 :]

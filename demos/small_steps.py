@@ -38,7 +38,7 @@ from mpm_dolfinx.verification.exact import terzaghi_pressure
 HEIGHT, SOIL = terzaghi.HEIGHT, terzaghi.SOIL
 T_END = 0.1
 CASES = {"resting": (0.0, 0.0), "moving": (0.5, 0.0), "moving, soft water": (0.5, 1.0)}
-"""For each column: base displacement divided by height, and storage coefficient of the water times M."""
+"""For each column: base displacement divided by height, and storage coefficient of the water multiplied by M."""
 STRIP_STEPS = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)  # length of the step, divided by the time of consolidation
 
 

@@ -52,7 +52,7 @@ ELEMENTS = np.array(
         [-0.129321, -0.090335, -0.006179],
     ]
 )
-"""Upward displacements of extrapolated Taylor-Hood elements at `TIMES` and `PLACES`, divided by `HEIGHT`, for q/E =
+"""Upward displacements at `TIMES` and `PLACES` by Taylor-Hood elements (extrapolated), divided by `HEIGHT`, for q/E =
 0.25.
 """
 WALLS = {"left": "x", "right": "x", "bottom": "y"}
@@ -75,7 +75,7 @@ def times(a_decade: int) -> NDArray[np.float64]:
 
 @dataclass
 class Outcome:
-    """Histories of reduced times, and of upward displacements at `PLACES` divided by `HEIGHT`.
+    """After each step: reduced times `T`, and upward displacements `moved` at `PLACES`, divided by `HEIGHT`.
 
     frames: T, corners, pressures divided by E, and porosities of the points.
     why: reason if the run ended early.
@@ -118,7 +118,7 @@ def seen(s: mpm.Simulation, T: float) -> tuple[float, NDArray, NDArray, NDArray]
 
 
 def elements(cells: int, load: float, a_decade: int) -> NDArray[np.float64]:
-    """Return the upward displacements of Taylor-Hood elements at `TIMES` and `PLACES`, divided by `HEIGHT`."""
+    """Return the upward displacements by Taylor-Hood elements at `TIMES` and `PLACES`, divided by `HEIGHT`."""
     fem, out = BiotFEM(mpm.Grid([0, 0], [HEIGHT] * 2, [cells] * 2), SOIL, **conditions(load)), []
     for T in times(a_decade):
         fem.step(T * UNIT - fem.t)

@@ -71,7 +71,7 @@ def written(page: str) -> str:
 
 
 def runs(pages: Iterable[str]) -> dict[str, str]:
-    """Return the runs in the comments of pages, each with the table that it writes, or an empty string."""
+    """Return the runs in the comments of pages, each with the name of the table that it writes, or ""."""
     found = {}
     for page in pages:
         found |= {m["run"]: "" for m in FIGURE.finditer(page) if m["run"] not in found}

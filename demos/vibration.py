@@ -40,7 +40,7 @@ class Bar(mpm.LinearElastic):
 
 
 def struck(h: float, way: str, steps: int = 80) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return times, displacements of the tip, and the frequency (Hz) of a beam after an impulse."""
+    """Return times (s), displacements of the tip (m), and the frequency (Hz) of a beam after an impulse."""
     grid = mpm.Grid([0, 0], [LENGTH + 3 * h, DEPTH + 4 * h], [round(LENGTH / h) + 3, round(DEPTH / h) + 4])
     beam, axis = mpm.box(grid, [0, 2 * h], [LENGTH, DEPTH + 2 * h]), ("along", "across").index(way)
 
@@ -61,8 +61,8 @@ def struck(h: float, way: str, steps: int = 80) -> tuple[np.ndarray, np.ndarray,
 
 
 def flown(cells: int, periods: int, steps: int) -> dict[str, np.ndarray]:
-    """Move the free bar. Return times (in periods), the oscillation of its end (m), and its energy over the initial
-    energy.
+    """Move the free bar. Return times (in periods), the oscillation of its end (m), and its energy, divided by the
+    initial energy.
     """
     h, count = 1 / cells, 3 * cells + 8 + round(2.5 * cells)
     grid = mpm.Grid([0, 0], [count * h, h], [count, 1])

@@ -36,7 +36,7 @@ CONVERGED = {
     4: (1.1005, 1.0426, 0.9378, 0.8528, 0.7834, 0.7210),
     8: (1.2187, 1.1601, 1.0531, 0.9557, 0.8642, 0.7720),
 }
-"""By hour: heights of the water table at the six positions, in m."""
+"""For each time (h): heights of the water table at the six positions, in m."""
 FLOW = 653.1e-4 / HOUR  # m²/s into the ditch after 8 hours
 LEVEE, CREST, SLOPE, FLOOD = 3.0, 2.0, 2.0, 2.5  # m, m, slope: run divided by rise, m
 SEEN = (2.0, 4.0, 6.0, 8.0)  # days

@@ -91,7 +91,7 @@ def harmonic(w: float, conductivity: float, z: np.ndarray) -> tuple[complex, np.
 def swinging(
     cells: int, steps: int, periods: int, w: float, conductivity: float, growth: float = GROWTH
 ) -> tuple[complex, np.ndarray, np.ndarray]:
-    """Return the computed amplitudes of settlement (m) and pressures (Pa), and depths, for a load of 1 Pa."""
+    """Return the computed amplitudes of settlement (m) and pressures (Pa) for a load of 1 Pa, and their depths (m)."""
     soil = SOIL(grain_density=GRAINS, conductivity=conductivity)
     load = mpm.Traction("top", lambda t: (0, -np.cos(w * t)))
     foot = mpm.Displacement("bottom", (0, 0), "y")
@@ -116,7 +116,7 @@ def hard_exact(t: np.ndarray) -> np.ndarray:
 
 
 def hard(cells: int, steps: int, growth: float = GROWTH) -> dict[str, np.ndarray]:
-    """Return times (s) and computed and exact settlements of a saturated column under a sudden load (m)."""
+    """Return times (s), and computed and exact settlements (m), of a saturated column under a sudden load."""
     soil = mpm.LinearElastic(
         bulk=HARD["young"] / 1.2,
         shear=HARD["young"] / 2.6,

@@ -59,7 +59,7 @@ def family(bound: float):
 
 
 def decades(low: int, high: int, step: int = 1) -> list[float]:
-    """Return powers of ten from 10^low to 10^high, by factors of 10^step."""
+    """Return powers of ten from 10^low to 10^high, each 10^step times the power before."""
     return [float(f"1e{n}") for n in range(low, high + 1, step)]
 
 
@@ -116,7 +116,7 @@ def fluid_bulk():
 
 @family(0.02)
 def combined():
-    """Compare a nearly undrained or drained beam with finite elements in this limit, for three K_w and two nu."""
+    """Compare beams near the undrained or drained limit with finite elements in this limit, for several K_w and nu."""
     for bulk in (1e4, 2.2e9, inf):
         for nu in (0.0, 0.499):
             sealed = Beam(soil(nu=nu, conductivity=0), mpm.Fluid(bulk), drained=())
@@ -132,7 +132,7 @@ def beside(beam: Beam, limit: Beam) -> Scene:
 
 @family(0.02)
 def poisson():
-    """Compare a beam with and without water with finite elements, for nu = 0 to 0.499."""
+    """Compare a dry and a saturated beam with finite elements, for nu = 0 to 0.499."""
     for nu in (0.0, 0.2, 0.3, 0.4, 0.45, 0.48, 0.49, 0.499):
         truth = (80, 32) if nu > 0.45 else (40, 16)
         yield f"drained, nu = {nu}", Beam(soil(nu=nu), truth=truth)
@@ -194,7 +194,7 @@ def offset():
 
 @family(0.02)
 def rotation():
-    """Compare a square, rotated by 0 to 90 degrees, with exact values if undrained, else with a finer grid."""
+    """Compare a square, rotated by 0 to 90 degrees, with exact values (undrained) or with results on a finer grid."""
     K, S = SOIL.drained_modulus(2), SOIL.storage(WATER.bulk, SOIL.porosity)
     J = stretch(1e5 / (2 * K)) ** 2
     a = brentq(lambda a: 2 * K * log(a) / a - (1 - a * a) / (S * a) + 1e5, 0.5, 1)
@@ -216,7 +216,7 @@ def held(s: mpm.Simulation) -> float:
 
 @cache
 def half_drained() -> float:
-    """Return the final mean pressure of the square on a fine grid that fits its sides, in Pa."""
+    """Return the final mean pressure, in Pa, of the unrotated square on a grid of half the cell size."""
     scene = square(0, None, **{**DRAINING, "cells": 48})()
     scene.simulation.run(scene.end, scene.end / scene.steps, progress=False)
     return held(scene.simulation)
@@ -245,7 +245,7 @@ def points_per_cell():
 
 @family(0.01)
 def filling():
-    """Compare a beam with FEM and a column with exact values, for outermost cells filled to 1e-10 to 0.5."""
+    """Compare a beam with FEM and a column with exact values, if bodies fill 1e-10 to 0.5 of their outermost cells."""
     for f in (*decades(-10, -1), 0.5):
         yield f"beam, {f:.0e} of a cell", Beam(soil(conductivity=1e-5), WATER, offset=1 - f)
         top = 1 + 0.05 * f
@@ -261,7 +261,7 @@ def few_points():
 
 @family(1.0)
 def thin():
-    """Compare beams half a cell, one and two cells high with Q1 elements on as many cells.
+    """Compare beams that are half a cell, one and two cells high with Q1 elements on cells of this size.
 
     The thinnest beam has at least two points over its height. With one point the beam would creep, and the package
     would warn.
@@ -335,7 +335,7 @@ def overload():
 
 
 def pressed(material, load: float) -> Error | None:
-    """Return the error of the settlement under a load (Pa), or None if no stretch is in equilibrium with this load."""
+    """Return a function for the error of the settlement under a load (Pa), or None if there is no equilibrium."""
 
     def excess(a):
         lam = material.bulk - 2 * material.shear / 3
@@ -348,7 +348,7 @@ def pressed(material, load: float) -> Error | None:
 
 @family(0.01)
 def units():
-    """Compare beams of 1e-6 to 1e6 m, and of E = 1 to 1e15 Pa, with finite elements for 1 m and 10 MPa."""
+    """Compare beams of 1e-6 to 1e6 m, or with E = 1 to 1e15 Pa, with scaled FEM for 1 m and 10 MPa."""
     exact = Beam().elements()
     for x in decades(-6, 6, 3):
         beam = Beam(size=(x, 0.4 * x), h=(0.05 * x, 0.05 * x))
@@ -411,7 +411,7 @@ def dried(k: float, steep: float, driest: float = -1.5) -> Scene:
 def layered_rain():
     """Compare two layers under rain with exact heads, for ratios of k from 1e-3 to 1e3 and alpha h = 1e-2 to 1e2.
 
-    `rain` defines alpha h. The interface is off the grid lines.
+    `rain` defines alpha h. The interface is not on a grid line.
     """
     for ratio in decades(-3, 3, 2):
         for steep in decades(-2, 2):

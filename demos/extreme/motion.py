@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Families of scenes with inertia for `extreme_cases`: columns and bars, one cell wide, under small loads.
 
-The reference is a bar of linear finite elements with the elements and the time integration of the material points.  The
-reference holds for steps of any length: in short steps forces change velocities, and in long steps the bar is at rest.
+The reference is a bar of linear finite elements, one for each cell, with the package's time integration.  The reference
+holds for steps of any length: in short steps forces change velocities, and in long steps the bar is at rest.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def bar(
 ) -> Motion:
     """Return nodal displacements and velocities of a bar of linear elements after some steps of SDIRK2.
 
-    young, density, h: of each element.  load: force on the last node.  weight: acceleration along the bar.
+    young, density, h: modulus, density, length of each element.  load: force on the last node.  weight: gravity.
     v: initial velocities of the nodes.  held: whether the first node is fixed.
     """
     young, density, h = np.broadcast_arrays(*map(np.asarray, (young, density, h)))
@@ -71,7 +71,7 @@ def bar(
 
 
 def ends(s: mpm.Simulation, axis: int) -> tuple[float, float]:
-    """Return displacement and velocity of the last face of a body along an axis."""
+    """Return displacement and velocity, along an axis, of the outermost face of a body."""
     points = s.points
     i = points.x[:, axis].argmax()
     face = points.corners[i, :, axis].max()
@@ -81,7 +81,7 @@ def ends(s: mpm.Simulation, axis: int) -> tuple[float, float]:
 
 
 def against(exact: Motion, dt: float, least: float = 0.0) -> Callable[[mpm.Simulation, mpm.Result], float]:
-    """Return a function for the error of displacement and velocity at the top, divided by their largest values.
+    """Return a function for the larger error of displacement and velocity at the top, divided by their largest values.
 
     least: displacement, m, below which only velocities are compared.  If the bar moves in a step of dt by less than
     `REST` times its displacement, it is at rest, and only displacements are compared.
@@ -110,7 +110,7 @@ def column(
 ) -> Make:
     """Return a function that makes a column of two halves between smooth walls, with inertia.
 
-    young, density: values of the lower and of the upper half. load: Pa, on the top. units: factors of m, kg and s.
+    young, density: of the lower and the upper half. load: stress on the top. units: factors of length, mass, time.
     """
     m, kg, second = units
     stress = kg / (m * second**2)
@@ -140,7 +140,7 @@ def column(
 
 
 def halves(one: float, other: float) -> np.ndarray:
-    """Return values of the elements of a column of two halves."""
+    """Return the values of all elements: `one` in the lower half of a column, and `other` in the upper half."""
     return np.repeat([one, other], N // 2)
 
 
@@ -195,7 +195,7 @@ def inertia_units():
 
 @family(0.01)
 def inertia_filling():
-    """Compare a column whose top fills a cell to 1e-10 to 0.9 with a bar of finite elements of equal length."""
+    """Compare a column that fills 1e-10 to 0.9 of its top cell with a bar of finite elements of equal length."""
     weight = -10 * SMALL * YOUNG / DENSITY
     for part in (1e-10, 1e-8, 1e-6, 1e-4, 1e-3, 1e-2, 0.1, 0.5, 0.9):
         exact = bar(YOUNG, DENSITY, [H] * N + [part * H], CROSSES, 8, weight=weight)
@@ -239,7 +239,7 @@ def inertia_base():
 
 
 def driven(dt: float, steps: int = 4) -> Scene:
-    """Return a block off the grid lines, whose left side accelerates."""
+    """Return a block whose left side accelerates; no side is on a grid line."""
     grid = mpm.Grid([0, 0], [N * H, N * H], [N, N])
     body = mpm.box(grid, [0.23, 0.23], [0.63, 0.63])
     way = H * min(0.1, SMALL * dt / CROSSES)  # m

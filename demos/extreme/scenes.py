@@ -33,7 +33,7 @@ Error = Callable[[mpm.Simulation, mpm.Result], float]
 class Scene:
     """A simulation that must be run in equal steps until `end`, in s.
 
-    error: function of the simulation and its result that returns the error, or None for a scene without equilibrium.
+    error: function that computes the error from the simulation and its result; None if no equilibrium exists.
     """
 
     simulation: mpm.Simulation
@@ -68,7 +68,7 @@ def turned(x: np.ndarray, angle: float) -> np.ndarray:
 
 
 def place(s: mpm.Simulation, corners: np.ndarray) -> None:
-    """Move the undeformed body to new corners (n, 4, 2) of its domains."""
+    """Move the undeformed body: its domains get the corners (n, 4, 2), in m."""
     corners = corners - s.grid.base
     points = replace(s.state.points, corners=corners, origin=corners, x=corners.mean(axis=1))
     s.state = replace(s.state, points=points)
@@ -76,7 +76,7 @@ def place(s: mpm.Simulation, corners: np.ndarray) -> None:
 
 @dataclass(frozen=True)
 class Beam:
-    """A cantilever, clamped at its left end, with the tip displacement of Taylor-Hood elements as reference."""
+    """A cantilever, clamped at its left end, with the tip displacement by Taylor-Hood elements as reference."""
 
     material: mpm.materials.Skeleton = SOIL
     fluid: mpm.Fluid | None = None

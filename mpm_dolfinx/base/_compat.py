@@ -47,9 +47,9 @@ def box_mesh(
         Global indices of the nodes of this process's cells.  In the order of the nodes of a cell, the first coordinate
         varies fastest.
     x : (m, d), m
-        Positions of the nodes that this process contributes.  Nodes are numbered globally in the order of the ranks.
+        Positions of the nodes that this process adds.  Nodes of lower ranks have lower global indices.
     ranks, offsets
-        The owner of cell i, and the other ranks with this cell, are `ranks[offsets[i] : offsets[i + 1]]`.
+        `ranks[offsets[i] : offsets[i + 1]]` contains the owner of cell i, then the ranks where this cell is a ghost.
     """
     kind = {4: "quadrilateral", 8: "hexahedron"}[cells.shape[1]]
     where = (ranks, offsets)
@@ -123,7 +123,7 @@ def geometry_dofs(msh: mesh.Mesh) -> NDArray[np.int32]:
 
 
 def scatter_reverse_add(u: fem.Function) -> None:
-    """Add values at ghosts to the values at their owners."""
+    """Add the values of ghost entries to the values on the processes that own these entries."""
     u.x.scatter_reverse(la.ScatterMode.add if OLD else la.InsertMode.add)
 
 
@@ -146,9 +146,9 @@ class Timer:
 
 
 def expanded(form: ufl.Form) -> ufl.Form:
-    """Return a form with expanded derivatives.
+    """Return a form in which all derivatives are expanded.
 
-    In forms over faces, dolfinx 0.9 packs coefficients that vanish in derivatives, but the kernel omits them.
+    Expansion may remove coefficients of a facet form.  Otherwise dolfinx 0.9 packs them, but its kernel omits them.
     """
     return ufl.algorithms.expand_derivatives(form)
 
@@ -159,7 +159,7 @@ class CompiledForm:
     The kernel is called once for each entry of the list, so a cell may occur several times.  Ghost cells are not
     allowed, because dolfinx 0.5 silently skips them.
 
-    `form`: form whose integrals have one type, and the subdomain id `SUBDOMAIN`.
+    `form`: form whose integrals all have the same type, and the subdomain id `SUBDOMAIN`.
     """
 
     def __init__(self, form: ufl.Form):
@@ -223,23 +223,23 @@ class CompiledForm:
         return self.form
 
     def packed(self, form=None) -> dict:
-        """Return dolfinx's array of coefficients, with one row for each entity."""
+        """Return dolfinx's coefficient values: an array for each integral, with one row for each entity."""
         form = form or self.form
         return cpp.fem.pack_coefficients(form)
 
     def assemble_vector(self, b: NDArray[np.float64], rows: NDArray[np.float64] | None = None, form=None) -> None:
-        """Add the assembled vector to `b`, without communication.
+        """Add the assembled vector to `b`, without communication between processes.
 
-        `rows`: coefficients, one row for each entity, by default `packed()`.
+        `rows`: values of the coefficients, one row for each entity, by default from `packed()`.
         """
         form = form or self.form
         packed = self.packed(form) if rows is None else dict.fromkeys(self._keys, rows)
         cpp.fem.assemble_vector(b, form, cpp.fem.pack_constants(form), packed)
 
     def assemble_matrix(self, A: PETSc.Mat, rows: NDArray[np.float64] | None = None, form=None) -> None:
-        """Add the assembled matrix, in unrolled dofs, to `A`.  The caller must assemble `A`.
+        """Add the matrix of the form to `A`, with one row for each component of a node.  The caller must assemble `A`.
 
-        `rows`: coefficients, one row for each entity, by default `packed()`.
+        `rows`: values of the coefficients, one row for each entity, by default from `packed()`.
         """
         form = form or self.form
         packed = self.packed(form) if rows is None else dict.fromkeys(self._keys, rows)
@@ -247,7 +247,7 @@ class CompiledForm:
 
     @cached_property
     def _keys(self) -> list[tuple]:
-        """Keys of dolfinx's coefficients: indices of the integrals in dolfinx 0.11, else subdomain ids."""
+        """Keys of `packed()`: indices of the integrals in dolfinx 0.11, subdomain ids in older releases."""
         return [(fem.IntegralType.cell, key) for _, key in self.packed()] or [(fem.IntegralType.cell, SUBDOMAIN)]
 
 
@@ -268,7 +268,7 @@ def links(msh: mesh.Mesh) -> list[NDArray[np.int32]]:
 
 
 def _facet_cells(msh, facets, dim: int) -> NDArray[np.int32]:
-    """Return two cells and local facets of each interior facet: (cell0, local facet0, cell1, local facet1, ...)."""
+    """Return the two cells of each interior facet, and its index in each: (cell0, index0, cell1, index1, ...)."""
     adjacency = msh.topology.connectivity(dim, dim + 1)
     cells = adjacency.array[adjacency.offsets[facets][:, None] + np.arange(2)]
     cell_facets = msh.topology.connectivity(dim + 1, dim).array.reshape(-1, 2 * (dim + 1))  # boxes only

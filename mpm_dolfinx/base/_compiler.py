@@ -38,25 +38,25 @@ from mpm_dolfinx.parallel.exchange import at_root, first
 WORKSHOP = ".mpm_dolfinx-"
 """Prefix of the folders in which libraries are compiled."""
 ABANDONED = 600.0
-"""Age, in s, of an aborted program's mark, which is ignored.  A mark is a `.c` file without a `.c.cached` file."""
+"""Age, in s, above which a mark is ignored.  A mark is a `.c` file without a `.c.cached` file."""
 DAY = 86400.0  # Source: definition
 logger = logging.getLogger("mpm_dolfinx")
 _settings = jit.get_options if hasattr(jit, "get_options") else jit.get_parameters  # OLD
 _ffcx_settings = ffcx.get_options if hasattr(ffcx, "get_options") else ffcx.get_parameters  # OLD
 _replacements: dict[Path, Path] = {}
-"""Temporary folders that replace cache folders which are not writable."""
+"""For each cache folder that is not writable: the temporary folder that replaces it."""
 _warnings: dict[Path, str] = {}
-"""Warnings about temporary folders.  The first compilation in such a folder issues its warning."""
+"""For each temporary folder: the warning that the first compilation in this folder issues."""
 
 
 @contextmanager
 def compiler(comm: MPI.Intracomm) -> Iterator[None]:
-    """Context in which dolfinx finds or compiles libraries, on all processes of `comm`.
+    """Context in which dolfinx finds or compiles libraries of forms, on all processes of `comm`.
 
     Raises
     ------
     OSError
-        Settings are unreadable, no folder is writable, or the C compiler fails.  All processes raise the error.
+        dolfinx's settings are unreadable, no folder is writable, or the C compiler fails.  All processes raise it.
     """
     folder = at_root(comm, _folder)
     messages = [""]
@@ -98,7 +98,7 @@ def _folder() -> Path:
 
 
 def _of_this_run(cache: Path, why: OSError) -> Path:
-    """Return a new folder for libraries that exists until the end of the run."""
+    """Return a new folder for libraries.  The folder is deleted at the end of the run."""
     allowed = "must be a folder that can be written; set XDG_CACHE_HOME to another folder"
     what = f"cache folder of dolfinx's compiled forms, {cache}: {why.strerror}"
     try:
@@ -152,7 +152,7 @@ def _complete(make: Callable, folder: Path, messages: list[str]) -> Callable:
 
 @cache
 def _loaded(name: str, library: Path) -> ModuleType:
-    """Return the module of a library.  FFCx's loader is slower, because it lists the whole cache."""
+    """Return a library as a Python module.  FFCx's loader is slower, because it lists the whole cache."""
     spec = spec_from_file_location(name, library)
     module = module_from_spec(spec)
     spec.loader.exec_module(module)
@@ -212,7 +212,7 @@ def _replaced(**functions: Callable) -> Iterator[None]:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Context in which setuptools logs no compiler calls."""
+    """Context in which setuptools does not log the calls of the compiler."""
     root = logging.getLogger()
     level, handlers = root.level, root.handlers[:]
     root.addFilter(_is_wanted)

@@ -11,7 +11,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 PACKAGES = {"dolfinx": "fenics-dolfinx", "scipy": "scipy", "tqdm": "tqdm", "meshio": "meshio"}
-"""Required packages and their names on conda-forge.  Debian's names begin with python3-."""
+"""Python names of required packages, and their names on conda-forge.  Debian's names begin with python3-."""
 BROUGHT = ("mpi4py", "petsc4py", "basix", "ffcx", "ufl")  # installed with dolfinx
 SUPPORTED = ((0, 5), (0, 9), (0, 10), (0, 11))
 

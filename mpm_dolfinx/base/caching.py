@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Cache of the last value of a function, with its key.  Keys are compared by value."""
+"""Cache of the last value of a function, with its key: the data on which the value depends."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ EMPTY = object()
 
 
 class Latest(Generic[T]):
-    """Cache of the last value.
+    """Cache of the last value, which is valid as long as its key is the same.
 
     The cache is empty while a value is computed, so an exception leaves no incomplete value in the cache.
 
@@ -47,14 +47,14 @@ class Latest(Generic[T]):
         return self.value
 
     def clear(self) -> None:
-        """Remove the value, and the values that depend on it."""
+        """Empty this cache and the caches `derived`."""
         self._key, self.value = EMPTY, None
         for one in self._derived:
             one.clear()
 
 
 class Keyed:
-    """Base class of objects with a unique token for keys.  A cache with the token does not keep the object alive."""
+    """Base class of objects that a unique token represents in keys.  The token does not keep the object alive."""
 
     @cached_property
     def key(self) -> object:
@@ -63,7 +63,7 @@ class Keyed:
 
 
 def same(a: Any, b: Any) -> bool:
-    """Return whether two keys are equal.  Equal arrays have equal shapes and values."""
+    """Return whether two keys are equal.  Arrays are equal if their shapes and values are equal."""
     if a is b:
         return True
     if isinstance(a, tuple) and isinstance(b, tuple):

@@ -67,7 +67,7 @@ class LeftGrid(StepFailed):
     Attributes
     ----------
     report
-        Report of the step.  A shorter step may succeed only if the estimated error in the report is too large.
+        Report of the step.  A shorter step may succeed only if the estimated error in the report exceeds the tolerance.
     """
 
     def __init__(self, message: str, report: Report | None = None):
@@ -76,7 +76,7 @@ class LeftGrid(StepFailed):
 
 
 def raise_interrupt(error: BaseException) -> None:
-    """Raise the KeyboardInterrupt that caused an error, if any.  Some PETSc releases replace it by a solver error."""
+    """Raise the KeyboardInterrupt that caused an error, if any.  Some PETSc releases report it as a solver error."""
     cause = error
     while cause is not None and not isinstance(cause, KeyboardInterrupt):
         cause = cause.__cause__ or cause.__context__

@@ -10,7 +10,7 @@ is a linear function a J + b of J, where a is the value of S at n = 1, and
 
 The term in brackets is the mass of a fluid of density rho that fills the volume J + b / a.  The change of zeta in a
 step is alpha times the change of this mass, divided by rho at the mean pressure of the step.  This formula is
-second-order accurate for any path.  If no fluid flows, the change of zeta is exactly zero in a step of any size.
+second-order accurate for any J(t), p(t).  If no fluid flows, the change of zeta is exactly zero in a step of any size.
 
 Fluxes between cells conserve mass.  The density of the fluid is rho_w exp(p / K_w).  The mass flux is -rho_w kappa grad
 pi.  The mobility kappa is the conductivity divided by the unit weight.  Kirchhoff's transformation gives the mass
@@ -34,8 +34,8 @@ def change_of_content(alpha, a, storage, J, dp):
     """Return as UFL the change of the fluid content in a step, divided by the volume at the start of the step.
 
     `alpha`: Biot coefficient.
-    `a`, `storage`: storage coefficients S, in 1/Pa, at the porosity 1 and at the start of the step.
-    `J`: volume ratio of the step.
+    `a`, `storage`: storage coefficient S, in 1/Pa, at the porosity 1 (`a`), and at the start of the step (`storage`).
+    `J`: volume at the end of the step, divided by the volume at its start.
     `dp`: change of the pore pressure, Pa.
     """
     z = a * dp / (2 * alpha)
@@ -67,9 +67,9 @@ def pressure_of(pi, bulk: float):
 
 
 def mass_potential_form(p, compliance):
-    """Return the mass potential (Pa) at p as a UFL expression.
+    """Return as UFL the mass potential pi at the pressure p, both in Pa.
 
-    `compliance`: 1 / K_w, in 1/Pa.
+    `compliance`: compressibility 1 / K_w of water, in 1/Pa.
     """
     return p * density_between(p, 0.0, compliance)
 
@@ -80,7 +80,7 @@ def density_between(p0, p1, compliance):
 
 
 def mean_density(p0, p1, bulk: float) -> NDArray[np.float64]:
-    """Like `density_between`, for numbers: arrays (n,) of pressures, in Pa.  `bulk` is K_w, in Pa."""
+    """Return the numbers (n,) of `density_between` for arrays (n,) of pressures, in Pa.  `bulk` is K_w, in Pa."""
     z = (p0 - p1) / (2 * bulk)
     small = np.abs(z) < SERIES
     away = np.where(small, 1.0, z)

@@ -30,11 +30,11 @@ class Row(NamedTuple):
 
 
 COLUMNS = tuple(name for name in Row._fields if name != "outcome")
-"""Names of the quantities of a `Row` that are arrays."""
+"""Names of the numerical quantities of a `Row`: all except `outcome`."""
 
 
 class _Columns:
-    """Storage of histories: an array for each quantity, and a list of outcomes (reactions, outflows and others)."""
+    """Storage of histories: an array for each quantity, and a list of the effects of conditions, such as reactions."""
 
     def __init__(self, arrays: dict[str, NDArray[np.float64]], outcomes: list[Any]):
         self.arrays, self.outcomes = arrays, outcomes
@@ -44,7 +44,7 @@ class _Columns:
         return len(self.outcomes)
 
     def reshaped(self, count: int, capacity: int, shapes: dict[str, tuple[int, ...]]) -> _Columns:
-        """Return copies of the first `count` rows in larger arrays, which contain nan elsewhere."""
+        """Return a copy of the first `count` rows in larger arrays.  The spare rows contain nan."""
         out = {}
         for name, shape in shapes.items():
             out[name] = np.full((capacity, *shape), np.nan)
@@ -57,13 +57,13 @@ class _Columns:
 class Rows(Sequence[Row]):
     """Immutable sequence of one `Row` for each output time of a run.
 
-    The method `more` returns a new object that shares its arrays with this object.  It therefore takes equal time for
+    The method `more` returns a new object that shares its arrays with this object.  `more` thus takes the same time for
     any number of rows.  If a quantity has different shapes in two rows, the smaller array is padded with nan.
 
     Attributes
     ----------
     run
-        Token of the run.  The method `more` copies the token into the new object.
+        Object that identifies the run.  The result of `more` has the same `run`.
     """
 
     def __init__(self, rows: Iterable[Row] = ()):
@@ -76,7 +76,7 @@ class Rows(Sequence[Row]):
 
     @classmethod
     def of_columns(cls, columns: dict[str, NDArray[np.float64]], outcomes: Sequence[Any]) -> Rows:
-        """Return n rows from n outcomes and an array (n, ...) of each quantity.  Different lengths raise ValueError."""
+        """Return n rows from n outcomes and an array (n, ...) of each quantity.  Raise ValueError if lengths differ."""
         if columns.keys() != set(COLUMNS):
             raise ValueError(f"the columns are {', '.join(columns)}, must be {', '.join(COLUMNS)}")
         if {len(values) for values in columns.values()} != {len(outcomes)}:
@@ -100,7 +100,7 @@ class Rows(Sequence[Row]):
 
     @property
     def outcomes(self) -> list[Mapping[str, Mapping[str, NDArray[np.float64]]]]:
-        """List of reactions, outflows and other effects of the conditions at each output time."""
+        """For each output time: reactions, outflows and other effects of the conditions."""
         return self._columns.outcomes[: self._count]
 
     def column(self, name: str) -> NDArray[np.float64]:

@@ -18,7 +18,7 @@ Outcome = Mapping[str, Mapping[str, NDArray[np.float64]]]
 
 
 class Histories(Protocol):
-    """Results at the probes, at one output time, or at all output times (first axis of the arrays)."""
+    """Results at one output time, or at all output times, which are then the first axis of the arrays."""
 
     t: Any
     displacement: NDArray[np.float64]
@@ -34,7 +34,7 @@ def components(tensors: NDArray[np.float64], dim: int) -> dict[str, NDArray[np.f
 
 
 def columns(of: Histories, outcome: Outcome) -> dict[str, tuple[Any, str]]:
-    """Return the values and the unit of each column by name."""
+    """Return a dictionary from the name of each column to its values and its unit."""
     dim, rank = of.displacement.shape[-1], np.ndim(of.t)
     out = {"t": (of.t, "s")}
     for k, name in enumerate(("p_min", "p_max")[: of.pressure.shape[-1]]):
@@ -60,7 +60,7 @@ def columns(of: Histories, outcome: Outcome) -> dict[str, tuple[Any, str]]:
 
 
 def _axes(dim: int, size: int) -> list[str]:
-    """Return suffixes of column names for the components of a force and for its moments."""
+    """Return suffixes of column names for the components of a force, and for its moment if it has one."""
     axes = ["_x", "_y", "_z"][:dim]
     return axes + {0: [], 1: ["_moment"], 3: [f"_moment{axis}" for axis in axes]}[size - dim]
 

@@ -11,8 +11,8 @@ length dt, and 1 and 2 denote the ends of its substeps.  The two methods are
 
 With gamma = 1 - 1 / sqrt(2), `sdirk2` is Alexander's method (1977).  This method is second-order and L-stable.  It does
 not use zeta' at the start of the step, because a grid reset makes zeta' noisy.  After a jump of the loads, the pressure
-in one long step overshoots by a fifth of the jump, but not in two half steps (see `step_size`).  The rates of the two
-substeps give an estimated error of the step: see `solve.newton.note_pressures`.
+in one long step overshoots by a fifth of the jump, but not in two half steps (see `step_size`).  The flow rates Q of
+the two substeps give an estimate of the error, see `solve.newton.note_pressures`.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def in_step(
     the end of the substep.  This parabola passes through the three exact displacements.
 
     `share`: end of the substep as a fraction of the step.
-    `start`, `now`, `end`: exact displacements at the start of the step, and at the ends of the substep and the step.
+    `start`, `now`, `end`: exact displacements at the start of the step, end of the substep, and end of the step.
     """
     return start + ((2 * share - 1) * (now - start) - share**2 * (end - start)) / (share - 1)
 

@@ -14,19 +14,19 @@ SAME = EPSILON**0.5
 relative size `SAME` leaves only rounding errors.  Source: Dennis and Schnabel (1983), sections 5.4 and 2.4.
 """
 ITERATIONS = 60
-"""Largest number of Newton iterations for a few unknowns, such as those of a law at a point."""
+"""Largest number of Newton iterations for a few unknowns, such as the unknowns of a material law at a point."""
 CENTRAL = EPSILON ** (1 / 3)
 """Increment of central differences, relative to the variable.  Source: Dennis and Schnabel (1983), 5.6."""
 SECOND = EPSILON**0.25
 """Increment of second differences, relative to the variable.  Source: Dennis and Schnabel (1983), 5.6."""
 NEAR = 8 * float(np.finfo(np.float32).eps)
-"""Relative distance, 1e-6, below which positions are considered equal.
+"""Distance below which positions are considered equal, divided by a length such as the cell size: 1e-6.
 
 Source: epsilon of single precision (IEEE 754), as in mesh files, times 8 for a few operations.
 """
 TINY = float(np.finfo(float).tiny) / EPSILON
-"""Lower bound of divisors, or a number added to divisors, so that quotients of numbers below (1 / epsilon) are finite.
+"""Lower bound of a divisor, or a term added to it.  Quotients of numbers below (1 / epsilon) are then finite.
 Source: IEEE 754.
 """
 FOREVER = 1 / EPSILON**2
-"""Very long time step, in s: a change by (1 / epsilon) in it has the rate epsilon.  Source: epsilon squared."""
+"""Very long time step, in s: a change by (1 / epsilon) in this step has the rate epsilon.  Source: epsilon squared."""

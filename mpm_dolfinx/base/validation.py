@@ -12,14 +12,14 @@ X : (n, d), m
 x : (n, d), m
     Positions of the n places at the start of the step, for example to prescribe a water level.
 
-If a function has a single parameter with another name, this parameter receives the time.  Other names among several
-parameters raise an error.  Parameters with a default value receive an argument only if all parameters have default
-values.  Material constants may be functions of X.  Initial pressures and stresses may be functions of x, the seeded
-positions.
+If a function has a single parameter with another name, this parameter receives the time.  If one of several parameters
+has another name, an error is raised.  Parameters with a default value receive an argument only if all parameters have
+default values.  Material constants may be functions of X.  Initial pressures and stresses may be functions of x, the
+seeded positions.
 
 A function of position returns a number or an array (n,).  Where vectors are allowed, the function may also return a
-vector (d,) or an array (n, d).  If n <= d, the function receives positions several times, so that n > d distinguishes
-the two shapes.
+vector (d,) or an array (n, d).  If n <= d, the function receives each position several times, so that an array (n,) is
+longer than a vector.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from numpy.typing import NDArray
 
 LONGEST = 160  # most characters of a value in a message
 _known: WeakKeyDictionary[Callable, list[Parameter]] = WeakKeyDictionary()
-"""Parameters of functions that have been called, by function."""
+"""Cache of the results of `_parameters` for each function."""
 
 
 def line(value) -> str:
@@ -69,7 +69,7 @@ def numbers(
     `name`: name of the object, for the message.
     `shapes`: allowed shapes; None allows any shape.  By default only a scalar is allowed.
     `allowed`: description of the allowed values, for the message.
-    `test`: condition that each number, or all numbers together, must meet.
+    `test`: function that returns for the array, or for each number, whether it is allowed.
 
     Raises
     ------
@@ -179,7 +179,7 @@ def _plain(function: Callable) -> bool:
 
 
 def _parameters(function: Callable) -> list[Parameter] | None:
-    """Return the parameters that receive arguments.  Return None if Python does not know them."""
+    """Return the parameters to which `called` passes arguments, or None if Python cannot determine them."""
     try:
         return _known[function]
     except (KeyError, TypeError):  # some objects have no hash
@@ -249,7 +249,7 @@ def called(function: Callable, values: dict) -> object:
 
 
 def at_places(what: str, allowed: str, function: Callable, name: str, places: NDArray[np.float64]) -> object:
-    """Return the value of a function of positions.  The name of its only parameter must be `name`, "X" or "x".
+    """Return the value of a function of positions.  Its only parameter must have the name `name` ("X" or "x").
 
     Raises
     ------
@@ -268,8 +268,8 @@ def given(
 ) -> NDArray[np.float64]:
     """Return a value at time t.
 
-    The result has the shape () or, for m places, (m,).  If `dim` > 0, the shapes (d,) and (m, d) are also possible.  If
-    a function of position returns a single vector (d,), the result (m, d) contains it m times.
+    The result has the shape () or, for m places, (m,).  If `dim` = d > 0, the shapes (d,) and (m, d) are also possible.
+    If a function of position returns a single vector (d,), the result (m, d) contains it m times.
 
     Parameters
     ----------
@@ -282,7 +282,7 @@ def given(
     dim
         Number of components of a vector value, or 0 if only scalars are allowed.
     among
-        Allowed parameter names, among t, X and x.
+        Names among t, X and x that the parameters of a function may have.
     number
         Whether a scalar is allowed as well, if `dim` > 0.
 

@@ -29,13 +29,13 @@ def balancing_tractions(
 ) -> dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]:
     """For each side of bodies at rest, return its points, and the tractions that replace its reactions.
 
-    Tractions are forces per reference area, computed from the stresses.  Additional tractions, which vary like
-    rigid-body displacements, give each connected part the resultant and the moment of its reactions.
+    Tractions are forces per reference area, computed from the stresses.  Additional tractions vary like rigid-body
+    displacements.  They adapt the resultant and the moment on each connected part to its reactions.
 
-    `stresses`: total stresses (faces, k, k), in Pa, on each side.
+    `stresses`: total stresses (faces, k, k), in Pa, with k = d or 3, at the faces of each side.
     `parts`: connected parts of the bodies.
     `forces` (nodes, d), in N: reactions of the sides at the owned nodes of this process, zero at other nodes.
-    `held` (nodes, d): whether displacement components remain fixed.
+    `held` (nodes, d): whether each displacement component of a node remains fixed.
 
     Returns for each side the ids (n,) of its points and the tractions (n, d), in Pa.
     """
@@ -74,9 +74,9 @@ def balancing_tractions(
 
 
 def _rigid(arm: NDArray[np.float64], free: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return the rigid-body displacements (k, n, d) of n points with lever arms (n, d).
+    """Return k rigid-body displacements (k, n, d) of n points with lever arms (n, d).
 
-    Rotations are omitted if the displacement along any axis is fixed.
+    Displacements along fixed axes are omitted.  If an axis is fixed, rotations are omitted too.
     """
     n, d = arm.shape
     fields = [np.broadcast_to(e, (n, d)) for e in np.eye(d)[free]]

@@ -22,7 +22,7 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 
 
 def stored(materials: SceneMaterials, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
-    """Return the kinetic and elastic energies of points, in J.  All processes must call this function."""
+    """Return the total kinetic and elastic energy of all points, in J.  All processes must call this function."""
     mass = materials.masses(points)
     v, L = points.data[VELOCITY], velocity_gradients(points)
     moments = spreads(points.corners, materials.grid.axisymmetric)
@@ -32,7 +32,7 @@ def stored(materials: SceneMaterials, points: MaterialPoints) -> dict[str, NDArr
 
 
 def drift(materials: SceneMaterials, points: MaterialPoints, held: NDArray[np.bool_]) -> list[float]:
-    """Return the mean velocity of all bodies, in m/s.  It is zero along axes with supports, and along the radius.
+    """Return the mean velocity of all bodies, in m/s.  It is set to 0 along axes with supports and along the radius.
 
     All processes must call this function.
 
@@ -48,7 +48,7 @@ def drift(materials: SceneMaterials, points: MaterialPoints, held: NDArray[np.bo
 def initial_energies(
     materials: SceneMaterials, points: MaterialPoints, kinetic: float, renews: bool
 ) -> dict[str, NDArray[np.float64]]:
-    """Return the energies at the start, in J, see `Result.energies`.
+    """Return the energies at the start of a run, in J, see `Result.energies`.
 
     `kinetic`: kinetic energy of free tools, in J.
     `renews`: whether domains may be renewed.
@@ -83,7 +83,7 @@ def after(
 def after_renewal(
     materials: SceneMaterials, energy: Mapping, old: MaterialPoints, new: MaterialPoints, renewed: int
 ) -> Mapping[str, NDArray[np.float64]]:
-    """Return the energies after a renewal of domains, in J.  The energy `renewal` is the total loss by renewal."""
+    """Return the energies after a renewal of domains, in J.  The entry `renewal` is the loss by all renewals."""
     if not renewed:
         return energy
     now = stored(materials, new)

@@ -23,17 +23,17 @@ def motion_error(
     own: float,
     drift: Sequence[float],
 ) -> tuple[float, float]:
-    """Return the estimated error and the size of the motion of a step, in J^(1/2).
+    """Return the estimated error of a step and the size of its motion, both in J^(1/2).
 
     The substeps end with the velocities v1, v2 and accelerations a1, a2.  A first-order step would give a velocity that
     differs by `seconds * (a2 - a1)`, and a displacement that differs by `seconds * (v2 - v1)`.  The estimate is `ERROR`
-    times the difference between the two steps.  In a resolved mode of angular frequency omega, the true error is 0.081
-    omega dt times this difference, with the step length dt.  In unresolved modes, a solution with the matrix of the
+    times the energy norm of these differences.  In a resolved mode of angular frequency omega, the true error is 0.081
+    omega dt times this norm, with the step length dt.  In unresolved modes, a linear solve with the matrix of the
     substep limits the estimate (Hosea and Shampine 1996).
 
-    `K`, `mass`: momentum tangent and mass of the last substep.
+    `K`, `mass`: momentum tangent and mass matrix of the last substep.
     `flights`: velocities and accelerations after the two substeps.
-    `seconds`, `own`: in the last substep, time weights of the rates of the first and of the last substep, in s.
+    `seconds`, `own`: weights, in s, of the first and the last substep's time derivatives in the last substep.
     `drift`: mean velocity of free bodies at the start of the run, in m/s, see `energies.drift`.
     """
     first, last = flights

@@ -28,7 +28,7 @@ from mpm_dolfinx.grid.grid import Grid
 
 
 def traction_name(name: str) -> str:
-    """Return the name of the point field with the traction of a quiet side at rest."""
+    """Return the name of the point field that contains the traction t_0 of a quiet side at rest."""
     return f"{name}_traction"
 
 
@@ -61,7 +61,7 @@ class QuietSides(Acting):
     ------
     ValueError
         Two quiet sides overlap.  Prescribed displacements or walls of the grid fix all displacement components on a
-        face.
+        face of a quiet side.
     """
 
     conditions, title = (Quiet,), "quiet sides"
@@ -86,7 +86,7 @@ class QuietSides(Acting):
         return [faces for _, faces in self._sides.values()]
 
     def kept(self, n: int) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """Return the point fields of the tractions on sides at rest, initially zero at n points."""
+        """Return point fields for the tractions t_0 of the sides, with zeros at n points as initial values."""
         return {name: {traction_name(name): np.zeros((n, self._grid.dim))} for name in self._sides}
 
     def placed(self, place: Place) -> Loads:

@@ -19,7 +19,7 @@ MOTION = VELOCITY, RATE
 
 
 class Momenta(NamedTuple):
-    """Masses, momenta and moments of inertia of groups of pieces, as arrays over the groups."""
+    """Masses, momenta and moments of inertia of groups of pieces.  Each array has one row for each group."""
 
     mass: NDArray[np.float64]  # (groups,), kg
     centre: NDArray[np.float64]  # centre of mass (groups, 2), m
@@ -33,7 +33,7 @@ class Momenta(NamedTuple):
     ) -> Momenta:
         """Return the momenta of `count` groups of pieces.
 
-        `piece`, `group` (k,): indices of k pieces in `pieces`, and their groups.
+        `piece`, `group` (k,): for each of k pieces, its index in `pieces`, and the index of its group.
         `mass` (k,), in kg: masses of these pieces.
         `v` (n, 2), in m/s: velocity of each domain.
         `L` (n, 2, 2), in 1/s: velocity gradient of each domain.
@@ -61,7 +61,7 @@ def velocities(
 
     `corners` (n, 4, 2), in m: corners of each new domain.
     `x` (n, 2), in m: position of each new domain.
-    `group` (n,): group of each new domain.
+    `group` (n,): index of the group of each new domain.
     `masses`: masses of all old domains, and of all new domains, in kg.
     """
     points = work.points
@@ -85,10 +85,10 @@ def velocities(
 def centred(work: RefilledCells, group: NDArray, x: NDArray, mass: NDArray, old: NDArray) -> NDArray[np.float64]:
     """Return masses of new domains, in kg, with which each renewed cell keeps its centre of mass.
 
-    Domains outside renewed cells keep their masses.  A mass changes by at most half, so some cells keep their centre of
+    Domains outside renewed cells keep their masses.  A mass changes by at most 50 %, so some cells keep their centre of
     mass only approximately.
 
-    `group` (n,): group of each new domain.
+    `group` (n,): index of the group of each new domain.
     `x` (n, 2), in m: position of each new domain.
     `mass` (n,), in kg: mass of each new domain before the correction.
     `old` (points,), in kg: masses of the old domains.
@@ -110,6 +110,6 @@ def centred(work: RefilledCells, group: NDArray, x: NDArray, mass: NDArray, old:
 
 
 def _received(work: RefilledCells, mass: NDArray[np.float64]) -> tuple[NDArray, NDArray, NDArray]:
-    """Return the pieces of the removed domains, with their groups and masses."""
+    """Return the pieces of the removed domains, the group of new domains that receives each, and its mass."""
     piece, groups, share = work.into
     return piece, groups, share * mass[work.pieces.point[piece]]

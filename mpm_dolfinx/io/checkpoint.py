@@ -87,7 +87,7 @@ class Checkpoint:
         numbers("checkpoint: seconds", self.seconds, test=lambda v: v >= 0, allowed=">= 0")
 
     def __call__(self, simulation: Simulation) -> None:
-        """Save the state if the output interval and the wall time require a checkpoint."""
+        """Save the state if `every` and `seconds` require a checkpoint, or if the run ends."""
         result, comm = simulation.result, simulation.grid.comm
         writes = (len(result.rows) - 1) % self.every == 0
         if writes and self.seconds > 0:
@@ -164,7 +164,7 @@ def _scalars(result: Result) -> dict[str, Any]:
 
 
 def _arrays(state: State) -> dict[str, NDArray]:
-    """Return all arrays of a state by name."""
+    """Return a dictionary from the names of arrays in the file to all arrays of a state."""
     named = {"points": vars(state.points), "outcome": state.outcome}
     named["result"] = {name: state.result.rows.column(name) for name in COLUMNS}
     for i, outcome in enumerate(state.result.rows.outcomes):
@@ -276,7 +276,7 @@ def _like(outcome: dict[str, dict[str, NDArray]], now: Outcome) -> dict[str, dic
 
 
 def _nested(arrays: dict[str, NDArray]) -> dict[str, Any]:
-    """Return nested dictionaries of arrays, whose keys are the parts of the arrays' names between slashes."""
+    """Return nested dictionaries: the array with the name "a/b" becomes the entry ["a"]["b"]."""
     out: dict[str, Any] = {}
     for name, value in arrays.items():
         *folders, last = name.split("/")
@@ -314,7 +314,7 @@ def _check_ids(points: MaterialPoints, simulation: Simulation, count: int) -> No
 
 
 def _partition(file: Path, given: list, grid: Grid) -> NDArray[np.int64]:
-    """Return the boxes of cells of the processes that wrote a file.  Raise ValueError if the boxes are invalid."""
+    """Return the box of cells of each process that wrote a file.  Raise ValueError if the boxes are invalid."""
     with _complete(file):
         boxes = np.array(given, dtype=np.int64).reshape(-1, 2, grid.dim)
         grid.check_boxes(boxes)
@@ -336,7 +336,7 @@ def _nodal_rows(simulation: Simulation, name: str, nodal: NDArray[np.float64] | 
 
 
 def _check_lines(arrays: dict[str, NDArray], grid: Grid) -> None:
-    """Raise ValueError if the arrays are not lines of this grid, or if the grid's lines cannot move."""
+    """Raise ValueError if the arrays cannot be positions of this grid's lines, or if these lines cannot move."""
     shapes = {letter: x.shape for letter, x in zip("xyz", grid.lines, strict=False)}
     if grid.follow is None or {name: x.shape for name, x in arrays.items()} != shapes:
         raise ValueError("lines: these are not lines of the grid")
@@ -360,7 +360,7 @@ def _nodal(name: str, arrays: dict[str, NDArray], grid: Grid) -> tuple[NDArray, 
 
 
 def _check_trend(trend: Trend, points: MaterialPoints, wet: bool) -> None:
-    """Raise ValueError if the stored motion of the last steps does not belong to the points."""
+    """Raise ValueError if the stored motion in the last steps does not fit the points."""
     (n, d), k = points.x.shape, len(trend.lengths)
     right = k in (1, 2, 3) and trend.lengths.shape == (k,) and trend.rates.shape == (n, k, d * (1 + d) + wet)
     numbers_only = all(v.dtype == np.float64 and np.isfinite(v).all() for v in vars(trend).values())
@@ -369,7 +369,7 @@ def _check_trend(trend: Trend, points: MaterialPoints, wet: bool) -> None:
 
 
 def _check_pieces(arrays: dict[str, NDArray], ids: NDArray[np.int64], dim: int) -> None:
-    """Raise ValueError if the arrays are not the pieces of the points with these ids."""
+    """Raise ValueError if the arrays do not describe pieces of the points with these ids."""
     shapes, count = {"x": (dim,), "slope": (dim,), "bounds": (2,)}, len(arrays["id"])
     for name, rows in arrays.items():
         kind = np.int64 if name in ("id", "cell") else np.float64
@@ -380,7 +380,7 @@ def _check_pieces(arrays: dict[str, NDArray], ids: NDArray[np.int64], dim: int) 
 
 
 def _named(prefix: str, values: dict) -> dict[str, NDArray]:
-    """Return all arrays in nested dictionaries, by keys joined with slashes."""
+    """Return all arrays of nested dictionaries in one: the entry ["a"]["b"] gets the name `prefix` + "a/b"."""
     out = {}
     for name, value in values.items():
         out |= _named(f"{prefix}{name}/", value) if isinstance(value, Mapping) else {prefix + name: value}
@@ -388,7 +388,7 @@ def _named(prefix: str, values: dict) -> dict[str, NDArray]:
 
 
 def _part(arrays: dict[str, NDArray], prefix: str) -> dict[str, NDArray]:
-    """Move all arrays whose names begin with a prefix to a new dictionary, by names without the prefix."""
+    """Move all arrays whose names begin with a prefix to a new dictionary, and remove the prefix from their names."""
     return {name.removeprefix(prefix): arrays.pop(name) for name in list(arrays) if name.startswith(prefix)}
 
 
@@ -402,12 +402,12 @@ def _complete(file: Path) -> Iterator[None]:
 
 
 def _numbered(name: str) -> str | None:
-    """Return the name of the array that contains the row numbers of an array, or None if there is no such array."""
+    """Return the name of the array that numbers the rows of an array, or None if it has no numbers."""
     return next((numbers for start, numbers in NUMBERED.items() if name.startswith(start)), None)
 
 
 def _ranges(comm: MPI.Intracomm, file: Path, of: dict[str, Member]) -> dict[str, tuple[int, int]]:
-    """Return the range of rows that this process reads of each array.  Raise ValueError if row numbers are invalid."""
+    """Return for each array the rows (start, stop) to read here.  Raise ValueError if row numbers are invalid."""
     out = {}
     for name in dict.fromkeys(map(_numbered, of)):
         first, last = (of[name].shape[0] * (comm.rank + k) // comm.size for k in (0, 1))
@@ -424,7 +424,7 @@ def _ranges(comm: MPI.Intracomm, file: Path, of: dict[str, Member]) -> dict[str,
 
 
 def _before(file: Path, of: dict[str, Member], row: int) -> int:
-    """Return the number of pieces of all points stored before the row `row`."""
+    """Return the number of pieces of all points that are stored before the point in row `row`."""
     points, pieces = of[POINTS], of[PIECES]
     if row == points.shape[0]:
         return pieces.shape[0]
@@ -433,7 +433,7 @@ def _before(file: Path, of: dict[str, Member], row: int) -> int:
 
 
 def _read(file: Path) -> tuple[dict[str, NDArray], dict[str, Member], dict[str, Any]]:
-    """Return all short arrays of a checkpoint, the positions of long arrays in the file, and metadata."""
+    """Return the arrays without numbered rows, the positions of all other arrays in the file, and the metadata."""
     with open(file, "rb") as f:
         begin = f.read(4)
     what = "is cut short or damaged, must be a whole checkpoint" if begin == ZIP else FOREIGN

@@ -25,10 +25,10 @@ if TYPE_CHECKING:  # meshio takes long to import, so functions import it
 def one_file(folder: str | os.PathLike) -> Path:
     """Join the point files of a `Writer` in one time series: `points.xdmf` and `points.h5`.
 
-    ParaView, VTK and meshio (xdmf.TimeSeriesReader) read these files.  For dolfinx, the particle domains at one output
-    time are a mesh: `XDMFFile.read_mesh(name="2", xpath="/Xdmf/Domain/Grid")` reads the third output time.  The
-    elements `<Information>` in points.xdmf describe the fields and their units.  The files of the `Writer` remain.
-    During a run, the function joins all files written so far.
+    ParaView, VTK and meshio (xdmf.TimeSeriesReader) read these files.  dolfinx reads the particle domains at one output
+    time as a mesh: `XDMFFile.read_mesh(name="2", xpath="/Xdmf/Domain/Grid")` reads the third output time.  The elements
+    `<Information>` in points.xdmf describe the fields and their units.  The files of the `Writer` remain.  During a
+    run, the function joins all files written so far.
 
     Parameters
     ----------

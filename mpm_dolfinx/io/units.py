@@ -50,7 +50,7 @@ FIELDS = {
         "outflow_NAME": "m^3/s, in plane strain m^2/s, outflow through the open side NAME",
     },
 }
-"""Unit and meaning of each written field, by file and name."""
+"""For each output file: the unit and the meaning of each field, or of each column."""
 
 
 def text() -> str:

@@ -38,7 +38,7 @@ if TYPE_CHECKING:  # meshio takes long to import, so functions import it
     import meshio
 
 VTK_CELLS = {2: ("quad", [0, 1, 3, 2]), 3: ("hexahedron", [0, 1, 3, 2, 4, 5, 7, 6])}
-"""VTK's cell type for a particle domain, and VTK's order of the corners, by dimension."""
+"""In 2 and 3 dimensions: VTK's cell type for a particle domain, and VTK's order of its corners."""
 WRITABLE = "in a writable folder with free space; `after=simulation.result` continues the run"
 COUNTS = ("steps", "newton", "coupling", "cuts", "reinitialised", "balance", "residual", "wall")
 
@@ -53,12 +53,12 @@ class Writer:
     * `history.csv`: one row for each output time, with counts and errors of `Result`, smallest and largest pressure,
       quantities at probes, forces of prescribed displacements and tools, and outflows;
     * `fields.txt`: meaning and unit of each field in these files;
-    * `tools.pvd`, in scenes with tools: the shapes of the tools (parts of grid cells), with the forces of the tools;
+    * `tools.pvd`, in scenes with tools: the shapes of the tools, cut along the grid lines, and the tools' forces;
     * `grid.pvd`, with `grid=True`: the fields of the cells (`Simulation.cells`), zero in empty cells.
 
     ParaView and VTK read all files; meshio reads the points.
 
-    If the folder contains output of earlier times, the new run continues this output.  An interrupted run with `resume`
+    If the folder contains output of earlier times, the new run continues this output.  A run continued by `resume`
     therefore gives the same files as an uninterrupted run.  A writer locks its folder until the writer is closed.
 
     Parameters
@@ -68,8 +68,8 @@ class Writer:
     folder
         Folder of the files.
     every
-        Number of output intervals between two files of points and grid, >= 1.  The first and last output times have
-        files.
+        Number of output intervals between two files of points and grid, >= 1.  The first and last output times always
+        have files.
     grid
         Whether to write `grid.pvd`.
 
@@ -139,7 +139,7 @@ class Writer:
         self._write_indices()
 
     def _start(self, result: Result) -> None:
-        """Remove output of times later than the start of the run from all indices and from the table."""
+        """Remove all output later than the start of the run from the indices and from the table."""
         if (start := result.rows[-2][0]) != self._t:
             what = f"writer: made at t = {self._t:g} s, but the run starts at t = {start:g} s"
             raise ValueError(f"{what}; must be made just before the run")
@@ -194,7 +194,7 @@ def fields_of_points(simulation: Simulation) -> dict[str, NDArray[np.float64]]:
 
 
 def _write_tools(simulation: Simulation, file: Path) -> None:
-    """Write the shapes of all tools as parts of grid cells, with the index and the force of each tool."""
+    """Write the shapes of all tools, cut along the grid lines, with the index and the force of each tool."""
     grid, tools = simulation.grid, simulation.state.stage.of(Tool)
     corners = [
         tool.drawn(grid, simulation.t, motion_by_forces(simulation.state.outcome, name)) for name, tool in tools.items()
@@ -206,7 +206,7 @@ def _write_tools(simulation: Simulation, file: Path) -> None:
 
 
 class Lock:
-    """An exclusive lock of a folder.  It ends when all writers of this process have released it."""
+    """An exclusive lock of a folder.  The lock ends when all writers of this process have released it."""
 
     _held: ClassVar[WeakValueDictionary[Path, Lock]] = WeakValueDictionary()
 
@@ -294,7 +294,7 @@ def _grid_fields(simulation: Simulation) -> list[fem.Function]:
 
 @contextmanager
 def _true_places(grid: Grid) -> Iterator[None]:
-    """Context in which the mesh of a grid is at its true position, not relative to the base."""
+    """Context in which the mesh of a grid is at its true position, not relative to `Grid.base`."""
     x = grid.mesh.geometry.x
     own = x.copy()
     x[:, : grid.dim] += grid.base
@@ -325,7 +325,7 @@ def replacing(file: Path) -> Iterator[Path]:
 
 @contextmanager
 def _ours(file: Path) -> Iterator[None]:
-    """Context in which errors in reading raise a ValueError for a file of another program."""
+    """Context that turns errors in reading into a ValueError: the file was not written by a `Writer`."""
     try:
         yield
     except (ElementTree.ParseError, KeyError, TypeError, ValueError) as error:
@@ -333,7 +333,7 @@ def _ours(file: Path) -> Iterator[None]:
 
 
 def kept(entries: Sequence[tuple[float, Any]], t: float) -> list[tuple[float, Any]]:
-    """Return the entries (time, ...) up to the time `t`, or no entries if none is before `t`."""
+    """Return the entries (time, ...) up to and including the time `t`, or [] if none is before `t`."""
     out = [entry for entry in entries if entry[0] <= t]
     return out if any(entry[0] < t for entry in out) else []
 
@@ -356,7 +356,7 @@ class Series:
         return self.folder / f"{len(self.entries):06d}"
 
     def pieces(self, counts: Sequence[int]) -> dict[int, Path]:
-        """Return the path of the next file, by rank, for each process that has points."""
+        """Return a dictionary from the rank of each process with points to the path of its next file."""
         names = {rank: f"{self.next.name}_p{rank}.vtu" for rank, count in enumerate(counts) if count}
         names = names if len(counts) > 1 else {0: f"{self.next.name}.vtu"}
         return {rank: self.folder / name for rank, name in names.items()}
@@ -421,7 +421,7 @@ class Table:
         at_root(self.comm, write)
 
     def add(self, row: dict[str, float]) -> None:
-        """Add a row to the file.  In new columns, all older rows have nan."""
+        """Add a row to the file.  If the row has new columns, these contain nan in all older rows."""
         self._check(row)
         new = [name for name in row if name not in self.columns]
         self.columns.extend(new)

@@ -53,7 +53,7 @@ class PoreWater:
     ) -> NDArray[np.float64]:
         """Return the pressures (n,), in Pa, at which the cells have prescribed fluid contents.
 
-        Newton's method solves for the logarithm of the suction, within a bracket.
+        Newton's method solves for the logarithm of the suction, within an interval that contains the solution.
 
         `content` (n,), in m^d: prescribed fluid contents.
         `p` (n,), in Pa: initial guesses.  Guesses that give the prescribed fluid contents remain unchanged.

@@ -7,7 +7,7 @@ p >= 0 the pores are saturated.  The saturation S and the relative permeability 
     content of fluid   n S,      conductivity   k k_r,      stress   sigma = sigma' - alpha chi p
 
 with the porosity n, the saturated conductivity k, the effective stress sigma', Biot's coefficient alpha and Bishop's
-coefficient chi (Richards 1931; Bishop 1959).  By default chi is the effective saturation
+coefficient chi (Richards 1931; Bishop 1959).  In the curves of this module chi is the effective saturation
 S_e = (S - S_r) / (1 - S_r), with the residual saturation S_r.
 
 A user-defined curve is any object with the methods `saturation(p)` and `relative_permeability(p)`, which return UFL.  A
@@ -251,10 +251,10 @@ def scale_of(law) -> float:
 class Retentions:
     """Retention curves of a scene, as UFL expressions of fields at the integration points.
 
-    The points have the field `retention`.  The first entry of this field is the number of the law (1, 2, ...), or 0 if
-    the pores stay saturated.  The other entries are the constants of the law.  Pieces also have the field `lever`, the
-    vector to the piece from the centroid of the material in its cell.  The pressure of a piece is the cell pressure
-    plus the hydrostatic difference along `lever`.
+    The points have the field `retention`.  The first entry of this field is the number of the kind of law (1, 2, ...),
+    or 0 if the pores stay saturated.  The other entries are the constants of the law.  Pieces also have the field
+    `lever`, the vector to the piece from the centroid of the material in its cell.  The pressure of a piece is the cell
+    pressure plus the hydrostatic difference along `lever`.
 
     `laws`: distinct retention curves of the scene's materials.
     `everywhere`: whether every material has a retention curve.
@@ -339,7 +339,7 @@ def property_of(law, name: str, p):
 
 
 def _called(law, name: str, p):
-    """Return the result of a method of a law as UFL."""
+    """Return as UFL the result of the method `name` of a law."""
     what = f"{line(law)}: {name}"
     out = asked(what, "UFL of p", lambda: ufl.as_ufl(getattr(law, name)(p)))
     if out.ufl_shape:
@@ -370,7 +370,7 @@ class SaturationAt:
 
 
 def anywhere(points: FormPoints, **fields: NDArray[np.float64]) -> PointData:
-    """Return points with the given fields, for expressions of these fields only.  Their positions are arbitrary."""
+    """Return points with the given fields, for expressions of these fields only.  Their positions are placeholders."""
     count = len(next(iter(fields.values())))
     cells = np.zeros(count, dtype=np.int32)
     return points.at(cells, points.grid.midpoints[cells], np.ones(count), **fields)
@@ -421,14 +421,14 @@ class Conductance:
 
 
 REACH = (1e-8, 1e8)
-"""Smallest and largest tabulated suction, over the law's scale.  Source: k_r beyond is constant, exact to 1e-8."""
+"""Smallest and largest tabulated suction, divided by `scale`.  Source: k_r outside is 1 or 0, exact to 1e-8."""
 ROWS = 4000
 """Number of tabulated suctions.  Plateau (scene "dry" of tests/plateaus.py): half this value changes the result by
 2.1e-08, twice this value by 2.6e-09, and finer cells by 6.6e-03.
 """
 GAUSS = 8
-"""Quadrature points between two tabulated suctions.  Plateau (scene "dry" of tests/plateaus.py): half this value
-changes the result by 8.2e-10, twice this value by 1.5e-09, and finer cells by 6.6e-03.
+"""Number of quadrature points between two tabulated suctions.  Plateau (scene "dry" of tests/plateaus.py): half this
+value changes the result by 8.2e-10, twice this value by 1.5e-09, and finer cells by 6.6e-03.
 """
 
 
@@ -438,15 +438,15 @@ def logarithm(p: NDArray[np.float64], scale: NDArray[np.float64]) -> NDArray[np.
 
 
 def pressure_at(y: NDArray[np.float64], scale: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the pressures, in Pa, for values y of `logarithm`."""
+    """Return the pressures, in Pa, at which `logarithm` has the values y."""
     return np.where(y < 0, scale * np.sinh(y), scale * y)
 
 
 FARTHEST = np.log(10)
 """Largest change of the natural logarithm of the suction in a Newton step.
 
-Without this limit, fronts in dry soil do not converge.  With the limit 2, Celia's column takes 310 Newton steps in 25
-cells, and 500 in 100 cells.  With the limit 4, it takes 330 Newton steps in 25 cells, and 920 in 100 cells.
+Without this limit, fronts in dry soil do not converge.  With the limit 2, the column of Celia (1990) takes 310 Newton
+steps in 25 cells, and 500 in 100 cells.  With the limit 4, it takes 330 Newton steps in 25 cells, and 920 in 100 cells.
 
 Plateau (scene "dry" of tests/plateaus.py): half this value changes the result by 7.6e-10, twice this value by 9.8e-10,
 and finer cells by 6.6e-03.
@@ -459,14 +459,14 @@ def restrained(
     scale: NDArray[np.float64] | float,
     previous: NDArray[np.float64] | float = 0.0,
 ) -> NDArray[np.float64]:
-    """Return the pressure decreases (n,) of a Newton step, in Pa, after limitation.
+    """Return the limited pressure decreases (n,) of a Newton step, in Pa.
 
     A step across the characteristic suction ends at this suction.  On each side of the characteristic suction the
     saturation is convex or concave, so that Newton's method converges (Wang and Tchelepi 2013).  The logarithm of the
     suction changes by at most `FARTHEST`.  A change of opposite sign to the previous change is at most half as large.
 
     `p` (n,), in Pa: pressures.
-    `dp` (n,), in Pa: decreases of the pressures before limitation.
+    `dp` (n,), in Pa: decreases of the pressures in the Newton step without limits.
     `scale` (n,), in Pa: characteristic suctions.
     `previous` (n,): changes of `logarithm` in the previous Newton step.
     """

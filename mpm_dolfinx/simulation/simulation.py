@@ -182,7 +182,7 @@ class Simulation:
 
     @property
     def t(self) -> float:
-        """Time, in s.  You may set the time between two runs."""
+        """Time, in s.  Between two runs, you may set the time."""
         return self.state.t
 
     @t.setter
@@ -240,9 +240,9 @@ class Simulation:
         return self.outcome("tool_travel")
 
     def outcome(self, quantity: str) -> ByName[NDArray[np.float64]]:
-        """Return one result of all conditions at the end of the last step, for example "reactions", by name.
+        """Return one quantity, such as "reactions", at the end of the last step, for each condition by its name.
 
-        User-defined conditions are included.  The dictionary is empty if no condition of the stage has this result.
+        User-defined conditions are included.  The dictionary is empty if no condition of the stage has this quantity.
 
         Raises
         ------
@@ -256,7 +256,7 @@ class Simulation:
 
     @property
     def present(self) -> tuple[bool, ...]:
-        """Whether each body is present."""
+        """Whether each body is present in the current stage."""
         return self.state.stage.present
 
     def effective_stress(self) -> NDArray[np.float64]:

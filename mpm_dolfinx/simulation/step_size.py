@@ -24,14 +24,14 @@ from mpm_dolfinx.stepping.scene import Scene
 from mpm_dolfinx.stepping.state import StepControl
 
 MIN_CUT, MIN_CUT_BY_ERROR = 2.0**-10, 2.0**-30
-"""Shortest length of equal steps and of adaptive steps, divided by the nominal length.
+"""Shortest length of equal steps, and shortest length of adaptive steps, divided by the nominal length of a step.
 
 Adaptive steps may have grown by several powers of ten before a slide begins, and must then shrink again.
 """
 FINEST = NEAR**2
-"""Smallest adaptive step, divided by the time.
+"""Length of the shortest adaptive step, divided by the present time.
 
-Source: epsilon, smaller steps change only the last four digits of the time.
+Source: epsilon; shorter steps change only the last four digits of the time.
 """
 SAFETY, SHRINKS, GROWS, KEEPS = 0.9, 0.2, 5.0, 1.2
 """Constants for the ratio of the lengths of an adaptive step and the previous step.
@@ -41,7 +41,7 @@ between 1 and `KEEPS`, the step keeps its length.  Source: Hairer, Norsett and W
 Hairer and Wanner (1996), IV.8.
 """
 RINGS = 5e-3
-"""Sudden pressure change for which a step is halved, divided by the largest pressure change so far.
+"""Sudden pressure change above which a step is halved, divided by the largest pressure change so far.
 
 SDIRK2 overshoots a jump by at most 0.21 times the jump.
 """
@@ -115,7 +115,7 @@ class StepSize:
         return target - t <= slack
 
     def least(self, size: float, t: float) -> float:
-        """Return the smallest allowed step at the time `t`, for the nominal step `size`."""
+        """Return the length of the shortest allowed step at the time `t`, for the nominal length `size`, in s."""
         return max(MIN_CUT_BY_ERROR * size, FINEST * abs(t)) if self.by_error else MIN_CUT * size
 
     def preferred(self, size: float) -> float:
@@ -180,7 +180,7 @@ class StepSize:
         return bool((excess > np.maximum(RINGS * np.asarray(control.change), NEAR * max(control.change))).any())
 
     def _factor(self, report: Report, control: StepControl, power: float) -> float:
-        """Return the ratio of lengths of the next step and the computed step, from the error of the computed step."""
+        """Return the length of the next step, divided by the length of the computed step, from its error."""
         excess = self._excess(report, control)
         return min(GROWS, max(SHRINKS, SAFETY / excess**power if excess > 0 else GROWS))
 
@@ -245,7 +245,7 @@ class Times:
                 f"dt = {line(interval)}, must be left out with rtol and t_eval, because t_eval are the output times"
             )
         self.interval, self.each = 0.0, given is None and interval is None
-        """Output interval, in s (0 if intervals are unequal), and whether every step is an output."""
+        """`interval`: output interval, in s; 0 if intervals are unequal.  `each`: whether every step is an output."""
         if interval is not None:
             allowed = f"> 0, and not below {(self.end - now) / MOST:g} s"
             test = lambda v: (v > 0) & (v * MOST >= self.end - now)  # noqa: E731

@@ -5,11 +5,11 @@ Trials with different factors give bounds of this number.  The factor divides co
 tangents of the angles of friction and dilation (Griffiths and Lane 1999).  Failure of Newton's method is no criterion,
 because it may also fail in soil that is strong enough.  Instead, a trial adds a viscous stress to the soil, and
 computes the motion in time.  The criterion is the overload, the ratio of the viscous stress to the shear stress.  If
-the soil is strong enough, the bodies come to rest, and the overload vanishes.  In a slide, the overload remains.  Then
-it equals the missing strength, for any viscosity and cell size.
+the soil is strong enough, the bodies come to rest, and the overload vanishes.  In a slide, the overload remains.  It
+then equals the missing strength divided by the present strength, for any viscosity and cell size.
 
 All trials start after one step with soil that cannot yield.  In this step, bodies in equilibrium keep their stresses.
-All other bodies get elastic stresses.
+Bodies that are not in equilibrium get elastic stresses.
 """
 
 from __future__ import annotations
@@ -45,15 +45,15 @@ if TYPE_CHECKING:
     from mpm_dolfinx.simulation.simulation import Simulation
 
 WIDER, WIDEST = 2**0.5, 16.1
-"""Ratio of two successive factors in the search for bounds, and the largest factor."""
+"""`WIDER`: ratio of two successive factors in the search for bounds.  `WIDEST`: largest factor."""
 LACKS = 0.25
-"""Largest overload of a trial that comes to rest, divided by `rtol`.
+"""Largest overload with which a body counts as being at rest, divided by `rtol`.
 
 Plateau (scene "safety" of tests/plateaus.py): half this value changes the result by 1.1e-02, twice this value by
 5.4e-03, and finer cells by 4.2e-02.
 """
 STRAINS = 4.0
-"""Strain in a trial that barely slides, divided by the smaller of the overload and the elastic strain at yield.
+"""Total strain of a trial that barely slides, divided by the smaller of the overload and the elastic strain at yield.
 
 Twice the number of steps changes the factor of safety of a slope by less than 0.1 %.  Plateau (scene "safety" of
 tests/plateaus.py): half this value changes the result by 1.1e-02, twice this value by 1.1e-02, and finer cells by
@@ -72,8 +72,8 @@ class Safety:
     bounds
         Largest factor of a trial that came to rest, and smallest factor of a trial with a slide.
     overloads
-        Overloads (n,) in the n steps of each trial, by the factor of the trial.  The overload of a step is the work of
-        the viscous stress, divided by the work of the shear stress, in soil that may yield.
+        For the factor of each trial: the overloads (n,) in the n steps of the trial.  The overload of a step is the
+        work of the viscous stress, divided by the work of the shear stress, in soil that may yield.
     newton
         Number of Newton steps of all trials.
     """
@@ -164,7 +164,7 @@ class _Bar:
         self._bar.close()
 
     def show(self, factor: float, count: int, overload: float) -> None:
-        """Show the factor of a trial, and the number and overload of its last step."""
+        """Show the factor of a trial, and the number and the overload of its latest step."""
         self._bar.update()
         known = "".join(f", {what} at {at}" for what, at in self._known.items() if at)
         self._bar.set_postfix_str(f"strength over {factor:.4g}: step {count}, overload {overload:.1e}{known}")
@@ -199,7 +199,7 @@ def _ends(overloads: Sequence[float], steps: int, least: float) -> bool:
 
 @dataclass
 class _Trial:
-    """Scene and state of a trial for the time loop, with the number of Newton steps of each step."""
+    """Scene and state of a trial for the time loop, with the number of Newton steps in each time step."""
 
     scene: Scene
     state: State
@@ -256,7 +256,7 @@ class _Weakened:
         self._viscosity.value = steps / STRAINS * max(least * modulus, stress) * dt
 
     def overloads(self, factor: float, tell: Callable[[int, float], None]) -> NDArray[np.float64]:
-        """Return the overloads in the steps of a trial.  `tell`: function that is called after each step."""
+        """Return the overloads in the steps of a trial.  `tell`: called with step number and overload."""
         trial, out = self._trial(self._start, lambda name, value: _over(name, value, factor)), []
         while len(out) < self._steps and not (out and _ends(out, self._steps, self._least)):
             before = trial.state.points
@@ -273,7 +273,7 @@ class _Weakened:
         return replace(trial.state, t=initial.t)
 
     def _trial(self, start: State, strength: Callable[[str, NDArray[np.float64]], NDArray[np.float64]]) -> _Trial:
-        """Return a trial that starts from a state.  The function `strength` gives its strengths."""
+        """Return a trial that starts from a state.  `strength`: returns a strength from name and full value."""
         data = {name: strength(name, value) for name, value in self._strengths.items()}
         points = replace(start.points, data={**start.points.data, **data})
         return _Trial(self._scene, replace(start, points=points, velocity=None, result=None, control=None), self.newton)
@@ -287,7 +287,7 @@ class _Weakened:
             raise GaveUp(f"factor_of_safety: {what}: {error}", error.result, error.history) from error
 
     def _overload(self, before: MaterialPoints, now: MaterialPoints) -> float:
-        """Return the overload of a step, without points that have moved to another process."""
+        """Return the overload of a step.  Points that have moved to another process are ignored."""
         _, old, new = np.intersect1d(before.id, now.id, assume_unique=True, return_indices=True)
         d = before.F.shape[1]
         increment = now.F[new] @ np.linalg.inv(before.F[old]) - np.eye(d)
@@ -311,7 +311,7 @@ def _yielding_volume(scene: Scene, points: MaterialPoints) -> NDArray[np.float64
 
 
 def _mean_stress(scene: Scene, points: MaterialPoints) -> float:
-    """Return the mean norm of the effective stress in soil that may yield, in Pa.  Raise ValueError without stress."""
+    """Return the mean norm of the effective stress in soil that may yield, in Pa.  Raise ValueError if it is zero."""
     grid = scene.grid
     size = np.linalg.norm(scene.materials.effective_stress_3d(points), axis=(1, 2))
     moduli, volume = scene.materials.table(points, lambda m: m.oedometric), _yielding_volume(scene, points)
@@ -331,7 +331,7 @@ def _shear_modulus(scene: Scene, points: MaterialPoints) -> float:
 
 
 def _of(m: Skeleton) -> list[str]:
-    """Return the names of the material constants that a factor divides."""
+    """Return the names of the constants of a material that the factor of safety divides."""
     if not isinstance(m, Frictional):
         return []
     own = {f.name for f in fields(m)} & set(STRENGTHS)
@@ -339,7 +339,7 @@ def _of(m: Skeleton) -> list[str]:
 
 
 def _as_fields(m: Skeleton) -> Skeleton:
-    """Return a copy of a material whose strengths are functions of position."""
+    """Return a copy of a material in which functions of position replace all constant strengths."""
     carried = {name: partial(_constant, value=getattr(m, name)) for name in _of(m) if not callable(getattr(m, name))}
     if isinstance(m, Frictional) and m.symmetric:
         carried |= {"dilation": carried.get("friction", m.friction)}
@@ -351,7 +351,7 @@ def _constant(X: NDArray[np.float64], value: float) -> NDArray[np.float64]:
 
 
 def _strengths(scene: Scene, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
-    """Return the values of each strength at the points, by name, with zeros for materials without this strength."""
+    """Return for the name of each strength its values at the points, or zeros in materials without this strength."""
     out = {}
     for i, m in enumerate(scene.materials.materials):
         rows = np.flatnonzero(points.material == i)

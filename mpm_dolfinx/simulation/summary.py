@@ -117,8 +117,8 @@ def table(scene: Scene, state: State) -> str:
 def imbalance(scene: Scene, state: State) -> dict[str, float]:
     """Return the imbalance of points, pieces and active cells over the processes, by name.
 
-    An imbalance is the largest number on any process, divided by the mean over all processes.  Before the first step,
-    the imbalance of pieces and cells is 1.  All processes must call this function.
+    An imbalance is the largest count on any process, divided by the mean count of all processes.  Before the first
+    step, the imbalance of pieces and cells is 1.  All processes must call this function.
     """
     comm, (on_grid, _) = scene.grid.comm, scene.last
     pieces = on_grid.data.pieces if on_grid else None

@@ -33,7 +33,7 @@ class Tangent:
         prescribed displacements and contacts, and the inertia of free tools, but not the inertia of bodies.  Fixed
         displacement components are excluded.
     nodes, components : (n,)
-        Grid node and axis of each displacement.
+        Index of the grid node, and of the axis, of each displacement.
     x : (n, d)
         Position of the node of each displacement, m.
     pressure : (n, k)
@@ -43,7 +43,7 @@ class Tangent:
     storage : (k, k)
         Derivative of fluid contents with respect to pressures.
     cells : (k,)
-        Cell of each pressure.
+        Index of the cell of each pressure.
     """
 
     stiffness: csr_matrix

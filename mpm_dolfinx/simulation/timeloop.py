@@ -107,7 +107,7 @@ def run(
         Function called after all observers, such as a `Checkpoint`.
     after
         Histories that this run continues: the result of `resume`, or `Simulation.result` after an interrupted run. `dt`
-        must be the same.
+        must be the same as in that run.
     energies
         Whether to record energies of bodies with inertia, and the work of forces since the start, in `Result.energies`.
     progress
@@ -191,7 +191,7 @@ def _bar(start: float, now: float, end: float, shown: bool) -> tqdm:
 
 
 def _show(bar: tqdm, state: State, before: float) -> None:
-    """Update the progress bar of a run, which has shown the time `before` until now."""
+    """Update the progress bar of a run.  Until now the bar has shown the time `before`, in s."""
     result = state.result
     bar.update(state.t - before)
     counts = {"t": f"{state.t:.4g} s", "steps": result.steps, "newton": result.newton, "coupling": result.coupling}
