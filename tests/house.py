@@ -5,8 +5,8 @@ A number is *structure* if no other value is possible: see `structure` below. A 
 line, or the string below it, has one of two forms:
 
     Source: an equation, a paper (with its year), a definition, a format, or an exact bound, see `SOURCE`;
-    Plateau (scene "name" of tests/plateaus.py): half this value changes the result by a, twice this value by b, and
-    finer cells by c.
+    Sensitivity (scene "name" of tests/plateaus.py): half this value changes the result by a, and twice this value by b.
+    Finer cells change it by c.
 
 The changes are relative. a or b is not zero, so the number affects the scene. Both are below c.
 `python tests/plateaus.py` measures these changes again. All other numbers are *ad hoc*.
@@ -25,8 +25,8 @@ SOURCE = re.compile(
     re.DOTALL,
 )
 PLATEAU = re.compile(
-    r'\bPlateau \(scene "(\w+)" of tests/plateaus.py\): half this value changes the result by ([\d.e+-]+), '
-    r"twice this value by ([\d.e+-]+), and finer cells by ([\d.e+-]*[\d])"
+    r'\bSensitivity \(scene "(\w+)" of tests/plateaus.py\): half this value changes the result by ([\d.e+-]+), '
+    r"and twice this value by ([\d.e+-]*[\d])\. +Finer cells change it by ([\d.e+-]*[\d])"
 )
 UNITS = {60, 90, 100, 180, 360, 1000, 1e6, 1024, 86400}
 """Per cent, degrees, and the like."""

@@ -266,8 +266,8 @@ def main(arguments: list[str]) -> None:
         began = time.time()
         found = moved(where, name, scene)
         half, twice, cells = (f"{value:.1e}" for value in found)
-        where = f'Plateau (scene "{scene}" of tests/plateaus.py): half this value changes the result by {half}'
-        told = f"{where}, twice this value by {twice}, and finer cells by {cells}."
+        where = f'Sensitivity (scene "{scene}" of tests/plateaus.py): half this value changes the result by {half}'
+        told = f"{where}, and twice this value by {twice}. Finer cells change it by {cells}."
         print(f"{number} {told}  {time.time() - began:.0f} s", flush=True)
 
 

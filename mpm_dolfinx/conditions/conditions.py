@@ -384,22 +384,22 @@ class Tied(Condition):
 
 
 RIGIDITY = 1e4
-"""Rigidity of a plate, divided by the oedometric modulus of the body and by the length of the side.  Plateau (scene
-"plate" of tests/plateaus.py): half this value changes the result by 1.3e-06, twice this value by 6.7e-07, and finer
-cells by 4.8e-05.
+"""Rigidity of a plate, divided by the oedometric modulus of the body and by the length of the side.  Sensitivity (scene
+"plate" of tests/plateaus.py): half this value changes the result by 1.3e-06, and twice this value by 6.7e-07.  Finer
+cells change it by 4.8e-05.
 """
 HOLD = 3e2
 """Penalty stiffness for prescribed displacements, times cell size, divided by the `holding` modulus.
 
 The displacement error is the change of the traction in the step, divided by the stiffness.  If a body is much stiffer
-than the penalty, multipliers remove this error (`HoldLoads.augment`).  Plateau (scene "soil" of tests/plateaus.py):
-half this value changes the result by 5.9e-05, twice this value by 2.0e-05, and finer cells by 3.0e-02.
+than the penalty, multipliers remove this error (`HoldLoads.augment`).  Sensitivity (scene "soil" of tests/plateaus.py):
+half this value changes the result by 5.9e-05, and twice this value by 2.0e-05.  Finer cells change it by 3.0e-02.
 """
 YIELDING = 0.1
 """For laws with state variables, the modulus of the penalty is this factor times the elastic modulus.
 
-Plateau (scene "soil" of tests/plateaus.py): half this value changes the result by 6.5e-05, twice this value by 1.9e-05,
-and finer cells by 3.0e-02.
+Sensitivity (scene "soil" of tests/plateaus.py): half this value changes the result by 6.5e-05, and twice this value by
+1.9e-05. Finer cells change it by 3.0e-02.
 """
 
 

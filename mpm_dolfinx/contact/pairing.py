@@ -41,8 +41,8 @@ DEEP = 0.25
 """Largest penetration at which a pair is found, and smallest gap at which it may be dropped, in cell sizes."""
 BESIDE = 0.6
 """Distance from another group, in cell sizes, below which domain corners move with the Q1 field, without corrections.
-Plateau (scene "contact" of tests/plateaus.py): half this value changes the result by 1.1e-03, twice this value by
-6.3e-04, and finer cells by 1.1e-02.
+Sensitivity (scene "contact" of tests/plateaus.py): half this value changes the result by 1.1e-03, and twice this value
+by 6.3e-04. Finer cells change it by 1.1e-02.
 """
 PLACES = 1 << 32
 """Upper bound of the number of quadrature points on a surface, on one process."""

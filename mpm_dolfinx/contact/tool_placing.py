@@ -30,9 +30,9 @@ from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
 from mpm_dolfinx.points.material_points import MaterialPoints, middle
 
 NEAR = 0.1
-"""Distance from a tool, in cell sizes, below which domain corners move with the Q1 field, without corrections. Plateau
-(scene "tool" of tests/plateaus.py): half this value changes the result by 4.1e-03, twice this value by 1.5e-03, and
-finer cells by 7.1e-02."""
+"""Distance from a tool, in cell sizes, below which domain corners move with the Q1 field, without corrections.
+Sensitivity (scene "tool" of tests/plateaus.py): half this value changes the result by 4.1e-03, and twice this value by
+1.5e-03. Finer cells change it by 7.1e-02."""
 FACING = 0.5  # smallest cosine between the normal of a face that faces the tool and the direction to the tool
 
 

@@ -26,8 +26,8 @@ STILL = 3e-4
 """Largest motion of corners, divided by the cell size, without a new cut of the domains.
 
 In a consolidating column of ten cells, a new cut in every step changes pressures by 7e-5 of the load, and the
-settlement by the fraction 3e-5.  Plateau (scene "strip" of tests/plateaus.py): half this value changes the result by
-0.0e+00, twice this value by 7.6e-05, and finer cells by 3.7e-02.
+settlement by the fraction 3e-5.  Sensitivity (scene "strip" of tests/plateaus.py): half this value changes the result
+by 0.0e+00, and twice this value by 7.6e-05.  Finer cells change it by 3.7e-02.
 """
 
 

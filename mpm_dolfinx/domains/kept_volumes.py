@@ -29,8 +29,8 @@ from mpm_dolfinx.parallel.exchange import to_root
 SOFT = 0.15
 """Weight of the motion d of the corners, and of its differences along edges, relative to the volume errors.
 
-Plateau (scene "flow" of tests/plateaus.py): half this value changes the result by 1.5e-04, twice this value by 2.4e-04,
-and finer cells by 9.1e-02.
+Sensitivity (scene "flow" of tests/plateaus.py): half this value changes the result by 1.5e-04, and twice this value by
+2.4e-04. Finer cells change it by 9.1e-02.
 """
 
 

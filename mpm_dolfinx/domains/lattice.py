@@ -37,8 +37,8 @@ from mpm_dolfinx.points.material_points import MaterialPoints
 FAST = 10
 """Fraction (at most 1) of a wave with a length of two domains that the filter removes, per crossed cell.
 
-Plateau (scene "cycles" of tests/plateaus.py): half this value changes the result by 1.5e-04, twice this value by
-3.4e-04, and finer cells by 6.2e-03.
+Sensitivity (scene "cycles" of tests/plateaus.py): half this value changes the result by 1.5e-04, and twice this value
+by 3.4e-04. Finer cells change it by 6.2e-03.
 """
 THIRD = (-1, 3, -3, 1)
 MARGIN = len(THIRD) - 1

@@ -39,8 +39,8 @@ least `V / ((d + 1) THICK h^(d-1))` from the centroid of the body.  Smaller dist
 """
 ALONG = 0.1
 """A drained side determines the pressure slope along axes on which its unit normal has a component above this value.
-Plateau (scene "beam" of tests/plateaus.py): half this value changes the result by 9.9e-11, twice this value by 8.7e-11,
-and finer cells by 1.4e-02.
+Sensitivity (scene "beam" of tests/plateaus.py): half this value changes the result by 9.9e-11, and twice this value by
+8.7e-11. Finer cells change it by 1.4e-02.
 """
 
 

@@ -30,8 +30,8 @@ from mpm_dolfinx.parallel.exchange import over_all
 
 INCLINED = 0.01
 """Smallest slope of layers, relative to the grid, at which the pressure position moves to the more conductive end.
-Plateau (scene "slope" of tests/plateaus.py): half this value changes the result by 4.1e-04, twice
-this value by 5.0e-05, and finer cells by 3.4e-03.
+Sensitivity (scene "slope" of tests/plateaus.py): half this value changes the result by 4.1e-04, and twice this value by
+5.0e-05. Finer cells change it by 3.4e-03.
 """
 PAIRS = 2**16
 """Number of pairs of pieces in a batch."""

@@ -30,18 +30,18 @@ from mpm_dolfinx.forms.point_forms import FacetSum
 from mpm_dolfinx.grid.grid import Grid, sum_by
 
 ALONG = 1e-4
-"""Fluxes are corrected if the offset of two centroids along the face exceeds this fraction of the cell size.  Plateau
-(scene "clay" of tests/plateaus.py): half this value changes the result by 2.4e-06, twice this value by 2.5e-06, and
-finer cells by 1.2e-02.
+"""Fluxes are corrected if the offset of two centroids along the face exceeds this fraction of the cell size.
+Sensitivity (scene "clay" of tests/plateaus.py): half this value changes the result by 2.4e-06, and twice this value by
+2.5e-06.  Finer cells change it by 1.2e-02.
 """
 NEAREST = 0.1
-"""Lower bound of distances in the weights of the least-squares fit, divided by the cell size.  Plateau (scene "slope"
-of tests/plateaus.py): half this value changes the result by 3.0e-08, twice this value by 1.2e-06, and finer cells by
-3.4e-03."""
+"""Lower bound of distances in the weights of the least-squares fit, divided by the cell size.  Sensitivity (scene
+"slope" of tests/plateaus.py): half this value changes the result by 3.0e-08, and twice this value by 1.2e-06.  Finer
+cells change it by 3.4e-03."""
 SIDES = 2.0
-"""Total weight of the open sides of a cell in the least-squares fit, divided by the weight of one neighbour.  Plateau
-(scene "slope" of tests/plateaus.py): half this value changes the result by 4.8e-06, twice this value by 2.8e-06, and
-finer cells by 3.4e-03.
+"""Total weight of the open sides of a cell in the least-squares fit, divided by the weight of one neighbour.
+Sensitivity (scene "slope" of tests/plateaus.py): half this value changes the result by 4.8e-06, and twice this value by
+2.8e-06.  Finer cells change it by 3.4e-03.
 """
 
 

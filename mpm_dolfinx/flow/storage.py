@@ -65,8 +65,8 @@ from mpm_dolfinx.pores.retention import logarithm, restrained
 
 FILTER = 0.75
 """Fraction, in [0, 1], of the fixed-stress term `beta V` that is omitted for checkerboard pressures.  Here beta is the
-fixed-stress coefficient, and V is the volume.  Plateau (scene "beam" of tests/plateaus.py): half this value changes
-the result by 5.2e-11, twice this value by 1.3e-10, and finer cells by 1.5e-02.
+fixed-stress coefficient, and V is the volume.  Sensitivity (scene "beam" of tests/plateaus.py): half this value changes
+the result by 5.2e-11, and twice this value by 1.3e-10.  Finer cells change it by 1.5e-02.
 """
 
 

@@ -34,8 +34,8 @@ MATCHES = {
 """For each fit to the Mohr-Coulomb law: a function of tan phi, sin phi and cos phi that returns eta and xi."""
 LEAST = 1e-20
 """Constant added to the squared deviatoric strain under a square root, so that the root is differentiable at zero.
-Plateau (scene "soil" of tests/plateaus.py): half this value changes the result by 2.3e-11, twice this value by 1.0e-11,
-and finer cells by 3.0e-02.
+Sensitivity (scene "soil" of tests/plateaus.py): half this value changes the result by 2.3e-11, and twice this value by
+1.0e-11. Finer cells change it by 3.0e-02.
 """
 
 

@@ -211,8 +211,8 @@ def mean_size(grid: Grid) -> float:
 MOST = 100.0
 """Upper limit of the softness, because softness is infinite in perfectly plastic flow.
 
-Plateau (scene "soil" of tests/plateaus.py): half this value changes the result by 4.0e-03, twice this value by 5.0e-03,
-and finer cells by 3.0e-02.
+Sensitivity (scene "soil" of tests/plateaus.py): half this value changes the result by 4.0e-03, and twice this value by
+5.0e-03. Finer cells change it by 3.0e-02.
 """
 
 

@@ -41,14 +41,14 @@ RESERVED = frozenset(
 """Reserved names of fields at quadrature points.  No parameter or state variable may have such a name."""
 WHAT_IS_NAMED = "parameters, state and unknowns"
 EVOLVED = 1e-3
-"""Soil has yielded if a state variable differs from its initial value by more than this number.  Plateau (scene "soil"
-of tests/plateaus.py): half this value changes the result by 6.6e-05, twice this value by 1.4e-04, and finer cells by
-3.0e-02.
+"""Soil has yielded if a state variable differs from its initial value by more than this number.  Sensitivity (scene
+"soil" of tests/plateaus.py): half this value changes the result by 6.6e-05, and twice this value by 1.4e-04.  Finer
+cells change it by 3.0e-02.
 """
 STIFFEST = 100.0
 """Upper limit of (alpha^2 / S) / (lambda + 2G), the ratio of the pore fluid's stiffness to the skeleton's stiffness.  S
-is the storage coefficient.  The limit keeps rounding errors small.  Plateau (scene "soil" of tests/plateaus.py): half
-this value changes the result by 1.2e-07, twice this value by 1.0e-07, and finer cells by 3.0e-02.
+is the storage coefficient.  The limit keeps rounding errors small.  Sensitivity (scene "soil" of tests/plateaus.py):
+half this value changes the result by 1.2e-07, and twice this value by 1.0e-07.  Finer cells change it by 3.0e-02.
 """
 
 

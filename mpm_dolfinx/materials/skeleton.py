@@ -45,8 +45,9 @@ nu = 0.499: -10.3 % without F-bar, -0.02 % with F-bar.
 """
 
 SEPARATION = 1e-4
-"""Relative difference added to equal eigenvalues, for finite derivatives.  Plateau (scene "beam" of tests/plateaus.py):
-half this value changes the result by 1.8e-09, twice this value by 7.2e-09, and finer cells by 1.5e-02.
+"""Relative difference added to equal eigenvalues, for finite derivatives.  Sensitivity (scene "beam" of
+tests/plateaus.py): half this value changes the result by 1.8e-09, and twice this value by 7.2e-09.  Finer cells change
+it by 1.5e-02.
 """
 
 

@@ -28,28 +28,28 @@ from mpm_dolfinx.grid.grid import TURN, Grid, across_faces
 from mpm_dolfinx.materials.skeleton import Skeleton
 
 GHOST = 0.05
-"""Strength of the ghost penalty.  Plateau (scene "beam" of tests/plateaus.py): half this value changes the result by
-9.9e-06, twice this value by 1.9e-05, and finer cells by 1.5e-02.
+"""Strength of the ghost penalty.  Sensitivity (scene "beam" of tests/plateaus.py): half this value changes the result
+by 9.9e-06, and twice this value by 1.9e-05.  Finer cells change it by 1.5e-02.
 """
 YIELDING = 0.02
-"""Smallest value of the factor that reduces the penalty for nearly incompressible laws with a state.  Plateau (scene
-"flow" of tests/plateaus.py): half this value changes the result by 6.4e-04, twice this value by 1.1e-03, and finer
-cells by 8.9e-02.
+"""Smallest value of the factor that reduces the penalty for nearly incompressible laws with a state.  Sensitivity
+(scene "flow" of tests/plateaus.py): half this value changes the result by 6.4e-04, and twice this value by 1.1e-03.
+Finer cells change it by 8.9e-02.
 """
 RATIO = 0.3
 """Ratio of the volume fractions of two cells below which their common face has a penalty.
 
-Plateau (scene "soil" of tests/plateaus.py): half this value changes the result by 1.3e-03, twice this value by 5.9e-04,
-and finer cells by 3.0e-02.
+Sensitivity (scene "soil" of tests/plateaus.py): half this value changes the result by 1.3e-03, and twice this value by
+5.9e-04. Finer cells change it by 3.0e-02.
 """
 SPARSE = 0.2
-"""Strength of the penalty for integration at material points.  Plateau (scene "points" of tests/plateaus.py): half this
-value changes the result by 5.2e-03, twice this value by 4.2e-03, and finer cells by 9.5e-03.
+"""Strength of the penalty for integration at material points.  Sensitivity (scene "points" of tests/plateaus.py): half
+this value changes the result by 5.2e-03, and twice this value by 4.2e-03.  Finer cells change it by 9.5e-03.
 """
 FULL = 0.9
-"""Largest volume fraction of a penalised cell for integration at material points.  Plateau (scene "points" of
-tests/plateaus.py): half this value changes the result by 5.7e-04, twice this value by 4.1e-04, and finer cells by
-9.5e-03.
+"""Largest volume fraction of a penalised cell for integration at material points.  Sensitivity (scene "points" of
+tests/plateaus.py): half this value changes the result by 5.7e-04, and twice this value by 4.1e-04.  Finer cells change
+it by 9.5e-03.
 """
 
 

@@ -25,24 +25,24 @@ from mpm_dolfinx.mechanics.ghost_penalty import RATIO
 from mpm_dolfinx.parallel.exchange import over_all
 
 ALIGNED = 1e-2
-"""Largest slope of a side relative to a grid axis at which the side has a stiff penalty at each point.
-Plateau (scene "held" of tests/plateaus.py): half this value changes the result by 0.0e+00, twice this value by 1.4e-05,
-and finer cells by 4.0e-03.
+"""Largest slope of a side relative to a grid axis at which the side has a stiff penalty at each point. Sensitivity
+(scene "held" of tests/plateaus.py): half this value changes the result by 0.0e+00, and twice this value by 1.4e-05.
+Finer cells change it by 4.0e-03.
 """
 WEAK = 8.0
-"""Stiffness of the weak penalty on deviations from the mean, divided by (modulus + 10 stress) / cell size.  Plateau
-(scene "soil" of tests/plateaus.py): half this value changes the result by 5.0e-06, twice this value by 7.9e-06, and
-finer cells by 3.0e-02.
+"""Stiffness of the weak penalty on deviations from the mean, divided by (modulus + 10 stress) / cell size.  Sensitivity
+(scene "soil" of tests/plateaus.py): half this value changes the result by 5.0e-06, and twice this value by 7.9e-06.
+Finer cells change it by 3.0e-02.
 """
 EVERYWHERE = 1e2
-"""Normal stiffness at points of sides with slopes below `ALIGNED`, divided by modulus / cell size.  Plateau
-(scene "soil" of tests/plateaus.py): half this value changes the result by 2.2e-05, twice this value by 1.7e-05, and
-finer cells by 3.0e-02.
+"""Normal stiffness at points of sides with slopes below `ALIGNED`, divided by modulus / cell size.  Sensitivity (scene
+"soil" of tests/plateaus.py): half this value changes the result by 2.2e-05, and twice this value by 1.7e-05.  Finer
+cells change it by 3.0e-02.
 """
 TENSE = 10
 """The modulus of the weak penalty is the soil's modulus plus this factor times the norm of the stress.  The stress term
-prevents buckling of the side.  Plateau (scene "soil" of tests/plateaus.py): half this value changes the result by
-2.8e-06, twice this value by 4.7e-06, and finer cells by 3.0e-02.
+prevents buckling of the side.  Sensitivity (scene "soil" of tests/plateaus.py): half this value changes the result by
+2.8e-06, and twice this value by 4.7e-06.  Finer cells change it by 3.0e-02.
 """
 
 

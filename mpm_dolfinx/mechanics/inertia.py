@@ -55,8 +55,8 @@ from mpm_dolfinx.points.material_points import MaterialPoints, middle
 
 GHOST_MASS = 0.02
 """Strength c of the ghost mass.  A rotating block has the same energies with 0.002 and 0.2 (tests/test_inertia.py).
-Plateau (scene "bar" of tests/plateaus.py): half this value changes the result by 6.4e-03, twice this value by
-1.4e-02, and finer cells by 1.1e-01.
+Sensitivity (scene "bar" of tests/plateaus.py): half this value changes the result by 6.4e-03, and twice this value by
+1.4e-02.  Finer cells change it by 1.1e-01.
 """
 RELAXES = 2.0
 """Rate r of relaxation: in a motion by n cells, point velocities approach nodal velocities by the fraction 1 - exp(-r
@@ -66,8 +66,8 @@ Relaxation removes velocity modes of the points that the nodes cannot represent.
 moves across 50 cells, with 40 steps a period.  After 25 periods the velocity error is 1.7 % at the rate 0, and 1.2 % at
 the rates 0.1, 2 and 10.  The energy loss is 1.58 % at the rate 0, 1.60 % at the rates 0.1 and 2, and 1.67 % at 10.
 
-Plateau (scene "bar" of tests/plateaus.py): half this value changes the result by 8.4e-04, twice this value by 1.2e-03,
-and finer cells by 1.1e-01.
+Sensitivity (scene "bar" of tests/plateaus.py): half this value changes the result by 8.4e-04, and twice this value by
+1.2e-03. Finer cells change it by 1.1e-01.
 """
 
 VELOCITY, RATE = "velocity", "F_rate"

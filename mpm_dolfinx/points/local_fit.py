@@ -30,9 +30,9 @@ Source: exact. A parabola needs three points.  At an end of the data, these poin
 UNTOLD = (0.0, 1e-10, 1e-6)
 """Weights c_k of polynomial coefficients of degrees 0, 1 and 2, divided by the sum of the data weights.
 
-With weights 0.01 or 100 times as large, pressures of a consolidating column change by 1e-5 of the load.  Plateau (scene
-"adaptive" of tests/plateaus.py): half this value changes the result by 5.8e-08, twice this value by 1.2e-07, and finer
-cells by 3.8e-02.
+With weights 0.01 or 100 times as large, pressures of a consolidating column change by 1e-5 of the load.  Sensitivity
+(scene "adaptive" of tests/plateaus.py): half this value changes the result by 5.8e-08, and twice this value by 1.2e-07.
+Finer cells change it by 3.8e-02.
 """
 
 

@@ -423,12 +423,12 @@ class Conductance:
 REACH = (1e-8, 1e8)
 """Smallest and largest tabulated suction, divided by `scale`.  Source: k_r outside is 1 or 0, exact to 1e-8."""
 ROWS = 4000
-"""Number of tabulated suctions.  Plateau (scene "dry" of tests/plateaus.py): half this value changes the result by
-2.1e-08, twice this value by 2.6e-09, and finer cells by 6.6e-03.
+"""Number of tabulated suctions.  Sensitivity (scene "dry" of tests/plateaus.py): half this value changes the result by
+2.1e-08, and twice this value by 2.6e-09.  Finer cells change it by 6.6e-03.
 """
 GAUSS = 8
-"""Number of quadrature points between two tabulated suctions.  Plateau (scene "dry" of tests/plateaus.py): half this
-value changes the result by 8.2e-10, twice this value by 1.5e-09, and finer cells by 6.6e-03.
+"""Number of quadrature points between two tabulated suctions.  Sensitivity (scene "dry" of tests/plateaus.py): half
+this value changes the result by 8.2e-10, and twice this value by 1.5e-09.  Finer cells change it by 6.6e-03.
 """
 
 
@@ -448,8 +448,8 @@ FARTHEST = np.log(10)
 Without this limit, fronts in dry soil do not converge.  With the limit 2, the column of Celia (1990) takes 310 Newton
 steps in 25 cells, and 500 in 100 cells.  With the limit 4, it takes 330 Newton steps in 25 cells, and 920 in 100 cells.
 
-Plateau (scene "dry" of tests/plateaus.py): half this value changes the result by 7.6e-10, twice this value by 9.8e-10,
-and finer cells by 6.6e-03.
+Sensitivity (scene "dry" of tests/plateaus.py): half this value changes the result by 7.6e-10, and twice this value by
+9.8e-10. Finer cells change it by 6.6e-03.
 """
 
 

@@ -49,15 +49,15 @@ WIDER, WIDEST = 2**0.5, 16.1
 LACKS = 0.25
 """Largest overload with which a body counts as being at rest, divided by `rtol`.
 
-Plateau (scene "safety" of tests/plateaus.py): half this value changes the result by 1.1e-02, twice this value by
-5.4e-03, and finer cells by 4.2e-02.
+Sensitivity (scene "safety" of tests/plateaus.py): half this value changes the result by 1.1e-02, and twice this value
+by 5.4e-03. Finer cells change it by 4.2e-02.
 """
 STRAINS = 4.0
 """Total strain of a trial that barely slides, divided by the smaller of the overload and the elastic strain at yield.
 
-Twice the number of steps changes the factor of safety of a slope by less than 0.1 %.  Plateau (scene "safety" of
-tests/plateaus.py): half this value changes the result by 1.1e-02, twice this value by 1.1e-02, and finer cells by
-4.2e-02.
+Twice the number of steps changes the factor of safety of a slope by less than 0.1 %.  Sensitivity (scene "safety" of
+tests/plateaus.py): half this value changes the result by 1.1e-02, and twice this value by 1.1e-02.  Finer cells change
+it by 4.2e-02.
 """
 STRENGTHS = ("cohesion", "residual", "hardening", "tension", "friction", "dilation")
 ANGLES = ("friction", "dilation")

@@ -21,8 +21,8 @@ from dataclasses import dataclass
 import numpy as np
 
 SHORTEST = 1e-3
-"""Smallest length of a step, as a fraction of the full Newton step.  Plateau (scene "tool" of tests/plateaus.py): half
-this value changes the result by 1.2e-03, twice this value by 0.0e+00, and finer cells by 7.1e-02.
+"""Smallest length of a step, as a fraction of the full Newton step.  Sensitivity (scene "tool" of tests/plateaus.py):
+half this value changes the result by 1.2e-03, and twice this value by 0.0e+00.  Finer cells change it by 7.1e-02.
 """
 EXPLODES = 1e4
 """Largest factor by which the residual may grow in a step without yield.

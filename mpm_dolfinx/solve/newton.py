@@ -46,19 +46,19 @@ INNER = 1e-3  # tolerance of momentum solves / storage residual; small, because 
 MOMENTUM_STEPS = 10
 REBALANCED = 6  # largest number of Newton steps while contacts change, divided by the usual largest number
 LOOSEST = 1e-2
-"""Largest ratio of the residual after a linear solve to the residual before this solve. Plateau (scene "soil" of
-tests/plateaus.py): half this value changes the result by 2.2e-11, twice this value by 6.0e-12, and finer cells by
-3.0e-02.
+"""Largest ratio of the residual after a linear solve to the residual before this solve. Sensitivity (scene "soil" of
+tests/plateaus.py): half this value changes the result by 2.2e-11, and twice this value by 6.0e-12. Finer cells change
+it by 3.0e-02.
 """
 SOLVED = 0.05
-"""Smallest residual that a linear solve must reach, divided by the tolerance of Newton's method.  Plateau (scene "soil"
-of tests/plateaus.py): half this value changes the result by 4.0e-12, twice this value by 3.1e-11, and finer cells by
-3.0e-02.
+"""Smallest residual that a linear solve must reach, divided by the tolerance of Newton's method.  Sensitivity (scene
+"soil" of tests/plateaus.py): half this value changes the result by 4.0e-12, and twice this value by 3.1e-11.  Finer
+cells change it by 3.0e-02.
 """
 SETTLED = 1e-2
-"""Largest relative residual at which slip of contacts may end.  At larger residuals the contact area changes.  Plateau
-(scene "contact" of tests/plateaus.py): half this value changes the result by 1.5e-13, twice this value by 6.4e-12, and
-finer cells by 1.1e-02.
+"""Largest relative residual at which slip of contacts may end.  At larger residuals the contact area changes.
+Sensitivity (scene "contact" of tests/plateaus.py): half this value changes the result by 1.5e-13, and twice this value
+by 6.4e-12.  Finer cells change it by 1.1e-02.
 """
 ERROR = 1 / 20
 """Assumed pressure error of a run, divided by the estimated error e of a first-order step (`note_pressures`).
@@ -67,8 +67,8 @@ For a mode with decay rate l, the stability function of sdirk2 gives an error of
 0.28 e. A pressure that follows a varying load has an error of at most 0.14 e. With little decay, the errors of all
 steps add up to 0.081 e. Errors were measured by comparison with steps an eighth as long. The errors are 0.01 to 0.08 e
 for varying loads, pressures and sources. The error is 0.17 e in a first step from zero load, and 0.26 e after a jump.
-The error of a run is at most 5 times the assumed error e / 20. Plateau (scene "adaptive" of tests/plateaus.py): half
-this value changes the result by 1.8e-02, twice this value by 3.9e-03, and finer cells by 3.8e-02.
+The error of a run is at most 5 times the assumed error e / 20. Sensitivity (scene "adaptive" of tests/plateaus.py):
+half this value changes the result by 1.8e-02, and twice this value by 3.9e-03. Finer cells change it by 3.8e-02.
 """
 SUDDEN = np.sqrt(2)
 """Pressure change in the second substep divided by the change in the first substep, below which sdirk2 overshoots.

@@ -57,18 +57,19 @@ class Thresholds:
 
 THRESHOLDS = Thresholds()
 FORCING = 1e-5
-"""Smallest relative tolerance of a linear solve.  Plateau (scene "soil" of tests/plateaus.py): half this value changes
-the result by 4.0e-11, twice this value by 1.2e-11, and finer cells by 3.0e-02.
+"""Smallest relative tolerance of a linear solve.  Sensitivity (scene "soil" of tests/plateaus.py): half this value
+changes the result by 4.0e-11, and twice this value by 1.2e-11.  Finer cells change it by 3.0e-02.
 """
 FORCING_3D = 1e-3
 """Smallest relative tolerance of a linear solve with multigrid in 3D."""
 KEEP = 0.05
-"""Largest ratio of successive residuals for which the tangent is reused.  Plateau (scene "soil" of tests/plateaus.py):
-half this value changes the result by 4.9e-11, twice this value by 1.0e-11, and finer cells by 3.0e-02.
+"""Largest ratio of successive residuals for which the tangent is reused.  Sensitivity (scene "soil" of
+tests/plateaus.py): half this value changes the result by 4.9e-11, and twice this value by 1.0e-11.  Finer cells change
+it by 3.0e-02.
 """
 KEEP_WET = 0.01
-"""Value of `KEEP` in wet 2D scenes without yield.  Plateau (scene "beam" of tests/plateaus.py): half this value changes
-the result by 1.8e-11, twice this value by 2.9e-10, and finer cells by 1.5e-02.
+"""Value of `KEEP` in wet 2D scenes without yield.  Sensitivity (scene "beam" of tests/plateaus.py): half this value
+changes the result by 1.8e-11, and twice this value by 2.9e-10.  Finer cells change it by 1.5e-02.
 """
 
 

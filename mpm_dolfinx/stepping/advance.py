@@ -51,9 +51,9 @@ from mpm_dolfinx.stepping.state import State, Stay, Trend
 TAKES_IN = 0.1
 """Rate r of the correction of volume defects: a motion by n cells corrects the fraction 1 - exp(-r n) of the defect.
 
-The defect is the difference between the volume of a domain and the volume that its fluid content implies. Plateau
-(scene "beam" of tests/plateaus.py): half this value changes the result by 1.7e-03, twice this value by 2.8e-03, and
-finer cells by 1.5e-02.
+The defect is the difference between the volume of a domain and the volume that its fluid content implies. Sensitivity
+(scene "beam" of tests/plateaus.py): half this value changes the result by 1.7e-03, and twice this value by 2.8e-03.
+Finer cells change it by 1.5e-02.
 """
 
 
