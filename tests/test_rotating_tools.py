@@ -148,7 +148,7 @@ def test_a_box_tips_over_as_a_rigid_one_on_either_side_alike(tmp_path):
         ({"mass": 1.0, "centre": (0.6, 1.5)}, r"centre = \(0.6, 1.5\), must be the centroid"),
         (
             {"mass": 1.0, "moment": 1.0, "shape": mpm.HalfSpace((0, 1), (0, -1))},
-            "must be given with the centre",
+            "both must be given for this shape",
         ),
     ],
 )

@@ -35,7 +35,7 @@ class ConductingContacts(Feeding):
     """The contacts that conduct pore fluid in a stage.  `conducts`: for each contact name, whether it conducts."""
 
     title = "contacts that conduct"
-    varies = True  # the closed pairs change
+    varies = True  # because the set of closed pairs changes
 
     def __init__(self, conducts: Mapping[str, bool]):
         self._conducts = conducts
@@ -115,7 +115,7 @@ class ContactFeeds(Feeds):
     def begin(self, at: Conduction, fluid: Fluid, difference: NDArray[np.float64]) -> None:
         """Store, for each closed pair, the non-orthogonal correction of the pressure difference."""
         links = self._links
-        near, far = np.split(difference, [len(links.near.at)])  # as in `sides`
+        near, far = np.split(difference, [len(links.near.at)])  # in the order of `sides`
         self._correction = self._contact.pairs.place[links.closed], near - links.exchange.back(far)
 
     def _flows(self, flow: Conduction, fluid: Fluid) -> Flows:

@@ -84,7 +84,7 @@ class Contact:
 
 
 def groups_of(contacts: Sequence[Contact], count: int) -> list[tuple[int, ...]]:
-    """Return the groups, as tuples of body indices, in a scene of `count` bodies, sorted by smallest index."""
+    """Return the groups in a scene of `count` bodies, as tuples of body indices, sorted by smallest index."""
     pairs = [contact.groups(count) for contact in contacts]
     groups = sorted({group for pair in pairs for group in pair})
     for one, other in combinations(groups, 2):

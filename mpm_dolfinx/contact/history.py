@@ -45,7 +45,7 @@ class Origin:
     def means(
         self, contacts: Mapping[str, Rough], points: MaterialPoints, push: NDArray, shear: NDArray
     ) -> MaterialPoints:
-        """Return the points with mean pressures `push` and tractions `shear` of their contact pairs."""
+        """Return the points, with stored means of pressures `push` and tractions `shear` of their contact pairs."""
         push = self.exchange.back(push)
         shear = self.exchange.back(shear)
         data = dict(points.data)

@@ -163,7 +163,7 @@ class ContactLaw:
         trial = np.einsum("kij,kj->ki", P, old * on[:, None] - hold[:, None] * slip)
         size, ramp = np.maximum(np.linalg.norm(trial, axis=1), TINY), RAMP * pressure < adhesion
         most = mu * pressure + np.minimum(adhesion, RAMP * pressure)
-        onward = slips & (np.einsum("kd,kd->k", trial, state.slip) > 0)  # else the shear stays until the next update
+        onward = slips & (np.einsum("kd,kd->k", trial, state.slip) > 0)  # else t is constant until the next update
         along = np.where(onward[:, None], trial / size[:, None], state.slip)
         scale = hold * np.where(slips, onward * most / size, 1.0)
         grip = scale[:, None, None] * (P - along[:, :, None] * along[:, None, :])
@@ -231,7 +231,7 @@ class ContactLaw:
         return replace(state, slip=slip, resticks=resticks, parts=parts, stuck=stuck), changed
 
     def augmented(self, state: ContactState, touch: Touch, largest: Callable[[NDArray], NDArray]) -> ContactState:
-        """Augment lambda in the connected parts of the bodies with penetrations above `DEPTH`.  Return the new state.
+        """Augment lambda in connected parts of the bodies where penetrations exceed `DEPTH`.  Return the new state.
 
         `largest`: function that replaces each of k values by the largest value in its connected part.  More than
         `ROUNDS` augmentations raise NotConverged.

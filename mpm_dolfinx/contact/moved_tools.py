@@ -173,7 +173,7 @@ class MovedTools(ContactProblem):
         return np.hstack([force, moment[:, None][:, : self.grid.dim == 2]])
 
     def _motion(self, w: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the motions of tools at relative displacements w, by static condensation."""
+        """Return the motions of tools at relative displacements w of the pairs, by static condensation."""
         last, law = self.now.linear, self.now.law
         d = self.grid.dim
         dw = w - last.w
@@ -194,7 +194,7 @@ class MovedTools(ContactProblem):
         return np.clip((motion * e).sum(axis=1, keepdims=True), -h, h) * e
 
     def _bearing_displacement(self, found: Found) -> NDArray[np.float64]:
-        """Return for each tool (k,) the displacement, in m, at which the first pair bears the load, or infinity."""
+        """Return the displacement of each tool (k,), in m, at which a pair first bears its load, or infinity."""
         law, state = self.now.law, self.now.state
         of = self.pairs.number
         along = (found.at.n * self._moved.direction[of, : self.grid.dim]).sum(axis=1)
@@ -227,7 +227,7 @@ class MovedTools(ContactProblem):
         S = guides @ S + inertia[:, None] * np.eye(len(motions))
         whole = np.trace(S, axis1=1, axis2=2)
         bears = inertia.any(axis=1) | (whole > 0)
-        S = S + np.abs(whole)[:, None, None] * (np.eye(len(motions)) - guides)  # regular beside the guides
+        S = S + np.abs(whole)[:, None, None] * (np.eye(len(motions)) - guides)  # regular where the tool is guided
         inverse = np.zeros_like(S)
         inverse[bears] = guides[bears] @ np.linalg.inv(S[bears])
         off = self._forces - inertial - np.einsum("kij,kj->ki", guides, sums[:, :, 0])

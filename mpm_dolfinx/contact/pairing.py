@@ -40,7 +40,7 @@ REACH = 2.0
 DEEP = 0.25
 """Largest penetration at which a pair is found, and smallest gap at which it may be dropped, in cell sizes."""
 BESIDE = 0.6
-"""Distance from another group, in cell sizes, below which domain corners move with the Q1 field, without corrections.
+"""Distance from another group, in cell sizes, below which domain corners move without the correction of `bending`.
 Sensitivity (scene "contact" of tests/plateaus.py): half this value changes the result by 1.1e-03, and twice this value
 by 6.3e-04. Finer cells change it by 1.1e-02.
 """
@@ -52,8 +52,8 @@ class Facets(NamedTuple):
     """Quadrature points of all processes on the faces of one group."""
 
     x: NDArray[np.float64]  # position (n, d), m
-    face: NDArray[np.int64]  # row of the face in its `Surface` (n,)
-    cell: NDArray[np.int64]  # lexicographic cell (n,)
+    face: NDArray[np.int64]  # index of the face in its `Surface` (n,)
+    cell: NDArray[np.int64]  # lexicographic index of the cell (n,)
     stiffness: NDArray[np.float64]  # modulus and density (n, 2), see `Touching._stiffness`
     corners: NDArray[np.float64]  # current corners of the face (n, 2^(d-1), d), m
     cut: NDArray[np.float64]  # corners of the face at the last grid reset (n, 2^(d-1), d), m
@@ -66,7 +66,7 @@ class Pairs(NamedTuple):
     row: NDArray[np.int64]  # index of the point among the quadrature points of this process (m,)
     facet: NDArray[np.int64]  # index in `Facets` of a point on the opposite face (m,)
     t: NDArray[np.float64]  # coordinates of the opposite position on its face, in [0, 1] (m, 2)
-    gap: NDArray[np.float64]  # distance along the normal at the point (m,), m
+    gap: NDArray[np.float64]  # distance to the opposite position, along the normal at the point (m,), m
 
 
 class Contacts(Touching):
@@ -79,7 +79,7 @@ class Contacts(Touching):
         sides, self.contacts = setting.sides, tuple(contacts.values())
         self.conducts = any(contact.conducts for contact in self.contacts)
         self._rank = _ranks(setting)
-        self._faces: list[tuple[int, Surface, Surface, int]] = []  # contact, own and opposite faces, sign of forces
+        self._faces: list[tuple[int, Surface, Surface, int]] = []  # index of contact, own faces, opposite faces, sign
         for number, contact in enumerate(self.contacts):
             both = [sides.around(group) for group in contact.groups(len(sides.bodies))]
             for sign, (own, other) in ((1, both), (-1, both[::-1])):
@@ -110,7 +110,7 @@ class Contacts(Touching):
         present: MaterialPoints,
         cell_pairs: Callable[[], NDArray[np.int64]],
     ) -> tuple[ContactLaw, Origin]:
-        """Return the contact law and the material points of its pairs.  `found`: pairs of the points `seen`."""
+        """Return the contact law and the material points of its pairs.  `found`: facets and pairs for points `seen`."""
         grid = self.grid
         d = self.grid.dim
         rows = []
@@ -164,7 +164,7 @@ class Contacts(Touching):
         return [self._opposite(cut, own, other, points) for _, own, other, _ in self._faces]
 
     def _cells_within_reach(self, cut: CutDomains, found: Sequence[tuple[Facets, Pairs]]) -> NDArray[np.int64]:
-        """Return the pairs of cells that may be in contact in the step, as `first * grid.all_cells + second`."""
+        """Return numbers `first * grid.all_cells + second` of the pairs of cells that may be in contact in the step."""
         grid = self.grid
         keys = []
         count = self.grid.all_cells
@@ -203,7 +203,7 @@ class Contacts(Touching):
     def _opposite(
         self, cut: CutDomains, faces: Surface, others: Surface, points: MaterialPoints
     ) -> tuple[Facets, Pairs]:
-        """Return the facets of `others`, and the pairs of points on `faces` with opposite positions on `others`."""
+        """Return the facets of `others`, and the pairs: a point on `faces`, and the opposite position on `others`."""
         patches = cut.surface(faces)
         facets = self._facets(cut, others, points)
         d = self.grid.dim
@@ -229,7 +229,7 @@ class Contacts(Touching):
         return facets, Pairs(row[order], other[order], t[order], gap[order])
 
     def _under(self, facets: Facets, chosen: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return, for positions x on the chosen facets, the cells on the inner side of the surface."""
+        """Return the cell below the surface at each position x, which lies on the facet `chosen`."""
         grid, inside = self.grid, x - NEAR * self.grid.least * facets.outward[chosen]
         number = grid.number(grid.index_from_base(inside)) + facets.cell[chosen] // grid.cells * grid.cells
         keys = np.unique(facets.face * grid.all_cells + facets.cell)
@@ -311,7 +311,7 @@ class ContactLoads(ContactProblem):
 
 
 def _ranks(setting: Setting) -> NDArray[np.int64]:
-    """Return for each point the index of its connected part in a list of all parts, sorted by surface and extent."""
+    """Return the index of the connected part of each point.  Parts are sorted by surface area and extent."""
     grid, bodies = setting.grid, setting.sides.bodies
     corners = np.concatenate([body.corners() for body in bodies])
     copy = np.asarray(grid.copy(np.arange(len(corners))))
@@ -342,7 +342,7 @@ def _on(corners: NDArray[np.float64], t: NDArray[np.float64]) -> NDArray[np.floa
 
 def _along(corners: NDArray, x: NDArray, n: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Intersect lines from x along n with faces.  Return face coordinates, and distances from x in m."""
-    if corners.shape[2] == 2:  # as in `Faces`, with unit width along a third axis
+    if corners.shape[2] == 2:  # as in `Faces`, 2D faces have the width 1 along a third axis
         corners = np.dstack([corners[:, BITS[:, 0]], np.broadcast_to(BITS[:, 1], (len(x), 4))])
         x, n = np.column_stack([x, np.full(len(x), 0.5)]), np.column_stack([n, np.zeros(len(x))])
     off = np.einsum("mkd,md->mk", corners - x[:, None], n)

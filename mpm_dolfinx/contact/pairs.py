@@ -124,9 +124,9 @@ class ToolPairs(Pairs):
 
 @dataclass(frozen=True, eq=False)
 class FacePairs(Pairs):
-    """Contact pairs between two groups: a point on one group, and the position on the other group along the normal."""
+    """Contact pairs of a point on one group, and a position on another group, along the normal at the point."""
 
-    other: NDArray[np.int64]  # lexicographic cell of the other side (m,)
+    other: NDArray[np.int64]  # lexicographic index of the opposite cell (m,)
     y: NDArray[np.float64]  # opposite position in the undeformed grid (m, d), m
     n: NDArray[np.float64]  # outward unit normal of the other side at y (m, d)
     offset: NDArray[np.float64]  # vector from y to the point, without the displacement in the step (m, d), m
@@ -150,14 +150,14 @@ class FacePairs(Pairs):
 
 
 def shape_values_in(grid: Grid, cells: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the Q1 shape functions (m, 2^d) of lexicographic cells (m,) at positions x (m, d), in m."""
+    """Return the Q1 shape functions (m, 2^d) of cells (m,), by lexicographic index, at positions x (m, d), in m."""
     index = np.stack(np.unravel_index(cells % grid.cells, tuple(grid.shape)), axis=1)
     off = grid.in_cells(x) - index - 0.5
     return np.prod(0.5 + off[:, None] * grid.signs, axis=2)
 
 
 def on_owners(grid: Grid, cells: NDArray[np.int64]) -> NDArray[np.int32]:
-    """Send lexicographic cells to the processes that own them, and return their local indices there."""
+    """Send lexicographic indices of cells to the processes that own the cells.  Return the local indices there."""
     return grid.locals[Exchange(grid.comm, grid.owner(cells)).send(cells)]
 
 
@@ -170,8 +170,8 @@ def at_nodes(
 ) -> PETSc.Mat:
     """Return the matrix that maps the unknowns to weighted sums (m d,) of nodal displacements.
 
-    `value` (m, 2^d): weights at the nodes of the local cells `cell` (m,).  If lexicographic cells `other` (m,) are
-    given, `value` (m, 2 * 2^d) also has weights at the nodes of these cells.
+    `value` (m, 2^d): weights at the nodes of the local cells `cell` (m,).  If `other` (m,), lexicographic indices of
+    cells, is given, `value` (m, 2 * 2^d) also has weights at the nodes of these cells.
     """
     d = grid.dim
     numbers = unknowns.map.indices.reshape(-1, d)
@@ -191,9 +191,9 @@ def at_nodes(
 def between_cells(unknowns: Unknowns, grid: Grid, pairs: NDArray[np.int64], slopes: NDArray[np.float64]) -> PETSc.Mat:
     """Return the derivative of the outflow of cells with respect to cell pressures.
 
-    `pairs` (m, 2): lexicographic cells.  Fluid flows from the first to the second cell of each pair.
-    `slopes` (2, m), m^d/(Pa s): derivative of the flow with respect to the first pressure, and minus the derivative
-    with respect to the second pressure.
+    `pairs` (m, 2): lexicographic indices of cells.  Fluid flows from the first to the second cell of each pair.
+    `slopes` (2, m), m^d/(Pa s): derivative of the flow with respect to the pressure of the first cell, and minus the
+    derivative with respect to the pressure of the second cell.
     """
     (one, other), (own, far) = pairs.T, slopes
     rows, columns = np.concatenate([one, one, other, other]), np.concatenate([one, other, one, other])

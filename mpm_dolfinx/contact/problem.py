@@ -48,7 +48,7 @@ class Current(NamedTuple):
     law: ContactLaw
     origin: Origin
     state: ContactState
-    linear: Found | None = None  # contact at which the motion of tools is linearised
+    linear: Found | None = None  # geometry and forces at which the motion of tools is linearised
 
 
 class SubstepMotion(NamedTuple):
@@ -93,11 +93,11 @@ class ContactProblem(Loads):
     Parameters
     ----------
     law, origin
-        Contact law at the start of the step, and the material points of its pairs.
+        Contact law at the start of the step (`law`), and the material points of its pairs (`origin`).
     again
-        Function that returns `law` and `origin` for the pairs at given nodal displacements (local array, in m).
+        Function that finds the pairs at nodal displacements (local array, in m), and returns `law` and `origin`.
     cell_pairs
-        Function that returns all pairs of cells between which contact is possible: `first * grid.all_cells + second`.
+        Function that returns numbers `first * grid.all_cells + second` of all pairs of cells that may be in contact.
     """
 
     linear, smooth, touches = False, False, True
@@ -129,7 +129,7 @@ class ContactProblem(Loads):
 
     @property
     def still(self) -> NDArray[np.float64]:
-        """Zero motions (k, q) of tools, as without forces.  Between groups there are no tools, so q = 0."""
+        """Motions (k, q) of tools without forces, which are zero.  Between groups there are no tools, so q = 0."""
         return np.zeros((len(self.now.law.contacts), 0))
 
     def found(self, at: At) -> Found:
@@ -164,7 +164,7 @@ class ContactProblem(Loads):
         return Found(w, at, touch, motion, touch.force)
 
     def _motion(self, w: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the motions (k, q) of tools due to forces at relative displacements w."""
+        """Return the motions (k, q) of tools that the contact forces cause at relative displacements w of the pairs."""
         return self.still
 
     def closed(self, at: At) -> NDArray[np.bool_]:
@@ -257,7 +257,7 @@ class ContactProblem(Loads):
         return bool(late.any())
 
     def _continued(self, new: Current, at: At) -> tuple[Current, NDArray[np.bool_]]:
-        """Return the contact with updated pairs, and which connected parts have gap changes above `DEPTH` cells."""
+        """Return the contact with updated pairs, and flags of connected parts with gap changes above `DEPTH` cells."""
         found = self.found(at)
         law, state = self.now.law, self.now.state
         pairs = new.law.pairs
@@ -303,13 +303,13 @@ class ContactProblem(Loads):
         return -float((shear * (moves - tool)).sum()), more
 
     def tool_velocity(self, at: At) -> NDArray[np.float64] | float:
-        """Return the velocities (m, d), in m/s, of contact positions on tools, or zero between groups."""
+        """Return the velocities (m, d), in m/s, of contact positions on tools.  Between groups, they are zero."""
         return 0.0
 
     def outcome(self, at: At) -> dict[str, dict[str, NDArray[np.float64]]]:
         """See `Loads`.  Each contact has an array of forces (N) and moments (N m) on bodies: (3,) in 2D, (6,) in 3D."""
         found, where = self.found(at), self.found(at).at
-        if self.pairs.other_side() is not None:  # arms to present positions: moments of a body at rest sum to zero
+        if self.pairs.other_side() is not None:  # lever arms at present: moments of a body at rest sum to zero
             where = where._replace(arm=where.arm + self.grid.at(self.pairs.cell, self.pairs.x, at.nodal))
         return {"tool_forces": dict(zip(self.now.law.names, self.now.law.forces(found.touch, where), strict=True))}
 
@@ -336,14 +336,14 @@ class ContactProblem(Loads):
 
     @property
     def rounding_beside(self) -> float:
-        """Largest rounding error, in N, of contact forces in the cells with the opposite positions."""
+        """Largest rounding error, in N, of contact forces in the cells that contain opposite positions."""
         if self.pairs.other_side() is None:
             return 0.0
         return over_all(self.grid.comm, float(self.now.law.rounding(self.now.state).max(initial=0.0)), MPI.MAX)
 
 
 def _merged(both: Sequence[Any], kept: Sequence[NDArray[np.bool_]], order: NDArray[np.int64]) -> Any:
-    """Merge the entries of two `Pairs`, or of two `ContactState`, that `kept` flags, and sort them by `order`."""
+    """Merge two `Pairs`, or two `ContactState`: the entries that `kept` flags, sorted by `order`."""
     names = (f.name for f in fields(both[1]) if f.name != "grid")
     columns = {name: [getattr(of, name)[rows] for of, rows in zip(both, kept, strict=True)] for name in names}
     return replace(both[1], **{name: np.concatenate(rows)[order] for name, rows in columns.items()})

@@ -17,7 +17,7 @@ from mpm_dolfinx.base.validation import asked, line, numbers
 
 ROUNDED = SAME  # penetration, divided by the cell size, below which a position lies on the surface
 DISTANCE = 0.1
-"""Largest deviation from 1 of the slope of a user's distance function."""
+"""Largest allowed difference between 1 and the slope of a user's distance function."""
 
 
 DistanceField = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
@@ -282,7 +282,7 @@ class Distance:
 
     def _at(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the signed distances, in m, at positions y in the user's coordinates."""
-        if not len(y):  # user functions may fail for no positions
+        if not len(y):  # a user's function may fail for an empty array
             return np.zeros(0)
         allowed = f"a finite number for each of {len(y)} places (m, {y.shape[1]})"
         value = asked("Tool: shape", allowed, self.function, y)

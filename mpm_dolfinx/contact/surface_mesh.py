@@ -57,12 +57,12 @@ class Facets:
         self.area = size / factorial(d - 1)
         longest = np.linalg.norm(along, axis=2).max(axis=1)
         self.height = size / np.maximum(longest ** (d - 2), TINY)
-        """Length of a segment, or smallest height of a triangle, in m (n,)."""
+        """Length of each segment, or smallest height of each triangle (n,), in m."""
         self.normal /= np.maximum(size, TINY)[:, None]
         out = np.cross(along, self.normal[:, None]) if d == 3 else -along
         self.along = along * (d == 3)
         columns = [self.corners, out / np.maximum(np.linalg.norm(out, axis=2, keepdims=True), TINY), self.along]
-        self._columns = [np.ascontiguousarray(of.transpose(1, 2, 0)) for of in columns]  # side, component, facet
+        self._columns = [np.ascontiguousarray(of.transpose(1, 2, 0)) for of in columns]  # axes: side, component, facet
         self._normal = np.ascontiguousarray(self.normal.T)
         self._margin = ROUND_OFF * np.abs(x).max()
         self.rounded = ROUNDED * np.ptp(x, axis=0).max()
@@ -84,7 +84,7 @@ class Facets:
         return ((y - self._columns[0][0].take(at, 1)) * self._normal.take(at, 1)).sum(axis=0)
 
     def _from_sides(self, y: NDArray[np.float64], at: NDArray[np.int64]) -> tuple[NDArray, NDArray]:
-        """Return, for each side, its nearest point to y: coordinate from 0 to 1 (d, m), and vector to y (d, d, m)."""
+        """Return the nearest points to y on the sides: coordinates from 0 to 1 (d, m), and vectors to y (d, d, m)."""
         corners, _, along = (of.take(at, 2) for of in self._columns)
         offset = y - corners
         share = np.clip((offset * along).sum(axis=1) / self._squares.take(at, 1), 0, 1)
@@ -98,7 +98,7 @@ class Facets:
         return out
 
     def nearest(self, y: NDArray[np.float64]) -> Nearest:
-        """Return the nearest positions on the surface, for positions y (m, d)."""
+        """Return the position on the surface that is nearest to each position y (m, d)."""
         parts = [self._nearest(y[start : start + AT_ONCE].T) for start in range(0, max(len(y), 1), AT_ONCE)]
         return Nearest(*map(np.concatenate, zip(*parts, strict=True)))
 
@@ -119,7 +119,7 @@ class Facets:
         return Nearest(facet, part, offset.T)
 
     def part_at(self, y: NDArray[np.float64], at: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the part of its facet (m,), see `Nearest`, on which each position y (m, d) lies."""
+        """Return the part (m,) of the facet `at` on which each position y (m, d) lies, numbered as in `Nearest`."""
         d, rows = y.shape[1], np.arange(len(at))
         to_corners = np.linalg.norm(y[:, None] - self.corners[at], axis=2)
         vectors = self._from_sides(np.ascontiguousarray(y.T), at)[1]
@@ -337,7 +337,7 @@ class SurfaceMesh(Placed):
 
 
 def _merged(x: NDArray[np.float64], facets: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Merge coincident vertices.  Return the vertices, and the facets that still have different vertices."""
+    """Merge coincident vertices.  Return the vertices, and the facets without a repeated vertex."""
     used, facets = np.unique(facets, return_inverse=True)
     x, same = np.unique(x[used], axis=0, return_inverse=True)
     facets = same.ravel()[facets.reshape(-1, x.shape[1])]
@@ -393,7 +393,7 @@ def _outward(x: NDArray[np.float64], facets: NDArray[np.int64], pairs: tuple[NDA
     (one, other), agree = pairs[0].T, pairs[1]
     m = len(facets)
     part, number = linked(m, one, other)
-    turn = np.where(agree, 0, m)  # facets m to 2 m are turned
+    turn = np.where(agree, 0, m)  # indices m to 2 m: facets with reversed orientation
     sheet, sheets = linked(2 * m, np.append(one, one + m), np.append(other + turn, other + m - turn))
     if sheets != 2 * number:
         raise ValueError("SurfaceMesh: the surface has one side only, must have an inside and an outside")

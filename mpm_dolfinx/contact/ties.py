@@ -58,7 +58,7 @@ class Ties(Acting):
     Parameters
     ----------
     setting, ties
-        `Setting` of the stage, and the tied sides by name.
+        Data of the stage (`setting`), and the tied sides by name (`ties`).
 
     Raises
     ------
@@ -113,7 +113,7 @@ class TieLoads(Loads):
     x : (m, d), m
         Positions on this side.
     other : (m,)
-        Lexicographic cells that contain the opposite positions; other processes may own them.
+        Lexicographic indices of the cells that contain the opposite positions; other processes may own these cells.
     y : (m, d), m
         Opposite positions on the other side.
     stiffness : (m,), N/m
@@ -153,7 +153,7 @@ class TieLoads(Loads):
 
     @property
     def held_cells(self) -> NDArray[np.int32]:
-        """Cells along both tied sides."""
+        """Cells that contain positions on the tied sides."""
         cell, other = self._cells
         return np.append(cell, on_owners(self._grid, other))
 

@@ -16,7 +16,7 @@ from mpm_dolfinx.contact.shapes import ROUNDED, Ball, Convex, Distance, Placed, 
 from mpm_dolfinx.contact.surface_mesh import SurfaceMesh
 from mpm_dolfinx.grid.grid import Grid
 
-AS_CELL = [0, 1, 2, 2, 0, 1, 2, 2]  # corners of a triangle at the corners of a flat cell
+AS_CELL = [0, 1, 2, 2, 0, 1, 2, 2]  # triangle corner at each corner of a flat cell
 
 
 class Pose(NamedTuple):
@@ -124,7 +124,7 @@ class Tool:
     _moved: ClassVar[Shape | None] = None
 
     def __repr__(self) -> str:
-        """Return the constructor's call without defaults, for messages."""
+        """Return the call of the constructor, for messages.  Arguments equal to their defaults are left out."""
         given = [f"{f.name}={getattr(self, f.name)!r}" for f in fields(self) if getattr(self, f.name) is not f.default]
         return f"Tool({', '.join(given)})"
 
@@ -220,7 +220,7 @@ class Tool:
             return np.zeros(dim)
         along = unit_vector("Tool: direction", self.direction)
         if len(along) != dim:
-            raise ValueError(f"Tool: direction = {line(self.direction)}, must have {dim} components as the grid")
+            raise ValueError(f"Tool: direction = {line(self.direction)}, must have {dim} components in a {dim}D grid")
         return along
 
     def on(self, grid: Grid) -> Tool:
@@ -251,7 +251,7 @@ class Tool:
         """Raise an error for a tool of the wrong dimension, or with an invalid initial motion."""
         of = dim if callable(self.shape) else self.shape.dim
         if of != dim:
-            raise ValueError(f"{line(self)}: the shape is in {of}D, must be in {dim}D as the grid")
+            raise ValueError(f"{line(self)}: the shape is in {of}D, must be in {dim}D like the grid")
         if dim == 3 and (callable(self.rotation_rad) or self.rotation_rad):
             raise ValueError(f"Tool: rotation_rad = {line(self.rotation_rad)}, must be 0 in 3D")
         for name in ("displacement", "rotation_rad"):  # values of functions are checked when they are used
@@ -272,7 +272,7 @@ class Tool:
         if not rotates:
             return
         if self.centre is None and of is None:
-            raise ValueError(f"Tool: moment = {line(self.moment)}, must be given with the centre of this shape")
+            raise ValueError(f"Tool: moment = {line(self.moment)}, centre = None: both must be given for this shape")
         if self.moment is None:
             off, size = self._centre(dim) + self._base - of.centroid, np.sqrt(of.gyration)
             if np.linalg.norm(off) > ROUNDED * (size + np.linalg.norm(of.centroid)):

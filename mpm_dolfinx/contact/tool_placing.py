@@ -30,7 +30,7 @@ from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
 from mpm_dolfinx.points.material_points import MaterialPoints, middle
 
 NEAR = 0.1
-"""Distance from a tool, in cell sizes, below which domain corners move with the Q1 field, without corrections.
+"""Distance from a tool, in cell sizes, below which domain corners move without the correction of `bending`.
 Sensitivity (scene "tool" of tests/plateaus.py): half this value changes the result by 4.1e-03, and twice this value by
 1.5e-03. Finer cells change it by 7.1e-02."""
 FACING = 0.5  # smallest cosine between the normal of a face that faces the tool and the direction to the tool
@@ -47,7 +47,7 @@ def motion_count(dim: int) -> int:
 
 
 class LoadMotion(NamedTuple):
-    """Displacements and rotations of tools due to forces, at the start and the end of a step."""
+    """Displacements and rotations of tools that forces cause, at the start and the end of a step."""
 
     start: float  # start of the step, s
     end: float  # end of the step, s
@@ -83,7 +83,7 @@ class Tools(Touching):
             if grid.axisymmetric and tool.free and (tool.spin or np.isfinite(tool.moment or np.inf)):
                 raise ValueError(f"{line(tool)}: spin and moment must be left out in axisymmetry")
             if grid.axisymmetric and getattr(tool.shape, "on_axis", False):
-                raise ValueError(f"{line(tool)}: a side lies on the axis, must extend over both sides of it")
+                raise ValueError(f"{line(tool)}: a side lies on the axis, the tool must extend over the axis")
             if not callable(tool.displacement) and not callable(tool.rotation_rad):
                 self._pose(tool, 0.0)
         self.tools = tuple(tool.on(grid) for tool in self.tools)
@@ -108,7 +108,7 @@ class Tools(Touching):
         return self._pose(self.tools[number], t)
 
     def _posed(self, tool: Tool, start: float, t: float) -> Pose:
-        """Return the pose of a tool at the end of a substep; with inertia, velocities have second-order accuracy."""
+        """Return the pose of a tool at the end of a substep.  With inertia, the first substep uses `in_step`."""
         pose = self._pose(tool, t)
         if self._end is None or not start < t < self._end or tool.free:
             return pose
@@ -143,11 +143,11 @@ class Tools(Touching):
         return out | {quantity: values for quantity, values in of_free.items() if values}
 
     def _before(self, place: Place) -> NDArray[np.float64]:
-        """Return the displacements and rotations of tools due to forces before a step."""
+        """Return the displacements and rotations of tools that forces have caused before a step."""
         return self._motions(place.before, "tool_travel", "tool_rotation")
 
     def _motions(self, before: Outcome, along: str, around: str) -> NDArray[np.float64]:
-        """Return two results of a step, such as displacement and rotation, or their rates, for all tools (tools, q)."""
+        """Return the results `along` (such as displacements) and `around` (rotations) of all tools (tools, q)."""
         d = self.grid.dim
         out = np.zeros((len(self.tools), motion_count(d)))
         for row, name, tool in zip(out, self.names, self.tools, strict=True):
@@ -164,7 +164,7 @@ class Tools(Touching):
         return MovedToolLoads(tools, place, moved=moved) if moved.guides.any() else ToolLoads(tools, place)
 
     def _moved(self, place: Place) -> Moved:
-        """Return masses, motions and loads of tools that forces move; none while an initial stress is balanced."""
+        """Return mass, motion and load of tools that forces move.  None moves while an initial stress is balanced."""
         d, q = self.grid.dim, motion_count(self.grid.dim)
         of = [tool for tool in self.tools if tool.free or (tool.load is not None and place.t > place.start)]
         moves = [tool in of and tool.free == place.inertia for tool in self.tools]
@@ -251,14 +251,14 @@ class Tools(Touching):
         return edge if over_all(grid.comm, int((~edge).sum())) else np.zeros_like(edge)
 
     def _warn_light(self, place: Place) -> None:
-        """Warn of free tools that are lighter than half a cell of the body."""
+        """Warn of free tools whose mass is less than the mass of soil in half a cell."""
         free = [tool for tool in self.tools if tool.free]
         if not (free and place.inertia and place.dt):
             return
         grid = self.grid
         dense = float(self._materials.present_density(place.points).max(initial=0.0))
         half = over_all(grid.comm, dense, MPI.MAX) * grid.least**grid.dim / 2
-        half *= np.pi * grid.least if grid.axisymmetric else 1.0  # the first ring about the axis
+        half *= np.pi * grid.least if grid.axisymmetric else 1.0  # half of the first ring of cells about the axis
         for tool in free:
             if tool.mass < half:
                 what = "%s: its mass is less than that of half a cell, %.3g kg, so its rebound depends on the step in "
@@ -291,7 +291,7 @@ class Tools(Touching):
             corners = points.corners[self._gaps(tool, points.corners, t).min(axis=1) < -MISFIT * self.grid.least]
             deep, where = self._deepest(tool, x, t)
             held, at_middle = self._deepest(tool, middle(corners), t)
-            if deep > NEAR or held > 0:  # a round tool contains the middles, but not the corners, of stretched domains
+            if deep > NEAR or held > 0:  # a round tool may contain the middle of a long domain, but no corner
                 where = where if deep > NEAR else at_middle
                 raise NotConverged(f"{line(tool)}: has passed through the surface, to {where}; renewal may help")
             if where := self._passed(tool, (start, x), (place.start, t)):
@@ -309,8 +309,8 @@ class Tools(Touching):
     ) -> NDArray[np.float64]:
         """Return the corners (n, 2^d, d) of domains at time t (s), after a correction of penetrations into tools.
 
-        The correction reduces penetrations of at most `most` cell sizes to twice `DEPTH` cell sizes.  Only the
-        components flagged by `free` (n, 2^d, d) change.
+        Penetrations of less than `most` cell sizes are reduced to 2 `DEPTH` cell sizes.  Deeper penetrations do not
+        change.  Only the components flagged by `free` (n, 2^d, d) change.
         """
         out, h = corners.copy(), self.grid.least
         for tool in self.tools:
@@ -329,7 +329,7 @@ class Tools(Touching):
         return gap.reshape(corners.shape[:2])
 
     def _passed(self, tool: Tool, x: tuple[NDArray[np.float64], ...], times: tuple[float, ...]) -> str:
-        """Return, as text, a position at which the path from x[0] to x[1] crosses a tool, or "" without a crossing.
+        """Return a position, as text, where the path from x[0] to x[1] crosses a tool, or "" without a crossing.
 
         Source: Hart (1996), for sphere tracing.
         """
@@ -341,7 +341,7 @@ class Tools(Touching):
         along = (end - y) / np.maximum(length, TINY)[:, None]
         inside = together(self.grid.comm, lambda: (tool.gap(y, h) < 0) | (tool.gap(end, h) < 0))
         a, b = together(self.grid.comm, lambda: (tool.solid(h).normal(y[inside]), tool.solid(h).normal(end[inside])))
-        crossed = x[1][inside][np.einsum("nd,nd->n", a, b) < 0][:1]  # inside, and the nearest side has changed
+        crossed = x[1][inside][np.einsum("nd,nd->n", a, b) < 0][:1]  # inside, and the nearest side of the tool changes
         if where := first(comm, "".join(np.array2string(place, precision=6) for place in crossed + self.grid.base)):
             return where
         on = on[~inside]
@@ -373,7 +373,7 @@ class ToolLoads(ContactProblem):
         super().__init__(*tools.contact(place))
         self._tools, self._place = tools, place
         self.before = tools.by_loads.before
-        """Motions (k, q), in m and rad, of the tools due to forces before the step."""
+        """Motions (k, q) of the tools, in m and rad, that forces have caused before the step."""
         self.shares, self._earlier = Shares(np.inf, 0.0, None), None
 
     @property
