@@ -52,7 +52,7 @@ class Found(NamedTuple):
     number: int  # index of the function in `until`
     dt: float  # time from the start of the step, s
     new: State  # state at the event
-    report: Report  # report of the step to the event
+    report: Report  # report of the step that ends at the event
 
 
 class Events:

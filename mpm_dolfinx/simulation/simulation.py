@@ -172,7 +172,7 @@ class Simulation:
     def state(self, state: State) -> None:
         materials = state.stage.materials if isinstance(state, State) else None
         if materials is not self.scene.materials and materials in self.scene.former:
-            state = self.scene.adopted(state)  # stored before the cells were distributed anew
+            state = self.scene.adopted(state)  # a state from before the cells were distributed anew
         self._state = state
 
     @property
@@ -236,7 +236,7 @@ class Simulation:
 
     @property
     def tool_travel(self) -> ByName[NDArray[np.float64]]:
-        """Displacement of each `Tool` under its load, by name, in m.  Prescribed displacements are not included."""
+        """Displacement of each `Tool` due to its load, by name, in m.  Prescribed displacements are not included."""
         return self.outcome("tool_travel")
 
     def outcome(self, quantity: str) -> ByName[NDArray[np.float64]]:

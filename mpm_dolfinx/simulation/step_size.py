@@ -24,14 +24,14 @@ from mpm_dolfinx.stepping.scene import Scene
 from mpm_dolfinx.stepping.state import StepControl
 
 MIN_CUT, MIN_CUT_BY_ERROR = 2.0**-10, 2.0**-30
-"""Shortest length of equal steps, and shortest length of adaptive steps, divided by the nominal length of a step.
+"""Shortest length of a step, divided by its nominal length: first for equal steps, then for adaptive steps.
 
 Adaptive steps may have grown by several powers of ten before a slide begins, and must then shrink again.
 """
 FINEST = NEAR**2
 """Length of the shortest adaptive step, divided by the present time.
 
-Source: epsilon; shorter steps change only the last four digits of the time.
+Source: machine epsilon; shorter steps change only the last four digits of the time.
 """
 SAFETY, SHRINKS, GROWS, KEEPS = 0.9, 0.2, 5.0, 1.2
 """Constants for the ratio of the lengths of an adaptive step and the previous step.
@@ -144,7 +144,7 @@ class StepSize:
             return max(control.small, min(2 * size, self.longest)) if grows else control.small
         factor = self._factor(report, control, 0.5)
         if factor >= 1:
-            # a step as long as a failed step mostly fails again: in yielding soil 78 reductions, in place of 1
+            # a step as long as a failed step mostly fails again, in a test in yielding soil 78 times instead of once
             factor = 1.0 if factor < KEEPS or failed or not report.easy else factor
             return min(max(size * factor, control.small), self.longest)  # an output time may have shortened the step
         return size * factor

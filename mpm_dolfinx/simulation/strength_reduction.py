@@ -5,8 +5,8 @@ Trials with different factors give bounds of this number.  The factor divides co
 tangents of the angles of friction and dilation (Griffiths and Lane 1999).  Failure of Newton's method is no criterion,
 because it may also fail in soil that is strong enough.  Instead, a trial adds a viscous stress to the soil, and
 computes the motion in time.  The criterion is the overload, the ratio of the viscous stress to the shear stress.  If
-the soil is strong enough, the bodies come to rest, and the overload vanishes.  In a slide, the overload remains.  It
-then equals the missing strength divided by the present strength, for any viscosity and cell size.
+the soil is strong enough, the bodies come to rest, and the overload vanishes.  In a slide, the overload approaches the
+missing strength divided by the present strength, for any viscosity and cell size.
 
 All trials start after one step with soil that cannot yield.  In this step, bodies in equilibrium keep their stresses.
 Bodies that are not in equilibrium get elastic stresses.
@@ -53,7 +53,7 @@ Sensitivity (scene "safety" of tests/plateaus.py): half this value changes the r
 by 5.4e-03. Finer cells change it by 4.2e-02.
 """
 STRAINS = 4.0
-"""Total strain of a trial that barely slides, divided by the smaller of the overload and the elastic strain at yield.
+"""Total strain of a trial that barely slides, divided by its overload or the elastic strain at yield, if smaller.
 
 Twice the number of steps changes the factor of safety of a slope by less than 0.1 %.  Sensitivity (scene "safety" of
 tests/plateaus.py): half this value changes the result by 1.1e-02, and twice this value by 1.1e-02.  Finer cells change
@@ -189,8 +189,8 @@ def _bracket(rests: Callable[[float], bool]) -> tuple[float, float]:
 def _ends(overloads: Sequence[float], steps: int, least: float) -> bool:
     """Return whether the overloads of the first steps already determine the result of a trial.
 
-    The overload decreases more and more slowly.  The bodies slide if the overload, at its present rate of decrease,
-    does not vanish in the remaining steps.
+    The bodies slide if the overload, at its present rate of decrease, does not vanish in the remaining steps.  This is
+    certain, because the rate of decrease only becomes smaller.
     """
     *before, last = overloads
     rate = min(1.0, last / before[-1]) if before else 0.0
@@ -256,7 +256,7 @@ class _Weakened:
         self._viscosity.value = steps / STRAINS * max(least * modulus, stress) * dt
 
     def overloads(self, factor: float, tell: Callable[[int, float], None]) -> NDArray[np.float64]:
-        """Return the overloads in the steps of a trial.  `tell`: called with step number and overload."""
+        """Return the overloads in the steps of a trial.  `tell`: function of step number and overload."""
         trial, out = self._trial(self._start, lambda name, value: _over(name, value, factor)), []
         while len(out) < self._steps and not (out and _ends(out, self._steps, self._least)):
             before = trial.state.points
@@ -273,7 +273,7 @@ class _Weakened:
         return replace(trial.state, t=initial.t)
 
     def _trial(self, start: State, strength: Callable[[str, NDArray[np.float64]], NDArray[np.float64]]) -> _Trial:
-        """Return a trial that starts from a state.  `strength`: returns a strength from name and full value."""
+        """Return a trial that starts from a state.  `strength`: function of a name and a full strength."""
         data = {name: strength(name, value) for name, value in self._strengths.items()}
         points = replace(start.points, data={**start.points.data, **data})
         return _Trial(self._scene, replace(start, points=points, velocity=None, result=None, control=None), self.newton)
@@ -351,7 +351,7 @@ def _constant(X: NDArray[np.float64], value: float) -> NDArray[np.float64]:
 
 
 def _strengths(scene: Scene, points: MaterialPoints) -> dict[str, NDArray[np.float64]]:
-    """Return for the name of each strength its values at the points, or zeros in materials without this strength."""
+    """Return the values of strengths at the points, by name.  Materials without a strength have zeros."""
     out = {}
     for i, m in enumerate(scene.materials.materials):
         rows = np.flatnonzero(points.material == i)

@@ -82,7 +82,7 @@ def tangent(simulation: Simulated, dt: float) -> Tangent:
         of = storage.system
         blocks |= {"pressure": -_csr(of.B_momentum).T.tocsr(), "content": _csr(of.B), "storage": _csr(of.C)}
         blocks["cells"] = of.unknowns.owned.copy()
-    scene.forget()  # these matrices belong to no step
+    scene.forget()  # no later step may reuse these matrices
     return Tangent(**blocks)
 
 

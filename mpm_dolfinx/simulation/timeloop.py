@@ -124,7 +124,7 @@ def run(
         An argument is invalid, or a function of time returns an invalid value.
     GaveUp
         The shortest allowed step failed. The exception contains the histories so far, and the simulation is in the
-        state after the last good step.
+        state after the last completed step.
     """
     comm = simulation.scene.grid.comm
     simulation.scene.check(simulation.state)
@@ -233,10 +233,10 @@ def _histories(
     now = state.t
     start = after.rows[0]
     last = after.rows[-1].t
-    # an interrupted run may have stopped within its next interval
+    # an interrupted run may have stopped between two outputs
     if control.interval != times.interval or not last <= now <= times.next(last):
         what = f"dt = {times.interval!r} from t = {now!r}: the run that is continued has dt = {control.interval!r}"
-        raise ValueError(f"{what}, t = {last!r}; for other steps, or t_eval, start new histories, without after")
+        raise ValueError(f"{what}, t = {last!r}; for other steps or t_eval, leave out after: histories then begin anew")
     count = 0 if probes is None else len(probes.id)
     if (recorded := len(start.displacement)) != count:
         raise ValueError(f"probes: {count} probes, must be {recorded}, as in the run that is continued")
@@ -312,7 +312,7 @@ def _advance(simulation: Simulated, rule: StepSize, target: float, verbose: bool
         try:
             new, report = simulation.advanced(size)
         except StepFailed as failed:
-            cause = cause if isinstance(cause, CannotFollow) else failed  # this cause is clearer than later ones
+            cause = cause if isinstance(cause, CannotFollow) else failed  # its message is clearer than later ones
             cut, counted = rule.cut(size, control), replace(result, cuts=result.cuts + 1)
             left = _has_left(failed, rule, size, state)
             if not left and cut.small >= rule.least(preferred, state.t):
