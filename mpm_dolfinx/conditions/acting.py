@@ -52,7 +52,7 @@ class FormsOf:
         self._made: dict[Callable, Any] = {}
 
     def __call__(self, make: Callable[..., T], *more) -> T:
-        """Return the forms `make(grid, u, *more)`.  The first call with a class `make` compiles these forms."""
+        """Return the forms `make(grid, u, *more)`.  The first call for each class `make` compiles them."""
         if make not in self._made:
             self._made[make] = make(self.grid, self.u, *more)
         return self._made[make]
@@ -115,15 +115,15 @@ class Shares(NamedTuple):
 
     own: float  # weight of the rate in this substep, s
     before: float  # weight of the rate in the previous substep, s
-    gravity: NDArray[np.float64] | None  # (d,), m/s^2, at the end of the substep; None without gravity
+    gravity: NDArray[np.float64] | None  # at the end of the substep (d,), m/s^2; None without gravity
 
 
 class At(NamedTuple):
-    """Displacement increment `u` of the step (m) in an iterate, its numbering `unknowns`, and connected `parts`."""
+    """Displacement increment of the step in one iteration of Newton's method."""
 
-    unknowns: Unknowns
-    u: NDArray[np.float64]
-    parts: Parts | None = None
+    unknowns: Unknowns  # numbering of u
+    u: NDArray[np.float64]  # nodal displacements (dofs,), m
+    parts: Parts | None = None  # connected parts of the bodies
 
     @property
     def nodal(self) -> NDArray[np.float64]:
@@ -211,16 +211,16 @@ class Loads:
         """Return the inertia forces at u, in N, or None without inertia."""
 
     def pattern(self, unknowns: Unknowns) -> PETSc.Mat | None:
-        """Return a zero matrix with the sparsity pattern of `coupling`, or None if this method returns None."""
+        """Return a zero matrix with the sparsity pattern of `coupling`, or None if `coupling` returns None."""
 
     def joins(self, unknowns: Unknowns) -> PETSc.Mat | None:
-        """Return a zero matrix with the sparsity pattern of couplings between cell pressures; None without them."""
+        """Return a zero matrix with the sparsity pattern of couplings between cell pressures, or None if none exist."""
 
     def coupling(self, at: At) -> PETSc.Mat | None:
         """Return minus the derivative, with respect to u, of the forces in `push`, or None if `tangent` adds it."""
 
     def settle(self, at: At, sticks: bool) -> bool:
-        """Update the set of slipping positions.  Return whether it changed.  If `sticks`, positions may stick again."""
+        """Update the set of slipping positions, and return whether it changed.  If `sticks`, some may stick again."""
         return False
 
     def augment(self, at: At) -> bool:
@@ -239,11 +239,11 @@ class Loads:
         return self
 
     def counted(self, at: At) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return local dofs (n,), and forces on them (n,), in N, which do not belong to the wall reactions."""
+        """Return local dofs (n,), and the forces (n,), in N, on these dofs that wall reactions must not include."""
         return np.empty(0, dtype=np.int64), np.empty(0)
 
     def within_reach(self) -> NDArray[np.int64]:
-        """Return the pairs (n, 2) of lexicographic cells that the condition may couple in the step."""
+        """Return the pairs (n, 2) of cells, by lexicographic index, that the condition may couple in the step."""
         return np.empty((0, 2), dtype=np.int64)
 
     def touching(self) -> tuple | None:
@@ -280,7 +280,7 @@ class Loads:
         return self
 
     def near(self, points: MaterialPoints, corners: NDArray[np.float64]) -> NDArray[np.bool_] | bool:
-        """Return which corners (n, 2^d, d) are near a contact after a step, and move with the Q1 field, uncorrected."""
+        """Return which corners (n, 2^d, d) are near a contact after a step, and get no correction of the Q1 field."""
         return False
 
     def outside(
@@ -296,10 +296,10 @@ class Loads:
     def under_held(
         self, ids: NDArray[np.int64], tracked: NDArray[np.float64], volume: NDArray[np.float64], corners: NDArray
     ) -> NDArray[np.float64]:
-        """Return corners (n, 2^d, d), in m, of re-initialised domains, as prisms at sides with prescribed displacement.
+        """Return corners (n, 2^d, d), in m, of re-initialised domains: prisms at sides with prescribed displacement.
 
         `ids` (n,): identifiers of the points.
-        `tracked`, `corners`: corners before and after re-initialisation from F.
+        `tracked`: corners before the re-initialisation from F; `corners`: corners after it.
         `volume` (n,), in m^d: volumes of the domains.
         """
         return corners
@@ -329,7 +329,7 @@ class Acting:
     held: Sequence[tuple[Any, Surface, Sequence[int]]] = ()
     """Prescribed displacements, each with condition, faces and prescribed axes."""
     seeded: Sequence[Surface] = ()
-    """Faces not in `held` whose conditions refer to seeded positions.  Renewal must not replace their domains."""
+    """Other faces whose conditions refer to seeded positions.  Renewal must not replace domains at these faces."""
 
     def placed(self, place: Place) -> Loads:
         """Return the loads of a substep."""

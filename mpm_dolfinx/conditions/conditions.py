@@ -213,7 +213,7 @@ class Through(NamedTuple):
     pressure: NDArray[np.float64] | float  # pore pressure outside, Pa; nan if only the flux is prescribed
     flux: NDArray[np.float64] | float  # prescribed flux into the body, m/s
     one_way: NDArray[np.bool_] | bool  # whether fluid can only leave the body
-    driest: NDArray[np.float64] | float = np.nan  # lowest pressure, Pa, with the prescribed flux; nan: no limit
+    driest: NDArray[np.float64] | float = np.nan  # lowest pressure, Pa, at which the flux is prescribed; nan: no limit
 
 
 @dataclass(frozen=True, eq=False)
@@ -440,9 +440,9 @@ class Displacement(Condition):
     Raises
     ------
     ValueError
-        No body has this side, or `value` or `components` is invalid.  A wall fixes a component that moves.  Another
-        `Displacement` prescribes this component on the same part of a face, or at a common edge with another value.
-        The scene or a step raises the error.
+        No body has this side, or `value` or `components` is invalid.  A wall fixes a component whose value is not 0.
+        Another `Displacement` prescribes this component on the same part of a face, or at a common edge with another
+        value.  The scene or a step raises the error.
     """
 
     side: str

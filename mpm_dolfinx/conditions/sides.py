@@ -66,7 +66,7 @@ class Sides:
         neighbours = [self.of(other).X for other in others]
 
         def along(boxes: NDArray[np.float64], axis: int, x: float) -> NDArray[np.bool_]:
-            """Return which boxes are adjacent to the faces, and contain the coordinate x along an axis."""
+            """Return which boxes contain the coordinate x along an axis, and overlap the faces along all other axes."""
             across = np.arange(d) != axis
             low, high = X[:, 0].min(axis=0) - near, X[:, 1].max(axis=0) + near
             beside = ((boxes[:, 0] < high) & (boxes[:, 1] > low))[:, across].all(axis=1)
@@ -82,7 +82,7 @@ class Sides:
                     box[end, axis] -= sign * self._beyond_nodes(side, at_end, axis, limit, sign)
         box[:, box[0] > box[1]] = faces.region[:, box[0] > box[1]]
         shorter = self._of(condition.side, box)
-        return shorter if len(shorter) else faces  # the region is narrower than a cell
+        return shorter if len(shorter) else faces  # a region narrower than a cell is not shortened
 
     def _beyond_nodes(self, side: Surface, at_end: NDArray[np.bool_], axis: int, x: float, sign: int) -> float:
         """Return the length, in m, by which to shorten a region at its end x along a reference axis."""

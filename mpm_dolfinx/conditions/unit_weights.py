@@ -17,8 +17,8 @@ from mpm_dolfinx.materials.initial_stress import OfWater
 from mpm_dolfinx.materials.skeleton import STANDARD_GRAVITY, Fluid
 from mpm_dolfinx.parallel.messages import ConditionWarning, warn
 
-WEIGHS = 5e-3  # relative difference between unit weights of water, or between gravities, that gives no warning
-DENSITIES = (500.0, 2000.0)  # kg/m^3: from oils to brines
+WEIGHS = 5e-3  # largest relative difference of two unit weights of water, or of two gravities, without a warning
+DENSITIES = (500.0, 2000.0)  # kg/m^3: densities of liquids, from oils to brines
 SOFTEST = 1e5  # Pa: bulk modulus of a gas at atmospheric pressure.  Source: exact, by Boyle's law
 
 T = TypeVar("T")

@@ -54,7 +54,7 @@ def stopped(
 ) -> NDArray[np.float64]:
     """Return the corners (n, 2^d, d), in m, of particle domains, after corners outside the grid have moved onto walls.
 
-    Corners also move onto sides without a wall, if their old positions `before` were inside the grid.
+    Corners also move onto sides of the grid without a wall, if their old positions `before` were inside the grid.
     """
     shut = np.zeros((2, grid.dim), dtype=bool)
     for name, axes in walls.items():
@@ -69,8 +69,8 @@ def wall_forces(
 ) -> dict[str, NDArray[np.float64]]:
     """Return the force (d,), in N, of each wall by name.  All processes must call this function.
 
-    If several walls fix a component of a node, the wall normal to this component gets the force.  Otherwise these walls
-    have equal shares of the force.
+    If several walls fix a component of a node, the wall normal to this component gets the force.  If none of them is
+    normal to the component, all get equal shares.
 
     `dofs` (n,): flat local degrees of freedom, possibly repeated.
     `forces` (n,), in N: forces on these degrees of freedom.
