@@ -48,8 +48,8 @@ class _Lattice:
 
     `number` (n, cells): lexicographic indices of the cells in the grid, or -1 outside the grid.
     `middle`: index of the probe's cell in its block.
-    `stride` (d,): increment of the index in a block to the next cell along each axis.
-    `neighbours`: for each axis and end (0 or 1), indices in a block of cells, and of their neighbours.
+    `stride` (d,): difference of the indices, in a block, of two neighbouring cells along each axis.
+    `neighbours`: indices, in a block, of cells and of their neighbours, for each axis and end (0 or 1).
     """
 
     def __init__(self, grid: Grid, cell: NDArray[np.int64]):
@@ -156,7 +156,7 @@ class _Around:
         return reached & groups, reached
 
     def _opening(self, axis: int, end: int) -> NDArray[np.bool_]:
-        """Return for each pair of neighbouring cells along an axis whether their common face is open to flow."""
+        """Return whether the common face is open to flow, for each pair of neighbouring cells along an axis."""
         one, other = self._lattice.neighbours[axis, end]
         return (self._open[:, one, axis, end] > 0) & (self._open[:, other, axis, 1 - end] > 0)
 
@@ -212,7 +212,7 @@ class _Around:
         out = []
         for (axis, end), pair in self._lattice.neighbours.items():
             own_cells, other_cells = pair
-            inward = (1 - 2 * end, 2 * end - 1)  # from the face
+            inward = (1 - 2 * end, 2 * end - 1)  # signs of directions from the face into both cells
             size, offset = self._lattice.size[:, :, axis], (self._half + self._shift)[:, :, axis]
             lengths = [
                 np.maximum(size[:, i] / 2 + sign * offset[:, i], 0) for sign, i in zip(inward, pair, strict=True)
@@ -229,7 +229,7 @@ class _Around:
         return out
 
     def _drained(self, weight: NDArray[np.float64]) -> tuple[NDArray, ...]:
-        """Return for each drained side of a cell: probe, position, head, weight, and whether this is the probe's cell.
+        """Return probe, position, head and weight of each drained side of a cell, and whether this cell has the probe.
 
         Positions and heads are means over all drained faces on the side.
         """

@@ -42,19 +42,19 @@ class Probes:
             raise ValueError(f"probe at {self.x0[first]}: body {body[first]} is absent, must be present")
 
     def displacement(self, points: MaterialPoints, comm: MPI.Intracomm) -> NDArray[np.float64]:
-        """Return on every process the displacements (n, d) of all probes, in m."""
+        """Return the displacements (n, d) of all probes, in m, on every process."""
         known, at = points.find(self.id)
         return self._shared(comm, known, interpolate(points.corners[at] - points.origin[at], self.xi[known]))
 
     def position(self, points: MaterialPoints, comm: MPI.Intracomm) -> NDArray[np.float64]:
-        """Return on every process the present positions (n, d) of all probes, in m."""
+        """Return the present positions (n, d) of all probes, in m, on every process."""
         known, at = points.find(self.id)
         return self._shared(comm, known, interpolate(points.corners[at], self.xi[known]))
 
     def _shared(
         self, comm: MPI.Intracomm, known: NDArray[np.int64], values: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return the values of all probes on all processes.  `values`: values of the probes `known` here."""
+        """Return the values of all probes on all processes.  `values`: values of the probes `known` on this process."""
         out = np.zeros((len(self.id), *values.shape[1:]))
         out[known] = values
         return over_all(comm, out)
@@ -111,7 +111,7 @@ def probes(bodies: Sequence[Body], x0: ArrayLike, *, stress: bool = False) -> Pr
     flag("probes: stress", stress)
     x0 = positions(x0, bodies[0].dim)
     ids, xi = np.empty(len(x0), dtype=np.int64), np.empty(x0.shape)
-    for i, x in enumerate(x0):  # a loop suffices for few positions, once for a scene
+    for i, x in enumerate(x0):  # a loop is fast enough for a few positions
         found = next(_domains_at(bodies, x, rounding(x0)), None)
         if found is None:
             raise ValueError(f"probe at {x}: outside the bodies, must be in a body or on its surface")
@@ -142,7 +142,7 @@ def coordinates(corners: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray
         hats = 0.5 * (1 + signs * xi[:, None, :])
         dN = np.stack([0.5 * signs[:, a] * np.delete(hats, a, axis=2).prod(axis=2) for a in range(len(x))], axis=2)
         slope, off = np.einsum("nkd,nka->nda", corners, dN), x - interpolate(corners, xi)
-        step = (np.linalg.pinv(slope) @ off[:, :, None])[:, :, 0]  # outside a domain a solution need not exist
+        step = (np.linalg.pinv(slope) @ off[:, :, None])[:, :, 0]  # a position outside the domain may have no solution
         xi = np.clip(xi + step, -2.0, 2.0)
         if np.abs(step).max(initial=0.0) < ROUND_OFF:
             break
