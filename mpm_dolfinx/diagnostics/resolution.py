@@ -27,7 +27,7 @@ FULL = 1.2
 
 
 def warn_overlaps(cut: CutDomains, bodies: Sequence[Body]) -> Callable[..., Any] | None:
-    """Warn about the fullest cell if particle domains overlap.  Return the next check, or None after a warning."""
+    """Warn about the fullest cell if particle domains overlap.  Return this function, or None after the warning."""
     grid, points = cut.grid, cut.points
     volume = cut.shares(points.volume0 * points.J)
     fill = sum_by(cut.cells, cut.plane(volume)[0], grid.num_owned)[cut.cells] / grid.volumes(cut.cells)
@@ -113,7 +113,7 @@ def _losses(cut: CutDomains, volume: NDArray[np.float64], modulus: NDArray[np.fl
     """
     n, order = cut.grid.num_owned, np.argsort(-modulus, kind="stable")
     softest, hardest = (np.zeros(n, dtype=np.int64) for _ in range(2))
-    softest[cut.cells[order]], hardest[cut.cells[order[::-1]]] = order, order[::-1]  # the last entry wins
+    softest[cut.cells[order]], hardest[cut.cells[order[::-1]]] = order, order[::-1]  # the last index of a cell remains
     total, stiffness, compliance = (sum_by(cut.cells, volume * y, n) for y in (1.0, modulus, 1 / modulus))
     loss = np.zeros(n)
     contrast = np.ones(n)
@@ -124,7 +124,7 @@ def _losses(cut: CutDomains, volume: NDArray[np.float64], modulus: NDArray[np.fl
 
 
 COARSE = 0.7  # domain size in cells, above which constant stress lowers the stiffness more than Q1 bending raises it
-FEW = 3  # points over the thickness at which bending is an eighth too large.  Source: exact, 1 / (n^2 - 1)
+FEW = 3  # points over the thickness at which the deflection is an eighth too large.  Source: exact, 1 / (n^2 - 1)
 SLENDER = 4  # length divided by thickness from which on a body counts as a beam
 LOST_WET = 2.5  # lost fraction of a wet beam's stiffness, times n^2; undrained: 1.8 (n = 4), 2.3 (n = 8), 3.2 (n = 16)
 FEW_WET = int((100 * LOST_WET) ** 0.5)  # points over the thickness at which the loss is 1 %.  Source: exact
@@ -162,7 +162,7 @@ def check_stiff(grid: Grid, bodies: Sequence[Body]) -> None:
     displacement field of this kind, and walls prevent it.
     """
     for i, body in enumerate(bodies if grid.dim == 3 else ()):
-        low, between = np.array([[np.inf], [-np.inf]]) * np.ones(grid.dim)  # of domains; the highest end inside a cell
+        low, between = np.array([[np.inf], [-np.inf]]) * np.ones(grid.dim)  # lower ends: lowest; highest within a cell
         cells = []
         for part in in_chunks(len(body)):
             x = body.corners(part) - grid.base

@@ -85,7 +85,7 @@ def initial_velocity(grid: Grid, quadrature: str, inertia: bool | Moving | None)
     flag("inertia", moves or inertia)
     velocity = inertia.velocity if moves else np.zeros(grid.dim)
     if quadrature != "domain":
-        raise ValueError(f"inertia = {line(inertia)} with quadrature {quadrature!r}, must be None")
+        raise ValueError(f"inertia = {line(inertia)}, must be None with quadrature {quadrature!r}")
     if callable(velocity):
         check_names("velocity", velocity, ("x",))
     elif numbers("velocity", velocity, (grid.dim,), allowed=f"{grid.dim} finite numbers")[0] and grid.axisymmetric:
