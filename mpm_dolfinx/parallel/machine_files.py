@@ -24,7 +24,7 @@ ALIGNED = np.dtype(np.float64).itemsize
 
 
 def once_a_machine(comm: MPI.Intracomm, make: Callable[[], dict[Hashable, NDArray]]) -> dict[Hashable, NDArray]:
-    """Return on every process the arrays that `make` returns on rank 0.  On several processes the arrays are read-only.
+    """Call `make` on rank 0, and return its arrays on every process.  On several processes the arrays are read-only.
 
     If `make` raises an error, all processes raise this error.  Empty arrays are not allowed.
     """

@@ -24,9 +24,9 @@ from numpy.typing import NDArray
 
 from mpm_dolfinx.parallel.exchange import at_root, over_all, together
 
-LOCAL = Struct("<26xHH")  # Source: format of zip archives: lengths of name and extra field, in the header of a member
-CRC_32 = 0xEDB88320  # Source: definition of the checksum of zip archives: its polynomial, with the lowest power first
-ONE = 1 << 31  # Source: definition of the same order of the powers
+LOCAL = Struct("<26xHH")  # lengths of name and extra field in the header of a member.  Source: format of zip archives
+CRC_32 = 0xEDB88320  # polynomial of the checksum, lowest power first.  Source: format of zip archives
+ONE = 1 << 31  # the polynomial 1, lowest power first.  Source: definition
 
 
 class Member(NamedTuple):
@@ -44,7 +44,7 @@ def write(comm: MPI.Intracomm, file: Path, arrays: Mapping[str, NDArray], rows: 
 
     If a process cannot write, all processes raise its error.
 
-    `arrays`: arrays by name that are not distributed, on rank 0.
+    `arrays`: on rank 0, the arrays that are not distributed, by name.
     `rows`: this process's rows (n, ...) of distributed arrays, by name.  The file contains the rows of all processes,
     in the order of the ranks.
     """
@@ -56,7 +56,7 @@ def write(comm: MPI.Intracomm, file: Path, arrays: Mapping[str, NDArray], rows: 
     for (name, of), length in zip(rows.items(), total.tolist(), strict=True):
         info, head = ZipInfo(f"{name}.npy"), _head(of.dtype, (length, *of.shape[1:]))
         size = length * _row_bytes(of.dtype, of.shape)
-        info.CRC = 0  # unknown so far
+        info.CRC = 0  # replaced when it is known
         info.file_size = info.compress_size = len(head) + size
         info.header_offset = end
         start = end + len(info.FileHeader(zip64=True)) + len(head)
@@ -162,7 +162,7 @@ def _row_bytes(dtype: np.dtype, shape: tuple[int, ...]) -> int:
 
 
 def _joined(crc: int, parts: Iterable[tuple[int, int]]) -> int:
-    """Return the checksum of bytes with checksum `crc`, followed by bytes whose checksums and lengths are `parts`."""
+    """Return the checksum of joined bytes.  `crc`: checksum of the first; `parts`: checksums and lengths of others."""
     for more, length in parts:
         for k in range(length.bit_length()):
             crc = _product(_power(k), crc) if length >> k & 1 else crc
