@@ -148,7 +148,7 @@ class Timer:
 def expanded(form: ufl.Form) -> ufl.Form:
     """Return a form in which all derivatives are expanded.
 
-    Expansion may remove coefficients of a facet form.  Otherwise dolfinx 0.9 packs them, but its kernel omits them.
+    Expansion may remove coefficients of a facet form.  Unexpanded, dolfinx 0.9 packs them, but its kernel omits them.
     """
     return ufl.algorithms.expand_derivatives(form)
 
@@ -262,7 +262,7 @@ def links(msh: mesh.Mesh) -> list[NDArray[np.int32]]:
     """Return the arrays of all computed connectivities of a mesh."""
     found = []
     for pair in np.ndindex(*[msh.topology.dim + 1] * 2):
-        with suppress(RuntimeError):  # from dolfinx 0.9 on, for others
+        with suppress(RuntimeError):  # raised by dolfinx 0.9 and later if not computed
             found.append(msh.topology.connectivity(*pair))
     return [one.array for one in found if one is not None]
 
@@ -271,7 +271,7 @@ def _facet_cells(msh, facets, dim: int) -> NDArray[np.int32]:
     """Return the two cells of each interior facet, and its index in each: (cell0, index0, cell1, index1, ...)."""
     adjacency = msh.topology.connectivity(dim, dim + 1)
     cells = adjacency.array[adjacency.offsets[facets][:, None] + np.arange(2)]
-    cell_facets = msh.topology.connectivity(dim + 1, dim).array.reshape(-1, 2 * (dim + 1))  # boxes only
+    cell_facets = msh.topology.connectivity(dim + 1, dim).array.reshape(-1, 2 * (dim + 1))  # cells are boxes
     local = np.argmax(cell_facets[cells] == facets[:, None, None], axis=2)
     return np.stack([cells, local], axis=2).reshape(-1).astype(np.int32)
 

@@ -186,7 +186,7 @@ def _publish(workshop: Path, folder: Path) -> None:
     mark, name = folder / source.name, source.stem
     ready = mark.with_suffix(".c.cached")
     try:
-        open(mark, "x").close()  # FFCx claims names in the same way
+        open(mark, "x").close()  # FFCx marks libraries in the same way
     except FileExistsError:
         if not ready.exists() and time.time() - mark.stat().st_mtime < ABANDONED:
             return

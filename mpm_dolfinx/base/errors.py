@@ -18,14 +18,14 @@ class Report:
     coupling: int = 0  # iterations of the coupled linear solver
     history: list[tuple[float, float]] = field(default_factory=list)  # relative residuals (momentum, storage)
     balance: float = 0.0  # relative error of the fluid balance
-    reinitialised: int = 0  # number of inverted particle domains that were initialised again from F
+    reinitialised: int = 0  # number of inverted particle domains re-initialised from the deformation gradient F
     renewed: int = 0  # number of particle domains replaced by renewal
     easy: bool = True  # whether a longer step may converge too
     error: float = 0.0  # estimated error of the pressures, Pa
     change: NDArray[np.float64] | tuple = (0.0,)  # largest pressure change of each body in the step, Pa
     extremes: NDArray[np.float64] | None = None  # at start and end: smallest and largest pressures (2, 2, bodies), Pa
     undrained: float = 0.0  # largest pressure change, Pa, in the same step without flow
-    first: NDArray[np.float64] | tuple = (0.0,)  # `change` in the first substep, Pa; 0 for bodies whose pieces are kept
+    first: NDArray[np.float64] | tuple = (0.0,)  # `change` in the first substep, Pa; 0 if a body keeps its pieces
     sudden: NDArray[np.float64] | tuple = (0.0,)  # `first`, Pa; 0 if the second substep changes p enough, see `SUDDEN`
     stress: float = 0.0  # root mean square of the nodal forces, divided by the area of a cell face, Pa
     moves: tuple[float, float] = (0.0, 0.0)  # estimated error and size of the motion, see `motion_error`

@@ -117,7 +117,7 @@ class Rows(Sequence[Row]):
         values = {name: np.asarray(value, dtype=np.float64) for name, value in zip(COLUMNS, row, strict=False)}
         old = {name: rows.shape[1:] if n else values[name].shape for name, rows in columns.arrays.items()}
         shapes = {name: tuple(np.maximum(v.shape, old.get(name, v.shape))) for name, v in values.items()}
-        if columns.used != n or shapes != old:  # another object has extended the arrays, or the new row is longer
+        if columns.used != n or shapes != old:  # another object has extended the arrays, or the row has larger arrays
             columns = columns.reshaped(n, max(8, 2 * n), shapes)
         elif n == len(columns.arrays["t"]):
             columns.arrays = columns.reshaped(n, 2 * n, shapes).arrays

@@ -18,7 +18,7 @@ Outcome = Mapping[str, Mapping[str, NDArray[np.float64]]]
 
 
 class Histories(Protocol):
-    """Results at one output time, or at all output times, which are then the first axis of the arrays."""
+    """Results at one output time, or at all output times.  In the second case, arrays have the time as first axis."""
 
     t: Any
     displacement: NDArray[np.float64]
@@ -66,7 +66,7 @@ def _axes(dim: int, size: int) -> list[str]:
 
 
 def unit_of(quantity: str, dim: int, moment: bool = False) -> str:
-    """Return the unit of a quantity, or of its moments if `moment` is True, in plane strain per metre of thickness."""
+    """Return the unit of a quantity, or of its moments if `moment` is True.  Units in plane strain are per metre."""
     units = {"tool_travel": "m", "tool_velocity": "m/s", "tool_rotation": "rad", "tool_spin": "rad/s"}
     units |= {"outflows": "m^3/s", "runoff": "m^3/s", "energy": "J"}
     units |= dict.fromkeys(("flowed", "ran_off", "ponded"), "m^3")

@@ -25,8 +25,8 @@ NEAR = 8 * float(np.finfo(np.float32).eps)
 Source: epsilon of single precision (IEEE 754), as in mesh files, times 8 for a few operations.
 """
 TINY = float(np.finfo(float).tiny) / EPSILON
-"""Lower bound of a divisor, or a term added to it.  Quotients of numbers below (1 / epsilon) are then finite.
+"""Lower bound of a divisor, or a term added to it.  Quotients with a numerator below (1 / epsilon) are then finite.
 Source: IEEE 754.
 """
 FOREVER = 1 / EPSILON**2
-"""Very long time step, in s: a change by (1 / epsilon) in this step has the rate epsilon.  Source: epsilon squared."""
+"""Very long time step, in s, in which a change by (1 / epsilon) has the rate epsilon.  Source: epsilon squared."""

@@ -230,7 +230,7 @@ def check_names(what: str, function: Callable, among: Sequence[str]) -> tuple[st
         return names
     given = ", ".join(p.name for p in _parameters(function) or ())
     if given == "x" and "x" in among:  # such as an interpolation in time
-        raise ValueError(f"{what}: an object or a library's function of x, must be lambda t: ..., or lambda x: ...")
+        raise ValueError(f"{what}: an object, or a function of x in a library, must be lambda t: ..., or lambda x: ...")
     allowed = "must be a function of the time alone"
     if len(among) > 1:
         allowed += f", or of parameters named {', '.join(among[:-1])} or {among[-1]}"
