@@ -37,7 +37,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
-LONGEST = 160  # most characters of a value in a message
+LONGEST = 160  # largest number of characters of a value in a message
 _known: WeakKeyDictionary[Callable, list[Parameter]] = WeakKeyDictionary()
 """Cache of the results of `_parameters` for each function."""
 

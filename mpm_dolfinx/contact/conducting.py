@@ -113,7 +113,7 @@ class ContactFeeds(Feeds):
         return flow
 
     def begin(self, at: Conduction, fluid: Fluid, difference: NDArray[np.float64]) -> None:
-        """Store, for each closed pair, the non-orthogonal correction of the pressure difference."""
+        """Store the non-orthogonal correction of the pressure difference at each closed pair."""
         links = self._links
         near, far = np.split(difference, [len(links.near.at)])  # in the order of `sides`
         self._correction = self._contact.pairs.place[links.closed], near - links.exchange.back(far)

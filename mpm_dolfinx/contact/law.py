@@ -236,7 +236,7 @@ class ContactLaw:
         `largest`: function that replaces each of k values by the largest value in its connected part.  More than
         `ROUNDS` augmentations raise NotConverged.
         """
-        # penetrations count by volume: small parts of faces follow their neighbours, and correct no penetration alone
+        # penetrations count by volume, because small parts of faces follow their neighbours
         x = self.pairs.x
         plane = self.total(self.pairs.area / np.maximum(self.grid.around(x), TINY))  # both are 0 on the axis
         whole = np.minimum(1.0, plane / self.grid.smallest_faces(self.cell))
@@ -252,7 +252,7 @@ class ContactLaw:
             message = f"{name}: penetrates by {most[k]:.2g} cells at {where}; does a wall fix the body there?"
         if message := first(self.grid.comm, message):
             raise NotConverged(message)
-        # the pore fluid, or a nearly incompressible body, is stiffer than k
+        # if penetrations decrease slowly, the pore fluid, or a nearly incompressible body, is stiffer than k
         updates = state.updates + np.array([0, 0, 1, 0])
         updates[:, 0] *= np.where(most > updates[:, 1] / 2, STIFFER, 1.0)
         updates[:, 1] = most

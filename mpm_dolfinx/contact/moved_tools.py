@@ -168,7 +168,7 @@ class MovedTools(ContactProblem):
         return np.hstack([force, (across(found.at.arm) * force).sum(axis=1, keepdims=True)])
 
     def _sizes(self, found: Found, force: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return upper bounds of the contributions that `_onto` returns."""
+        """Return upper bounds of the absolute contributions that `_onto` returns."""
         moment = np.linalg.norm(found.at.arm, axis=1) * np.linalg.norm(force, axis=1)
         return np.hstack([force, moment[:, None][:, : self.grid.dim == 2]])
 

@@ -40,7 +40,7 @@ REACH = 2.0
 DEEP = 0.25
 """Largest penetration at which a pair is found, and smallest gap at which it may be dropped, in cell sizes."""
 BESIDE = 0.6
-"""Distance from another group, in cell sizes, below which domain corners move without the correction of `bending`.
+"""Distance from another group, in cell sizes, below which Q1 displacements of domain corners get no correction.
 Sensitivity (scene "contact" of tests/plateaus.py): half this value changes the result by 1.1e-03, and twice this value
 by 6.3e-04. Finer cells change it by 1.1e-02.
 """

@@ -212,7 +212,7 @@ class ContactProblem(Loads):
 
     def coupling(self, at: At) -> PETSc.Mat:
         """Return minus the derivative of the contact forces with respect to the nodal displacements, at u."""
-        collect_garbage(self.grid.comm)  # with friction in 3D, pairs in 12 cells fill 60 MB in each iteration
+        collect_garbage(self.grid.comm)  # with friction in 3D, matrices of 12 cells fill 60 MB in each iteration
         found, law = self.found(at), self.now.law
         B, _ = self._B(law, at.unknowns)
         return petsc_matrix(law.tangent(found.touch, found.at), B.getLocalSize()[0], self.grid.comm, own=True).PtAP(B)

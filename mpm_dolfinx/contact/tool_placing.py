@@ -30,7 +30,7 @@ from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
 from mpm_dolfinx.points.material_points import MaterialPoints, middle
 
 NEAR = 0.1
-"""Distance from a tool, in cell sizes, below which domain corners move without the correction of `bending`.
+"""Distance from a tool, in cell sizes, below which Q1 displacements of domain corners get no correction.
 Sensitivity (scene "tool" of tests/plateaus.py): half this value changes the result by 4.1e-03, and twice this value by
 1.5e-03. Finer cells change it by 7.1e-02."""
 FACING = 0.5  # smallest cosine between the normal of a face that faces the tool and the direction to the tool
@@ -221,7 +221,7 @@ class Tools(Touching):
         """Return which positions below a tool are within half a cell of an edge of the tool.
 
         These positions have no contact, because the last loaded node also represents the half cell beyond the edge.
-        Edges beyond which the surface of the body does not continue are ignored.
+        Edges at which the surface of the body ends are ignored.
         """
         grid, (y, n) = self.grid, (x[faces], unit[faces])
         h = grid.sizes_at(y)

@@ -180,7 +180,7 @@ class StepSize:
         return bool((excess > np.maximum(RINGS * np.asarray(control.change), NEAR * max(control.change))).any())
 
     def _factor(self, report: Report, control: StepControl, power: float) -> float:
-        """Return the length of the next step, divided by the length of the computed step, from its error."""
+        """Return the ratio of the next step length to the present one, from the error of the present step."""
         excess = self._excess(report, control)
         return min(GROWS, max(SHRINKS, SAFETY / excess**power if excess > 0 else GROWS))
 
