@@ -148,7 +148,7 @@ class Timer:
 def expanded(form: ufl.Form) -> ufl.Form:
     """Return a form in which all derivatives are expanded.
 
-    Expansion may remove coefficients of a facet form.  Unexpanded, dolfinx 0.9 packs them, but its kernel omits them.
+    Expansion may remove coefficients of a facet form, which dolfinx 0.9 packs, although its kernel omits them.
     """
     return ufl.algorithms.expand_derivatives(form)
 

@@ -66,7 +66,7 @@ def _axes(dim: int, size: int) -> list[str]:
 
 
 def unit_of(quantity: str, dim: int, moment: bool = False) -> str:
-    """Return the unit of a quantity, or of its moments if `moment` is True.  Units in plane strain are per metre."""
+    """Return the unit of a quantity, or of its moments if `moment` is True; in plane strain per metre of depth."""
     units = {"tool_travel": "m", "tool_velocity": "m/s", "tool_rotation": "rad", "tool_spin": "rad/s"}
     units |= {"outflows": "m^3/s", "runoff": "m^3/s", "energy": "J"}
     units |= dict.fromkeys(("flowed", "ran_off", "ponded"), "m^3")

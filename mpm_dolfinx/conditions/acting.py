@@ -239,7 +239,7 @@ class Loads:
         return self
 
     def counted(self, at: At) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return local dofs (n,), and the forces (n,), in N, on these dofs that wall reactions must not include."""
+        """Return local dofs (n,), and forces (n,) on them, in N, that wall reactions must not include."""
         return np.empty(0, dtype=np.int64), np.empty(0)
 
     def within_reach(self) -> NDArray[np.int64]:
@@ -247,7 +247,7 @@ class Loads:
         return np.empty((0, 2), dtype=np.int64)
 
     def touching(self) -> tuple | None:
-        """Return the constraints of displacements by this condition, before the first iteration.
+        """Return the constraints that this condition imposes on displacements, before the first iteration.
 
         The result has cells (n,), opposite cells (n,), positions (n, d) and directions (n, d) of n constraints.  In
         contact of two bodies, opposite cells belong to the second body; otherwise they are None.
@@ -329,7 +329,7 @@ class Acting:
     held: Sequence[tuple[Any, Surface, Sequence[int]]] = ()
     """Prescribed displacements, each with condition, faces and prescribed axes."""
     seeded: Sequence[Surface] = ()
-    """Other faces whose conditions refer to seeded positions.  Renewal must not replace domains at these faces."""
+    """Faces, without `held`, whose conditions refer to seeded positions.  Renewal must not replace their domains."""
 
     def placed(self, place: Place) -> Loads:
         """Return the loads of a substep."""

@@ -90,7 +90,7 @@ def warn_levels(comm: MPI.Intracomm, fluid: Fluid | None, gravity: Gravity, leve
 
 
 def other_gravity(fluid: Fluid, gravity: Sequence[NDArray[np.float64]]) -> float | None:
-    """Return the last magnitude of `gravity`, in m/s^2, if conductivities refer to another gravity, or else None.
+    """Return the magnitude of the last `gravity`, in m/s^2, if conductivities refer to another gravity, or else None.
 
     If gravity varies in the step, and its last magnitude is at most 9.81 m/s^2, the function returns None.
 

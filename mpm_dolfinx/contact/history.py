@@ -35,7 +35,7 @@ def shear_name(name: str) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Origin:
-    """For each contact pair, the indices of its material point and its contact."""
+    """Indices of the material point and the contact of each contact pair."""
 
     exchange: Exchange  # sends the pairs to the owners of their cells
     point: NDArray[np.int64]  # index of the material point on this process (n,)
@@ -45,7 +45,7 @@ class Origin:
     def means(
         self, contacts: Mapping[str, Rough], points: MaterialPoints, push: NDArray, shear: NDArray
     ) -> MaterialPoints:
-        """Return the points, with stored means of pressures `push` and tractions `shear` of their contact pairs."""
+        """Return the points.  They store means of the pressures `push` and tractions `shear` of their contact pairs."""
         push = self.exchange.back(push)
         shear = self.exchange.back(shear)
         data = dict(points.data)
@@ -60,7 +60,7 @@ class Origin:
 
 
 def joined(both: Sequence[Origin], kept: Sequence[NDArray[np.bool_]]) -> tuple[Origin, NDArray[np.int64]]:
-    """Merge the pairs of two `Origin` that `kept` flags.  Return the result, and the new order of the pairs (n,)."""
+    """Merge two `Origin`: the pairs that `kept` flags.  Return the result, and the new order of the pairs (n,)."""
     columns, start = [], 0
     comm = both[0].exchange.comm
     for of, rows in zip(both, kept, strict=True):

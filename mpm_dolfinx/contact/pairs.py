@@ -170,8 +170,8 @@ def at_nodes(
 ) -> PETSc.Mat:
     """Return the matrix that maps the unknowns to weighted sums (m d,) of nodal displacements.
 
-    `value` (m, 2^d): weights at the nodes of the local cells `cell` (m,).  If `other` (m,), lexicographic indices of
-    cells, is given, `value` (m, 2 * 2^d) also has weights at the nodes of these cells.
+    `value` (m, 2^d): weights at the nodes of the local cells `cell` (m,).
+    `other` (m,): lexicographic indices of other cells; `value` (m, 2 * 2^d) then has weights at their nodes too.
     """
     d = grid.dim
     numbers = unknowns.map.indices.reshape(-1, d)

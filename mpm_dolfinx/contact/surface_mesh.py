@@ -419,7 +419,7 @@ def _flipped(facets: NDArray[np.int64], which: NDArray[np.bool_]) -> NDArray[np.
 
 
 def _winding(x: NDArray[np.float64]) -> float:
-    """Return the winding number about the origin of the surface with facets x (m, d, d).
+    """Return the winding number of the surface with facets x (m, d, d) about the origin.
 
     Source: van Oosterom and Strackee (1983), for the solid angle of a triangle.
     """

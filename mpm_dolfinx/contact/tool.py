@@ -70,8 +70,8 @@ class Tool:
     rotation_rad : float or callable t (s) -> float, rad
         Counterclockwise rotation about `centre`, applied before the displacement.  Tools rotate in plane strain only.
     centre : (d,), m
-        Centre of rotation, at the initial position of the tool.  Moments are about this centre.  In a free tool, it is
-        the centre of mass.  The default is the centroid of a free disc or polygon, and the origin for other tools.
+        Centre of rotation, at the initial position of the tool.  Moments are about this centre.  A free tool has its
+        centre of mass there.  The default is the centroid of a free disc or polygon, and the origin for other tools.
     friction
         Coulomb's coefficient mu, >= 0.
     adhesion

@@ -139,7 +139,7 @@ def check_alike(comm: MPI.Intracomm, given: Mapping[str, Any]) -> None:
 
 
 def _crossed(before: Sequence[float], now: Sequence[float]) -> NDArray[np.bool_]:
-    """Return for each value whether its sign has changed since the start of a step."""
+    """Return whether the sign of each value has changed since the start of a step."""
     sign = np.sign(before)
     return (sign != 0) & (np.sign(now) != sign)
 

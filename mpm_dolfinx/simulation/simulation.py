@@ -311,7 +311,7 @@ class Simulation:
             Indices of bodies to be removed, for example by an excavation.
         reset_displacement
             Whether displacements are measured from the present positions from now on. Values of conditions do not
-            change: a present `Displacement` with the value d moves its side by another d.
+            change: a present `Displacement` with the value d then moves its side by another d.
         fields
             New values of entries of `points.data`, by name.  A value is an array (n, ...) for the n points of this
             process, or one value for all points.  An entry is a state variable of a law, a material constant that

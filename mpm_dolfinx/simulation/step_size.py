@@ -48,7 +48,7 @@ SDIRK2 overshoots a jump by at most 0.21 times the jump.
 AGAIN = 2.0
 """A pressure change is a jump only if its rate exceeds this factor times the rate at the start of the last step."""
 MOST = SAME / EPSILON
-"""Largest number of output intervals.  Source: exact; `SAME` times a shorter interval is below rounding errors."""
+"""Largest number of output intervals.  Source: exact; `SAME` times a shorter interval is below rounding errors of t."""
 RESOLVED = 10
 """Smallest `rtol`, divided by the solver's tolerance.  If `rtol` is smaller, errors of the solver dominate."""
 FIRST = 1e-3

@@ -53,7 +53,7 @@ Sensitivity (scene "safety" of tests/plateaus.py): half this value changes the r
 by 5.4e-03. Finer cells change it by 4.2e-02.
 """
 STRAINS = 4.0
-"""Total strain of a trial that barely slides, divided by its overload or the elastic strain at yield, if smaller.
+"""Total strain of a trial that barely slides, divided by the minimum of its overload and the elastic strain at yield.
 
 Twice the number of steps changes the factor of safety of a slope by less than 0.1 %.  Sensitivity (scene "safety" of
 tests/plateaus.py): half this value changes the result by 1.1e-02, and twice this value by 1.1e-02.  Finer cells change
@@ -72,7 +72,7 @@ class Safety:
     bounds
         Largest factor of a trial that came to rest, and smallest factor of a trial with a slide.
     overloads
-        For the factor of each trial: the overloads (n,) in the n steps of the trial.  The overload of a step is the
+        Dictionary from the factor of each trial to the overloads (n,) in its n steps.  The overload of a step is the
         work of the viscous stress, divided by the work of the shear stress, in soil that may yield.
     newton
         Number of Newton steps of all trials.
@@ -190,7 +190,7 @@ def _ends(overloads: Sequence[float], steps: int, least: float) -> bool:
     """Return whether the overloads of the first steps already determine the result of a trial.
 
     The bodies slide if the overload, at its present rate of decrease, does not vanish in the remaining steps.  This is
-    certain, because the rate of decrease only becomes smaller.
+    certain, because the overload decreases ever more slowly.
     """
     *before, last = overloads
     rate = min(1.0, last / before[-1]) if before else 0.0
@@ -256,7 +256,7 @@ class _Weakened:
         self._viscosity.value = steps / STRAINS * max(least * modulus, stress) * dt
 
     def overloads(self, factor: float, tell: Callable[[int, float], None]) -> NDArray[np.float64]:
-        """Return the overloads in the steps of a trial.  `tell`: function of step number and overload."""
+        """Return the overloads in the steps of a trial.  `tell`: receives number and overload of each step."""
         trial, out = self._trial(self._start, lambda name, value: _over(name, value, factor)), []
         while len(out) < self._steps and not (out and _ends(out, self._steps, self._least)):
             before = trial.state.points
@@ -273,7 +273,7 @@ class _Weakened:
         return replace(trial.state, t=initial.t)
 
     def _trial(self, start: State, strength: Callable[[str, NDArray[np.float64]], NDArray[np.float64]]) -> _Trial:
-        """Return a trial that starts from a state.  `strength`: function of a name and a full strength."""
+        """Return a trial that starts from a state.  `strength`: function from name and full to present value."""
         data = {name: strength(name, value) for name, value in self._strengths.items()}
         points = replace(start.points, data={**start.points.data, **data})
         return _Trial(self._scene, replace(start, points=points, velocity=None, result=None, control=None), self.newton)
