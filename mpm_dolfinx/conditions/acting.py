@@ -106,7 +106,7 @@ class Place(NamedTuple):
 
     @property
     def rate(self) -> float:
-        """Derivative of acceleration by displacement in a substep of SDIRK2, in 1/s^2, or 0 without inertia."""
+        """Derivative of acceleration with respect to displacement in a substep of SDIRK2, 1/s^2; 0 without inertia."""
         return 1 / (GAMMA * self.dt) ** 2 if self.inertia and self.dt > 0 else 0.0
 
 

@@ -38,7 +38,7 @@ from mpm_dolfinx.points.parts import parts_of_domains
 REACH = 2.0
 """Largest gap, in cell sizes, that may close in a step, if both bodies move by one cell.  Source: definition."""
 DEEP = 0.25
-"""Largest penetration at which a pair is found, and smallest gap at which it may be dropped, in cell sizes."""
+"""Largest penetration at which a pair is found, and smallest gap at which a pair may be dropped, in cell sizes."""
 BESIDE = 0.6
 """Distance from another group, in cell sizes, below which Q1 displacements of domain corners get no correction.
 Sensitivity (scene "contact" of tests/plateaus.py): half this value changes the result by 1.1e-03, and twice this value

@@ -75,7 +75,7 @@ class Facets:
         return FacetTree(self.corners)
 
     def inside(self, y: NDArray[np.float64], at: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return whether each position y (d, m) lies in its facet (m,) after orthogonal projection onto its plane."""
+        """Return whether each position y (d, m) lies in its facet (m,) after projection onto the plane of the facet."""
         corners, out, _ = self._columns
         return (((y - corners.take(at, 2)) * out.take(at, 2)).sum(axis=1) <= self._margin).all(axis=0)
 

@@ -95,9 +95,9 @@ def run(
         One function of the simulation, or several, that end the run before t_end. An event occurs within a step when a
         returned number changes its sign, or a returned boolean changes. A number that is zero at the start of a step
         causes no event.  Example of a number: `lambda s: -s.points.displacement[:, 1].min() - 0.1`.  The run ends at
-        most a thousandth of the step length after the event.  The final state is an output, and `Result.event` contains the
-        function's index and the time. The functions must return equal values on all processes.  An event ends the run
-        like t_end.  A later run without `until` may continue its histories.
+        most a thousandth of the step length after the event.  The final state is an output, and `Result.event` contains
+        the function's index and the time. The functions must return equal values on all processes.  An event ends the
+        run like t_end.  A later run without `until` may continue its histories.
     probes
         Material particles at which results are recorded.
     observe
