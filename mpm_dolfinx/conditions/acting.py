@@ -121,8 +121,8 @@ class Shares(NamedTuple):
 class At(NamedTuple):
     """Displacement increment of the step in one iteration of Newton's method."""
 
-    unknowns: Unknowns  # numbering of u
-    u: NDArray[np.float64]  # nodal displacements (dofs,), m
+    unknowns: Unknowns  # numbering of the unknowns in u
+    u: NDArray[np.float64]  # nodal displacement increments (dofs,), m
     parts: Parts | None = None  # connected parts of the bodies
 
     @property

@@ -227,7 +227,7 @@ class MovedTools(ContactProblem):
         S = guides @ S + inertia[:, None] * np.eye(len(motions))
         whole = np.trace(S, axis1=1, axis2=2)
         bears = inertia.any(axis=1) | (whole > 0)
-        S = S + np.abs(whole)[:, None, None] * (np.eye(len(motions)) - guides)  # regular where the tool is guided
+        S = S + np.abs(whole)[:, None, None] * (np.eye(len(motions)) - guides)  # regular in fixed directions too
         inverse = np.zeros_like(S)
         inverse[bears] = guides[bears] @ np.linalg.inv(S[bears])
         off = self._forces - inertial - np.einsum("kij,kj->ki", guides, sums[:, :, 0])

@@ -229,7 +229,7 @@ class Contacts(Touching):
         return facets, Pairs(row[order], other[order], t[order], gap[order])
 
     def _under(self, facets: Facets, chosen: NDArray[np.int64], x: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the cell below the surface at each position x, which lies on the facet `chosen`."""
+        """Return the cell on the inner side of the surface at each position x, which lies on the facet `chosen`."""
         grid, inside = self.grid, x - NEAR * self.grid.least * facets.outward[chosen]
         number = grid.number(grid.index_from_base(inside)) + facets.cell[chosen] // grid.cells * grid.cells
         keys = np.unique(facets.face * grid.all_cells + facets.cell)
