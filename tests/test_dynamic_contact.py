@@ -15,6 +15,7 @@ from mpm_dolfinx.points.cutting import spreads
 from mpm_dolfinx.stepping.balances import Balances
 
 G = 9.81
+FOOT = np.array([0.21, 0.39])  # m, contact point of the disc on an incline
 STIFF = mpm.Hencky(bulk=1e6, shear=6e5, grain_density=2000.0)
 BAR = Bar(bulk=1 / 3, shear=0.5, grain_density=2.0, porosity=0.5)  # c = 1 m/s, rho = 1 kg/m^3, E = 1 Pa
 
@@ -166,6 +167,24 @@ def test_a_block_that_friction_holds_stays():
     assert abs((of_centre(s, s.points.x) - start) @ e) < 5e-3  # while it settles
 
 
+def disc_on_incline(friction, cells, **modulus):
+    """Return a disc at rest on an incline of 30 degrees, the incline's direction, and its normal.
+
+    `cells`: number of cells over the diameter of 0.3 m.
+    """
+    turn, radius = -np.pi / 6, 0.15
+    e = np.array([np.cos(turn), np.sin(turn)])
+    normal = np.array([-e[1], e[0]])
+    grid = mpm.Grid([0, 0], [0.9, 0.75], [3 * cells, 5 * cells // 2])
+    around = np.linspace(0, 2 * np.pi, 128, endpoint=False)
+    rim = radius * (normal + np.stack([np.cos(around), np.sin(around)], axis=1))
+    floor = mpm.Tool(mpm.HalfSpace(tuple(FOOT), tuple(normal)), friction=friction)
+    rubber = mpm.Hencky(**modulus, grain_density=2000.0)
+    disc = mpm.polygon(grid, FOOT + rim, sides="rim")
+    s = mpm.Simulation(grid, [disc], [rubber], walls={}, conditions=[floor], gravity=(0, -G), inertia=True)
+    return s, e, normal
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("friction", [0.3, 0.1])
 def test_a_disc_rolls_down_an_incline_or_slips(friction):
@@ -174,23 +193,35 @@ def test_a_disc_rolls_down_an_incline_or_slips(friction):
     Its angular velocity grows by a / R, or by 2 mu g cos b / R.
     """
     pytest.importorskip("gmsh")
-    angle, turn, radius, t = np.pi / 6, -np.pi / 6, 0.15, 0.4
-    e = np.array([np.cos(turn), np.sin(turn)])
-    normal = np.array([-e[1], e[0]])
-    grid = mpm.Grid([0, 0], [0.9, 0.75], [30, 25])
-    foot = np.array([0.21, 0.39])
-    around = np.linspace(0, 2 * np.pi, 128, endpoint=False)
-    disc = mpm.polygon(grid, foot + radius * (normal + np.stack([np.cos(around), np.sin(around)], axis=1)), sides="rim")
-    floor = mpm.Tool(mpm.HalfSpace(tuple(foot), tuple(normal)), friction=friction)
-    gravity = G * (np.sin(angle) * e - np.cos(angle) * normal)
-    rubber = mpm.Hencky(bulk=1e8, shear=6e7, grain_density=2000.0)
-    s = mpm.Simulation(grid, [disc], [rubber], walls={}, conditions=[floor], gravity=gravity, inertia=True)
+    angle, radius, t = np.pi / 6, 0.15, 0.4
+    s, e, _ = disc_on_incline(friction, 10, bulk=1e8, shear=6e7)
     start = of_centre(s, s.points.x)
     s.run(t, 0.01, progress=False)
     a = max(2 / 3 * G * np.sin(angle), G * (np.sin(angle) - friction * np.cos(angle)))
     assert (of_centre(s, s.points.x) - start) @ e == pytest.approx(a * t**2 / 2, rel=0.01)
     assert of_centre(s, s.points.data["velocity"]) @ e == pytest.approx(a * t, rel=0.01)
     assert spin_of(s) == pytest.approx(min(a, 2 * friction * G * np.cos(angle)) * t / radius, rel=0.01)
+
+
+@pytest.mark.slow
+def test_a_soft_disc_that_slips_turns_as_theory_says():
+    """Reference: sliding contact of an elastic disc and a rigid plane (Johnson 1985, section 8.2).
+
+    With beta = (1 - 2 nu) / (2 - 2 nu) and tan(pi c) = mu beta, the pressure in the contact of half-width a is
+    proportional to (a + x)^(1/2 + c) (a - x)^(1/2 - c). Its resultant acts 8/3 c a ahead of the disc's centre.
+    """
+    pytest.importorskip("gmsh")
+    mu, t, K, shear, radius = 0.1, 0.4, 1e6, 6e5, 0.15
+    nu, across = (3 * K - 2 * shear) / (6 * K + 2 * shear), G * np.cos(np.pi / 6)
+    load, stiffness = 2000 * np.pi * radius**2 * across, 2 * shear / (1 - nu)
+    width, c = np.sqrt(4 * load * radius / np.pi / stiffness), np.arctan(mu * (0.5 - nu) / (1 - nu)) / np.pi
+    errors = []
+    for cells in (10, 20):
+        s, _, normal = disc_on_incline(mu, cells, bulk=K, shear=shear)
+        s.run(t, 0.005, progress=False)
+        arm = (of_centre(s, s.points.x) - FOOT) @ normal - 8 / 3 * c * width / mu
+        errors.append(spin_of(s) / (2 * mu * across * arm * t / radius**2) - 1)
+    assert abs(errors[0]) < 0.06 and abs(errors[1]) < 0.7 * abs(errors[0]), errors
 
 
 def spin_of(s):

@@ -143,7 +143,7 @@ class BlockSolver:
         self._ksp.setConvergenceHistory(MOST, reset=True)
         self._ksp.pc.setType(PETSc.PC.Type.PYTHON)
         self._ksp.setOperators(self._A)
-        self._foresight = Foresight(max(1, how.many // 4))
+        self._foresight = Foresight(how.many if how.fallback == SWEEPS else max(1, how.many // 4))
         self._ksp.setMonitor(self._foresight)
         self._ksp.setFromOptions()
 
