@@ -143,7 +143,7 @@ class BlockSolver:
         self._ksp.setConvergenceHistory(MOST, reset=True)
         self._ksp.pc.setType(PETSc.PC.Type.PYTHON)
         self._ksp.setOperators(self._A)
-        self._foresight = Foresight(how.many if how.fallback == SWEEPS else max(1, how.many // 4))
+        self._foresight = Foresight(max(1, how.many // 4))
         self._ksp.setMonitor(self._foresight)
         self._ksp.setFromOptions()
 
@@ -169,8 +169,9 @@ class BlockSolver:
         """
         given = du, dp, scales, rtol, slopes
         cycles = self._plan.fallback == SWEEPS
-        self._foresight.active = replaceable = bool(self._plan.fallback) and not (factors and cycles)
-        count = self._iterate(factors or self._cycles, *given, MOST if cycles or not replaceable else self._plan.many)
+        replaceable = bool(self._plan.fallback) and not (factors and cycles)
+        self._foresight.active = replaceable and not cycles
+        count = self._iterate(factors or self._cycles, *given, self._plan.many if replaceable else MOST)
         self._foresight.active = False
         if replaceable and self._ksp.getConvergedReason() < 0:
             with _compat.Timer("factorisation"):
