@@ -309,17 +309,22 @@ class Tools(Touching):
     ) -> NDArray[np.float64]:
         """Return the corners (n, 2^d, d) of domains at time t (s), after a correction of penetrations into tools.
 
-        The correction reduces penetrations of at most `most` cell sizes to twice `DEPTH` cell sizes.  Only the
-        components flagged by `free` (n, 2^d, d) change.
+        The correction reduces penetrations of at most `most` cell sizes to twice `DEPTH` cell sizes.  The direction is
+        the mean gradient of the distance over the depth, which is continuous at edges and at the axis of a cone.  Only
+        the components flagged by `free` (n, 2^d, d) change.
         """
         out, h = corners.copy(), self.grid.least
         for tool in self.tools:
             gap, pose = self._gaps(tool, out, t), self._pose(tool, t)
             gap += 2 * DEPTH * h
             at = (gap < 0) & (gap > -most * h)
-            own = pose.own(out[at])
-            n = together(self.grid.comm, lambda tool=tool, own=own: tool.solid(h).normal(own))
-            out[at] -= free[at] * (gap[at, None] * n @ pose.R.T)
+            own, depth = pose.own(out[at]), -gap[at, None]
+            motion = np.empty_like(own)
+            for axis, e in enumerate(np.eye(self.grid.dim)):
+                ends = [own + sign * depth * e for sign in (1, -1)]
+                ahead, behind = together(self.grid.comm, lambda tool=tool, y=ends: [tool.gap(end, h) for end in y])
+                motion[:, axis] = (ahead - behind) / 2
+            out[at] += free[at] * (motion @ pose.R.T)
         return out
 
     def _gaps(self, tool: Tool, corners: NDArray[np.float64], t: float) -> NDArray[np.float64]:
