@@ -186,7 +186,7 @@ class Tools(Touching):
         cut, points = place.cut, place.points
         start, t = place.start, place.t
         grid, d = self.grid, self.grid.dim
-        patches = cut.surface(self.outside)
+        patches = cut.contact_surface(self.outside)
         x, area = patches.now(points), patches.area(points)
         size, free = np.linalg.norm(area, axis=1), self._free[patches.face]
         stiffness = self._stiffness(cut.points)[patches.at] * [1.0, place.rate]
