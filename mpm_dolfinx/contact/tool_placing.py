@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from copy import copy
+from functools import partial
 from typing import NamedTuple
 
 from mpi4py import MPI
@@ -15,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from mpm_dolfinx.base.errors import NotConverged
 from mpm_dolfinx.base.time_integration import in_step
-from mpm_dolfinx.base.tolerances import TINY
+from mpm_dolfinx.base.tolerances import SAME, TINY
 from mpm_dolfinx.base.validation import line
 from mpm_dolfinx.bodies.touching import MISFIT
 from mpm_dolfinx.conditions.acting import At, Loads, Outcome, Place, Setting, Shares
@@ -44,6 +45,18 @@ def _box(x: NDArray[np.float64]) -> list[tuple[NDArray[np.float64], MPI.Op]]:
 def motion_count(dim: int) -> int:
     """Return the number of degrees of freedom of a tool: d displacements, and in 2D a rotation."""
     return dim + (dim == 2)
+
+
+def _outwards(tool: Tool, y: NDArray[np.float64], depth: NDArray[np.float64], h: float) -> NDArray[np.float64]:
+    """Return motions (n, d), in m, of positions y (n, d) out of a tool by their depths (n, 1) along the normal.
+
+    If the normal varies within the depth, its mean replaces it.  The result is continuous at edges and axes.
+    """
+    out = depth * tool.solid(h).normal(y)
+    ends = [[tool.gap(y + sign * depth * e, h) for sign in (1, -1)] for e in np.eye(y.shape[1])]
+    mean = np.stack([(ahead - behind) / 2 for ahead, behind in ends], axis=1)
+    varies = np.abs(mean - out).max(axis=1, keepdims=True, initial=0.0) > SAME * h
+    return np.where(varies, mean, out)
 
 
 class LoadMotion(NamedTuple):
@@ -309,21 +322,15 @@ class Tools(Touching):
     ) -> NDArray[np.float64]:
         """Return the corners (n, 2^d, d) of domains at time t (s), after a correction of penetrations into tools.
 
-        The correction reduces penetrations of at most `most` cell sizes to twice `DEPTH` cell sizes.  The direction is
-        the mean gradient of the distance over the depth, which is continuous at edges and at the axis of a cone.  Only
-        the components flagged by `free` (n, 2^d, d) change.
+        The correction reduces penetrations of at most `most` cell sizes to twice `DEPTH` cell sizes.  Only the
+        components flagged by `free` (n, 2^d, d) change.
         """
         out, h = corners.copy(), self.grid.least
         for tool in self.tools:
             gap, pose = self._gaps(tool, out, t), self._pose(tool, t)
             gap += 2 * DEPTH * h
             at = (gap < 0) & (gap > -most * h)
-            own, depth = pose.own(out[at]), -gap[at, None]
-            motion = np.empty_like(own)
-            for axis, e in enumerate(np.eye(self.grid.dim)):
-                ends = [own + sign * depth * e for sign in (1, -1)]
-                ahead, behind = together(self.grid.comm, lambda tool=tool, y=ends: [tool.gap(end, h) for end in y])
-                motion[:, axis] = (ahead - behind) / 2
+            motion = together(self.grid.comm, partial(_outwards, tool, pose.own(out[at]), -gap[at, None], h))
             out[at] += free[at] * (motion @ pose.R.T)
         return out
 

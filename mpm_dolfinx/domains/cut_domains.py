@@ -200,11 +200,13 @@ class CutDomains(Keyed):
         return self.surfaces([faces])[0]
 
     def contact_surface(self, faces: Surface) -> Patches:
-        """Return the quadrature points on a surface in contact.  Corners within `NEAR` cells of a plane lie on it.
+        """Return the quadrature points on a surface in contact.  In 3D, corners within `NEAR` cells of a plane lie on it.
 
-        If a plane cut off a tiny corner, all points on the face would move, and the contact of a sharp tool would
-        change by a finite amount.
+        If a plane cut off a tiny corner of a triangle, all points on the triangle would move.  The contact of a sharp
+        tool would then change by a finite amount.  In 2D, points on an edge change continuously.
         """
+        if self.grid.dim == 2:
+            return self.surface(faces)
         key = faces, "contact"
         if key not in self._patches:
             self._patches[key] = self._cut_surfaces([faces], NEAR)[0]
