@@ -279,7 +279,8 @@ class Contacts(Touching):
             deepest = over_all(comm, float(pairs.gap.min(initial=np.inf)), MPI.MIN)
             if deepest < -MISFIT * h:
                 row = pairs.row[pairs.gap == deepest][:1]
-                where = first(comm, "".join(f"{x}" for x in cut.contact_surface(faces).now(points)[row] + cut.grid.base))
+                found = cut.contact_surface(faces).now(points)[row] + cut.grid.base
+                where = first(comm, "".join(map(str, found)))
                 return f"{line(self.contacts[number])}: bodies overlap by {-deepest / h:.3g} cells at {where}"
         return ""
 

@@ -200,7 +200,7 @@ class CutDomains(Keyed):
         return self.surfaces([faces])[0]
 
     def contact_surface(self, faces: Surface) -> Patches:
-        """Return the quadrature points on a surface in contact.  In 3D, corners within `NEAR` cells of a plane lie on it.
+        """Return quadrature points on a surface in contact.  In 3D, corners within `NEAR` cells of a plane lie on it.
 
         If a plane cut off a tiny corner of a triangle, all points on the triangle would move.  The contact of a sharp
         tool would then change by a finite amount.  In 2D, points on an edge change continuously.
