@@ -118,7 +118,7 @@ class Contacts(Touching):
         cut, points = place.cut, place.points
         own = self._stiffness(cut.points)
         for i, ((number, faces, others, sign), (facets, pairs)) in enumerate(zip(self._faces, found, strict=True)):
-            patches = cut.surface(faces)
+            patches = cut.contact_surface(faces)
             now = facets if present is seen else self._facets(cut, others, present)
             cell = self._under(facets, pairs.facet, _on(facets.cut[pairs.facet], pairs.t))
             if present is not points:
@@ -169,7 +169,7 @@ class Contacts(Touching):
         keys = []
         count = self.grid.all_cells
         for (_, faces, *_), (facets, pairs) in zip(self._faces, found, strict=True):
-            patches = cut.surface(faces)
+            patches = cut.contact_surface(faces)
             where = _on(facets.cut[pairs.facet], pairs.t)
             keys.append(patches.cell[pairs.row] * count + self._under(facets, pairs.facet, where))
             cells = np.unique(patches.cell), np.unique(facets.cell)
@@ -183,7 +183,7 @@ class Contacts(Touching):
 
     def _facets(self, cut: CutDomains, faces: Surface, points: MaterialPoints) -> Facets:
         """Return the quadrature points on the faces, of all processes."""
-        patches, d = cut.surface(faces), self.grid.dim
+        patches, d = cut.contact_surface(faces), self.grid.dim
         index = FACES[d][faces.face[patches.face]]
         now, then = (
             np.take_along_axis(of.corners[patches.at], index[:, :, None], axis=1) for of in (points, cut.points)
@@ -204,7 +204,7 @@ class Contacts(Touching):
         self, cut: CutDomains, faces: Surface, others: Surface, points: MaterialPoints
     ) -> tuple[Facets, Pairs]:
         """Return the facets of `others`, and the pairs: a point on `faces`, and the opposite position on `others`."""
-        patches = cut.surface(faces)
+        patches = cut.contact_surface(faces)
         facets = self._facets(cut, others, points)
         d = self.grid.dim
         x, area = patches.now(points), patches.area(points)
@@ -279,7 +279,8 @@ class Contacts(Touching):
             deepest = over_all(comm, float(pairs.gap.min(initial=np.inf)), MPI.MIN)
             if deepest < -MISFIT * h:
                 row = pairs.row[pairs.gap == deepest][:1]
-                where = first(comm, "".join(f"{x}" for x in cut.surface(faces).now(points)[row] + cut.grid.base))
+                found = cut.contact_surface(faces).now(points)[row] + cut.grid.base
+                where = first(comm, "".join(map(str, found)))
                 return f"{line(self.contacts[number])}: bodies overlap by {-deepest / h:.3g} cells at {where}"
         return ""
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from copy import copy
+from functools import partial
 from typing import NamedTuple
 
 from mpi4py import MPI
@@ -15,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from mpm_dolfinx.base.errors import NotConverged
 from mpm_dolfinx.base.time_integration import in_step
-from mpm_dolfinx.base.tolerances import TINY
+from mpm_dolfinx.base.tolerances import SAME, TINY
 from mpm_dolfinx.base.validation import line
 from mpm_dolfinx.bodies.touching import MISFIT
 from mpm_dolfinx.conditions.acting import At, Loads, Outcome, Place, Setting, Shares
@@ -44,6 +45,18 @@ def _box(x: NDArray[np.float64]) -> list[tuple[NDArray[np.float64], MPI.Op]]:
 def motion_count(dim: int) -> int:
     """Return the number of degrees of freedom of a tool: d displacements, and in 2D a rotation."""
     return dim + (dim == 2)
+
+
+def _outwards(tool: Tool, y: NDArray[np.float64], depth: NDArray[np.float64], h: float) -> NDArray[np.float64]:
+    """Return motions (n, d), in m, of positions y (n, d) out of a tool by their depths (n, 1) along the normal.
+
+    If the normal varies within the depth, its mean replaces it.  The result is continuous at edges and axes.
+    """
+    out = depth * tool.solid(h).normal(y)
+    ends = [[tool.gap(y + sign * depth * e, h) for sign in (1, -1)] for e in np.eye(y.shape[1])]
+    mean = np.stack([(ahead - behind) / 2 for ahead, behind in ends], axis=1)
+    varies = np.abs(mean - out).max(axis=1, keepdims=True, initial=0.0) > SAME * h
+    return np.where(varies, mean, out)
 
 
 class LoadMotion(NamedTuple):
@@ -186,7 +199,7 @@ class Tools(Touching):
         cut, points = place.cut, place.points
         start, t = place.start, place.t
         grid, d = self.grid, self.grid.dim
-        patches = cut.surface(self.outside)
+        patches = cut.contact_surface(self.outside)
         x, area = patches.now(points), patches.area(points)
         size, free = np.linalg.norm(area, axis=1), self._free[patches.face]
         stiffness = self._stiffness(cut.points)[patches.at] * [1.0, place.rate]
@@ -317,9 +330,8 @@ class Tools(Touching):
             gap, pose = self._gaps(tool, out, t), self._pose(tool, t)
             gap += 2 * DEPTH * h
             at = (gap < 0) & (gap > -most * h)
-            own = pose.own(out[at])
-            n = together(self.grid.comm, lambda tool=tool, own=own: tool.solid(h).normal(own))
-            out[at] -= free[at] * (gap[at, None] * n @ pose.R.T)
+            motion = together(self.grid.comm, partial(_outwards, tool, pose.own(out[at]), -gap[at, None], h))
+            out[at] += free[at] * (motion @ pose.R.T)
         return out
 
     def _gaps(self, tool: Tool, corners: NDArray[np.float64], t: float) -> NDArray[np.float64]:

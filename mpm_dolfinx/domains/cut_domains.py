@@ -124,7 +124,7 @@ class CutDomains(Keyed):
         self.grid = grid
         self.points = points
         self.domains = domains
-        self._patches: dict[Surface, Patches] = {}
+        self._patches: dict[Surface | tuple[Surface, str], Patches] = {}
         pieces = cut(grid, points.corners, second, faces) if domains else whole_points(grid, points.x)
         if grid.copies > 1:
             pieces.cell += grid.copy(points.id)[pieces.point]
@@ -199,13 +199,26 @@ class CutDomains(Keyed):
         """
         return self.surfaces([faces])[0]
 
+    def contact_surface(self, faces: Surface) -> Patches:
+        """Return quadrature points on a surface in contact.  In 3D, corners within `NEAR` cells of a plane lie on it.
+
+        If a plane cut off a tiny corner of a triangle, all points on the triangle would move.  The contact of a sharp
+        tool would then change by a finite amount.  In 2D, points on an edge change continuously.
+        """
+        if self.grid.dim == 2:
+            return self.surface(faces)
+        key = faces, "contact"
+        if key not in self._patches:
+            self._patches[key] = self._cut_surfaces([faces], NEAR)[0]
+        return self._patches[key]
+
     def surfaces(self, several: Sequence[Surface]) -> list[Patches]:
         """Return the quadrature points of several surfaces."""
         if new := [faces for faces in dict.fromkeys(several) if faces not in self._patches]:
             self._patches.update(zip(new, self._cut_surfaces(new), strict=True))
         return [self._patches[faces] for faces in several]
 
-    def _cut_surfaces(self, several: Sequence[Surface]) -> list[Patches]:
+    def _cut_surfaces(self, several: Sequence[Surface], least: float = 0.0) -> list[Patches]:
         origin = None
         if ROOT in self.points.data:
             several, origin = zip(*[on_parts(faces, self.points) for faces in several], strict=True)
@@ -220,7 +233,7 @@ class CutDomains(Keyed):
         corners = self.points.corners[at]
         count = xi.shape[1]
         places = interpolate(corners.repeat(count, axis=0), xi.reshape(-1, self.grid.dim)).reshape(xi.shape)
-        face, x, xi, share, middle = cut_faces(self.grid, places, xi)
+        face, x, xi, share, middle = cut_faces(self.grid, places, xi, least)
         outward = face_vectors(corners, number)
         size = np.sqrt(np.add.reduce(outward**2, axis=1, keepdims=True))
         skew = skew[here][face].nonzero()[0]  # over a triangle, positions are linear, but xi is not

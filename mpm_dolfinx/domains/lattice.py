@@ -30,7 +30,7 @@ from mpm_dolfinx.bodies.bodies import Body
 from mpm_dolfinx.bodies.faces import Surface
 from mpm_dolfinx.bodies.touching import Faces, covers
 from mpm_dolfinx.domains.renewed_faces import ROOT, is_part, roots
-from mpm_dolfinx.grid.grid import FACES, Grid, among, corner_bits, in_chunks
+from mpm_dolfinx.grid.grid import FACES, Grid, among, corner_bits, in_chunks, sum_by
 from mpm_dolfinx.parallel.exchange import Exchange
 from mpm_dolfinx.points.material_points import MaterialPoints
 
@@ -151,8 +151,8 @@ def _at_sites(
 ) -> tuple[NDArray[np.float64], slice, Callable[[NDArray[np.float64]], NDArray[np.float64]]]:
     """Return the values at the lattice sites of this process, its layers, and a function from sites to corners.
 
-    The layers of the lattice are distributed over the processes.  A site with values that differ by more than
-    `tolerance` has nan.
+    The layers of the lattice are distributed over the processes.  A site has the mean value of its corners, or nan if a
+    value differs from the mean by more than `tolerance`.
     """
     across, starts = int(np.prod(shape[1:])), np.arange(comm.size + 1) * shape[0] // comm.size
     layer = number // across
@@ -170,6 +170,11 @@ def _at_sites(
     field = np.full(((last - first) * across, values.shape[1]), np.nan)
     for at, d in rows:
         field[at] = d
+    count = np.maximum(sum(np.bincount(at, minlength=len(field)) for at, _ in rows), 1)
+    for column in range(values.shape[1]):  # the mean of equal values is exact
+        here = field[:, column].copy()
+        off = sum(sum_by(at, d[:, column] - here[at], len(field)) for at, d in rows)
+        field[:, column] = here + off / count
     for at, d in rows:
         for part in in_chunks(len(at)):
             sites = at[part]

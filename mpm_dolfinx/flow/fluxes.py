@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from mpm_dolfinx.base import _compat
 from mpm_dolfinx.base.caching import Keyed
 from mpm_dolfinx.base.fluid_content import density_between, mass_potential, mean_density
-from mpm_dolfinx.base.tolerances import TINY
+from mpm_dolfinx.base.tolerances import ROUND_OFF, TINY
 from mpm_dolfinx.forms.point_forms import FacetForm, FacetSum
 from mpm_dolfinx.forms.unknowns import sum_ghosts
 from mpm_dolfinx.grid.grid import Grid, across_faces, sum_by
@@ -239,8 +239,10 @@ class CellContents(Keyed):
         forms.fixed_stress.x.array[filled] = self.fixed_stress
         centroid, lower, upper = (f.x.array.reshape(-1, d) for f in shapes)
         centroid[filled] = (sums[3 : 3 + d] / area).T - grid.midpoints[filled]
+        rounding = np.reshape(ROUND_OFF * grid.around(grid.midpoints[filled]), (-1, 1))
         for target, faces in ((lower, sums[3 + d :: 2]), (upper, sums[4 + d :: 2])):
-            target[filled] = faces.T * grid.sizes(filled) / np.array(grid.volumes(filled)).reshape(-1, 1)
+            share = faces.T * grid.sizes(filled) / np.array(grid.volumes(filled)).reshape(-1, 1)
+            target[filled] = np.where(share > rounding, share, 0.0)  # rounding errors open no face
         for f in (forms.fixed_stress, *shapes):
             f.x.scatter_forward()
         at = grid.midpoints[filled] + centroid[filled]

@@ -187,7 +187,7 @@ def cut(grid: Grid, corners: NDArray[np.float64], second: bool = False, faces: b
 
 
 def on_planes(
-    grid: Grid, true: NDArray[np.float64], x: NDArray[np.float64], axes: int
+    grid: Grid, true: NDArray[np.float64], x: NDArray[np.float64], axes: int, least: float = 0.0
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return positions in cell units, and positions for slicing.  Positions near a grid plane are moved onto this
     plane.
@@ -197,11 +197,12 @@ def on_planes(
     `true`: positions from the lower corner of the grid, in cell units.
     `x`, in m: the same positions, from the base of the grid.
     `axes`: array axis of the d components of a position.
+    `least`, in cell sizes: smallest distance that counts as near, at least `grid.snap`.
     """
     shape = [1] * true.ndim
     shape[axes] = grid.dim
     nearest = np.rint(true)
-    near = np.abs(true - nearest) < grid.snap.reshape(shape)
+    near = np.abs(true - nearest) < np.maximum(grid.snap, least).reshape(shape)
     y = np.where(near, nearest, true)
     if grid.even:
         return y, y
@@ -459,12 +460,13 @@ def _products(
 
 
 def cut_faces(
-    grid: Grid, corners: NDArray[np.float64], local: NDArray[np.float64]
+    grid: Grid, corners: NDArray[np.float64], local: NDArray[np.float64], least: float = 0.0
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Cut faces of domains by the grid, and return integration points that are exact for products of Q1 functions.
 
     `corners` (faces, 2^(d-1), d), in m: corners of the faces; triangles repeat their last corner.
     `local` (faces, 2^(d-1), e): e values at the corners, which are interpolated to the points.
+    `least`: see `on_planes`.
 
     Returns
     -------
@@ -475,7 +477,7 @@ def cut_faces(
     Middle (n, d) of the segment or triangle of each point.
     """
     d, m = grid.dim, len(corners)
-    y = on_planes(grid, grid.in_cells(corners), corners, 2)[1]
+    y = on_planes(grid, grid.in_cells(corners), corners, 2, least)[1]
     both = np.concatenate([y, local], axis=2).transpose(1, 2, 0)
     split = [(0, 1)]
     if d == 3:
