@@ -117,7 +117,7 @@ def slide(o: Namespace) -> dict:
     s.stage(inertia=True)
     s.run(LONGEST, 10, until=lambda s: shot(s).speed > REST, observe=look, progress=False)
     if film[-1].speed <= REST:
-        raise SystemExit("the bank stands")
+        raise SystemExit("the bank does not fail")
     failed, rained = s.t, len(film)
     crept = float(np.linalg.norm(s.points.displacement, axis=1).max())
     result = s.run(failed + SLIDES, o.slide_step, energies=True, observe=look, progress=False)
