@@ -41,10 +41,10 @@ def bar(
     v: ArrayLike | None = None,
     held: bool = True,
 ) -> Motion:
-    """Return nodal displacements and velocities of a bar of linear elements after some steps of SDIRK2.
+    """Return nodal displacements and velocities of a bar of linear elements after `steps` steps of SDIRK2.
 
-    young, density, h: modulus, density, length of each element.  load: force on the last node.  weight: gravity.
-    v: initial velocities of the nodes.  held: whether the first node is fixed.
+    young, density, h: Young's modulus, density and length of each element.  load: force on the last node.
+    weight: gravity.  v: initial velocities of the nodes.  held: whether the first node is fixed.
     """
     young, density, h = np.broadcast_arrays(*map(np.asarray, (young, density, h)))
     n, k = len(h), np.arange(len(h))
