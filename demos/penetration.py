@@ -16,9 +16,9 @@ diameter, the clay is therefore seeded with new points, which take over the stre
 new seeding, N is lower for one or two steps. Errors refer to the mean of N over the steps before each new seeding.
 `spread` is the range of N in these steps, divided by this mean.
 
-A smooth bar is also pushed through saturated ("wet") clay by one diameter, at three rates `V = v D / c_v`, with the
-velocity v and the coefficient of consolidation c_v. Water exerts the pressure on the top, so the clay starts without
-effective stress. Wet clay is seeded only once. Domains longer than a cell are replaced by new domains (renewal).
+A smooth bar is also pushed through saturated ("wet") clay by one diameter, at three rates V. The rate is
+`V = v D / c_v`, with the velocity v and the coefficient of consolidation c_v. Water exerts the pressure on the top, so
+the clay starts without effective stress. Wet clay is seeded only once. New domains replace domains longer than a cell.
 
 With --follow the bar is pushed once more, on grid lines that follow the bar. The number of cells does not change.
 """
