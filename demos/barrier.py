@@ -14,7 +14,7 @@ the clay at the wall. The equilibrium of the wedge bounds the force F normal to 
     F >= ((W - V) sin(theta) - c l) / cos(theta),        F <= ((W + V) sin(theta) + c l) / cos(theta).
 
 Coulomb's active force is the largest lower bound of all planes. Coulomb's passive force is the smallest upper bound.
-The computed force lies between the two.
+The computed force lies between these two forces.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ WEIGHT = 20e3  # N/m³
 SCALE = WEIGHT * HEIGHT  # Pa
 STRONG, WEAK = 0.3 * SCALE, 0.07 * SCALE  # Pa: strength before and after
 ADHESION = 0.5 * WEAK  # Pa: of the barrier
-DURATION = 600.0  # s, time in which the strength is lost
+DURATION = 600.0  # s: time in which the strength decreases
 VISCOSITY = 0.01 * SCALE * DURATION  # Pa s
 SHEAR = 30 * SCALE
 ANGLES = np.radians(np.linspace(20, 85, 261))  # angles of the planes of wedges

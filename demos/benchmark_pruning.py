@@ -6,9 +6,9 @@ feature hardly changes the results. Examples are a gravity of zero, a conductivi
 from yield. `settlement` is the relative difference between the final settlements of the two scenes. In the pair "mean
 dilatation" (F-bar), the two scenes have different Poisson ratios and therefore different settlements.
 
-The two scenes of a pair take four steps each in turn, --repeat times. The table gives the run time of the fastest step
-of each scene. All times are processor times. The compile time is the additional time of the first step with an empty
-cache of compiled forms. The memory is the peak memory with a full cache.
+The two scenes of a pair alternate, each with four steps at a time, --repeat times. The table gives the run time of the
+fastest step of each scene. All times are processor times. The compile time is the additional time of the first step
+with an empty cache of compiled forms. The memory is the peak memory with a full cache.
 """
 
 from __future__ import annotations
@@ -144,7 +144,7 @@ class Watched(mpm.Hencky):
 
 
 def conducting(cells: int, law: type[mpm.Skeleton]) -> mpm.Simulation:
-    """Return the draining block. With its conductivity and `Watched`, pressure jumps are computed, but not damped."""
+    """Return the draining block, with a conductivity so large that pressure jumps are not damped."""
     kappa = 8 * soil().pressure_damping() / cells**2 / (GAMMA * DT)
     return block(cells, soil(law, conductivity=kappa * WATER["fluid"].unit_weight), **WATER)
 
@@ -346,7 +346,7 @@ def measure(name: str, cells: int, repeat: int) -> dict:
     least, tops = [np.inf, np.inf], [0.0, 0.0]
     with TemporaryDirectory() as folder:
         files = [None, folder if name == "files written in each step" else None]
-        for turn in range(repeat + 1):  # the first is not counted
+        for turn in range(repeat + 1):  # the first turn is not counted
             for k in (0, 1):
                 seconds, result = take(pair[k], files[k] and f"{files[k]}/{turn}")
                 tops[k] = result.displacement[-1][0, 1]
@@ -369,7 +369,7 @@ def main(argv: list[str] | None = None) -> dict:
     """Run the demo and return its results."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=40, help="cells over the width of the block")
-    parser.add_argument("--repeat", type=int, default=8, help="turns of a pair, after one that is not counted")
+    parser.add_argument("--repeat", type=int, default=8, help="turns of each pair, after one that is not counted")
     parser.add_argument("--quick", action="store_true", help="one pair of small blocks, one turn")
     parser.add_argument("--only", nargs="+", choices=list(PAIRS), metavar="FEATURE", help="rows of these features only")
     parser.add_argument("--one", type=int, help=argparse.SUPPRESS)  # index in MAKES

@@ -102,7 +102,7 @@ def factored(n: int, soil: mpm.Skeleton) -> Iterator[tuple[str, int, list[float]
     makers |= {"PETSc, minimum degree": partial(by_entries, None, False)}
     makers |= {package: partial(by_entries, package, False) for package in ("mumps", "umfpack", "cholmod")}
     for name, make in makers.items():
-        with suppress(PETSc.Error):  # PETSc has no such package, or none for this symmetry
+        with suppress(PETSc.Error):  # PETSc has no such solver, or none for matrices of this symmetry
             began = time.process_time()
             actions = make()
             times = [began]
@@ -115,7 +115,7 @@ def factored(n: int, soil: mpm.Skeleton) -> Iterator[tuple[str, int, list[float]
 def main(argv: list[str] | None = None) -> dict:
     """Print the tables, and return the times for each threshold and number of unknowns."""
     parser = common.Parser(__doc__, __file__, processes=True)
-    parser.add_argument("--repeat", type=int, default=2, help="turns of a pair")
+    parser.add_argument("--repeat", type=int, default=2, help="runs of each scene with each solver")
     parser.add_argument("--quick", action="store_true", help="small blocks, one turn")
     o = parser.parse_args(argv)
     lines = []

@@ -35,7 +35,7 @@ ARC = np.linspace(0, LENGTH, 41)  # m; arc lengths of the probes on the axis
 
 
 def traction(alpha: float) -> tuple[float, float]:
-    """Return the traction on the right end for a load parameter, in Pa."""
+    """Return the traction on the right end, in Pa, for the load parameter alpha."""
     return 0.0, -alpha * STIFFNESS / LENGTH**2 / HEIGHT
 
 
@@ -44,14 +44,14 @@ PHYSICS = {"walls": {"left": "xy"}, "conditions": [mpm.Traction("right", tractio
 
 @dataclass
 class Outcome:
-    """Results of a run: the axis (k, 2) of the beam for each alpha (m), and the `mpm.Result`."""
+    """Results of a run: the axis (k, 2) of the beam in m, for each alpha, and the `mpm.Result`."""
 
     axis: dict[int, np.ndarray]
     result: mpm.Result
 
 
 def run(cells: int = 8, steps: int = 40, last: int = 10) -> tuple[dict[str, float], Outcome]:
-    """Bend the beam to alpha = `last` in increments of 10 / `steps`.
+    """Increase alpha to `last` in increments of 10 / `steps`, and bend the beam.
 
     Returns the errors by name, and the results of the run.
     """

@@ -14,8 +14,8 @@ steps are needed because laws with history are first-order accurate in the step.
    infinite soil. The outer boundary therefore follows a radial solution (`mpm_dolfinx.verification.cavity`).
 
 Pressures are divided by the initial pressure p_0. Errors are relative errors of the cavity pressure, and in undrained
-clay also of the pore pressure at the wall. In undrained clay errors are evaluated at the radii `MARKS`, and in drained
-soil at the radii with published pressures.
+clay also of the pore pressure at the wall. In undrained clay errors are evaluated at the cavity radii `MARKS`, and in
+drained soil at the cavity radii with published pressures.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class Drained:
     """A drained cavity in infinite soil; all radii are divided by the initial radius of the cavity.
 
     state: initial state variables of the soil.
-    known: published cavity pressure divided by p_0, for each radius.
+    known: published cavity pressure divided by p_0, for each radius of the cavity.
     reach: outer radius of the radial solution.
     """
 
@@ -68,7 +68,7 @@ class Drained:
     state: Mapping[str, np.ndarray] = field(default_factory=dict)
 
 
-PRESSED = {"plastic": np.exp(-2 * P0 / (3 * SAND.bulk)) * np.eye(3)}  # initial pressure of sand, as elastic strain
+PRESSED = {"plastic": np.exp(-2 * P0 / (3 * SAND.bulk)) * np.eye(3)}  # elastic strain under the initial pressure
 DRAINED = {
     "well": Drained(well(), {1.02: 2.0685, 1.08293: 2.8928, 1.5: 4.4063}, 100.0),
     "sand-0": Drained(SAND, {1.02: 2.812, 1.1: 4.489, 1.5: 6.531}, state=PRESSED),

@@ -127,7 +127,7 @@ def main(argv: list[str] | None = None) -> dict:
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--aspects", type=float, nargs="+", default=list(CELLS), help="height-to-width ratios")
     parser.add_argument("--finer", type=float, default=1.0, help="factor for the number of cells over the width")
-    parser.add_argument("--steps", type=float, default=STEPS, help="steps in sqrt(H/g)")
+    parser.add_argument("--steps", type=float, default=STEPS, help="steps in the time sqrt(H/g)")
     parser.add_argument("--grain", type=float, default=GRAIN, help="grain size divided by the width; 0: no viscosity")
     parser.add_argument("--renewal", action="store_true", help="replace particle domains that are longer than a cell")
     o = parser.parse_args(argv)

@@ -38,7 +38,7 @@ R, WIDE, BELOW = 1.0, 20.0, 12.0  # m: radius of the shaft and of the clay; clay
 STRENGTH, ROUGH, INDEX = 1e3, 0.3, 100.0  # s_u, Pa; adhesion and G, divided by s_u
 SHEAR = INDEX * STRENGTH
 HALF_ANGLE = 30.0  # degrees, between axis and flank of the cone
-FINE, ABOVE, RATIO = 2.0, 6.5, 1.3  # m: radius of the small cells; cells above the surface; ratio of neighbouring cells
+FINE, ABOVE, RATIO = 2.0, 6.5, 1.3  # m: radius of the fine region; cells above the clay; ratio of neighbouring cells
 AROUND = 1.0, 2.5  # m: small cells below and above the tip, if grid lines follow the cone
 WAY = np.linspace(0.5, 1, 101)  # depths, divided by the final depth, at which runs are compared
 STEP, WET_STEP = 1 / 6, 1 / 12  # motion of the cone in a step, in cell sizes: undrained and saturated clay
@@ -145,10 +145,10 @@ def push(cells: int, depth: float, clay: mpm.Skeleton, follow: bool = False) -> 
 
 @dataclass
 class Dissipation:
-    """Results in wet clay. excess: pressure at the edge between cone and shaft when the cone stops, divided by s_u.
+    """Results in wet clay. excess: excess pressure at the cone's edge when the cone stops, divided by s_u.
 
     rest: fraction of the excess pressure that remains at the times T* of `TIMES`.
-    frame: corners of the domains, excess pressures divided by s_u, and outline of the cone, when the cone stops.
+    frame: when the cone stops, corners of the domains, excess pressures divided by s_u, and outline of the cone.
     """
 
     N: float = 0.0
@@ -158,7 +158,7 @@ class Dissipation:
     frame: tuple = ()
 
     def time_of(self, degree: np.ndarray) -> np.ndarray:
-        """Return the time factors T* at which the pressure has dissipated to these degrees."""
+        """Return the time factors T* at these degrees of dissipation, by interpolation."""
         return np.exp(np.interp(degree, 1 - np.array(self.rest), np.log(TIMES)))
 
 
@@ -198,7 +198,7 @@ def main(argv: list[str] | None = None) -> dict:
     parser.add_argument("--depth", type=float, default=10.0, help="depth of the tip, divided by R")
     parser.add_argument("--wet-depth", type=float, default=5.0, help="the same depth in saturated clay; 0: no run")
     parser.add_argument("--mises", action="store_true", help="von Mises's law in place of Tresca's, in undrained clay")
-    parser.add_argument("--follow", action="store_true", help="push the cone again, on grid lines that follow")
+    parser.add_argument("--follow", action="store_true", help="push the cone again, on grid lines that follow it")
     o = parser.parse_args(argv)
     if not 2 <= o.cells <= 16 or not 0 < o.depth <= 20:
         parser.error(f"--cells {o.cells}: must be 2 to 16; --depth {o.depth}: must be in (0, 20]")

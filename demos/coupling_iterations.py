@@ -53,7 +53,7 @@ SCHEMES = {
 The entry None stands for beta = 1/K_w.
 """
 MOST = 200  # iterations after which a scheme counts as divergent
-RAMP_STEP = 0.02  # s: all systems have the load increment of this time, for any dt
+RAMP_STEP = 0.02  # s: the load of all systems increases as in a step of this length, for any dt
 CLEAR = 0.1  # m from the corners of the clamp, where the pressure is singular
 GOAL = 15  # iterations
 
@@ -128,7 +128,7 @@ class System:
 
 
 def with_water(s: mpm.Simulation, bulk: float) -> mpm.Simulation:
-    """Return a copy of the scene in its present state, with water of another bulk modulus, in Pa.
+    """Return a copy of the scene in its present state, with water of the bulk modulus `bulk`, in Pa.
 
     Pressures are scaled to at most a tenth of the bulk modulus, so that the density of the water stays physical.
     """
@@ -208,7 +208,7 @@ def cells(s: mpm.Simulation) -> NDArray[np.float64]:
 
 
 def roughness(p: NDArray[np.float64]) -> float:
-    """Return the rms difference of pressures (nx, ny) from their neighbours' mean, divided by the largest pressure."""
+    """Return the rms difference between pressures (nx, ny) and means of neighbours, divided by the largest pressure."""
     deviation = p[1:-1, 1:-1] - (p[:-2, 1:-1] + p[2:, 1:-1] + p[1:-1, :-2] + p[1:-1, 2:]) / 4
     return float(np.sqrt(np.nanmean(deviation**2)) / np.nanmax(np.abs(p)))
 

@@ -31,12 +31,12 @@ from mpm_dolfinx.verification.biot_fem import BiotFEM
 STRETCH = 0.1  # stretch of the block before its rotation
 BLOCK = 1.0  # m
 AWAY = 0.1  # m: distance from the wall beyond which the singular edges have no influence
-SPRINGS = 5e7  # Pa/m: springs instead of the clamp, as stiff as a third of the beam, without singularity
-COLORS = ("C1", "C0", "C2", "C4", "C5")  # one for each cell size
+SPRINGS = 5e7  # Pa/m: springs without singularity in place of the clamp, as stiff as a third of the beam's length
+COLORS = ("C1", "C0", "C2", "C4", "C5")  # one colour for each cell size
 
 
 def options(h: float, load: float, quadrature: str = "domain") -> Namespace:
-    """Return the beam's options."""
+    """Return the options of `poroelastic_beam.py` for a drained run."""
     return beam.arguments(f"--drained --h {h} --load {load} --quadrature {quadrature}".split())
 
 
@@ -170,7 +170,7 @@ def turn(h: float, nu: float = 0.3, steps: int = 90, fluid: mpm.Fluid | None = N
 
 
 def orders(h: list[float], left: list[float]) -> list[float]:
-    """Return the orders of convergence between successive cell sizes."""
+    """Return the orders of convergence of the residual stress, between successive cell sizes."""
     return [float(np.log(a / b) / np.log(c / d)) for a, b, c, d in zip(left, left[1:], h, h[1:], strict=False)]
 
 

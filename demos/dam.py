@@ -148,7 +148,7 @@ def driving(level: float, top: float) -> float:
 
 
 def drained(cells: int, days: float = 100.0) -> tuple[float, float]:
-    """Return the outflow of a column of 10 m (m) by material points and by finite elements.
+    """Return the outflow (m) from a column 10 m high, by material points and by finite elements.
 
     The free surface starts at 8 m, and the head at the base is lowered to 2 m.
     """

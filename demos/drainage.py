@@ -59,7 +59,7 @@ def main(argv: list[str] | None = None) -> dict:
     """Run the demo and return its results."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=40, help="cells over the height")
-    parser.add_argument("--step", type=float, default=60.0, help="step up to 10 minutes, s; later three times as long")
+    parser.add_argument("--step", type=float, default=60.0, help="step, s; after 10 minutes three times as long")
     o = parser.parse_args(argv)
     if o.cells < 5:
         parser.error(f"--cells {o.cells}: must be >= 5")

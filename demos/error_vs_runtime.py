@@ -70,7 +70,7 @@ class Row:
 
 
 def beam_runs(drained: bool, quick: bool) -> Iterator[tuple[str, str, Run]]:
-    """Yield the method and the setting of each run of the beam, with or without water, and a function that runs it."""
+    """Yield the method, the setting and the function of each run of the beam, with or without water."""
     time = "--drained --ramp 1 --t-end 1 --dt 0.1" if drained else f"--t-end {0.4 if quick else 1.2}"
     times, truth = np.array(beam.TIMES), np.array(beam.TRUTH)
     if drained:
@@ -130,7 +130,7 @@ def beam_fem(time: str, element: str, cells: tuple[int, int]) -> tuple[mpm.Resul
 def scene_runs(
     physics: dict, material, size: tuple[float, float], width: int, time: tuple[float, int], exact: float, cells, steps
 ) -> Iterator[tuple[str, str, Run]]:
-    """Yield the method and the setting of each run of a box, and a function that runs it.
+    """Yield the method, the setting and the function of each run of a rectangular body.
 
     width: number of cells over the width, or -1 for as many as over the height.
     time: end time (s), and number of steps in the runs that compare cell sizes.

@@ -273,7 +273,7 @@ def plasticity(cells: int) -> Example:
     sand = mpm.DruckerPrager(bulk=1e7, shear=1e7, friction=20.0, dilation=5.0, cohesion=5e4)
     strain, stress = path(column(cells, sand, load=1e6), 20)
     shear = 2 * sand.shear / np.sqrt(3)  # growth of sqrt(J_2) with the compression; -p grows by K
-    toward = shear - sand.eta * sand.bulk  # the yield surface, which is met at xi c / toward
+    toward = shear - sand.eta * sand.bulk  # the strain at yield is xi c / toward
     beyond = np.maximum(0, strain - sand.xi * sand.cohesion / toward)
     gamma = toward * beyond / (sand.shear + sand.bulk * sand.eta * sand.eta_flow)
     exact = sand.oedometric * strain - (shear - sand.bulk * sand.eta_flow) * gamma

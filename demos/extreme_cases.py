@@ -92,7 +92,7 @@ def judge(row: Row, make: Make, bound: float, rtol: float | None = None) -> Row:
         row.outcome = "recovered" if result.cuts else "converged"
     except (mpm.GaveUp, ValueError) as refusal:
         row.outcome, row.note, result = "refused", str(refusal), getattr(refusal, "result", result)
-    except Exception as error:  # not an error that explains the problem
+    except Exception as error:  # an error that does not explain the problem
         hung = isinstance(error, Hung) or time.process_time() - began >= LIMIT  # some stop within PETSc
         row.outcome, row.note = ("hung", f"more than {LIMIT} s") if hung else ("wrong", repr(error))
     finally:

@@ -31,8 +31,8 @@ longer than its finer neighbour, up to eight times the smallest length.
 With --square, square and circular footings, rough and smooth, are pushed into Tresca's soil, on graded cells. The
 footings are tools. A quarter of the square is computed in 3D. N_c is the limit load, divided by area and c. The bounds
 of N_c are 5.52 and 6.22 for a rough square (Salgado, Lyamin, Sloan and Yu 2004), and 2 + pi and 5.71 for a smooth
-square (Shield and Drucker 1955). Circles are computed in axisymmetry, with about twice as many cells over the width.
-The exact N_c is 6.05 for a rough circle (Cox, Eason and Hopkins 1961), and 5.69 for a smooth circle (Shield 1955).
+square (Shield and Drucker 1955). Circles are computed in axisymmetry, on cells about half as large. The exact N_c is
+6.05 for a rough circle (Cox, Eason and Hopkins 1961), and 5.69 for a smooth circle (Shield 1955).
 
 With non-associated flow the solution is not unique (Rudnicki and Rice 1975). Shear bands change their position between
 steps, and on fine grids many steps are cut. The option --viscosity adds a small viscous stress, which makes the
@@ -114,8 +114,8 @@ def embedded(depth):
 class ExplicitFriction(mpm.DruckerPrager):
     """Drucker-Prager soil whose friction follows from the mean stress at the start of each step.
 
-    Within a step, the friction angle equals the dilation angle, so flow is associated. The cohesion of the step
-    contains friction minus dilation (Krabbenhoft, Karim, Lyamin and Sloan 2012). Two state variables are added:
+    Within a step, the friction angle equals the dilation angle, so flow is associated. The cohesion contains the rest
+    of the friction (Krabbenhoft, Karim, Lyamin and Sloan 2012). Two state variables are added:
     mean: mean Kirchhoff stress, in Pa.
     strength: strength at zero mean stress in the last step, in Pa.
     """
@@ -259,7 +259,7 @@ def limit_load(
 
     how: key of `LIMITS_OF`.
     box, graded: see `push`; by default the box of `LIMITS_OF`, with cells of equal size.
-    steps: number of steps that are computed, of the 40 steps of an undrained push.
+    steps: number of computed steps; a complete undrained push has 40 steps.
     """
     soil, (depth, own) = replace(SOIL, bulk=STIFF * SOIL.bulk, shear=STIFF * SOIL.shear), LIMITS_OF[how]
     box = box or own

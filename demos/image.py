@@ -36,7 +36,7 @@ def picture(pixels: int, seed: int = 9) -> NDArray[np.float64]:
     """Return grey values (x, y) from 0 to 1, with holes outside the largest connected part."""
     noise = np.random.default_rng(seed).standard_normal((pixels, pixels))
     smooth = gaussian_filter(noise, pixels / 16, mode="reflect")
-    smooth += 3 * smooth.std() * np.exp(-np.arange(pixels)[::-1] / (0.06 * pixels))  # a skin, for the plate
+    smooth += 3 * smooth.std() * np.exp(-np.arange(pixels)[::-1] / (0.06 * pixels))  # no holes near the plate
     grey = smooth.ravel().argsort().argsort().reshape(smooth.shape) / (smooth.size - 1)
     parts, _ = label(grey >= HOLES)
     return np.where(parts == np.bincount(parts[parts > 0]).argmax(), grey, 0.0)

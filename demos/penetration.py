@@ -13,12 +13,12 @@ wide, N of a rough bar is 10.9 with 8 cells over the diameter, and 10.8 with 16 
 
 Clay that flows around the bar stretches by a factor of about e^4 for each diameter of depth. After each quarter of a
 diameter, the clay is therefore seeded with new points, which take over the stresses (Hu and Randolph 1998). After each
-new seeding, N is lower for one or two steps. Errors refer to the mean of N before each new seeding. `spread` is the
-range of N in these steps, divided by their mean.
+new seeding, N is lower for one or two steps. Errors refer to the mean of N over the steps before each new seeding.
+`spread` is the range of N in these steps, divided by this mean.
 
-A smooth bar is also pushed through saturated ("wet") clay by one diameter, at three rates `V = v D / c_v`, with the
-velocity v and the coefficient of consolidation c_v. Water exerts the pressure on the top, so the clay starts without
-effective stress. Wet clay is seeded only once. Domains longer than a cell are replaced by new domains (renewal).
+A smooth bar is also pushed through saturated ("wet") clay by one diameter, at three rates V. The rate is
+`V = v D / c_v`, with the velocity v and the coefficient of consolidation c_v. Water exerts the pressure on the top, so
+the clay starts without effective stress. Wet clay is seeded only once. New domains replace domains longer than a cell.
 
 With --follow the bar is pushed once more, on grid lines that follow the bar. The number of cells does not change.
 """
@@ -161,7 +161,7 @@ def kept(simulation: mpm.Simulation) -> Callable:
 
     def bearable(x: np.ndarray) -> np.ndarray:
         values = between(x)
-        values = np.where(np.isnan(values), nearest(x), values)  # outside of the outermost points
+        values = np.where(np.isnan(values), nearest(x), values)  # outside the convex hull of the points
         out = values[:, :3, None] * np.eye(3)
         out[:, 0, 1] = out[:, 1, 0] = values[:, 3]
         mean = np.trace(out, axis1=1, axis2=2)[:, None, None] / 3 * np.eye(3)
@@ -209,7 +209,7 @@ def main(argv: list[str] | None = None) -> dict:
     parser.add_argument("--depth", type=float, default=1.0, help="depth of each push, divided by the diameter")
     parser.add_argument("--wet-cells", type=int, default=4, help="cells over the diameter in saturated clay")
     parser.add_argument("--wet-depth", type=float, default=1.0, help="depth in saturated clay, divided by the diameter")
-    parser.add_argument("--follow", action="store_true", help="push the last bar again, on grid lines that follow")
+    parser.add_argument("--follow", action="store_true", help="push the last bar again, on grid lines that follow it")
     o = parser.parse_args(argv)
     if not 4 <= o.cells <= 32 or not 0 < o.depth <= 4 or any(not 0 <= alpha <= 1 for alpha in o.rough):
         cells, depth = f"--cells {o.cells}: must be 4 to 32", f"--depth {o.depth}: must be in (0, 4]"

@@ -61,7 +61,7 @@ def arguments(argv: list[str] | None = None) -> Namespace:
     add("--offset", type=float, default=0.5, help="distance of the beam's underside from a grid line, cells")
     add("--box-scale", type=int, default=1, help="length and height of the background grid, divided by 1.5 m and 1.2 m")
     add("--coupling", choices=tuple(mpm.COUPLINGS), default="schur-cg", help="coupling scheme")
-    add("--drained", action="store_true", help="no fluid at all")
+    add("--drained", action="store_true", help="no pore fluid")
     add("--reference", action="store_true", help="also compute the Taylor-Hood solution")
     add("--paraview", action="store_true", help="write points, grid and histories of every step to OUT/paraview")
     add("--profile", action="store_true", help="print the run time of each part of the program")

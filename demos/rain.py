@@ -13,8 +13,8 @@ steady flow the suction s of exponential soil is known exactly:
 
     exp(-alpha s / gamma_w) = q / k + (1 - q / k) exp(-alpha z cos(b)^2).
 
-Here alpha is Gardner's constant, gamma_w is the unit weight of water, q is the rain, k is the conductivity, and z is
-the height above the water table. The error is the largest relative error of FS at depths of 1, 2, 3 and 5 m, at rest
+Here alpha is Gardner's constant, gamma_w is the unit weight of water, q is the rain, and k is the conductivity. The
+height above the water table is z. The error is the largest relative error of FS at depths of 1, 2, 3 and 5 m, at rest
 and in steady flow. Source: Lu and Godt (2008) for vertical flow.
 
 With `--slope 10` rain falls on a bank of soil, 5 m high and inclined at 60 degrees, on rough rock. Suction and cohesion
@@ -117,7 +117,7 @@ def slide(o: Namespace) -> dict:
     s.stage(inertia=True)
     s.run(LONGEST, 10, until=lambda s: shot(s).speed > REST, observe=look, progress=False)
     if film[-1].speed <= REST:
-        raise SystemExit("the bank stands")
+        raise SystemExit("the bank does not fail")
     failed, rained = s.t, len(film)
     crept = float(np.linalg.norm(s.points.displacement, axis=1).max())
     result = s.run(failed + SLIDES, o.slide_step, energies=True, observe=look, progress=False)

@@ -89,7 +89,7 @@ def scene(dim: int, points: float) -> tuple[mpm.Simulation, float]:
 
 
 def sent() -> np.ndarray:
-    """Return this process's counts: messages, bytes of exchanges, and messages, bytes, reductions of solvers."""
+    """Return counts of this process: messages and bytes of exchanges; messages, bytes and reductions of solvers."""
     events = [PETSc.Log.Event(name).getPerfInfo() for name in ("KSPSolve", "PCSetUp")]
     solver = [sum(e[name] for e in events) for name in ("numMessages", "messageLength", "numReductions")]
     return np.array([traffic.messages, traffic.bytes, *solver], dtype=float)
@@ -136,7 +136,7 @@ def measure(dim: int, points: float) -> dict:
 
 
 def held(root: object, buffers: bool = True) -> tuple[dict[str, int], set[int]]:
-    """Return for each kind of array the bytes of an object's arrays on this process, and all lengths of axes.
+    """Return the bytes of the arrays in an object on this process, by kind of array, and the lengths of all axes.
 
     Shared memory counts once. Arrays in files that are mapped into memory have the kind "files"; the lengths of their
     axes are omitted.
@@ -158,7 +158,7 @@ def held(root: object, buffers: bool = True) -> tuple[dict[str, int], set[int]]:
             mapped = isinstance(getattr(one.base, "obj", None), mmap)
             (files if mapped else arrays)[one.__array_interface__["data"][0]] = one
         elif isinstance(one, PETSc.Mat):
-            if one.handle and "aij" in one.getType():  # others have no entries of their own
+            if one.handle and "aij" in one.getType():  # other matrices store no entries
                 entries = int(one.getInfo(PETSc.Mat.InfoType.LOCAL)["nz_allocated"])
                 out["matrices"] += entries * (8 + np.dtype(PETSc.IntType).itemsize)
         elif isinstance(one, PETSc.Vec):
@@ -168,7 +168,7 @@ def held(root: object, buffers: bool = True) -> tuple[dict[str, int], set[int]]:
             objects.append(one.function_space)
         elif isinstance(one, Mesh):
             out["mesh"] += one.geometry.x.nbytes + sum(link.nbytes for link in _compat.links(one))
-        elif isinstance(one, FunctionType):  # its globals are of no scene
+        elif isinstance(one, FunctionType):  # globals of a function belong to no scene
             objects += [one.__closure__, one.__defaults__]
         elif buffers or not isinstance(one, point_forms.Rows):
             objects.extend(gc.get_referents(one))
@@ -348,7 +348,7 @@ def main(argv: list[str] | None = None) -> dict:
     size = parser.add_mutually_exclusive_group()
     size.add_argument("--quick", action="store_true", help="a few small sizes")
     size.add_argument("--largest", action="store_true", help="up to 1e6 points in 2D, 3e5 in 3D: a quarter of an hour")
-    size.add_argument("--points", type=float, nargs="+", help="numbers of points, instead of these sizes")
+    size.add_argument("--points", type=float, nargs="+", help="numbers of points, instead of the default sizes")
     add("--processes", type=int, nargs="+", default=[1], help="numbers of processes; under mpirun: its own")
     add("--one", nargs=2, help=argparse.SUPPRESS)  # a run in a process of its own: dimension, points
     o = parser.parse_args(argv)

@@ -96,7 +96,7 @@ def main(argv: list[str] | None = None) -> dict:
 
 
 def draw(out: Path, safety: mpm.Safety, before: np.ndarray, corners: np.ndarray, moved: np.ndarray) -> None:
-    """Draw the viscous stress in the trials, and the slope before and after its slide."""
+    """Draw the viscous stress in the trial runs, and the slope before and after its slide."""
     fig, ((trials, after),) = common.figure(1, 2, (13, 3.6))
     for factor, shares in sorted(safety.overloads.items()):
         rests = factor <= safety.bounds[0]

@@ -74,9 +74,9 @@ def bank(cells: int, length: float, room: float, friction: float, cohesion: floa
 
 @dataclass
 class Failure:
-    """Stability numbers gamma' H / c (n,), `number`, and settlement rates (n,) of the crest, `rate`.
+    """Stability numbers and settlements of the crest in n steps. number (n,): stability numbers gamma' H / c.
 
-    A settlement rate is the settlement in a step, divided by the mean settlement in the first five steps.
+    rate (n,): settlement in each step, divided by the mean settlement in the first five steps.
     critical: stability number at which the bank fails.
     """
 

@@ -3,9 +3,9 @@
 
 Terzaghi's column (demo `terzaghi`) consolidates until the reduced time `T_v = c_v t / height²` is 0.1, with the
 coefficient of consolidation c_v and the time t. The column takes 1, 10, ..., 10 000 equal steps. The error is the root
-mean square of (p - exact) / p0 at the centroids of all cells, with the pressure p and its initial value p0. With many
-steps, the remaining error must be the spatial error. The spatial error follows from exact integration in time. Three
-columns are computed:
+mean square of (p - exact) / p0 at the centroids of all cells. Here p is the pressure, and p0 its initial value. With
+many steps, the remaining error must be the spatial error. The spatial error follows from exact integration in time.
+Three columns are computed:
 
 * column at rest on the grid.
 * moving column: during consolidation the base moves down by half the height, through half of all cells.

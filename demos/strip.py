@@ -139,7 +139,7 @@ def main(argv: list[str] | None = None) -> dict:
     """Run the demo and return its results."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--cells", type=int, default=40, help="cells over the height")
-    parser.add_argument("--load", type=float, default=0.25, help="q/E")
+    parser.add_argument("--load", type=float, default=0.25, help="load divided by Young's modulus, q/E")
     parser.add_argument("--steps", type=int, default=30, help="steps in each decade of T from 0.01 on")
     parser.add_argument("--reference", action="store_true", help="also run Taylor-Hood elements on the same cells")
     o = parser.parse_args(argv)

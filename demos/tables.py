@@ -7,8 +7,8 @@ format:
     | Terzaghi's column, pressure at T_v = 0.5 | 0.004 % <!-- terzaghi --cells 50; errors/p_0.5; % --> |
 
 demos/results contains the output of the demos, with the run time in `seconds` and the release of dolfinx.
-demos/pictures contains the pictures of each demo. They come from the run that the pages name first. A table that a demo
-writes to a file is copied between comments such as `<!-- error_vs_runtime; comparison.md -->` and `<!-- end -->`.
+demos/pictures contains the pictures of each demo, from the run that the pages name first. A table that a demo writes to
+a file is copied between comments such as `<!-- error_vs_runtime; comparison.md -->` and `<!-- end -->`.
 
 `bash demos/run.sh tables` writes the numbers from demos/results.  With `--run terzaghi mandel`, it first runs these
 demos; `--run all` takes hours.
@@ -54,7 +54,7 @@ def figure(value: float, form: str) -> str:
 def figures(run: str, entries: str, form: str) -> str:
     """Return the numbers that a comment requests, as text."""
     if not kept(run).exists():
-        sys.exit(f"{kept(run)}: missing: bash demos/run.sh tables --run {run.split()[0]}")
+        sys.exit(f"{kept(run)}: missing, is written by: bash demos/run.sh tables --run {run.split()[0]}")
     printed, values = json.loads(kept(run).read_text()), []
     for entry in entries.split(" and "):
         value = printed
@@ -91,7 +91,7 @@ def take(run: str, table: str, pictures: bool) -> None:
         start = time.perf_counter()
         done = subprocess.run(command, stdout=subprocess.PIPE, text=True)
         if done.returncode:
-            sys.exit(f"{run}: ended with {done.returncode}")
+            sys.exit(f"{run}: ended with the exit status {done.returncode}")
         printed = {"run": run, "dolfinx": dolfinx.__version__, "seconds": round(time.perf_counter() - start, 1)}
         printed |= json.loads(done.stdout.splitlines()[-1])
         RESULTS.mkdir(exist_ok=True)

@@ -83,7 +83,7 @@ def costs(cells: int, steps: int = 30) -> dict[str, float]:
             begun = time.process_time()
             newton[name] += s.run(float(k), 1.0, progress=False).newton
             spent[name].append(time.process_time() - begun)
-    medians = {name: float(np.median(seconds[2:])) for name, seconds in spent.items()}  # the first two compile
+    medians = {name: float(np.median(seconds[2:])) for name, seconds in spent.items()}  # the first two steps compile
     for name, seconds in medians.items():
         ratio = seconds / medians["Drucker-Prager"]
         times = f"{seconds:.3f} s per time step, {ratio:.2f} times that of Drucker-Prager"

@@ -116,7 +116,7 @@ def main(argv: list[str] | None = None) -> dict:
     """Run the demo and return its results."""
     parser = common.Parser(__doc__, __file__)
     parser.add_argument("--h", type=float, default=0.1, help="cell size of the slab, m; cell size of the levee: 2.5 h")
-    parser.add_argument("--step", type=float, default=600.0, help="step of the slab, s; that of the levee: 9 times")
+    parser.add_argument("--step", type=float, default=600.0, help="step of the slab, s; of the levee: 9 times as long")
     o = parser.parse_args(argv)
     if not 0.025 <= o.h <= 0.25:
         parser.error(f"--h {o.h:g}: must be in [0.025, 0.25] m")

@@ -8,11 +8,11 @@
 2. A slow or a fast harmonic load acts on a saturated column of 10 m, drained at its top (Zienkiewicz, Chang and Bettess
    1980). Amplitudes and phases of settlement and pore pressures are compared. In the slow case, water drains only from
    a layer of 0.3 m below the top.
-3. The column of part 2, with incompressible water and grains and the conductivity k = 0.01 m/s, carries a sudden load q
-   (after de Boer, Ehlers and Liu 1993). Until a wave returns from the base, the settlement of the top at the time t is
-   `q / (M a^(1/2)) int_0^t exp(-r s) I_0(r s) ds`. Here `r = b / (2 a)`, I_0 is the modified Bessel function,
-   `a = n_s (rho_s - rho_w) / M` and `b = g rho_w / (k M)`. M is the oedometric modulus, and n_s is the volume fraction
-   of the grains. The densities of grains and water are rho_s and rho_w.
+3. The column of part 2 carries a sudden load q (after de Boer, Ehlers and Liu 1993). Here water and grains are
+   incompressible, and the conductivity is k = 0.01 m/s. Until a wave returns from the base, the settlement of the top
+   at the time t is `q / (M a^(1/2)) int_0^t exp(-r s) I_0(r s) ds`. Here `r = b / (2 a)`, I_0 is the modified Bessel
+   function, `a = n_s (rho_s - rho_w) / M` and `b = g rho_w / (k M)`. M is the oedometric modulus, and n_s is the volume
+   fraction of the grains. The densities of grains and water are rho_s and rho_w.
 
 The equations are the u-p form: water accelerates with the grains. In the saturated columns each cell is 1.05 times as
 high as the cell above, so that cells resolve the layer that drains.

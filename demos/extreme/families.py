@@ -65,7 +65,7 @@ def decades(low: int, high: int, step: int = 1) -> list[float]:
 
 @family(0.01)
 def conductivity():
-    """Compare a beam that drains at its free end with finite elements, for k = 1e-14 to 1e2 m/s."""
+    """Compare a beam with finite elements, for k = 1e-14 to 1e2 m/s. The beam drains at its free end."""
     for k in decades(-14, 2):
         yield f"k = {k:.0e} m/s", Beam(soil(conductivity=k), WATER)
 
@@ -95,14 +95,14 @@ def terzaghi(h: float, s: mpm.Simulation, r: mpm.Result) -> float:
 
 @family(0.01)
 def time_step_of_a_beam():
-    """Compare a beam that drains at its free end with finite elements, for dt = 1e-9 to 1e9 s."""
+    """Compare a beam with finite elements, for dt = 1e-9 to 1e9 s. The beam drains at its free end."""
     for dt in decades(-9, 9, 3):
         yield f"dt = {dt:.0e} s", Beam(SOIL, WATER, end=8 * dt)
 
 
 @family(0.01)
 def fluid_bulk():
-    """Compare an undrained column with exact values and an undrained beam with FEM, for K_w = 1e4 Pa to infinity."""
+    """Compare an undrained column with exact values, and an undrained beam with FEM, for K_w = 1e4 Pa to infinity."""
     load = 1e-5 * M
     for bulk in [*decades(4, 12), inf]:
         p = load / (1 + SOIL.storage(bulk, SOIL.porosity) * M)
@@ -126,7 +126,7 @@ def combined():
 
 
 def beside(beam: Beam, limit: Beam) -> Scene:
-    """Return the scene of `beam`, with the finite element solution of `limit` as reference."""
+    """Return the scene of `beam`. The reference is the finite element solution for the beam `limit`."""
     return replace(beam(), error=lambda s, r: off(tip(r), limit.elements()))
 
 
@@ -186,7 +186,7 @@ def contrast_of_stiffness():
 
 @family(0.01)
 def offset():
-    """Compare a beam at 20 random positions on the grid with finite elements."""
+    """Compare a beam with finite elements, at 20 random positions on the grid."""
     for i, (x, y) in enumerate(np.random.default_rng(0).random((20, 2))):
         place = {"offset": float(y), "h": (1 / (19 + float(x)), 0.05)}
         yield f"{i}: {x:.3f}, {y:.3f} of a cell", Beam(soil(conductivity=1e-5), WATER, **place)
@@ -236,7 +236,7 @@ def rotation_of_a_beam():
 
 @family(0.01)
 def points_per_cell():
-    """Compare a beam with 1 to 5 points per cell and direction with finite elements."""
+    """Compare a beam with finite elements, for 1 to 5 points per cell and direction."""
     for n in range(1, 6):
         for y in (0.0, 0.3):
             many = {"per_cell": n, "offset": y, "h": (0.025, 0.025)}
@@ -245,7 +245,7 @@ def points_per_cell():
 
 @family(0.01)
 def filling():
-    """Compare a beam with FEM and a column with exact values, if bodies fill 1e-10 to 0.5 of their outermost cells."""
+    """Compare a beam with FEM, and a column with exact values. Their outermost cells are filled to 1e-10 to 0.5."""
     for f in (*decades(-10, -1), 0.5):
         yield f"beam, {f:.0e} of a cell", Beam(soil(conductivity=1e-5), WATER, offset=1 - f)
         top = 1 + 0.05 * f
@@ -261,7 +261,7 @@ def few_points():
 
 @family(1.0)
 def thin():
-    """Compare beams that are half a cell, one and two cells high with Q1 elements on cells of this size.
+    """Compare beams with Q1 elements on cells of the same size. Beams are half a cell, one or two cells high.
 
     The thinnest beam has at least two points over its height. With one point the beam would creep, and the package
     would warn.
@@ -335,7 +335,7 @@ def overload():
 
 
 def pressed(material, load: float) -> Error | None:
-    """Return a function for the error of the settlement under a load (Pa), or None if there is no equilibrium."""
+    """Return a function that computes the error of the settlement under a load (Pa), or None without equilibrium."""
 
     def excess(a):
         lam = material.bulk - 2 * material.shear / 3
@@ -348,7 +348,7 @@ def pressed(material, load: float) -> Error | None:
 
 @family(0.01)
 def units():
-    """Compare beams of 1e-6 to 1e6 m, or with E = 1 to 1e15 Pa, with scaled FEM for 1 m and 10 MPa."""
+    """Compare beams of 1e-6 to 1e6 m, or with E = 1 to 1e15 Pa, with the scaled FEM solution for 1 m and 10 MPa."""
     exact = Beam().elements()
     for x in decades(-6, 6, 3):
         beam = Beam(size=(x, 0.4 * x), h=(0.05 * x, 0.05 * x))

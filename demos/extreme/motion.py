@@ -26,7 +26,7 @@ YOUNG, DENSITY = 1e7, 1000.0  # Pa, kg/m^3
 CROSSES = H / np.sqrt(YOUNG / DENSITY)  # s, in which a wave crosses a cell
 SMALL = 1e-5  # strain
 REST = 1e-3
-DIGIT = 1e-12  # m; a smaller displacement is a few digits of a position
+DIGIT = 1e-12  # m; a smaller displacement changes only the last digits of a position
 Motion = tuple[np.ndarray, np.ndarray]
 
 
@@ -41,10 +41,10 @@ def bar(
     v: ArrayLike | None = None,
     held: bool = True,
 ) -> Motion:
-    """Return nodal displacements and velocities of a bar of linear elements after some steps of SDIRK2.
+    """Return nodal displacements and velocities of a bar of linear elements after `steps` steps of SDIRK2.
 
-    young, density, h: modulus, density, length of each element.  load: force on the last node.  weight: gravity.
-    v: initial velocities of the nodes.  held: whether the first node is fixed.
+    young, density, h: Young's modulus, density and length of each element.  load: force on the last node.
+    weight: gravity.  v: initial velocities of the nodes.  held: whether the first node is fixed.
     """
     young, density, h = np.broadcast_arrays(*map(np.asarray, (young, density, h)))
     n, k = len(h), np.arange(len(h))
@@ -81,7 +81,7 @@ def ends(s: mpm.Simulation, axis: int) -> tuple[float, float]:
 
 
 def against(exact: Motion, dt: float, least: float = 0.0) -> Callable[[mpm.Simulation, mpm.Result], float]:
-    """Return a function for the larger error of displacement and velocity at the top, divided by their largest values.
+    """Return a function for the larger of two relative errors: of displacement and of velocity at the top.
 
     least: displacement, m, below which only velocities are compared.  If the bar moves in a step of dt by less than
     `REST` times its displacement, it is at rest, and only displacements are compared.
@@ -204,7 +204,7 @@ def inertia_filling():
 
 @family(0.01)
 def inertia_flight():
-    """Compare a vibrating bar that flies by 0 to 100 cells a step with a bar of finite elements that does not fly."""
+    """Compare a flying, vibrating bar with finite elements that do not fly, for 0 to 100 cells of flight in a step."""
     amplitude = SMALL * np.sqrt(YOUNG / DENSITY)
     shape = amplitude * np.cos(np.pi * np.arange(N + 1) / N)
     exact = bar(YOUNG, DENSITY, [H] * N, CROSSES, 4, v=shape, held=False)

@@ -21,7 +21,7 @@ walls = {"left": "x", "right": "x", "bottom": "xy"}
 simulation = mpm.Simulation(grid, [ground], [soil], walls=walls, gravity=(0, -9.81))
 safety = mpm.factor_of_safety(simulation, rtol=0.02)
 print(f"factor of safety: {safety.factor:.2f}")
-for factor, overload in sorted(safety.overloads.items()):  # falls to zero in trials that come to rest
+for factor, overload in sorted(safety.overloads.items()):  # the overload of a stable trial falls to zero
     plt.semilogy(range(1, len(overload) + 1), overload, "o-", label=f"trial factor {factor:.3f}")
 plt.gca().set(xlabel="step of the trial", ylabel="overload (-)", xticks=range(1, 6))
 plt.legend()
