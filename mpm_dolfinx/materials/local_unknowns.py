@@ -61,7 +61,7 @@ class LocalUnknowns:
     Attributes
     ----------
     values
-        UFL of the unknowns, by name, as functions of F; under the name `trial`, the trial values.
+        Dictionary of UFL: the unknowns as functions of F, by name, and the trial values under the name `trial`.
     known
         Like `values`, but the unknowns do not depend on F.  For laws with an energy, `known` equals `values`.
     """
@@ -195,7 +195,7 @@ class _Equations:
             raise NotConverged(message)
 
     def _in_numpy(self, data: PointData, trial: NDArray[np.float64]) -> Solved:
-        """Return the local unknowns of a law with the numpy function `solution`."""
+        """Return the local unknowns that the law's numpy function `solution` computes."""
         n, k, values, start = *trial.shape, {}, 0
         for name, shape in self._trial.items():  # copies, because a law may change its arguments
             values[name] = trial[:, start : start + _size(shape)].reshape(n, *shape).copy()
@@ -338,7 +338,7 @@ def _size(shape: tuple[int, ...]) -> int:
 
 
 def _named(shapes: Mapping[str, tuple[int, ...]], vector) -> dict:
-    """Return tensors by name from the components of a UFL vector."""
+    """Divide the components of a UFL vector among tensors, and return these by name."""
     out, start = {}, 0
     for name, shape in shapes.items():
         index = np.arange(start, start + _size(shape)).reshape(shape)

@@ -13,8 +13,8 @@ e_i are the principal directions.
 The final stress lies on one of ten faces, edges and vertices of the yield surface.  On each face, edge and vertex, the
 final stress is linear in the trial stress (de Souza Neto, Peric and Owen 2008, 8.2, without the cut-off).  Three
 conditions hold: the final stress is admissible, its principal stresses keep the order of the trial stresses, and
-plastic multipliers are >= 0.  The return mapping chooses the face, edge or vertex that violates these conditions least.
-Derivatives of the stress are exact, also for equal eigenvalues.
+plastic multipliers are >= 0.  The return mapping chooses the face, edge or vertex whose stress violates these
+conditions least.  Derivatives of the stress are exact, also for equal eigenvalues.
 """
 
 from __future__ import annotations
