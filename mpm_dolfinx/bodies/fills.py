@@ -77,9 +77,9 @@ def put(
     Parameters
     ----------
     bodies, others, fill
-        All bodies of the scene; the indices of the active bodies; the index of the fill.
+        All bodies (`bodies`), the indices of the active bodies (`others`), and the index of the fill (`fill`).
     points, new
-        Points of this process: the present points of the active bodies; the seeded points of the fill.
+        Points of this process: present points of the active bodies (`points`), and seeded points of the fill (`new`).
 
     Raises
     ------
@@ -208,7 +208,7 @@ def _check_shape(grid: Grid, fill: int, corners: NDArray, u: NDArray) -> None:
     if ratio[k] < TANGLED:
         raise ValueError(
             f"{name}; the domain at {corners[k].mean(axis=0) + grid.base} keeps {ratio[k]:.2g} of its volume, "
-            f"must keep {TANGLED}"
+            f"must keep at least {TANGLED}"
         )
     out = np.flatnonzero(grid.outside(now.reshape(-1, grid.dim), REACH))
     if len(out):

@@ -66,7 +66,7 @@ def _along(corners: NDArray, unit_weight: NDArray, x: NDArray, places: NDArray) 
 
 
 def _hits(corners: NDArray, at: NDArray) -> Iterator[tuple[NDArray, NDArray, NDArray]]:
-    """Yield, for each face, the crossings of line i with domain i: indices of lines, heights in m, and signs.
+    """Yield the crossings of line i with each face of domain i: indices of lines, heights in m, and signs.
 
     The sign is 1 if an upward line leaves the domain, and -1 if the line enters the domain.
     """
