@@ -76,7 +76,7 @@ class Space:
     `old`: w at the start of the step.
     `past`: contribution of the rate in the previous substep to the change of w in the step.
     `b`, `f`: residual and loads.
-    `same`: copy of w, which is constant in derivatives.
+    `same`: copy of w that derivatives of forms treat as a constant.
     `u`, `p`: displacement and scaled pressure, the parts of w.
     `p_dofs`: degrees of freedom of the pressures.
     `of_p`: space of the pressures alone.
@@ -116,8 +116,8 @@ class BiotFEM:
     grid
         Mesh of the box-shaped body: a `Grid` with cells of equal size, which no other model uses.
     material, fluid
-        Skeleton whose law has no state variables and no local unknowns; pore fluid, or None.  With steep retention
-        curves (n > 2.5, or with an air entry), steps may fail to converge.
+        `material`: skeleton whose law has no state variables and no local unknowns.  `fluid`: pore fluid, or None.
+        With steep retention curves (n > 2.5, or with an air entry), steps may fail to converge.
     walls
         Sides of the box, each with the displacement components that are zero there, such as {"left": "xy"}.
     conditions
