@@ -276,7 +276,7 @@ def _unique(
 
 
 def _groups(placed: list[_Placed], cells: list, numbers: list) -> dict[str, list[NDArray[np.int64]]]:
-    """Return, by name, the cells of instances, element sets and surfaces in each block of cells."""
+    """Return the cells of instances, element sets and surfaces in each block of cells, by name."""
     chosen: dict[str, list[tuple[int, NDArray[np.int64]]]] = {}
     seen = [
         [key for key, found in one.scope.sets.items() if not (found.internal and key.startswith("_"))] for one in placed

@@ -251,7 +251,7 @@ def _interval(X: NDArray[np.float64], region: NDArray[np.float64]) -> tuple[NDAr
 def _clipped(
     X: NDArray[np.float64], t: NDArray[np.float64], region: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Divide parts of faces into triangles, and clip these to a region.  Return the triangles, and the part of each."""
+    """Divide parts of faces into triangles, and clip these to a region.  Return each triangle, and its part's index."""
     places = np.einsum("npk,nkd->npd", weights(t.reshape(-1, 2)).reshape(*t.shape[:2], 4), X)
     three = (t[:, 2] == t[:, 3]).all(axis=1)[:, None]  # in triangles, the middle is a corner
     middle = np.where(three, places[:, 2], places.mean(axis=1))

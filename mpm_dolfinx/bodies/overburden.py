@@ -36,7 +36,7 @@ def overburden(
 
 
 def _along(corners: NDArray, unit_weight: NDArray, x: NDArray, places: NDArray) -> tuple[NDArray, NDArray]:
-    """Return overburden stresses at the heights of x, and ground levels, on vertical lines through `places`."""
+    """Return overburden stresses and ground levels above the heights of x, on vertical lines through `places`."""
     low, high = corners[..., :-1].min(axis=1), corners[..., :-1].max(axis=1)
     half = (high - low).max(initial=0.0) / 2
     across, line = np.unique(places, axis=0, return_inverse=True)

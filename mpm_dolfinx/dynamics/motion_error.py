@@ -33,7 +33,7 @@ def motion_error(
 
     `K`, `mass`: momentum tangent and mass matrix of the last substep.
     `flights`: velocities and accelerations after the two substeps.
-    `seconds`, in s: weight of the first substep's rates in the last substep.  `own`, in s: weight of its own rates.
+    `seconds`, in s: weight of the first substep's time derivatives in the last substep.  `own`: weight of its own.
     `drift`: mean velocity of free bodies at the start of the run, in m/s, see `energies.drift`.
     """
     first, last = flights

@@ -68,7 +68,9 @@ def _faces(dim: int) -> NDArray[np.int64]:
 FACES = {d: _faces(d) for d in (2, 3)}
 """Corner indices (2d, 2^(d-1)) of the faces of a cell or a particle domain."""
 FACE_SIGNS = (-1, 1, 1, -1, -1, 1)
-"""Signs (6,) of the face normals from the corner order in `FACES`: 1 outward, -1 inward; in 2D only the first four."""
+"""Sign (6,) of the normal that follows from the order of the corners in `FACES`, for each face: 1 if this normal points
+outward, and -1 if inward.  In 2D, only the first four apply.
+"""
 ABOUT_MIDDLE = ((0, 1, 4), (1, 3, 4), (3, 2, 4), (2, 0, 4))
 """Triangles that divide a face in 3D symmetrically.  Each triangle has two corners of the face and its middle."""
 
@@ -165,7 +167,7 @@ def values_at(
 
 
 def across_faces(grid: Grid, n: Any) -> tuple[Any, Any, Any]:
-    """Return as UFL the lengths of the "+" and "-" cells along the normal n of their face, and the mean length."""
+    """Return the lengths of the "+" and "-" cells along the normal n of their face, and the mean length, as UFL."""
     h = grid.edge_in_forms()
     if grid.even:
         return (sum(abs(n[a]) * h[a] for a in range(grid.dim)),) * 3

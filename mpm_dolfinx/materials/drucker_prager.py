@@ -41,7 +41,7 @@ Sensitivity (scene "soil" of tests/plateaus.py): half this value changes the res
 
 @dataclass(frozen=True, kw_only=True)
 class DruckerPrager(Frictional):
-    """Hencky elasticity with a Drucker-Prager yield surface in Kirchhoff stress, perfectly plastic or hardening.
+    """Perfectly plastic or hardening law with Hencky elasticity, and with a Drucker-Prager cone in Kirchhoff stress.
 
     Parameters
     ----------

@@ -132,7 +132,7 @@ class SceneMaterials:
             for i, m in zip(self._used, used, strict=True)
             if m.conductivity_law
         }
-        """For checkpoints: checksums of varying constants, and samples of conductivity laws and retention curves."""
+        """For checkpoints: checksums of constants that vary, and samples of conductivity laws and retention curves."""
         for i, m in zip(self._used, used, strict=True):
             if m.retention is not None:
                 self.checksums[f"retention of material {i}"] = drained(m.retention)
@@ -199,7 +199,7 @@ class SceneMaterials:
             raise ValueError(f"{law.__name__}: has {has}; must define {allowed}")
         own, others = (*constants_of(m), *law.state), {*constants_of(m), *law.state, *BY_SCENE, "F", "trial"}
         if clashes := [name for name in own if name in BY_SCENE] + [name for name in law.unknowns if name in others]:
-            raise ValueError(f"{law.__name__}: the name {clashes[0]!r} is taken; {WHAT_IS_NAMED} must have others")
+            raise ValueError(f"{law.__name__}: the name {clashes[0]!r} is taken; {WHAT_IS_NAMED} must have other names")
         for name, value in law.unknowns.items():
             _known(f"{law.__name__}: unknown {name!r}", value)
         if self.fluid is None and m.retention is not None:
@@ -222,7 +222,7 @@ class SceneMaterials:
 
     def _set_shape(self, law, name: str, shape: tuple[int, ...]) -> None:
         if name in RESERVED or hasattr(FormPoints(self.grid), name):
-            raise ValueError(f"{law.__name__}: the name {name!r} is taken; {WHAT_IS_NAMED} must have others")
+            raise ValueError(f"{law.__name__}: the name {name!r} is taken; {WHAT_IS_NAMED} must have other names")
         other = self.shapes.setdefault(name, shape)
         if other != shape:
             raise ValueError(f"{law.__name__}: {name} has shape {shape}, in another law {other}; must be equal")

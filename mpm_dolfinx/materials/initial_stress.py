@@ -161,7 +161,7 @@ class InitialStresses:
         return stressed(materials, points, rows, target)
 
     def lifted(self, materials: SceneMaterials, points: MaterialPoints) -> str:
-        """Return as text the stress and position of a point where K0 gives vertical tension, or "" without tension.
+        """Return a text: stress and position of a point where K0 gives vertical tension, or "" without tension.
 
         All processes must call this method.
         """
@@ -222,7 +222,7 @@ def _in_columns(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return corners and unit weights of all particle domains in the vertical columns that contain the given domains.
 
-    `ids` (n,), `corners` (n, 2^d, d), in m, `unit_weight` (n,), in N/m^3: particle domains of this process.
+    `ids` (n,), `corners` (n, 2^d, d), in m, and `unit_weight` (n,), in N/m^3, of this process's particle domains.
     `above` (k, 2^d, d), in m: corners of the given domains of this process.
     """
     ends = [above[..., :-1].min(axis=(0, 1), initial=np.inf), above[..., :-1].max(axis=(0, 1), initial=-np.inf)]

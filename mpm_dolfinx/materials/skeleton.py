@@ -375,7 +375,7 @@ def _deviatoric(F):
 
 
 def _stretch_difference(C):
-    """Return as UFL the difference of the logarithmic principal stretches for the tensor C = F^T F (2, 2)."""
+    """Return the difference of the logarithmic principal stretches for the tensor C = F^T F (2, 2), as UFL."""
     ratio = ((C[0, 0] - C[1, 1]) ** 2 + 4 * C[0, 1] ** 2) / (C[0, 0] + C[1, 1]) ** 2
     radius = ufl.sqrt(ratio + SEPARATION**2 / 4)
     return (ufl.ln(1 + radius) - ufl.ln(1 - radius)) / 2

@@ -8,9 +8,8 @@ the start of the step.  Possible arguments of these functions are:
 points
     Quadrature points.  The integral of 1 over the measure `points.dx` is the volume of the material points.
     `points.value(f)` and `points.grad(f)` are the value and gradient of f = u or v.  In axisymmetry the gradient is (3,
-    3), with f_r / r as last diagonal entry.  `points.F` is the deformation gradient at the start of the step, in the
-    shape of grad u; det F is the volume ratio since seeding.  `points.position` is the position at the start of the
-    step.
+    3), with f_r / r on the diagonal.  `points.F` is the deformation gradient at the start of the step, in the shape of
+    grad u; det F is the volume ratio since seeding.  `points.position` is the position at the start of the step.
     `points.displacement` is the displacement since the start of the run, or since a stage that reset it to zero.  Other
     attributes are the laws' state variables, and parameters that are functions of position.
 t
@@ -158,7 +157,7 @@ def term_of(term: Callable, unknown: ufl.Coefficient, test: ufl.Argument, **avai
 
 @contextmanager
 def compiling(what: str, allowed: str) -> Iterator[None]:
-    """Replace errors of UFL and its compiler by a ValueError with the name `what` of the object."""
+    """Replace errors of UFL and its compiler by a ValueError that begins with the object's name, `what`."""
     try:
         yield
     except (Exception, ArityMismatch) as error:  # UFL and FFCx raise many kinds; one is no Exception

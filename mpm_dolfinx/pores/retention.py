@@ -339,7 +339,7 @@ def property_of(law, name: str, p):
 
 
 def _called(law, name: str, p):
-    """Return as UFL the result of the method `name` of a law."""
+    """Return the result of the method `name` of a law, as UFL."""
     what = f"{line(law)}: {name}"
     out = asked(what, "UFL of p", lambda: ufl.as_ufl(getattr(law, name)(p)))
     if out.ufl_shape:
@@ -421,7 +421,7 @@ class Conductance:
 
 
 REACH = (1e-8, 1e8)
-"""Smallest and largest tabulated suction, divided by `scale`.  Source: k_r is 1 below and 0 above them, exact to 1e-8."""
+"""Smallest and largest tabulated suction, divided by `scale`.  Source: k_r is 1 below, and 0 above, exact to 1e-8."""
 ROWS = 4000
 """Number of tabulated suctions.  Sensitivity (scene "dry" of tests/plateaus.py): half this value changes the result by
 2.1e-08, and twice this value by 2.6e-09.  Finer cells change it by 6.6e-03.
