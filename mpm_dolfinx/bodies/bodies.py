@@ -129,7 +129,7 @@ class Body:
 
     def images(self, X: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the images (..., d) of reference positions (..., d) under `map`, both in m."""
-        if self.map is None or not X.size:  # user maps may fail for no positions
+        if self.map is None or not X.size:  # user maps may fail for an empty array
             return X
         x = X.reshape(-1, X.shape[-1])
         images = numbers("body: the map", asked("body: the map", "a function of positions", self.map, x), None)

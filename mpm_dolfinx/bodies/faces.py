@@ -43,7 +43,7 @@ class Surface:
 
     id: NDArray[np.int64]  # identifier of the material point (m,), ascending
     face: NDArray[np.int64]  # index of the face in its domain (m,), see `grid.FACES`
-    # corners (m, 2^(d-1), d) of the polygon, in local coordinates of the domain from -1 to 1; a triangle repeats one
+    # corners (m, 2^(d-1), d) of the polygon, in local coordinates of the domain, -1 to 1; triangles repeat a corner
     xi: NDArray[np.float64]
     domain: NDArray[np.float64]  # seeded corners of the domain, after all maps (m, 2^d, d), m
     before: NDArray[np.float64]  # reference positions of the domain's corners, before all maps (m, 2^d, d), m

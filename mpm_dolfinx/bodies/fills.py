@@ -22,7 +22,7 @@ from mpm_dolfinx.parallel.messages import ResolutionWarning, warn
 from mpm_dolfinx.points.cutting import TANGLED, centroids, domain_volumes, volumes
 from mpm_dolfinx.points.material_points import MaterialPoints
 
-UPRIGHT = 0.95  # cosine of the largest angle between an axis and normals of mesh faces on the side opposite a contact
+UPRIGHT = 0.95  # cosine of the largest angle between an axis and the normals of faces on the side opposite to a contact
 
 
 @dataclass
@@ -157,7 +157,7 @@ def _follow(grid: Grid, body: Body, corners: NDArray[np.float64], contacts: Sequ
         sides[contact.side] = sides.get(contact.side, 0.0) + contact.area()
     axis, end = max(sides, key=sides.get)
     opposite = Faces.of(body, *body.facing(axis, 1 - end, UPRIGHT))
-    fixed = np.minimum(np.abs(x - grid.low), np.abs(x - grid.high)) < SAME * grid.finest  # normal to walls of the grid
+    fixed = np.minimum(np.abs(x - grid.low), np.abs(x - grid.high)) < SAME * grid.finest  # components normal to walls
     fixed[hits > 0] = True
     fixed[node[opposite.row[:, None], opposite.index]] = True
     K = _springs(body, node, len(nodes))

@@ -251,7 +251,7 @@ def _merged(
         several = np.flatnonzero(np.bincount(same)[same] > 1)
         member = np.stack([np.isin(several, found[kind]) for found in parts.values()] or [np.zeros(len(several), bool)])
         if len(np.unique(np.stack([same[several], *member]), axis=1).T) < len(several):
-            continue  # repeated in the same parts: an error if the cell is seeded
+            continue  # cells repeated in the same parts are an error if they are seeded
         order = np.argsort(first)  # in the order of the file
         number = np.empty_like(order)
         number[order] = np.arange(len(order))
@@ -271,7 +271,7 @@ def _groups(
 ) -> Iterator[tuple[str, NDArray[np.bool_]]]:
     """Yield the name of each group, and which cells of a block belong to the group."""
     known = {name: int(tag) for name, (tag, d) in _pairs(mesh.field_data) if int(d) == dim} | dict(names)
-    families = getattr(mesh, "cell_tags", None) or {}  # in MED files: names of groups for each number
+    families = getattr(mesh, "cell_tags", None) or {}  # in MED files: names of the groups of each tag
     for key in (tags,) if tags is not None else TAGS:
         if key not in mesh.cell_data:
             continue

@@ -84,7 +84,7 @@ def _hits(corners: NDArray, at: NDArray) -> Iterator[tuple[NDArray, NDArray, NDA
         for corner in ABOUT_MIDDLE:
             part = x[:, corner]
             off = part[:, :, :2] - at[:, None]
-            area = cross_in_plane(off[:, [1, 2, 0]], off[:, [2, 0, 1]])  # opposite to each corner
+            area = cross_in_plane(off[:, [1, 2, 0]], off[:, [2, 0, 1]])  # areas opposite to each corner
             on = np.flatnonzero((area > 0).all(axis=1) | (area < 0).all(axis=1))
             area = area[on]
             whole = area.sum(axis=1)

@@ -66,8 +66,8 @@ class Cover:
     Face coordinates run from 0 to 1 along two edges of the covered face.
     """
 
-    face: NDArray[np.int64]  # the covered face (n,)
-    by: NDArray[np.int64]  # the covering face (n,)
+    face: NDArray[np.int64]  # index of the covered face (n,)
+    by: NDArray[np.int64]  # index of the covering face (n,)
     low: NDArray[np.float64]  # lower corner of the covering face's bounding box (n, 2), in face coordinates
     high: NDArray[np.float64]  # upper corner of this box (n, 2)
     corner: NDArray[np.int64]  # corner of this box for each corner of the covering face (n, 4); -1 for rotated faces

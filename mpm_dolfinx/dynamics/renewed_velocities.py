@@ -23,7 +23,7 @@ class Momenta(NamedTuple):
 
     mass: NDArray[np.float64]  # (groups,), kg
     centre: NDArray[np.float64]  # centre of mass (groups, 2), m
-    velocity: NDArray[np.float64]  # of the centre (groups, 2), m/s
+    velocity: NDArray[np.float64]  # velocity of the centre (groups, 2), m/s
     angular: NDArray[np.float64]  # angular momentum about the centre (groups,), kg m^2/s
     inertia: NDArray[np.float64]  # moment of inertia about the centre (groups,), kg m^2
 

@@ -37,7 +37,7 @@ SIDES = {
     3: {"left": (0, 0), "right": (0, 1), "front": (1, 0), "back": (1, 1), "bottom": (2, 0), "top": (2, 1)},
 }
 """Axis and end of each side of a box.  The end is 0 at the lower coordinate, and 1 at the upper coordinate."""
-REACH = 1e-4  # distance, in cell sizes, by which bodies may lie outside the grid: walls act by penalties, inexactly
+REACH = 1e-4  # distance, in cell sizes, by which bodies may lie outside the grid: penalties of walls are inexact
 
 TURN = 2 * np.pi
 """Angle of a whole revolution.  Axisymmetric volumes, forces and outflows refer to this angle.  Source: definition."""

@@ -115,7 +115,7 @@ def _bisect(weight: NDArray[np.float64], filled: NDArray[np.bool_], low: NDArray
     if len(layers) == 1:  # all filled cells lie in one layer
         axis = int(np.argmax(weight.shape))
         layers = weight.sum(axis=tuple(a for a in range(weight.ndim) if a != axis))
-    cells = np.arange(1, len(layers)) * (weight.size // len(layers))  # below each plane
+    cells = np.arange(1, len(layers)) * (weight.size // len(layers))  # numbers of cells below each plane
     ranks = np.clip(count // 2, count - (weight.size - cells), cells)  # below each plane: half, unless some get no cell
     even = (ranks == count // 2) | (ranks != count // 2).all()
     off = np.abs(np.cumsum(layers)[:-1] - layers.sum() * ranks / count)

@@ -149,7 +149,7 @@ def resume(simulation: Simulation, file: str | os.PathLike) -> Result:
             arrays |= read(comm, file, rows, together(comm, lambda: _ranges(comm, file, rows)))
     count = rows[POINTS].shape[0]
     state = together(comm, lambda: _state(file, arrays, note, simulation, count))
-    # the distribution of the file gives equal bits, except for sums in the order of messages
+    # the file's distribution of cells gives bitwise equal results, except for sums in the order of messages
     if len(boxes) == comm.size > 1 and (boxes != simulation.grid.partition.boxes).any():
         distribute_by(simulation, boxes)
     nodal = {name: simulation.grid.from_rows(*of) for name in NODAL if (of := getattr(state, name)) is not None}

@@ -135,7 +135,7 @@ class ModifiedCamClay(Skeleton):
         else:
             bulk = -np.mean(stress, axis=-1) / kappa
             bulk = bulk if np.ndim(bulk) else _Follows(bulk)
-        if self.bulk is None or getattr(self.bulk, "follows", False):  # derived for another material before `replace`
+        if self.bulk is None or getattr(self.bulk, "follows", False):  # it was derived before `replace`
             object.__setattr__(self, "bulk", bulk)
         elif callable(self.bulk) or (not callable(bulk) and not np.allclose(self.bulk, bulk, rtol=SAME)):
             raise ValueError(f"{type(self).__name__}: bulk = {line(self.bulk)}, must be left out; it is P_0 / kappa")
@@ -312,7 +312,7 @@ class _Return:
     """Result of the return mapping for a value of the unknown d.
 
     `compaction`: the unknown `a`, plastic compaction divided by kappa.
-    `flow`: the unknown h = ln(Q_t / Q).
+    `flow`: h = ln(Q_t / Q), which depends on dgamma.
     `steepness`: w exp(-d), the square of Q / (M P) at the end of the step.
     `trial_pressure`: P_t, in Pa.
     `rho`: kappa / (lambda - kappa).

@@ -182,7 +182,7 @@ def knows_space(grid: Grid, m: Skeleton) -> bool:
     try:
         law_of_F = expression(function, [shape], F=F, **given, **by_scene(grid))
         apply_derivatives(apply_algebra_lowering(ufl.diff(law_of_F, F)))  # here UFL detects sizes that disagree
-    except Exception:  # UFL has several kinds
+    except Exception:  # UFL raises several kinds of errors
         return False
     finally:
         log.disabled = before

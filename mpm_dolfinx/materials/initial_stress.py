@@ -169,7 +169,7 @@ class InitialStresses:
         own = np.isin(np.searchsorted(self._start, points.id, side="right") - 1, kept)
         d = points.x.shape[1]
         vertical, pore = materials.effective_stress_3d(points)[:, d - 1, d - 1], materials.pore_stress(points)
-        rows = np.flatnonzero(own & (vertical > SAME * np.abs(pore)))[:1]  # beyond rounding errors
+        rows = np.flatnonzero(own & (vertical > SAME * np.abs(pore)))[:1]  # above rounding errors
         where = points.x + materials.grid.base
         return first(materials.grid.comm, "".join(f"{vertical[i]:.4g} Pa at {where[i].tolist()}" for i in rows))
 

@@ -81,7 +81,7 @@ def expression(function: Callable, shapes: Sequence[tuple[int, ...]], of: str = 
     try:
         out = ufl.as_ufl(value)
         apply_algebra_lowering(out)  # here UFL detects most errors
-    except Exception as error:  # UFL has several kinds
+    except Exception as error:  # UFL raises several kinds of errors
         why = f" ({line_of(error)})" if isinstance(value, ufl.core.expr.Expr) else ""
         raise ValueError(f"{_name(function)}: returns {line(value)}{why}, must be {allowed}") from error
     if out.ufl_shape not in shapes:
@@ -115,7 +115,7 @@ def named(what: str, given, shapes: Mapping[str, tuple[int, ...]], some: bool = 
     for name, value in given.items():
         try:
             out[name] = ufl.as_ufl(value)
-        except Exception as error:  # UFL has several kinds
+        except Exception as error:  # UFL raises several kinds of errors
             raise ValueError(f"{what}: {name} = {line(value)}, must be UFL; the dict must have {allowed}") from error
         _check_parts(f"{what}: {name}", out[name])
     found = {name: value.ufl_shape for name, value in out.items()}
@@ -160,7 +160,7 @@ def compiling(what: str, allowed: str) -> Iterator[None]:
     """Replace errors of UFL and its compiler by a ValueError that begins with the object's name, `what`."""
     try:
         yield
-    except (Exception, ArityMismatch) as error:  # UFL and FFCx raise many kinds; one is no Exception
+    except (Exception, ArityMismatch) as error:  # UFL and FFCx raise many kinds of errors; one is no Exception
         if isinstance(error, (ValueError, OSError)) and _is_ours(error):  # OSError: a fault of the C compiler
             raise
         why = f"{type(error).__name__}: {line_of(error)}"

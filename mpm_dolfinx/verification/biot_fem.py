@@ -104,7 +104,7 @@ class Forms(NamedTuple):
     dt: fem.Constant  # time weight of the flux, s
     since: fem.Constant  # time since the start of the step, s
     t: fem.Constant  # time at the end of the substep, s
-    # functions of time, each with the constant of its value
+    # functions of time, each with the UFL constant of its value
     given: list[tuple[Callable[[float], ArrayLike], fem.Constant]]
 
 
@@ -208,7 +208,7 @@ class BiotFEM:
         outlets = drained if element == "q1-dg0" else None
         with compiling(f"{type(material).__name__}, terms, sources", "UFL, terms linear in v or energies of u"):
             self._forms = self._compile(tractions, outlets, gravity, terms, sources)
-        self.jit = time.perf_counter() - start  # s, to compile or load the forms
+        self.jit = time.perf_counter() - start  # time, in s, to compile or load the forms
         self._snes = self._solver()
 
     @property
