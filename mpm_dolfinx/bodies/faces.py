@@ -135,7 +135,7 @@ def limits(region: Region | None, dim: int) -> NDArray[np.float64]:
 def surface(
     bodies: Sequence[Body], name: str | None, region: Region | None = None, present: Sequence[bool] | None = None
 ) -> Surface:
-    """Return the faces on a side of the active bodies, without parts in contact with other bodies at seeding.
+    """Return the faces on a side of the active bodies, without the parts that touch other bodies at seeding.
 
     Parameters
     ----------

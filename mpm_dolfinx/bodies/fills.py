@@ -52,7 +52,7 @@ class Contact:
         return on, weights(np.clip(s, 0, 1).reshape(-1, 2)).reshape(*s.shape[:2], 4) @ self.moved
 
     def misfit(self, u: NDArray[np.float64]) -> float:
-        """Return the largest distance, in m, of corners of the body's faces from the faces of the displaced fill."""
+        """Return the largest distance, in m, between corners of the body's faces and faces of the displaced fill."""
         on = (np.abs(self.cover.t - 0.5) <= 0.5).all(axis=2)
         share = weights(np.clip(self.cover.t, 0, 1).reshape(-1, 2)).reshape(*on.shape, 4)
         off = share @ u[self.corners()] - self.moved
@@ -175,7 +175,7 @@ def _springs(body: Body, node: NDArray[np.int64], count: int) -> csr_array:
 
 
 def _between(K: csr_array, fixed: NDArray[np.bool_], u: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the displacements of a network of springs with stiffness K, and with given u at `fixed` nodes."""
+    """Return the displacements of a network of springs with stiffness K, if the `fixed` nodes move by u."""
     out, free = u.copy(), np.flatnonzero(~fixed)
     if len(free):
         held = np.flatnonzero(fixed)

@@ -460,7 +460,8 @@ class Grid:
         return Spacing(lines, widths, finest, float(finest.min()), float(most.max()), snap)
 
     def move(self, lines: Mapping[str, NDArray[np.float64]] | None) -> None:
-        """Move the lines of a grid with `follow` to `lines`: coordinates (n,) for "x", "y" and "z", in m from the base.
+        """Move the lines of a grid that has `follow` to `lines`: coordinates (n,) for "x", "y", "z", in m from the
+        base.
 
         With None, the lines return to their initial coordinates.  All coordinates of nodes, cells and mesh are then
         bitwise equal to coordinates in a new grid with these lines.

@@ -104,7 +104,7 @@ def imbalance(load: NDArray[np.float64], of: NDArray[np.int64]) -> float:
 def _bisect(weight: NDArray[np.float64], filled: NDArray[np.bool_], low: NDArray[np.int64], out: NDArray[np.int64]):
     """Divide a box of cells into a box for each rank, written to `out`.
 
-    If there are enough cells, each rank gets at least one cell, even if the work of the ranks is then less equal.
+    If there are enough cells, each rank gets at least one cell, even if this makes the work less equal.
     """
     count = len(out)
     if count == 1 or weight.size == 1:

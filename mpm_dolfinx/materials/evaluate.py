@@ -342,7 +342,7 @@ class ConductivityAtPieces:
 
 
 def sampled(law: Callable) -> list[float | None]:
-    """Return the conductivities of a law in three states of deformation, as stored in checkpoints."""
+    """Return a law's conductivities in three states of deformation, which checkpoints store."""
     out = []
     for J in (0.75, 1.0, 1.25):
         F = ufl.as_matrix([[J, J / 8], [0.0, 1.0]])

@@ -282,7 +282,7 @@ def _real(name: str, value, shape: tuple[int, ...]) -> NDArray[np.float64]:
 def _newton(system, y: NDArray[np.float64]) -> NDArray[np.int64]:
     """Solve f(y) = 0 in place, and return the indices of points without a solution.
 
-    `system`: function that returns f, df/dy and the norms of f for point indices (r,) and their y (r, m).
+    `system`: function of point indices (r,) and their y (r, m) that returns f, df/dy and the norms of f.
     """
     rows, failed = np.arange(len(y)), np.zeros(len(y), dtype=bool)
     f, slope, norm = system(rows, y)

@@ -110,8 +110,7 @@ class Skeleton:
         for the balances is slow if the derivative of `energy` with respect to the unknowns is not zero.
     trial
         Function of F that returns trial values as UFL, by name.  Residuals depend on F only through these values.
-        Without `trial`, residuals have F as argument.  Trial values that are not UFL are passed to `kirchhoff` and
-        `update` only.
+        Without `trial`, residuals have F as argument.  Only `kirchhoff` and `update` get trial values that are not UFL.
 
     All these functions may have the argument `dt`, the time since the start of the step, s, for rate-dependent laws.
     If a law receives the new state and dt = 0, it must return the stress at the end of the step.  The argument
