@@ -101,7 +101,7 @@ class Mandel:
 
     Parameters
     ----------
-    a, b : m, > 0; width and height of the quarter, which are half those of the slab
+    a, b : m, > 0; width and height of the quarter: half the width and half the height of the slab
     bulk, shear : Pa, > 0; drained moduli K (in three dimensions) and G
     mobility : m²/(Pa s), > 0; kappa = permeability / viscosity = conductivity / (density of the fluid * g)
     storage : 1/Pa, >= 0; storage coefficient S at constant strain, n/K_w + (alpha - n)/K_s
